@@ -1,7 +1,7 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
@@ -17,7 +17,7 @@ from evlcp_sdk.io.open import STDIN, is_recording
 from evlcp_sdk.io.patience import open_until, pieces_until
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.link.several import load_links, named_links
+from evlcp_sdk.link.several import load_links, named_links, placing_links
 from evlcp_sdk.live.budget import Budget
 from evlcp_sdk.live.loop import LiveLoop
 from evlcp_sdk.live.outlet import Outlet
@@ -800,7 +800,7 @@ def _views(
 ) -> list[CalibrationView]:
     """What a recording shows at the times of known poses."""
     who = Whereabouts(sites, link.position)
-    seen = _seen_at(url, poses, link, registry, who)
+    seen, _ = _seen_at(url, poses, {"": link}, registry, who)
     for how in who.contradicted.values():
         raise ConfigError(f"{url}: {how}")
     stands_at, views = who.stands_at, []
@@ -829,38 +829,45 @@ def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> Calibrat
 
 
 def _seen_at(
-    url: str, poses: Sequence[KnownPose], link: Link, registry: Registry, who: Whereabouts
-) -> list[dict[int, SeenPoints]]:
-    """What `points_at` gives of each transmitter at the times of known poses."""
-    clusters, spec = link.bar.clusters, link.position
-    period_us = link.packet.packet_chips * link.packet.chip_us
+    url: str, poses: Sequence[KnownPose], links: Mapping[str, Link], registry: Registry, who: Whereabouts
+) -> tuple[list[dict[int, SeenPoints]], dict[int, str]]:
+    """What `points_at` gives of each transmitter at the times of known poses; the link of each."""
+    placing = placing_links(links)
+    periods = {name: one.packet.packet_chips * one.packet.chip_us for name, one in placing.items()}
     frames: dict[int, list[Frame]] = {}
-    with receive(url, link, registry=registry) as packets:
+    link_of: dict[int, str] = {}
+    with receive(url, list(links.values()), registry=registry) as packets:
         for packet in packets:
+            if packet.link not in placing:
+                continue
             who.hear(packet)
             if packet.echo_of is not None:
                 frames.pop(packet.transmitter, None)
                 continue
+            link_of[packet.transmitter] = packet.link
             kept = frames.setdefault(packet.transmitter, [])
+            clusters, period_us = placing[packet.link].bar.clusters, periods[packet.link]
             for one in packet.frames:
                 if len(one.points_px) == clusters and any(
                     abs(one.points_t_us - pose.t_us) <= period_us for pose in poses
                 ):
                     kept.append(one)
-    return [
-        {
-            number: points
-            for number, seen in frames.items()
-            if (points := points_at(seen, pose.t_us, period_us, clusters, spec)) is not None
-        }
-        for pose in poses
-    ]
+    found: list[dict[int, SeenPoints]] = []
+    for pose in poses:
+        found.append({})
+        for number, seen in frames.items():
+            name = link_of[number]
+            link = placing[name]
+            points = points_at(seen, pose.t_us, periods[name], link.bar.clusters, link.position)
+            if points is not None:
+                found[-1][number] = points
+    return found, link_of
 
 
 def survey(
     recordings: Sequence[str],
     poses: Sequence[KnownPose],
-    link: Link | None = None,
+    link: Link | Path | str | Sequence[Link | Path | str] | None = None,
     *,
     registry: Registry | None = None,
     name: str = "poses",
@@ -871,7 +878,8 @@ def survey(
     Args:
         recordings: Recordings of the bars.
         poses: Where the camera was, how it was turned, and when.
-        link: The configuration, or a `link.toml`; None for all defaults.
+        link: The configuration, or a `link.toml`, or several, whose bars are told apart by their codes and
+            whose sites name them; None for all defaults.
         registry: The plugins; None for all that are installed.
         name: What a message calls the poses: the file they come from, which has a heading and a line a pose.
         known: Bars that need no survey.
@@ -881,35 +889,52 @@ def survey(
         ConfigError: A pose belongs to none of the recordings, or has no attitude, or too little was seen.
     """
     registry = Registry.load() if registry is None else registry
-    link = link if isinstance(link, Link) else load_link(link, registry=registry)
-    if not link.bar.in_even_line or link.bar.clusters < 2:
-        raise ConfigError(
-            "a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
-        )
+    links = named_links(load_links(link, registry=registry))
+    placing = placing_links(links)
+    for link_name, one in placing.items():
+        if not one.bar.in_even_line or one.bar.clusters < 2:
+            which = f"link '{link_name}': " if link_name else ""
+            raise ConfigError(
+                f"{which}a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
+            )
     _check_names(recordings, poses, name)
     listed = {site.transmitter_id for site in known}
-    first = poses[0]
+    first, like = poses[0], next(iter(placing.values()))
     axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)
     views: list[CalibrationView] = []
+    sends: dict[int, str] = {}
     for url in recordings:
         mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
-        who = Whereabouts((), link.position)
-        seen = _seen_at(url, mine, link, registry, who)
+        who = Whereabouts((), like.position)
+        seen, link_of = _seen_at(url, mine, links, registry, who)
         ids = who.ids
         for pose, points in zip(mine, seen, strict=True):
-            new = [(ids[n], found) for n, found in points.items() if n in ids and ids[n] not in listed]
-            bars = [
-                BarView(number, np.empty((0, 3)), found.points_px, found.sigma_px, pixel_px=found.pixel_px)
-                for number, found in new
-            ]
+            bars = []
+            for n, found in points.items():
+                if n not in ids or ids[n] in listed:
+                    continue
+                number, by = ids[n], link_of[n]
+                if sends.setdefault(number, by) != by:
+                    raise ConfigError(
+                        f"{url}: id {number} is sent by '{sends[number]}' and '{by}': give one link at a time"
+                    )
+                bars.append(
+                    BarView(
+                        number, np.empty((0, 3)), found.points_px, found.sigma_px, pixel_px=found.pixel_px
+                    )
+                )
             views.append(_view(pose, bars, axes))
-    return survey_bars(views, axes, link.bar.length_m, link.camera, link.camera_sigma, link.position)
+    long_m = {number: placing[by].bar.length_m for number, by in sends.items()}
+    surveyed = survey_bars(views, axes, long_m, like.camera, like.camera_sigma, like.position)
+    return [
+        replace(bar, site=replace(bar.site, link=sends[bar.site.transmitter_id] or None)) for bar in surveyed
+    ]
 
 
 def survey_on_the_way(
     recordings: Sequence[str],
     plan: PositionPlan,
-    link: Link | None = None,
+    link: Link | Path | str | Sequence[Link | Path | str] | None = None,
     *,
     attitude: Attitude | AttitudeLog | None = None,
     registry: Registry | None = None,
@@ -922,7 +947,7 @@ def survey_on_the_way(
         recordings: Recordings in which known bars, or fixes of satellites, give positions, and new bars send
             their ids.
         plan: Where the known bars stand; fixes of satellites.
-        link: The configuration, or a `link.toml`; None for all defaults.
+        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
         attitude: What is known of the camera's attitude, the same always or over time; None for nothing.
         registry: The plugins; None for all that are installed.
 
@@ -931,30 +956,31 @@ def survey_on_the_way(
         ConfigError: No new bar is in view where the track is known, or too little was seen.
     """
     registry = Registry.load() if registry is None else registry
-    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    links = load_links(link, registry=registry)
+    plan.check_links(list(named_links(links)))
     poses: list[KnownPose] = []
     known = {site.transmitter_id: site for site in plan.sites}
     for url in recordings:
-        found, placed = _own_poses(url, plan, link, attitude, registry)
+        found, placed = _own_poses(url, plan, links, attitude, registry)
         poses += found
         known = {site.transmitter_id: site for site in placed} | known
     if not poses:
         raise ConfigError("no new bar was in view where the track is known: nothing to survey")
-    return survey(recordings, poses, link, registry=registry, name="track", known=[*known.values()])
+    return survey(recordings, poses, links, registry=registry, name="track", known=[*known.values()])
 
 
 def _own_poses(
     url: str,
     plan: PositionPlan,
-    link: Link,
+    links: Sequence[Link],
     attitude: Attitude | AttitudeLog | None,
     registry: Registry,
 ) -> tuple[list[KnownPose], list[BarSite]]:
     """The poses of a recording's own track while new bars are in view, and the bars that it goes by."""
-    navigator = Navigator(link, plan, attitude)
+    navigator = Navigator(placing_links(named_links(links)), plan, attitude)
     own = OwnPoses(navigator, attitude_source(attitude), Path(url).name)
     taken: dict[int, BarSite] = {}
-    with receive(url, link, registry=registry, attitude=attitude) as packets:
+    with receive(url, links, registry=registry, attitude=attitude) as packets:
         for packet in packets:
             own.take(packet)
             taken = navigator.positioner.stands_at | taken
@@ -971,4 +997,4 @@ def _own_poses(
     )
     if sites == plan.sites:
         raise ConfigError(f"{url}: transmitter {wrong[0]} sends one id and then another")
-    return _own_poses(url, replace(plan, sites=sites), link, attitude, registry)
+    return _own_poses(url, replace(plan, sites=sites), links, attitude, registry)

@@ -42,7 +42,6 @@ __all__ = [
     "clock_zero_of",
     "json_lines_of",
     "plan_of",
-    "position_plan_of",
     "sinks_of",
 ]
 
@@ -188,7 +187,7 @@ def plan_of(
     placing = links[0]
     if sites is not None:
         placing = next(iter(placing_links(named_links(links)).values()))
-    return position_plan_of(sites, gnss, placing, zero, mcap=mcap)
+    return _position_plan_of(sites, gnss, placing, zero, mcap=mcap)
 
 
 def sinks_of(
@@ -210,7 +209,7 @@ def sinks_of(
     return asked
 
 
-def position_plan_of(
+def _position_plan_of(
     sites: Path | None, gnss: Path | None, link: "Link", zero: "datetime | None", *, mcap: bool
 ) -> "PositionPlan | None":
     """What the options say of positions; None without sites."""

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
-from evlcp_sdk.cli._receiving import clock_zero_of, position_plan_of
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo
+from evlcp_sdk.cli._receiving import clock_zero_of, plan_of
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
@@ -55,7 +55,7 @@ def survey(
         str | None,
         typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0, for NMEA."),
     ] = None,
-    link_file: LinkFile = None,
+    link_files: LinkFiles = None,
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
@@ -68,6 +68,8 @@ def survey(
     By its own track past known bars: [bold]evlcp survey REC.raw --sites known.toml --attitude imu.csv
     -c camera.toml -o new.toml[/]
 
+    Bars of two kinds:        [bold]evlcp survey REC.raw --poses poses.csv -c a.toml -c b.toml -o site.toml[/]
+
     poses.csv is that of `evlcp calibrate`, with heading_deg, pitch_deg and roll_deg. What all poses may have
     wrong in common, by position_sigma_m and attitude_sigma_deg, is in the sigmas of the sites.
     """
@@ -76,7 +78,7 @@ def survey(
 
     from evlcp_sdk import run
     from evlcp_sdk.files import Outputs
-    from evlcp_sdk.link.resolve import load_link
+    from evlcp_sdk.link.several import load_links
     from evlcp_sdk.place.poses import read_poses
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import AttitudeLog
@@ -85,17 +87,17 @@ def survey(
     if (poses is None) == (sites is None):
         raise typer.BadParameter("give --poses, or --sites of known bars", param_hint="--poses")
     registry = Registry.load()
-    link = load_link(link_file, overrides or [], registry)
+    links = load_links(link_files, overrides or [], registry)
     if poses is not None:
         for name, given in (("--attitude", attitude), ("--gnss", gnss), ("--clock-zero", clock_zero)):
             if given is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
-        found = run.survey(recordings, read_poses(poses), link, registry=registry, name=str(poses))
+        found = run.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
     else:
-        plan = position_plan_of(sites, gnss, link, clock_zero_of(clock_zero), mcap=False)
+        plan = plan_of(sites, gnss, links, clock_zero_of(clock_zero), mcap=False)
         assert plan is not None
         known = None if attitude is None else AttitudeLog.read(attitude)
-        found = run.survey_on_the_way(recordings, plan, link, attitude=known, registry=registry)
+        found = run.survey_on_the_way(recordings, plan, links, attitude=known, registry=registry)
     with Outputs() as outputs:
         outputs.open(out).write(to_toml([bar.site for bar in found]))
         outputs.commit()
@@ -112,7 +114,8 @@ def survey(
 
 def _line(bar: "SurveyedBar") -> str:
     site = bar.site
+    kind = f" ({site.link})" if site.link else ""
     return (
-        f"transmitter {site.transmitter_id}: {site.latitude_deg:.9f}, {site.longitude_deg:.9f} deg,"
+        f"transmitter {site.transmitter_id}{kind}: {site.latitude_deg:.9f}, {site.longitude_deg:.9f} deg,"
         f" {site.height_m:.3f} m, to {site.position_sigma_m:.3f} m, from {counted(bar.views, 'view')}"
     )

@@ -1,13 +1,14 @@
 """Packets to the camera's trajectory: fixes as they are known, filtered at once, smoothed a window later."""
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
 from evlcp_sdk.place.learnt import Learnt, focal_share, learnt
@@ -21,6 +22,7 @@ from evlcp_sdk.place.trajectory import (
 )
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
+from evlcp_sdk.spelling import nearest
 from evlcp_sdk.values import Fix, Packet
 
 __all__ = ["Navigator", "Place", "Placed", "PositionPlan", "Settled"]
@@ -50,6 +52,19 @@ class PositionPlan:
 
     sites: tuple[BarSite, ...]
     gnss: GnssLog | None = None
+
+    def check_links(self, names: Sequence[str]) -> None:
+        """Check that the sites' `link` are among several links' names; a single link has no name to check.
+
+        Raises:
+            ConfigError: One is not: no bar would ever stand there.
+        """
+        for site in self.sites if len(names) > 1 else ():
+            if site.link is not None and site.link not in names:
+                raise ConfigError(
+                    f"site of id {site.transmitter_id}: link = '{site.link}': no link is named so"
+                    + nearest(site.link, names, "links")
+                )
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,7 +6,7 @@ IMU's mount.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -53,7 +53,7 @@ class SurveyedBar:
 def survey(
     views: Sequence[CalibrationView],
     axes: LocalAxes,
-    length_m: float,
+    length_m: float | Mapping[int, float],
     camera: CameraModel,
     sigma: CameraSigma | None = None,
     spec: PositionSpec | None = None,
@@ -64,7 +64,7 @@ def survey(
         views: From known places with known attitudes; the bars' `transmitter` is the id, their `enu_m` does
             not count.
         axes: The local axes of the views.
-        length_m: Length of the bars.
+        length_m: Length of the bars; of each by its id where they differ.
         camera: The camera.
         sigma: How precisely it is known; None: exactly.
         spec: Weights; None for the defaults.
@@ -75,11 +75,13 @@ def survey(
     spec = PositionSpec() if spec is None else spec
     if any(view.rotation is None for view in views):
         raise ConfigError("a survey needs poses with heading_deg, pitch_deg and roll_deg")
-    started = {number: _start(views, number, camera, length_m) for number in _numbers(views)}
+    numbers = _numbers(views)
+    long_m = length_m if isinstance(length_m, Mapping) else dict.fromkeys(numbers, length_m)
+    started = {number: _start(views, number, camera, long_m[number]) for number in numbers}
     start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
     loose = _whitening(camera, sigma)
     for _ in range(_PASSES):
-        placed = [SeenView.of(_placed(view, started, length_m), camera, spec) for view in views]
+        placed = [SeenView.of(_placed(view, started, long_m), camera, spec) for view in views]
         placed = [view for view in placed if len(view.points_px)]
         if not placed:
             raise ConfigError("no view shows a bar: nothing to survey")
@@ -117,7 +119,7 @@ def survey(
             height_m=place.height_m,
             heading_deg=math.degrees(math.atan2(east, north)) % 360,
             tilt_deg=math.degrees(math.acos(min(max(up, -1.0), 1.0))),
-            length_m=length_m,
+            length_m=long_m[number],
             position_sigma_m=math.sqrt(float(np.linalg.eigvalsh(covariance)[-1])),
             attitude_sigma_deg=math.degrees(math.sqrt(float(np.linalg.eigvalsh(leans)[-1]))),
         )
@@ -152,12 +154,12 @@ def _start(
 
 
 def _placed(
-    view: CalibrationView, started: dict[int, tuple[Floats, Floats]], length_m: float
+    view: CalibrationView, started: dict[int, tuple[Floats, Floats]], length_m: Mapping[int, float]
 ) -> CalibrationView:
     bars = []
     for bar in view.bars:
         clusters = len(bar.points_px)
-        along = (0.5 - (np.arange(clusters) + 0.5) / clusters) * length_m
+        along = (0.5 - (np.arange(clusters) + 0.5) / clusters) * length_m[bar.transmitter]
         centre, axis = started[bar.transmitter]
         survey = (_PLACE_M, _TURN_RAD, 0.0)
         bars.append(replace(bar, enu_m=centre + along[:, None] * axis, survey=survey))

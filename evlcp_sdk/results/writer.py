@@ -70,6 +70,8 @@ class ResultWriter:
         self._links = named_links(link)
         first = next(iter(self._links.values()))
         placing = placing_links(self._links) if plan is not None else {}
+        if plan is not None:
+            plan.check_links(list(self._links))
         self._placing = next(iter(placing), "")
         self._tally = RunTally({name: one.packet for name, one in self._links.items()})
         self._positions = PositionTally()

@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -95,6 +96,52 @@ def test_bars_of_two_links_give_one_position(tmp_path: Path) -> None:
         sigmas = [float(row[f"sigma_{name}_m"]) for name in ("east", "north", "up")]
         assert (np.abs(off) < 4 * np.array(sigmas)).all()
         assert np.linalg.norm(off) < 1.5
+
+
+def test_bars_of_two_links_are_surveyed(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    """From sites to sites: what a survey of two links says, positions by it, and names that no link has."""
+    (tmp_path / "bar.toml").write_text("")
+    (tmp_path / "short.toml").write_text('[modulation]\nid = "wh8"\n[bar]\nrows = 60\ncluster_rows = 6\n')
+    (tmp_path / "scene.toml").write_text(
+        "duration_s = 0.24\n[background]\nlight_w_m2 = 1e-3\n[motion]\ndistance_m = 45.0\npitch_deg = 4.0\n"
+        "[world]\nlatitude_deg = 35.1\nlongitude_deg = 137.0\nheight_m = 50.0\nheading_deg = 30.0\n"
+        '[[bars]]\nx_m = -3.0\ny_m = -3.5\npayload = "messages"\nlink = "bar.toml"\n'
+        '[[bars]]\nx_m = 3.0\ny_m = -4.0\npayload = "messages"\nlink = "short.toml"\n'
+    )
+    recording, poses, out = tmp_path / "two.raw", tmp_path / "poses.csv", tmp_path / "new.toml"
+    simulate(tmp_path / "scene.toml", 3).save(recording)
+    path = read_truth(tmp_path / "two.truth.json").camera_path
+    names = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "roll_deg")
+    lines = [",".join(("t_us", *names, "attitude_sigma_deg"))]
+    lines += [f"{ms}000," + ",".join(str(path[n][ms]) for n in names) + ",0.01" for ms in (90, 130, 180)]
+    poses.write_text("\n".join(lines) + "\n")
+    links = ("-c", tmp_path / "bar.toml", "-c", tmp_path / "short.toml")
+    done = evlcp("survey", recording, "--poses", poses, "-o", out, *links, "--json")
+    assert done.code == 0, done.err
+    true = {site.transmitter_id: site for site in load_sites(tmp_path / "two.site.toml")}
+    found = load_sites(out)
+    assert [(site.link, site.length_m) for site in found] == [("bar", 0.96), ("short", 0.6)]
+    for site, told in zip(found, json.loads(done.out)["bars"], strict=True):
+        off = LocalAxes.of([true[site.transmitter_id]]).to_enu(
+            site.latitude_deg, site.longitude_deg, site.height_m
+        )
+        assert off @ np.linalg.solve(told["covariance_m2"], off) < 20
+        assert site.position_sigma_m < 1
+
+    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--gravity-sigma-deg", "0.3", "--heading-deg", "30")
+    receive_it = ("receive", recording, *links, *angles, "-o", tmp_path / "out")
+    assert evlcp(*receive_it, "--sites", out).code == 0
+    with (tmp_path / "out" / "fixes.csv").open(newline="") as file:
+        fixes = [row for row in csv.DictReader(file) if not row["refusal"]]
+    assert {" ".join(sorted(row["link"].split())) for row in fixes} == {"bar short"}
+
+    out.write_text(out.read_text().replace('"short"', '"shrot"'))
+    told = "link = 'shrot': no link is named so; did you mean 'short'? (links: bar, short)"
+    for command in (receive_it, ("survey", recording, "-o", tmp_path / "more.toml", *links)):
+        done = evlcp(*command, "--sites", out)
+        assert done.code == 2
+        assert done.err.strip().endswith(told)
+        assert done.err.strip().count("\n") == 0
 
 
 @pytest.mark.parametrize("other", OTHERS)
