@@ -129,7 +129,9 @@ class PacketFraming:
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
         self._unknown.setflags(write=False)
         self._rows = RowDelays(link.codebook.preamble)
-        self._find_points = points_finder(layout_of(centres_m))
+        self._find_points = points_finder(
+            layout_of(centres_m), link.codebook.pilot_edges.astype(np.int64), link.codebook.edge_every
+        )
         self._echoes = judged.echoes
         self._judged = judged
         self._joined: set[int] = set()
@@ -320,7 +322,9 @@ class PacketFraming:
         if due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             distance = self._measured(FrameView(look.sums, look.offset_px, look.presence, read))
-            points_px, sigma_px = self._find_points(look.presence, look.placement)
+            points_px, sigma_px = self._find_points(
+                look.presence, look.placement, look.sums[: self._packet.pilot_chips]
+            )
             points = points_px + look.corner_px, sigma_px
             centre_px = self._looker.centre(look, points[0])
             sight = self._sight(points, look.middle_us)

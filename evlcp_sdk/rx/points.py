@@ -17,9 +17,11 @@ else:
 
 __all__ = ["FindPoints", "points_finder"]
 
-FindPoints = Callable[[PresenceMap, Placement], tuple[NDArray[np.float64], NDArray[np.float64]]]
-"""Presence of a pilot and where it shows the layout -> points (K, 2) in the image and sigmas (K,), px; NaN
-where unseen."""
+FindPoints = Callable[
+    [PresenceMap, Placement, NDArray[np.int16]], tuple[NDArray[np.float64], NDArray[np.float64]]
+]
+"""Presence of a pilot, where it shows the layout, and its polarity sums (chips, rows, columns) -> points
+(K, 2) in the image and sigmas (K,), px; NaN where unseen."""
 
 _SIGMA_PX = 0.12
 """Error expected before any is seen: a boundary inside a pixel, found from a few columns of correlations of
@@ -28,19 +30,26 @@ eight values each, of which a fifth of the negative events is missing."""
 _EXPECTED_WORTH = 8.0
 """Residuals that this expectation is worth; the 28 of a whole bar outweigh it."""
 
+_ACROSS_PX = 5.0
+"""How far beside a line's middle its light counts, px, at the least: a thin bar's lights three pixels to each
+side, by the lens's blur and wings; more is darkness. Nearer bars are wider, and clusters longer."""
+
 _OUTER = 1.5
 """Sigma of a cluster with a boundary on one side only, in those of one between two: two errors over two, and
 a spacing's beside, against one over the root of two."""
 
 
-def points_finder(layout: Layout) -> FindPoints:
+def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindPoints:
     """Precompute for a layout; the function that is returned is pure.
 
     A cluster's centre along the layout lies midway between its boundaries with its neighbours, where the
-    shares of both in a row of pixels balance; across it, it is the mean of its pixels. An outer edge, which
-    light without a neighbour moves outward by a third of a pixel, is not used: beyond the last boundary the
-    spacing of the others counts. Pixels out of place do not, as a window about the cluster's place leaves
-    them out.
+    shares of both in a row of pixels balance; across it, it is the mean of its pixels, across a line that of
+    their events in a window that reaches equally far to both sides. An outer edge, which light without a
+    neighbour moves outward by a third of a pixel, is not used: beyond the last boundary the spacing of the
+    others counts. Pixels out of place do not, as a window about the cluster's place leaves them out.
+
+    `edges` are those of the clusters' pilots, int64 (K, n), `every` the chips from one to the next; the first
+    is that into chip 1.
 
     Sigma is the scatter of the points about their best similarity with the layout, pooled with what is
     expected, and larger at the ends.
@@ -53,7 +62,9 @@ def points_finder(layout: Layout) -> FindPoints:
             if len(beside):
                 neighbours[axis, k] = beside[0]
 
-    def find(presence: PresenceMap, placement: Placement) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def find(
+        presence: PresenceMap, placement: Placement, heard: NDArray[np.int16]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         if np.count_nonzero(placement.seen) < 3:
             return np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
         points, ends = np.empty((clusters, 2)), np.empty(clusters)
@@ -65,6 +76,11 @@ def points_finder(layout: Layout) -> FindPoints:
             placement.scale,
             placement.shift,
             neighbours,
+            heard,
+            edges,
+            every,
+            layout.way,
+            max(_ACROSS_PX, abs(placement.scale) * spacing_m / 2) if layout.line else 0.0,
             points,
             ends,
         )

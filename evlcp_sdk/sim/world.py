@@ -4,6 +4,7 @@ A scene's axes are x to the right, y down and z ahead, with its origin at `[worl
 `world.heading_deg`.
 """
 
+import hashlib
 import math
 from dataclasses import replace
 from typing import Any
@@ -113,7 +114,7 @@ def sites_said(scene: Scene, seed: int, registry: Registry | None = None) -> tup
     """
     world, axes = _world(scene)
     true = sites_of(scene, registry)
-    errors = np.random.default_rng([seed, 0x517E]).normal(size=(len(true), 3)) * world.survey_sigma_m
+    errors = _drawn(scene, seed, 0x517E).normal(size=(len(true), 3)) * world.survey_sigma_m
     said = []
     for i, (bar, site) in enumerate(zip(scene.bars, true, strict=True)):
         if bar.site_of is not None and bar.site_of >= len(true):
@@ -197,7 +198,7 @@ def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | Non
         return None
     t_us = np.append(np.arange(0.0, scene.duration_s * 1e6, 1000.0), scene.duration_s * 1e6)
     yaw, pitch, roll = np.degrees(path.at(np.maximum(t_us - world.attitude_late_ms * 1e3, 0.0))[1]).T
-    error = np.random.default_rng([seed, 0xA77]).normal(size=3) * world.attitude_errs
+    error = _drawn(scene, seed, 0xA77).normal(size=3) * world.attitude_errs
     off = np.array(world.attitude_off_deg)
     heading = world.heading_deg + yaw + error[2] * world.heading_sigma_deg + off[2]
     return AttitudeLog(
@@ -208,6 +209,17 @@ def attitude_log(scene: Scene, seed: int, path: CameraPath) -> AttitudeLog | Non
         np.full(len(t_us), world.gravity_sigma_deg),
         np.full(len(t_us), world.heading_sigma_deg),
     )
+
+
+def _drawn(scene: Scene, seed: int, of: int) -> np.random.Generator:
+    """Random numbers of a recording's own: other ones where the camera or a bar stands or moves otherwise.
+
+    What is merely said of the scene does not count, so that a fault is compared with the same drive without.
+    """
+    motion = replace(scene.motion, path_file=None)
+    bars = [(bar.x_m, bar.y_m, bar.z_m, bar.lean_deg, bar.tilt_deg) for bar in scene.bars]
+    digest = hashlib.sha256(repr((motion, bars)).encode()).digest()
+    return np.random.default_rng([seed, of, int.from_bytes(digest[:8])])
 
 
 def _world(scene: Scene) -> tuple[WorldSpec, LocalAxes]:

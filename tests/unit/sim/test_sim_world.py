@@ -11,7 +11,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import LocalAxes, load_sites, to_toml
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
-from evlcp_sdk.sim.motion import project
+from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.world import attitude_log, rendered, scene_to_enu, sites_said
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
@@ -123,6 +123,20 @@ def test_an_imu_tells_the_attitude_and_one_error(tmp_path: Path) -> None:
     assert again.heading_deg == pytest.approx(found.heading_deg, abs=1e-4)
     assert again.pitch_deg == pytest.approx(found.pitch_deg, abs=1e-4)
     assert again.heading_sigma_deg == 0.1
+
+
+def test_errors_are_a_recordings_own_and_faults_leave_them() -> None:
+    def said(*settings: str) -> list[float]:
+        scene = load_scene("drive-30kmh", ["world.survey_sigma_m=0.05", "world.heading_deg=0", *settings])
+        log = attitude_log(scene, 3, CameraPath(scene.motion, scene.duration_s, 3))
+        assert log is not None
+        assert log.heading_deg is not None
+        return [log.heading_deg[0], sites_said(scene, 3)[0].height_m]
+
+    here, there = said(), said("motion.distance_m=61")
+    assert here == said()
+    assert all(abs(a - b) > 1e-6 for a, b in zip(here, there, strict=True))
+    assert said("world.attitude_off_deg=[0, 0, 1]") == [pytest.approx(here[0] + 1), here[1]]
 
 
 @pytest.mark.parametrize("known", ["none", "gravity", "heading"])
