@@ -91,6 +91,15 @@ class Scene:
     rotation: Floats
 
 
+def own_shift(points_px: Floats, spec: PositionSpec) -> Floats:
+    """A root of the covariance of the shift that a bar's points share, px^2, float64 (2, 2)."""
+    whole = points_px[-1] - points_px[0]
+    length_px = float(np.linalg.norm(whole))
+    along = whole / length_px
+    longways = math.hypot(spec.shared_along_px, spec.shared_share * length_px * 16 / 15)
+    return spec.shared_sigma_px * np.eye(2) + (longways - spec.shared_sigma_px) * np.outer(along, along)
+
+
 def scene(world: World, rng: np.random.Generator) -> Scene:
     """A scene with errors of the sigmas that are stated."""
     pitch, roll, heading = rng.uniform(0, 6), rng.normal(0, 1), rng.uniform(0, 360)
@@ -98,7 +107,7 @@ def scene(world: World, rng: np.random.Generator) -> Scene:
     focal_mm = CAMERA.focal_mm * (1 + world.focal * rng.normal())
     true = replace(CAMERA, focal_mm=focal_mm)
     depth = rng.uniform(30, 90)
-    views = []
+    views, shaken = [], rng.normal(0, SPEC.shaken_sigma_px, 2)
     # Thirds of the image's width, so that no two bars cover each other.
     slots = rng.permutation(3)[: world.bars]
     for number, slot in enumerate(slots):
@@ -108,9 +117,8 @@ def scene(world: World, rng: np.random.Generator) -> Scene:
         axis = np.array([*lean, 1.0]) / math.sqrt(1 + lean @ lean)
         stands = rotation @ (sight * far) + ALONG[:, None] * axis
         points, _ = project_bars(stands, np.zeros(3), rotation, true)
-        length_px = float(np.linalg.norm(points[-1] - points[0])) * 16 / 15
-        shift = math.hypot(SPEC.shared_sigma_px, SPEC.shared_share * length_px)
-        points = points + rng.normal(0, POINT_PX, points.shape) + rng.normal(0, shift, 2)
+        shift = own_shift(points, SPEC) @ rng.normal(size=2)
+        points = points + rng.normal(0, POINT_PX, points.shape) + shift + shaken
         place, turn, length = world.survey
         arm = stands - stands.mean(0)
         said = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
@@ -188,20 +196,20 @@ def known_by_points(seen: Scene) -> Floats:
     Written out with every shared error as an unknown of sigma 1, which are then eliminated.
     """
     parts = []
-    shared = 2 + 9 * len(seen.views)
+    shared = 4 + 9 * len(seen.views)
     for b, view in enumerate(seen.views):
         points, slope = project_bars(view.enu_m, np.zeros(3), seen.rotation, seen.camera)
         weight = 1 / view.sigma_px[:, None, None]
         arm, by = view.enu_m - view.enu_m.mean(0), -slope[:, :, :3]
-        length_px = float(np.linalg.norm(view.points_px[-1] - view.points_px[0])) * 16 / 15
         place, turn, length = view.survey
         rows = np.zeros((len(points), 2, 6 + shared))
         rows[:, :, :6] = slope
         away = points - np.array(seen.camera.centre_px)
         rows[:, :, 6] = away * WRONG_FOCAL
         rows[:, :, 7] = away * seen.sigma.focal_mm / seen.camera.focal_mm
-        own = rows[:, :, 8 + 9 * b : 17 + 9 * b]
-        own[:, :, :2] = math.hypot(SPEC.shared_sigma_px, SPEC.shared_share * length_px) * np.eye(2)
+        rows[:, :, 8:10] = SPEC.shaken_sigma_px * np.eye(2)
+        own = rows[:, :, 10 + 9 * b : 19 + 9 * b]
+        own[:, :, :2] = own_shift(view.points_px, SPEC)
         own[:, :, 2] = math.hypot(length, SPEC.stretch_share) * np.einsum("nij,nj->ni", by, arm)
         own[:, :, 3:6] = place * by
         own[:, :, 6:] = turn * np.cross(arm[:, None], by)
@@ -371,15 +379,12 @@ def drive(world: World, rng: np.random.Generator, spec: PositionSpec) -> tuple[l
     root, sigma = np.linalg.cholesky(power), CameraSigma(focal_mm=world.focal * CAMERA.focal_mm)
     fixes, places = [], []
     for step in range(STEPS):
-        views = []
+        views, shaken = [], rng.normal(0, spec.shaken_sigma_px, 2)
         for number, (stands, said, slow) in enumerate(bars):
             slow[:] = fade * slow + math.sqrt(1 - fade**2) * rng.normal(0, PIXEL_PX, (16, 2))
             points, _ = project_bars(stands, state[:3], rotation, true)
-            length_px = float(np.linalg.norm(points[-1] - points[0])) * 16 / 15
-            points = points + slow + rng.normal(0, NOISE_PX, points.shape)
-            points = points + rng.normal(
-                0, math.hypot(spec.shared_sigma_px, spec.shared_share * length_px), 2
-            )
+            shift = own_shift(points, spec) @ rng.normal(size=2)
+            points = points + slow + rng.normal(0, NOISE_PX, points.shape) + shift + shaken
             views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey, PIXEL_PX))
         found = solve_pose(views, CAMERA, told, spec, sigma)
         if isinstance(found, Pose):

@@ -103,25 +103,34 @@ class PositionSpec:
     huber_sigmas: Annotated[
         float, Field(gt=0, description="Miss of a point, in its sigmas, beyond which it weighs less.")
     ] = 3.0
-    shared_sigma_px: Annotated[
+    shaken_sigma_px: Annotated[
         float,
         Field(
-            ge=0, description="Error that a bar's points share: motion inside the pilot, up to half a pixel."
+            ge=0,
+            description="Error that all bars in view share at a time: the image moves between their frames.",
         ),
-    ] = 0.05
+    ] = 0.08
+    shared_sigma_px: Annotated[
+        float,
+        Field(ge=0, description="Error that the points of one bar share, across it: where in a pixel it is."),
+    ] = 0.022
+    shared_along_px: Annotated[
+        float, Field(ge=0, description="The same along it, where its ends are half a cluster's light.")
+    ] = 0.06
     shared_share: Annotated[
-        float, Field(ge=0, le=0.1, description="The same that grows with the bar: a share of its length.")
-    ] = 0.0005
+        float,
+        Field(ge=0, le=0.1, description="What of that grows with the bar: a share of its length."),
+    ] = 0.0003
     stretch_share: Annotated[
         float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
-    ] = 0.0005
+    ] = 0.0004
     pixel_sigma_px: Annotated[
         float,
         Field(
             ge=0,
             description="Error of a point that no averaging over frames removes: where in a pixel it is.",
         ),
-    ] = 0.08
+    ] = 0.15
     min_view_deg: Annotated[
         float,
         Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),

@@ -39,11 +39,10 @@ def normal(
     """Normal equations at a point; twice the robust cost, or NaN where a point is behind the camera.
 
     In: `points` (n, 10) of place, arm from the bar's centre, m, image, px, 1 / sigma, and the share of its
-    variance that stands; `bar` (n,), rising; `bar_sigma` (bars, 4) of the image's shift, px, place, m, turn,
-    radians, and length, a share; `lens` (8,) of focal length, px, principal point, k1, k2, p1, p2, k3;
-    `lens_root` (7, 7), a root of the covariance of the first seven; `felt` (3,) up in the camera's axes,
-    `heading`, radians, `known` rows of these, and `white` (3, 3), which whitens them. The point: `position`
-    (3,), `rotation` (3, 3), `local` (bars, 9), `error` (7,).
+    variance that stands; `bar` (n,), rising; `bar_sigma` (bars, 6), as of `shared`; `lens` (8,) of focal
+    length, px, principal point, k1, k2, p1, p2, k3; `lens_root` (7, 7), a root of the covariance of the first
+    seven; `felt` (3,) up in the camera's axes, `heading`, radians, `known` rows of these, and `white` (3, 3),
+    which whitens them. The point: `position` (3,), `rotation` (3, 3), `local` (bars, 9), `error` (7,).
 
     Out, bar by bar with its local unknowns eliminated: `info` (bars, 14, 14), `right` (bars, 14), `gain`
     (bars, 9, 14) and `step` (bars, 9), by which the local unknowns follow, `cost` (bars,), and, unless it is
@@ -67,7 +66,7 @@ def normal(
     total = 0.0
     at = 0
     for b in range(bars):
-        sh, sp, st, sl = bar_sigma[b]
+        sp, st, sl, sxx, sxy, syy = bar_sigma[b]
         tall = LOCAL if sp > 0 or st > 0 else 3
         last = tall + wide
         sum_ = 0.0
@@ -95,8 +94,8 @@ def normal(
             bent_u = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
             bent_v = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
             w = points[at, 8]
-            mx = (points[at, 6] - (cx + f * bent_u) - sh * local[b, 0]) * w
-            my = (points[at, 7] - (cy + f * bent_v) - sh * local[b, 1]) * w
+            mx = (points[at, 6] - (cx + f * bent_u) - sxx * local[b, 0] - sxy * local[b, 1]) * w
+            my = (points[at, 7] - (cy + f * bent_v) - sxy * local[b, 0] - syy * local[b, 1]) * w
             size = math.sqrt(mx * mx + my * my)
             weight = 1.0
             if size > huber:
@@ -129,8 +128,8 @@ def normal(
                 row[tall + 3, a] = no * oz - up * oy
                 row[tall + 4, a] = up * ox - e * oz
                 row[tall + 5, a] = e * oy - no * ox
-            row[0, k], row[1, count + k] = sh * w, sh * w
-            row[0, count + k] = row[1, k] = 0
+            row[0, k], row[1, count + k] = sxx * w, syy * w
+            row[0, count + k] = row[1, k] = sxy * w
             row[tall + FAULT, k], row[tall + FAULT, count + k] = bent_u * scale_f * w, bent_v * scale_f * w
             if wide > LENS:
                 by_lens[0, 0], by_lens[1, 0] = bent_u, bent_v
@@ -452,7 +451,7 @@ def fitted(
         return False, best, position, rotation, local, error
     summed(info, right, rows, miss, error, free, whole, side)
     gain_here, step_here = gain.copy(), step.copy()
-    surveyed, still = bar_sigma[:, 1:3].max() > 0, np.zeros(GLOBAL)
+    surveyed, still = bar_sigma[:, :2].max() > 0, np.zeros(GLOBAL)
     damping, growth, stalled = 1e-4, 4.0, 0
     for _ in range(steps):
         if not solved(whole, side, damping, move[:n]):
@@ -1106,8 +1105,7 @@ def gathered(
     """A bar's whole clusters as rows of a `Problem`, where they are `least` or more; how many they are.
 
     From row `at`, `points` (n, 10) and `bar` (n,). `pixel` is the sigma of a point that its pixel leaves, px;
-    `usual` (3,) are that of the image's shift, px, the same as a share of its length, and by how much a bar
-    looks too long, a share; `sigma` (4,) as of `shared`.
+    `usual` (4,) and `sigma` (6,) are as of `shared`.
     """
     count = len(enu_m)
     seen = np.zeros(count, np.bool_)
@@ -1133,19 +1131,34 @@ def gathered(
 
 @njit(cache=True, nogil=True)
 def shared(enu_m: Array, points_px: Array, seen: Array, usual: Array, sigma: Array) -> None:
-    """What a bar's points share, by those `seen` (K,): `sigma` (4,), of the image's shift, px, to length.
+    """What a bar's points share, by those `seen` (K,), into `sigma` (6,).
 
-    The last three are its survey's, and by how much it looks too long is added to the length's. The whole is
-    as long as from one of its clusters to the farthest other, and a cluster's own part; its image is so by
-    what is seen of it.
+    The first three are its survey's, place, m, turn, radians, and length, a share, to which is added by how
+    much it looks too long, `usual[3]`; the others are of a root of the covariance of its image's shift, px:
+    of columns, of both, of rows. Its sigma is `usual[0]` across the bar, and along it `usual[1]` with a share
+    of the length, `usual[2]`; of a layout that is no line, the latter in all directions. The whole is as long
+    as from one of its clusters to the farthest other, and a cluster's own part; its image is so by what is
+    seen of it.
     """
     everything = np.ones(len(seen), np.bool_)
     i, j = _ends(enu_m, seen)
     first, last = _ends(enu_m, everything)
     share = _apart(enu_m, first, last) / _apart(enu_m, i, j) * len(seen) / (len(seen) - 1)
-    length_px = math.hypot(points_px[j, 0] - points_px[i, 0], points_px[j, 1] - points_px[i, 1]) * share
-    sigma[0] = math.hypot(usual[0], usual[1] * length_px)
-    sigma[3] = math.hypot(sigma[3], usual[2])
+    dx, dy = points_px[j, 0] - points_px[i, 0], points_px[j, 1] - points_px[i, 1]
+    size = math.hypot(dx, dy)
+    along = math.hypot(usual[1], usual[2] * size * share)
+    across = usual[0] if size > 0 else along
+    ax, ay = (dx / size, dy / size) if size > 0 else (1.0, 0.0)
+    # Half a cluster beside the line from end to end is no error of a point in it.
+    aside = 0.5 * size * share / len(seen)
+    for k in range(len(seen)):
+        if seen[k]:
+            off = (points_px[k, 0] - points_px[i, 0]) * ay - (points_px[k, 1] - points_px[i, 1]) * ax
+            across = along if abs(off) > aside else across
+    sigma[2] = math.hypot(sigma[2], usual[3])
+    sigma[3] = across + (along - across) * ax * ax
+    sigma[4] = (along - across) * ax * ay
+    sigma[5] = across + (along - across) * ay * ay
 
 
 @njit(cache=True, nogil=True)

@@ -59,7 +59,10 @@ def bar_point(
     if not (math.isfinite(depth) and math.isfinite(frame.range.sigma_m) and np.isfinite(sight).all()):
         return None
     along = np.array([sight[0], sight[1], 1.0])
-    shift = math.hypot(spec.shared_sigma_px, spec.shared_share * camera.focal_px * length_m / depth)
+    grown = spec.shared_share * camera.focal_px * length_m / depth
+    shift = math.hypot(
+        spec.shaken_sigma_px, max(spec.shared_sigma_px, math.hypot(spec.shared_along_px, grown))
+    )
     across = depth * np.linalg.inv(camera.distort_slope(sight)) * shift
     standing = np.zeros((3, 8))
     if sigma is not None and sigma.known:

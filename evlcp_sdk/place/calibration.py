@@ -237,7 +237,7 @@ class SeenView:
         flat = np.concatenate([np.empty((0, 3)), *enu])
         seen = np.concatenate([np.empty((0, 2)), *points])
         rotation = view.rotation
-        sigma = math.radians(view.attitude_sigma_deg)
+        sigma = math.hypot(math.radians(view.attitude_sigma_deg), spec.shaken_sigma_px / camera.focal_px)
         if rotation is None:
             rotation, sigma = _turned(flat - view.enu_m, seen, camera), _FREE_SIGMA_RAD
         bars = np.concatenate([np.empty(0, np.int64), *number])

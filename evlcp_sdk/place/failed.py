@@ -34,7 +34,8 @@ def failed_bar(problem: Problem, bar: int, pose: Pose, test: float, parts: int) 
     """
     rows = problem.points[problem.bar == bar]
     weight = rows[:, 8]
-    shift = np.kron(weight[:, None], np.eye(2)) * problem.bar_sigma[bar, 0]
+    columns, both, rows_px = problem.bar_sigma[bar, 3:]
+    shift = np.kron(weight[:, None], [[columns, both], [both, rows_px]])
     whole = np.linalg.inv(np.eye(2 * len(rows)) + shift @ shift.T)
     off_m = np.zeros(3)
     for _ in range(_STEPS):
@@ -44,7 +45,7 @@ def failed_bar(problem: Problem, bar: int, pose: Pose, test: float, parts: int) 
         missed = ((rows[:, 6:8] - points) * weight[:, None]).ravel()
         follow = np.linalg.solve(by_place.T @ whole @ by_place, by_place.T @ whole)
         off_m = off_m + follow @ missed
-    place_m = problem.bar_sigma[bar, 1]
+    place_m = problem.bar_sigma[bar, 0]
     by_camera = follow @ by_pose
     covariance = follow @ np.linalg.inv(whole) @ follow.T + by_camera @ pose.covariance @ by_camera.T
     covariance = covariance + place_m**2 * np.eye(3)

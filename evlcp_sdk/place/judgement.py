@@ -242,7 +242,8 @@ def _standing(problem: Problem, camera: Floats, attitude: Floats, bars: Floats) 
     if problem.attitude is not None and problem.free[3:6].any():
         standing["attitude"] = attitude
     for moves, sigma, number in zip(bars, problem.bar_sigma.tolist(), problem.transmitters, strict=True):
-        if any(sigma[1:]):
+        survey = sigma[:3]
+        if any(survey):
             # Its length, by which it also looks too long; place and turn where these have a sigma.
-            standing[f"bar {number}"] = moves if any(sigma[1:3]) else moves[:, :1].copy()
+            standing[f"bar {number}"] = moves if any(survey[:2]) else moves[:, :1].copy()
     return standing

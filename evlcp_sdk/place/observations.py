@@ -88,7 +88,8 @@ class Problem:
         points: A row a cluster that is seen: its place in the local axes and from its bar's centre, m, where
             it is seen, px, 1 / sigma, and the share of its variance that stands for a while, float64 (n, 10).
         bar: Number of each point's bar, rising, int64 (n,).
-        bar_sigma: Of each bar: its image's shift, px, and its survey, float64 (bars, 4).
+        bar_sigma: Of each bar: its survey, and a root of the covariance of its image's shift, px, float64
+            (bars, 6): see `_kernels.shared`.
         transmitters: Number of each bar.
         lens: Focal length, px, principal point, px, k1, k2, p1, p2, k3, float64 (8,).
         lens_root: A lower root of the covariance of the first seven, float64 (7, 7).
@@ -130,13 +131,13 @@ class Problem:
     ) -> "Problem | Refusal":
         """What the views give, or why that is too little for a position."""
         count = sum([len(view.sigma_px) for view in views])
-        points, bar, bar_sigma = np.empty((count, 10)), np.empty(count, np.int64), np.empty((len(views), 4))
+        points, bar, bar_sigma = np.empty((count, 10)), np.empty(count, np.int64), np.empty((len(views), 6))
         usual, width, height = _usual(spec), camera.width, camera.height
         kept: list[int] = []
         at = most = 0
         for view in views:
             own = bar_sigma[len(kept)]
-            own[1:] = view.survey
+            own[:3] = view.survey
             pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
             number = _kernels.gathered(
                 view.enu_m, view.points_px, view.sigma_px, pixel, width, height, usual, spec.min_points,
@@ -151,7 +152,7 @@ class Problem:
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
             )
         points, bar = points[:at], bar[:at]
-        told = _told(attitude, points, bar, len(kept))
+        told = _told(attitude, points, bar, len(kept), spec.shaken_sigma_px / camera.focal_px)
         if isinstance(told, Refusal):
             return told
         known = sigma.known
@@ -184,7 +185,8 @@ class Problem:
 
     def told(self, attitude: Attitude | None) -> "Problem | Refusal":
         """The same where this is known of the attitude, or why that is too little."""
-        told = _told(attitude, self.points, self.bar, len(self.transmitters))
+        shaken_rad = self.spec.shaken_sigma_px / self.camera.focal_px
+        told = _told(attitude, self.points, self.bar, len(self.transmitters), shaken_rad)
         if isinstance(told, Refusal):
             return told
         free = self.free.copy()
@@ -223,8 +225,13 @@ class Problem:
         return other
 
 
-def _told(attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bars: int) -> Any:
-    """What an attitude says to a `Problem`, and which of the turns are free; or why it is too little."""
+def _told(
+    attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bars: int, shaken_rad: float
+) -> Any:
+    """What an attitude says to a `Problem`, and which of the turns are free; or why it is too little.
+
+    What shifts the images of all bars alike is to a position as if the camera were turned by `shaken_rad`.
+    """
     compass = attitude is not None and attitude.heading_deg is not None
     if not compass and bars == 1:
         return Refusal("heading-unknown", "one bar gives a position only with the camera's heading known")
@@ -242,12 +249,12 @@ def _told(attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bar
             "turns": True,
         }
     turns = (True, True, True)
-    if attitude.gravity_sigma_deg == attitude.white_sigma_deg == attitude.time_sigma_us == 0:
+    if shaken_rad == attitude.gravity_sigma_deg == attitude.white_sigma_deg == attitude.time_sigma_us == 0:
         turns = (False, False, not compass or attitude.heading_sigma_deg > 0)
     angles = 3 if compass else 2
     level = attitude.rotation()
     causes = attitude.standing()
-    white = _whitening(attitude, causes, angles)
+    white = _whitening(attitude, causes, angles, shaken_rad)
     return {
         "level": level,
         "felt": level[2],
@@ -260,22 +267,33 @@ def _told(attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bar
 
 
 def shared_sigmas(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec) -> tuple[float, ...]:
-    """Of a bar: its image's shift, px; its place, m, turn, radians, and length, a share."""
-    found = np.array([0.0, *view.survey])
+    """Of a bar: its image's shift, px, in any direction at most; its place, m, turn, radians, and length, a
+    share.
+    """
+    found = np.array([*view.survey, 0.0, 0.0, 0.0])
     _kernels.shared(view.enu_m, view.points_px, seen, _usual(spec), found)
-    return tuple(found.tolist())
+    place, turn, length, columns, both, rows = found.tolist()
+    return float(np.linalg.eigvalsh([[columns, both], [both, rows]])[-1]), place, turn, length
 
 
 def _usual(spec: PositionSpec) -> Floats:
-    """What kernels take of it, float64 (3,): see `_kernels.gathered`."""
-    return np.array([spec.shared_sigma_px, spec.shared_share, spec.stretch_share], np.float64)
+    """What kernels take of it, float64 (4,): see `_kernels.shared`."""
+    shift = spec.shared_sigma_px, spec.shared_along_px, spec.shared_share
+    return np.array([*shift, spec.stretch_share], np.float64)
 
 
-def _whitening(attitude: Attitude, causes: Floats, angles: int) -> Floats:
-    """What makes errors of pitch, roll and heading, `causes` (3, 4), independent and of sigma 1: (3, 3)."""
+def _whitening(attitude: Attitude, causes: Floats, angles: int, shaken_rad: float) -> Floats:
+    """What makes errors of pitch, roll and heading, `causes` (3, 4), independent and of sigma 1: (3, 3).
+
+    All have those that are new with each time, too: the attitude's own and, of what shifts an image down or
+    aside, `shaken_rad`.
+    """
     white = np.zeros((3, 3))
     least = math.radians(attitude.white_sigma_deg) ** 2 + EXACT_RAD**2
-    _kernels.whitening(causes, least, white)
+    pitch = math.radians(attitude.pitch_deg)
+    # As a camera turns about its own axes across and upright: the second is not the world's.
+    aside = [[1.0, 0.0], [0.0, math.tan(pitch)], [0.0, 1 / math.cos(pitch)]]
+    _kernels.whitening(np.concatenate([causes, shaken_rad * np.array(aside)], 1), least, white)
     if angles < 3:
         white[2] = (0.0, 0.0, 1.0)
     return white

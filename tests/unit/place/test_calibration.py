@@ -26,7 +26,7 @@ from evlcp_sdk.scene.camera import CameraModel
 
 TRUE = CameraModel(focal_mm=8.2, centre_x_px=652.0, centre_y_px=351.0, k1=-0.12, k2=0.05, p1=8e-4, p2=-5e-4)
 NOMINAL = CameraModel(focal_mm=8.0)
-SPEC = PositionSpec(shared_sigma_px=0, shared_share=0, stretch_share=0)
+SPEC = PositionSpec(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0)
 ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
 
 

@@ -114,11 +114,12 @@ def misses(p: Problem, at: Fit, change: Floats) -> Floats:
         own = at.local[b] + change[14 + 9 * b : 23 + 9 * b]
         rows = p.points[p.bar == b]
         arm = rows[:, 3:6]
-        place, lean, length = p.bar_sigma[b, 1:]
+        place, lean, length, columns, both, rows_px = p.bar_sigma[b]
         stands = rows[:, :3] + place * own[3:6] + np.cross(lean * own[6:9], arm) + length * own[2] * arm
         points, _ = project_bars(stands, position, rotation, camera)
         centre = np.array(camera.centre_px)
-        points = centre + (points - centre) * (1 + FOCAL_UNIT * change[6]) + p.bar_sigma[b, 0] * own[:2]
+        points = centre + (points - centre) * (1 + FOCAL_UNIT * change[6])
+        points = points + np.array([[columns, both], [both, rows_px]]) @ own[:2]
         found.append(((rows[:, 6:8] - points) * rows[:, 8:9]).ravel())
         found.append(-own)
     found.append(-z)
@@ -320,6 +321,22 @@ def test_what_whitens_is_the_inverse_of_the_root() -> None:
     np.testing.assert_allclose(out, want, atol=1e-12)
 
 
+def test_the_shift_of_a_bars_image_is_another_one_across_and_along() -> None:
+    turn = np.radians(30.0)
+    along, across = np.array([np.cos(turn), np.sin(turn)]), np.array([-np.sin(turn), np.cos(turn)])
+    enu = np.outer(np.arange(16.0), [0.0, 0.0, 0.06])
+    points = np.array([500.0, 300.0]) + 10.0 * np.arange(16)[:, None] * along
+    own = np.zeros(6)
+    _kernels.shared(enu, points, np.ones(16, np.bool_), np.array([0.02, 0.06, 0.001, 0.0]), own)
+    root = np.array([[own[3], own[4]], [own[4], own[5]]])
+    np.testing.assert_allclose(root @ across, 0.02 * across, atol=1e-12)
+    np.testing.assert_allclose(root @ along, math.hypot(0.06, 0.16) * along, atol=1e-12)
+    # What is no line has neither: 150 px from one corner to the other, 16 of 15 parts.
+    points[7] += 20 * across
+    _kernels.shared(enu, points, np.ones(16, np.bool_), np.array([0.02, 0.06, 0.001, 0.0]), own)
+    np.testing.assert_allclose(own[3:], [math.hypot(0.06, 0.16), 0.0, math.hypot(0.06, 0.16)], atol=1e-12)
+
+
 def test_clusters_that_count_and_their_rows() -> None:
     """12 px apart: beside an edge, three quarters of that and half a pixel must be free."""
     rng = np.random.default_rng(10)
@@ -331,13 +348,15 @@ def test_clusters_that_count_and_their_rows() -> None:
     assert _kernels.whole(points, sigma, 1280, 720, seen) == 3
     assert seen.nonzero()[0].tolist() == [1, 2, 7]
     out, bar = np.zeros((5, 10)), np.zeros(5, np.int64)
-    own, usual = np.array([0.0, 0.3, 0.2, 0.03]), np.array([0.06, 0.001, 0.04])
+    own, usual = np.array([0.3, 0.2, 0.03, 0, 0, 0]), np.array([0.02, 0.06, 0.001, 0.04])
     given = (enu, points, sigma, 0.05, 1280, 720, usual)
     assert _kernels.gathered(*given, 4, 4, 1, out, bar, own.copy()) == 3
     assert not out.any()
     assert _kernels.gathered(*given, 3, 4, 1, out, bar, own) == 3
     # Six of eight clusters, 12 px apart.
-    np.testing.assert_allclose(own, [math.hypot(0.06, 0.001 * 72 * 8 / 6), 0.3, 0.2, 0.05])
+    across, along = 0.02, math.hypot(0.06, 0.001 * 72 * 8 / 6)
+    # Upright: rows are along it.
+    np.testing.assert_allclose(own, [0.3, 0.2, 0.05, across, 0.0, along], atol=1e-15)
     assert not out[[0, 4]].any()
     out, bar = out[1:4], bar[1:4]
     arm, sharp = enu - enu.mean(0), 1 / sigma[seen]
@@ -595,7 +614,7 @@ def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -
     enu_m = np.stack([centres_m[:, 0], 0 * centres_m[:, 0], -centres_m[:, 1]], 1)
     seen = ~np.isin(np.arange(len(enu_m)), dark)
     points = np.where(seen[:, None], 300 + 250 * centres_m, np.nan)
-    spec = PositionSpec(shared_sigma_px=0.05, shared_share=0.002, stretch_share=0.003)
+    spec = PositionSpec(shared_along_px=0.05, shared_share=0.002, stretch_share=0.003)
     view = BarView(0, enu_m, points, np.full(len(enu_m), 0.1), (0.1, 0.2, 0.004))
     shift, *site = shared_sigmas(view, seen, spec)
     assert shift == pytest.approx(math.hypot(0.05, 0.002 * 250 * length_m), rel=1e-9)

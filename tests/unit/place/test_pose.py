@@ -23,7 +23,9 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 CAMERA = CameraModel()
 BENT = CameraModel(k1=-0.3, k2=0.1, p1=1e-3, p2=-1e-3, centre_x_px=655.0, centre_y_px=350.0)
-POINT_ONLY = PositionSpec(shared_sigma_px=0, shared_share=0, stretch_share=0)
+POINT_ONLY = PositionSpec(
+    shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0
+)
 LEVEL = Attitude(gravity_sigma_deg=0)
 UP = Attitude(pitch_deg=5.0, heading_deg=0.0)
 """The camera looks up by 5 degrees, as it must to see bars on poles 4 m above it at 50 m."""
@@ -173,18 +175,48 @@ def test_errors_at_50_m_and_their_sigmas(
     assert low / 1.03 < square.mean() < high * 1.03
 
 
+def own_shift(
+    points_px: NDArray[np.float64], spec: PositionSpec, rng: np.random.Generator
+) -> NDArray[np.float64]:
+    """By what a bar's points are off alike, drawn across the bar and along it."""
+    whole = points_px[-1] - points_px[0]
+    long_px = float(np.linalg.norm(whole)) * 16 / 15
+    along = whole / np.linalg.norm(whole)
+    longways = math.hypot(spec.shared_along_px, spec.shared_share * long_px)
+    across = np.array([-along[1], along[0]])
+    return rng.normal(0, longways) * along + rng.normal(0, spec.shared_sigma_px) * across
+
+
 def test_an_error_that_a_bars_points_share_is_accounted_for() -> None:
     rng = np.random.default_rng(3)
     bars, rotation = [bar(p) for p in THREE], UP.rotation()
-    spec, square = dataclasses.replace(POINT_ONLY, shared_sigma_px=0.2), []
+    spec, square = dataclasses.replace(POINT_ONLY, shared_sigma_px=0.1, shared_along_px=0.3), []
     for _ in range(200):
         seen = [
-            BarView(v.transmitter, v.enu_m, v.points_px + rng.normal(0, 0.2, 2), v.sigma_px)
+            BarView(v.transmitter, v.enu_m, v.points_px + own_shift(v.points_px, spec, rng), v.sigma_px)
             for v in views(bars, np.zeros(3), rotation, rng, 0.1)
         ]
         pose = solved(solve_pose(seen, CAMERA, Attitude(5.0, 0.0, None, 0.0), spec))
         square.append(pose.enu_m @ np.linalg.solve(pose.covariance[:3, :3], pose.enu_m))
     low, high = stats.chi2.interval(0.95, 3 * 200)
+    assert low / 200 < np.mean(square) < high / 200
+
+
+@pytest.mark.parametrize(("places", "heading"), [(POLES[:1], 0.0), (POLES, None), (POLES, 0.0)])
+def test_an_error_that_all_bars_share_is_that_of_an_exact_attitude(
+    places: list[tuple[float, float, float]], heading: float | None
+) -> None:
+    rng, spec = np.random.default_rng(4), dataclasses.replace(POINT_ONLY, shaken_sigma_px=0.5)
+    bars, rotation, square = [bar(p) for p in places], UP.rotation(), []
+    for _ in range(200):
+        shaken = rng.normal(0, 0.5, 2)
+        seen = [
+            BarView(v.transmitter, v.enu_m, v.points_px + shaken, v.sigma_px)
+            for v in views(bars, np.zeros(3), rotation, rng, 0.1)
+        ]
+        pose = solved(solve_pose(seen, CAMERA, Attitude(5.0, 0.0, heading, 0.0, 0.0), spec))
+        square.append(pose.enu_m @ np.linalg.solve(pose.covariance[:3, :3], pose.enu_m))
+    low, high = stats.chi2.interval(0.99, 3 * 200)
     assert low / 200 < np.mean(square) < high / 200
 
 
@@ -215,9 +247,7 @@ def drawn(
         said = view.enu_m + rng.normal(0, survey[0], 3) + np.cross(rng.normal(0, survey[1], 3), arm)
         said = said + rng.normal(0, survey[2]) * arm
         said = said + rng.normal(0, spec.stretch_share) * arm
-        long_px = np.linalg.norm(view.points_px[-1] - view.points_px[0]) * 16 / 15
-        shift = math.hypot(spec.shared_sigma_px, spec.shared_share * float(long_px))
-        points = view.points_px + rng.normal(0, shift, 2)
+        points = view.points_px + own_shift(view.points_px, spec, rng)
         seen.append(BarView(view.transmitter, said, points, view.sigma_px, survey))
     told = None
     if known is not None:
@@ -501,7 +531,8 @@ def test_a_cluster_that_the_edge_cuts_off_is_left_out() -> None:
 @pytest.mark.parametrize("gravity_sigma_deg", [0.0, 0.1])
 def test_a_lone_bar_and_a_poor_compass(gravity_sigma_deg: float) -> None:
     """Half a degree is a compass's usual error: 0.44 m at 50 m, along an arc 8 mm off its tangent."""
-    rng, spec = np.random.default_rng(5), dataclasses.replace(POINT_ONLY, shared_sigma_px=0.1)
+    rng = np.random.default_rng(5)
+    spec = dataclasses.replace(POINT_ONLY, shared_sigma_px=0.1, shared_along_px=0.1)
     squares = []
     for _ in range(60):
         told = Attitude(

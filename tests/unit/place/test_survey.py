@@ -19,7 +19,7 @@ from evlcp_sdk.scene.sites import BarSite, LocalAxes
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
 CAMERA = CameraModel(focal_mm=16.0)
-SPEC = PositionSpec(shared_sigma_px=0, shared_share=0, stretch_share=0)
+SPEC = PositionSpec(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0)
 ROTATION = Attitude(3.0, 1.0, 2.0).rotation()
 
 
