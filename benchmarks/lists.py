@@ -1,6 +1,7 @@
 """Lists of events of one LED outdoors: wrong bits of `uart` beside a plain and a told receiver.
 
     python benchmarks/lists.py [--seeds 1 2] [--characters 400] [--only NAME ...]
+        [--lamp sine100|sine120|square100 ...] [--strength 0.1 1 ...]
 
 Pixels as in the sensor's model (logarithmic receptor with a lag, thresholds, refractory time, missing events,
 latencies with jitter, noise) look at one LED that sends 7 data bits, highest first, even parity and two stop
@@ -8,6 +9,10 @@ bits; their events are merged by time. The plain receiver sums events with a lea
 best of four pairs) and samples the middles of bits between falling edges. The told one is given when each
 character starts, and learns from the other half of the characters what events come after which bits; what it
 gets wrong is in the events.
+
+`--lamp` lets a lamp shine on the same pixels, so many times as bright at its brightest as the background: the
+square of a sine, 100 or 120 times a second, or a square wave. The told receiver is then told its phase,
+too, and learns each eighth of its period apart.
 """
 
 import argparse
@@ -57,6 +62,8 @@ class Pixels:
 THRESHOLD, THRESHOLD_SPREAD, CHARGE = 0.223, 0.1, 14.6
 DELAYS_US, JITTER = (33.0, 22.0), 0.25
 CLOCK = 1.003
+LAMP_STEP_US, PHASES = 100.0, 8
+LAMPS = {"sine100": 10_000.0, "sine120": 1e6 / 120, "square100": 10_000.0}
 QUIET_BITS = 40
 
 
@@ -72,6 +79,7 @@ SCENES: dict[str, tuple[float, Pixels]] = {
     "3125 near": (3125.0, Pixels(spot(2, 10), lag_us=200.0, refractory_us=200.0)),
     "3125 noise": (3125.0, Pixels(spot(1, 8), noise_hz=60.0)),
     "3125 far": (3125.0, Pixels(spot(2, 10), lag_us=250.0, refractory_us=300.0)),
+    "10000 near": (10_000.0, Pixels(spot(4, 20), lag_us=20.0, refractory_us=50.0)),
 }
 
 
@@ -91,15 +99,40 @@ def edges(bits: NDArray[np.int64], bit_us: float, start_us: float) -> list[Edge]
     return [(start_us + k * bit_us, bool(padded[k + 1])) for k in at.tolist()]
 
 
-def seen(rng: np.random.Generator, light: Sequence[Edge], end_us: float, pixels: Pixels) -> Pulses:
+def lit_by(lamp: str, end_us: float) -> list[tuple[float, float]]:
+    """From when on a lamp is how bright, of its brightest."""
+    period_us = LAMPS[lamp]
+    if lamp.startswith("square"):
+        return [(k * period_us / 2, float(k % 2)) for k in range(math.ceil(2 * end_us / period_us))]
+    at = np.arange(0, end_us, LAMP_STEP_US)
+    return list(zip(at.tolist(), (np.sin(np.pi * at / period_us) ** 2).tolist(), strict=True))
+
+
+def seen(
+    rng: np.random.Generator,
+    light: Sequence[Edge],
+    end_us: float,
+    pixels: Pixels,
+    lamp: tuple[str, float] | None = None,
+) -> Pulses:
     """Times and polarities of what pixels make of the edges, ascending."""
     found: list[tuple[float, bool]] = []
+    # Until when the LED is on or off, and how bright the background is.
+    parts, shares, on, share = [], [(end_us, 0.0)], True, 0.0
+    if lamp is not None:
+        shares = [(t_us, 1 + lamp[1] * value) for t_us, value in lit_by(lamp[0], end_us)] + shares
+    changes = sorted([(t_us, True, float(lit)) for t_us, lit in light] + [(t, False, v) for t, v in shares])
+    share = 1.0
+    for t_us, of_led, value in changes:
+        parts.append((t_us, on, pixels.background * share))
+        on, share = (bool(value), share) if of_led else (on, value)
     for contrast in pixels.contrasts:
         thresholds = np.maximum(THRESHOLD * (1 + THRESHOLD_SPREAD * rng.standard_normal(2)), 0.05)
-        lit, dark = pixels.background * (1 + contrast), pixels.background
-        level, inverse, now, blind = lit, 1 / lit, 0.0, 0.0
+        lit = pixels.background * (1 + contrast)
+        inverse, now, blind = 1 / lit, 0.0, 0.0
         reference = math.log(lit)
-        for next_us, on in [*light, (end_us, True)]:
+        for next_us, is_on, background in parts:
+            level = background + pixels.background * contrast * is_on
             lag = CHARGE / level + pixels.lag_us
             while True:
                 wake = max(now, blind)
@@ -123,7 +156,7 @@ def seen(rng: np.random.Generator, light: Sequence[Edge], end_us: float, pixels:
                     found.append((now + DELAYS_US[rising] * math.exp(JITTER * rng.standard_normal()), rising))
                 blind = now + pixels.refractory_us * math.exp(0.1 * rng.standard_normal())
             inverse = 1 / level + (inverse - 1 / level) * math.exp(-max(next_us - now, 0.0) / lag)
-            now, level = max(now, next_us), lit if on else dark
+            now = max(now, next_us)
         noise = rng.uniform(0, end_us, rng.poisson(pixels.noise_hz * end_us * 1e-6))
         found += [(t, bool(rng.integers(2))) for t in noise.tolist()]
     found.sort()
@@ -160,8 +193,13 @@ def plain(events: Pulses, bits: NDArray[np.int64], bit_us: float, start_us: floa
     return best
 
 
-def told(events: Pulses, values: NDArray[np.int64], bit_us: float, start_us: float) -> float:
-    """Share of the data bits that the told receiver gets wrong; where bits begin is the best of four."""
+def told(
+    events: Pulses, values: NDArray[np.int64], bit_us: float, start_us: float, lamp_us: float = 0.0
+) -> float:
+    """Share of the data bits that the told receiver gets wrong; where bits begin is the best of four.
+
+    With the period of a lamp it is told its phase, too: it learns each eighth of the period apart.
+    """
     characters: Characters = UART.characters
     tick_us, word = bit_us / TICKS, BITS * TICKS
     ticks = (events[0] / tick_us).astype(np.int64)
@@ -172,23 +210,31 @@ def told(events: Pulses, values: NDArray[np.int64], bit_us: float, start_us: flo
         starts = start_us / tick_us + shift + word * np.arange(len(values))
         at = np.rint(starts[:, None] + TICKS * np.arange(BITS)).astype(np.int64)
         windows = counts[:, at[..., None] + np.arange(TICKS)].transpose(1, 2, 0, 3)
+        phases = np.zeros(at.shape, np.int64)
+        if lamp_us:
+            phases = np.floor(at * tick_us / lamp_us * PHASES).astype(np.int64) % PHASES
         wrong = 0
         for half in (0, 1):
             known = np.arange(len(values)) % 2 == half
-            taught = windows[known].reshape(-1, 2, TICKS)
-            light = Light(
-                np.full((CONTEXTS, 2, TICKS), taught.mean()),
-                np.ones(CONTEXTS),
-                np.ones((CONTEXTS, len(GAINS))),
-            )
-            for _ in range(6):
-                light = light.learn(taught, np.eye(CONTEXTS)[contexts[known].ravel()], 0.0, 1.0)
-            said = np.logaddexp.reduce(light.said(windows[~known].reshape(-1, 2, TICKS)), 2)
-            said = np.logaddexp(said - said.max(1, keepdims=True), math.log(DOUBT))
-            read = characters.likelihoods(said.reshape(-1, BITS, CONTEXTS)).argmax(1)
+            said = np.zeros((int((~known).sum()), BITS, CONTEXTS))
+            for phase in np.unique(phases[~known]).tolist():
+                taught, here = phases[known] == phase, phases[~known] == phase
+                light = learned(windows[known][taught], contexts[known][taught])
+                found = np.logaddexp.reduce(light.said(windows[~known][here]), 2)
+                said[here] = np.logaddexp(found - found.max(1, keepdims=True), math.log(DOUBT))
+            read = characters.likelihoods(said).argmax(1)
             wrong += wrong_bits(read, values[~known])
         best = min(best, wrong / (7 * len(values)))
     return best
+
+
+def learned(windows: NDArray[np.float64], contexts: NDArray[np.int64]) -> Light:
+    """The light as bits of known contexts show it."""
+    blank = np.full((CONTEXTS, 2, TICKS), windows.mean() if len(windows) else 1.0)
+    light = Light(blank, np.ones(CONTEXTS), np.ones((CONTEXTS, len(GAINS))))
+    for _ in range(6 if len(windows) else 0):
+        light = light.learn(windows, np.eye(CONTEXTS)[contexts], 0.0, 1.0)
+    return light
 
 
 def wrong_bits(read: NDArray[np.int64], sent: NDArray[np.int64]) -> int:
@@ -205,6 +251,7 @@ class Rates:
         plain: Wrong bits of the plain receiver, as a share.
         ours: Wrong bits of `uart`; a lost character counts half its bits.
         told: Wrong bits of the told one.
+        phase: The same where it is told the lamp's phase, too.
         lost: Characters that `uart` does not give.
         of_nobody: Characters that it gives where none was sent.
     """
@@ -213,11 +260,12 @@ class Rates:
     plain: float
     ours: float
     told: float
+    phase: float
     lost: int
     of_nobody: int
 
 
-def measure(name: str, seed: int, many: int) -> Rates:
+def measure(name: str, seed: int, many: int, lamp: tuple[str, float] | None = None) -> Rates:
     """One scene, received by each."""
     bit_hz, pixels = SCENES[name]
     rng = np.random.default_rng(seed)
@@ -226,7 +274,7 @@ def measure(name: str, seed: int, many: int) -> Rates:
     bit_us = 1e6 / bit_hz * CLOCK
     start_us = 5000 + QUIET_BITS * bit_us
     light = edges(bits, bit_us, start_us)
-    events = seen(rng, light, start_us + (bits.size + QUIET_BITS) * bit_us, pixels)
+    events = seen(rng, light, start_us + (bits.size + QUIET_BITS) * bit_us, pixels, lamp)
     found = read_characters(*events, bit_hz, UART)
     places = [(one.t_us - start_us) / (BITS * bit_us) for one in found]
     inside = {round(at): one for at, one in zip(places, found, strict=True) if abs(at - round(at)) < 0.2}
@@ -238,6 +286,7 @@ def measure(name: str, seed: int, many: int) -> Rates:
         plain(events, bits, bit_us, start_us),
         (wrong + 3.5 * lost) / (7 * many),
         told(events, values, bit_us, start_us),
+        told(events, values, bit_us, start_us, LAMPS[lamp[0]]) if lamp else np.nan,
         lost,
         len(found) - len(read),
     )
@@ -251,18 +300,26 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--characters", type=int, default=400)
     parser.add_argument("--only", nargs="+", default=list(SCENES), choices=list(SCENES), metavar="NAME")
+    parser.add_argument("--lamp", nargs="+", default=[], choices=list(LAMPS), help="Beside the LED.")
+    parser.add_argument("--strength", type=float, nargs="+", default=[1.0], metavar="TIMES")
     args = parser.parse_args()
-    head = "| scene | events an edge | plain | `uart` | told | lost | of nobody | s CPU |"
+    lamps = [(lamp, strength) for lamp in args.lamp for strength in args.strength] or [None]
+    phase = " told the lamp's phase |" if args.lamp else ""
+    head = f"| scene | events an edge | plain | `uart` | told |{phase} lost | of nobody | s CPU |"
     print(head + "\n|" + "---|" * (head.count("|") - 1))
-    for name in args.only:
+    for name, lamp in ((name, lamp) for name in args.only for lamp in lamps):
         begun = time.process_time()
-        rates = [measure(name, seed, args.characters) for seed in args.seeds]
-        mean = [np.mean([getattr(one, key) for one in rates]) for key in ("events", "plain", "ours", "told")]
+        rates = [measure(name, seed, args.characters, lamp) for seed in args.seeds]
+        mean = [
+            np.mean([getattr(one, key) for one in rates])
+            for key in ("events", "plain", "ours", "told", "phase")
+        ]
         counted = f"{sum(one.lost for one in rates)} | {sum(one.of_nobody for one in rates)}"
         spent = time.process_time() - begun
+        which = f"{name}, {lamp[0]} x {lamp[1]:g}" if lamp else name
+        figures = " | ".join(f"{value:.2g}" for value in mean[1 : 5 if lamp else 4])
         print(
-            f"| {name} | {mean[0]:.1f} | {mean[1]:.2g} | {mean[2]:.2g} | {mean[3]:.2g} | {counted}"
-            f" | {spent:.0f} |",
+            f"| {which} | {mean[0]:.1f} | {figures} | {counted} | {spent:.0f} |",
             flush=True,
         )
 
