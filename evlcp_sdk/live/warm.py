@@ -1,6 +1,8 @@
 """Kernels loaded before anything is live."""
 
 from collections.abc import Sequence
+from dataclasses import replace
+from itertools import product
 from typing import Final
 
 import numpy as np
@@ -28,6 +30,9 @@ _PITCH_DEG: Final = 5.0
 _NOISE_PX: Final = 0.3
 _OFF_PX: Final = (0.0, 0.9, 6.0)
 """Of a bar: none; three sigmas, which is doubted; twenty, so that fits without each bar are tried."""
+
+_OFF_SIGMAS: Final = (0.0, 2.5)
+"""Of an attitude: none; so many that it is doubted."""
 
 
 def warm_up(links: Sequence[Link], *, positions: bool = False) -> None:
@@ -67,13 +72,16 @@ def _find_places(link: Link) -> None:
     along = np.linspace(0.5, -0.5, link.bar.clusters)[:, None] * (0.0, 0.0, link.bar.length_m)
     knowledge = (Attitude(_PITCH_DEG, heading_deg=0.0), Attitude(_PITCH_DEG), None)
     for bars, known in enumerate(knowledge, 1):
-        for off_px in _OFF_PX:
+        for off_px, off_sigmas in product(_OFF_PX, _OFF_SIGMAS):
             views = []
             for number, place in enumerate(_PLACES[:bars]):
                 points, _ = project_bars(along + place, np.zeros(3), rotation, link.camera)
                 points += rng.normal(0, _NOISE_PX, points.shape) + off_px * (number == 0)
                 views.append(BarView(number, along + place, points, np.full(len(points), _NOISE_PX)))
-            solve_pose(views, link.camera, known, link.position, link.camera_sigma)
+            said = known
+            if known is not None:
+                said = replace(known, pitch_deg=known.pitch_deg + off_sigmas * known.gravity_sigma_deg)
+            solve_pose(views, link.camera, said, link.position, link.camera_sigma)
 
 
 def _shaken(events: Events) -> Events:

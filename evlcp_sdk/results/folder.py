@@ -1,6 +1,7 @@
 """The folder of a result: a run's files come into place together, or not at all."""
 
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO, Self, TextIO
@@ -31,6 +32,7 @@ class ResultFolder:
         self._files = tuple(dict.fromkeys((*files, SUMMARY)))
         self._used: set[str] = set()
         self._outputs = Outputs()
+        self._made = not folder.exists()
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as fault:
@@ -99,8 +101,11 @@ class ResultFolder:
     def __exit__(
         self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Drop what `finish` has not moved into place."""
+        """Drop what `finish` has not moved into place, and the folder, if it was made for nothing."""
         self._outputs.discard()
+        if self._made:
+            with suppress(OSError):  # It holds a result.
+                self.folder.rmdir()
 
 
 def read_summary(folder: Path | str) -> dict[str, Any] | None:

@@ -25,6 +25,7 @@ from evlcp_sdk.errors import ConfigError, InputError, OutputError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.results.columns import FRAME_COLUMNS
+from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
@@ -435,3 +436,19 @@ def test_figures_of_the_newest_transmitters_are_kept() -> None:
     assert set(range(1030)) - set(tally.transmitters) == set(range(6))
     assert (tally.others, tally.others_frames) == (6, 12)
     assert tally.headline() == "1024 transmitters, 2049 frames; 6 earlier ones, 12 frames"
+
+
+@pytest.mark.parametrize("kept", [False, True])
+def test_a_folder_that_was_made_for_nothing_is_gone(kept: bool, tmp_path: Path) -> None:
+    """An earlier result's stays, and one that somebody else made."""
+    out = tmp_path / "out"
+    if kept:
+        out.mkdir()
+    folder = ResultFolder(out, ["fixes.csv"])
+    with folder:
+        folder.open("fixes.csv").write("t_us\n")  # The run ends before it is finished.
+    assert out.exists() == kept
+    with ResultFolder(out, ["fixes.csv"]) as folder:
+        folder.open("fixes.csv").write("t_us\n")
+        folder.finish()
+    assert [path.name for path in out.iterdir()] == ["fixes.csv"]
