@@ -5,14 +5,11 @@ import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from importlib.metadata import EntryPoints, entry_points
 from pathlib import Path
 
 import pytest
 import typer
 from hypothesis import settings
-
-from evlcp_sdk.plugin import registry
 
 # A thread a core for matrices of a few rows takes ten times the processor, and each worker has a core: before
 # numpy is there, which asks once. Processes that tests start inherit it.
@@ -25,19 +22,8 @@ ROOT = Path(__file__).parents[1]
 settings.register_profile("same", derandomize=True, deadline=None)
 settings.load_profile("same")
 
-# What parameters a command has, and which packages have plugins, is looked up at every run of a command and
-# for every recording that is opened: with tens of packages, most of the time of many tests.
+# What parameters a command has is looked up at every run of it: much of the time of many tests.
 typer.main.get_params_from_function = cache(typer.main.get_params_from_function)
-
-
-@cache
-def _entry_points(path: tuple[str, ...], group: str) -> EntryPoints:
-    """What the packages in these folders have."""
-    del path
-    return entry_points(group=group)
-
-
-registry.entry_points = lambda group: _entry_points(tuple(sys.path), group)
 
 
 @dataclass(frozen=True)

@@ -6,11 +6,14 @@ A plugin that fails is left out with all its hooks, and shown: as a `PluginWarni
 
 import importlib
 import platform
+import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import lru_cache
 from importlib.metadata import Distribution, EntryPoint, entry_points, version
+from pathlib import Path
 from typing import Any
 
 import pluggy
@@ -54,6 +57,24 @@ class Broken:
         return f"plugin {self.plugin}{owner} is broken and left out: {self.reason}"
 
 
+def _stamp(folder: str) -> tuple[str, int, int]:
+    """What tells whether packages came into a folder of `sys.path`, or left it."""
+    try:
+        status = Path(folder).stat()
+    except OSError:
+        return folder, 0, 0
+    return folder, status.st_ino, status.st_mtime_ns
+
+
+@lru_cache(maxsize=1)
+def _found(
+    find: Callable[..., Iterable[EntryPoint]], folders: tuple[tuple[str, int, int], ...]
+) -> tuple[EntryPoint, ...]:
+    """The installed plugins, as long as `folders` are the same: a file of every package is read for them."""
+    del folders
+    return tuple(find(group=ENTRY_POINT_GROUP))
+
+
 class Registry:
     """The installed plugins; made by `Registry.load()`, passed to whoever needs it.
 
@@ -83,11 +104,13 @@ class Registry:
     def load(cls, *plugins: object) -> "Registry":
         """Find all installed plugins; `plugins` are objects with hooks to add, e.g. a probe.
 
+        What is installed is read once, and again when a folder of `sys.path` has changed.
+
         Raises:
             PluginError: Such an object has a hook that the SDK does not have.
         """
         registry = cls(*plugins)
-        for entry in entry_points(group=ENTRY_POINT_GROUP):
+        for entry in _found(entry_points, tuple(map(_stamp, sys.path))):
             registry._load(entry)
         return registry
 

@@ -18,7 +18,6 @@ import numpy as np
 import typer
 from matplotlib.figure import Figure
 
-import evlcp_sdk.plugin.registry
 import evlcp_sdk.results.figures
 import evlcp_sdk.run
 import evlcp_sdk.study.campaign.task as task
@@ -307,7 +306,6 @@ def sweep(work: Path) -> tuple[list[str], tuple[str, ...]]:
 def tell(name: str, work: Path, demo: Path) -> None:
     # Looked up once for all forks.
     typer.main.get_params_from_function = cache(typer.main.get_params_from_function)
-    evlcp_sdk.plugin.registry.entry_points = cache(evlcp_sdk.plugin.registry.entry_points)
     if name == "sweep":
         faults, calls = sweep(work)
     else:
