@@ -39,6 +39,21 @@ _AGILE_US = 4000.0
 _VEIL_PX, _VEIL = 128.0, 2.5
 """How far around a light lenses scatter some of it, and how much brighter it is than what they make of it."""
 
+_ALIKE, _LEARNT_TURNS = 0.5, 12
+"""Correlation with the events of a much brighter light, slot by slot, from which on a light is but what the
+lens scatters of it: less than three quarters of its power come at other instants. And turns by which that is
+known: with fewer, two lights of random bits are as alike by chance."""
+
+_SCATTERED = 6.0
+"""How much brighter a light is than what its halo wakes here and there as the image shakes, which has no
+edges to compare: a bright LED at 30 m woke bursts of a ninth of its own."""
+
+_LAG_US = 1000.0
+"""How much later dim pixels see an edge than bright ones, at the most."""
+
+_MOST_VEILED = 4
+"""Lights, the brightest, that are followed to see whether they have edges of their own: there may be many."""
+
 _LARGE_PX = 64.0
 """Three lights so near one another that none is much brighter are places of one that is larger, as a bar."""
 
@@ -107,6 +122,10 @@ class _Spot:
         lit: The last burst was ON.
         turned_us: When the polarity of its bursts changed last, us.
         found_us: When it was found, us.
+        own: It is no part of what the lens scatters of another, as far as is known.
+        alike: Products of its events and a brighter light's by lag, and the squares of either: see `_alike`.
+        turns: Its turns beside a much brighter light, at one place beside it.
+        off_px: Where that is: (right, down) of the brighter light.
     """
 
     id: int
@@ -120,6 +139,10 @@ class _Spot:
     lit: bool
     turned_us: float
     found_us: float
+    own: bool = True
+    alike: tuple[float, ...] = ()
+    turns: int = 0
+    off_px: tuple[float, float] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -155,49 +178,133 @@ class _SpotDetector:
         now_us = float(events.t_us[-1]) if len(events) else float(start_us)
         moved: list[_Spot] = []
         regions: list[Region] = []
-        for spot in state.spots:
-            seen, x_px, y_px = self._followed(spot, start_us, now_us, events)
+        places = self._all_followed(state.spots, start_us, now_us, events)
+        for before, (seen, x_px, y_px) in zip(state.spots, places, strict=True):
             beside = any(_apart(x_px, y_px, other) < self.spec.reach_px for other in moved)
             faded = now_us - seen.turned_us > self.spec.fade_us
-            if not (beside or faded or _is_veil(seen, state.spots)):
-                moved.append(seen)
+            if not (beside or faded):
+                moved.append(self._judged(before, seen, (x_px, y_px), places, start_us, events))
                 regions.append(self._region(seen, x_px, y_px, now_us))
         cells, new = self._turned(state.cells, start_us, events)
         next_id = state.next_id
         for spot in new:
-            near = any(_apart(spot.x_px, spot.y_px, other) < 2 * self.spec.reach_px for other in moved)
-            if near or _is_veil(spot, moved):
+            veil = _brighter(spot, moved) is not None
+            # What is not known to be a light of its own makes way for one that is.
+            near = [other for other in moved if _apart(spot.x_px, spot.y_px, other) < 2 * self.spec.reach_px]
+            here = any(_apart(spot.x_px, spot.y_px, other) < self.spec.reach_px for other in near)
+            if here or any(other.own or veil for other in near):
                 continue
-            if len(moved) >= self.spec.most:
-                least = min(moved, key=lambda one: one.burst)
-                if least.burst >= spot.burst:
-                    continue
-                moved.remove(least)
-                regions = [region for region in regions if region.id != least.id]
-            moved.append(replace(spot, id=next_id))
+            gone = list(near)
+            if veil:
+                veiled = [other for other in moved if not other.own]
+                gone += _dimmest(veiled, spot, _MOST_VEILED)
+            if len(moved) - len(gone) >= self.spec.most:
+                gone += _dimmest(moved, spot, self.spec.most)
+            if any(one is spot for one in gone):
+                continue
+            regions = [region for region in regions if region.id not in {one.id for one in gone}]
+            moved = [one for one in moved if one.id not in {other.id for other in gone}]
+            moved.append(replace(spot, id=next_id, own=not veil))
             regions.append(self._region(moved[-1], spot.x_px, spot.y_px, now_us))
             next_id += 1
         single = [
             region
             for region, spot in zip(regions, moved, strict=True)
-            if now_us - spot.found_us >= _YOUNG_US and not _is_part(spot, moved)
+            if spot.own and now_us - spot.found_us >= _YOUNG_US and not _is_part(spot, moved)
         ]
         return _State(tuple(moved), cells, next_id), single
+
+    def _judged(
+        self,
+        before: _Spot,
+        spot: _Spot,
+        place: tuple[float, float],
+        places: Sequence[tuple[_Spot, float, float]],
+        start_us: int,
+        events: Events,
+    ) -> _Spot:
+        """A light with what a step says of whether it is but what the lens scatters of a brighter one."""
+        other = _brighter(spot, [one for one, _, _ in places])
+        if other is None:
+            return spot
+        beside = next((x, y) for one, x, y in places if one is other)
+        off_px = place[0] - beside[0], place[1] - beside[1]
+        off = max(abs(one - then) for one, then in zip(off_px, spot.off_px, strict=True))
+        turned = before.lit != spot.lit
+        if spot.alike and turned and off > self.spec.reach_px:
+            # Two lights shake together; what does not is a halo's.
+            return replace(spot, own=False, alike=(), turns=0)
+        turns = spot.turns + turned
+        # One that was there before is a light of its own until it shows that it is not.
+        own = spot.own and (bool(spot.alike) or spot.found_us + _YOUNG_US < other.found_us)
+        alike = self._alike(place, beside, start_us, events)
+        if spot.alike:
+            alike = tuple(one + more for one, more in zip(spot.alike, alike, strict=True))
+        if turns >= _LEARNT_TURNS:
+            *products, mine, its = alike
+            own = other.burst < _SCATTERED * spot.burst and max(products) < _ALIKE * math.sqrt(mine * its)
+        return replace(spot, own=own, alike=alike, turns=turns, off_px=spot.off_px if spot.alike else off_px)
+
+    def _alike(
+        self, place: tuple[float, float], other: tuple[float, float], start_us: int, events: Events
+    ) -> tuple[float, ...]:
+        """How alike events are at two places in a step, slot by slot.
+
+        Products of ON less OFF events at the first place with those at the second so many slots before, for
+        each lag; and the sums of the squares at either.
+        """
+        slots = []
+        lags = int(_LAG_US / self.slot_us) + 2
+        for x_px, y_px in (place, other):
+            x, y = np.abs(events.x - x_px), np.abs(events.y - y_px)
+            inside = (x <= self.spec.reach_px) & (y <= self.spec.reach_px)
+            slot = self._slots(events.t_us[inside], start_us)
+            signed = 2.0 * events.p[inside] - 1.0
+            slots.append(np.bincount(slot, signed) if len(slot) else np.zeros(1))
+        mine, its = (np.pad(one, (0, max(map(len, slots)) - len(one))) for one in slots)
+        products = [
+            float(mine[max(lag, 0) : len(mine) + min(lag, 0)] @ its[max(-lag, 0) : len(its) - max(lag, 0)])
+            if abs(lag) < len(mine)
+            else 0.0
+            for lag in range(-1, lags)
+        ]
+        return *products, float(mine @ mine), float(its @ its)
 
     def _region(self, spot: _Spot, x_px: float, y_px: float, now_us: float) -> Region:
         side = 2 * (min(max(_BOX_SIZES * spot.size_px, _BLUR_PX), self.spec.reach_px) + _BLUR_PX) + 1
         return Region(spot.id, now_us, x_px, y_px, side, side)
 
+    def _all_followed(
+        self, spots: Sequence[_Spot], start_us: int, now_us: float, events: Events
+    ) -> list[tuple[_Spot, float, float]]:
+        """Lights after a step, and where they are in it; dark dim ones take no bright one's events."""
+        found: dict[int, tuple[_Spot, float, float]] = {}
+        for spot in sorted(spots, key=lambda one: -one.burst):
+            brighter = [(x, y) for one, x, y in found.values() if one.burst > _VEIL * spot.burst]
+            found[spot.id] = self._followed(spot, start_us, now_us, events, brighter)
+        return [found[spot.id] for spot in spots]
+
     def _followed(
-        self, spot: _Spot, start_us: int, now_us: float, events: Events
+        self,
+        spot: _Spot,
+        start_us: int,
+        now_us: float,
+        events: Events,
+        others: Sequence[tuple[float, float]],
     ) -> tuple[_Spot, float, float]:
-        """A light after a step, and where it is in it: seen there, or where it should be."""
+        """A light after a step, and where it is in it: seen there, or where it should be.
+
+        What is in reach of the places of others is theirs.
+        """
         away_us = max(now_us - spot.t_us, 0.0)
         straight_us = _AGILE_US * (1 - math.exp(-away_us / _AGILE_US))
         x_px, y_px = spot.x_px + spot.right * straight_us, spot.y_px + spot.down * straight_us
         gate_px = min(self.spec.reach_px + self.spec.speed_px_ms * away_us * 1e-3, _MOST_GATE_PX)
         x, y = events.x.astype(np.float64), events.y.astype(np.float64)
-        near = np.flatnonzero((np.abs(x - x_px) <= gate_px) & (np.abs(y - y_px) <= gate_px))
+        wanted = (np.abs(x - x_px) <= gate_px) & (np.abs(y - y_px) <= gate_px)
+        for u_px, v_px in others:
+            wanted &= (np.abs(x - u_px) > self.spec.reach_px) | (np.abs(y - v_px) > self.spec.reach_px)
+        near = np.flatnonzero(wanted)
         if len(near) < _LEAST:
             return spot, x_px, y_px
         x, y, t, on = x[near], y[near], events.t_us[near], events.p[near] > 0
@@ -305,12 +412,22 @@ class _SpotDetector:
         return known, sorted(new, key=lambda spot: -spot.burst)
 
 
-def _is_veil(spot: _Spot, others: Sequence[_Spot]) -> bool:
-    """Whether it is what the lens scatters of a much brighter light."""
-    return any(
-        other.burst > _VEIL * spot.burst and _apart(spot.x_px, spot.y_px, other) < _VEIL_PX
+def _brighter(spot: _Spot, others: Sequence[_Spot]) -> _Spot | None:
+    """The brightest light that is so near, and so much brighter, that the lens may scatter this one of it."""
+    near = [
+        other
         for other in others
-    )
+        if other.burst > _VEIL * spot.burst and _apart(spot.x_px, spot.y_px, other) < _VEIL_PX
+    ]
+    return max(near, key=lambda other: other.burst, default=None)
+
+
+def _dimmest(spots: Sequence[_Spot], new: _Spot, most: int) -> list[_Spot]:
+    """What must go so that a new light is one of so many: nothing, the dimmest, or the new one itself."""
+    if len(spots) < most:
+        return []
+    least = min(spots, key=lambda one: one.burst)
+    return [new] if least.burst >= new.burst else [least]
 
 
 def _is_part(spot: _Spot, spots: Sequence[_Spot]) -> bool:
@@ -319,6 +436,7 @@ def _is_part(spot: _Spot, spots: Sequence[_Spot]) -> bool:
         other
         for other in spots
         if other.id != spot.id
+        and other.own
         and _apart(spot.x_px, spot.y_px, other) < _LARGE_PX
         and other.burst < _VEIL * spot.burst
         and spot.burst < _VEIL * other.burst

@@ -99,6 +99,48 @@ def test_places_of_a_larger_light_are_no_lights() -> None:
     assert not any(regions for _, regions in regions_of(link_of(3125.0), Events.of(t, x, y, p), 0.1))
 
 
+def moved(events: Events, right: int, share: float, late_us: int, rng: np.random.Generator) -> Events:
+    """Some of the events elsewhere and later, as a lens scatters light and dim pixels see it."""
+    kept = rng.random(len(events)) < share
+    t = events.t_us[kept] + late_us + rng.integers(0, 40, int(kept.sum()))
+    order = np.argsort(t)
+    x, y, p = events.x[kept].astype(np.int64) + right, events.y[kept], events.p[kept]
+    return Events.of(t[order], x[order], y[order], p[order])
+
+
+def together(*streams: Events) -> Events:
+    order = np.argsort(np.concatenate([one.t_us for one in streams]), kind="stable")
+    columns = (np.concatenate([getattr(one, name) for one in streams]) for name in ("t_us", "x", "y", "p"))
+    return Events.of(*(column[order] for column in columns))
+
+
+def places_of(found: list[tuple[int, list[Region]]], from_us: int, x_px: float) -> float:
+    """In what share of the steps from a time on there is a light some columns beside the shaking one."""
+    late = [(start, regions) for start, regions in found if start >= from_us]
+    hits = 0
+    for start, regions in late:
+        x, _ = shaking(np.array([start + STEP_US / 2]))
+        hits += any(abs(region.x_px - x[0] - x_px) < 12 for region in regions)
+    return hits / len(late)
+
+
+@pytest.mark.parametrize("rate_hz", [500.0, 3125.0, 10_000.0])
+@pytest.mark.parametrize("late_us", [0, 60, 300])
+def test_what_the_lens_scatters_is_no_light_and_a_dim_one_beside_is(rate_hz: float, late_us: int) -> None:
+    """Three times dimmer either: one goes with the edges of the bright light, one has its own."""
+    rng = np.random.default_rng(5)
+    seconds = 1.0 if rate_hz < 1000 else 0.3
+    bright = events_of(rng, rate_hz, seconds, 90, 0.0)
+    dim = events_of(rng, rate_hz, seconds, 28, 0.0)
+    noise = events_of(rng, rate_hz, seconds, 1, 10_000.0)
+    flare, dim = moved(bright, -70, 0.3, late_us, rng), moved(dim, 60, 1.0, late_us, rng)
+    found = regions_of(link_of(rate_hz), together(bright, flare, dim, noise), seconds)
+    half_us = int(seconds * 5e5)
+    assert places_of(found, half_us, 0) == 1
+    assert places_of(found, half_us, 60) > 0.97
+    assert places_of(found, 20_000, -70) < 0.03
+
+
 def test_a_framing_names_what_finds_its_lights() -> None:
     assert link_of(500.0).table["detection"]["id"] == "spots"
     assert resolve({}).table["detection"] == {"id": "rhythm"}
