@@ -408,13 +408,22 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
 
     Raises:
         InputError: The file cannot be read, or is not CSV.
+        ConfigError: A line has more or fewer fields than the first one.
     """
     try:
         # Spreadsheets start a file with a byte order mark.
         with Path(path).open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             rows = [(reader.line_num, row) for row in reader]
-            return tuple(reader.fieldnames or ()), rows
+            names = tuple(reader.fieldnames or ())
+            for line, row in rows:
+                beyond = len(row.get(None, ()))
+                if beyond or None in row.values():
+                    fields = len(names) + beyond - list(row.values()).count(None)
+                    raise ConfigError(
+                        f"{path}: line {line}: {fields} fields, expected {len(names)}, as line 1 has"
+                    )
+            return names, rows
     except OSError as fault:
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (UnicodeDecodeError, csv.Error) as fault:

@@ -158,7 +158,8 @@ class Navigator:
             link.position,
             link.camera_sigma,
         )
-        self._imu = attitude.between if isinstance(attitude, AttitudeLog) else None
+        self._log = attitude if isinstance(attitude, AttitudeLog) else None
+        self._imu = None if self._log is None else self._log.between
         self._attitude_at = attitude_source(attitude)
         self._gnss, self._gnss_next = plan.gnss, 0
         self._span: tuple[float, float] | None = None
@@ -173,11 +174,19 @@ class Navigator:
     @property
     def counts(self) -> dict[str, int]:
         """Fixes of satellites: taken, left out of the track, without a heading that the antenna needs, and
-        outside of the recording's time, as far as it has come.
+        outside of the recording's time, as far as it has come; and lines of an attitude outside of it.
         """
         used = self._counts["gnss"] + self._counts["gnss_without_heading"]
         given = 0 if self._gnss is None else len(self._gnss.t_us)
-        return self._counts | {"gnss_outside": given - used}
+        return self._counts | {"gnss_outside": given - used, "attitude_outside": self._attitude_outside()}
+
+    def _attitude_outside(self) -> int:
+        """How many lines an attitude's file has, if all that it spans is before or after the recording."""
+        if self._log is None or self._span is None:
+            return 0
+        first_us, last_us = self._span
+        outside = self._log.t_us[-1] < first_us or self._log.t_us[0] > last_us
+        return len(self._log.t_us) if outside else 0
 
     def seen(self, first_us: float, last_us: float) -> None:
         """Take note that the recording has events from one time to another: fixes of satellites count in it.

@@ -17,6 +17,9 @@ PLACE = {
 }
 """Columns of a place on earth, and what they may be, least and most."""
 
+_ANGLES = ("heading_deg", "pitch_deg", "roll_deg")
+"""Columns that come together."""
+
 _RANGES = PLACE | {
     "position_sigma_m": (1e-6, 1e6),
     "attitude_sigma_deg": (1e-6, 1e6),
@@ -63,7 +66,7 @@ def read_poses(path: Path | str) -> list[KnownPose]:
         InputError: The file cannot be read.
         ConfigError: A column is missing, or a value is not a number or is out of range.
     """
-    _, rows = read_csv(path)
+    names, rows = read_csv(path)
     if not rows:
         raise ConfigError(f"{path}: expected one line of values or more")
     poses = []
@@ -77,9 +80,13 @@ def read_poses(path: Path | str) -> list[KnownPose]:
                 return usual
             return csv_number(path, line, name, text, _RANGES[name])
 
-        angles = [name for name in ("heading_deg", "pitch_deg", "roll_deg") if row.get(name)]
+        angles = [name for name in _ANGLES if row.get(name)]
         attitude = None
         if angles:
+            if absent := [name for name in _ANGLES if name not in names]:
+                raise ConfigError(
+                    f"{path}: line 1: no column {absent[0]}: angles come together, {', '.join(_ANGLES)}"
+                )
             attitude = Attitude(value("pitch_deg"), value("roll_deg"), value("heading_deg"))
         poses.append(
             KnownPose(

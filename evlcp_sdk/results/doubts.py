@@ -415,6 +415,12 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
             f"{number} time{_s(number)} bars and GNSS contradict one another",
             "compare the sigmas of both, position.antenna_m, and both clocks",
         )
+    if number := positions["attitude_outside"]:
+        yield Doubt(
+            "attitude-outside",
+            f"none of the attitude's {number} lines is within the recording's time",
+            "t_us of its file has to be the camera's clock, us",
+        )
     if (number := positions["gnss_outside"]) and not positions["gnss"]:
         yield Doubt(
             "gnss-outside",

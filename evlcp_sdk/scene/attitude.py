@@ -134,7 +134,8 @@ class AttitudeLog:
         Raises:
             InputError: The file cannot be read.
             ConfigError: A column is missing, a value is not a number, or times do not rise; of rates or
-                forces one axis is there and another is not, or there are forces and no rates.
+                forces one axis is there and another is not, or there are forces and no rates, or they are
+                half as much from gravity as gravity is, or more.
         """
         usual = Attitude() if usual is None else usual
         names, rows = read_csv(path)
@@ -166,14 +167,14 @@ class AttitudeLog:
             if name in table and (table[name] < 0).any():
                 i = int(np.flatnonzero(table[name] < 0)[0])
                 raise ConfigError(f"{path}: line {lines[i]}: {name} = {table[name][i]:g}: expected 0 or more")
-        for name in _RATES + _FORCES:
-            if name in table and (np.abs(table[name]) > _MOST_MEASURED).any():
-                i = int(np.flatnonzero(np.abs(table[name]) > _MOST_MEASURED)[0])
+        most = dict.fromkeys(_RATES + _FORCES, _MOST_MEASURED) | {"pitch_deg": 90.0}
+        for name, limit in most.items():
+            if name in table and (np.abs(table[name]) > limit).any():
+                i = int(np.flatnonzero(np.abs(table[name]) > limit)[0])
                 raise ConfigError(
-                    f"{path}: line {lines[i]}: {name} = {table[name][i]:g}: expected at most"
-                    f" {_MOST_MEASURED:g}"
+                    f"{path}: line {lines[i]}: {name} = {table[name][i]:g}: expected at most {limit:g}"
                 )
-        return cls(
+        log = cls(
             t_us,
             table["pitch_deg"],
             np.degrees(np.unwrap(np.radians(table["roll_deg"]))),
@@ -184,6 +185,14 @@ class AttitudeLog:
             usual.time_sigma_us,
             *(np.stack([table[n] for n in a], 1) if a[0] in table else None for a in (_RATES, _FORCES)),
         )
+        if log._push_m_s2 is not None:
+            upward = float(log._push_m_s2[:, 2].mean()) + _GRAVITY_M_S2
+            if not 0.5 * _GRAVITY_M_S2 < upward < 1.5 * _GRAVITY_M_S2:
+                raise ConfigError(
+                    f"{path}: forces hold the camera up by {upward:.1f} m/s2 on the mean, expected about 9.8:"
+                    " a level camera at rest has force_down_m_s2 = -9.8"
+                )
+        return log
 
     def to_csv(self) -> str:
         """The text of a file that `read` takes."""

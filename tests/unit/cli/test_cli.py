@@ -703,6 +703,17 @@ def test_satellites_by_nmea_are_in_the_track(evlcp: Evlcp, street: Path, tmp_pat
     assert summary["positions"]["gnss_outside"] == 2
 
 
+def test_an_attitude_of_another_time_is_warned_of(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    for start_us, told in ((0, False), (10**12, True)):
+        imu = tmp_path / "imu.csv"
+        imu.write_text(f"t_us,pitch_deg,roll_deg,heading_deg\n{start_us},4,0,0\n{start_us + 200_000},4,0,0\n")
+        args = ("receive", street / "rec.raw", "--sites", street / "site.toml", "--attitude", imu)
+        done = evlcp(*args, "-o", tmp_path / str(start_us))
+        assert (
+            "none of the attitude's 2 lines is within the recording's time" in done.out + done.err
+        ) == told
+
+
 def test_live_takes_what_receive_takes(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
     """Attitude, satellites and MCAP: the files of a live run are those of `receive`."""
     reader = pytest.importorskip("mcap.reader", reason="the extra mcap is not installed")

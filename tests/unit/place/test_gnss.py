@@ -177,7 +177,7 @@ def test_a_file_of_fixes(tmp_path: Path) -> None:
         (HEAD + "\n0,35,137,x,1,1,1\n", "line 2: height_m = 'x': expected a number"),
         (HEAD + "\n0,35,137,5,1,1,1\n0,35,137,5,1,1,1\n", "line 3: t_us = 0: expected more than"),
         (HEAD + ",cov_east_up_m2\n0,35,137,5,1,1,1,2\n", "line 2: sigmas and covariances"),
-        (HEAD + "\n0,35\n", "line 2: longitude_deg = None: expected a number"),
+        (HEAD + "\n0,35\n", "line 2: 2 fields, expected 7, as line 1 has"),
     ],
 )
 def test_faults_of_a_file(tmp_path: Path, text: str, message: str) -> None:

@@ -21,6 +21,7 @@ NO_POSITIONS = {
     "gnss": 0,
     "gnss_without_heading": 0,
     "gnss_outside": 0,
+    "attitude_outside": 0,
     "bars_exact": [],
     "excluded": {},
     "alarms": {},

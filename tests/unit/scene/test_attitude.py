@@ -1,13 +1,14 @@
 """An IMU's rates and forces against cameras whose turn and way are known in closed form."""
 
 import itertools
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 
 Floats = NDArray[np.float64]
@@ -112,3 +113,34 @@ def test_parts_of_an_imu_are_told(tmp_path: Path, columns: str, message: str) ->
     (tmp_path / "imu.csv").write_text(f"t_us,pitch_deg,roll_deg,{columns}\n{rows}\n")
     with pytest.raises(ConfigError, match=message):
         AttitudeLog.read(tmp_path / "imu.csv")
+
+
+IMU = "t_us,pitch_deg,roll_deg,rate_right_deg_s,rate_down_deg_s,rate_forward_deg_s,"
+IMU += "force_right_m_s2,force_down_m_s2,force_forward_m_s2"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t_us,pitch_deg,roll_deg\n0,0,0\n1000,0,0,7\n", "line 3: 4 fields, expected 3, as line 1 has"),
+        ("t_us,pitch_deg,roll_deg\n0,0\n1000,0,0\n", "line 2: 2 fields, expected 3, as line 1 has"),
+        ("t_us,pitch_deg,roll_deg\n0,0,0\n1000,95,0\n", "line 3: pitch_deg = 95: expected at most 90"),
+        (
+            f"{IMU}\n0,0,0,0,0,0,0,9.8,0\n9,0,0,0,0,0,0,9.8,0\n",
+            "up by -9.8 m/s2 on the mean, expected about 9.8",
+        ),
+        (
+            f"{IMU}\n0,0,0,0,0,0,0,-1,0\n9,0,0,0,0,0,0,-1,0\n",
+            "up by 1.0 m/s2 on the mean, expected about 9.8",
+        ),
+    ],
+)
+def test_lines_that_cannot_be_are_told(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "imu.csv").write_text(text)
+    with pytest.raises(EvlcpError, match=re.escape(message)):
+        AttitudeLog.read(tmp_path / "imu.csv")
+
+
+def test_an_upside_down_camera_at_rest_is_no_fault(tmp_path: Path) -> None:
+    (tmp_path / "imu.csv").write_text(f"{IMU}\n0,0,180,0,0,0,0,9.8,0\n9,0,180,0,0,0,0,9.8,0\n")
+    assert AttitudeLog.read(tmp_path / "imu.csv").forces_m_s2 is not None

@@ -132,7 +132,7 @@ def test_a_csv_file_is_read_into_the_table(tmp_path: Path) -> None:
         ("x_m,y_m,cluster\n0,101,0\n", "line 2: y_m = '101': expected -100 to 100"),
         ("x_m,y_m,cluster\n0,0,0.5\n", "line 2: cluster = '0.5': expected a whole number"),
         ("x_m,y_m,cluster\n0,0,-1\n", "line 2: cluster = '-1': expected 0 to 65535"),
-        ("x_m,y_m,cluster\n0,0\n", "line 2: cluster = None: expected a number"),
+        ("x_m,y_m,cluster\n0,0\n", "line 2: 2 fields, expected 3, as line 1 has"),
     ],
 )
 def test_a_fault_of_a_csv_file_is_one_line(text: str, said: str, tmp_path: Path) -> None:
