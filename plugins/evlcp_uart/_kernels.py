@@ -78,7 +78,10 @@ def bit_evidence(
 def character_scores(
     evidence: Column, places: Column, bits: int, parity: int, likeliest: bool, out: Column
 ) -> None:
-    """Log-likelihood ratio of a character that starts at a tick, of any bits, against mark throughout.
+    """Log-likelihood ratio of a character that starts at a tick, of any bits, against a light that stands.
+
+    It may stand as for a mark, or as for a space: a long pause is less noisy than the marks that follow an
+    edge, and is no character for that.
 
     Args:
         evidence: Of every tick and context, whose binary digits are the bits before and that of the window,
@@ -96,7 +99,10 @@ def character_scores(
         # The mean over all words matters only where a character may be.
         if not likeliest and total > 0:
             total = _character_score(evidence, places, bits, parity, False, s, states)
-        out[s] = total + fair
+        still = 0.0
+        for b in range(len(places)):
+            still += evidence[s + places[b], 0]
+        out[s] = total + fair - max(still, 0.0)
 
 
 @njit(cache=True, nogil=True)
