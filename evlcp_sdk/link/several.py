@@ -1,13 +1,17 @@
 """Several links of one receiver: their names, and what they must share."""
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 
-__all__ = ["load_links", "named_links", "placing_links"]
+__all__ = ["alike_links", "load_links", "named_links", "placing_links"]
 
 LinkLike = Link | Path | str | None
 
@@ -110,6 +114,51 @@ def placing_links(links: Mapping[str, Link]) -> dict[str, Link]:
                 f"links '{first}' and '{name}': [position] differs; expected one for all of them"
             )
     return bars
+
+
+def alike_links(links: Mapping[str, Link]) -> list[tuple[str, str]]:
+    """Pairs of links of which what one sends can be read by the other, so that rows may name the wrong one.
+
+    Of framings that read transmitters that rest between characters, whichever way round the light is, with
+    a clock that is known to `Framing.clock_share`: their rates are not further apart than that, and each
+    codeword of one, but for what it rests longer, is one of the other.
+
+    Args:
+        links: As `named_links` gives them.
+
+    >>> from evlcp_sdk.link.resolve import load_link
+    >>> one_led = ["bar.rows=1", "bar.columns=1", "bar.cluster_rows=1", "bar.cluster_columns=1"]
+    >>> lamp = load_link(None, [*one_led, "framing.id=uart"])
+    >>> other = load_link(None, [*one_led, "framing.id=uart", "framing.idle=off"])
+    >>> alike_links({"lamp": lamp, "other": other})
+    [('lamp', 'other')]
+    """
+    pairs = []
+    for (name, one), (other_name, other) in combinations(links.items(), 2):
+        ours, theirs = _rested(one), _rested(other)
+        if ours is None or theirs is None:
+            continue
+        share = max(link.algorithm("framing").clock_share for link in (one, other))
+        apart = abs(one.air.chip_rate_hz / other.air.chip_rate_hz - 1)
+        if apart <= share and (_within(ours, theirs) or _within(theirs, ours)):
+            pairs.append((name, other_name))
+    return pairs
+
+
+def _rested(link: Link) -> NDArray[np.bool_] | None:
+    """A link's codewords, true where the light is as at rest; None where it has no rest that is known."""
+    framing = link.algorithms.get("framing")
+    rest = framing.rest() if framing is not None else None
+    return None if rest is None else link.codebook.codewords == rest
+
+
+def _within(words: NDArray[np.bool_], others: NDArray[np.bool_]) -> bool:
+    """Whether all words are among others that are not longer, resting from there on."""
+    length = others.shape[1]
+    if words.shape[1] < length or not words[:, length:].all():
+        return False
+    known = {row.tobytes() for row in others}
+    return all(row.tobytes() in known for row in np.ascontiguousarray(words[:, :length]))
 
 
 def _check(name: str, one: Link, other_name: str, other: Link) -> None:

@@ -137,11 +137,13 @@ class Framing(ABC):
         roles: The roles that do its steps; a link has tables of these only, of those in `STEPS`.
         detection: Id of the detection of a link that names none; empty for the role's default.
         characters_on_air: A symbol is the code of a character, so that packets without a block say a text.
+        clock_share: Share by which a transmitter's clock may be off and still be read; 0: not said.
     """
 
     roles: ClassVar[frozenset[str]] = frozenset()
     detection: ClassVar[str] = ""
     characters_on_air: ClassVar[bool] = False
+    clock_share: ClassVar[float] = 0.0
 
     @abstractmethod
     def codebook(self, clusters: int) -> Codebook | None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.link.several import alike_links
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.results.tallies import RunTally, TransmitterTally
@@ -246,6 +247,7 @@ def warnings_of_links(
         placing: Name of the link that says what is wrong with them.
     """
     found = [*saturation(seen), *_dropped(counts, seen), *_room(counts)]
+    found += _alike(links)
     if not tally.transmitters:
         return found + list(_frames(counts))
     for name, part in links.items():
@@ -260,6 +262,17 @@ def warnings_of_links(
         )
         found += [replace(doubt, link=name) for doubt in told]
     return found
+
+
+def _alike(links: Mapping[str, LinkPart]) -> Iterator[Doubt]:
+    """Links of which nothing on air tells one from the other."""
+    for one, other in alike_links({name: part.link for name, part in links.items()}):
+        yield Doubt(
+            "alike-links",
+            f"what one of the links '{one}' and '{other}' sends, the other may read: the rates are alike,"
+            " and codewords of one are codewords of the other",
+            "give the one that is sent with, or let them differ in rate or parity",
+        )
 
 
 def _of_link(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from evlcp_uart.characters import Characters
 from evlcp_uart.light import CONTEXTS, DOUBT, EARLY, LOG_GAINS, TICKS, Light, guesses
 
-__all__ = ["Character", "CharacterDecoder", "CharacterState"]
+__all__ = ["CLOCK_SHARE", "Character", "CharacterDecoder", "CharacterState"]
 
 _BLOCK = 32
 """Characters of a stretch that is decoded at once, if they follow one another."""
@@ -41,7 +41,7 @@ _AHEAD = 4
 _JITTER, _NEAR = 0.7, 2
 """What a tick early or late costs a character that follows another at once, and how many that may be."""
 
-_CLOCK = 0.025
+CLOCK_SHARE = 0.025
 """Share by which the clock may be off."""
 
 _RATES = np.linspace(-0.012, 0.012, 13)
@@ -452,7 +452,7 @@ class CharacterDecoder:
             ]
             rate = sum(m * span for m, span in spans) / (sum(m * m for m, _ in spans) * self._length)
             gain = 4 * many / (4 * many + weight / 12)
-            return float(np.clip(light.rate + gain * (rate - light.rate), 1 - _CLOCK, 1 + _CLOCK))
+            return float(np.clip(light.rate + gain * (rate - light.rate), 1 - CLOCK_SHARE, 1 + CLOCK_SHARE))
         contexts = self.characters.contexts
         at = np.clip(starts[:, None] + self._places(light), 0, len(evidence) - 1)
         values = self.characters.likelihoods(evidence[at]).argmax(1)
@@ -473,7 +473,7 @@ class CharacterDecoder:
             left, here, right = worth[top - 1 : top + 2]
             if (bend := left - 2 * here + right) < 0:
                 rate += 0.5 * (left - right) / bend * float(rates[1] - rates[0])
-        return float(np.clip(light.rate + gain * (rate - light.rate), 1 - _CLOCK, 1 + _CLOCK))
+        return float(np.clip(light.rate + gain * (rate - light.rate), 1 - CLOCK_SHARE, 1 + CLOCK_SHARE))
 
     def _acquire(self, stretch: "Stretch") -> Light | None:
         """Learn the light from a stretch of which nothing is known; None where it shows no characters.

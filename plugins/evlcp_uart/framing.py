@@ -15,7 +15,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Deframer, Framing
 from evlcp_sdk.values import Events, Heard, SoftSymbols
 from evlcp_uart.characters import BitOrder, Characters, Parity
-from evlcp_uart.decoder import Character, CharacterDecoder, CharacterState
+from evlcp_uart.decoder import CLOCK_SHARE, Character, CharacterDecoder, CharacterState
 
 __all__ = ["Uart", "read_characters"]
 
@@ -33,6 +33,7 @@ class Uart(Framing):
     roles: ClassVar[frozenset[str]] = frozenset()
     detection: ClassVar[str] = "spots"
     characters_on_air: ClassVar[bool] = True
+    clock_share: ClassVar[float] = CLOCK_SHARE
 
     data_bits: Annotated[int, Field(ge=5, le=9, description="Data bits of a character.")] = 8
     parity: Annotated[Parity, Field(description="The parity bit makes the number of ones so.")] = "none"

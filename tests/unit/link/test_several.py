@@ -5,7 +5,10 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.several import load_links
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.link.several import alike_links, load_links, named_links
+from evlcp_sdk.results.doubts import LinkPart, Seen, warnings_of_links
+from evlcp_sdk.results.tallies import RunTally
 
 
 @pytest.fixture
@@ -29,3 +32,50 @@ def test_a_setting_of_no_link_is_refused(files: list[Path]) -> None:
         ConfigError, match=r"^--set fra\.ranging\.id=poc: no link is named 'fra': .* bar, far"
     ):
         load_links(files, ["fra.ranging.id=poc"])
+
+
+ONE_LED = "[bar]\nrows = 6\ncolumns = 1\ncluster_rows = 6\ncluster_columns = 1\n"
+TOLD = '[air]\nchip_rate_hz = {rate}\n[framing]\nid = "uart"\n'
+
+
+@pytest.mark.parametrize(
+    ("rate", "settings", "alike"),
+    [
+        (3125.0, "idle = 'off'", True),
+        (3160.0, "", True),
+        (3300.0, "", False),
+        (3125.0, "parity = 'even'", False),
+        (3125.0, "data_bits = 7\nparity = 'even'", True),
+        (3125.0, "data_bits = 7\nparity = 'even'\nidle = 'off'", True),
+        (3125.0, "stop_bits = 2", True),
+        (3125.0, "data_bits = 7", False),
+        (3125.0, "pause_bits = 40", True),
+    ],
+    ids=str,
+)
+def test_links_whose_characters_the_other_reads_are_named(
+    tmp_path: Path, rate: float, settings: str, alike: bool
+) -> None:
+    (tmp_path / "lamp.toml").write_text(ONE_LED + TOLD.format(rate=3125.0))
+    (tmp_path / "other.toml").write_text(ONE_LED + TOLD.format(rate=rate) + settings)
+    (tmp_path / "bar.toml").write_text("")
+    links = named_links(load_links([tmp_path / f"{name}.toml" for name in ("bar", "lamp", "other")]))
+    assert alike_links(links) == [("lamp", "other")] * alike
+
+
+def test_two_kinds_of_odd_and_even_parity_are_told_apart(tmp_path: Path) -> None:
+    for parity in ("odd", "even"):
+        text = ONE_LED + TOLD.format(rate=3125.0) + f"data_bits = 7\nparity = '{parity}'"
+        (tmp_path / f"{parity}.toml").write_text(text)
+    assert not alike_links(named_links(load_links([tmp_path / "odd.toml", tmp_path / "even.toml"])))
+
+
+def test_links_alike_are_warned_of_before_anything_is_read(tmp_path: Path) -> None:
+    lamp = load_link(None, ["bar.rows=1", "bar.columns=1", "bar.cluster_rows=1", "framing.id=uart"])
+    off = load_link(
+        None, ["bar.rows=1", "bar.columns=1", "bar.cluster_rows=1", "framing.id=uart", "framing.idle=off"]
+    )
+    parts = {name: LinkPart(link, {}, True) for name, link in (("lamp", lamp), ("off", off))}
+    (told,) = warnings_of_links(RunTally({}), {}, parts, seen=Seen())
+    assert told.code == "alike-links"
+    assert "'lamp' and 'off'" in told.text
