@@ -113,7 +113,7 @@ class PositionSpec:
     shared_sigma_px: Annotated[
         float,
         Field(ge=0, description="Error that the points of one bar share, across it: where in a pixel it is."),
-    ] = 0.022
+    ] = 0.05
     shared_along_px: Annotated[
         float, Field(ge=0, description="The same along it, where its ends are half a cluster's light.")
     ] = 0.06
