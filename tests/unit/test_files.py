@@ -250,13 +250,20 @@ def test_a_spreadsheet_finds_no_formula(text: str) -> None:
 
 def test_a_csv_file_is_read_by_line(tmp_path: Path) -> None:
     file = tmp_path / "a.csv"
-    file.write_bytes(b"\xef\xbb\xbft_s,name\r\n1,a\r\n\r\n2\r\n")
+    file.write_bytes(b"\xef\xbb\xbft_s,name\r\n1,a\r\n\r\n2,\r\n")
     assert read_csv(file) == (
         ("t_s", "name"),
-        [(2, {"t_s": "1", "name": "a"}), (4, {"t_s": "2", "name": None})],
+        [(2, {"t_s": "1", "name": "a"}), (4, {"t_s": "2", "name": ""})],
     )
     file.write_bytes(b"")
     assert read_csv(file) == ((), [])
+
+
+@pytest.mark.parametrize(("line", "fields"), [("2", 1), ("2,b,c", 3)])
+def test_lines_of_a_csv_file_have_the_fields_of_the_first(line: str, fields: int, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"t_s,name\n1,a\n\n{line}\n")
+    with pytest.raises(ConfigError, match=f"a.csv: line 4: {fields} fields, expected 2, as line 1 has"):
+        read_csv(tmp_path / "a.csv")
 
 
 @pytest.mark.parametrize("content", [b"a\n\xff\n", b'a,b\n"' + 140_000 * b"x" + b'",1\n'])

@@ -377,4 +377,4 @@ def test_the_command_line_tells_it_in_one_line(
         "evlcp: ranging algorithm 'joint-scale': KeyError: 'boom' (test_guard.py, line "
     )
     assert done.err.count("\n") == 1
-    assert list((tmp_path / "out").iterdir()) == []
+    assert not (tmp_path / "out").exists()
