@@ -90,7 +90,7 @@ class Camera:
     def say(self, *what):
         print(*what, flush=True)
 
-    def handle(self, _base, client):
+    def handle(self, client):
         if not self.opened:
             self.opened = True
             self.say("open")
@@ -219,9 +219,27 @@ class Camera:
         self.waiting.clear()
         self.say("unplugged")
 
+
+class Port:
+    """Where a camera is plugged in: who opened one that is gone never sees the next, as with the kernel."""
+
+    def __init__(self, made):
+        self.made = made
+        self.camera = made()
+        self.opened = {}
+
+    def handle(self, _base, client):
+        return self.opened.setdefault(client, self.camera).handle(client)
+
+    def vanished(self, _base, client):
+        self.opened.pop(client, None)
+
+    def unplug(self):
+        self.camera.unplug()
+
     def plug(self):
-        self.__init__(self.words, self.rate, self.chunk, self.tell, self.then)
-        self.say("plugged")
+        self.camera = self.made()
+        self.camera.say("plugged")
 
 
 def main():
@@ -242,16 +260,17 @@ def main():
     tell = {int(address, 16) for address in given.tell.split(",") if address}
     testbed = UMockdev.Testbed.new()
     testbed.add_from_string(description())
-    camera = Camera(words, given.rate, given.chunk, tell, given.then)
+    port = Port(lambda: Camera(words, given.rate, given.chunk, tell, given.then))
     handler = UMockdev.IoctlBase()
-    handler.connect("handle-ioctl", camera.handle)
+    handler.connect("handle-ioctl", port.handle)
+    handler.connect("client-vanished", port.vanished)
     testbed.attach_ioctl(NODE, handler)
     loop = GLib.MainLoop()
     print(testbed.get_root_dir(), flush=True)
 
     def listen():
         for line in sys.stdin:
-            action = {"unplug": camera.unplug, "plug": camera.plug}.get(line.strip())
+            action = {"unplug": port.unplug, "plug": port.plug}.get(line.strip())
             if action is None:
                 break
             GLib.idle_add(lambda action=action: action() and False)

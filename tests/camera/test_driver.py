@@ -57,6 +57,7 @@ class Emulator:
         threading.Thread(target=self._listen, daemon=True).start()
         self.folder = self.lines.get(timeout=20)
         self.seen: list[str] = []
+        self.programs: list[subprocess.Popen[str]] = []
 
     def _listen(self) -> None:
         assert self.process.stdout is not None
@@ -70,12 +71,23 @@ class Emulator:
 
     def wait(self, what: str) -> None:
         while not self.seen or not self.seen[-1].startswith(what):
-            self.seen.append(self.lines.get(timeout=120))
+            try:
+                self.seen.append(self.lines.get(timeout=120))
+            except queue.Empty:
+                raise AssertionError(f"never {what!r}: {self.seen[-5:]}, {self._ended()}") from None
+
+    def _ended(self) -> str:
+        """What its programs left, once they are ended."""
+        for program in self.programs:
+            program.kill()
+        return "; ".join(f"{program.returncode}: {program.communicate()[1]}" for program in self.programs)
 
     def run(self, command: list[str], **more: Any) -> "subprocess.Popen[str]":
         preload = {"LD_PRELOAD": "libumockdev-preload.so.0", "UMOCKDEV_DIR": self.folder}
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-        return subprocess.Popen(command, text=True, env={**os.environ, **preload}, **{**pipes, **more})
+        program = subprocess.Popen(command, text=True, env={**os.environ, **preload}, **{**pipes, **more})
+        self.programs.append(program)
+        return program
 
 
 @contextlib.contextmanager
@@ -86,6 +98,10 @@ def emulator(recording: Path, folder: Path, *options: str) -> Iterator[Emulator]
     try:
         yield one
     finally:
+        for program in one.programs:
+            if program.poll() is None:
+                program.kill()
+                program.communicate()
         with contextlib.suppress(OSError):
             one.tell("end")
         assert one.process.stdin is not None
