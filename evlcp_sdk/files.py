@@ -7,16 +7,18 @@ refuse.
 """
 
 import csv
+import difflib
 import errno
 import hashlib
 import io
 import json
 import math
 import os
+import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -29,6 +31,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Outputs",
+    "check_columns",
     "check_output",
     "check_sha256",
     "csv_number",
@@ -408,7 +411,7 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
 
     Raises:
         InputError: The file cannot be read, or is not CSV.
-        ConfigError: A line has more or fewer fields than the first one.
+        ConfigError: Two columns have one name, or a line has more or fewer fields than the first one.
     """
     try:
         # Spreadsheets start a file with a byte order mark.
@@ -416,6 +419,9 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
             reader = csv.DictReader(file)
             rows = [(reader.line_num, row) for row in reader]
             names = tuple(reader.fieldnames or ())
+            for name in filter(None, names):
+                if names.count(name) > 1:
+                    raise ConfigError(f"{path}: line 1: {names.count(name)} columns {name}: expected one")
             for line, row in rows:
                 beyond = len(row.get(None, ()))
                 if beyond or None in row.values():
@@ -428,6 +434,47 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
         raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (UnicodeDecodeError, csv.Error) as fault:
         raise InputError(f"{path}: not a CSV file: {fault}") from fault
+
+
+_UNITS = frozenset(
+    ("deg", "rad", "mrad", "m", "mm", "cm", "km", "s", "ms", "us", "ns", "g", "m2", "s2", "m2s")
+)
+"""Words of a column's name that are its unit."""
+
+_LIKE = 0.85
+"""Share of letters in common by which one name is a slip of another: a letter of four to eight."""
+
+
+def check_columns(
+    path: Path | str, names: Sequence[str], needed: Sequence[str], optional: Sequence[str] = ()
+) -> None:
+    """Check the columns of a CSV file that was read; further ones of other names are anyone's.
+
+    An optional column that is not there, beside one that looks like it (other unit, case, order of words, a
+    slip, another axis of what comes by axes), would be lost in silence.
+
+    Raises:
+        ConfigError: A needed one is missing, or one looks like another that is missing.
+    """
+    known = (*needed, *optional)
+    lacking = {name: _words(name) for name in known if name not in names}
+    starts = [_words(name)[:1] for name in known]
+    for name in names:
+        if name in known or not name:
+            continue
+        words = _words(name)
+        for meant, its in lacking.items():
+            axes = words[:1] == its[:1] and starts.count(words[:1]) >= 3
+            slip = difflib.SequenceMatcher(None, "_".join(words), "_".join(its)).ratio() >= _LIKE
+            if axes or slip or sorted(words) == sorted(its):
+                raise ConfigError(f"{path}: line 1: column {name!r:.40}: expected {meant}")
+    missing = [name for name in needed if name not in names]
+    if missing:
+        raise ConfigError(f"{path}: line 1: no column {missing[0]} (columns: {', '.join(known)})")
+
+
+def _words(name: str) -> list[str]:
+    return [word for word in re.split("[^a-z0-9]+", name.lower()) if word and word not in _UNITS]
 
 
 _MOST = 1e18

@@ -1,5 +1,6 @@
 """The use cases: what a program does with a recording, and what the commands parse and print."""
 
+import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
@@ -774,7 +775,7 @@ def calibrate(
     views: list[CalibrationView] = []
     for url in recordings:
         mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
-        views += _views(url, mine, link, sites, axes, registry)
+        views += _views(url, mine, link, sites, axes, registry, name)
     return fit_camera(views, link.camera, link.position, limit_px=limit_px)
 
 
@@ -797,10 +798,11 @@ def _views(
     sites: Sequence[BarSite],
     axes: LocalAxes,
     registry: Registry,
+    source: str,
 ) -> list[CalibrationView]:
     """What a recording shows at the times of known poses."""
     who = Whereabouts(sites, link.position)
-    seen, _ = _seen_at(url, poses, {"": link}, registry, who)
+    seen, _ = _seen_at(url, poses, {"": link}, registry, who, source)
     for how in who.contradicted.values():
         raise ConfigError(f"{url}: {how}")
     stands_at, views = who.stands_at, []
@@ -829,13 +831,24 @@ def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> Calibrat
 
 
 def _seen_at(
-    url: str, poses: Sequence[KnownPose], links: Mapping[str, Link], registry: Registry, who: Whereabouts
+    url: str,
+    poses: Sequence[KnownPose],
+    links: Mapping[str, Link],
+    registry: Registry,
+    who: Whereabouts,
+    source: str,
 ) -> tuple[list[dict[int, SeenPoints]], dict[int, str]]:
-    """What `points_at` gives of each transmitter at the times of known poses; the link of each."""
+    """What `points_at` gives of each transmitter at the times of known poses; the link of each.
+
+    Raises:
+        InputError: The recording cannot be read.
+        ConfigError: No pose is of a time at which bars are in view.
+    """
     placing = placing_links(links)
     periods = {name: one.packet.packet_chips * one.packet.chip_us for name, one in placing.items()}
     frames: dict[int, list[Frame]] = {}
     link_of: dict[int, str] = {}
+    first_us, last_us = math.inf, -math.inf
     with receive(url, list(links.values()), registry=registry) as packets:
         for packet in packets:
             if packet.link not in placing:
@@ -848,6 +861,7 @@ def _seen_at(
             kept = frames.setdefault(packet.transmitter, [])
             clusters, period_us = placing[packet.link].bar.clusters, periods[packet.link]
             for one in packet.frames:
+                first_us, last_us = min(first_us, one.t_us), max(last_us, one.t_us)
                 if len(one.points_px) == clusters and any(
                     abs(one.points_t_us - pose.t_us) <= period_us for pose in poses
                 ):
@@ -861,6 +875,12 @@ def _seen_at(
             points = points_at(seen, pose.t_us, periods[name], link.bar.clusters, link.position)
             if points is not None:
                 found[-1][number] = points
+    times = [pose.t_us for pose in poses]
+    if times and first_us <= last_us and not any(found) and not any(first_us <= t <= last_us for t in times):
+        raise ConfigError(
+            f"{source}: t_us from {min(times):.16g} to {max(times):.16g}: expected the camera's clock, us,"
+            f" which is at {first_us:.0f} to {last_us:.0f} where {url} shows bars"
+        )
     return found, link_of
 
 
@@ -903,10 +923,12 @@ def survey(
     axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)
     views: list[CalibrationView] = []
     sends: dict[int, str] = {}
+    heard: list[Whereabouts] = []
     for url in recordings:
         mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
         who = Whereabouts((), like.position)
-        seen, link_of = _seen_at(url, mine, links, registry, who)
+        seen, link_of = _seen_at(url, mine, links, registry, who, name)
+        heard.append(who)
         ids = who.ids
         for pose, points in zip(mine, seen, strict=True):
             bars = []
@@ -926,9 +948,12 @@ def survey(
             views.append(_view(pose, bars, axes))
     long_m = {number: placing[by].bar.length_m for number, by in sends.items()}
     surveyed = survey_bars(views, axes, long_m, like.camera, like.camera_sigma, like.position)
-    return [
+    named = [
         replace(bar, site=replace(bar.site, link=sends[bar.site.transmitter_id] or None)) for bar in surveyed
     ]
+    sites = [bar.site for bar in named]
+    said = {id_: how for who in heard for id_, how in who.contradicted_by(sites).items()}
+    return [replace(bar, contradicted=said.get(bar.site.transmitter_id, "")) for bar in named]
 
 
 def survey_on_the_way(
@@ -960,12 +985,16 @@ def survey_on_the_way(
     plan.check_links(list(named_links(links)))
     poses: list[KnownPose] = []
     known = {site.transmitter_id: site for site in plan.sites}
+    seen = []
     for url in recordings:
-        found, placed = _own_poses(url, plan, links, attitude, registry)
+        found, placed, told = _own_poses(url, plan, links, attitude, registry)
         poses += found
         known = {site.transmitter_id: site for site in placed} | known
+        seen.append(f"{url}: {told}")
     if not poses:
-        raise ConfigError("no new bar was in view where the track is known: nothing to survey")
+        raise ConfigError(
+            f"no new bar was in view where the track is known: nothing to survey ({'; '.join(seen)})"
+        )
     return survey(recordings, poses, links, registry=registry, name="track", known=[*known.values()])
 
 
@@ -975,8 +1004,10 @@ def _own_poses(
     links: Sequence[Link],
     attitude: Attitude | AttitudeLog | None,
     registry: Registry,
-) -> tuple[list[KnownPose], list[BarSite]]:
-    """The poses of a recording's own track while new bars are in view, and the bars that it goes by."""
+) -> tuple[list[KnownPose], list[BarSite], str]:
+    """The poses of a recording's own track while new bars are in view, the bars that it goes by, and what it
+    saw.
+    """
     navigator = Navigator(placing_links(named_links(links)), plan, attitude)
     own = OwnPoses(navigator, attitude_source(attitude), Path(url).name)
     taken: dict[int, BarSite] = {}
@@ -987,7 +1018,7 @@ def _own_poses(
     poses, ids = own.close(), navigator.positioner.ids
     wrong = [n for n, site in taken.items() if ids.get(n, site.transmitter_id) != site.transmitter_id]
     if not wrong:
-        return poses, list(taken.values())
+        return poses, list(taken.values()), own.told
     # A new bar was taken for a known one as long as it had not sent its id: its number is no site's.
     numbers = {said: number for number, said in ids.items()}
     none = max(ids) + 1

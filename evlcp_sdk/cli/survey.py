@@ -103,7 +103,9 @@ def survey(
         outputs.commit()
     if as_json:
         bars = [
-            asdict(bar.site) | {"covariance_m2": bar.covariance_m2.tolist(), "views": bar.views}
+            asdict(bar.site)
+            | {"covariance_m2": bar.covariance_m2.tolist(), "views": bar.views}
+            | ({"contradicted": bar.contradicted} if bar.contradicted else {})
             for bar in found
         ]
         echo(json.dumps({"bars": bars}))
@@ -118,4 +120,5 @@ def _line(bar: "SurveyedBar") -> str:
     return (
         f"transmitter {site.transmitter_id}{kind}: {site.latitude_deg:.9f}, {site.longitude_deg:.9f} deg,"
         f" {site.height_m:.3f} m, to {site.position_sigma_m:.3f} m, from {counted(bar.views, 'view')}"
+        + (f"; its beacon contradicts that: {bar.contradicted}" if bar.contradicted else "")
     )

@@ -53,6 +53,9 @@ _FREE_SIGMA_RAD = 0.5
 _MOST_AWAY = 10.0
 """How many times as far as a bar looks it may be: no lens is mistaken for one ten times as long."""
 
+_MOST_USUAL = 4.0
+"""Sigmas of what is usual, 1 in 16 000, beyond which it is not the lens or its mount that is off."""
+
 _MOST_MISFIT = 4.0
 """Mean square of the misses, in sigmas, above which nothing is believed."""
 
@@ -150,6 +153,13 @@ def calibrate(
             f"the views miss their places by {math.sqrt(misfit):.1f} sigmas (rms):"
             " a site or pose is not as was said"
         )
+    for name in PARAMETERS[1:]:
+        value, said = getattr(found, name), getattr(start, name)
+        if abs(value - said) > _MOST_USUAL * usual[name]:
+            raise ConfigError(
+                f"{name} = {value:.4g} would fit the views, {said:.4g} is configured and {usual[name]:.2g} a"
+                " usual difference: angles of the poses, a place, or the configuration are not as was said"
+            )
     kept = replace(start, **{name: getattr(found, name) for name in sure})
     # What keeps its configured value is off by as much as the fit has it elsewhere, too.
     off = np.array([getattr(kept, name) - getattr(found, name) for name in PARAMETERS])

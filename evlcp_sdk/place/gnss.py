@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import csv_number, read_csv
+from evlcp_sdk.files import check_columns, csv_number, read_csv
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.nmea import read_nmea
 from evlcp_sdk.place.poses import PLACE
@@ -52,7 +52,9 @@ class GnssLog:
     def read(
         cls, path: Path | str, clock_zero: datetime | None = None, usual_sigma_m: float = 0.0
     ) -> "GnssLog":
-        """Read a CSV whose columns are named as those of `fixes.csv`, or a `.nmea` with GGA and GST.
+        """Read a CSV whose columns are named as those of `fixes.csv`, or NMEA with GGA and GST.
+
+        NMEA is what is named `.nmea`, or starts with a dollar sign.
 
         t_us, latitude_deg, longitude_deg, height_m, sigma_east_m, sigma_north_m, sigma_up_m; optional
         cov_east_north_m2, cov_east_up_m2, cov_north_up_m2.
@@ -67,14 +69,12 @@ class GnssLog:
             ConfigError: A column is missing, a value is not a number or is out of range, times do not rise,
                 a covariance is none, or NMEA lacks what it needs.
         """
-        if Path(path).suffix.lower() == ".nmea":
+        if Path(path).suffix.lower() == ".nmea" or _starts_with_dollar(Path(path)):
             return cls._of_nmea(path, clock_zero, usual_sigma_m)
+        if Path(path).suffix.lower() == ".pos":
+            raise ConfigError(f"{path}: a solution of RTKLIB: expected its NMEA (rnx2rtkp -n), or a CSV file")
         names, rows = read_csv(path)
-        needed = ("t_us", *PLACE, *_SIGMAS)
-        missing = [name for name in needed if name not in names]
-        if missing:
-            known = ", ".join((*needed, *_CROSSED))
-            raise ConfigError(f"{path}: line 1: no column {missing[0]} (columns: {known})")
+        check_columns(path, names, ("t_us", *PLACE, *_SIGMAS), tuple(_CROSSED))
         if not rows:
             raise ConfigError(f"{path}: expected one line of values or more")
         t_us, place = np.empty(len(rows)), np.empty((len(rows), 3))
@@ -88,8 +88,7 @@ class GnssLog:
             for name, (a, b) in _CROSSED.items():
                 if name in names:
                     spread[i, a, b] = spread[i, b, a] = value(name, row[name])
-            if not np.linalg.eigvalsh(spread[i])[0] > 0:
-                raise ConfigError(f"{path}: line {line}: sigmas and covariances: expected a covariance")
+            _check_covariance(f"{path}: line {line}", spread[i])
         return cls(t_us, place, spread)
 
     @classmethod
@@ -108,6 +107,31 @@ class GnssLog:
         return cls(
             t_us, np.array([fix.place for fix in found]), np.array([fix.covariance_m2 for fix in found])
         )
+
+
+def _starts_with_dollar(path: Path) -> bool:
+    """Whether a file does; a pipe, of which a byte would be lost, counts by its name."""
+    try:
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return file.read(1) == b"$"
+    except OSError:
+        return False
+
+
+def _check_covariance(where: str, spread: Floats) -> None:
+    """Whether sigmas and covariances go together."""
+    sigma = np.sqrt(np.diag(spread))
+    for name, (a, b) in _CROSSED.items():
+        most = float(sigma[a] * sigma[b])
+        if not abs(spread[a, b]) < most:
+            both = f"{_SIGMAS[a]} times {_SIGMAS[b]}"
+            raise ConfigError(f"{where}: {name} = {spread[a, b]:g}: expected less than {most:g}, {both}")
+    # Of the correlations, so that units do not count: below it the inverse has no digit that is right.
+    if not np.linalg.eigvalsh(spread / sigma / sigma[:, None])[0] > 3 * np.finfo(float).eps:
+        said = ", ".join(f"{name} = {spread[at]:g}" for name, at in _CROSSED.items())
+        raise ConfigError(f"{where}: {said}: expected a covariance, which these are not together")
 
 
 def _check_rising(path: Path | str, line: int, t_us: Floats) -> None:

@@ -1,6 +1,7 @@
 """Packets to the camera's trajectory: fixes as they are known, filtered at once, smoothed a window later."""
 
 import math
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -167,18 +168,28 @@ class Navigator:
         self._link = link
         self._attitude: Attitude | None = None
         self._standing: dict[str, tuple[Floats, Floats]] = {}
-        self._counts = dict.fromkeys(("gnss", "gnss_left_out", "gnss_without_heading"), 0)
+        self._counts = dict.fromkeys(("gnss", "gnss_left_out", "gnss_without_heading", "attitude_missing"), 0)
+        self._apart: deque[Floats] = deque(maxlen=_BLOCK)
         self._state: TrajectoryPoint | None = None
         self._window: list[tuple[Fix, TrajectoryPoint, Place]] = []
 
     @property
     def counts(self) -> dict[str, int]:
         """Fixes of satellites: taken, left out of the track, without a heading that the antenna needs, and
-        outside of the recording's time, as far as it has come; and lines of an attitude outside of it.
+        outside of the recording's time, as far as it has come; fixes of bars, given or not, at whose times
+        an attitude's file has none, and its lines if all are outside of that time.
         """
         used = self._counts["gnss"] + self._counts["gnss_without_heading"]
         given = 0 if self._gnss is None else len(self._gnss.t_us)
         return self._counts | {"gnss_outside": given - used, "attitude_outside": self._attitude_outside()}
+
+    @property
+    def apart_m(self) -> Floats | None:
+        """By how much GNSS is to the east, north and up of bars where they contradict one another.
+
+        The median of the last thousand times, float64 (3,); None for none.
+        """
+        return np.median(self._apart, 0) if self._apart else None
 
     def _attitude_outside(self) -> int:
         """How many lines an attitude's file has, if all that it spans is before or after the recording."""
@@ -213,6 +224,7 @@ class Navigator:
             if self._span is None:
                 self._span = (fix.t_us, fix.t_us)
             placed += self._satellites(fix.t_us)
+            self._counts["attitude_missing"] += self._log is not None and self._log.at(fix.t_us) is None
             placed.append(self._placed(fix))
         return placed
 
@@ -274,8 +286,11 @@ class Navigator:
             self._taken[fix.source] = fix.t_us
             return fix
         self._counts["gnss_left_out"] += fix.source == GNSS
-        others = (n for n, t in self._taken.items() if n != fix.source and fix.t_us - t <= _STANDS_US)
-        return replace(fix, contradicted=tuple(others))
+        others = tuple(n for n, t in self._taken.items() if n != fix.source and fix.t_us - t <= _STANDS_US)
+        if others:
+            off = fix.enu_m - point.mean[:3]
+            self._apart.append(off if fix.source == GNSS else -off)
+        return replace(fix, contradicted=others)
 
     def _settle(self, count: int) -> tuple[Settled, ...]:
         """Smooth the window, and drop its first points from it."""

@@ -67,6 +67,9 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
         if kind == "GST" and not all(fields[6:9]):
             continue
         value = partial(_value, path, line, fields)
+        if kind == "GGA":
+            _check_letters(path, line, fields)
+            value(6, "quality", (0, 9))
         hours, minutes, seconds = (
             value(1, f"{kind}'s time", (0, most), piece)
             for most, piece in ((23, slice(0, 2)), (59, slice(2, 4)), (61, slice(4, None)))
@@ -125,6 +128,19 @@ def _sentences(path: Path | str) -> Iterator[tuple[int, str, list[str]]]:
         yield line, fields[0][2:], fields + [""] * 15
 
 
+_LETTERS = {3: ("N", "S"), 5: ("E", "W"), 10: ("M", ""), 12: ("M", "")}
+"""Fields of GGA that are a letter: hemispheres, and metres."""
+
+
+def _check_letters(path: Path | str, line: int, fields: list[str]) -> None:
+    for field, letters in _LETTERS.items():
+        if fields[field] not in letters:
+            told = " or ".join(filter(None, letters))
+            raise ConfigError(
+                f"{path}: line {line}: GGA's field {field} = {fields[field]!r:.40}: expected {told}"
+            )
+
+
 def _value(
     path: Path | str,
     line: int,
@@ -141,5 +157,5 @@ def _angle(value: "partial[float]", fields: list[str], field: int, name: str, si
     """Degrees of ddmm.mmm and its sign, which is the next field."""
     point = fields[field].partition(".")[0]
     digits = slice(0, len(point) - 2), slice(len(point) - 2, None)
-    degrees = value(field, name, PLACE[name], digits[0]) + value(field, name, (0, 60), digits[1]) / 60
+    degrees = value(field, name, (0, PLACE[name][1]), digits[0]) + value(field, name, (0, 60), digits[1]) / 60
     return -degrees if fields[field + 1] == signs[1] else degrees

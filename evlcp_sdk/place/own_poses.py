@@ -1,6 +1,7 @@
 """Where a camera was while new bars were in view, by its own track: the poses that a survey goes by."""
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterable
 
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from evlcp_sdk.place.navigator import Navigator, Placed, Settled
 from evlcp_sdk.place.poses import KnownPose
 from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Packet
 
 __all__ = ["OwnPoses"]
@@ -36,6 +38,7 @@ class OwnPoses:
         self._recording = recording
         self._spans: dict[int, list[tuple[float, float]]] = {}
         self._found: dict[float, KnownPose] = {}
+        self._given, self._refused = 0, Counter[str]()
 
     def take(self, packet: Packet) -> None:
         """Take the receiver's next packet."""
@@ -63,8 +66,18 @@ class OwnPoses:
                 chosen |= {times[row] for row in rows.round().astype(int).tolist()}
         return [self._found[t] for t in sorted(chosen)]
 
+    @property
+    def told(self) -> str:
+        """How many positions and new bars there were, in one line."""
+        refused = "".join(f", {count} refused ({why})" for why, count in self._refused.most_common())
+        ids = self._navigator.positioner.ids
+        new = ", ".join(str(ids.get(number, "without an id")) for number in self._new()) or "none"
+        return f"{counted(self._given, 'position')}{refused}; new bars: {new}"
+
     def _settle(self, placed: Iterable[Placed]) -> None:
         for one in placed:
+            self._given += not one.fix.refusal
+            self._refused.update([one.fix.refusal] if one.fix.refusal else [])
             for settled in one.settled:
                 self._keep(settled)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import csv_number, read_csv
+from evlcp_sdk.files import check_columns, csv_number, read_csv
 from evlcp_sdk.scene.attitude import Attitude
 
 __all__ = ["PLACE", "KnownPose", "read_poses"]
@@ -20,11 +20,13 @@ PLACE = {
 _ANGLES = ("heading_deg", "pitch_deg", "roll_deg")
 """Columns that come together."""
 
+_OPTIONAL = ("recording", "position_sigma_m", "attitude_sigma_deg", *_ANGLES)
+
 _RANGES = PLACE | {
     "position_sigma_m": (1e-6, 1e6),
     "attitude_sigma_deg": (1e-6, 1e6),
     "heading_deg": (-360.0, 360.0),
-    "pitch_deg": (-360.0, 360.0),
+    "pitch_deg": (-90.0, 90.0),
     "roll_deg": (-360.0, 360.0),
     "t_us": (-1e18, 1e18),
 }
@@ -67,6 +69,7 @@ def read_poses(path: Path | str) -> list[KnownPose]:
         ConfigError: A column is missing, or a value is not a number or is out of range.
     """
     names, rows = read_csv(path)
+    check_columns(path, names, ("t_us", *PLACE), _OPTIONAL)
     if not rows:
         raise ConfigError(f"{path}: expected one line of values or more")
     poses = []

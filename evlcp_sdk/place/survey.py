@@ -43,11 +43,14 @@ class SurveyedBar:
         site: With its sigmas.
         covariance_m2: Of its place, to the east, north and up, float64 (3, 3).
         views: From how many places it was seen.
+        contradicted: How its own beacon contradicts that, beyond both sigmas; empty where it does not, or is
+            not asked (`position.beacons`).
     """
 
     site: BarSite
     covariance_m2: Floats
     views: int
+    contradicted: str = ""
 
 
 def survey(

@@ -81,6 +81,12 @@ class Whereabouts:
         found = {number: self.contradiction(number) for number in sorted(self._said)}
         return {number: how for number, how in found.items() if how}
 
+    def contradicted_by(self, sites: Sequence[BarSite]) -> dict[int, str]:
+        """How beacons contradict other sites than these here, by their ids."""
+        others = Whereabouts(sites, self._spec, self._alone)
+        others._said = self._said
+        return {self.ids[number]: how for number, how in others.contradicted.items() if number in self.ids}
+
     def hear(self, packet: Packet) -> None:
         """Take what a packet's beacons say of its transmitter; a reflection is left out."""
         if packet.echo_of is not None:

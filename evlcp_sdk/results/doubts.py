@@ -389,6 +389,15 @@ def _s(number: int) -> str:
     return "s" * (number != 1)
 
 
+def _apart(positions: Mapping[str, Any]) -> str:
+    """By how much GNSS is off bars, if that is known."""
+    apart = positions["gnss_apart_m"]
+    if apart is None:
+        return ""
+    east, north, up = (f"{value:+.3g}" for value in apart)
+    return f": it is {east} m east, {north} north, {up} up of them"
+
+
 def _read(counts: Mapping[str, int]) -> int:
     return counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0)
 
@@ -425,8 +434,15 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
     if number := positions["alarms"].get("contradicted", 0):
         yield Doubt(
             "gnss-contradicted",
-            f"{number} time{_s(number)} bars and GNSS contradict one another",
-            "compare the sigmas of both, position.antenna_m, and both clocks",
+            f"{number} time{_s(number)} bars and GNSS contradict one another{_apart(positions)}",
+            "compare heights (above the ellipsoid), the sigmas of both, position.antenna_m, and both clocks",
+        )
+    if (number := positions["attitude_missing"]) and not positions["attitude_outside"]:
+        tried = positions["fixes"] + sum(positions["refused"].values())
+        yield Doubt(
+            "attitude-missing",
+            f"{number} of {tried} positions have no attitude: its file does not reach there, or lacks lines",
+            "t_us of its file has to be the camera's clock, us, from before the first bar to after the last",
         )
     if number := positions["attitude_outside"]:
         yield Doubt(
@@ -572,8 +588,8 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
     if askew >= _FEW_FRAMES and askew > _ASKEW_SHARE * frames:
         yield Doubt(
             "attitude",
-            f"{askew} of {frames} frames show bars that do not stand plumb by the camera's attitude, which"
-            " does not correct their distances",
+            f"{min(askew, frames)} of {frames} frames show bars that do not stand plumb by the camera's"
+            " attitude, which does not correct their distances",
             "check pitch and roll, their signs and their sigma",
         )
 

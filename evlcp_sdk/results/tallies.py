@@ -322,6 +322,7 @@ class PositionTally:
             "focal_mm_fits": number_or_none(positioner.fitting_focal_mm(), 2),
             "left_out_of_track": self.left_out,
             **navigator.counts,
+            "gnss_apart_m": None if navigator.apart_m is None else navigator.apart_m.round(3).tolist(),
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
             "sites_contradicted": {str(n): how for n, how in positioner.contradicted.items()},

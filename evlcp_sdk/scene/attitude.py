@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import csv_number, read_csv
+from evlcp_sdk.files import check_columns, csv_number, read_csv
 from evlcp_sdk.scene.swing import Swing
 
 __all__ = ["Attitude", "AttitudeLog", "attitude_source"]
@@ -26,6 +26,17 @@ _GRAVITY_M_S2 = 9.80665
 
 _MOST_MEASURED = 1e5
 """Rate, degrees/s, or force, m/s2, of more than any sensor's."""
+
+_GAP = 10.0
+"""How many times as long as usual (the median) two lines lie apart where lines between them are lost: clocks
+and buffers that jitter make it two or three."""
+
+_PIECES = 32
+"""Of a log, whose turns by headings and by rates are compared: of so many that have nothing to do with one
+another, less than 1 in 100 000 agree by half (r2)."""
+
+_DRIFT_DEG_S = 5.0
+"""Rate that no gyroscope which is of use for a track has at rest."""
 
 _MOST_KNOTS = 4096
 """Lines of a log that one step of a track goes by; of more, every second, third ... counts."""
@@ -95,7 +106,9 @@ class Attitude:
 
 @dataclass(frozen=True, eq=False)
 class AttitudeLog:
-    """Attitudes at rising times, straight between them, nothing before and after.
+    """Attitudes at rising times, straight between them, nothing before, after, and where lines are lost.
+
+    Lines are lost where two lie ten times as far apart as they do usually (the median).
 
     Attributes:
         t_us: Camera clock, us, float64 (n,), rising.
@@ -135,15 +148,13 @@ class AttitudeLog:
             InputError: The file cannot be read.
             ConfigError: A column is missing, a value is not a number, or times do not rise; of rates or
                 forces one axis is there and another is not, or there are forces and no rates, or they are
-                half as much from gravity as gravity is, or more.
+                half as much from gravity as gravity is, or more, or rates turn the other way than headings
+                do, or by another measure.
         """
         usual = Attitude() if usual is None else usual
         names, rows = read_csv(path)
         lines = [line for line, _ in rows]
-        missing = [name for name in _NEEDED if name not in names]
-        if missing:
-            known = ", ".join(_NEEDED + _OPTIONAL)
-            raise ConfigError(f"{path}: line 1: no column {missing[0]} (columns: {known})")
+        check_columns(path, names, _NEEDED, _OPTIONAL + _RATES + _FORCES)
         for axes in (_RATES, _FORCES):
             absent = [name for name in axes if name not in names]
             if 0 < len(absent) < len(axes):
@@ -192,7 +203,30 @@ class AttitudeLog:
                     f"{path}: forces hold the camera up by {upward:.1f} m/s2 on the mean, expected about 9.8:"
                     " a level camera at rest has force_down_m_s2 = -9.8"
                 )
+        times = log._times_turned()
+        if times is not None and not 0.5 < times < 1.5:
+            raise ConfigError(
+                f"{path}: rates turn the camera {times:.3g} times as far as its headings do, expected 1:"
+                " a turn to the right is positive about down, in degrees/s"
+            )
         return log
+
+    def _times_turned(self) -> float | None:
+        """How many times as far as by headings the camera turns by rates; None where nothing says so.
+
+        Noise of headings makes it less than 1, but not less than by what share both agree (r2).
+        """
+        turned = self._turned_rad
+        if self.heading_deg is None or self.rates_deg_s is None or turned is None:
+            return None
+        ends = np.linspace(self.t_us[0], self.t_us[-1], _PIECES + 1)
+        took_s = (ends[1] - ends[0]) * 1e-6
+        said = np.diff(np.interp(ends, self.t_us, self.heading_deg)) / took_s
+        measured = np.degrees(np.diff(np.interp(ends, self.t_us, turned))) / took_s
+        both, own = float(said @ measured), float(said @ said)
+        if np.sqrt(((measured - said) ** 2).mean()) < _DRIFT_DEG_S:
+            return None
+        return both / own if both**2 > 0.5 * own * float(measured @ measured) else None
 
     def to_csv(self) -> str:
         """The text of a file that `read` takes."""
@@ -212,8 +246,11 @@ class AttitudeLog:
         return "\n".join(lines) + "\n"
 
     def at(self, t_us: float) -> Attitude | None:
-        """The attitude at a time; None outside of the track."""
+        """The attitude at a time; None outside of the track, and where lines are lost."""
         if not self.t_us[0] <= t_us <= self.t_us[-1]:
+            return None
+        before, after = (int(np.searchsorted(self.t_us, t_us, side)) for side in ("left", "right"))
+        if before == after and self._is_lost(before - 1, after):
             return None
 
         def value(column: NDArray[np.float64]) -> float:
@@ -239,6 +276,8 @@ class AttitudeLog:
         if turned is None or not self.t_us[0] <= start_us < end_us <= self.t_us[-1]:
             return None
         first, last = np.searchsorted(self.t_us, (start_us, end_us), "right").tolist()
+        if self._is_lost(first - 1, int(np.searchsorted(self.t_us, end_us))):
+            return None
         inner = self.t_us[first:last]
         inner = inner[inner < end_us][:: 1 + len(inner) // _MOST_KNOTS]
         t_us = np.concatenate([[start_us], inner, [end_us]])
@@ -247,6 +286,14 @@ class AttitudeLog:
         if push is not None:
             push = np.stack([np.interp(t_us, self.t_us, column) for column in push.T], 1)
         return Swing((t_us - start_us) * 1e-6, angle - angle[0], self.rates_deg_s is not None, push)
+
+    def _is_lost(self, first: int, last: int) -> bool:
+        """Whether lines are lost anywhere from one line to another."""
+        return bool((np.diff(self.t_us[first : last + 1]) > self._longest_us).any())
+
+    @cached_property
+    def _longest_us(self) -> float:
+        return _GAP * float(np.median(np.diff(self.t_us)))
 
     @cached_property
     def _turned_rad(self) -> NDArray[np.float64] | None:

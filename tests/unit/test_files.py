@@ -14,6 +14,7 @@ import pytest
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
 from evlcp_sdk.files import (
     Outputs,
+    check_columns,
     defused,
     open_log,
     read_csv,
@@ -263,6 +264,48 @@ def test_a_csv_file_is_read_by_line(tmp_path: Path) -> None:
 def test_lines_of_a_csv_file_have_the_fields_of_the_first(line: str, fields: int, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(f"t_s,name\n1,a\n\n{line}\n")
     with pytest.raises(ConfigError, match=f"a.csv: line 4: {fields} fields, expected 2, as line 1 has"):
+        read_csv(tmp_path / "a.csv")
+
+
+NEEDED, OPTIONAL = (
+    ("t_us", "height_m"),
+    ("gravity_sigma_deg", "rate_right_deg_s", "rate_down_deg_s", "rate_up_deg_s"),
+)
+
+
+@pytest.mark.parametrize(
+    ("further", "meant"),
+    [
+        (("gravity_sigma",), "gravity_sigma_deg"),
+        (("Gravity_Sigma_Deg",), "gravity_sigma_deg"),
+        ((" gravity_sigma_deg",), "gravity_sigma_deg"),
+        (("gravity_sigma_rad",), "gravity_sigma_deg"),
+        (("sigma_gravity_deg",), "gravity_sigma_deg"),
+        (("gravty_sigma_deg",), "gravity_sigma_deg"),
+        (("rate_x_deg_s",), "rate_right_deg_s"),
+        (("rate_right_deg_s", "rate_down_rad_s", "rate_up_deg_s"), "rate_down_deg_s"),
+        (OPTIONAL[1:], None),
+        ((*OPTIONAL, "rate_x_deg_s", "gravity_sigma_rad"), None),
+        (("temperature", "weight_m", "note", "", "", "right"), None),
+    ],
+)
+def test_a_column_that_looks_like_one_that_is_missing_is_told(
+    further: tuple[str, ...], meant: str | None
+) -> None:
+    if meant is None:
+        check_columns("a.csv", (*NEEDED, *further), NEEDED, OPTIONAL)
+        return
+    with pytest.raises(ConfigError, match=r"^a\.csv: line 1: column '.*': expected " + meant):
+        check_columns("a.csv", (*NEEDED, *further), NEEDED, OPTIONAL)
+
+
+def test_columns_that_are_missing_or_there_twice_are_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"a\.csv: line 1: column 'height': expected height_m"):
+        check_columns("a.csv", ("t_us", "height"), NEEDED)
+    with pytest.raises(ConfigError, match=r"line 1: no column height_m \(columns: t_us, height_m\)"):
+        check_columns("a.csv", ("t_us",), NEEDED)
+    (tmp_path / "a.csv").write_text("t_s,x_m,x_m\n1,2,3\n")
+    with pytest.raises(ConfigError, match=r"a\.csv: line 1: 2 columns x_m: expected one"):
         read_csv(tmp_path / "a.csv")
 
 

@@ -624,6 +624,7 @@ def test_survey_finds_the_sites(evlcp: Evlcp, street: Path, tmp_path: Path) -> N
         assert bar.position_sigma_m == pytest.approx(said["position_sigma_m"])
         assert bar.position_sigma_m < 0.3
         assert said["views"] == 3
+    assert not any("contradicted" in said for said in told)
     # With these sites the drive is where it was.
     out = tmp_path / "out"
     angles = ("--pitch-deg", "4", "--roll-deg", "0", "--gravity-sigma-deg", "0.1")
@@ -633,6 +634,20 @@ def test_survey_finds_the_sites(evlcp: Evlcp, street: Path, tmp_path: Path) -> N
         "needs poses with heading_deg"
         in evlcp("survey", street / "rec.raw", "--poses", poses, "-o", site).err
     )
+    # Heights of another zero, which the views do not show, but the bars' own beacons do.
+    rows = [line.split(",") for line in lines[1:]]
+    higher = [",".join([*row[:3], str(float(row[3]) + 5), *row[4:]]) for row in rows]
+    poses.write_text("\n".join([lines[0], *higher]) + "\n")
+    done = evlcp("survey", street / "rec.raw", "--poses", poses, "-o", site)
+    assert done.out.count("its beacon contradicts that: transmitter") == 2
+    assert " says that it is 5 m from the site of its id" in " ".join(done.out.split())
+    # Of a clock that is not the camera's.
+    later = [",".join([str(int(row[0]) + 10**9), *row[1:]]) for row in rows]
+    poses.write_text("\n".join([lines[0], *later]) + "\n")
+    done = evlcp("survey", street / "rec.raw", "--poses", poses, "-o", site)
+    assert done.code == 2
+    told = " ".join(done.err.replace("│", " ").split())
+    assert "poses.csv: t_us from 1000050000 to 1000110000: expected the camera's clock, us" in told
 
 
 def test_a_car_surveys_a_new_bar_on_its_way(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
@@ -704,14 +719,17 @@ def test_satellites_by_nmea_are_in_the_track(evlcp: Evlcp, street: Path, tmp_pat
 
 
 def test_an_attitude_of_another_time_is_warned_of(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
-    for start_us, told in ((0, False), (10**12, True)):
+    outside = "none of the attitude's 2 lines is within the recording's time"
+    missing = "positions have no attitude: its file does not reach there, or lacks lines"
+    for start_us, lasts_us, told in ((0, 200_000, None), (10**12, 200_000, outside), (0, 200, missing)):
         imu = tmp_path / "imu.csv"
-        imu.write_text(f"t_us,pitch_deg,roll_deg,heading_deg\n{start_us},4,0,0\n{start_us + 200_000},4,0,0\n")
+        imu.write_text(
+            f"t_us,pitch_deg,roll_deg,heading_deg\n{start_us},4,0,0\n{start_us + lasts_us},4,0,0\n"
+        )
         args = ("receive", street / "rec.raw", "--sites", street / "site.toml", "--attitude", imu)
-        done = evlcp(*args, "-o", tmp_path / str(start_us))
-        assert (
-            "none of the attitude's 2 lines is within the recording's time" in done.out + done.err
-        ) == told
+        done = evlcp(*args, "-o", tmp_path / f"{start_us}-{lasts_us}")
+        said = " ".join((done.out + done.err).split())
+        assert [text in said for text in (outside, missing)] == [told == outside, told == missing]
 
 
 def test_live_takes_what_receive_takes(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:

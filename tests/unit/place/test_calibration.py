@@ -147,6 +147,25 @@ def test_a_pose_in_another_town_is_told_and_not_the_lens() -> None:
         calibrate(away, NOMINAL, SPEC)
 
 
+def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
+    """Poses pitched by 4 degrees that say 0 move it by hundreds of pixels."""
+    camera, rng = CameraModel(focal_mm=35.0), np.random.default_rng(5)
+    seen = []
+    for n in range(8):
+        place, bars = np.array([0.0, 0.5 * n, 0.0]), []
+        for i, east in enumerate((-3.0, 3.0)):
+            pole = np.array([east, 45.0 + 5 * i, 3.5]) + ALONG[:, None] * [0, 0, 1]
+            points, _ = project_bars(pole, place, Attitude(4.0, 0.0, 0.0).rotation(), camera)
+            bars.append(BarView(i, pole, points + rng.normal(0, 0.05, points.shape), np.full(16, 0.05)))
+        seen.append(CalibrationView(tuple(bars), place, 0.01, Attitude(4.0, 0.0, 0.0).rotation(), 0.1))
+    assert calibrate(seen, camera).camera.focal_mm == pytest.approx(35.0, abs=0.2)
+    level = Attitude(0.07, 0.0, 0.0).rotation()
+    with pytest.raises(
+        ConfigError, match=r"centre_y_px = [\d.-]+ would fit the views, 360 is configured and 26 "
+    ):
+        calibrate([dataclasses.replace(view, rotation=level) for view in seen], camera)
+
+
 def test_slopes_are_the_numerical_ones() -> None:
     rng = np.random.default_rng(1)
     direction = rng.uniform(-0.5, 0.5, (5, 2))
@@ -181,7 +200,8 @@ def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
         (head, "one line of values or more"),
         (head + "a.raw,,35,137,5,,,\n", r"line 2: t_us = '': expected a number"),
         (head + "a.raw,1,35,137,5,3,,\n", r"line 2: pitch_deg = '': expected a number"),
-        ("t_us,latitude_deg\n1,2\n", r"line 2: longitude_deg = None: expected a number"),
+        ("t_us,latitude_deg\n1,2\n", r"line 1: no column longitude_deg \(columns: t_us"),
+        (head.replace("heading_deg", "heading"), r"line 1: column 'heading': expected heading_deg"),
         (head + "\na.raw,1,95,137,5,,,\n", r"line 3: latitude_deg = '95': expected -90 to 90"),
         (f"attitude_sigma_deg,{head}0,a.raw,1,35,137,5,1,1,1\n", r"line 2: attitude_sigma_deg = '0'"),
         (

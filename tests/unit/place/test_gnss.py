@@ -176,7 +176,19 @@ def test_a_file_of_fixes(tmp_path: Path) -> None:
         (HEAD + "\n0,35,137,50,1,1,0\n", "line 2: sigma_up_m = '0': expected 0.0001 to 10000"),
         (HEAD + "\n0,35,137,x,1,1,1\n", "line 2: height_m = 'x': expected a number"),
         (HEAD + "\n0,35,137,5,1,1,1\n0,35,137,5,1,1,1\n", "line 3: t_us = 0: expected more than"),
-        (HEAD + ",cov_east_up_m2\n0,35,137,5,1,1,1,2\n", "line 2: sigmas and covariances"),
+        (
+            HEAD + ",cov_east_up_m2\n0,35,137,5,1,1,3,-4\n",
+            "line 2: cov_east_up_m2 = -4: expected less than 3, sigma_east_m times sigma_up_m",
+        ),
+        (
+            HEAD + ",cov_east_north_m2,cov_east_up_m2,cov_north_up_m2\n0,35,137,5,1,1,1,-.9,.9,.9\n",
+            "line 2: cov_east_north_m2 = -0.9, cov_east_up_m2 = 0.9, cov_north_up_m2 = 0.9: expected a",
+        ),
+        (
+            HEAD + ",cov_north_east_m2\n0,35,137,5,1,1,1,0\n",
+            "column 'cov_north_east_m2': expected cov_east_n",
+        ),
+        (HEAD + ",sigma_up_m\n0,35,137,5,1,1,1,1\n", "line 1: 2 columns sigma_up_m: expected one"),
         (HEAD + "\n0,35\n", "line 2: 2 fields, expected 7, as line 1 has"),
     ],
 )
@@ -185,3 +197,9 @@ def test_faults_of_a_file(tmp_path: Path, text: str, message: str) -> None:
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         GnssLog.read(path)
+
+
+def test_a_solution_of_rtklib_is_told(tmp_path: Path) -> None:
+    (tmp_path / "out.pos").write_text("% program : RTKLIB\n% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n")
+    with pytest.raises(ConfigError, match=r"out\.pos: a solution of RTKLIB: expected its NMEA"):
+        GnssLog.read(tmp_path / "out.pos")

@@ -76,19 +76,30 @@ def test_days_follow_one_another(tmp_path: Path) -> None:
         ),
         (
             [gga("120000,9530")],
-            "latitude_deg = '95': expected -90 to 90",
+            "latitude_deg = '95': expected 0 to 90",
         ),
         ([gga("120000,")], "latitude_deg = '': expected a number"),
         (
             [gga("120000,3530", "")],
             "line 1: GGA without the height of the geoid",
         ),
+        ([gga("120000,-3530")], "latitude_deg = '-35': expected 0 to 90"),
+        ([sentence("GPGGA,120000,3530,s,00015,E,1,9,1,50,M,40,M,,")], "GGA's field 3 = 's': expected N or S"),
+        ([sentence("GPGGA,120000,3530,N,00015,N,1,9,1,50,M,40,M,,")], "GGA's field 5 = 'N': expected E or W"),
+        ([sentence("GPGGA,120000,3530,N,00015,E,1,9,1,50,F,40,M,,")], "GGA's field 10 = 'F': expected M"),
+        ([sentence("GPGGA,120000,3530,N,00015,E,X,9,1,50,M,40,M,,")], "quality = 'X': expected a number"),
         ([GGA, GST, GGA], "line 3: t_us = 19694000000: expected more"),
     ],
 )
 def test_faults_of_nmea(tmp_path: Path, lines: list[str], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         GnssLog.read(write(tmp_path, *lines), NOON)
+
+
+def test_nmea_is_known_by_its_first_letter_too(tmp_path: Path) -> None:
+    path = write(tmp_path, GGA, GST)
+    other = path.rename(tmp_path / "gnss.txt")
+    assert GnssLog.read(other, NOON).place.tolist() == GnssLog.read(other.rename(path), NOON).place.tolist()
 
 
 def test_utc_needs_the_clock(tmp_path: Path) -> None:

@@ -22,6 +22,8 @@ NO_POSITIONS = {
     "gnss_without_heading": 0,
     "gnss_outside": 0,
     "attitude_outside": 0,
+    "attitude_missing": 0,
+    "gnss_apart_m": None,
     "bars_exact": [],
     "excluded": {},
     "alarms": {},

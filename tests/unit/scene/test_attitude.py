@@ -144,3 +144,69 @@ def test_lines_that_cannot_be_are_told(tmp_path: Path, text: str, message: str) 
 def test_an_upside_down_camera_at_rest_is_no_fault(tmp_path: Path) -> None:
     (tmp_path / "imu.csv").write_text(f"{IMU}\n0,0,180,0,0,0,0,9.8,0\n9,0,180,0,0,0,0,9.8,0\n")
     assert AttitudeLog.read(tmp_path / "imu.csv").forces_m_s2 is not None
+
+
+def test_angles_are_not_drawn_across_lines_that_are_lost() -> None:
+    t_us = np.concatenate([np.arange(0, 50) * 1e3, np.arange(200, 250) * 1e3])
+    angle = t_us * 1e-3
+    still = np.zeros(len(t_us))
+    log = AttitudeLog(t_us, angle, still, angle, still, still)
+    for known_us in (0.0, 48.5e3, 49e3, 200e3, 249e3):
+        at = log.at(known_us)
+        assert at is not None
+        assert at.pitch_deg == pytest.approx(known_us * 1e-3)
+    assert log.at(49.1e3) is None
+    assert log.at(199e3) is None
+    assert log.between(48.5e3, 49.5e3) is None
+    assert log.between(10e3, 210e3) is None
+    for start_us, end_us in ((10e3, 49e3), (200e3, 249e3)):
+        swing = log.between(start_us, end_us)
+        assert swing is not None
+        assert swing.turn_rad[-1] == pytest.approx(np.radians((end_us - start_us) * 1e-3))
+    # Lines that come late, but not by much, and logs of few lines have no gaps.
+    late = AttitudeLog(np.array([0.0, 1e3, 2e3, 9e3, 10e3]), *(np.zeros(5),) * 2, None, *(np.zeros(5),) * 2)
+    assert late.at(5e3) is not None
+    two = AttitudeLog(np.array([0.0, 1e9]), *(np.zeros(2),) * 2, None, *(np.zeros(2),) * 2)
+    assert two.at(5e8) is not None
+
+
+def rates_log(folder: Path, rate: Floats, heading: Floats, t_s: Floats) -> AttitudeLog:
+    head = "t_us,pitch_deg,roll_deg,heading_deg,rate_right_deg_s,rate_down_deg_s,rate_forward_deg_s"
+    rows = "\n".join(
+        f"{t * 1e6:.0f},0,0,{h % 360:.6f},0,{r:.6f},0" for t, h, r in zip(t_s, heading, rate, strict=True)
+    )
+    (folder / "imu.csv").write_text(f"{head}\n{rows}\n")
+    return AttitudeLog.read(folder / "imu.csv")
+
+
+@pytest.mark.parametrize("turning", ["circle", "curves"])
+@pytest.mark.parametrize("times", [1.0, np.pi / 180, -1.0, 1e3])
+def test_rates_of_another_measure_or_sign_are_told(tmp_path: Path, turning: str, times: float) -> None:
+    t_s = np.arange(0, 6, 0.01)
+    if turning == "circle":
+        heading, rate = 350 + 45 * t_s, np.full(len(t_s), 45.0)
+    else:
+        heading, rate = 10 * np.sin(2 * t_s), 20 * np.cos(2 * t_s)
+    # A compass that is noisy, a gyroscope with a bias: neither is a fault.
+    heading = heading + np.random.default_rng(1).normal(0, 0.5, len(t_s))
+    if times == 1.0:
+        rates_log(tmp_path, rate + 1.0, heading, t_s)
+        return
+    with pytest.raises(ConfigError) as caught:
+        rates_log(tmp_path, rate * times, heading, t_s)
+    told = re.search(r"rates turn the camera (\S+) times as far as its headings do", str(caught.value))
+    assert told is not None
+    assert float(told[1]) == pytest.approx(times, rel=0.1)
+
+
+@pytest.mark.parametrize("rate", [0.0, -3.0])
+def test_a_gyroscope_that_is_off_at_rest_is_no_fault(tmp_path: Path, rate: float) -> None:
+    t_s = np.arange(0, 6, 0.01)
+    rates_log(tmp_path, np.full(len(t_s), rate), 1.5 * t_s, t_s)
+
+
+def test_headings_that_say_nothing_do_not_contradict_rates(tmp_path: Path) -> None:
+    t_s = np.arange(0, 6, 0.01)
+    noise = np.random.default_rng(2).normal(0, 5.0, len(t_s))
+    for heading in (np.zeros(len(t_s)), noise):
+        rates_log(tmp_path, np.full(len(t_s), 45.0), heading, t_s)
