@@ -43,6 +43,9 @@ _CLOCK = np.uint32(CLOCK_AT)
 _BLOCK = 32
 """Events that are looked at together: of a bar alone in the dark, every other block has no stray in it."""
 
+FEW_BOXES = 16
+"""Boxes up to which comparing all events with each takes less than looking up which box is near."""
+
 _ROUND = np.uint32(CLOCK_ROUND - 1)
 
 
@@ -354,6 +357,40 @@ def label_boxes(boxes: Array, cell_shift: int, labels: Array, alone: Array) -> N
                     labels[v, u] = k + 1
 
 
+@njit(nogil=True)
+def _name_few(x: Array, y: Array, boxes: Array, of: Array, alone: Array) -> None:
+    """Say which box (n, 4) each event is in, k + 1, or 0; not of those that share events with one before.
+
+    Box by box: so a comparison takes sixteen events at a time.
+    """
+    of[:] = 0
+    for k in range(len(boxes)):
+        left, top = np.uint16(boxes[k, 0]), np.uint16(boxes[k, 1])
+        width = np.uint16(max(boxes[k, 2] - boxes[k, 0], 0))
+        height = np.uint16(max(boxes[k, 3] - boxes[k, 1], 0))
+        name, shared = np.uint16(k + 1), np.uint16(0)
+        for i in range(x.size):
+            inside = np.uint16(np.uint16(x[i] - left) < width) & np.uint16(np.uint16(y[i] - top) < height)
+            free = np.uint16(of[i] == 0)
+            shared |= inside & ~free
+            of[i] |= np.uint16(inside & free) * name
+        alone[k] = shared == 0
+        for i in range(x.size if shared else 0):
+            of[i] *= np.uint16(of[i] != name)
+
+
+@njit(nogil=True)
+def _name_by_label(x: Array, y: Array, boxes: Array, cell_shift: int, labels: Array, of: Array) -> None:
+    """Say which labelled box (n, 4) each event is in, k + 1, or 0: as quick however many there are."""
+    shift = np.uint64(cell_shift)
+    for i in range(x.size):
+        name = labels[np.uint64(y[i]) >> shift, np.uint64(x[i]) >> shift]
+        k = np.uint64(max(name - 1, 0))
+        u, v = np.int64(x[i]), np.int64(y[i])
+        inside = (boxes[k, 0] <= u) & (u < boxes[k, 2]) & (boxes[k, 1] <= v) & (v < boxes[k, 3])
+        of[i] = name * inside
+
+
 @njit(cache=True, nogil=True)
 def select_boxes(
     t_us: Array,
@@ -367,40 +404,46 @@ def select_boxes(
     same: int,
     cell_shift: int,
     labels: Array,
+    alone: Array,
     begins: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """Events inside labelled boxes (n, 4), see `label_boxes`, one box after the other.
+    """Events inside some boxes (n, 4), one box after the other, but for those that are not `alone` (n,).
 
     Those of a box begin at `begins` (n + 1,). Of one that is `filtered` (n,), they are events that
-    `in_rhythm` marks. An event costs the same however many boxes there are.
+    `in_rhythm` marks. Labels, see `label_boxes`, are taken of more than `FEW_BOXES`, with `alone` by them.
     """
-    shift = np.uint64(cell_shift)
-    which, of = np.empty(t_us.size + 1, np.uint32), np.empty(t_us.size + 1, np.int16)
-    n = np.uint64(0)
-    for i in range(t_us.size):
-        label = labels[np.uint64(y[i]) >> shift, np.uint64(x[i]) >> shift]
-        which[n], of[n] = i, label
-        n += np.uint64(label != 0)
-    m = np.uint64(0)
-    begins[:] = 0
-    for j in range(n):
-        i, k = which[j], np.uint64(of[j] - 1)
-        u, v = np.int64(x[i]), np.int64(y[i])
-        wanted = (boxes[k, 0] <= u) & (u < boxes[k, 2]) & (boxes[k, 1] <= v) & (v < boxes[k, 3])
-        if filtered[k]:
-            wanted &= _listened(pixels[v, u], least, same)
-        which[m], of[m] = i, k
-        begins[k + np.uint64(1)] += np.int64(wanted)
-        m += np.uint64(wanted)
-    for b in range(len(boxes)):
-        begins[b + 1] += begins[b]
-    out_t, out_p = np.empty(m, np.int64), np.empty(m, np.uint8)
-    out_x, out_y = np.empty(m, np.uint16), np.empty(m, np.uint16)
-    place = begins[:-1].copy()
-    for j in range(m):
-        i, k = which[j], np.uint64(of[j])
-        at = np.uint64(place[k])
-        place[k] += 1
+    many, size = len(boxes), t_us.size
+    of = np.empty(size, np.uint16)
+    if many <= FEW_BOXES:
+        _name_few(x, y, boxes, of, alone)
+    else:
+        _name_by_label(x, y, boxes, cell_shift, labels, of)
+    if filtered.any():
+        for i in range(size):
+            if of[i] and filtered[of[i] - 1]:
+                of[i] *= _listened(pixels[y[i], x[i]], least, same)
+    counts = np.zeros(many + 1, np.int64)
+    if many <= FEW_BOXES:
+        for k in range(many):
+            for i in range(size):
+                counts[k + 1] += of[i] == np.uint16(k + 1)
+    else:
+        for i in range(size):
+            counts[of[i]] += 1
+    # Events in none are written, too, each over the one before: a branch would be a coin toss.
+    place, step = np.empty(many + 1, np.uint64), np.ones(many + 1, np.uint64)
+    begins[0], step[0] = 0, 0
+    for k in range(many):
+        place[k + 1] = begins[k]
+        begins[k + 1] = begins[k] + counts[k + 1]
+    place[0] = begins[many]
+    room = begins[many] + 1
+    out_t, out_p = np.empty(room, np.int64), np.empty(room, np.uint8)
+    out_x, out_y = np.empty(room, np.uint16), np.empty(room, np.uint16)
+    for i in range(size):
+        name = np.uint64(of[i])
+        at = place[name]
+        place[name] = at + step[name]
         out_t[at], out_x[at], out_y[at], out_p[at] = t_us[i], x[i], y[i], p[i]
     return out_t, out_x, out_y, out_p
 

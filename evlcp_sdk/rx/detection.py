@@ -72,8 +72,8 @@ _MIN_PIXELS = 4
 _CENTRE_SIGMA_PX = 0.25
 """Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
 
-_FEW = 3
-"""Boxes up to which looking at all events for each takes less than looking up which boxes are near."""
+_FEW = 1
+"""Boxes up to which whole blocks of events are copied: of two bars, few blocks are one's alone."""
 
 BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""

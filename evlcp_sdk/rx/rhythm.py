@@ -183,9 +183,10 @@ class Rhythm:
             boxes: (left, top, right, bottom) of each, int64 (n, 4), px.
             filtered: Of which boxes only candidates that are no lamps are meant, bool (n,).
         """
-        self._labels[:] = 0
         alone = np.empty(len(boxes), np.bool_)
-        _kernels.label_boxes(boxes, _LABEL_SHIFT, self._labels, alone)
+        if len(boxes) > _kernels.FEW_BOXES:
+            self._labels[:] = 0
+            _kernels.label_boxes(boxes, _LABEL_SHIFT, self._labels, alone)
         begins = np.empty(len(boxes) + 1, np.int64)
         columns = _kernels.select_boxes(
             events.t_us,
@@ -199,9 +200,10 @@ class Rhythm:
             _LAMP,
             _LABEL_SHIFT,
             self._labels,
+            alone,
             begins,
         )
-        total, found = len(columns[0]), []
+        total, found = int(begins[-1]), []
         for k, (begin, end) in enumerate(pairwise(begins.tolist())):
             if not alone[k]:
                 inside = select(events, tuple(boxes[k].tolist()))
