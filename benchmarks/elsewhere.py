@@ -1,7 +1,7 @@
 """The conditions of `benchmarks/road.toml` at other places: nearer, farther, to other sides, with other bits.
 
     python benchmarks/elsewhere.py [--only NAME ...] [--seeds 2] [--first 1] [--near 0.86] [--far 1.17]
-        [--keep FOLDER] [--frames]
+        [--keep FOLDER] [--frames] [--level]
 
 Each road recording that the receiver is held against has its like here, rendered by the simulator: the same
 kind of thing happens, but a tenth to a sixth nearer (even seeds) or farther (odd ones), and speed, the bar's
@@ -10,7 +10,8 @@ blindness) are drawn anew by the seed. Figures to reach are those of the recordi
 with its square. The last conditions are mixtures, which have no figures of their own: there must be no ghost,
 and a warning where half of a bar's frames or more are missing. Received by the default link.
 
-`--keep` keeps the recordings and results, and takes recordings that are there; `--frames` prints frames. A
+`--keep` keeps the recordings and results, and takes recordings that are there; `--frames` prints frames.
+`--level` tells the receiver that the camera is level, to 0.02 degrees, which all but the pitched ones are. A
 minute of processor time. The exit code is 1 where a figure is missed.
 """
 
@@ -31,6 +32,7 @@ from scipy.stats import chi2
 import evlcp_sdk as evlcp
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.sim import read_truth, resolve_scene, truth_path
 from evlcp_sdk.study.frames import GivenFrame, read_frames
 from evlcp_sdk.study.match import match
@@ -40,6 +42,7 @@ from evlcp_sdk.study.tally import Statistics
 Table = dict[str, Any]
 
 LINK = load_link()
+LEVEL = Attitude(0.0, 0.0, gravity_sigma_deg=0.02)
 FOCAL_PX, BAR_M = LINK.camera.focal_px, LINK.bar.length_m
 
 
@@ -343,7 +346,7 @@ def lines_of(
     """The rows of a scene, one a bar, and what was counted of each."""
     path, distance_m = rendered(name, seed, folder, args.near, args.far)
     truth, out = read_truth(truth_path(path)), folder / f"{path.stem}-out"
-    summary = receive_to_folder(path, out, LINK)
+    summary = receive_to_folder(path, out, LINK, attitude=LEVEL if args.level else None)
     frames = read_frames(out)
     score = Score.of(frames, truth, road=True)
     if args.frames:
@@ -430,6 +433,7 @@ def main() -> None:
     parser.add_argument("--far", type=float, default=1.17)
     parser.add_argument("--keep", type=Path)
     parser.add_argument("--frames", action="store_true")
+    parser.add_argument("--level", action="store_true")
     args = parser.parse_args()
     rows: list[list[str]] = []
     total: list[Statistics] = []

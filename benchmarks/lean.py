@@ -9,7 +9,8 @@ default link without an attitude and with what an IMU says, whose sigma is 0.1 d
 the bar by one sigma of both, to either side by turns. Five minutes of processor time.
 
 `--level` prints how far off the distances of level bars are on average, by short drives whose distances are
-spread over a tenth, so that the bar's ends fall on any part of a pixel: two minutes.
+spread over a tenth, so that the bar's ends fall on any part of a pixel; and the same at 50 m by cameras that
+stand or go elsewhere, without row time, and with hardly blind pixels: two minutes.
 
 `--prior` prints what sigmas can be worth by an ideal receiver that no attitude tells anything: its frames'
 distances and leans are as good as the bounds allow, and it weighs them by Bayes' rule. A camera may lean as
@@ -19,8 +20,9 @@ ones and ones of 3 to 5 degrees; a few seconds.
 
 import argparse
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -42,6 +44,17 @@ BLUR_PX, NOISE = 0.45, 0.3
 SIGMA_DEG = 0.1
 EARLY_S = 0.1
 LEVEL_DRIVES, LEVEL_S = 24, 0.06
+LEVEL_CASES: Sequence[tuple[float, str, Mapping[str, Mapping[str, float]]]] = (
+    (30, "", {}),
+    (50, "", {}),
+    (80, "", {}),
+    (50, "20 m/s", {"motion": {"speed_mps": 20.0}}),
+    (50, "standing", {"motion": {"speed_mps": 0.0}}),
+    (50, "backwards, 20 m/s", {"motion": {"speed_mps": -20.0}}),
+    (50, "no row time", {"sensor": {"t_row_us": 0.0}}),
+    (50, "blind for 1 us", {"sensor": {"refr_us": 1.0}}),
+    (50, "blind for 20 us", {"sensor": {"refr_us": 20.0}}),
+)
 SHARES, IDEAL_FRAMES, IDEAL_DRIVES = (0.1, 0.3, 0.5, 0.7), 56, 1000
 
 
@@ -61,7 +74,12 @@ def bounds() -> None:
 
 
 def drive(
-    distance_m: float, pitch_deg: float, row_px: float, seed: int, duration_s: float
+    distance_m: float,
+    pitch_deg: float,
+    row_px: float,
+    seed: int,
+    duration_s: float,
+    more: Mapping[str, Mapping[str, float]] = MappingProxyType({}),
 ) -> dict[str, NDArray[np.float64]]:
     """Time, error and sigma of each distance, float64 (n, 3): without an attitude, and with one."""
     # Attitude and bar are off to opposite sides: by one sigma of both together.
@@ -70,7 +88,8 @@ def drive(
     scene = resolve_scene(
         {
             "duration_s": duration_s,
-            "motion": {"distance_m": float(distance_m), "pitch_deg": pitch_deg},
+            "motion": {"distance_m": float(distance_m), "pitch_deg": pitch_deg, **more.get("motion", {})},
+            "sensor": more.get("sensor", {}),
             "background": {"light_w_m2": 0.3},
             "world": {"latitude_deg": 35.0, "gravity_sigma_deg": 0.0, "attitude": "gravity"},
             "bars": [{"x_m": -0.8, "y_m": -distance_m * math.tan(up), "tilt_deg": off_deg}],
@@ -103,17 +122,17 @@ def errors(packets: Sequence[Packet], truth: Truth) -> NDArray[np.float64]:
 
 def level() -> None:
     """Mean errors of level bars, in millionths of the distance, with the standard error over drives."""
-    print("| m | without an attitude | with one | drives | frames |")
-    print("|---|---|---|---|---|")
-    for distance_m in (30, 50, 80):
+    print("| m | | without an attitude | with one | drives | frames |")
+    print("|---|---|---|---|---|---|")
+    for distance_m, name, more in LEVEL_CASES:
         spread = distance_m * np.linspace(0.95, 1.05, LEVEL_DRIVES)
-        drives = [drive(d, 0.0, 0.0, seed, LEVEL_S) for seed, d in enumerate(spread.tolist())]
+        drives = [drive(d, 0.0, 0.0, seed, LEVEL_S, more) for seed, d in enumerate(spread.tolist())]
         cells = []
-        for name in ("without", "with"):
-            off = np.array([x[name][:, 1].mean() / d * 1e6 for x, d in zip(drives, spread, strict=True)])
+        for told in ("without", "with"):
+            off = np.array([x[told][:, 1].mean() / d * 1e6 for x, d in zip(drives, spread, strict=True)])
             cells.append(f"{off.mean():+.0f} +- {off.std(ddof=1) / math.sqrt(len(off)):.0f}")
         frames = sum(len(x["with"]) for x in drives)
-        print(f"| {distance_m} | {cells[0]} | {cells[1]} | {len(drives)} | {frames} |", flush=True)
+        print(f"| {distance_m} | {name} | {cells[0]} | {cells[1]} | {len(drives)} | {frames} |", flush=True)
 
 
 def ideal(
