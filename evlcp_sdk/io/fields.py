@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.io.writers import LAST_TIME_US
 
-__all__ = ["Fields", "TimeUnit", "fields_of", "fields_of_values", "polarities", "time_unit"]
+__all__ = ["Fields", "RowError", "TimeUnit", "fields_of", "fields_of_values", "polarities", "time_unit"]
 
 UNITS_US: Final = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 
@@ -21,7 +21,7 @@ _UNITS: Final = {
     "ns": "ns|nsecs?|nanos|nanoseconds?",
 }
 _TIME: Final = re.compile(
-    r"(?:events?[ _.]?)?(?:t|ts|times?|timestamps?|time[ _]stamps?)[ _.]?[(\[]?"
+    r"(?:events?[ _.]?)?(?:t|ts|times?|timestamps?|time[ _]stamps?)[ _.]?[(\[/]?[ ]?"
     + f"(?:{'|'.join(f'(?P<{unit}>{words})' for unit, words in _UNITS.items())})?"
     + r"[)\]]?"
 )
@@ -44,6 +44,19 @@ MOST_RATE_HZ: Final = 5e7
 
 _EPOCH_S: Final = (0.9e9, 4.2e9)
 """Seconds since 1970 of a clock of today's computers: from 1998 to 2103."""
+
+
+class RowError(ValueError):
+    """A value that its column cannot have.
+
+    Args:
+        row: Its place among those given, from 0.
+        what: Value and what was expected.
+    """
+
+    def __init__(self, row: int, what: str) -> None:
+        super().__init__(what)
+        self.row = row
 
 
 @dataclass(frozen=True)
@@ -72,13 +85,13 @@ class TimeUnit:
         """Times in us, int64 (n,), rounded down.
 
         Raises:
-            ValueError: One is no number, or too large.
+            RowError: One is no number, or too large.
         """
         if times.dtype.kind == "f":
             # To a thousandth before that: 0.000057 s times 1e6 is a little less than 57.
             scaled = np.round(times.astype(np.float64) * UNITS_US[self.name], 3)
-            if not np.isfinite(scaled).all() or np.abs(scaled).max(initial=0.0) > LAST_TIME_US:
-                raise ValueError("a time that is no number or too large")
+            # No number is not within, either.
+            self._refuse(~(np.abs(scaled) <= LAST_TIME_US), times)
             if times.dtype.itemsize < 8:
                 # Fewer digits than a microsecond needs: the nearest one.
                 return np.rint(scaled).astype(np.int64)
@@ -86,9 +99,16 @@ class TimeUnit:
         if self.name == "ns":
             return times.astype(np.int64) // 1000
         factor = round(UNITS_US[self.name])
-        if len(times) and max(int(times.max()), -int(times.min())) > LAST_TIME_US // factor:
-            raise ValueError("a time that is too large")
+        most = LAST_TIME_US // factor
+        self._refuse((times > most) | (times < -most), times)
         return times.astype(np.int64) * factor
+
+    def _refuse(self, wrong: NDArray[np.bool_], times: NDArray[Any]) -> None:
+        if wrong.any():
+            row = int(wrong.argmax())
+            raise RowError(
+                row, f"time {times[row]} {self.name}, expected a number up to {LAST_TIME_US:.0e} us"
+            )
 
 
 @dataclass(frozen=True)
@@ -254,7 +274,7 @@ def polarities(values: NDArray[Any]) -> NDArray[np.uint8]:
     """Polarities of 0 and 1, -1 and 1, false and true, or words such as ON and OFF, uint8 (n,).
 
     Raises:
-        ValueError: One is none of them.
+        RowError: One is none of them.
 
     >>> polarities(np.array(["ON", "off"])).tolist()
     [1, 0]
@@ -265,11 +285,13 @@ def polarities(values: NDArray[Any]) -> NDArray[np.uint8]:
             text = (word.decode("utf-8", "replace") if isinstance(word, bytes) else word).strip().strip("\"'")
             plain = text.lower().removesuffix(".0")
             if plain not in _ON and plain not in _OFF:
-                raise ValueError(f"polarity {text!r}, expected 0 or 1, or -1 or 1, or ON or OFF")
+                row = int((values == word).argmax())
+                raise RowError(row, f"polarity {text!r}, expected 0 or 1, or -1 or 1, or ON or OFF")
             words[word] = plain in _ON
         kinds, which = np.unique(values, return_inverse=True)
         return np.array([words[kind] for kind in kinds.tolist()], np.uint8)[which.ravel()]
     wrong = ~np.isin(values, (-1, 0, 1))
     if wrong.any():
-        raise ValueError(f"polarity {values[int(wrong.argmax())]}, expected 0 or 1, or -1 or 1")
+        row = int(wrong.argmax())
+        raise RowError(row, f"polarity {values[row]}, expected 0 or 1, or -1 or 1")
     return (values > 0).astype(np.uint8)

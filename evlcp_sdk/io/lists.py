@@ -11,6 +11,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final, Literal
 
@@ -22,6 +23,7 @@ from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.fields import (
     UNITS_US,
     Fields,
+    RowError,
     TimeUnit,
     fields_of,
     fields_of_values,
@@ -53,8 +55,8 @@ _MAT: Final = b"MATLAB "
 SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".txt", ".txt.gz", ".dat", ".npy", ".mat")
 """Of names, where the content alone does not say that it is a list."""
 
-Piece = tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, int]
-"""Times, polarities, places (n, 2) or None, and the line or row of the first."""
+Piece = tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, Callable[[int], int]]
+"""Times, polarities, places (n, 2) or None, and in which line or row of the file the k-th of them stands."""
 
 
 def open_list(url: str) -> "ListSource":
@@ -139,7 +141,8 @@ class ListSource(EventSource):
                 self._unit = TimeUnit(unit, "as told")
             self._sieve = Sieve(self._where, None, None)
             self._waiting: list[Events] = []
-            self._row = first[3] if first is not None else 1
+            self._row = first[3](0) if first is not None and len(first[0]) else 1
+            self._low: tuple[int, int] | None = None
             self._latest_us: int | None = None
             self._open = True
             header = {
@@ -182,7 +185,7 @@ class ListSource(EventSource):
             rows, cut = table.rows(lines, line, last_is_cut, self._fault)
             self._counts["rows_cut"] += cut
             if len(rows[0]):
-                yield (*rows, max(line, table.line))
+                yield (*rows, partial(table.number, lines, line))
             line += len(lines)
             if not more:
                 return
@@ -316,18 +319,39 @@ class ListSource(EventSource):
             raise InputError(f"{self.path}: damaged or closed file: {said(error)}") from error
         if piece is None:
             return None
-        times, values, places, first = piece
+        times, values, places, number = piece
         try:
             t_us, p = self._unit.us(times), polarities(values)
             x, y = _places(places, len(t_us))
-        except ValueError as error:
-            raise InputError(f"{self.path}: from {self._where} {first} on: {error}") from error
+            self._check_low(values, number)
+        except RowError as error:
+            raise InputError(f"{self.path}: {self._where} {number(error.row)}: {error}") from error
         if len(t_us):
             before = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
             latest = np.maximum.accumulate(np.concatenate([[before], t_us]))
             self._counts["rows_out_of_order"] += int((t_us < latest[:-1]).sum())
             self._latest_us = int(latest[-1])
         return Events(t_us, x, y, 1 - p if self._inverted else p)
+
+    def _check_low(self, values: NDArray[Any], number: Callable[[int], int]) -> None:
+        """Refuse 0 beside -1: of three values nobody knows which are OFF.
+
+        Raises:
+            RowError: There are both, in this piece or together with one before.
+        """
+        if values.dtype.kind not in "if":
+            return
+        for low in (-1, 0):
+            at = values == low
+            if at.any():
+                row = int(at.argmax())
+                if self._low is not None and self._low[0] != low:
+                    raise RowError(
+                        row,
+                        f"polarity {values[row]}, but {self._low[0]} in {self._where} {self._low[1]},"
+                        " expected 0 and 1, or -1 and 1",
+                    )
+                self._low = self._low or (low, number(row))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -401,7 +425,7 @@ def _kind(path: Path) -> str:
 
 def _piece(columns: list[NDArray[Any]], row: int) -> Piece:
     times = columns[0] if columns[0].dtype.kind == "f" else columns[0].astype(np.int64)
-    return times, columns[1], np.stack(columns[2:], 1) if len(columns) > 2 else None, row
+    return times, columns[1], np.stack(columns[2:], 1) if len(columns) > 2 else None, row.__add__
 
 
 def _places(places: NDArray[Any] | None, n: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
@@ -410,7 +434,8 @@ def _places(places: NDArray[Any] | None, n: int) -> tuple[NDArray[np.uint16], ND
     whole = np.rint(places.astype(np.float64))
     wrong = ~((whole >= 0) & (whole < _PLACES) & (whole == places))
     if wrong.any():
-        raise ValueError(f"place {places[wrong][0]}, expected whole numbers from 0 to {_PLACES - 1}")
+        row = int(wrong.any(1).argmax())
+        raise RowError(row, f"place {places[wrong][0]}, expected whole numbers from 0 to {_PLACES - 1}")
     found = whole.astype(np.uint16)
     return np.ascontiguousarray(found[:, 0]), np.ascontiguousarray(found[:, 1])
 
@@ -598,7 +623,11 @@ class _Text:
 
     def cells(self, line: bytes) -> list[str]:
         """What stands between the separators of a line."""
-        text = line.decode("utf-8", "replace").strip()
+        try:
+            text = line.decode().strip()
+        except UnicodeDecodeError:
+            # As older programs write a micro sign.
+            text = line.decode("latin-1").strip()
         if self._separator == b" ":
             return [self._plain(cell) for cell in text.split()]
         return [self._plain(cell) for cell in text.split(self._separator.decode())]
@@ -651,6 +680,11 @@ class _Text:
         times = np.array([int(row[0]) for row in table] if whole else [float(row[0]) for row in table])
         places = np.array([[float(cell) for cell in row[2:]] for row in table]) if len(which) > 2 else None
         return (times, np.array([row[1] for row in table]), places), cut
+
+    def number(self, lines: list[bytes], first: int, row: int) -> int:
+        """In which line the row stands, of these from `first` on, the row from 0."""
+        data = (k for k, line in enumerate(lines, first) if k >= self.first and _is_data(line))
+        return next(itertools.islice(data, row, None))
 
     def _loaded(
         self, lines: list[bytes], which: tuple[int, ...]

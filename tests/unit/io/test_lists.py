@@ -78,17 +78,42 @@ def test_pieces_of_a_long_list_are_the_whole(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t,p\n1,1\n2,5\n", "from line 2 on: polarity 5, expected 0 or 1"),
+        ("t,p\n1,1\n2,5\n", "line 3: polarity 5, expected 0 or 1"),
+        ("t,p\n1,1\n\n# dark\n2,nan\n3,0\n", "line 5: polarity nan, expected 0 or 1"),
+        ("t,p\n1,1\n2,-1\n3,0\n4,0\n", "line 4: polarity 0, but -1 in line 3, expected 0 and 1, or -1 and 1"),
+        ("t,x,y,p\n1,1,1,1\n2,1,70000,1\n", "line 3: place 70000, expected whole numbers from 0"),
         ("t,p\n1,1\nx,1\n", "line 3: found 'x,1', expected a time and a polarity"),
         ("t,p\n1,1\n\n3\n", "line 4: found '3', expected a time and a polarity"),
-        ("t,p\n1.0,1\nnan,1\n", "from line 2 on: a time that is no number"),
-        ("t_s,p\n99999999999999999,1\n", "from line 2 on: a time that is too large"),
+        ("t,p\n1.0,1\nnan,1\n", "line 3: time nan us, expected a number up to 1e.18 us"),
+        ("t_s,p\n99999999999999999,1\n", "line 2: time 9{17} s, expected a number up to"),
     ],
 )
 def test_a_fault_is_one_line_with_its_place(text: str, message: str, tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(text)
     with pytest.raises(InputError, match=message):
         read_events(tmp_path / "a.csv")
+
+
+def test_polarities_of_pieces_far_apart_are_of_one_kind(tmp_path: Path) -> None:
+    """A zero among -1 and 1, a hundred thousand rows after the first."""
+    t_us = np.arange(300_000) * 7
+    p = np.where(t_us % 2, 1, -1)
+    p[200_000] = 0
+    (tmp_path / "a.csv").write_text("t,p\n" + "".join(f"{a},{b}\n" for a, b in zip(t_us, p, strict=True)))
+    np.savez(tmp_path / "a.npz", t=t_us, p=p)
+    with pytest.raises(InputError, match="line 200002: polarity 0, but -1 in line 2,"):
+        read_events(tmp_path / "a.csv")
+    with pytest.raises(InputError, match="row 200001: polarity 0, but -1 in row 1,"):
+        read_events(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize("head", ["time/us", "t [\u00b5s]", "t / us"])
+def test_units_as_older_programs_write_them(head: str, tmp_path: Path) -> None:
+    rows = "".join(f"{t},{p}\n" for t, p in zip(T_US, P, strict=True))
+    (tmp_path / "a.csv").write_bytes(f"{head},p\n{rows}".encode("latin-1"))
+    with open_source(tmp_path / "a.csv") as source:
+        assert source.header["time"] == "in us, as its column says"
+        np.testing.assert_array_equal(source.read()[0].t_us, T_US)
 
 
 def test_an_empty_list_has_no_events(tmp_path: Path) -> None:
