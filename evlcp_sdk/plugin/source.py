@@ -186,9 +186,7 @@ class EventSource(ABC):
         except (Exception, SystemExit) as fault:
             if type(self).__module__.startswith("evlcp_sdk."):
                 raise
-            last = traceback.extract_tb(fault.__traceback__)[-1]
-            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
-            raise self._refused(f"{what} ({Path(last.filename).name}, line {last.lineno})") from fault
+            raise self._failed(fault) from fault
         if piece is None:
             return None
         if not isinstance(piece, tuple) or tuple(map(type, piece)) != (Events, Triggers):
@@ -198,6 +196,11 @@ class EventSource(ABC):
         if not self._gives_bits and len(events) and events.p.max() > 1:
             raise self._refused(f"gave polarity {events.p.max()}, expected 0 or 1")
         return events, triggers
+
+    def _failed(self, fault: BaseException) -> PluginError:
+        last = traceback.extract_tb(fault.__traceback__)[-1]
+        what = f"{type(fault).__name__}: {fault}".splitlines()[0]
+        return self._refused(f"{what} ({Path(last.filename).name}, line {last.lineno})")
 
     def _refused(self, what: str) -> PluginError:
         return PluginError(f"{self.path}: source {type(self).__name__}: {what}")
@@ -233,4 +236,13 @@ class EventSource(ABC):
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self.close()
+        try:
+            self.close()
+        except EvlcpError:
+            raise
+        except (Exception, SystemExit) as fault:
+            if type(self).__module__.startswith("evlcp_sdk."):
+                raise
+            # What went wrong before says more than a source that cannot be closed after it.
+            if error is None:
+                raise self._failed(fault) from fault

@@ -4,6 +4,7 @@ import json
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from pathlib import Path
 from typing import Any
 
@@ -93,9 +94,12 @@ class Sinks:
         said: dict[str, Mapping[str, Any]] = {}
         for installed, sink in self._sinks:
             with self._blame(installed):
-                if part := sink.finish():
+                part: object = sink.finish()
+                if part is not None and not isinstance(part, Mapping):
+                    raise PluginError(f"{installed}: finish() gave {type(part).__name__}, expected a mapping")
+                if part:
                     # What JSON cannot say is the sink's fault, not the summary's.
-                    json.dumps(dict(part))
+                    json.dumps(dict(part), allow_nan=False)
                     said[installed.record.name] = dict(part)
         return said
 
@@ -103,7 +107,8 @@ class Sinks:
         """Hand on the summary, all but its `files`."""
         for installed, sink in self._sinks:
             with self._blame(installed):
-                sink.conclude(summary)
+                # A copy: what a sink changes in it would be missing in summary.json.
+                sink.conclude(deepcopy(dict(summary)))
 
     @contextmanager
     def _blame(self, installed: InstalledSink) -> Iterator[None]:

@@ -51,6 +51,25 @@ def test_what_no_receiver_can_take_is_named(gives: Callable[[], Any], says: str)
         Strange(gives).read()
 
 
+class Stuck(Strange):
+    """One that cannot be closed."""
+
+    def close(self) -> None:
+        raise RuntimeError("stuck")
+
+
+def test_a_source_that_cannot_be_closed_is_named_unless_something_failed_before() -> None:
+    with (
+        pytest.raises(
+            PluginError, match=r"^strange:0: source Stuck: RuntimeError: stuck \(test_source.py, line"
+        ),
+        Stuck(lambda: None),
+    ):
+        pass
+    with pytest.raises(InputError, match="lens cap"), Stuck(lambda: None):
+        raise InputError("the lens cap is on")
+
+
 def test_what_a_source_says_itself_is_left_as_it_is() -> None:
     with pytest.raises(InputError, match=r"^the lens cap is on$"):
         Strange(lambda: raises(InputError("the lens cap is on"))).read()

@@ -13,7 +13,7 @@ from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 from evlcp_sdk.plugin.records import installed_sinks
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.folder import ResultFolder, read_summary
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.run import receive, receive_to_folder
 from evlcp_sdk.values import Packet
@@ -96,6 +96,8 @@ def bring(name: str, target: str, *files: str, **more: Any) -> object:
             f"{__name__}:Unsayable",
             r"sink 'objects' of .*: TypeError: Object of type object is not",
         ),
+        ("nan", f"{__name__}:Nan", r"sink 'nan' of .*: ValueError: Out of range float values are not JSON"),
+        ("counts", f"{__name__}:Counting", r"sink 'counts' of .*: finish\(\) gave int, expected a mapping"),
         (
             "watches",
             f"{__name__}:Watching",
@@ -157,6 +159,29 @@ def test_a_format_that_clashes_is_left_out(plugin: Any, told: str, demo_raw: Pat
 class Unsayable(Sink):
     def finish(self) -> dict[str, Any]:
         return {"what": object()}
+
+
+class Nan(Sink):
+    def finish(self) -> dict[str, Any]:
+        return {"mean": float("nan")}
+
+
+class Counting(Sink):
+    def finish(self) -> Any:
+        return 5
+
+
+class Clearing(Sink):
+    def conclude(self, summary: Any) -> None:
+        summary["counts"].clear()
+        summary.clear()
+
+
+def test_a_sink_that_clears_the_summary_clears_its_own_copy(demo_raw: Path, tmp_path: Path) -> None:
+    registry = Registry.load(bring("clears", f"{__name__}:Clearing"))
+    summary = receive_to_folder(demo_raw, tmp_path, registry=registry, sinks=["clears"])
+    assert summary["counts"]
+    assert read_summary(tmp_path)["counts"] == summary["counts"]
 
 
 class Watching(Sink):
