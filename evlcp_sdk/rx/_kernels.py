@@ -1196,23 +1196,32 @@ def _middle_across(
     left, right = max(int(np.ceil(x - wide)), 0), min(int(x + wide), width - 1)
     if top > bottom or left > right:
         return 0.0
-    light = np.zeros((bottom - top + 1, right - left + 1), np.int64)
+    wide = right - left + 1
+    light = np.zeros((bottom - top + 1, wide), np.int64)
     for j in range(edges.size):
         edge, image = edges[j], heard[1 + every * j]
         if edge != 0:
             for v in range(top, bottom + 1):
-                for u in range(left, right + 1):
-                    light[v - top, u - left] += edge * image[v, u]
+                into, line = light[v - top], image[v, left:]
+                for u in range(wide):
+                    into[u] += edge * line[u]
+    # What lies within `along`, and how far beside: the same in each round.
+    lit, aside = np.empty(light.size, np.int64), np.empty(light.size)
+    many = 0
+    for v in range(top, bottom + 1):
+        for u in range(left, right + 1):
+            away = complex(u - x, v - y) * unit.conjugate()
+            if abs(away.real) <= along:
+                lit[many], aside[many] = light[v - top, u - left], away.imag
+                many += 1
     for _ in range(_ROUNDS_ACROSS):
         total, moment = 0.0, 0.0
-        for v in range(top, bottom + 1):
-            for u in range(left, right + 1):
-                away = complex(u - x, v - y) * unit.conjugate()
-                beside = away.imag - off
-                share = min(max(across + 0.5 - abs(beside), 0.0), 1.0)
-                if abs(away.real) <= along and share > 0:
-                    total += share * light[v - top, u - left]
-                    moment += share * light[v - top, u - left] * beside
+        for i in range(many):
+            beside = aside[i] - off
+            share = min(max(across + 0.5 - abs(beside), 0.0), 1.0)
+            if share > 0:
+                total += share * lit[i]
+                moment += share * lit[i] * beside
         if total <= 0:
             return 0.0
         off += min(max(moment / total, -1.0), 1.0)

@@ -336,12 +336,14 @@ class RegionFollower:
         Rows of a bar below would be as good as its own, so that a region would move on to them.
         """
         seam = self._spec.margin_px
-        bars = [_grown(box, -seam) for box, one in zip(boxes, self.alive, strict=True) if one.size_px]
+        tight = [
+            _grown(box, -seam) if one.size_px else None for box, one in zip(boxes, self.alive, strict=True)
+        ]
+        bars = [bar for bar in tight if bar is not None]
         if len(bars) < 2:
             return boxes
         return [
-            _cut_off(box, _grown(box, -seam), bars) if followed.size_px else box
-            for followed, box in zip(self.alive, boxes, strict=True)
+            box if bar is None else _cut_off(box, bar, bars) for box, bar in zip(boxes, tight, strict=True)
         ]
 
     def _let_go(self) -> None:

@@ -1,7 +1,7 @@
 """Where a transmitter's packets and frames stand on the camera's clock."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.values import SyncLock
@@ -51,6 +51,7 @@ class PacketGrid:
     lock: SyncLock | None = None
     packet: int = 0
     frame: int = 0
+    _known: tuple[SyncLock, int, int, DueFrame] | None = field(default=None, init=False, repr=False)
 
     def follow(self, lock: SyncLock) -> bool:
         """Take a lock, frames going on where they are; False, and nothing taken, where it is off the grid."""
@@ -92,35 +93,30 @@ class PacketGrid:
     @property
     def due_us(self) -> float:
         """When the events of the next frame's last edge end, us; infinite before a lock."""
-        if self.lock is None:
-            return math.inf
-        has_pilot = self.format.has_pilot(self.frame % self.format.frames)
-        return self._end_us(self.lock, self.start_us(self.frame), self._chips(has_pilot))
+        return math.inf if self.lock is None else self._next(self.lock).end_us
 
     def due(self, until_us: float) -> DueFrame | None:
         """The next frame, if it lies before a time with the events after its last edge."""
-        lock = self.lock
-        if lock is None:
+        if self.lock is None:
             return None
+        frame = self._next(self.lock)
+        return frame if frame.end_us <= until_us else None
+
+    def _next(self, lock: SyncLock) -> DueFrame:
+        """The next frame; asked for again and again before it is due."""
+        known = self._known
+        if known is not None and known[0] is lock and known[1:3] == (self.packet, self.frame):
+            return known[3]
         start_us = self.start_us(self.frame)
-        if start_us > until_us:
-            return None
         number, index = divmod(self.frame, self.format.frames)
         has_pilot = self.format.has_pilot(index)
-        chips = self._chips(has_pilot)
-        end_us = self._end_us(lock, start_us, chips)
-        if end_us > until_us:
-            return None
-        packet_us = start_us - self.format.frame_start_chip(index) * lock.chip_us
-        return DueFrame(self.frame, number, index, chips, has_pilot, packet_us, start_us, end_us, lock)
-
-    def _chips(self, has_pilot: bool) -> int:
-        return self.format.frame_chips if has_pilot else self.format.info_chips
-
-    @staticmethod
-    def _end_us(lock: SyncLock, start_us: float, chips: int) -> float:
+        chips = self.format.frame_chips if has_pilot else self.format.info_chips
         late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
-        return start_us + chips * lock.chip_us + late_us
+        end_us = start_us + chips * lock.chip_us + late_us
+        packet_us = start_us - self.format.frame_start_chip(index) * lock.chip_us
+        frame = DueFrame(self.frame, number, index, chips, has_pilot, packet_us, start_us, end_us, lock)
+        self._known = lock, self.packet, self.frame, frame
+        return frame
 
     def _period_us(self, lock: SyncLock) -> float:
         return self.format.packet_chips * lock.chip_us

@@ -127,7 +127,11 @@ def middles(maps: Array, used: Array, min_pixels: int, out: Array) -> None:
         columns[:] = 0.0
         lit = 0
         for v in range(height):
+            some = False
             for u in range(width):
+                some |= maps[k, v, u] > 0
+            # Most rows are dark, and that is seen of many pixels at a time.
+            for u in range(width if some else 0):
                 w = maps[k, v, u]
                 if w > 0:
                     rows[v] += w
@@ -162,9 +166,11 @@ def cut_maps(maps: Array, used: Array, middle: Array, out: Array) -> None:
             continue
         top = middle[n, 0] - rows // 2
         left = middle[n, 1] - columns // 2
+        first, end = max(left, 0), min(left + columns, width)
         for v in range(max(top, 0), min(top + rows, height)):
-            for u in range(max(left, 0), min(left + columns, width)):
-                out[n, v - top, u - left] = maps[used[n], v, u]
+            into, line = out[n, v - top, first - left :], maps[used[n], v, first:]
+            for u in range(end - first):
+                into[u] = line[u]
 
 
 @njit(cache=True, nogil=True)
