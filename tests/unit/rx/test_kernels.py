@@ -267,7 +267,7 @@ def test_events_in_boxes(n, freeze):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("many", [0, 1, 2, 40])
+@pytest.mark.parametrize("many", [0, 1, 2, 9, 40])
 def test_events_in_many_boxes_at_once(seed, many):
     rng = np.random.default_rng(seed)
     events = random_events(rng, 700)
