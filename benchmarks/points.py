@@ -41,6 +41,8 @@ SCENES = {
     "one bar": ("one-bar", []),
     "two bars": ("gate", ['world.attitude="gravity"']),
     "three bars": ("portal", ['world.attitude="none"']),
+    "by day": ("gate", ['world.attitude="gravity"', "background.light_w_m2=3.0"]),
+    "no wings": ("gate", ['world.attitude="gravity"', "lens.wings=false"]),
 }
 DISTANCES_M = (27.0, 31.0, 37.0, 43.0, 52.0, 59.0, 68.0, 78.0)
 START = (0.05, 0.03, 0.05, 1e-4, 0.1, 4e-4)
@@ -48,10 +50,19 @@ NAMES = (
     "shaken_sigma_px", "shared_sigma_px", "shared_along_px", "shared_share", "pixel_sigma_px", "stretch_share"
 )  # fmt: skip
 MODES = ("columns", "rows", "stretch", "lean", "bend along", "bend across")
-ROW = [("seed", int), ("drive", int), ("t_us", float), ("along", float, 2), ("length_px", float)]
-DTYPE = np.dtype([*ROW, ("white_px", float), ("pixel_px", float), ("modes_px", float, len(MODES))])
+ROW = [
+    ("scene", "U12"),
+    ("seed", int),
+    ("drive", int),
+    ("t_us", float),
+    ("along", float, 2),
+    ("length_px", float),
+]
+SIGMAS = [("white_px", float), ("pixel_px", float), ("shift_px", float), ("between", float)]
+DTYPE = np.dtype([*ROW, *SIGMAS, ("modes_px", float, len(MODES))])
 """A bar at the time of a fix. Sigmas of a mode of sum of squares 1: `white_px` by frames, `pixel_px` by where
-in a pixel it is, of a `pixel_sigma_px` of 1; `modes_px` are its errors, the shifts those of the mean."""
+in a pixel it is, of a `pixel_sigma_px` of 1; `shift_px` is what frames do not show across the bar, `between`
+that of `BarView`; `modes_px` are its errors, the shifts those of the mean."""
 
 
 def rows_of(what: str, distance_m: float, seed: int, duration_s: float, drive: int) -> NDArray[np.void]:
@@ -79,7 +90,7 @@ def rows_of(what: str, distance_m: float, seed: int, duration_s: float, drive: i
             points = points_at(seen, t_us, period_us, LINK.bar.clusters, spec)
             if points is not None:
                 rows.append(
-                    row_of(points, true_points(simulation, t_us, points.points_px), (seed, drive, t_us))
+                    row_of(points, true_points(simulation, t_us, points.points_px), (what, seed, drive, t_us))
                 )
     return np.array([row for row in rows if row is not None], DTYPE)
 
@@ -94,7 +105,7 @@ def true_points(simulation: Simulation, t_us: float, near_px: Floats) -> Floats:
     return min(bars, key=lambda bar: float(np.nanmean(np.linalg.norm(near_px - bar, axis=1))))
 
 
-def row_of(points: SeenPoints, true_px: Floats, when: tuple[int, int, float]) -> tuple[Any, ...] | None:
+def row_of(points: SeenPoints, true_px: Floats, when: tuple[str, int, int, float]) -> tuple[Any, ...] | None:
     """Of one bar at a time: `DTYPE`; None of one that is not seen whole."""
     off = points.points_px - true_px
     if not np.isfinite(off).all():
@@ -112,7 +123,16 @@ def row_of(points: SeenPoints, true_px: Floats, when: tuple[int, int, float]) ->
     clusters = len(off)
     length_px = float(np.linalg.norm(whole)) * clusters / (clusters - 1)
     modes = (*mean, line @ a, line @ b, bend @ a, bend @ b)
-    return *when, along, length_px, math.sqrt(white.mean()), points.pixel_px, modes
+    return (
+        *when,
+        along,
+        length_px,
+        math.sqrt(white.mean()),
+        points.pixel_px,
+        points.shift_px,
+        points.between,
+        modes,
+    )
 
 
 def variances(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floats:
@@ -129,8 +149,15 @@ def own_shifts(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floa
     _, across, along, share, pixel, _ = sigmas
     each = (rows["white_px"] ** 2 + (pixel * rows["pixel_px"]) ** 2) / LINK.bar.clusters
     longways = rows["along"][:, :, None] * rows["along"][:, None]
-    more = along**2 + (share * rows["length_px"]) ** 2 - across**2
-    return (across**2 + each)[:, None, None] * np.eye(2) + more[:, None, None] * longways
+    _, of = np.unique(rows[["drive", "t_us"]], return_inverse=True)
+    moved = math.sqrt(2) * sigmas[0] * (rows["between"] - _means(rows["between"], of)[of])
+    aside = across**2 + rows["shift_px"] ** 2 + moved**2
+    more = along**2 + (share * rows["length_px"]) ** 2 + moved**2 - aside
+    return (aside + each)[:, None, None] * np.eye(2) + more[:, None, None] * longways
+
+
+def _means(values: Floats, of: NDArray[np.intp]) -> Floats:
+    return np.bincount(of, values) / np.bincount(of)
 
 
 def parted(
@@ -155,7 +182,7 @@ def parted(
     mean = np.einsum("nij,nj->ni", spread, moment)
     return (
         mean,
-        spread + sigmas[0] ** 2 * np.eye(2),
+        spread + (sigmas[0] * _means(rows["between"], of))[:, None, None] ** 2 * np.eye(2),
         shifts - mean[of],
         own - spread[of],
         np.bincount(of)[of] > 1,
@@ -175,7 +202,9 @@ def fitted(rows: NDArray[np.void], start: Sequence[float] | Floats) -> Floats:
         # Errors of a group with a common part: the means', and what is left about them.
         shifts = np.einsum("ni,nij,nj->", rest, np.linalg.inv(own), rest)
         shifts += np.einsum("ni,nij,nj->", mean, np.linalg.inv(of_mean), mean)
-        alone = of_mean - sigmas[0] ** 2 * np.eye(2)
+        _, when = np.unique(rows[["drive", "t_us"]], return_inverse=True)
+        common = sigmas[0] * _means(rows["between"], when)
+        alone = of_mean - common[:, None, None] ** 2 * np.eye(2)
         for covariance, sign in ((own, 1), (of_mean, 1), (alone, -1)):
             shifts += sign * np.linalg.slogdet(covariance)[1].sum()
         of = variances(rows, sigmas)[:, :2]
@@ -193,7 +222,8 @@ def ratios(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floats:
     own = []
     for way in (np.stack([-along[:, 1], along[:, 0]], 1), along):
         of = np.einsum("ni,nij,nj->n", way, of_rest, way)
-        own.append(((rest * way).sum(1)[several] ** 2 / of[several]).mean())
+        squares = (rest * way).sum(1)[several] ** 2 / of[several]
+        own.append(squares.mean() if len(squares) else math.nan)
     shapes = (rows["modes_px"][:, 2:] ** 2 / variances(rows, sigmas)).mean(0)
     return np.array([common, *own, *shapes])
 
@@ -276,6 +306,15 @@ def told(rows: NDArray[np.void]) -> None:
         ends = zip(ratios(odd, sigmas), *interval(odd, lambda of, by=sigmas: ratios(of, by)), strict=True)
         cells = " | ".join(f"{one:.2f} ({least:.2f} to {most:.2f})" for one, least, most in ends)
         print(f"| {by} | {cells} |")
+    print()
+    print("Shifts by scene, px, and squares over variances by what is fitted:")
+    print("| scene | n | columns | said by frames | common shift | own, across | along |")
+    print("|---|---|---|---|---|---|---|")
+    for scene in SCENES:
+        some = rows[rows["scene"] == scene]
+        columns, said = (some["modes_px"][:, 0] ** 2).mean() ** 0.5, (some["shift_px"] ** 2).mean() ** 0.5
+        cells = " | ".join(f"{one:.2f}" for one in ratios(some, best)[:3])
+        print(f"| {scene} | {len(some)} | {columns:.3f} | {said:.3f} | {cells} |")
 
 
 if __name__ == "__main__":

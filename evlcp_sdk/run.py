@@ -814,7 +814,14 @@ def _views(
                 enu = site.layout_positions_m(link.bar, axes)
                 bars.append(
                     BarView(
-                        site.transmitter_id, enu, found.points_px, found.sigma_px, site.survey, found.pixel_px
+                        site.transmitter_id,
+                        enu,
+                        found.points_px,
+                        found.sigma_px,
+                        site.survey,
+                        found.pixel_px,
+                        found.shift_px,
+                        found.between,
                     )
                 )
         views.append(_view(pose, bars, axes))
@@ -942,7 +949,13 @@ def survey(
                     )
                 bars.append(
                     BarView(
-                        number, np.empty((0, 3)), found.points_px, found.sigma_px, pixel_px=found.pixel_px
+                        number,
+                        np.empty((0, 3)),
+                        found.points_px,
+                        found.sigma_px,
+                        pixel_px=found.pixel_px,
+                        shift_px=found.shift_px,
+                        between=found.between,
                     )
                 )
             views.append(_view(pose, bars, axes))

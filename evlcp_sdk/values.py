@@ -381,6 +381,8 @@ class Frame:
         points_t_us: That time, camera clock, us.
         echo_of: Number of the transmitter that this is a reflection of; None for a frame of its own.
         link: Name of the link that it was sent with, of a receiver of several; empty of a receiver of one.
+        points_flank_px: Over how many pixels a line's image fades out to each side; the narrower, the less it
+            shows where in a pixel the line is. NaN where it is not known.
     """
 
     transmitter: int
@@ -397,6 +399,7 @@ class Frame:
     points_t_us: float = math.nan
     echo_of: int | None = None
     link: str = ""
+    points_flank_px: float = math.nan
 
     def __repr__(self) -> str:
         place = f"{_who(self.transmitter, self.echo_of)}, packet {self.packet}, frame {self.frame}"

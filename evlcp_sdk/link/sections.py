@@ -107,30 +107,33 @@ class PositionSpec:
         float,
         Field(
             ge=0,
-            description="Error that all bars in view share at a time: the image moves between their frames.",
+            description="How far the image moves unseen midway between two frames, for all bars alike.",
         ),
-    ] = 0.08
+    ] = 0.055
     shared_sigma_px: Annotated[
         float,
-        Field(ge=0, description="Error that the points of one bar share, across it: where in a pixel it is."),
-    ] = 0.05
+        Field(
+            ge=0,
+            description="Error that a bar's points share across it, besides what its image does not show.",
+        ),
+    ] = 0.01
     shared_along_px: Annotated[
         float, Field(ge=0, description="The same along it, where its ends are half a cluster's light.")
-    ] = 0.06
+    ] = 0.04
     shared_share: Annotated[
         float,
         Field(ge=0, le=0.1, description="What of that grows with the bar: a share of its length."),
-    ] = 0.0003
+    ] = 0.0001
     stretch_share: Annotated[
         float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
-    ] = 0.0004
+    ] = 0.0003
     pixel_sigma_px: Annotated[
         float,
         Field(
             ge=0,
             description="Error of a point that no averaging over frames removes: where in a pixel it is.",
         ),
-    ] = 0.15
+    ] = 0.14
     min_view_deg: Annotated[
         float,
         Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),

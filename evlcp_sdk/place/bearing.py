@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.points import unseen_px
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.values import Frame
 
@@ -61,7 +62,11 @@ def bar_point(
     along = np.array([sight[0], sight[1], 1.0])
     grown = spec.shared_share * camera.focal_px * length_m / depth
     shift = math.hypot(
-        spec.shaken_sigma_px, max(spec.shared_sigma_px, math.hypot(spec.shared_along_px, grown))
+        spec.shaken_sigma_px,
+        max(
+            math.hypot(spec.shared_sigma_px, unseen_px(frame.points_flank_px)),
+            math.hypot(spec.shared_along_px, grown),
+        ),
     )
     across = depth * np.linalg.inv(camera.distort_slope(sight)) * shift
     standing = np.zeros((3, 8))

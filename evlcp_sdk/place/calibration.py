@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.observations import BarView, project_bars, shared_sigmas
+from evlcp_sdk.place.observations import BarView, between_of, project_bars, shared_sigmas
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
 __all__ = [
@@ -227,6 +227,7 @@ class SeenView:
         """The points of the bars of which enough is seen."""
         enu, points, whiten, number, arm = [], [], [], [], []
         survey: dict[int, tuple[float, float, float]] = {}
+        between = between_of(view.bars)
         for bar in view.bars:
             good = np.isfinite(bar.points_px).all(1) & (bar.sigma_px > 0)
             if good.sum() < spec.min_points:
@@ -235,7 +236,7 @@ class SeenView:
             points.append(bar.points_px[good])
             number.append(np.full(int(good.sum()), bar.transmitter))
             arm.append(bar.enu_m[good] - bar.enu_m.mean(0))
-            shift, *site = shared_sigmas(bar, good, spec)
+            shift, *site = shared_sigmas(bar, good, spec, between)
             survey[bar.transmitter] = (site[0], site[1], site[2])
             covariance = np.diag(bar.sigma_px[good] ** 2) + shift**2
             whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
@@ -247,7 +248,8 @@ class SeenView:
         flat = np.concatenate([np.empty((0, 3)), *enu])
         seen = np.concatenate([np.empty((0, 2)), *points])
         rotation = view.rotation
-        sigma = math.hypot(math.radians(view.attitude_sigma_deg), spec.shaken_sigma_px / camera.focal_px)
+        shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
+        sigma = math.hypot(math.radians(view.attitude_sigma_deg), shaken_rad)
         if rotation is None:
             rotation, sigma = _turned(flat - view.enu_m, seen, camera), _FREE_SIGMA_RAD
         bars = np.concatenate([np.empty(0, np.int64), *number])

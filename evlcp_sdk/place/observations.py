@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.place._kernels")
 
-__all__ = ["EXACT_RAD", "BarView", "Problem", "project_bars", "shared_sigmas"]
+__all__ = ["EXACT_RAD", "BarView", "Problem", "between_of", "project_bars", "shared_sigmas"]
 
 Floats = NDArray[np.float64]
 
@@ -44,6 +44,9 @@ class BarView:
             a share; 0: exact.
         pixel_px: The part of `sigma_px` that stands until the image has moved; None: `position.
             pixel_sigma_px`.
+        shift_px: What all points share across the bar besides `position.shared_sigma_px`, px.
+        between: How far the image may have moved otherwise than its frames show, in `position.
+            shaken_sigma_px`.
     """
 
     transmitter: int
@@ -52,6 +55,8 @@ class BarView:
     sigma_px: Floats
     survey: tuple[float, float, float] = (0.0, 0.0, 0.0)
     pixel_px: float | None = None
+    shift_px: float = 0.0
+    between: float = 1.0
 
 
 def project_bars(
@@ -101,6 +106,7 @@ class Problem:
         white: What whitens the errors of these, float64 (3, 3).
         said: What moves these as they are said, whitened, by its sigmas, float64 (3, 4).
         free: Which unknowns of the fit there are, bool (14,): see `_kernels`.
+        shaken_rad: Sigma of what shifts the images of all bars alike.
     """
 
     camera: CameraModel
@@ -119,6 +125,7 @@ class Problem:
     white: Floats
     said: Floats
     free: NDArray[np.bool_]
+    shaken_rad: float
 
     @classmethod
     def of(
@@ -132,7 +139,7 @@ class Problem:
         """What the views give, or why that is too little for a position."""
         count = sum([len(view.sigma_px) for view in views])
         points, bar, bar_sigma = np.empty((count, 10)), np.empty(count, np.int64), np.empty((len(views), 6))
-        usual, width, height = _usual(spec), camera.width, camera.height
+        width, height, between = camera.width, camera.height, between_of(views)
         kept: list[int] = []
         at = most = 0
         for view in views:
@@ -140,7 +147,8 @@ class Problem:
             own[:3] = view.survey
             pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
             number = _kernels.gathered(
-                view.enu_m, view.points_px, view.sigma_px, pixel, width, height, usual, spec.min_points,
+                view.enu_m, view.points_px, view.sigma_px, pixel, width, height, _usual(spec, view, between),
+                spec.min_points,
                 len(kept), at, points, bar, own,
             )  # fmt: skip
             most = max(most, number)
@@ -152,7 +160,8 @@ class Problem:
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
             )
         points, bar = points[:at], bar[:at]
-        told = _told(attitude, points, bar, len(kept), spec.shaken_sigma_px / camera.focal_px)
+        shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
+        told = _told(attitude, points, bar, len(kept), shaken_rad)
         if isinstance(told, Refusal):
             return told
         known = sigma.known
@@ -171,6 +180,7 @@ class Problem:
             ),
             lens_root=sigma.root(camera) if known else np.zeros((7, 7)),
             free=free,
+            shaken_rad=shaken_rad,
             **told,
         )
 
@@ -185,8 +195,7 @@ class Problem:
 
     def told(self, attitude: Attitude | None) -> "Problem | Refusal":
         """The same where this is known of the attitude, or why that is too little."""
-        shaken_rad = self.spec.shaken_sigma_px / self.camera.focal_px
-        told = _told(attitude, self.points, self.bar, len(self.transmitters), shaken_rad)
+        told = _told(attitude, self.points, self.bar, len(self.transmitters), self.shaken_rad)
         if isinstance(told, Refusal):
             return told
         free = self.free.copy()
@@ -266,19 +275,32 @@ def _told(
     }
 
 
-def shared_sigmas(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec) -> tuple[float, ...]:
+def between_of(views: Sequence[BarView]) -> float:
+    """Of what moved between frames, the part that all bars have in common, see `BarView.between`."""
+    return sum([view.between for view in views]) / max(len(views), 1)
+
+
+def shared_sigmas(
+    view: BarView, seen: NDArray[np.bool_], spec: PositionSpec, between: float
+) -> tuple[float, ...]:
     """Of a bar: its image's shift, px, in any direction at most; its place, m, turn, radians, and length, a
-    share.
+    share. `between` is what it has in common with others, see `between_of`.
     """
     found = np.array([*view.survey, 0.0, 0.0, 0.0])
-    _kernels.shared(view.enu_m, view.points_px, seen, _usual(spec), found)
+    _kernels.shared(view.enu_m, view.points_px, seen, _usual(spec, view, between), found)
     place, turn, length, columns, both, rows = found.tolist()
     return float(np.linalg.eigvalsh([[columns, both], [both, rows]])[-1]), place, turn, length
 
 
-def _usual(spec: PositionSpec) -> Floats:
-    """What kernels take of it, float64 (4,): see `_kernels.shared`."""
-    shift = spec.shared_sigma_px, spec.shared_along_px, spec.shared_share
+def _usual(spec: PositionSpec, view: BarView, between: float) -> Floats:
+    """What kernels take of these, float64 (4,): see `_kernels.shared`.
+
+    The image moves as one: of what is not known of it, a bar has for its own what it has more or less than
+    others. These count as independent, so that two bars differ by as much as they do.
+    """
+    moved = math.sqrt(2) * spec.shaken_sigma_px * abs(view.between - between)
+    across = math.hypot(spec.shared_sigma_px, view.shift_px, moved)
+    shift = across, math.hypot(spec.shared_along_px, moved), spec.shared_share
     return np.array([*shift, spec.stretch_share], np.float64)
 
 

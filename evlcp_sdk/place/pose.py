@@ -36,11 +36,18 @@ _HOPELESS = 0.02
 _FAR = 1e3
 """Test value above which that is so, whatever is not linear: beyond 30 sigmas."""
 
+_CURVED = 0.25
+"""Share by which test values of two parts differ where either may be at fault: they are those of small
+faults, and an attitude that is off by some degrees moves an image along curves."""
+
 _FREE_FOCAL = 0.02
 """Sigma of a focal length that is other than said, as a share: what is left to be known of it."""
 
-_FOCAL_REACH, _FOCAL_STEPS = 4.0, 47
-"""Focal lengths that are tried are up to so many times longer or shorter, in so many steps of 6 %."""
+_FOCALS = np.geomspace(1 / 4.0, 4.0, 47)
+"""Focal lengths that are tried, as a share: steps of 6 %."""
+
+_FINER_FOCALS = np.linspace(0.94, 1.06, 25)
+"""Those about the best of them."""
 
 
 def solve_pose(
@@ -101,14 +108,16 @@ def solve_pose(
     names = [name for name, _ in fits]
     if "heading" in names:
         fits = [fit for fit in fits if fit[0] != "attitude"]
+    most = max((tests.get(name, 0.0) for name in names), default=0.0)
+    rivals = [n for n in unsure if n in tests and most - tests[n] < max(ODDS, _CURVED * most)]
     if len(fits) == 1:
         name, pose = fits[0]
-        rivals = [n for n in unsure if tests.get(name, 0.0) - tests.get(n, 0.0) < ODDS and n in tests]
         if not rivals and tests:
             rivals = [name for name, _ in _mixed_up(views, camera, attitude, spec, sigma)]
             if not rivals:
                 return replace(pose, excluded=(name,), failed=_failed(problem, name, pose, tests))
-        names = [name, *rivals]
+        names = [name]
+    names += rivals
     if isinstance(found, Refusal) and not names:
         return found
     could = f"; it may be {' or '.join(names)}" if names else ""
@@ -138,24 +147,29 @@ def fitting_focal_mm(
     spec = PositionSpec() if spec is None else spec
     sigma = CameraSigma() if sigma is None else sigma
 
-    def tried(focal_mm: float) -> Judged | None:
+    def tried(focal_mm: float, free: float) -> Problem | Refusal:
         other = replace(camera, focal_mm=focal_mm)
-        # Free within a step, so that none is stepped over.
-        step_mm = float(np.hypot(sigma.focal_mm, _FREE_FOCAL * focal_mm))
-        given = Problem.of(views, other, attitude, spec, replace(sigma, focal_mm=step_mm, correlation=()))
-        found = given if isinstance(given, Refusal) else _plain(given)
-        return found if isinstance(found, Judged) else None
+        step_mm = float(np.hypot(sigma.focal_mm, free * focal_mm))
+        return Problem.of(views, other, attitude, spec, replace(sigma, focal_mm=step_mm, correlation=()))
 
-    def best(lengths_mm: np.ndarray) -> tuple[float, Judged | None]:
-        found = [(float(f), tried(float(f))) for f in lengths_mm]
-        fit = [(f, one) for f, one in found if one is not None]
-        return min(fit, key=lambda pair: pair[1].pose.misfit, default=(math.nan, None))
+    def misfit(focal_mm: float, free: float) -> float:
+        problem = tried(focal_mm, free)
+        starts = () if isinstance(problem, Refusal) else likely_starts(problem)
+        if isinstance(problem, Refusal) or not starts:
+            return math.inf
+        tries = starts[:1] if is_hopeless(problem, starts[0]) else starts
+        return min(fit_pose(problem, start).cost for start in tries)
 
-    around, one = best(camera.focal_mm * np.geomspace(1 / _FOCAL_REACH, _FOCAL_REACH, _FOCAL_STEPS))
-    if one is None:
-        return math.nan
-    around, one = best(around * np.linspace(0.94, 1.06, 25))
-    return around if one is not None and not one.doubt else math.nan
+    around = camera.focal_mm
+    # Free within a step, so that none is stepped over.
+    for lengths, free in ((_FOCALS, _FREE_FOCAL), (_FINER_FOCALS, _FREE_FOCAL / 5)):
+        fit = {focal_mm: misfit(focal_mm, free) for focal_mm in (around * lengths).tolist()}
+        around = min(fit, key=lambda focal_mm: fit[focal_mm])
+        if math.isinf(fit[around]):
+            return math.nan
+    given = tried(around, _FREE_FOCAL / 5)
+    found = given if isinstance(given, Refusal) else _plain(given)
+    return around if isinstance(found, Judged) and not found.doubt else math.nan
 
 
 def _mixed_up(
@@ -191,7 +205,7 @@ def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Proble
             yield f"bar {number}", problem.without(i)
         if attitude is not None and attitude.heading_deg is not None:
             yield "heading", problem.told(replace(attitude, heading_deg=None))
-    if attitude is not None and len(bars) > 2:
+    if attitude is not None and len(bars) > 1:
         yield "attitude", problem.told(None)
     focal_mm = math.hypot(sigma.focal_mm, _FREE_FOCAL * problem.camera.focal_mm)
     yield FOCAL, problem.seen_by(replace(sigma, focal_mm=focal_mm, correlation=()))

@@ -208,7 +208,16 @@ class Positioner:
                 continue
             here = LocalAxes.of([site]) if here is None else here
             sited.append(
-                BarView(number, enu, points.points_px, points.sigma_px, site.survey, points.pixel_px)
+                BarView(
+                    number,
+                    enu,
+                    points.points_px,
+                    points.sigma_px,
+                    site.survey,
+                    points.pixel_px,
+                    points.shift_px,
+                    points.between,
+                )
             )
         if not views:
             return None

@@ -31,7 +31,7 @@ from evlcp_sdk.values import Frame, FrameView, Range, Region, SyncLock, changed
 __all__ = ["PacketFraming"]
 
 _NO_RANGE = Range(math.nan, math.nan, 0)
-_NO_POINTS = (np.empty((0, 2)), np.empty(0))
+_NO_POINTS = (np.empty((0, 2)), np.empty(0), math.nan)
 
 _TAIL_CHIPS = 0.5
 """A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
@@ -322,12 +322,12 @@ class PacketFraming:
         if due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             distance = self._measured(FrameView(look.sums, look.offset_px, look.presence, read))
-            points_px, sigma_px = self._find_points(
+            points_px, sigma_px, flank_px = self._find_points(
                 look.presence, look.placement, look.sums[: self._packet.pilot_chips]
             )
-            points = points_px + look.corner_px, sigma_px
+            points = points_px + look.corner_px, sigma_px, flank_px
             centre_px = self._looker.centre(look, points[0])
-            sight = self._sight(points, look.middle_us)
+            sight = self._sight(points[:2], look.middle_us)
         if max(soft.symbols.tolist()) < 0 and (
             transmitter.number is None or not math.isfinite(distance.distance_m)
         ):
@@ -353,6 +353,7 @@ class PacketFraming:
             y_px=centre_px[1],
             points_px=points[0],
             points_sigma_px=points[1],
+            points_flank_px=points[2],
             points_t_us=look.middle_us,
             echo_of=self._echoes.echo_of(number),
             link=self._name,

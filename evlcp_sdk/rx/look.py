@@ -161,13 +161,15 @@ class Looker:
             assert pilot is not None
             sums = np.concatenate([pilot.sums, sums])
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
-        # The image shows the pilot's mean, read from the chips behind edges that tell codes apart; the bar's
-        # centre at the instant is that of its region.
-        rest_x, rest_y = (sum(told) / len(told) for told in pilot.offset_px[:, 1 :: self._every].tolist())
-        corner_px = (
-            float(x[middle]) - (size[0] - 1) / 2 - rest_x,
-            float(y[middle]) - (size[1] - 1) / 2 - rest_y,
-        )
+        # The image shows the pilot's mean, read from the chips behind edges that tell codes apart: it lies
+        # where these were looked for in the mean, however much the region's track trembles between chips.
+        told = slice(1, packet.pilot_chips, self._every)
+        rest_x, rest_y = (sum(rest) / len(rest) for rest in pilot.offset_px[:, told].tolist())
+        if due.has_pilot:
+            centre_x, centre_y = float(x[told].mean()), float(y[told].mean())
+        else:
+            centre_x, centre_y = float(x[middle]), float(y[middle])
+        corner_px = (centre_x - (size[0] - 1) / 2 - rest_x, centre_y - (size[1] - 1) / 2 - rest_y)
         middle_us = float(middles[middle]) - lock.chip_us / 2
         look = Look(
             sums, offset_px, pilot.presence, pilot.placement, pilot.others, corner_px, middle_us, spread

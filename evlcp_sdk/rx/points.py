@@ -1,5 +1,6 @@
 """Where each cluster of a frame is seen, to a fraction of a pixel: what a position is computed from."""
 
+import math
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
@@ -18,10 +19,11 @@ else:
 __all__ = ["FindPoints", "points_finder"]
 
 FindPoints = Callable[
-    [PresenceMap, Placement, NDArray[np.int16]], tuple[NDArray[np.float64], NDArray[np.float64]]
+    [PresenceMap, Placement, NDArray[np.int16]], tuple[NDArray[np.float64], NDArray[np.float64], float]
 ]
 """Presence of a pilot, where it shows the layout, and its polarity sums (chips, rows, columns) -> points
-(K, 2) in the image and sigmas (K,), px; NaN where unseen."""
+(K, 2) in the image and sigmas (K,), px, NaN where unseen; over how many pixels a line's image fades out
+across it, NaN of no line."""
 
 _SIGMA_PX = 0.12
 """Error expected before any is seen: a boundary inside a pixel, found from a few columns of correlations of
@@ -64,11 +66,11 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
 
     def find(
         presence: PresenceMap, placement: Placement, heard: NDArray[np.int16]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         if np.count_nonzero(placement.seen) < 3:
-            return np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
+            return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan
         points, ends = np.empty((clusters, 2)), np.empty(clusters)
-        squares = _kernels.place_clusters(
+        squares, flank_px = _kernels.place_clusters(
             presence.pixels,
             placement.seen,
             layout.at_m,
@@ -87,6 +89,6 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
         seen = clusters - int(np.count_nonzero(np.isnan(ends)))
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)
-        return points, variance**0.5 * (1 + (_OUTER - 1) * ends)
+        return points, variance**0.5 * (1 + (_OUTER - 1) * ends), flank_px
 
     return find

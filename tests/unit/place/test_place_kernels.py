@@ -616,6 +616,6 @@ def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -
     points = np.where(seen[:, None], 300 + 250 * centres_m, np.nan)
     spec = PositionSpec(shared_along_px=0.05, shared_share=0.002, stretch_share=0.003)
     view = BarView(0, enu_m, points, np.full(len(enu_m), 0.1), (0.1, 0.2, 0.004))
-    shift, *site = shared_sigmas(view, seen, spec)
+    shift, *site = shared_sigmas(view, seen, spec, 1.0)
     assert shift == pytest.approx(math.hypot(0.05, 0.002 * 250 * length_m), rel=1e-9)
     assert site == pytest.approx([0.1, 0.2, 0.005])

@@ -1,13 +1,14 @@
 """A bar's image points between frames: their sigmas hold, in a still image, a moving and a shaken one."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.points import points_at
+from evlcp_sdk.place.points import points_at, unseen_px
 from evlcp_sdk.values import Frame, Range, SoftSymbols
 
 SPEC = PositionSpec(pixel_sigma_px=0.08)
@@ -90,3 +91,45 @@ def test_a_bar_that_leans_otherwise_in_each_frame_is_less_sure() -> None:
     # By what frames state alone it was beyond 4 sigmas in the mean.
     stated = math.hypot(0.05 * math.sqrt(float((weights() ** 2).sum())), 0.03)
     assert float(np.mean((lean / stated) ** 2)) > 10
+
+
+def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
+    """Brute force: means of trapezoids seen once a pixel, at all places and of many widths."""
+    columns, places = np.arange(-12, 13), np.linspace(0, 1, 50, endpoint=False)
+    for steep_px in (0.2, 0.5, 0.8):
+        errors = []
+        for width_px in np.linspace(3, 4, 40, endpoint=False):
+            away = np.abs(columns - places[:, None])
+            light = np.clip((width_px / 2 - away) / steep_px + 0.5, 0, 1)
+            errors.append((light @ columns) / light.sum(1) - places)
+        # Of a step, the second wave has a quarter of the first one's power.
+        assert 0.95 <= np.var(errors) / unseen_px(steep_px / 0.9) ** 2 <= 1.5
+    assert unseen_px(2.0) == unseen_px(math.nan) == 0.0
+
+
+@pytest.mark.parametrize(("step_px", "least", "most"), [(0.0, 1.0, 1.0), (0.2, 0.9, 1.0), (5.0, 0.7, 0.85)])
+def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: float, most: float) -> None:
+    points = BAR_PX + T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
+    seen = [replace(frame, points_flank_px=0.6) for frame in frames(points, 0.1)]
+    found = points_at(seen, 0.0, 36_000.0, 16, SPEC)
+    assert found is not None
+    assert least - 1e-9 <= found.shift_px / unseen_px(0.6) <= most + 1e-9
+    unknown = points_at(frames(points, 0.1), 0.0, 36_000.0, 16, SPEC)
+    assert unknown is not None
+    assert unknown.shift_px == 0.0
+
+
+def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> None:
+    """A quartic of the image's motion, of which frames show a cubic: off by a share of its coefficient."""
+    for t_us in (T_US, np.where(T_US > 0, T_US + 2600.0, T_US)):
+        quartic = 1e-16 * t_us**4
+        points = BAR_PX + quartic[:, None, None] * np.array([1.0, 0.0])
+        seen = [
+            replace(frame, points_t_us=t, points_px=at)
+            for frame, t, at in zip(frames(points, 0.1), t_us.tolist(), points, strict=True)
+        ]
+        found = points_at(seen, 0.0, 40_000.0, 16, SPEC)
+        assert found is not None
+        midway = 1e-16 * 0.5625 * 3600.0**4
+        off = abs(found.points_px[:, 0].mean() - 300.0)
+        assert found.between == pytest.approx(off / midway, rel=1e-6)

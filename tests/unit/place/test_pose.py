@@ -220,6 +220,26 @@ def test_an_error_that_all_bars_share_is_that_of_an_exact_attitude(
     assert low / 200 < np.mean(square) < high / 200
 
 
+@pytest.mark.parametrize("heading", [None, 0.0])
+@pytest.mark.parametrize("between", [(0.3, 5.3), (5.3, 5.3), (0.0, 1.0)])
+def test_bars_whose_frames_leave_gaps_at_other_times_err_apart(
+    between: tuple[float, float], heading: float | None
+) -> None:
+    """The image moves as one, and each bar's place is interpolated by its own frames."""
+    rng, spec = np.random.default_rng(6), dataclasses.replace(POINT_ONLY, shaken_sigma_px=0.1)
+    bars, rotation, square = [bar(p) for p in POLES], UP.rotation(), []
+    for _ in range(200):
+        shaken = rng.normal(0, 0.1, 2)
+        seen = [
+            dataclasses.replace(view, points_px=view.points_px + shaken * gap, between=gap)
+            for view, gap in zip(views(bars, np.zeros(3), rotation, rng, 0.05), between, strict=True)
+        ]
+        pose = solved(solve_pose(seen, CAMERA, Attitude(5.0, 0.0, heading, 0.0, 0.0), spec))
+        square.append(pose.enu_m @ np.linalg.solve(pose.covariance[:3, :3], pose.enu_m))
+    # What bars have for their own counts as independent of what they share, though it is the same motion.
+    assert 2.2 < np.mean(square) < 3.6
+
+
 def test_noise_and_what_was_said_make_up_the_covariance() -> None:
     seen = views([bar(POLES[0])], np.zeros(3), UP.rotation())
     told = Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
@@ -652,3 +672,19 @@ def test_never_a_silent_wrong_position(seed: int, count: int, told: str) -> None
         assert error @ np.linalg.solve(found.covariance[:3, :3], error) < stats.chi2.isf(1e-7, 3)
     else:
         assert found.kind in REFUSALS
+
+
+def test_a_pitch_of_the_wrong_sign_is_not_a_bar_at_fault() -> None:
+    """Either bar alone agrees with it: one that leans away looks much as an upright one."""
+    suspects = []
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        pitch = rng.uniform(2, 4)
+        places = [(side, rng.uniform(48, 60), rng.uniform(2, 4)) for side in (-3.0, 3.0)]
+        bars = [bar(place, (rng.normal(0, 0.01), rng.normal(0, 0.01), 1)) for place in places]
+        seen = views(bars, np.zeros(3), Attitude(pitch, 0.0, 0.0).rotation(), rng, 0.07)
+        found = solve_pose(seen, CAMERA, Attitude(-pitch, 0.0, 0.0, 0.1, 0.1))
+        assert isinstance(found, Refusal)
+        assert found.kind == "misfit"
+        suspects.append(found.suspects)
+    assert sum("attitude" in some for some in suspects) >= 15

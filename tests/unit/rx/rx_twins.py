@@ -368,3 +368,33 @@ def spread_across(sums, codes, every, places, seen, way, along, most):
             answers = (sums[1::every] * edges[:, None, None] > 0) & here
             out[:, column + most] += [answers.sum(), here.sum() * np.abs(edges).sum()]
     return out
+
+
+def middle_across(heard, edges, every, x, y, unit, along, across, profile):
+    """`_kernels.middle_across`, over the whole image."""
+    planes = heard[1 + every * np.arange(len(edges))]
+    light = np.tensordot(edges, planes.astype(np.int64), 1)
+    rows, columns = np.mgrid[: light.shape[0], : light.shape[1]]
+    away = (columns - x + 1j * (rows - y)) * unit.conjugate()
+    near = abs(away.real) <= along
+
+    def window(off):
+        return near * np.clip(across + 0.5 - abs(away.imag - off), 0, 1) * light
+
+    off = 0.0
+    for _ in range(4):
+        held = window(off)
+        if held.sum() <= 0:
+            return 0.0
+        off += np.clip((held * (away.imag - off)).sum() / held.sum(), -1, 1)
+    held = window(off)
+    summed = held.sum(0) if abs(unit.imag) >= abs(unit.real) else held.sum(1)
+    profile[: len(summed)] += summed
+    return off
+
+
+def flank_px(profile):
+    """`_kernels.flank_px`."""
+    top = 0.7 * np.sort(profile.clip(0))[-2:].mean()
+    share = np.minimum(profile / top, 1)
+    return max(3 * (share * (1 - share)).sum(), 0.0)

@@ -671,3 +671,36 @@ def test_rows_that_are_not_dark_and_bounds_of_places():
     image[2, 4] = image[5, 0] = 0.5
     assert _kernels.rows_of(image) == (2, 6)
     assert _kernels.bounds_of(np.array([3 + 9j, -1 + 4j, 2 - 5j])) == (-1, 3, -5, 9)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("turn", [1j, 1.0, np.exp(1.2j), np.exp(0.5j)])
+def test_middle_across(seed, turn) -> None:
+    rng = np.random.default_rng(seed)
+    edges = rng.choice([-1, 0, 1], 4)
+    edges[0] = 1
+    rows, columns = np.mgrid[:HEIGHT, :WIDTH]
+    away = (columns - 11.3 + 1j * (rows - 7.8)) * np.conj(turn)
+    light = 200 * np.exp(-((away.imag / 2) ** 2) / 2)
+    heard = np.zeros((9, HEIGHT, WIDTH), np.int16)
+    heard[1::2] = edges[:, None, None] * light + rng.integers(-3, 4, (4, HEIGHT, WIDTH))
+    given = heard, edges, 2, 11.0, 7.5, complex(turn), 5.0, 4.0
+    found, expected = np.zeros(WIDTH), np.zeros(WIDTH)
+    off = _kernels.middle_across(*given, found)
+    assert off == pytest.approx(twins.middle_across(*given, expected), abs=1e-9)
+    # The line goes through (11.3, 7.8).
+    assert off == pytest.approx((complex(0.3, 0.3) * np.conj(turn)).imag, abs=0.15)
+    assert_allclose(found, expected, atol=1e-6)
+    assert _kernels.flank_px(found) == pytest.approx(twins.flank_px(expected), rel=1e-9)
+
+
+def test_flanks_are_as_wide_as_they_are() -> None:
+    """In the mean over places within pixels; above seven tenths of the most they are not counted."""
+    columns, widths = np.arange(20), (1.0, 2.0, 3.5)
+    for width in widths:
+        found = [
+            _kernels.flank_px(np.clip((5 - abs(columns - 9 - place)) / width + 0.5, 0, 1))
+            for place in np.linspace(0, 1, 200, endpoint=False)
+        ]
+        assert np.mean(found) == pytest.approx(0.7 * width, rel=1e-3)
+    assert math.isnan(_kernels.flank_px(np.zeros(5)))
