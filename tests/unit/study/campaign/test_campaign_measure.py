@@ -203,9 +203,9 @@ def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
         return
     assert total.fixes >= 2
     assert total.fixes_refused == 0
-    # Exact points: what is left is a path straight between its milliseconds.
+    # Exact points: what is left is a path straight between its milliseconds, beside a sigma as small.
     assert total.position_rmse_m < 2e-3
-    assert total.position_nees < 1
+    assert total.position_nees < 3
     # A truth 1e-6 degrees further north is 0.111 m off.
     path = truth.camera_path
     moved = replace(truth, camera_path={**path, "latitude_deg": path["latitude_deg"] + 1e-6})
