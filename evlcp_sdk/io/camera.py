@@ -33,6 +33,10 @@ _MOST_PER_PERIOD: Final = (1 << 22) - 1
 _RING_PACKETS: Final = 1024
 """USB packets that the driver holds at the most, of 128 KB each: a second of the most that a camera sends."""
 
+_SETTLE_S: Final = 1.0
+"""How long a camera that is gone is kept before it is closed: the driver frees transfers that libusb's own
+thread is still giving up, and aborts on it. That takes milliseconds, unless other work has the processor."""
+
 _HEALTH_EVERY_S: Final = 5.0
 
 _MOST_FAULTS: Final = 8
@@ -218,7 +222,10 @@ class _CameraBytes:
 
     def close(self) -> None:
         """Let the camera go; a read in another thread ends soon."""
+        gone = bool(self._faults) and not self._closed
         self._closed = True
+        if gone:
+            time.sleep(_SETTLE_S)
         with self._lock, contextlib.suppress(RuntimeError):
             self._device.close()
 
