@@ -112,12 +112,18 @@ class Events:
         return cls.of([], [], [], [])
 
     @classmethod
-    def concat(cls, parts: Iterable["Events"]) -> Self:
+    def concat(cls, parts: Iterable["Events"]) -> "Events":
         """All events of `parts`, in order."""
         ps = list(parts)
         if not ps:
             return cls.empty()
-        return cls(*(np.concatenate([getattr(q, c) for q in ps]) for c in ("t_us", "x", "y", "p")))
+        # Columns of one type and length stay so.
+        return Events.as_is(
+            np.concatenate([q.t_us for q in ps]),
+            np.concatenate([q.x for q in ps]),
+            np.concatenate([q.y for q in ps]),
+            np.concatenate([q.p for q in ps]),
+        )
 
     def to_pandas(self) -> "pandas.DataFrame":
         """The events as a table of pandas, with the columns t_us, x, y, p; copied.

@@ -166,7 +166,7 @@ class Looker:
         told = slice(1, packet.pilot_chips, self._every)
         rest_x, rest_y = (sum(rest) / len(rest) for rest in pilot.offset_px[:, told].tolist())
         if due.has_pilot:
-            centre_x, centre_y = float(x[told].mean()), float(y[told].mean())
+            centre_x, centre_y = (float(np.add.reduce(place)) / len(place) for place in (x[told], y[told]))
         else:
             centre_x, centre_y = float(x[middle]), float(y[middle])
         corner_px = (centre_x - (size[0] - 1) / 2 - rest_x, centre_y - (size[1] - 1) / 2 - rest_y)

@@ -187,5 +187,7 @@ class Timeline:
             before = np.concatenate([[start_us // step_us], step[:-1]])
             return [int(i) for i in np.flatnonzero(step > before)]
         # Steps before the first event of these are not looked at, however many there are.
-        starts_us = np.arange(first_us + step_us * (first_us == start_us), int(t_us[-1]) + 1, step_us)
-        return sorted(set(np.searchsorted(t_us, starts_us).tolist()))
+        next_us, last_us = first_us + step_us * (first_us == start_us), int(t_us[-1])
+        if next_us > last_us:
+            return []
+        return sorted(set(t_us.searchsorted(np.arange(next_us, last_us + 1, step_us)).tolist()))

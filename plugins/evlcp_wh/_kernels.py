@@ -202,21 +202,30 @@ def weighted_values(sums: Array, probability: Array, grid: int, least: float, ou
     """Presence-weighted sum of the values of the info chips, `out` (K, values)."""
     clusters, rows, columns = probability.shape
     length = out.shape[1]
+    _, height, width = sums.shape
+    # Of all pixels at once, as they lie in memory; and so what is most of a cell.
+    flat = np.ascontiguousarray(sums[: 2 * length]).reshape(2 * length, height * width)
+    by_pixel = np.empty((length, height * width), np.int8)
+    for i in range(length):
+        _values(flat[2 * i], flat[2 * i + 1], by_pixel[i])
+    by_cell = np.ascontiguousarray(probability).reshape(clusters, rows * columns)
+    top = np.zeros(rows * columns, probability.dtype)
+    for k in range(clusters):
+        _raise_to(top, by_cell[k])
     values = np.empty(length, np.int64)
     for r in range(rows):
         for c in range(columns):
-            top = 0.0
-            for k in range(clusters):
-                top = max(top, probability[k, r, c])
-            if top < least:
+            cell = r * columns + c
+            if top[cell] < least:
                 continue
             values[:] = 0
-            for v in range(r * grid, (r + 1) * grid):
-                for u in range(c * grid, (c + 1) * grid):
-                    for i in range(length):
-                        values[i] += _value(sums[2 * i, v, u], sums[2 * i + 1, v, u])
+            for i in range(length):
+                value = by_pixel[i]
+                for v in range(r * grid, (r + 1) * grid):
+                    for u in range(c * grid, (c + 1) * grid):
+                        values[i] += value[v * width + u]
             for k in range(clusters):
-                weight = probability[k, r, c]
+                weight = by_cell[k, cell]
                 if weight >= least:
                     for i in range(length):
                         out[k, i] += weight * values[i]
