@@ -107,6 +107,11 @@ class Positioner:
         return self._bars.ids
 
     @property
+    def unseen(self) -> tuple[BarSite, ...]:
+        """The sites that no transmitter was received of."""
+        return self._bars.unseen
+
+    @property
     def contradicted(self) -> dict[int, str]:
         """Transmitters that are left out as their beacons contradict their sites, and how."""
         return self._bars.contradicted

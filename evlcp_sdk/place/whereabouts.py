@@ -76,6 +76,12 @@ class Whereabouts:
         return {n: s.transmitter_id for n, s in said if s.transmitter_id is not None and s.trust != "forged"}
 
     @property
+    def unseen(self) -> tuple[BarSite, ...]:
+        """The sites that no transmitter was received of."""
+        seen = [self._listed(number) for number in self._said]
+        return tuple(site for site in self._sites if all(site is not one for one in seen))
+
+    @property
     def contradicted(self) -> dict[int, str]:
         """Transmitters that are left out as their beacons contradict their sites, and how."""
         found = {number: self.contradiction(number) for number in sorted(self._said)}

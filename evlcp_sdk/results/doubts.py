@@ -28,6 +28,9 @@ __all__ = [
     "warnings_of_links",
 ]
 
+_MOST_IDS = 5
+"""Ids that a doubt names; how many there are besides, it counts."""
+
 _TOLD_SIGMAS = 3.0
 """Sigmas beyond which what a drive tells is hinted at."""
 
@@ -472,8 +475,25 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
             f" received: {ids}",
             "compare transmitter_id in site.toml",
         )
+    placed = {*positions["bars"], *positions["sites_contradicted"]}
+    strange = sorted({one for n, one in positions["heard"].items() if n not in placed})
+    unseen = positions["sites_unseen"]
+    if positions["fixes"] and strange and unseen:
+        # Either alone is no fault: a bar that is not on the list, a bar of the list that is elsewhere.
+        yield Doubt(
+            "unknown-id",
+            f"positions are without id{_s(len(strange))} {_some(strange)}, received and in no site;"
+            f" id{_s(len(unseen))} {_some(unseen)} of the sites {'were' if len(unseen) > 1 else 'was'} not",
+            "compare transmitter_id in site.toml",
+        )
     if number := positions["refused"].get("misfit", 0):
         yield _misfit(number, positions.get("suspects", {}), lens)
+
+
+def _some(ids: Sequence[int]) -> str:
+    """Ids, the first ones by name."""
+    more = f" and {len(ids) - _MOST_IDS} more" if len(ids) > _MOST_IDS else ""
+    return ", ".join(map(str, ids[:_MOST_IDS])) + more
 
 
 def _misfit(number: int, suspects: Mapping[str, int], lens: str) -> Doubt:

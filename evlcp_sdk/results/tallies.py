@@ -330,6 +330,7 @@ class PositionTally:
             "origin": asdict(axes) if axes is not None else None,
             "bars_exact": [n for n, s in positioner.stands_at.items() if s.position_sigma_m is None],
             "heard": {str(n): one for n, one in sorted(positioner.ids.items())},
+            "sites_unseen": [site.transmitter_id for site in positioner.unseen],
             "bars": {str(n): s.transmitter_id for n, s in positioner.stands_at.items()},
         }
 

@@ -28,6 +28,10 @@ NO_POSITIONS = {
     "excluded": {},
     "alarms": {},
     "learnt": [],
+    "heard": {},
+    "bars": {},
+    "sites_contradicted": {},
+    "sites_unseen": [],
 }
 NONE = Range(float("nan"), float("nan"), 0)
 NEAR = Range(50.0, 0.1, 15)
@@ -274,6 +278,25 @@ def test_bars_at_no_known_place_are_named_by_their_ids() -> None:
         assert all(
             one.code != "no-site" for one in warnings_of(RunTally(LINK.packet), {}, LINK, positions=known)
         )
+
+
+@pytest.mark.parametrize(
+    ("heard", "unseen", "says"),
+    [
+        ({"0": 7, "1": 107}, [8], "without id 107, received and in no site; id 8 of the sites was not"),
+        ({"0": 7, "1": 9, "2": 4}, [1, 2], "without ids 4, 9, received and in no site; ids 1, 2 of the"),
+        ({"0": 7, "1": 9}, list(range(20, 40)), "ids 20, 21, 22, 23, 24 and 15 more of the sites were not"),
+        ({"0": 7, "1": 107}, [], None),
+        ({"0": 7}, [8], None),
+    ],
+)
+def test_a_bar_that_is_not_used_for_a_mistyped_id(
+    heard: dict[str, int], unseen: list[int], says: str | None
+) -> None:
+    positions = dict(NO_POSITIONS, fixes=9, heard=heard, bars={"0": 7}, sites_unseen=unseen)
+    doubts = warnings_of(RunTally(LINK.packet), {}, LINK, positions=positions)
+    found = [str(one) for one in doubts if one.code == "unknown-id"]
+    assert [says in one for one in found] == [True] if says else not found
 
 
 @pytest.mark.parametrize(("quality", "said"), [(0.75, False), (0.3, True)])

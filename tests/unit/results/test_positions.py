@@ -618,4 +618,5 @@ def test_beacons_that_are_not_believed_give_no_positions(tmp_path: Path) -> None
     stranger = dataclasses.replace(SITE, transmitter=3)
     told = write(tmp_path, packets(5), PositionPlan((stranger,)))
     assert told["refused"] == {"no-site": 4}
+    assert told["sites_unseen"] == [SITE.transmitter_id]
     assert not list(tmp_path.glob(f"{STAGE_PREFIX}*"))
