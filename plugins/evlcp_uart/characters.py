@@ -89,6 +89,13 @@ class Characters:
         found: NDArray[np.float64] = words - any_bits
         return found
 
+    def said(self, evidence: NDArray[np.float64]) -> float:
+        """How much of what the data bits of characters could say is said of them, 0 to 1."""
+        likelihoods = self.likelihoods(evidence)
+        logs = likelihoods - np.logaddexp.reduce(likelihoods, 1)[:, None]
+        unknown = -(np.exp(logs) * logs).sum() / np.log(2)
+        return float(1 - unknown / (self.data_bits * len(evidence)))
+
     def soft(
         self, likelihoods: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
