@@ -822,6 +822,7 @@ def _views(
                         found.pixel_px,
                         found.shift_px,
                         found.between,
+                        found.early_px,
                     )
                 )
         views.append(_view(pose, bars, axes))
@@ -956,6 +957,7 @@ def survey(
                         pixel_px=found.pixel_px,
                         shift_px=found.shift_px,
                         between=found.between,
+                        early_px=found.early_px,
                     )
                 )
             views.append(_view(pose, bars, axes))

@@ -109,31 +109,38 @@ class PositionSpec:
             ge=0,
             description="How far the image moves unseen midway between two frames, for all bars alike.",
         ),
-    ] = 0.055
+    ] = 0.04
     shared_sigma_px: Annotated[
         float,
         Field(
             ge=0,
             description="Error that a bar's points share across it, besides what its image does not show.",
         ),
-    ] = 0.01
+    ] = 0.005
     shared_along_px: Annotated[
         float, Field(ge=0, description="The same along it, where its ends are half a cluster's light.")
-    ] = 0.04
+    ] = 0.045
     shared_share: Annotated[
         float,
         Field(ge=0, le=0.1, description="What of that grows with the bar: a share of its length."),
-    ] = 0.0001
+    ] = 0.00015
+    early_sigma_us: Annotated[
+        float,
+        Field(
+            ge=0,
+            description="How early, or late, a moving bar is seen where it is: all of it, and each point.",
+        ),
+    ] = 13.0
     stretch_share: Annotated[
         float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
-    ] = 0.0003
+    ] = 0.00025
     pixel_sigma_px: Annotated[
         float,
         Field(
             ge=0,
             description="Error of a point that no averaging over frames removes: where in a pixel it is.",
         ),
-    ] = 0.14
+    ] = 0.04
     min_view_deg: Annotated[
         float,
         Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),

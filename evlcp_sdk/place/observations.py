@@ -47,6 +47,7 @@ class BarView:
         shift_px: What all points share across the bar besides `position.shared_sigma_px`, px.
         between: How far the image may have moved otherwise than its frames show, in `position.
             shaken_sigma_px`.
+        early_px: What all points share in any direction besides, as a moving image is seen early or late, px.
     """
 
     transmitter: int
@@ -57,6 +58,7 @@ class BarView:
     pixel_px: float | None = None
     shift_px: float = 0.0
     between: float = 1.0
+    early_px: float = 0.0
 
 
 def project_bars(
@@ -298,7 +300,7 @@ def _usual(spec: PositionSpec, view: BarView, between: float) -> Floats:
     The image moves as one: of what is not known of it, a bar has for its own what it has more or less than
     others. These count as independent, so that two bars differ by as much as they do.
     """
-    moved = math.sqrt(2) * spec.shaken_sigma_px * abs(view.between - between)
+    moved = math.hypot(math.sqrt(2) * spec.shaken_sigma_px * abs(view.between - between), view.early_px)
     across = math.hypot(spec.shared_sigma_px, view.shift_px, moved)
     shift = across, math.hypot(spec.shared_along_px, moved), spec.shared_share
     return np.array([*shift, spec.stretch_share], np.float64)

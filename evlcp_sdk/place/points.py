@@ -35,10 +35,11 @@ class SeenPoints(NamedTuple):
     Attributes:
         points_px: Column and row of each cluster, px, float64 (K, 2); NaN where it is not seen.
         sigma_px: Their standard deviations, px, float64 (K,).
-        pixel_px: The part of these that is within pixels, px.
+        pixel_px: The part of these that stands: where in a pixel a point is, and in a moving image, when.
         shift_px: What all share across the bar besides, px: where in a pixel its thin image is.
         between: What is not known of how the image moved between frames, in that of an instant midway between
             two of frames that follow one another evenly.
+        early_px: What all share in any direction besides, px: as the image moves, it is seen early or late.
     """
 
     points_px: Floats
@@ -46,6 +47,7 @@ class SeenPoints(NamedTuple):
     pixel_px: float
     shift_px: float = 0.0
     between: float = 1.0
+    early_px: float = 0.0
 
 
 def unseen_px(flank_px: float) -> float:
@@ -83,14 +85,15 @@ def points_at(
     between the frames next to the time. Sigmas are those that the frames state, or, where the bar's length,
     lean and bend scatter more from frame to frame, as they do where the readout is late, what these show;
     with the error within pixels, as far as the image has not moved over others. What a thin bar's frames do
-    not show of where in a pixel it is, is apart, as all points share it.
+    not show of where in a pixel it is, is apart, as all points share it; so is by how much a moving image is
+    seen early or late.
 
     Args:
         frames: With points, in order of time.
         t_us: Camera clock, us.
         period_us: Frames within half of it, before and after, count, us.
         clusters: Clusters of a bar.
-        spec: Least number of points, and the error within pixels.
+        spec: Least number of points, the error within pixels, and that in time.
 
     Returns:
         The points; None where the bar is not seen before and after.
@@ -122,7 +125,9 @@ def points_at(
     sigmas = np.array([f.points_sigma_px for f in near])
     sure = common & np.isfinite(sigmas).all(0)
     wider = _scatter(dt, shapes[:, sure], sigmas[:, sure])
-    pixel_px = spec.pixel_sigma_px * _left(_line(dt)[0], places)
+    line = _line(dt)
+    early_px = spec.early_sigma_us * float(np.linalg.norm(line[1] @ places))
+    pixel_px = math.hypot(spec.pixel_sigma_px * _left(line[0], places), early_px)
     found, sigma = np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
     for k in range(clusters):
         seen = np.isfinite(shapes[:, k, 0])
@@ -132,7 +137,7 @@ def points_at(
         found[k] = place + (inverse @ shapes[seen, k])[0]
         drawn = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
         sigma[k] = math.hypot(wider * drawn, pixel_px)
-    return SeenPoints(found, sigma, pixel_px, shift_px, between)
+    return SeenPoints(found, sigma, pixel_px, shift_px, between, early_px)
 
 
 def _line(t: Floats) -> Floats:

@@ -222,6 +222,7 @@ class Positioner:
                     points.pixel_px,
                     points.shift_px,
                     points.between,
+                    points.early_px,
                 )
             )
         if not views:

@@ -7,6 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.air.codebook import edges_of_chips
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
@@ -129,9 +130,8 @@ class PacketFraming:
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
         self._unknown.setflags(write=False)
         self._rows = RowDelays(link.codebook.preamble)
-        self._find_points = points_finder(
-            layout_of(centres_m), link.codebook.pilot_edges.astype(np.int64), link.codebook.edge_every
-        )
+        edges = edges_of_chips(link.codebook.pilots).astype(np.int64)
+        self._find_points = points_finder(layout_of(centres_m), edges, link.codebook.edge_every)
         self._echoes = judged.echoes
         self._judged = judged
         self._joined: set[int] = set()

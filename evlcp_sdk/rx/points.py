@@ -25,9 +25,9 @@ FindPoints = Callable[
 (K, 2) in the image and sigmas (K,), px, NaN where unseen; over how many pixels a line's image fades out
 across it, NaN of no line."""
 
-_SIGMA_PX = 0.12
-"""Error expected before any is seen: a boundary inside a pixel, found from a few columns of correlations of
-eight values each, of which a fifth of the negative events is missing."""
+_SIGMA_PX = 0.08
+"""Error expected before any is seen: a boundary inside a pixel, found from the events of a few columns in
+sixteen edges, of which a fifth of the negative ones is missing."""
 
 _EXPECTED_WORTH = 8.0
 """Residuals that this expectation is worth; the 28 of a whole bar outweigh it."""
@@ -45,13 +45,13 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
     """Precompute for a layout; the function that is returned is pure.
 
     A cluster's centre along the layout lies midway between its boundaries with its neighbours, where the
-    shares of both in a row of pixels balance; across it, it is the mean of its pixels, across a line that of
-    their events in a window that reaches equally far to both sides. An outer edge, which light without a
-    neighbour moves outward by a third of a pixel, is not used: beyond the last boundary the spacing of the
-    others counts. Pixels out of place do not, as a window about the cluster's place leaves them out.
+    shares of both in the light of a row of pixels balance; across it, it is the mean of its pixels, across a
+    line that of their events in a window that reaches equally far to both sides. An outer edge, which light
+    without a neighbour moves outward by a third of a pixel, is not used: beyond the last boundary the spacing
+    of the others counts. Pixels out of place do not, as a window about the cluster's place leaves them out.
 
-    `edges` are those of the clusters' pilots, int64 (K, n), `every` the chips from one to the next; the first
-    is that into chip 1.
+    `edges` are those of the clusters' pilots, from each chip to the next, int64 (K, n); `every` is the number
+    of chips from one of those that tell clusters apart to the next, the first of which is that into chip 1.
 
     Sigma is the scatter of the points about their best similarity with the layout, pooled with what is
     expected, and larger at the ends.

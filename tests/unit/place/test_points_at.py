@@ -119,6 +119,14 @@ def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: fl
     assert unknown.shift_px == 0.0
 
 
+def test_a_moving_image_is_seen_early_or_late_by_its_speed() -> None:
+    for px_per_ms in (0.0, 2.0, 6.0):
+        points = BAR_PX + T_US[:, None, None] / 1000.0 * np.array([0.6, -0.8]) * px_per_ms
+        found = points_at(frames(points, 0.1), 0.0, 36_000.0, 16, replace(SPEC, early_sigma_us=15.0))
+        assert found is not None
+        assert found.early_px == pytest.approx(0.015 * px_per_ms, abs=1e-12)
+
+
 def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> None:
     """A quartic of the image's motion, of which frames show a cubic: off by a share of its coefficient."""
     for t_us in (T_US, np.where(T_US > 0, T_US + 2600.0, T_US)):

@@ -370,10 +370,39 @@ def spread_across(sums, codes, every, places, seen, way, along, most):
     return out
 
 
-def middle_across(heard, edges, every, x, y, unit, along, across, profile):
+def light_along(heard, code, every, at, unit, spacing, reach):
+    """`_kernels.light_along`, over the whole image; None where it has none."""
+    light = np.tensordot(code[::every], heard[1 : 1 + len(code) : every].astype(np.int64), 1)
+    if abs(unit.imag) < abs(unit.real):
+        light, at, unit = light.T, complex(at.imag, at.real), complex(unit.imag, unit.real)
+    line, pixel = np.mgrid[: light.shape[0], : light.shape[1]]
+    beside = pixel - at.real - unit.real / unit.imag * (line - at.imag)
+    sums = (light * np.clip(reach + 0.5 - abs(beside), 0, 1)).sum(1).clip(0)
+    half, away = spacing * abs(unit.imag) / 2, abs(line[:, 0] - at.imag)
+    sums *= np.clip(half + 2.5 - away, 0, 1)
+    middle = sums[away <= max(0.6 * half, 0.5)].mean()
+    return (sums / middle) ** 1.5 if middle > 0 else None
+
+
+def boundary_between(mine, its, start, end):
+    """`_kernels.boundary_between`."""
+    if abs(end - start) < 1:
+        return np.nan
+    sign = int(np.sign(end - start))
+    lines = np.arange(round(start), round(end) + sign, sign)
+    inside = (lines >= 0) & (lines < len(mine))
+    one, other = (np.where(inside, of[lines.clip(0, len(of) - 1)], 0) for of in (mine, its))
+    lit = one + other > 0
+    if 2 * (~lit).sum() > len(lines):
+        return np.nan
+    shares = np.divide(one, one + other, out=np.full(len(lines), 0.5), where=lit)
+    return (round(start) + sign * (shares.sum() - 0.5) - start) / (end - start)
+
+
+def middle_across(heard, edges, x, y, unit, along, across, profile):
     """`_kernels.middle_across`, over the whole image."""
-    planes = heard[1 + every * np.arange(len(edges))]
-    light = np.tensordot(edges, planes.astype(np.int64), 1)
+    weight = edges / np.where(edges > 0, max((edges > 0).sum(), 1), max((edges < 0).sum(), 1))
+    light = np.tensordot(weight, heard[1 : 1 + len(edges)].astype(np.int64), 1)
     rows, columns = np.mgrid[: light.shape[0], : light.shape[1]]
     away = (columns - x + 1j * (rows - y)) * unit.conjugate()
     near = abs(away.real) <= along

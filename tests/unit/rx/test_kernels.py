@@ -481,12 +481,38 @@ def test_answers_between_and_across_clusters(seed, turn, every):
         assert_array_equal(both[1], across if way else 0)
 
 
-@pytest.mark.parametrize("apart", [0j, 0.5 + 0.5j, -0.9j])
+@pytest.mark.parametrize("apart", [0.0, 0.5, -0.9])
 def test_centres_in_one_pixel_have_no_boundary(apart):
     """A reflection beside a bar may bring the centres of two neighbours together."""
-    pixels = np.ones((2, 9, 9), np.float32)
-    assert np.isnan(_kernels._boundary.py_func(pixels, 0, 1, 4 + 4j, 4 + 4j + apart, 3.0))
-    assert _kernels._boundary.py_func(pixels, 0, 1, 4 + 3j, 4 + 5j, 3.0) == pytest.approx(0.5)
+    mine = np.ones(9)
+    assert np.isnan(_kernels.boundary_between(mine, mine, 4.0, 4.0 + apart))
+    assert _kernels.boundary_between(mine, mine, 3.0, 5.0) == pytest.approx(0.5)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_boundaries_are_where_lines_balance(seed) -> None:
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        mine, its = rng.random((2, 12)) * (rng.random((2, 12)) > 0.4)
+        start, end = rng.uniform(-2, 13, 2)
+        found, expected = (of.boundary_between(mine, its, start, end) for of in (_kernels, twins))
+        assert found == pytest.approx(expected, nan_ok=True)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("turn", [1j, -1j, 1.0, np.exp(1.2j), -np.exp(0.5j)])
+def test_light_along_a_way(seed, turn) -> None:
+    rng = np.random.default_rng(seed)
+    code = rng.choice([-1, 0, 1], 7)
+    code[0] = 1
+    heard = rng.integers(-4, 8, (8, HEIGHT, WIDTH)).astype(np.int16)
+    heard[1:] *= code[:, None, None].astype(np.int16)
+    given = heard, code, 2, complex(11.2, 7.6), complex(turn), 6.3, 3.7
+    found = np.full(HEIGHT if abs(np.imag(turn)) >= abs(np.real(turn)) else WIDTH, np.nan)
+    assert _kernels.light_along(*given, found)
+    assert_allclose(found, twins.light_along(*given), atol=1e-9)
+    dark = np.broadcast_to(-code[:, None, None], (7, HEIGHT, WIDTH)).astype(np.int16)
+    assert not _kernels.light_along(np.concatenate([heard[:1], dark]), *given[1:], found)
 
 
 @pytest.mark.parametrize("grid", [1, 2])
@@ -682,9 +708,9 @@ def test_middle_across(seed, turn) -> None:
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
     away = (columns - 11.3 + 1j * (rows - 7.8)) * np.conj(turn)
     light = 200 * np.exp(-((away.imag / 2) ** 2) / 2)
-    heard = np.zeros((9, HEIGHT, WIDTH), np.int16)
-    heard[1::2] = edges[:, None, None] * light + rng.integers(-3, 4, (4, HEIGHT, WIDTH))
-    given = heard, edges, 2, 11.0, 7.5, complex(turn), 5.0, 4.0
+    heard = np.zeros((5, HEIGHT, WIDTH), np.int16)
+    heard[1:] = edges[:, None, None] * light + rng.integers(-3, 4, (4, HEIGHT, WIDTH))
+    given = heard, edges, 11.0, 7.5, complex(turn), 5.0, 4.0
     found, expected = np.zeros(WIDTH), np.zeros(WIDTH)
     off = _kernels.middle_across(*given, found)
     assert off == pytest.approx(twins.middle_across(*given, expected), abs=1e-9)

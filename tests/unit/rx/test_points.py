@@ -175,6 +175,25 @@ def test_a_track_that_trembles_does_not_move_the_points_along_a_bar() -> None:
     assert (np.array(off).std(0) < (0.1, 0.05)).all()
 
 
+def test_points_of_a_turning_camera_lie_where_they_are() -> None:
+    """At 45 degrees a second the image moves by half a pixel in a chip: codes of one sign were off by 2."""
+    sets = ["duration_s=0.1", 'motion.path_file="turning.csv"', "motion.vib_rate_rad_s=0.02"]
+    simulation = Simulation(load_scene("examples/scenes/one-bar.toml", sets), 5)
+    receiver = Receiver(load_link())
+    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
+    cuts = simulation.bars[0].strips[0].strip.cuts_m()
+    found = [f for p in packets for f in p.frames if np.isfinite(f.points_px).all()]
+    assert len(found) > 12
+    at = simulation.path.at([f.points_t_us - simulation.scene.t0_us for f in found])
+    want = project((cuts[1:] + cuts[:-1]) / 2, *at, simulation.scene.camera)[0]
+    off = np.array([f.points_px for f in found]) - want
+    # All are early alike, by a share of a chip.
+    assert np.abs(off.mean((0, 1))).max() < 0.3
+    shape = off - off.mean(1, keepdims=True)
+    assert np.abs(shape.mean(0)).max() < 0.25
+    assert shape.std() < 0.2
+
+
 @pytest.fixture(scope="module")
 def frames() -> list[Frame]:
     link = load_link()
