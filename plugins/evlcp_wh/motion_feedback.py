@@ -41,7 +41,7 @@ class MotionFeedback(Decoding):
     and each info value of a cluster is the one that fits better; in the second all are known from the
     decision. The likeliest smooth path over all values (Viterbi) is taken back from the sums, the clusters
     are separated again by their pilots, and their info segments decoded. A frame whose path stays at 0 is
-    decoded as by `ml-soft`.
+    decoded as by `ml-soft`; one whose path comes to the border of what is searched is searched farther.
 
     A path that started from decisions alone would confirm a wrong one: a bar off by the spacing of its
     clusters says its neighbours' symbols without a fault.
@@ -50,6 +50,12 @@ class MotionFeedback(Decoding):
     reach_px: Annotated[
         int, Field(ge=1, le=8, description="Farthest that the bar may be off its place in a frame.")
     ] = 4
+    far_px: Annotated[
+        int,
+        Field(
+            ge=1, le=16, description="Farthest where the path comes within a pixel of that; less is never."
+        ),
+    ] = 8
     step_px: Annotated[
         float,
         Field(gt=0, description="Likely change of place (sigma) from value to value: 1.5 px/ms for 0.2 ms."),
@@ -82,11 +88,17 @@ class MotionFeedback(Decoding):
             soft, least = self._decided(presence, sums, pilots, words, worth)
             if least >= self.sure_llr:
                 return soft
-            matches = self._matches(presence, sums, worth)
+            reach, first = self.reach_px, (presence, sums, worth)
+            matches = self._matches(*first, reach)
             known, aligned = pilots, sums
             done = np.zeros((len(sums) // 2, 2), np.int64)
             for _ in range(self.rounds):
                 path = self._path(matches, known)
+                # The best path may go on beyond the border, and the best within it be another one's.
+                if reach < self.far_px and np.abs(path).max() >= reach - 1:
+                    reach = self.far_px
+                    matches = self._matches(*first, reach)
+                    path = self._path(matches, known)
                 if (path == done).all():
                     break
                 aligned, done = _taken_back(sums, path), path
@@ -110,14 +122,14 @@ class MotionFeedback(Decoding):
         return soft_symbols(presence, sums, pilots, words, worth, *weights)
 
     def _matches(
-        self, presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64]
+        self, presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64], reach_px: int
     ) -> NDArray[np.float32]:
         """Log-likelihood ratio of each value of each cluster, by the shift of the bar from its place.
 
         float32 (K, n, n, values), from `reach_px` up and left to as much down and right.
         """
         _, height, width = sums.shape
-        values, seam, side = len(sums) // 2, self.reach_px, 2 * self.reach_px + 1
+        values, seam, side = len(sums) // 2, reach_px, 2 * reach_px + 1
         images = np.empty((height + 2 * seam, width + 2 * seam, values), np.float32)
         _kernels.worth_images(sums, worth.astype(np.float32), len(worth) // 2, seam, images)
         prior = presence.probability if presence.prior is None else presence.prior

@@ -476,11 +476,29 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
     if right_down[1]:
         assert (MlSoft().compile(book)(presence, sums).symbols != symbols).any()
     pilots = book.pilot_edges.astype(np.int64)
-    matches = algorithm._matches(presence, sums, learned_worth(presence, sums, pilots, 3, 1.0))
+    matches = algorithm._matches(presence, sums, learned_worth(presence, sums, pilots, 3, 1.0), 4)
     known = np.concatenate([pilots, book.codeword_edges[symbols].astype(np.int64)], axis=1)
     assert_array_equal(algorithm._path(matches, known), path)
     # Blind to what the clusters say, it is found as well.
     assert_array_equal(algorithm._path(matches, pilots), path)
+
+
+@pytest.mark.parametrize("right_down", [(0, 6), (0, -6), (6, 0), (-6, 0), (5, -6), (0, 7)])
+@pytest.mark.parametrize("seed", range(3))
+def test_a_bar_that_goes_farther_than_is_searched_is_searched_farther(right_down, seed):
+    """At the border the path ends, and what lies beyond is read as the clusters beside."""
+    book = book_of()
+    symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
+    shape = {"cluster_px": 4, "width_px": 4}
+    sums, _ = drifting(book, symbols, right_down, seed=seed, **shape)
+    presence = ideal_presence(CLUSTERS, **shape)
+    soft = MotionFeedback().compile(book)(presence, sums)
+    assert_array_equal(soft.symbols, symbols)
+    far = MotionFeedback(reach_px=8).compile(book)(presence, sums)
+    assert_array_equal(soft.llr, far.llr)
+    if right_down in ((0, 6), (0, -6), (0, 7)):
+        near = MotionFeedback(far_px=4).compile(book)(presence, sums)
+        assert (near.symbols != symbols).any()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
