@@ -31,8 +31,8 @@ _NOISE_PX: Final = 0.3
 _OFF_PX: Final = (0.0, 0.9, 6.0)
 """Of a bar: none; three sigmas, which is doubted; twenty, so that fits without each bar are tried."""
 
-_OFF_SIGMAS: Final = (0.0, 2.5)
-"""Of an attitude: none; so many that it is doubted."""
+_OFF_SIGMAS: Final = (0.0, *(2.0 + step / 4 for step in range(11)))
+"""Of an attitude: none; so many that it is doubted, up to where it is taken for wrong."""
 
 
 def warm_up(links: Sequence[Link], *, positions: bool = False) -> None:

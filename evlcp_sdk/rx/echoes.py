@@ -28,8 +28,8 @@ __all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"
 _TAIL_CHIPS = 2.5
 """The last events of a frame come late, some later than its clock says: it is whole if its light goes on for
 two chips after those due. The stream ends with the latest event, which is later than its light by more than
-the mean of those that the clock is set by: a tenth of a chip to a quarter, as latencies and rows spread, and a
-half where the rows of two bars and of their reflections wait for each other."""
+the mean of those that the clock is set by: a tenth of a chip to a quarter, as latencies and rows spread, and
+a half where the rows of two bars and of their reflections wait for each other."""
 
 _REPEATED = 0.25
 """Share of the symbols that a reflection repeats at the least; with fewer, nothing would be read of it."""

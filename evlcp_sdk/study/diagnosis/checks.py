@@ -312,7 +312,12 @@ def _light(facts: Facts) -> Check:
 def _unread(facts: Facts) -> Check | None:
     """Light of a code where no frame is read, beside one that is; None where there is none."""
     link_hz = facts.link.packet.chip_rate_hz
-    places = [one.last_px for one in facts.tally.transmitters.values()]
+    # The centre of a bar that has an end out of the picture may lie outside it, too.
+    last = (facts.link.camera.width - 1, facts.link.camera.height - 1)
+    places = [
+        tuple(float(min(max(at, 0.0), most)) for at, most in zip(one.last_px, last, strict=True))
+        for one in facts.tally.transmitters.values()
+    ]
     read = [one.box_px for one in facts.sources if any(_gap_px(one.box_px, (*at, *at)) <= 0 for at in places)]
     for source in facts.sources:
         left, top, right, bottom = source.box_px
