@@ -29,11 +29,11 @@ import argparse
 import multiprocessing
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from road import Clock
 
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link, load_link
@@ -50,80 +50,45 @@ PAPER = "ranging.id=poc", "decoding.id=wh-transform"
 COMMON = "every event", "the rest"
 EVEN = "selecting", "following"
 OWN = "hearing", "looking", "reading"
-TIMED: tuple[tuple[Any, str, str], ...] = (
-    (CameraClock, "take", "every event"),
-    (Rhythm, "step", "every event"),
-    (Rhythm, "select", "selecting"),
-    (detection, "select", "selecting"),
-    (detection.RegionFollower, "step", "following"),
-    (detection.RegionFollower, "_boxes", "following"),
-    (detection.RegionFollower, "_glance", "following"),
-    (PacketFraming, "_hear", "hearing"),
-    (PacketFraming, "_look", "looking"),
-    (PacketFraming, "_decode", "reading"),
-)
+PARTS: Mapping[str, tuple[tuple[Any, str], ...]] = {
+    "every event": ((CameraClock, "take"), (Rhythm, "step")),
+    "selecting": ((Rhythm, "select"), (detection, "select")),
+    "following": tuple((detection.RegionFollower, name) for name in ("step", "_boxes", "_glance")),
+    "hearing": ((PacketFraming, "_hear"),),
+    "looking": ((PacketFraming, "_look"),),
+    "reading": ((PacketFraming, "_decode"),),
+}
+
+Step = Counter[tuple[str, int]]
+"""Seconds of a time step by (kind of work, number of the region or -1)."""
 
 
-class Meter:
-    """Says what a receiver's time went to, time step by time step.
+def measured(link: Link, events: Events) -> list[Step]:
+    """What each time step of a receiver's time went to."""
+    clock = Clock(PARTS, ("the rest", -1), _whose)
+    steps: list[Step] = []
+    step = LinkListener.step
 
-    Attributes:
-        steps: Seconds by (kind of work, number of the region or -1), of each step.
-    """
+    def counted(*given: Any) -> Any:
+        found = step(*given)
+        clock.turn()
+        steps.append(clock.spent_s)
+        clock.spent_s = Counter()
+        return found
 
-    def __init__(self) -> None:
-        self.steps: list[Counter[tuple[str, int]]] = []
-        self._now: Counter[tuple[str, int]] = Counter()
-        self._open = [("the rest", -1)]
-        self._since_s = time.thread_time()
-
-    def _lap(self) -> None:
-        now_s = time.thread_time()
-        self._now[self._open[-1]] += now_s - self._since_s
-        self._since_s = now_s
-
-    def timed(self, function: Callable[..., Any], kind: str) -> Callable[..., Any]:
-        """The function, whose time is said to be of a kind; of a region where it is given one."""
-
-        def measured(*given: Any, **named: Any) -> Any:
-            self._lap()
-            region = getattr(given[1], "region", given[1]) if kind in OWN else None
-            self._open.append((kind, -1 if region is None else region.id))
-            try:
-                return function(*given, **named)
-            finally:
-                self._lap()
-                self._open.pop()
-
-        return measured
-
-    def ends_step(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """The function, whose end is that of a time step."""
-
-        def measured(*given: Any, **named: Any) -> Any:
-            found = function(*given, **named)
-            self._lap()
-            self.steps.append(self._now)
-            self._now = Counter()
-            return found
-
-        return measured
-
-    @contextmanager
-    def listening(self) -> Iterator[None]:
-        """Let every receiver be measured."""
-        plain = [(owner, name, getattr(owner, name)) for owner, name, _ in TIMED]
-        step = LinkListener.step
-        for (owner, name, function), (_, _, kind) in zip(plain, TIMED, strict=True):
-            setattr(owner, name, self.timed(function, kind))
-        LinkListener.step = self.ends_step(step)  # type: ignore[method-assign]
-        self._since_s = time.thread_time()
+    with clock.running():
+        LinkListener.step = counted  # type: ignore[method-assign]
         try:
-            yield
+            received(link, events)
         finally:
             LinkListener.step = step  # type: ignore[method-assign]
-            for owner, name, function in plain:
-                setattr(owner, name, function)
+    return steps
+
+
+def _whose(kind: str, given: tuple[Any, ...]) -> tuple[str, int]:
+    """Of a region, where a call is given one."""
+    region = getattr(given[1], "region", given[1]) if kind in OWN else None
+    return kind, -1 if region is None else region.id
 
 
 def bars_beside(many: int, seconds: float) -> Events:
@@ -144,7 +109,7 @@ def received(link: Link, events: Events) -> tuple[float, int]:
     return time.process_time() - begin_s, receiver.counts["frames"]
 
 
-def split_s(steps: list[Counter[tuple[str, int]]]) -> tuple[float, float]:
+def split_s(steps: list[Step]) -> tuple[float, float]:
     """What two cores need for measured steps with half of the regions each, s: waiting by steps, or not."""
     waits_s, common_s, own_s = 0.0, 0.0, np.zeros(2)
     for step in steps:
@@ -195,24 +160,21 @@ def main() -> None:
     long_s = int(events.t_us[-1] - events.t_us[0]) * 1e-6
     received(link, events)
     plain_s, frames = min(received(link, events) for _ in range(args.rounds))
-    meters = []
-    for _ in range(args.rounds):
-        meter = Meter()
-        with meter.listening():
-            received(link, events)
-        meters.append(meter)
-    meter = min(meters, key=lambda m: sum(step.total() for step in m.steps))
-    whole_s = sum(step.total() for step in meter.steps)
+    steps = min(
+        (measured(link, events) for _ in range(args.rounds)),
+        key=lambda steps: sum(step.total() for step in steps),
+    )
+    whole_s = sum(step.total() for step in steps)
     print(
         f"{args.bars} bars at 60 m, {len(events) / long_s / 1e6:.1f} Mev/s, {frames} frames:"
         f" one core {long_s / plain_s:.2f} x real time ({whole_s / plain_s:.2f} times as long while measured)"
     )
     for kind in ("every event", *EVEN, *OWN, "the rest"):
-        spent_s = sum(s for step in meter.steps for (of, _), s in step.items() if of == kind)
+        spent_s = sum(s for step in steps for (of, _), s in step.items() if of == kind)
         print(f"  {kind:14} {spent_s / whole_s:6.1%}")
-    waits_s, free_s = split_s(meter.steps)
+    waits_s, free_s = split_s(steps)
     reading_s, rest_s = (
-        sum(s for step in meter.steps for (of, _), s in step.items() if of == kind)
+        sum(s for step in steps for (of, _), s in step.items() if of == kind)
         for kind in ("reading", "the rest")
     )
     ideal = {

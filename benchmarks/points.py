@@ -49,11 +49,14 @@ SCENES = {
 TURNING = ("turning",)
 """Scenes whose path says how far away they are."""
 DISTANCES_M = (27.0, 31.0, 37.0, 43.0, 52.0, 59.0, 68.0, 78.0)
-START = (0.05, 0.03, 0.05, 1e-4, 0.1, 4e-4, 12.0)
+START = (0.05, 0.03, 0.05, 1e-4, 0.1, 4e-4, 12.0, 30.0)
 NAMES = (
     "shaken_sigma_px", "shared_sigma_px", "shared_along_px", "shared_share", "pixel_sigma_px",
     "stretch_share", "early_sigma_us",
 )  # fmt: skip
+ALIKE = "all bars alike, us"
+"""By how much a moving image is seen early, or late, in all bars: to a position, as if the camera had turned.
+The last of the sigmas, and none of `[position]`."""
 MODES = ("columns", "rows", "stretch", "lean", "bend along", "bend across")
 ROW = [
     ("scene", "U12"),
@@ -146,7 +149,7 @@ def row_of(points: SeenPoints, true_px: Floats, when: tuple[str, int, int, float
 
 def variances(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floats:
     """Of the `MODES` of a bar's shape, px^2, (n, 4), by `NAMES`."""
-    *_, pixel, stretch, early = sigmas
+    *_, pixel, stretch, early, _ = sigmas
     each = rows["white_px"] ** 2 + (pixel * rows["pixel_px"]) ** 2 + (early * rows["early_px"]) ** 2
     # All points of a bar are off by a share of their places.
     longer = each + (stretch * rows["length_px"]) ** 2 * (LINK.bar.clusters / 12)
@@ -155,7 +158,7 @@ def variances(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Float
 
 def own_shifts(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floats:
     """Covariance of the shift that is a bar's own, px^2, (n, 2, 2), by `NAMES`."""
-    _, across, along, share, pixel, _, early = sigmas
+    _, across, along, share, pixel, _, early, _ = sigmas
     each = rows["white_px"] ** 2 + (pixel * rows["pixel_px"]) ** 2 + (early * rows["early_px"]) ** 2
     each /= LINK.bar.clusters
     longways = rows["along"][:, :, None] * rows["along"][:, None]
@@ -169,6 +172,13 @@ def own_shifts(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floa
 
 def _means(values: Floats, of: NDArray[np.intp]) -> Floats:
     return np.bincount(of, values) / np.bincount(of)
+
+
+def common_px2(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floats:
+    """Variance of what all bars share at each time, px^2."""
+    _, of = np.unique(rows[["drive", "t_us"]], return_inverse=True)
+    shaken, early = sigmas[0] * _means(rows["between"], of), sigmas[-1] * _means(rows["early_px"], of)
+    return np.asarray(shaken**2 + early**2)
 
 
 def parted(
@@ -193,7 +203,7 @@ def parted(
     mean = np.einsum("nij,nj->ni", spread, moment)
     return (
         mean,
-        spread + (sigmas[0] * _means(rows["between"], of))[:, None, None] ** 2 * np.eye(2),
+        spread + common_px2(rows, sigmas)[:, None, None] * np.eye(2),
         shifts - mean[of],
         own - spread[of],
         np.bincount(of)[of] > 1,
@@ -213,16 +223,21 @@ def fitted(rows: NDArray[np.void], start: Sequence[float] | Floats) -> Floats:
         # Errors of a group with a common part: the means', and what is left about them.
         shifts = np.einsum("ni,nij,nj->", rest, np.linalg.inv(own), rest)
         shifts += np.einsum("ni,nij,nj->", mean, np.linalg.inv(of_mean), mean)
-        _, when = np.unique(rows[["drive", "t_us"]], return_inverse=True)
-        common = sigmas[0] * _means(rows["between"], when)
-        alone = of_mean - common[:, None, None] ** 2 * np.eye(2)
+        alone = of_mean - common_px2(rows, sigmas)[:, None, None] * np.eye(2)
         for covariance, sign in ((own, 1), (of_mean, 1), (alone, -1)):
             shifts += sign * np.linalg.slogdet(covariance)[1].sum()
         of = variances(rows, sigmas)[:, :2]
         shapes = np.log(of) + rows["modes_px"][:, 2:4] ** 2 / of
         return float(shifts + shapes.sum())
 
-    return np.exp(minimize(surprise, np.log(start), method="Nelder-Mead", options={"maxiter": 3000}).x)
+    return np.exp(
+        minimize(
+            surprise,
+            np.log(start),
+            method="Nelder-Mead",
+            options={"maxiter": 6000, "maxfev": 6000, "adaptive": True},
+        ).x
+    )
 
 
 def ratios(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floats:
@@ -286,14 +301,14 @@ def main() -> None:
 def told(rows: NDArray[np.void]) -> None:
     """Print what was found of all bars, `DTYPE` (n,)."""
     spec = LINK.position
-    stated = [getattr(spec, name) for name in NAMES]
+    stated = [*(getattr(spec, name) for name in NAMES), 0.0]
     even = rows[rows["seed"] % 2 == 0]
     odd = rows[rows["seed"] % 2 == 1]
     best = fitted(even, START)
     low, high = interval(even, lambda some: fitted(some, best), 40)
     print("| sigma | stated | fitted | 5 to 95 % |")
     print("|---|---|---|---|")
-    for name, now, then, least, most in zip(NAMES, stated, best, low, high, strict=True):
+    for name, now, then, least, most in zip([*NAMES, ALIKE], stated, best, low, high, strict=True):
         print(f"| `{name}` | {now:.4f} | {then:.4f} | {least:.4f} to {most:.4f} |")
     print()
     print("Root mean squares, px:")

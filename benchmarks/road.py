@@ -27,6 +27,7 @@ import sys
 import tempfile
 import time
 import tomllib
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial, wraps
@@ -72,29 +73,42 @@ Plain = dict[str, Any]
 
 
 class Clock:
-    """Processor time of each part, s, without that of other parts inside it."""
+    """Processor time of each part, s, without that of other parts inside it.
 
-    def __init__(self) -> None:
-        self.spent_s = dict.fromkeys([*PARTS, "files"], 0.0)
-        self._open = ["files"]
+    Args:
+        parts: The calls of each part.
+        rest: What everything else is.
+        key: What a part's time goes to, by its name and a call's arguments; None for the part.
+    """
+
+    def __init__(
+        self,
+        parts: Mapping[Any, Sequence[tuple[Any, str]]] = PARTS,
+        rest: Any = "files",
+        key: Callable[[Any, tuple[Any, ...]], Any] | None = None,
+    ) -> None:
+        self.spent_s: Counter[Any] = Counter(dict.fromkeys([*parts, rest] if key is None else (), 0.0))
+        self._parts, self._key = parts, key
+        self._open = [rest]
         self._since_s = time.process_time()
 
-    def _turn(self) -> None:
+    def turn(self) -> None:
+        """Count the time up to now."""
         now_s = time.process_time()
         self.spent_s[self._open[-1]] += now_s - self._since_s
         self._since_s = now_s
 
-    def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(self, part: Any, call: Callable[..., Any]) -> Callable[..., Any]:
         """The same call, its time counted."""
 
         @wraps(call)
         def run(*args: Any, **kwargs: Any) -> Any:
-            self._turn()
-            self._open.append(part)
+            self.turn()
+            self._open.append(part if self._key is None else self._key(part, args))
             try:
                 return call(*args, **kwargs)
             finally:
-                self._turn()
+                self.turn()
                 self._open.pop()
 
         return run
@@ -103,14 +117,14 @@ class Clock:
     def running(self) -> Iterator[None]:
         """Count while inside."""
         with ExitStack() as undo:
-            for part, calls in PARTS.items():
+            for part, calls in self._parts.items():
                 for owner, name in calls:
                     call = getattr(owner, name)
                     undo.callback(setattr, owner, name, call)
                     setattr(owner, name, self.timed(part, call))
             self._since_s = time.process_time()
             yield
-            self._turn()
+            self.turn()
 
 
 def targets_of(table: Mapping[str, Any], name: str, bar: int) -> Plain:

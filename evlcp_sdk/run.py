@@ -812,19 +812,7 @@ def _views(
             if number in stands_at:
                 site = stands_at[number]
                 enu = site.layout_positions_m(link.bar, axes)
-                bars.append(
-                    BarView(
-                        site.transmitter_id,
-                        enu,
-                        found.points_px,
-                        found.sigma_px,
-                        site.survey,
-                        found.pixel_px,
-                        found.shift_px,
-                        found.between,
-                        found.early_px,
-                    )
-                )
+                bars.append(BarView.of(site.transmitter_id, enu, found, site.survey))
         views.append(_view(pose, bars, axes))
     return views
 
@@ -948,18 +936,7 @@ def survey(
                     raise ConfigError(
                         f"{url}: id {number} is sent by '{sends[number]}' and '{by}': give one link at a time"
                     )
-                bars.append(
-                    BarView(
-                        number,
-                        np.empty((0, 3)),
-                        found.points_px,
-                        found.sigma_px,
-                        pixel_px=found.pixel_px,
-                        shift_px=found.shift_px,
-                        between=found.between,
-                        early_px=found.early_px,
-                    )
-                )
+                bars.append(BarView.of(number, np.empty((0, 3)), found))
             views.append(_view(pose, bars, axes))
     long_m = {number: placing[by].bar.length_m for number, by in sends.items()}
     surveyed = survey_bars(views, axes, long_m, like.camera, like.camera_sigma, like.position)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.points import SeenPoints
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -59,6 +60,27 @@ class BarView:
     shift_px: float = 0.0
     between: float = 1.0
     early_px: float = 0.0
+
+    @classmethod
+    def of(
+        cls,
+        transmitter: int,
+        enu_m: Floats,
+        seen: SeenPoints,
+        survey: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> "BarView":
+        """A bar by its points as they are seen."""
+        return cls(
+            transmitter,
+            enu_m,
+            seen.points_px,
+            seen.sigma_px,
+            survey,
+            seen.pixel_px,
+            seen.shift_px,
+            seen.between,
+            seen.early_px,
+        )
 
 
 def project_bars(

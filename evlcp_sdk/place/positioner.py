@@ -212,19 +212,7 @@ class Positioner:
                 unplaced.append(str(fault))
                 continue
             here = LocalAxes.of([site]) if here is None else here
-            sited.append(
-                BarView(
-                    number,
-                    enu,
-                    points.points_px,
-                    points.sigma_px,
-                    site.survey,
-                    points.pixel_px,
-                    points.shift_px,
-                    points.between,
-                    points.early_px,
-                )
-            )
+            sited.append(BarView.of(number, enu, points, site.survey))
         if not views:
             return None
         if here is None and unplaced:

@@ -78,8 +78,8 @@ class Whereabouts:
     @property
     def unseen(self) -> tuple[BarSite, ...]:
         """The sites that no transmitter was received of."""
-        seen = [self._listed(number) for number in self._said]
-        return tuple(site for site in self._sites if all(site is not one for one in seen))
+        seen = {id(self._listed(number)) for number in self._said}
+        return tuple(site for site in self._sites if id(site) not in seen)
 
     @property
     def contradicted(self) -> dict[int, str]:

@@ -468,7 +468,7 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
         )
     if (number := positions["refused"].get("no-site", 0)) and not positions["fixes"]:
         heard = sorted(set(positions["heard"].values()))
-        ids = f"id{_s(len(heard))} {', '.join(map(str, heard))}" if heard else "no id"
+        ids = f"id{_s(len(heard))} {_some(heard)}" if heard else "no id"
         yield Doubt(
             "no-site",
             f"{number} position{_s(number)} refused, as no bar in view stands at a known place;"

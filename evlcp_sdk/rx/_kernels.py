@@ -1400,6 +1400,7 @@ def place_clusters(
             continue
         along = s / abs(s) if axis == 0 else s / abs(s) * 1j
         rows = abs(along.imag) >= abs(along.real)
+        lines = height if rows else width
         before = np.full(clusters, np.nan)
         after = np.full(clusters, np.nan)
         for k in range(clusters):
@@ -1409,22 +1410,15 @@ def place_clusters(
                 off = (complex(mean[k, 0], mean[k, 1]) - at) * along.conjugate()
                 centres[k] = at + along * complex(0.0, off.imag)
                 lit[k] = light_along(
-                    heard,
-                    edges[k],
-                    every,
-                    centres[k],
-                    along,
-                    reach,
-                    window,
-                    lights[k, : height if rows else width],
+                    heard, edges[k], every, centres[k], along, reach, window, lights[k, :lines]
                 )
         for k in range(clusters):
             other = neighbours[axis, k]
             if other < 0 or not (lit[k] and lit[other]):
                 continue
             a, b = centres[k], centres[other]
-            mine, its = lights[k, : height if rows else width], lights[other, : height if rows else width]
-            share = boundary_between(mine, its, a.imag if rows else a.real, b.imag if rows else b.real)
+            start, end = (a.imag, b.imag) if rows else (a.real, b.real)
+            share = boundary_between(lights[k, :lines], lights[other, :lines], start, end)
             if -0.5 < share < 1.5:
                 z = (a + share * (b - a)) * along.conjugate()
                 after[k] = z.real

@@ -11,16 +11,6 @@ Array = NDArray[Any]
 
 
 @njit(cache=True, nogil=True)
-def _value(first: int, second: int) -> int:
-    """The value b' of a chip pair's polarity sums: sign of the second chip, else b'' = -sign of the first."""
-    if second != 0:
-        return 1 if second > 0 else -1
-    if first != 0:
-        return -1 if first > 0 else 1
-    return 0
-
-
-@njit(cache=True, nogil=True)
 def _add(into: Array, part: Array) -> None:
     """Long loops over flat arrays run on many pixels at once; those over a bar's few columns do not."""
     for j in range(into.size):
@@ -29,7 +19,7 @@ def _add(into: Array, part: Array) -> None:
 
 @njit(cache=True, nogil=True)
 def _values(first: Array, second: Array, out: Array) -> None:
-    """Values of pairs of polarity sums, as `_value` has them, `out` int8 (n,)."""
+    """Values of pairs of polarity sums, `out` int8 (n,): the second's sign, else less the first's."""
     for j in range(out.size):
         a, b = first[j], second[j]
         up = np.int8(b > 0) - np.int8(b < 0)

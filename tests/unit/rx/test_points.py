@@ -176,7 +176,7 @@ def test_a_track_that_trembles_does_not_move_the_points_along_a_bar() -> None:
 
 
 def test_points_of_a_turning_camera_lie_where_they_are() -> None:
-    """At 45 degrees a second the image moves by half a pixel in a chip: codes of one sign were off by 2."""
+    """At 45 degrees a second the image moves by half a pixel in a chip."""
     sets = ["duration_s=0.1", 'motion.path_file="turning.csv"', "motion.vib_rate_rad_s=0.02"]
     simulation = Simulation(load_scene("examples/scenes/one-bar.toml", sets), 5)
     receiver = Receiver(load_link())
