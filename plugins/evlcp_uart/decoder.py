@@ -232,10 +232,10 @@ class CharacterDecoder:
         if first is None:
             if not len(t_us):
                 return state
-            # A character may have begun before its first event.
+            # A character may have begun before its first event, wherever that is in time.
             seen = int(t_us[0] // tick_us) - _BEFORE_FIRST
             first = seen - self._length - TICKS
-            state = replace(state, seen=seen)
+            state = replace(state, start=first, seen=seen)
         ticks = np.floor_divide(t_us, tick_us).astype(np.int64) - first
         known = state.counts.shape[1]
         end = max(int(np.floor(until_us / tick_us)) - first, known, int(ticks[-1]) + 1 if len(ticks) else 0)

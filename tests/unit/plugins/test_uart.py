@@ -23,6 +23,7 @@ from evlcp_sdk.values import Events, Packet
 
 BAR = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
 CHARACTERS = Characters(7, "even", 2)
+BIT_504_US = 1e6 / 504
 
 
 def levels_of(values: np.ndarray, data_bits: int, parity: Parity, stop_bits: int) -> list[int]:
@@ -109,6 +110,19 @@ def test_bright_light_is_read_without_an_error(
     assert not any(c.wrong_parity for c in found)
     apart = np.diff([c.t_us for c in found])
     np.testing.assert_allclose(apart, 11 * bit_us, atol=bit_us / 5)
+
+
+@pytest.mark.parametrize("first_us", [0, 40, -3_000_000])
+def test_a_list_is_read_from_its_first_character_wherever_time_begins(first_us: int) -> None:
+    sent = list(b"Shall I compare thee")
+    levels = levels_of(np.array(sent), 7, "even", 2)
+    # Edges are seen late, so the first character begins before the first event.
+    events = seen(np.random.default_rng(5), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
+    t_us = events.t_us - events.t_us[0] + first_us
+    found = read_characters(t_us, events.p, 504.0, Uart(7, "even", 2))
+    assert [c.value for c in found] == sent
+    # It may start up to a bit before, as nothing was seen of the time before.
+    assert -BIT_504_US <= found[0].t_us - first_us <= BIT_504_US / TICKS
 
 
 @pytest.mark.parametrize(
