@@ -59,6 +59,10 @@ each is to be likelier than without."""
 DOUBTFUL = 0.85
 """How sure the first characters are on the average, where they are fewer than that before a pause."""
 
+_OTHERWISE = 3.0
+"""Nats by which a stream's first characters must be likelier than the best reading without them, odds of
+twenty: what was on air before the first event is unknown, and any bit that is 0 may be a start bit."""
+
 _INVERTED_BITS = 10.0
 """How much more must speak for a light the other way round than said: one link of a thousand errs."""
 
@@ -144,6 +148,7 @@ class CharacterState:
         default_factory=lambda: {
             "characters": 0,
             "characters_by_chance": 0,
+            "characters_ambiguous": 0,
             "characters_wrong_parity": 0,
             "frames_inverted": 0,
             "stretches_without_light": 0,
@@ -286,8 +291,10 @@ class CharacterDecoder:
                 needs = int(starts[kept][-1]) + (self.characters.bits - self.characters.stop_bits) * TICKS
                 if needs >= end and (found[-1].quality < _TELLING or found[-1].wrong_parity):
                     found.pop()
-            by_chance = 0
+            by_chance, ambiguous = 0, 0
             if state.light is None:
+                ambiguous = self._ambiguous(stretch, light, starts[kept])
+                found = found[ambiguous:]
                 by_chance, found = len(found), _without_chance(found)
                 by_chance -= len(found)
             sure = float(np.mean([one.quality for one in found])) if found else 1.0
@@ -296,6 +303,7 @@ class CharacterDecoder:
             blocks = 1 if sure >= _SURE else _MORE
             given["characters"] += len(found)
             given["characters_by_chance"] += by_chance
+            given["characters_ambiguous"] += ambiguous
             given["characters_wrong_parity"] += sum(c.wrong_parity for c in found)
             given["frames_inverted"] += len(found) * light.inverted
             if len(ahead):
@@ -334,16 +342,46 @@ class CharacterDecoder:
         self, stretch: "Stretch", light: Light, likeliest: bool
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], float]:
         """Starts of the characters, the evidence at every tick, and what the path is worth."""
+        evidence = self._evidence(stretch, light)
+        scores = self._scores(evidence, light, likeliest)
+        starts, worth = self._best_path(scores, stretch, light)
+        return self._steadied(stretch, light, starts, evidence), evidence, worth
+
+    def _scores(self, evidence: NDArray[np.float64], light: Light, likeliest: bool) -> NDArray[np.float64]:
+        """How much likelier a character is at every tick than none, float64 (n,)."""
         from evlcp_uart import _kernels
 
-        evidence = self._evidence(stretch, light)
         places = self._places(light)
         scores = np.empty(max(len(evidence) - int(places[-1]), 0))
         parity = ("none", "odd", "even").index(self.characters.parity)
         _kernels.character_scores(evidence, places, self.characters.data_bits, parity, likeliest, scores)
+        return scores
+
+    def _best_path(
+        self, scores: NDArray[np.float64], stretch: "Stretch", light: Light
+    ) -> tuple[NDArray[np.int64], float]:
+        """Starts of the characters that explain a stretch best, and what that is worth."""
+        from evlcp_uart import _kernels
+
         length = round(self._length * light.rate)
         starts, worth = _kernels.best_path(scores, length, stretch.start, _NEAR, *light.costs, _JITTER)
-        return self._steadied(stretch, light, starts, evidence), evidence, worth
+        return starts, float(worth)
+
+    def _ambiguous(self, stretch: "Stretch", light: Light, starts: NDArray[np.int64]) -> int:
+        """How many of the first characters, that start there, a reading without them explains nearly as well.
+
+        Some at most: where light is so dim that more do not stand out, their quality says so.
+        """
+        scores = self._scores(self._evidence(stretch, light), light, False)
+        _, worth = self._best_path(scores, stretch, light)
+        most = min(len(starts), _LEAST_CHARACTERS - 1)
+        for many, start in enumerate(starts[:most].tolist()):
+            # Half a bit from here a character is another one.
+            other = scores.copy()
+            other[max(start - TICKS // 2, 0) : start + TICKS // 2 + 1] = -np.inf
+            if worth - self._best_path(other, stretch, light)[1] >= _OTHERWISE:
+                return many
+        return most
 
     def _steadied(
         self, stretch: "Stretch", light: Light, starts: NDArray[np.int64], evidence: NDArray[np.float64]
@@ -507,23 +545,23 @@ class CharacterDecoder:
         explained = [
             self._explained(stretch, replace(light, most=least), starts) for light, starts in learned
         ]
-        light, starts = learned[int(np.argmax(explained))]
-        evidence = self._evidence(stretch, light)[starts[:, None] + self._places(light)]
-        if light.inverted:
-            kinds = np.unique(self.characters.likelihoods(evidence).argmax(1))
-            if len(kinds) < _INVERTED_KINDS:
-                return None
-        framed = float(self.characters.framed(evidence).sum() / np.log(2))
-        both = stretch.counts.any(1).all()
-        return None if both and self._of_another_code(evidence, framed) else (light, framed)
-
-    def _of_another_code(self, evidence: NDArray[np.float64], framed: float) -> bool:
-        """Whether a light is clear, and yet its characters have no start, parity and stop bits to speak of.
-
-        Of rises alone, or falls, none tells: what the others would say is missing.
-        """
-        said, fixed = self.characters.said(evidence), self.characters.bits - self.characters.data_bits
-        return said > _CLEAR and framed < _FRAMED * said * fixed * len(evidence)
+        both = bool(stretch.counts.any(1).all())
+        # Light a bit off explains events of text, too, but not its stop bits: then another may, and clearly.
+        for rank, k in enumerate(np.argsort(explained)[::-1].tolist()):
+            light, starts = learned[k]
+            evidence = self._evidence(stretch, light)[starts[:, None] + self._places(light)]
+            if light.inverted:
+                kinds = np.unique(self.characters.likelihoods(evidence).argmax(1))
+                if len(kinds) < _INVERTED_KINDS:
+                    continue
+            framed = float(self.characters.framed(evidence).sum() / np.log(2))
+            said, fixed = self.characters.said(evidence), self.characters.bits - self.characters.data_bits
+            # Of rises alone, or falls, none tells: what the others would say is missing.
+            clear = both and said > _CLEAR
+            of_another_code = clear and framed < _FRAMED * said * fixed * len(evidence)
+            if not of_another_code and (clear or rank == 0):
+                return light, framed
+        return None
 
     def _learnt(self, stretch: "Stretch", inverted: bool) -> list[tuple[Light, NDArray[np.int64]]]:
         """What the light may be like, on for a mark as said or the other way round, and its characters."""

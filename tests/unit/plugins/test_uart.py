@@ -125,6 +125,45 @@ def test_a_list_is_read_from_its_first_character_wherever_time_begins(first_us: 
     assert -BIT_504_US <= found[0].t_us - first_us <= BIT_504_US / TICKS
 
 
+@pytest.mark.parametrize("seed", [12, 22])
+def test_light_of_which_the_best_guess_is_an_illusion_is_read(seed: int) -> None:
+    """Falls late by a fifth of a bit: characters a bit late explain more events, but no stop bits."""
+    text = b"Shall I compare thee to a summers day? Thou art more lovely and more temperate: rough winds do "
+    sent = list((text + b"shake the darling buds of May")[seed * 3 % 40 :][:80])
+    levels = levels_of(np.array(sent), 7, "even", 2)
+    rng = np.random.default_rng(seed)
+    events = seen(rng, levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
+    found = read_characters(events.t_us - events.t_us[0], events.p, 504.0, Uart(7, "even", 2))
+    assert [c.value for c in found][: len(sent) - 1] == sent[: len(sent) - 1]
+
+
+@pytest.mark.parametrize("cut", [0, 3, 8])
+def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cut: int) -> None:
+    """The next one may start at any bit that is 0: what could be read otherwise as well is left out."""
+    rng = np.random.default_rng(cut)
+    bit_us, pause = 100.0, 16
+    sent = rng.integers(0, 256, 40)
+    levels: list[int] = []
+    starts = []
+    for k, value in enumerate(sent.tolist()):
+        starts.append(len(levels))
+        levels += levels_of(np.array([value]), 8, "even", 1) + [1] * (pause if k % 5 == 1 else 0)
+    events = seen(rng, levels, bit_us, late_us=(20.0, 30.0), noise_hz=0.0, start_us=0.0)
+    later = events.t_us >= cut * bit_us
+    decoder = Uart(8, "even", 1).decoder(1e6 / bit_us)
+    state, found = decoder.step(
+        decoder.init(), events.t_us[later], events.p[later], int(events.t_us[-1] + 3 * pause * bit_us)
+    )
+    state, more = decoder.close(state)
+    read = [(round(c.t_us / bit_us), c.value) for c in [*found, *more]]
+    right = [
+        (at + near, value) for at, value in zip(starts, sent.tolist(), strict=True) for near in (-1, 0, 1)
+    ]
+    assert not set(read) - set(right)
+    assert len(read) >= len(sent) - 3
+    assert state.given["characters"] == len(read)
+
+
 @pytest.mark.parametrize(
     ("data_bits", "parity", "stop_bits"), [(5, "none", 1), (8, "none", 1), (8, "odd", 1), (9, "even", 2)]
 )
