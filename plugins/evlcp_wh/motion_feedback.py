@@ -1,7 +1,7 @@
 """What the info segment of each cluster says, after the bar's motion within the frame is taken out."""
 
 from dataclasses import dataclass, replace
-from math import log
+from math import inf, log
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -41,7 +41,8 @@ class MotionFeedback(Decoding):
     and each info value of a cluster is the one that fits better; in the second all are known from the
     decision. The likeliest smooth path over all values (Viterbi) is taken back from the sums, the clusters
     are separated again by their pilots, and their info segments decoded. A frame whose path stays at 0 is
-    decoded as by `ml-soft`; one whose path comes to the border of what is searched is searched farther.
+    decoded as by `ml-soft`; one whose path comes within a pixel of the border of what is searched, or leaves
+    a bit unsure, is searched farther.
 
     A path that started from decisions alone would confirm a wrong one: a bar off by the spacing of its
     clusters says its neighbours' symbols without a fault.
@@ -51,11 +52,15 @@ class MotionFeedback(Decoding):
         int, Field(ge=1, le=8, description="Farthest that the bar may be off its place in a frame.")
     ] = 4
     far_px: Annotated[
-        int,
-        Field(
-            ge=1, le=16, description="Farthest where the path comes within a pixel of that; less is never."
-        ),
+        int, Field(ge=1, le=16, description="Farthest where that does not do; without effect if it is less.")
     ] = 8
+    unsure_llr: Annotated[
+        float,
+        Field(
+            ge=0,
+            description="Log-likelihood ratio of a bit below which a bar that moved is sought to `far_px`.",
+        ),
+    ] = 2.0
     step_px: Annotated[
         float,
         Field(gt=0, description="Likely change of place (sigma) from value to value: 1.5 px/ms for 0.2 ms."),
@@ -88,27 +93,44 @@ class MotionFeedback(Decoding):
             soft, least = self._decided(presence, sums, pilots, words, worth)
             if least >= self.sure_llr:
                 return soft
-            reach, first = self.reach_px, (presence, sums, worth)
-            matches = self._matches(*first, reach)
-            known, aligned = pilots, sums
-            done = np.zeros((len(sums) // 2, 2), np.int64)
-            for _ in range(self.rounds):
-                path = self._path(matches, known)
-                # The best path may go on beyond the border, and the best within it be another one's.
-                if reach < self.far_px and np.abs(path).max() >= reach - 1:
-                    reach = self.far_px
-                    matches = self._matches(*first, reach)
-                    path = self._path(matches, known)
-                if (path == done).all():
-                    break
-                aligned, done = _taken_back(sums, path), path
-                presence = self._separated(aligned, presence, pilots)
-                worth = learned_worth(presence, aligned, pilots, self.max_events, self.prior_count)
-                soft, _ = self._decided(presence, aligned, pilots, words, worth)
-                known = np.concatenate([pilots, words[soft.symbols].astype(np.int64)], axis=1)
-            return soft
+            read, beyond = self._fed_back(presence, sums, worth, soft, pilots, words, self.reach_px)
+            if beyond and self.far_px > self.reach_px:
+                read, _ = self._fed_back(presence, sums, worth, soft, pilots, words, self.far_px)
+            return read
 
         return decode
+
+    def _fed_back(
+        self,
+        presence: PresenceMap,
+        sums: NDArray[np.int16],
+        worth: NDArray[np.float64],
+        soft: SoftSymbols,
+        pilots: NDArray[np.int64],
+        words: NDArray[np.float64],
+        reach_px: int,
+    ) -> tuple[SoftSymbols, bool]:
+        """What is read with the path taken back, and whether the path may lie beyond `reach_px`.
+
+        The best path may go on beyond the border. Where it does not come there, it may have gone over to the
+        same clusters a spacing back: what it passed on the way contradicts what it reads, and leaves a bit
+        unsure. What was read until then does not count.
+        """
+        matches = self._matches(presence, sums, worth, reach_px)
+        known, least = pilots, inf
+        done = np.zeros((len(sums) // 2, 2), np.int64)
+        for _ in range(self.rounds):
+            path = self._path(matches, known)
+            if reach_px < self.far_px and np.abs(path).max() >= reach_px - 1:
+                return soft, True
+            if (path == done).all():
+                break
+            aligned, done = _taken_back(sums, path), path
+            presence = self._separated(aligned, presence, pilots)
+            worth = learned_worth(presence, aligned, pilots, self.max_events, self.prior_count)
+            soft, least = self._decided(presence, aligned, pilots, words, worth)
+            known = np.concatenate([pilots, words[soft.symbols].astype(np.int64)], axis=1)
+        return soft, least < self.unsure_llr
 
     def _decided(
         self,
