@@ -58,7 +58,8 @@ class MotionFeedback(Decoding):
         float,
         Field(
             ge=0,
-            description="Log-likelihood ratio of a bit below which a bar that moved is sought to `far_px`.",
+            description="Log-likelihood ratio of a bit below which a bar that moved is sought to `far_px`: "
+            "at 2, one such bit in eight is wrong.",
         ),
     ] = 2.0
     step_px: Annotated[

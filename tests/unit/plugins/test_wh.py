@@ -501,6 +501,21 @@ def test_a_bar_that_goes_farther_than_is_searched_is_searched_farther(right_down
         assert (near.symbols != symbols).any()
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_a_bar_that_leaves_a_bit_unsure_is_searched_farther(seed):
+    """The path may go over to the same clusters a spacing back, and never come to the border."""
+    book = book_of()
+    symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
+    shape = {"cluster_px": 3, "width_px": 3}
+    sums, _ = drifting(book, symbols, (0, -5), seed=seed, **shape)
+    presence = ideal_presence(CLUSTERS, **shape)
+    soft = MotionFeedback().compile(book)(presence, sums)
+    assert_array_equal(soft.symbols, symbols)
+    assert_array_equal(soft.llr, MotionFeedback(reach_px=8).compile(book)(presence, sums).llr)
+    by_border = MotionFeedback(unsure_llr=0.0).compile(book)(presence, sums)
+    assert (by_border.symbols != symbols).any()
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 def test_a_bar_that_stands_still_is_decoded_as_before(seed):
     book = book_of()
