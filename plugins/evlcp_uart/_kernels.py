@@ -146,18 +146,30 @@ def _character_score(
 
 @njit(cache=True, nogil=True)
 def best_path(
-    scores: Column, length: int, first: int, near: int, after_idle: float, after_one: float, jitter: float
+    scores: Column,
+    tails: Column,
+    length: int,
+    first: int,
+    near: int,
+    after_idle: float,
+    after_one: float,
+    jitter: float,
+    pause: int,
+    after_pause: float,
 ) -> tuple[Column, float]:
     """Starts of the characters that explain a stretch best, and how much better than none.
 
     Args:
         scores: Of a character that starts at each tick, float64 (n,).
+        tails: What a pause that begins at each tick is worth: edges before it go on into it, float64 (>= n,).
         length: Ticks from a character's start to the end of its last stop bit.
         first: The first tick at which one may start.
         near: Ticks by which one may follow another early or late and still count as following it at once.
         after_idle: What a character costs that follows a pause.
         after_one: What one costs that follows another at once.
         jitter: What a tick early or late costs.
+        pause: Ticks between the end of one and the start of another behind the pause that is sent; 0: none.
+        after_pause: What one costs behind just that pause.
 
     Returns:
         The starts, int64 (m,), and the score of the path.
@@ -172,8 +184,8 @@ def best_path(
     for s in range(n):
         if s:
             idle[s], of_idle[s] = idle[s - 1], of_idle[s - 1]
-            if ended[s] > idle[s]:
-                idle[s], of_idle[s] = ended[s], s - length
+            if ended[s] + tails[s] > idle[s]:
+                idle[s], of_idle[s] = ended[s] + tails[s], s - length
         if s < first:
             continue
         value, origin = idle[s] - after_idle, of_idle[s]
@@ -181,6 +193,11 @@ def best_path(
             e = s - d
             if 0 <= e < len(ended) and ended[e] > -np.inf:
                 follows = ended[e] - after_one - jitter * abs(d)
+                if follows > value:
+                    value, origin = follows, e - length
+            e -= pause
+            if pause and e >= 0 and ended[e] > -np.inf:
+                follows = ended[e] + tails[e] - after_pause - jitter * abs(d)
                 if follows > value:
                     value, origin = follows, e - length
         value += scores[s]

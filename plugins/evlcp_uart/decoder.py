@@ -41,6 +41,10 @@ _AHEAD = 4
 _JITTER, _NEAR = 0.7, 2
 """What a tick early or late costs a character that follows another at once, and how many that may be."""
 
+_PAUSE_TICKS = 5.0
+"""Ticks over which a pause of the length that is sent is spread, twice: half of all pauses are taken as such,
+each tick early or late as likely as `_JITTER` says. The others may end at any tick."""
+
 CLOCK_SHARE = 0.025
 """Share by which the clock may be off."""
 
@@ -181,11 +185,14 @@ class CharacterDecoder:
         characters: Their format.
         bit_us: Nominal length of a bit, us.
         mark_on: The light is on for a mark, which is 1 and idle.
+        pause_bits: Pause that is sent before a packet, by which characters are told where a recording begins
+            within one; 0 where nothing is known of it.
     """
 
     characters: Characters
     bit_us: float
     mark_on: bool = True
+    pause_bits: int = 0
 
     def init(self) -> CharacterState:
         """State before the first event."""
@@ -344,7 +351,7 @@ class CharacterDecoder:
         """Starts of the characters, the evidence at every tick, and what the path is worth."""
         evidence = self._evidence(stretch, light)
         scores = self._scores(evidence, light, likeliest)
-        starts, worth = self._best_path(scores, stretch, light)
+        starts, worth = self._best_path(scores, evidence, stretch, light)
         return self._steadied(stretch, light, starts, evidence), evidence, worth
 
     def _scores(self, evidence: NDArray[np.float64], light: Light, likeliest: bool) -> NDArray[np.float64]:
@@ -358,13 +365,21 @@ class CharacterDecoder:
         return scores
 
     def _best_path(
-        self, scores: NDArray[np.float64], stretch: "Stretch", light: Light
+        self, scores: NDArray[np.float64], evidence: NDArray[np.float64], stretch: "Stretch", light: Light
     ) -> tuple[NDArray[np.int64], float]:
         """Starts of the characters that explain a stretch best, and what that is worth."""
         from evlcp_uart import _kernels
 
         length = round(self._length * light.rate)
-        starts, worth = _kernels.best_path(scores, length, stretch.start, _NEAR, *light.costs, _JITTER)
+        pause = round(self.pause_bits * TICKS * light.rate)
+        after_idle, after_one = light.costs
+        after_pause = after_idle - (np.log(pause / _PAUSE_TICKS) if pause else 0.0)
+        # The first bit of a pause has the stop bits before it, and any before these.
+        contexts = np.arange((2 << self.characters.stop_bits) - 1, CONTEXTS, 2 << self.characters.stop_bits)
+        tails = np.logaddexp.reduce(evidence[:, contexts], 1) - np.log(len(contexts))
+        starts, worth = _kernels.best_path(
+            scores, tails, length, stretch.start, _NEAR, after_idle, after_one, _JITTER, pause, after_pause
+        )
         return starts, float(worth)
 
     def _ambiguous(self, stretch: "Stretch", light: Light, starts: NDArray[np.int64]) -> int:
@@ -372,14 +387,15 @@ class CharacterDecoder:
 
         Some at most: where light is so dim that more do not stand out, their quality says so.
         """
-        scores = self._scores(self._evidence(stretch, light), light, False)
-        _, worth = self._best_path(scores, stretch, light)
+        evidence = self._evidence(stretch, light)
+        scores = self._scores(evidence, light, False)
+        _, worth = self._best_path(scores, evidence, stretch, light)
         most = min(len(starts), _LEAST_CHARACTERS - 1)
         for many, start in enumerate(starts[:most].tolist()):
             # Half a bit from here a character is another one.
             other = scores.copy()
             other[max(start - TICKS // 2, 0) : start + TICKS // 2 + 1] = -np.inf
-            if worth - self._best_path(other, stretch, light)[1] >= _OTHERWISE:
+            if worth - self._best_path(other, evidence, stretch, light)[1] >= _OTHERWISE:
                 return many
         return most
 

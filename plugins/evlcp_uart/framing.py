@@ -74,7 +74,7 @@ class Uart(Framing):
 
     def decoder(self, bit_rate_hz: float) -> CharacterDecoder:
         """What reads characters from events."""
-        return CharacterDecoder(self.characters, 1e6 / bit_rate_hz, self.idle == "on")
+        return CharacterDecoder(self.characters, 1e6 / bit_rate_hz, self.idle == "on", self.pause_bits)
 
     def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer:
         """For the packet's length and the rate of its chips."""

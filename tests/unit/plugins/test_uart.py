@@ -164,6 +164,32 @@ def test_a_stream_that_begins_within_a_character_gives_none_that_was_not_sent(cu
     assert state.given["characters"] == len(read)
 
 
+def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet() -> None:
+    """From within 35, 35 and 175 read as 246 and 253, too, and by their bits alone just as well."""
+    packets = [[97, 119, 159, 35, 175], [28, 86, 233, 30, 5], [77, 124, 246, 18, 200], [3, 91, 44, 170, 66]]
+    levels: list[int] = []
+    for packet in packets:
+        levels += [1] * 16 + levels_of(np.array(packet), 8, "even", 1)
+    # From the last data bit of the 35 on.
+    cut_bits = 16 + 3 * 11 + 8.7
+    for pause_bits in (16, 9):
+        for seed in range(3):
+            events = seen(
+                np.random.default_rng(seed),
+                levels,
+                100.0,
+                events=(20.0, 15.0),
+                late_us=(20.0, 10.0),
+                noise_hz=0.0,
+                cut_bits=cut_bits,
+            )
+            found = read_characters(events.t_us, events.p, 1e4, Uart(8, "even", 1, pause_bits=pause_bits))
+            read = [c.value for c in found]
+            assert read[-15:] == [value for packet in packets[1:] for value in packet]
+            # By the wrong pause it is ambiguous, or another.
+            assert (175 in read) == (pause_bits == 16)
+
+
 @pytest.mark.parametrize(
     ("data_bits", "parity", "stop_bits"), [(5, "none", 1), (8, "none", 1), (8, "odd", 1), (9, "even", 2)]
 )
@@ -312,19 +338,28 @@ def test_light_is_learned_as_it_is() -> None:
     assert light.told(windows, known) > light.told(windows, np.roll(known, 1, 1))
 
 
-def test_the_best_path_is_the_best_of_all() -> None:
-    rng = np.random.default_rng(4)
-    scores = rng.normal(4, 6, 14)
-    starts, worth = _kernels.best_path(scores, 4, 0, 1, 5.0, 1.0, 0.5)
+@pytest.mark.parametrize(
+    ("seed", "pause", "after_pause"), [(4, 0, 5.0), (4, 3, 2.0), (6, 3, 2.0), (6, 2, 4.5)]
+)
+def test_the_best_path_is_the_best_of_all(seed: int, pause: int, after_pause: float) -> None:
+    rng = np.random.default_rng(seed)
+    scores, tails = rng.normal(4, 6, 14), rng.normal(0, 2, 14)
+    starts, worth = _kernels.best_path(scores, tails, 4, 0, 1, 5.0, 1.0, 0.5, pause, after_pause)
 
     def cost(path: tuple[int, ...]) -> float:
         total = 0.0
         for k, s in enumerate(path):
-            off = s - path[k - 1] - 4 if k else 99
+            if not k:
+                total += scores[s] - 5.0
+                continue
+            end = path[k - 1] + 4
+            off, late = s - end, s - end - pause
             if off < -1:
                 return -math.inf
-            joined = 1.0 + 0.5 * abs(off) if off <= 1 else math.inf
-            total += scores[s] - min(joined, 5.0 if off >= 0 else math.inf)
+            ways = [-1.0 - 0.5 * abs(off)] if off <= 1 else []
+            ways += [tails[end] - 5.0] if off >= 0 else []
+            ways += [tails[end] - after_pause - 0.5 * abs(late)] if pause and abs(late) <= 1 else []
+            total += scores[s] + max(ways)
         return total
 
     every = [p for n in range(6) for p in itertools.combinations(range(14), n)]

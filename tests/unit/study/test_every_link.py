@@ -105,8 +105,6 @@ def test_all_commands_agree(name: str, evlcp: Evlcp, tmp_path: Path) -> None:
     (plain,), (road,) = score["bars"], score["road"]["bars"]
     # Frames before the first pilot, and those from which no pilot follows, may be lost.
     most_lost = 2 * (link.get("air.pilot_every", 1) - 1)
-    # A recording that begins within a character does not always tell where the next one starts.
-    most_lost += name == "characters"
     assert 12 <= plain["frames_sent"] - most_lost <= plain["frames_found"]
     assert score["unmatched"] == 0
     # Chips of 50 us are nearly as short as the latency of the pixels beside the bar.
