@@ -134,6 +134,14 @@ class PositionSpec:
     stretch_share: Annotated[
         float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
     ] = 0.00025
+    bend_sigma_px: Annotated[
+        float,
+        Field(
+            ge=0,
+            description="How a bar looks bent along itself, all the time (root of the sum of squares over its "
+            "points): a survey cannot tell it from a lean towards the camera.",
+        ),
+    ] = 0.06
     pixel_sigma_px: Annotated[
         float,
         Field(

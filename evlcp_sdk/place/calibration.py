@@ -59,6 +59,12 @@ _MOST_USUAL = 4.0
 _MOST_MISFIT = 4.0
 """Mean square of the misses, in sigmas, above which nothing is believed."""
 
+_OF_BAR = 8
+"""Unknowns of a bar: of its site three of place, three of turn, its length; how it looks bent."""
+
+_LINE = 1e-6
+"""Share of the squares of a line's points about their middle that may lie across it."""
+
 
 @dataclass(frozen=True, eq=False)
 class CalibrationView:
@@ -209,13 +215,17 @@ def _usual_sigma(camera: CameraModel) -> dict[str, float]:
 
 @dataclass(frozen=True, eq=False)
 class SeenView:
-    """A view's points in one array, with what makes their errors white and of one sigma."""
+    """A view's points in one array, with what makes their errors white and of one sigma.
+
+    `bend_px` is by how much a bar that looks bent along itself, by a sigma, moves them, (n, 2).
+    """
 
     enu_m: Floats
     points_px: Floats
     whiten: Floats
     bar: NDArray[np.int64]
     arm_m: Floats
+    bend_px: Floats
     survey: Mapping[int, tuple[float, float, float]]
     place_m: Floats
     place_sigma_m: float
@@ -225,7 +235,7 @@ class SeenView:
     @classmethod
     def of(cls, view: CalibrationView, camera: CameraModel, spec: PositionSpec) -> "SeenView":
         """The points of the bars of which enough is seen."""
-        enu, points, whiten, number, arm = [], [], [], [], []
+        enu, points, whiten, number, arm, bend = [], [], [], [], [], []
         survey: dict[int, tuple[float, float, float]] = {}
         between = between_of(view.bars)
         for bar in view.bars:
@@ -236,6 +246,7 @@ class SeenView:
             points.append(bar.points_px[good])
             number.append(np.full(int(good.sum()), bar.transmitter))
             arm.append(bar.enu_m[good] - bar.enu_m.mean(0))
+            bend.append(spec.bend_sigma_px * _bend(bar.enu_m, good, bar.points_px))
             shift, *site = shared_sigmas(bar, good, spec, between)
             survey[bar.transmitter] = (site[0], site[1], site[2])
             covariance = np.diag(bar.sigma_px[good] ** 2) + shift**2
@@ -253,8 +264,24 @@ class SeenView:
         if rotation is None:
             rotation, sigma = _turned(flat - view.enu_m, seen, camera), _FREE_SIGMA_RAD
         bars = np.concatenate([np.empty(0, np.int64), *number])
-        arms = np.concatenate([np.empty((0, 3)), *arm])
-        return cls(flat, seen, joined, bars, arms, survey, view.enu_m, view.position_sigma_m, rotation, sigma)
+        arms, bends = np.concatenate([np.empty((0, 3)), *arm]), np.concatenate([np.empty((0, 2)), *bend])
+        place_m, place_sigma_m = view.enu_m, view.position_sigma_m
+        return cls(flat, seen, joined, bars, arms, bends, survey, place_m, place_sigma_m, rotation, sigma)
+
+
+def _bend(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
+    """How the points that are seen of a line move as it bends along itself, in the image, float64 (n, 2).
+
+    By what the square of a point's place has besides a constant and its place; the sum of squares over the
+    whole bar is 1. Nothing where clusters are not in a line.
+    """
+    arm = enu_m - enu_m.mean(0)
+    along = arm @ np.linalg.svd(arm)[2][0]
+    if (arm**2).sum() - along @ along > _LINE * (arm**2).sum():
+        return np.zeros((int(seen.sum()), 2))
+    modes, _ = np.linalg.qr(np.stack([np.ones_like(along), along, along**2], 1))
+    way = points_px[seen][-1] - points_px[seen][0]
+    return np.asarray(modes[seen, 2][:, None] * (way / max(float(np.linalg.norm(way)), 1e-9)))
 
 
 def _turned(offset_m: Floats, points_px: Floats, camera: CameraModel) -> Floats:
@@ -300,10 +327,10 @@ class SolvedViews:
 
     Attributes:
         camera: With its parameters as found.
-        x: All unknowns: the camera's parameters, six of each view, seven of each bar's site, in its sigmas,
-            and six that all views share, float64 (n,).
+        x: All unknowns: the camera's parameters, six of each view, eight of each bar, in its sigmas, and six
+            that all views share, float64 (n,).
         covariance: Of these, float64 (n, n).
-        bars: Where a bar's seven are.
+        bars: Where a bar's eight are: its site's place, turn and length, and how it looks bent.
         misfit: Mean square of the misses in sigmas, over the degrees of freedom.
     """
 
@@ -332,11 +359,16 @@ def solve_views(
     from scipy.spatial.transform import Rotation
 
     names, shared = PARAMETERS, len(PARAMETERS)
-    # Errors of sites, in sigmas, behind the views: place, turn and length of each bar that has any.
-    surveys = {number: sigma for view in views for number, sigma in view.survey.items() if any(sigma)}
-    bars = {number: shared + 6 * len(views) + 7 * i for i, number in enumerate(sorted(surveys))}
+    # Errors of sites, in sigmas, behind the views: place, turn, length and bend of each bar that has any.
+    surveys = {
+        number: sigma
+        for view in views
+        for number, sigma in view.survey.items()
+        if any(sigma) or view.bend_px.any()
+    }
+    bars = {number: shared + 6 * len(views) + _OF_BAR * i for i, number in enumerate(sorted(surveys))}
     first = np.array([float(getattr(camera, name)) for name in names])
-    start = np.concatenate([first, np.zeros(6 * len(views) + 7 * len(bars))])
+    start = np.concatenate([first, np.zeros(6 * len(views) + _OF_BAR * len(bars))])
     last = slice(len(start), len(start) + 6)
     if common is not None:
         start = np.append(start, np.zeros(6))
@@ -362,6 +394,8 @@ def solve_views(
                     moves[column] = mine, _site_slope(view.arm_m[mine], surveys[number])
                     stands[mine] += moves[column][1] @ x[column : column + 7]
             place, slope = project_bars(stands, position, rotation, now)
+            for column, (mine, _) in moves.items():
+                place[mine] += x[column + 7] * view.bend_px[mine]
             seen = (stands - position) @ rotation
             block = np.zeros((len(place), 2, len(x)))
             block[:, :, :shared] = _slopes(now, seen[:, :2] / seen[:, 2:], place, names)
@@ -371,6 +405,7 @@ def solve_views(
                 block[:, :, last] = block[:, :, at : at + 6]
             for column, (mine, by_site) in moves.items():
                 block[mine, :, column : column + 7] = -slope[mine][:, :, :3] @ by_site
+                block[mine, :, column + 7] = view.bend_px[mine]
             for axis in (0, 1):
                 # A step that turns a point behind the camera is not to be taken.
                 off = np.nan_to_num(place[:, axis] - view.points_px[:, axis], nan=1e6)
@@ -403,7 +438,7 @@ def solve_views(
     covariance = (half @ half.T) * scale * scale[:, None]
     points = 2 * sum(len(v.points_px) for v in views)
     freedom = max(points - shared - 3 * len(views), 1)
-    where = {number: slice(column, column + 7) for number, column in bars.items()}
+    where = {number: slice(column, column + _OF_BAR) for number, column in bars.items()}
     return SolvedViews(camera_of(fit.x), fit.x, covariance, where, float(misses @ misses) / freedom)
 
 

@@ -2,6 +2,7 @@
 
 import dataclasses
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -19,7 +20,9 @@ from evlcp_sdk.scene.sites import BarSite, LocalAxes
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
 CAMERA = CameraModel(focal_mm=16.0)
-SPEC = PositionSpec(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0)
+SPEC = PositionSpec(
+    shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0, bend_sigma_px=0
+)
 ROTATION = Attitude(3.0, 1.0, 2.0).rotation()
 
 
@@ -32,19 +35,31 @@ BARS = [site(7, [-3.0, 45.0, 3.0], 4.0, 200.0), site(9, [3.0, 50.0, 4.0], 90.0, 
 
 
 def views(
-    rng: np.random.Generator, place_m: float, turn_deg: float, focal: float = 0.0
+    rng: np.random.Generator,
+    place_m: float,
+    turn_deg: float,
+    focal: float = 0.0,
+    bend_px: float = 0.0,
+    bars: Sequence[BarSite] = BARS,
 ) -> list[CalibrationView]:
-    """A drive of 12 m towards the bars; poses are off by one error in common, and by one each."""
+    """A drive of 12 m towards the bars; poses are off by one error in common, and by one each.
+
+    Bars look bent along themselves, each by the same in all views.
+    """
+    place = np.linspace(-1, 1, 16)
+    square = place**2 - (place**2).mean()
+    bends = rng.normal(0, bend_px, len(bars))[:, None] * square / np.linalg.norm(square)
     lens = dataclasses.replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + focal * rng.normal()))
     drift, tilt = rng.normal(0, place_m, 3), rng.normal(0, math.radians(turn_deg), 3)
     found = []
     for step in range(7):
         place = np.array([0.2 * step, 2.0 * step, 0.0])
         seen = []
-        for bar in BARS:
+        for bar, bend in zip(bars, bends, strict=True):
             enu = bar.cluster_positions_m(16, AXES)
             points, _ = project_bars(enu, place, ROTATION, lens)
-            points = points + rng.normal(0, 0.1, points.shape)
+            way = points[-1] - points[0]
+            points = points + bend[:, None] * way / np.linalg.norm(way) + rng.normal(0, 0.1, points.shape)
             seen.append(BarView(bar.transmitter_id, np.empty((0, 3)), points, np.full(16, 0.1)))
         off = tilt + rng.normal(0, math.radians(turn_deg), 3)
         said = Rotation.from_rotvec(off).as_matrix() @ ROTATION
@@ -74,6 +89,23 @@ def test_bars_come_back_within_their_sigmas() -> None:
     # The two bars of a survey share its errors: the bounds are those of the surveys.
     assert stats.chi2.isf(0.999, 18) / 6 < np.mean(squares) < stats.chi2.isf(0.001, 18) / 6
     assert 0.03 < np.mean(wide) < 0.5
+
+
+def test_a_bar_that_looks_bent_leans_within_its_sigma() -> None:
+    """The perspective of a lean towards the camera is a bend, and the same in all views."""
+    rng = np.random.default_rng(12)
+    bars = [site(7, [0.1, 45.0, 0.2], 6.0, 10.0)]
+    bent = dataclasses.replace(SPEC, bend_sigma_px=0.2)
+    sigmas: dict[PositionSpec, list[float]] = {bent: [], SPEC: []}
+    for _ in range(12):
+        seen = views(rng, 0.002, 0.002, bend_px=0.2, bars=bars)
+        for spec, misses in sigmas.items():
+            (bar,) = survey(seen, AXES, 0.96, CAMERA, None, spec)
+            off = math.degrees(math.acos(min(bar.site.axis_enu() @ bars[0].axis_enu(), 1)))
+            misses.append(off / (bar.site.attitude_sigma_deg or 0))
+    # Towards the camera a bar leans by far more than across.
+    low, high = stats.chi2.ppf([0.001, 0.999], 12) / 12
+    assert low < np.mean(np.square(sigmas[bent])) < high < np.mean(np.square(sigmas[SPEC]))
 
 
 def test_by_exact_poses_bars_are_where_they_stand() -> None:
