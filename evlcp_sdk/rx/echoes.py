@@ -23,9 +23,9 @@ from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet, changed
 
-__all__ = ["EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
+__all__ = ["FOLLOWED_CHIPS", "EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
 
-_TAIL_CHIPS = 2.5
+FOLLOWED_CHIPS = 2.5
 """The last events of a frame come late, some later than its clock says: it is whole if its light goes on for
 two chips after those due. The stream ends with the latest event, which is later than its light by more than
 the mean of those that the clock is set by: a tenth of a chip to a quarter, as latencies and rows spread, and
@@ -364,7 +364,7 @@ class EchoQueue:
         if waiting.sighting is None or waiting.due is None:
             return waiting.packets.flush()
         due, frame = waiting.due, waiting.sighting.frame
-        if due.end_us + _TAIL_CHIPS * due.lock.chip_us > self.ends_us:
+        if due.end_us + FOLLOWED_CHIPS * due.lock.chip_us > self.ends_us:
             self.cut += 1
             return []
         echo_of = self.echoes.echo_of(frame.transmitter)

@@ -160,7 +160,7 @@ def test_frames_before_the_first_preamble_are_decoded() -> None:
 
 
 def test_a_frame_that_the_end_cuts_is_not_given() -> None:
-    """Its last events come late, 20 to 70 us after their edges: the stream must go on for two chips more.
+    """Its last events come late, 20 to 70 us after their edges: the stream must go on for 2.5 chips more.
 
     One that is decoded before the stream ends there is counted.
     """
