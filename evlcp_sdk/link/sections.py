@@ -138,10 +138,10 @@ class PositionSpec:
         float,
         Field(
             ge=0,
-            description="How a bar looks bent along itself, all the time (root of the sum of squares over its "
-            "points): a survey cannot tell it from a lean towards the camera.",
+            description="How a bar looks bent along itself, all the time: root of the sum of squares of its "
+            "points. A survey cannot tell it from a lean towards the camera.",
         ),
-    ] = 0.06
+    ] = 0.05
     pixel_sigma_px: Annotated[
         float,
         Field(

@@ -622,7 +622,8 @@ def test_survey_finds_the_sites(evlcp: Evlcp, street: Path, tmp_path: Path) -> N
         error = LocalAxes.of([true]).to_enu(bar.latitude_deg, bar.longitude_deg, bar.height_m)
         assert error @ np.linalg.solve(said["covariance_m2"], error) < 30
         assert bar.position_sigma_m == pytest.approx(said["position_sigma_m"])
-        assert bar.position_sigma_m < 0.3
+        # By a lean of 4 degrees it looks a quarter of a percent farther away.
+        assert bar.position_sigma_m < 0.5
         assert said["views"] == 3
     assert not any("contradicted" in said for said in told)
     # With these sites the drive is where it was.
