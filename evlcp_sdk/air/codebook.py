@@ -189,6 +189,11 @@ class Codebook:
         """Bits m that one symbol carries: symbol s < 2**m carries those of s; others carry none."""
         return len(self.codewords).bit_length() - 1
 
+    @property
+    def carrying(self) -> int:
+        """Symbols that carry bits, 2**m: all, or the first ones of an alphabet that is no power of two."""
+        return 1 << self.bits_per_symbol
+
     @cached_property
     def pairs(self) -> bool:
         """Whether all codes are pair codes."""

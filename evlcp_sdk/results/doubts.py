@@ -701,7 +701,7 @@ def _codewords(
     never = codewords_never(one, link)
     if not never:
         return
-    codewords, occur = len(link.codebook.codewords), len(one.values)
+    codewords, occur = link.codebook.carrying, len(one.values)
     tried = counts.get("blocks_tried", 0)
     unread = f", {tried} of {tried} blocks unreadable" if tried and not _read(counts) else ""
     for name, words in seen.others().items():
@@ -793,8 +793,8 @@ def codewords_never(one: TransmitterTally, link: Link) -> int:
 
     Packets may repeat one another, so that all of them say no more than one.
     """
-    codewords = len(link.codebook.codewords)
-    never = codewords - len(one.values)
+    codewords = link.codebook.carrying
+    never = codewords - sum(symbol < codewords for symbol in one.values)
     if not one.given or not never:
         return 0
     # Equally likely codewords; the union of all sets of so many bounds the chance that they never occur.

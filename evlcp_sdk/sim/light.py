@@ -301,7 +301,7 @@ class BarLight:
             one: NDArray[np.int64] = packets_of([message], self._coder)[0]
             return one
         book = self.link.codebook
-        return rng.integers(0, len(book.codewords), (self.link.packet.frames, book.clusters))
+        return rng.integers(0, book.carrying, (self.link.packet.frames, book.clusters))
 
     def sent_symbols(self, duration_s: float) -> list[list[list[int]]]:
         """Symbols [packet][frame][cluster] of every packet that at least starts in the scene."""

@@ -338,9 +338,9 @@ def _checked(symbols: ArrayLike) -> NDArray[Any]:
 
 
 def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.random.Generator) -> Symbols:
-    """Uniform symbols, int64 (packets, frames, clusters)."""
+    """Uniform symbols, of those that carry bits, int64 (packets, frames, clusters)."""
     shape = (packets, frames, codebook.clusters)
-    return generator.integers(0, len(codebook.codewords), shape, dtype=np.int64)
+    return generator.integers(0, codebook.carrying, shape, dtype=np.int64)
 
 
 def symbol_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> NDArray[np.uint8]:

@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
 
+from evlcp_sdk import simulate
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import ROLES, Filter, Ranging, Tracker, Tracking
@@ -18,6 +20,7 @@ from evlcp_sdk.testing import check, laws_of, suite
 from evlcp_sdk.testing.law import Law, Subject, Verdict
 from evlcp_sdk.testing.links import LINK
 from evlcp_sdk.testing.trees import difference
+from firmware_host.board.bank import random_symbols
 
 Evlcp = Callable[..., Any]
 
@@ -89,6 +92,17 @@ def test_excuses_are_strict() -> None:
     assert found["monotone"].status == "failed"
     assert found["monotone"].detail == "excused (a reason), but it holds: drop the excuse"
     assert {o.status for name, o in found.items() if name != "monotone"} == {"ok"}
+
+
+def test_an_alphabet_may_be_no_power_of_two() -> None:
+    """Nine symbols carry three bits: what is sent at random is of the first eight."""
+    ppm = load_link(None, ["modulation.id=ppm", "modulation.positions=3", "modulation.pulses=2"])
+    assert (len(ppm.codebook.codewords), ppm.codebook.carrying) == (9, 8)
+    assert {one.status for one in check("modulation", ppm.algorithm("modulation"))} == {"ok"}
+    sent = random_symbols(20, 10, ppm.codebook, np.random.default_rng(1))
+    assert (sent.min(), sent.max()) == (0, 7)
+    with simulate("night", seed=1, link=ppm, overrides={"duration_s": 0.1}) as source:
+        assert source.truth.bars[0].symbols.max() == 7
 
 
 def test_what_is_refused_is_skipped_but_for_one_law() -> None:

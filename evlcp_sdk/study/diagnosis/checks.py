@@ -594,7 +594,7 @@ def _orientation(facts: Facts) -> Check:
 
 
 def _codewords(facts: Facts) -> Check:
-    many = len(facts.link.codebook.codewords)
+    many = facts.link.codebook.carrying
     never = max((codewords_never(one, facts.link) for one in facts.tally.own), default=0)
     frames, quality = sum(one.frames for one in facts.tally.own), facts.tally.quality
     if not never and quality >= SURE:

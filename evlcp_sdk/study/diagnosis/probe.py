@@ -110,7 +110,7 @@ def try_link(link: Link, events: Events, changes: Sequence[tuple[str, Any]] = ()
         receiver.counts.get("frames_rejected", 0),
         tally.quality,
         max((codewords_never(one, link) for one in tally.own), default=0),
-        len(link.codebook.codewords),
+        link.codebook.carrying,
     )
 
 

@@ -136,7 +136,7 @@ CHIPS = Codebook("ppm", np.array([0, 1, 1]), np.array([[0, 1, 0], [1, 0, 0]]), n
 
 def test_codes_of_any_chips() -> None:
     assert not CHIPS.pairs
-    assert (CHIPS.bits_per_symbol, CHIPS.edge_every) == (1, 1)
+    assert (CHIPS.bits_per_symbol, CHIPS.carrying, CHIPS.edge_every) == (1, 2, 1)
     assert CHIPS.pilot_edges.tolist() == [[1, -1], [-1, 0]]
     assert CHIPS.to_dict()["codewords"] == ["1000", "0100", "0010"]
     again = Codebook.from_json(CHIPS.to_json())
