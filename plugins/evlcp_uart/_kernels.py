@@ -12,6 +12,9 @@ __all__ = ["best_path", "bit_evidence", "character_scores"]
 
 Column = NDArray[Any]
 
+_NOTHING = 30.0
+"""Nats by which what is less likely is left out: 1e-13 of it, against a doubt of a thousandth."""
+
 
 @njit(cache=True, nogil=True)
 def _log_sum(a: float, b: float) -> float:
@@ -43,6 +46,7 @@ def bit_evidence(
     strengths = len(gains)
     alike = np.empty(contexts)
     said = np.empty((contexts, strengths))
+    least = math.log(doubt)
     for s in range(len(out)):
         alike[:] = 0.0
         events = 0
@@ -64,11 +68,13 @@ def bit_evidence(
         for c in range(contexts):
             total = 0.0
             for j in range(strengths):
-                total += math.exp(said[c, j] - top)
+                # What is less is nothing beside the doubt; most gains of a bright light are.
+                if said[c, j] > top - _NOTHING:
+                    total += math.exp(said[c, j] - top)
             out[s, c] = total
             largest = max(largest, total)
         for c in range(contexts):
-            out[s, c] = math.log((1 - doubt) * out[s, c] / largest + doubt)
+            out[s, c] = math.log((1 - doubt) * out[s, c] / largest + doubt) if out[s, c] > 0.0 else least
         last = out[s, contexts - 1]
         for c in range(contexts):
             out[s, c] -= last

@@ -83,8 +83,22 @@ _FRAMED = 0.6
 have to say of clear characters: 1 but for misread bits, 0.8 where one bit in seven is wrong. Of another code,
 in which characters are sought where they fit, it is a tenth in the mean."""
 
+_NEXT_FRAMED = 0.9
+"""The same of a light that explains less than the best: it is one of several tries."""
+
+_REST_FRAMED = 0.4
+"""The same of characters from which the light was not learned: dim light that is true may have 0.6, another
+code has what chance gives."""
+
+_TOLD_EVENTS, _TOLD_CHARACTERS = 2400, 16
+"""Events and characters that tell what a light is like: more of a bright one take longer, and say no more.
+The events are 30 an edge, `_ENOUGH` of a window, of five edges a character."""
+
 _TRIED, _ROUNDS = 4, 5
 """Guesses of the light that are followed, and how often each is learned anew."""
+
+_CLOCKS = (-0.015, 0.015)
+"""Clocks by which those are tried, too: within a character, no bit is off by a quarter of itself then."""
 
 _SHIFTS, _TOLD = range(-14, 15, 2), 0.01
 """Ticks by which bits are tried to begin elsewhere, as a burst should be within its bit's window: the latest
@@ -277,11 +291,12 @@ class CharacterDecoder:
         tried = state.tried
         if light is None and events >= _LEAST_EVENTS:
             # Looking takes long: the less often, the longer there was none.
+            other = False
             if tried & (tried - 1) == 0 or tried % _SELDOM == 0:
-                light = self._acquire(stretch)
-            if light is None and state.blocks == 1 and not last:
+                light, other = self._acquire(stretch)
+            if light is None and not other and state.blocks == 1 and not last:
                 return replace(state, blocks=_MORE), []
-            tried = 0 if light is not None else tried + 1
+            tried = 0 if light is not None else max(tried, _SELDOM // 2 if other else 0) + 1
         blocks = state.blocks
         if light is None:
             given["stretches_without_light"] += events >= _LEAST_EVENTS
@@ -538,24 +553,63 @@ class CharacterDecoder:
                 rate += 0.5 * (left - right) / bend * float(rates[1] - rates[0])
         return float(np.clip(light.rate + gain * (rate - light.rate), 1 - CLOCK_SHARE, 1 + CLOCK_SHARE))
 
-    def _acquire(self, stretch: "Stretch") -> Light | None:
-        """Learn the light from a stretch of which nothing is known; None where it shows no characters.
+    def _acquire(self, stretch: "Stretch") -> tuple[Light | None, bool]:
+        """Learn the light from a stretch of which nothing is known.
 
         The light is the other way round than said where its characters have their start, parity and stop bits
         clearly more often so: only text of few kinds without a pause has them both ways.
+
+        Returns:
+            The light, None where the stretch shows no characters; and whether it clearly shows another code.
         """
-        told = self._best(stretch, self._learnt(stretch, inverted=False))
-        other = self._best(stretch, self._learnt(stretch, inverted=True))
+        light, other = self._found(told := self._telling(stretch))
+        if told is stretch:
+            return light, other
+        if light is None:
+            # Of some light more must be seen.
+            return (None, True) if other else self._found(stretch)
+        # The rest, of which it has learned nothing, must be of these characters, too.
+        rest = Stretch(stretch.counts, told.end, stretch.seen, stretch.end)
+        starts, _, _ = self._path(rest, light, False)
+        if len(starts) >= _LEAST_CHARACTERS:
+            found, other = self._best(rest, [(light, starts)], _REST_FRAMED)
+            if found is None:
+                return None, other
+        # A few characters may fit by chance: those that do not fit well must go on to.
+        starts, _, _ = self._path(told, light, False)
+        found, _ = self._best(told, [(light, starts)], _NEXT_FRAMED)
+        return self._found(stretch) if found is None else (light, False)
+
+    def _telling(self, stretch: "Stretch") -> "Stretch":
+        """As much of it as tells what its light is like."""
+        known = int(np.searchsorted(np.cumsum(stretch.counts.sum(0)), _TOLD_EVENTS))
+        end = max(known, max(stretch.start, stretch.seen) + _TOLD_CHARACTERS * self._length)
+        if end >= stretch.end:
+            return stretch
+        counts = stretch.counts[:, : end + self._length + 2 * _TAIL]
+        return Stretch(counts, stretch.start, stretch.seen, end)
+
+    def _found(self, stretch: "Stretch") -> tuple[Light | None, bool]:
+        """The light of a stretch as `_acquire` gives it, whatever it costs."""
+        told, of_another = self._best(stretch, self._learnt(stretch, inverted=False))
+        other, _ = self._best(stretch, self._learnt(stretch, inverted=True))
         if other is None or (told is not None and told[1] + _INVERTED_BITS >= other[1]):
-            return None if told is None else told[0]
-        return other[0] if told is not None or other[1] >= _INVERTED_BITS else None
+            return (None, of_another) if told is None else (told[0], False)
+        return (other[0], False) if told is not None or other[1] >= _INVERTED_BITS else (None, of_another)
 
     def _best(
-        self, stretch: "Stretch", learned: list[tuple[Light, NDArray[np.int64]]]
-    ) -> tuple[Light, float] | None:
-        """The light that explains most, and how much speaks for its characters' fixed bits, bits."""
+        self,
+        stretch: "Stretch",
+        learned: list[tuple[Light, NDArray[np.int64]]],
+        least_framed: float = _FRAMED,
+    ) -> tuple[tuple[Light, float] | None, bool]:
+        """The light that explains most, and how much speaks for its characters' fixed bits, bits.
+
+        Returns:
+            None where none fits; and whether the one that explains most is clearly of another code.
+        """
         if not learned:
-            return None
+            return None, False
         # Beside one another only where an event counts the same.
         least = min(light.share for light, _ in learned)
         explained = [
@@ -563,6 +617,7 @@ class CharacterDecoder:
         ]
         both = bool(stretch.counts.any(1).all())
         # Light a bit off explains events of text, too, but not its stop bits: then another may, and clearly.
+        of_another = False
         for rank, k in enumerate(np.argsort(explained)[::-1].tolist()):
             light, starts = learned[k]
             evidence = self._evidence(stretch, light)[starts[:, None] + self._places(light)]
@@ -574,19 +629,27 @@ class CharacterDecoder:
             said, fixed = self.characters.said(evidence), self.characters.bits - self.characters.data_bits
             # Of rises alone, or falls, none tells: what the others would say is missing.
             clear = both and said > _CLEAR
-            of_another_code = clear and framed < _FRAMED * said * fixed * len(evidence)
-            if not of_another_code and (clear or rank == 0):
-                return light, framed
-        return None
+            wanted = _NEXT_FRAMED if rank else least_framed
+            unframed = clear and framed < wanted * said * fixed * len(evidence)
+            if not unframed and (clear or rank == 0):
+                return (light, framed), False
+            of_another |= unframed and rank == 0
+        return None, of_another
 
     def _learnt(self, stretch: "Stretch", inverted: bool) -> list[tuple[Light, NDArray[np.int64]]]:
         """What the light may be like, on for a mark as said or the other way round, and its characters."""
-        tried = []
-        for light in guesses(stretch.counts, self.mark_on != inverted):
-            light = replace(light, inverted=inverted)
+        tried: list[tuple[float, Light]] = []
+
+        def explain(light: Light) -> None:
             starts = self._path(stretch, light, True)[0]
             tried.append((self._explained(stretch, light, starts), light))
-        tried.sort(key=lambda one: -one[0])
+            tried.sort(key=lambda one: -one[0])
+
+        for light in guesses(stretch.counts, self.mark_on != inverted):
+            explain(replace(light, inverted=inverted))
+        for _, light in tried[:_TRIED]:
+            for off in _CLOCKS:
+                explain(replace(light, rate=1 + off))
         learned = []
         for _, light in tried[:_TRIED]:
             for turn in range(_ROUNDS):

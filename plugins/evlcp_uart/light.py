@@ -238,8 +238,7 @@ def guesses(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
                         rates[context, on] += glow * bits[2] * events[on] / TICKS
                         # Bright pixels go on and on after an edge.
                         rates[context, on] += trail * (bits[2] == bits[1] == on) * events[on] / TICKS
-                for off in (-0.015, 0.0, 0.015):
-                    yield Light(2 * rates, np.full(CONTEXTS, 2.0), shares, 1 + off)
+                yield Light(2 * rates, np.full(CONTEXTS, 2.0), shares)
 
 
 def _smooth(rates: NDArray[np.float64]) -> NDArray[np.float64]:
