@@ -145,7 +145,10 @@ class Codebook:
                 hint = ""
                 if given.size and given.dtype.kind == "i" and np.isin(given, (-1, 1)).all():
                     hint = "; values of -1 and +1 become chips by chips_of_values"
-                raise ConfigError(f"codebook {name}: expected a {ndim}-D array of chips 0 and 1{hint}")
+                raise ConfigError(
+                    f"codebook {name}: expected a {ndim}-D array of chips 0 and 1{hint};"
+                    f" got {given.dtype} of shape {given.shape}"
+                )
             code = given.astype(np.uint8)
             code.setflags(write=False)
             object.__setattr__(self, name, code)
