@@ -90,6 +90,9 @@ _REST_FRAMED = 0.4
 """The same of characters from which the light was not learned: dim light that is true may have 0.6, another
 code has what chance gives."""
 
+_UNFRAMED_BITS = 10.0
+"""How much may speak against the start, parity and stop bits of characters: one of a thousand by chance."""
+
 _TOLD_EVENTS, _TOLD_CHARACTERS = 2400, 16
 """Events and characters that tell what a light is like: more of a bright one take longer, and say no more.
 The events are 30 an edge, `_ENOUGH` of a window, of five edges a character."""
@@ -631,6 +634,8 @@ class CharacterDecoder:
             clear = both and said > _CLEAR
             wanted = _NEXT_FRAMED if rank else least_framed
             unframed = clear and framed < wanted * said * fixed * len(evidence)
+            # However dim it is, characters are never that much less likely than bits without a frame.
+            unframed |= both and framed < -_UNFRAMED_BITS
             if not unframed and (clear or rank == 0):
                 return (light, framed), False
             of_another |= unframed and rank == 0

@@ -578,6 +578,16 @@ def test_a_clear_light_of_another_code_is_none_of_characters() -> None:
     assert read_characters(light.t_us, light.p, 10_000.0, Uart(7, "even", 2)) == []
 
 
+@pytest.mark.parametrize("seed", [3, 7])
+def test_pair_codes_without_a_parity_to_fail_are_none_of_characters(seed: int) -> None:
+    """What fits of them is as dim as it is wrong: the rest of the light speaks against it."""
+    rng = np.random.default_rng(seed)
+    values = rng.integers(0, 2, 260)
+    levels = np.stack([values, 1 - values], 1).ravel().tolist()
+    light = seen(rng, levels, 100.0, late_us=(20.0, 30.0), noise_hz=100.0)
+    assert read_characters(light.t_us, light.p, 10_000.0, Uart(8, "none", 1)) == []
+
+
 def test_characters_of_one_polarity_are_not_said_to_be_sure() -> None:
     """Of rises alone a character has several readings: as many are wrong as quality says, to a fifth."""
     sent = np.random.default_rng(4).integers(0, 128, 200)
