@@ -620,7 +620,7 @@ class CharacterDecoder:
         ]
         both = bool(stretch.counts.any(1).all())
         # Light a bit off explains events of text, too, but not its stop bits: then another may, and clearly.
-        of_another = False
+        of_another, dim = False, None
         for rank, k in enumerate(np.argsort(explained)[::-1].tolist()):
             light, starts = learned[k]
             evidence = self._evidence(stretch, light)[starts[:, None] + self._places(light)]
@@ -636,10 +636,13 @@ class CharacterDecoder:
             unframed = clear and framed < wanted * said * fixed * len(evidence)
             # However dim it is, characters are never that much less likely than bits without a frame.
             unframed |= both and framed < -_UNFRAMED_BITS
-            if not unframed and (clear or rank == 0):
+            if not unframed and clear:
                 return (light, framed), False
+            if not unframed and rank == 0:
+                dim = light, framed
             of_another |= unframed and rank == 0
-        return None, of_another
+        # One that tells little is taken where none is clear.
+        return dim, of_another
 
     def _learnt(self, stretch: "Stretch", inverted: bool) -> list[tuple[Light, NDArray[np.int64]]]:
         """What the light may be like, on for a mark as said or the other way round, and its characters."""
