@@ -66,12 +66,12 @@ ROW = [
     ("along", float, 2),
     ("length_px", float),
 ]
-SIGMAS = [(name, float) for name in ("white_px", "pixel_px", "shift_px", "between", "early_px")]
+SIGMAS = [(name, float) for name in ("white_px", "pixel_px", "shift_px", "between", "early_px", "across_px")]
 DTYPE = np.dtype([*ROW, *SIGMAS, ("modes_px", float, len(MODES))])
 """A bar at the time of a fix. Sigmas of a mode of sum of squares 1: `white_px` by frames, `pixel_px` by where
-in a pixel it is, of a `pixel_sigma_px` of 1, `early_px` by how far the image moves in a microsecond;
-`shift_px` is what frames do not show across the bar, `between` that of `BarView`; `modes_px` are its errors,
-the shifts those of the mean."""
+in a pixel it is, of a `pixel_sigma_px` of 1, `early_px` by how far the image moves in a microsecond; all
+along the bar, and `across_px` across it, as is stated; `shift_px` is what frames do not show across the bar,
+`between` that of `BarView`; `modes_px` are its errors, the shifts those of the mean."""
 
 
 def rows_of(what: str, distance_m: float, seed: int, duration_s: float, drive: int) -> NDArray[np.void]:
@@ -100,9 +100,10 @@ def rows_of(what: str, distance_m: float, seed: int, duration_s: float, drive: i
             t_us = number * period_us
             points = points_at(seen, t_us, period_us, LINK.bar.clusters, spec)
             if points is not None:
-                rows.append(
-                    row_of(points, true_points(simulation, t_us, points.points_px), (what, seed, drive, t_us))
-                )
+                stated = points_at(seen, t_us, period_us, LINK.bar.clusters, LINK.position)
+                assert stated is not None
+                true_px = true_points(simulation, t_us, points.points_px)
+                rows.append(row_of(points, stated, true_px, (what, seed, drive, t_us)))
     return np.array([row for row in rows if row is not None], DTYPE)
 
 
@@ -116,8 +117,13 @@ def true_points(simulation: Simulation, t_us: float, near_px: Floats) -> Floats:
     return min(bars, key=lambda bar: float(np.nanmean(np.linalg.norm(near_px - bar, axis=1))))
 
 
-def row_of(points: SeenPoints, true_px: Floats, when: tuple[str, int, int, float]) -> tuple[Any, ...] | None:
-    """Of one bar at a time: `DTYPE`; None of one that is not seen whole."""
+def row_of(
+    points: SeenPoints, stated: SeenPoints, true_px: Floats, when: tuple[str, int, int, float]
+) -> tuple[Any, ...] | None:
+    """Of one bar at a time: `DTYPE`; None of one that is not seen whole.
+
+    `points` are of sigmas of 1, and `stated` of those that are.
+    """
     off = points.points_px - true_px
     if not np.isfinite(off).all():
         return None
@@ -143,6 +149,7 @@ def row_of(points: SeenPoints, true_px: Floats, when: tuple[str, int, int, float
         points.shift_px,
         points.between,
         points.early_px,
+        stated.across * math.sqrt((stated.sigma_px**2).mean()),
         modes,
     )
 
@@ -153,21 +160,20 @@ def variances(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Float
     each = rows["white_px"] ** 2 + (pixel * rows["pixel_px"]) ** 2 + (early * rows["early_px"]) ** 2
     # All points of a bar are off by a share of their places.
     longer = each + (stretch * rows["length_px"]) ** 2 * (LINK.bar.clusters / 12)
-    return np.stack([longer, each, each, each], 1)
+    return np.stack([longer, rows["across_px"] ** 2, each, rows["across_px"] ** 2], 1)
 
 
 def own_shifts(rows: NDArray[np.void], sigmas: Sequence[float] | Floats) -> Floats:
     """Covariance of the shift that is a bar's own, px^2, (n, 2, 2), by `NAMES`."""
     _, across, along, share, pixel, _, early, _ = sigmas
     each = rows["white_px"] ** 2 + (pixel * rows["pixel_px"]) ** 2 + (early * rows["early_px"]) ** 2
-    each /= LINK.bar.clusters
     longways = rows["along"][:, :, None] * rows["along"][:, None]
     _, of = np.unique(rows[["drive", "t_us"]], return_inverse=True)
     moved = math.sqrt(2) * sigmas[0] * (rows["between"] - _means(rows["between"], of)[of])
     both = moved**2 + (early * rows["early_px"]) ** 2
-    aside = across**2 + rows["shift_px"] ** 2 + both
-    more = along**2 + (share * rows["length_px"]) ** 2 + both - aside
-    return (aside + each)[:, None, None] * np.eye(2) + more[:, None, None] * longways
+    aside = across**2 + rows["shift_px"] ** 2 + both + rows["across_px"] ** 2 / LINK.bar.clusters
+    more = along**2 + (share * rows["length_px"]) ** 2 + both + each / LINK.bar.clusters - aside
+    return aside[:, None, None] * np.eye(2) + more[:, None, None] * longways
 
 
 def _means(values: Floats, of: NDArray[np.intp]) -> Floats:

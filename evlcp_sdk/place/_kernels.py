@@ -39,7 +39,7 @@ def normal(
     """Normal equations at a point; twice the robust cost, or NaN where a point is behind the camera.
 
     In: `points` (n, 10) of place, arm from the bar's centre, m, image, px, 1 / sigma, and the share of its
-    variance that stands; `bar` (n,), rising; `bar_sigma` (bars, 6), as of `shared`; `lens` (8,) of focal
+    variance that stands; `bar` (n,), rising; `bar_sigma` (bars, 9), as of `shared`; `lens` (8,) of focal
     length, px, principal point, k1, k2, p1, p2, k3; `lens_root` (7, 7), a root of the covariance of the first
     seven; `felt` (3,) up in the camera's axes, `heading`, radians, `known` rows of these, and `white` (3, 3),
     which whitens them. The point: `position` (3,), `rotation` (3, 3), `local` (bars, 9), `error` (7,).
@@ -66,7 +66,7 @@ def normal(
     total = 0.0
     at = 0
     for b in range(bars):
-        sp, st, sl, sxx, sxy, syy = bar_sigma[b]
+        sp, st, sl, sxx, sxy, syy, gxx, gxy, gyy = bar_sigma[b]
         tall = LOCAL if sp > 0 or st > 0 else 3
         last = tall + wide
         sum_ = 0.0
@@ -94,8 +94,9 @@ def normal(
             bent_u = u * radial + 2 * p1 * u * v + p2 * (r2 + 2 * u * u)
             bent_v = v * radial + p1 * (r2 + 2 * v * v) + 2 * p2 * u * v
             w = points[at, 8]
-            mx = (points[at, 6] - (cx + f * bent_u) - sxx * local[b, 0] - sxy * local[b, 1]) * w
-            my = (points[at, 7] - (cy + f * bent_v) - sxy * local[b, 0] - syy * local[b, 1]) * w
+            px = (points[at, 6] - (cx + f * bent_u) - sxx * local[b, 0] - sxy * local[b, 1]) * w
+            py = (points[at, 7] - (cy + f * bent_v) - sxy * local[b, 0] - syy * local[b, 1]) * w
+            mx, my = gxx * px + gxy * py, gxy * px + gyy * py
             size = math.sqrt(mx * mx + my * my)
             weight = 1.0
             if size > huber:
@@ -112,8 +113,8 @@ def normal(
             vv = radial + v * v * growth + 6 * p1 * v + 2 * p2 * u
             for i in range(2):
                 a = k + i * count
-                by_u, by_v = (uu, cross) if i == 0 else (cross, vv)
-                by_u, by_v = f * w / z * by_u, f * w / z * by_v
+                gx, gy = (gxx, gxy) if i == 0 else (gxy, gyy)
+                by_u, by_v = f * w / z * (gx * uu + gy * cross), f * w / z * (gx * cross + gy * vv)
                 by_z = -(by_u * u + by_v * v)
                 e = by_u * rotation[0, 0] + by_v * rotation[0, 1] + by_z * rotation[0, 2]
                 no = by_u * rotation[1, 0] + by_v * rotation[1, 1] + by_z * rotation[1, 2]
@@ -128,9 +129,10 @@ def normal(
                 row[tall + 3, a] = no * oz - up * oy
                 row[tall + 4, a] = up * ox - e * oz
                 row[tall + 5, a] = e * oy - no * ox
-            row[0, k], row[1, count + k] = sxx * w, syy * w
-            row[0, count + k] = row[1, k] = sxy * w
-            row[tall + FAULT, k], row[tall + FAULT, count + k] = bent_u * scale_f * w, bent_v * scale_f * w
+            row[0, k], row[0, count + k] = (gxx * sxx + gxy * sxy) * w, (gxy * sxx + gyy * sxy) * w
+            row[1, k], row[1, count + k] = (gxx * sxy + gxy * syy) * w, (gxy * sxy + gyy * syy) * w
+            row[tall + FAULT, k] = (gxx * bent_u + gxy * bent_v) * scale_f * w
+            row[tall + FAULT, count + k] = (gxy * bent_u + gyy * bent_v) * scale_f * w
             if wide > LENS:
                 by_lens[0, 0], by_lens[1, 0] = bent_u, bent_v
                 by_lens[0, 1] = by_lens[1, 2] = 1
@@ -139,12 +141,13 @@ def normal(
                 by_lens[0, 4], by_lens[1, 4] = f * u * r2 * r2, f * v * r2 * r2
                 by_lens[0, 5], by_lens[1, 5] = 2 * f * u * v, f * (r2 + 2 * v * v)
                 by_lens[0, 6], by_lens[1, 6] = f * (r2 + 2 * u * u), 2 * f * u * v
-                for a in range(2):
-                    for j in range(wide - LENS):
-                        value = 0.0
-                        for i in range(j, 7):
-                            value += by_lens[a, i] * lens_root[i, j]
-                        row[tall + LENS + j, k + a * count] = value * w
+                for j in range(wide - LENS):
+                    by_x = by_y = 0.0
+                    for i in range(j, 7):
+                        by_x += by_lens[0, i] * lens_root[i, j]
+                        by_y += by_lens[1, i] * lens_root[i, j]
+                    row[tall + LENS + j, k] = (gxx * by_x + gxy * by_y) * w
+                    row[tall + LENS + j, count + k] = (gxy * by_x + gyy * by_y) * w
             at += 1
             k += 1
         _products(row, row, last + 1, 2 * count, sums)
@@ -1105,7 +1108,7 @@ def gathered(
     """A bar's whole clusters as rows of a `Problem`, where they are `least` or more; how many they are.
 
     From row `at`, `points` (n, 10) and `bar` (n,). `pixel` is the sigma of a point that its pixel leaves, px;
-    `usual` (4,) and `sigma` (6,) are as of `shared`.
+    `usual` (5,) and `sigma` (9,) are as of `shared`.
     """
     count = len(enu_m)
     seen = np.zeros(count, np.bool_)
@@ -1131,14 +1134,15 @@ def gathered(
 
 @njit(cache=True, nogil=True)
 def shared(enu_m: Array, points_px: Array, seen: Array, usual: Array, sigma: Array) -> None:
-    """What a bar's points share, by those `seen` (K,), into `sigma` (6,).
+    """What a bar's points share, and how they err across it, by those `seen` (K,), into `sigma` (9,).
 
     The first three are its survey's, place, m, turn, radians, and length, a share, to which is added by how
-    much it looks too long, `usual[3]`; the others are of a root of the covariance of its image's shift, px:
-    of columns, of both, of rows. Its sigma is `usual[0]` across the bar, and along it `usual[1]` with a share
-    of the length, `usual[2]`; of a layout that is no line, the latter in all directions. The whole is as long
+    much it looks too long, `usual[3]`; the next are of a root of the covariance of its image's shift, px: of
+    columns, of both, of rows. Its sigma is `usual[0]` across the bar, and along it `usual[1]` with a share of
+    the length, `usual[2]`; of a layout that is no line, the latter in all directions. The whole is as long
     as from one of its clusters to the farthest other, and a cluster's own part; its image is so by what is
-    seen of it.
+    seen of it. The last, of columns, of both, of rows, make a point's errors even in all directions, where
+    those across a line are `usual[4]` of those along it.
     """
     everything = np.ones(len(seen), np.bool_)
     i, j = _ends(enu_m, seen)
@@ -1147,18 +1151,21 @@ def shared(enu_m: Array, points_px: Array, seen: Array, usual: Array, sigma: Arr
     dx, dy = points_px[j, 0] - points_px[i, 0], points_px[j, 1] - points_px[i, 1]
     size = math.hypot(dx, dy)
     along = math.hypot(usual[1], usual[2] * size * share)
-    across = usual[0] if size > 0 else along
+    across, even = (usual[0], usual[4]) if size > 0 else (along, 1.0)
     ax, ay = (dx / size, dy / size) if size > 0 else (1.0, 0.0)
     # Half a cluster beside the line from end to end is no error of a point in it.
     aside = 0.5 * size * share / len(seen)
     for k in range(len(seen)):
         if seen[k]:
             off = (points_px[k, 0] - points_px[i, 0]) * ay - (points_px[k, 1] - points_px[i, 1]) * ax
-            across = along if abs(off) > aside else across
+            across, even = (along, 1.0) if abs(off) > aside else (across, even)
     sigma[2] = math.hypot(sigma[2], usual[3])
     sigma[3] = across + (along - across) * ax * ax
     sigma[4] = (along - across) * ax * ay
     sigma[5] = across + (along - across) * ay * ay
+    sigma[6] = (1 + (even - 1) * ax * ax) / even
+    sigma[7] = (even - 1) * ax * ay / even
+    sigma[8] = (1 + (even - 1) * ay * ay) / even
 
 
 @njit(cache=True, nogil=True)

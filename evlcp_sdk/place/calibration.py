@@ -249,7 +249,7 @@ class SeenView:
             bend.append(spec.bend_sigma_px * _bend(bar.enu_m, good, bar.points_px))
             shift, *site = shared_sigmas(bar, good, spec, between)
             survey[bar.transmitter] = (site[0], site[1], site[2])
-            covariance = np.diag(bar.sigma_px[good] ** 2) + shift**2
+            covariance = np.diag((max(bar.across, 1.0) * bar.sigma_px[good]) ** 2) + shift**2
             whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
         size = sum(map(len, points))
         joined, at = np.zeros((size, size)), 0

@@ -33,16 +33,18 @@ def failed_bar(problem: Problem, bar: int, pose: Pose, test: float, parts: int) 
         parts: How many parts are tested.
     """
     rows = problem.points[problem.bar == bar]
-    weight = rows[:, 8]
-    columns, both, rows_px = problem.bar_sigma[bar, 3:]
-    shift = np.kron(weight[:, None], [[columns, both], [both, rows_px]])
+    shift, even = (
+        np.array([[one[0], one[1]], [one[1], one[2]]]) for one in problem.bar_sigma[bar, 3:].reshape(2, 3)
+    )
+    weight = rows[:, 8, None, None] * even
+    shift = (weight @ shift).reshape(-1, 2)
     whole = np.linalg.inv(np.eye(2 * len(rows)) + shift @ shift.T)
     off_m = np.zeros(3)
     for _ in range(_STEPS):
         points, slope = project_bars(rows[:, :3] + off_m, pose.enu_m, pose.rotation, problem.camera)
-        by_pose = (slope * weight[:, None, None]).reshape(-1, 6)
+        by_pose = (weight @ slope).reshape(-1, 6)
         by_place = -by_pose[:, :3]
-        missed = ((rows[:, 6:8] - points) * weight[:, None]).ravel()
+        missed = (weight @ (rows[:, 6:8] - points)[:, :, None]).ravel()
         follow = np.linalg.solve(by_place.T @ whole @ by_place, by_place.T @ whole)
         off_m = off_m + follow @ missed
     place_m = problem.bar_sigma[bar, 0]

@@ -49,6 +49,7 @@ class BarView:
         between: How far the image may have moved otherwise than its frames show, in `position.
             shaken_sigma_px`.
         early_px: What all points share in any direction besides, as a moving image is seen early or late, px.
+        across: Errors of points across the bar, in those along it, which `sigma_px` are.
     """
 
     transmitter: int
@@ -60,6 +61,7 @@ class BarView:
     shift_px: float = 0.0
     between: float = 1.0
     early_px: float = 0.0
+    across: float = 1.0
 
     @classmethod
     def of(
@@ -80,6 +82,7 @@ class BarView:
             seen.shift_px,
             seen.between,
             seen.early_px,
+            seen.across,
         )
 
 
@@ -117,8 +120,8 @@ class Problem:
         points: A row a cluster that is seen: its place in the local axes and from its bar's centre, m, where
             it is seen, px, 1 / sigma, and the share of its variance that stands for a while, float64 (n, 10).
         bar: Number of each point's bar, rising, int64 (n,).
-        bar_sigma: Of each bar: its survey, and a root of the covariance of its image's shift, px, float64
-            (bars, 6): see `_kernels.shared`.
+        bar_sigma: Of each bar: its survey, a root of the covariance of its image's shift, px, and what makes
+            errors of points even in all directions, float64 (bars, 9): see `_kernels.shared`.
         transmitters: Number of each bar.
         lens: Focal length, px, principal point, px, k1, k2, p1, p2, k3, float64 (8,).
         lens_root: A lower root of the covariance of the first seven, float64 (7, 7).
@@ -162,7 +165,7 @@ class Problem:
     ) -> "Problem | Refusal":
         """What the views give, or why that is too little for a position."""
         count = sum([len(view.sigma_px) for view in views])
-        points, bar, bar_sigma = np.empty((count, 10)), np.empty(count, np.int64), np.empty((len(views), 6))
+        points, bar, bar_sigma = np.empty((count, 10)), np.empty(count, np.int64), np.empty((len(views), 9))
         width, height, between = camera.width, camera.height, between_of(views)
         kept: list[int] = []
         at = most = 0
@@ -310,14 +313,14 @@ def shared_sigmas(
     """Of a bar: its image's shift, px, in any direction at most; its place, m, turn, radians, and length, a
     share. `between` is what it has in common with others, see `between_of`.
     """
-    found = np.array([*view.survey, 0.0, 0.0, 0.0])
+    found = np.array([*view.survey, *[0.0] * 6])
     _kernels.shared(view.enu_m, view.points_px, seen, _usual(spec, view, between), found)
-    place, turn, length, columns, both, rows = found.tolist()
+    place, turn, length, columns, both, rows = found[:6].tolist()
     return float(np.linalg.eigvalsh([[columns, both], [both, rows]])[-1]), place, turn, length
 
 
 def _usual(spec: PositionSpec, view: BarView, between: float) -> Floats:
-    """What kernels take of these, float64 (4,): see `_kernels.shared`.
+    """What kernels take of these, float64 (5,): see `_kernels.shared`.
 
     The image moves as one: of what is not known of it, a bar has for its own what it has more or less than
     others. These count as independent, so that two bars differ by as much as they do.
@@ -325,7 +328,7 @@ def _usual(spec: PositionSpec, view: BarView, between: float) -> Floats:
     moved = math.hypot(math.sqrt(2) * spec.shaken_sigma_px * abs(view.between - between), view.early_px)
     across = math.hypot(spec.shared_sigma_px, view.shift_px, moved)
     shift = across, math.hypot(spec.shared_along_px, moved), spec.shared_share
-    return np.array([*shift, spec.stretch_share], np.float64)
+    return np.array([*shift, spec.stretch_share, view.across], np.float64)
 
 
 def _whitening(attitude: Attitude, causes: Floats, angles: int, shaken_rad: float) -> Floats:

@@ -28,18 +28,26 @@ through them grow with it. With fewer frames beside it, at an end, an instant co
 _MODES = 2
 """Of a bar's shape that a pose hangs on, along it and across: how long it is and how it leans, and a bend."""
 
+_ALIKE = 1.8
+"""By how much more than its points about it a line's lean and bend vary: neighbours err alike. Of simulated
+drives, by night and by day, with a lens's wings and without, turning."""
+
+_PIXEL_WORTH = 3
+"""Of how many squares the error within pixels is worth, beside the 13 that 16 points about a line show."""
+
 
 class SeenPoints(NamedTuple):
     """A bar's image points.
 
     Attributes:
         points_px: Column and row of each cluster, px, float64 (K, 2); NaN where it is not seen.
-        sigma_px: Their standard deviations, px, float64 (K,).
+        sigma_px: Their standard deviations along the bar, px, float64 (K,).
         pixel_px: The part of these that stands: where in a pixel a point is, and in a moving image, when.
         shift_px: What all share across the bar besides, px: where in a pixel its thin image is.
         between: What is not known of how the image moved between frames, in that of an instant midway between
             two of frames that follow one another evenly.
         early_px: What all share in any direction besides, px: as the image moves, it is seen early or late.
+        across: Their standard deviations across the bar, in those along it.
     """
 
     points_px: Floats
@@ -48,6 +56,7 @@ class SeenPoints(NamedTuple):
     shift_px: float = 0.0
     between: float = 1.0
     early_px: float = 0.0
+    across: float = 1.0
 
 
 def unseen_px(flank_px: float) -> float:
@@ -82,11 +91,12 @@ def points_at(
     """A bar's image points at a time between its frames.
 
     The shape is a straight line in time through all frames within half a period, the place is interpolated
-    between the frames next to the time. Sigmas are those that the frames state, or, where the bar's length,
-    lean and bend scatter more from frame to frame, as they do where the readout is late, what these show;
-    with the error within pixels, as far as the image has not moved over others. What a thin bar's frames do
-    not show of where in a pixel it is, is apart, as all points share it; so is by how much a moving image is
-    seen early or late.
+    between the frames next to the time. Sigmas along the bar are those that the frames state, or, where its
+    length and bend scatter more from frame to frame, as they do where the readout is late, what these show;
+    with the error within pixels, as far as the image has not moved over others. Across, they are the larger
+    of how much lean and bend scatter and of how far the points are beside a line, as frames that are wrong
+    together do not scatter. What a thin bar's frames do not show of where in a pixel it is, is apart, as all
+    points share it; so is by how much a moving image is seen early or late.
 
     Args:
         frames: With points, in order of time.
@@ -124,20 +134,38 @@ def points_at(
     shapes = points - places[:, None]
     sigmas = np.array([f.points_sigma_px for f in near])
     sure = common & np.isfinite(sigmas).all(0)
-    wider = _scatter(dt, shapes[:, sure], sigmas[:, sure])
+    wider, aside = _scatter(dt, shapes[:, sure], sigmas[:, sure])
     line = _line(dt)
     early_px = spec.early_sigma_us * float(np.linalg.norm(line[1] @ places))
     pixel_px = math.hypot(spec.pixel_sigma_px * _left(line[0], places), early_px)
-    found, sigma = np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
+    found, drawn = np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
     for k in range(clusters):
         seen = np.isfinite(shapes[:, k, 0])
         if seen.sum() < 3:
             continue
         inverse = _line(dt[seen])
         found[k] = place + (inverse @ shapes[seen, k])[0]
-        drawn = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
-        sigma[k] = math.hypot(wider * drawn, pixel_px)
-    return SeenPoints(found, sigma, pixel_px, shift_px, between, early_px)
+        drawn[k] = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
+    sigma = np.hypot(wider * drawn, pixel_px)
+    usual = math.sqrt(float(np.nanmean(drawn**2))) if np.isfinite(drawn).any() else math.nan
+    off_px2, many = _beside(found)
+    shown = math.sqrt((_PIXEL_WORTH * pixel_px**2 + _ALIKE * off_px2) / (_PIXEL_WORTH + many))
+    across = math.hypot(max(aside * usual, shown), early_px) / math.hypot(wider * usual, pixel_px)
+    return SeenPoints(found, sigma, pixel_px, shift_px, between, early_px, across)
+
+
+def _beside(points: Floats) -> tuple[float, int]:
+    """By how much points (K, 2) are beside a line that may bend: the sum of squares, and its freedom."""
+    points = points[np.isfinite(points[:, 0])]
+    axis = points[-1] - points[0]
+    if len(points) < 5 or not axis.any():
+        return 0.0, 0
+    axis = axis / np.linalg.norm(axis)
+    along, across = points @ axis, points @ np.array([-axis[1], axis[0]])
+    along -= along.mean()
+    modes, _ = np.linalg.qr(np.stack([np.ones(len(along)), along, along**2], 1))
+    rest = across - modes @ (modes.T @ across)
+    return float(rest @ rest), len(along) - 3
 
 
 def _line(t: Floats) -> Floats:
@@ -154,26 +182,30 @@ def _left(weight: Floats, places: Floats) -> float:
     return math.sqrt(min(float(weight @ np.exp(-apart / _PIXEL_PX) @ weight), 1.0))
 
 
-def _scatter(t: Floats, shapes: Floats, sigma: Floats) -> float:
-    """By how much a bar's shape scatters more about a straight line in time than its points' sigmas say.
+def _scatter(t: Floats, shapes: Floats, sigma: Floats) -> tuple[float, float]:
+    """By how much a bar's shape scatters about a straight line in time, in what its points' sigmas say.
 
-    Along the bar and across, its linear and square terms; what errors of neighbouring points have in common
-    is in these, and nearly all that a pose hangs on. At least 1.
+    By its linear and square terms; what errors of neighbouring points have in common is in these, and nearly
+    all that a pose hangs on. Along the bar at least 1; across, where a line is seen better than where it is
+    parted, what is usual counts, too.
 
     Args:
         t: float64 (n,).
         shapes: Points about their mean, px, float64 (n, k, 2).
         sigma: Theirs, float64 (n, k).
+
+    Returns:
+        Along the bar, and across.
     """
     n, count = shapes.shape[:2]
     if n < 3 or count <= _MODES:
-        return 1.0
+        return 1.0, 1.0
     course = np.stack([np.ones(n), t], 1) @ _line(t)
     rest = shapes - np.einsum("nm,mjk->njk", course, shapes)
     mean = shapes.mean(0)
     axis = mean[-1] - mean[0]
     if not axis.any():
-        return 1.0
+        return 1.0, 1.0
     axis = axis / np.linalg.norm(axis)
     along = mean @ axis
     modes, _ = np.linalg.qr(np.stack([np.ones(count), along, along**2], 1))
@@ -181,4 +213,4 @@ def _scatter(t: Floats, shapes: Floats, sigma: Floats) -> float:
     said = sigma**2 @ modes**2
     turned = np.stack([rest @ axis, rest @ np.array([-axis[1], axis[0]])])
     seen = (np.einsum("ank,km->anm", turned, modes) ** 2 / said).sum(1) / (n - 2)
-    return math.sqrt(max(float(seen[:, 0].max()), float(seen.mean(1).max()), 1.0))
+    return math.sqrt(max(float(seen[0].max()), 1.0)), math.sqrt(max(float(seen[1, 0]), float(seen[1].mean())))

@@ -29,8 +29,10 @@ def frames(points_px: NDArray[np.float64], sigma_px: float) -> list[Frame]:
 
 def trials(
     step_px: float, white_px: float, lean: float, stated_px: float, pixel_px: float, seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Errors of the shape, float64 (trials, 16, 2), and what is said of them: sigmas, and that of pixels.
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Errors of the shape, float64 (trials, 16, 2), and what is said of them.
+
+    Sigmas, that of pixels, and how much it is across.
 
     Between two frames the image moves by a step to the right. An error within pixels is a Gaussian process of
     the place, which forgets within a pixel; beside it white errors, and in each frame another lean.
@@ -39,7 +41,7 @@ def trials(
     course = T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
     apart = np.abs(T_US[:, None] - T_US) / 3600.0 * step_px
     root = np.linalg.cholesky(np.exp(-apart) + 1e-9 * np.eye(9))
-    errors, sigmas, pixels = [], [], []
+    errors, sigmas, pixels, across = [], [], [], []
     for _ in range(400):
         pixel = np.einsum("ij,jkl->ikl", root, rng.normal(0, pixel_px, (9, 16, 2)))
         points = BAR_PX + course + pixel + rng.normal(0, white_px, (9, 16, 2))
@@ -50,12 +52,13 @@ def trials(
         errors.append(error - error.mean(0))
         sigmas.append(found[1])
         pixels.append(found[2])
-    return np.array(errors), np.array(sigmas), np.array(pixels)
+        across.append(found.across)
+    return np.array(errors), np.array(sigmas), np.array(pixels), np.array(across)
 
 
 @pytest.mark.parametrize("step_px", [0.0, 0.5, 3.0])
 def test_an_error_within_pixels_stays_as_long_as_the_image_does(step_px: float) -> None:
-    errors, sigmas, pixels = trials(step_px, 0.1, 0.0, 0.1, 0.08, seed=1)
+    errors, sigmas, pixels, _ = trials(step_px, 0.1, 0.0, 0.1, 0.08, seed=1)
     # Their mean is taken with the bar's place.
     drawn = 0.1 * math.sqrt(float((weights() ** 2).sum()))
     pixel = math.sqrt(errors.var() * 16 / 15 - drawn**2)
@@ -73,7 +76,7 @@ def weights() -> NDArray[np.float64]:
 
 
 def test_frames_that_scatter_as_they_say_say_it_all() -> None:
-    _, sigmas, pixels = trials(3.0, 0.1, 0.0, 0.1, 0.0, seed=2)
+    _, sigmas, pixels, _ = trials(3.0, 0.1, 0.0, 0.1, 0.0, seed=2)
     drawn = np.sqrt(sigmas[:, 0] ** 2 - pixels**2)
     said = 0.1 * math.sqrt(float((weights() ** 2).sum()))
     assert (drawn >= said * (1 - 1e-9)).all()
@@ -81,16 +84,36 @@ def test_frames_that_scatter_as_they_say_say_it_all() -> None:
 
 
 def test_a_bar_that_leans_otherwise_in_each_frame_is_less_sure() -> None:
-    errors, sigmas, _ = trials(3.0, 0.05, 0.01, 0.05, 0.0, seed=3)
+    errors, sigmas, _, across = trials(3.0, 0.05, 0.01, 0.05, 0.0, seed=3)
     mode = LEVER / np.linalg.norm(LEVER)
     lean = errors[:, :, 0] @ mode
-    said = np.sqrt((sigmas**2) @ mode**2)
+    said = across * np.sqrt((sigmas**2) @ mode**2)
     # Of a variance estimated with 7 degrees of freedom: Student's t, 7 / 5, and 3 sigmas .02.
     assert 0.9 < float(np.mean((lean / said) ** 2)) < 1.7
     assert float(np.mean(np.abs(lean) > 3 * said)) < 0.04
-    # By what frames state alone it was beyond 4 sigmas in the mean.
+    # Along it, they scatter as they say.
+    assert float(np.mean(sigmas**2)) < 0.2 * float(np.mean(said**2))
+    # By what frames state alone it was beyond 3 sigmas in the mean.
     stated = math.hypot(0.05 * math.sqrt(float((weights() ** 2).sum())), 0.03)
     assert float(np.mean((lean / stated) ** 2)) > 10
+
+
+@pytest.mark.parametrize("across_px", [0.02, 0.06, 0.18])
+def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None:
+    """White errors of another size across than along: said within a factor of what there is, safe side."""
+    rng, spec = np.random.default_rng(4), replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
+    errors, said = [], []
+    for _ in range(300):
+        points = BAR_PX + rng.normal(0, [across_px, 0.06], (9, 16, 2))
+        found = points_at(frames(points, 0.06), 0.0, 36_000.0, 16, spec)
+        assert found is not None
+        error = found.points_px - BAR_PX
+        errors.append((error - error.mean(0)).T)
+        said.append([found.across * found.sigma_px.mean(), found.sigma_px.mean()])
+    there, said_px2 = np.var(errors, axis=(0, 2)) * 16 / 15, np.mean(np.square(said), axis=0)
+    # The lean's share is taken larger than the points' about a line, by 1.8, and of two estimates the larger.
+    assert 1.2 < said_px2[0] / there[0] < 2.3
+    assert 1.0 < said_px2[1] / there[1] < 1.5
 
 
 def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
