@@ -119,7 +119,7 @@ class PositionSpec:
     ] = 0.02
     shared_along_px: Annotated[
         float, Field(ge=0, description="The same along it, where its ends are half a cluster's light.")
-    ] = 0.04
+    ] = 0.038
     shared_share: Annotated[
         float,
         Field(ge=0, le=0.1, description="What of that grows with the bar: a share of its length."),
