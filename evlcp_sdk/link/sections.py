@@ -119,7 +119,7 @@ class PositionSpec:
     ] = 0.02
     shared_along_px: Annotated[
         float, Field(ge=0, description="The same along it, where its ends are half a cluster's light.")
-    ] = 0.038
+    ] = 0.04
     shared_share: Annotated[
         float,
         Field(ge=0, le=0.1, description="What of that grows with the bar: a share of its length."),
@@ -133,7 +133,7 @@ class PositionSpec:
     ] = 13.0
     stretch_share: Annotated[
         float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
-    ] = 0.00015
+    ] = 0.00012
     bend_sigma_px: Annotated[
         float,
         Field(
