@@ -52,7 +52,9 @@ SPEC = PositionSpec()
 NOISE_PX = 0.05
 PIXEL_PX = 0.05
 POINT_PX = math.hypot(NOISE_PX, PIXEL_PX)
-"""Of a point: new with every fix, what stands until the image has moved, and both."""
+"""Of a point along its bar: new with every fix, what stands until the image has moved, and both."""
+ACROSS = 0.6
+"""Errors across a bar in those along it, as of simulated drives by night."""
 ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
 WRONG_FOCAL = 0.005
 """By what share a focal length is wrong that is."""
@@ -100,6 +102,13 @@ def own_shift(points_px: Floats, spec: PositionSpec) -> Floats:
     return spec.shared_sigma_px * np.eye(2) + (longways - spec.shared_sigma_px) * np.outer(along, along)
 
 
+def uneven(points_px: Floats) -> Floats:
+    """What makes even errors of points `ACROSS` as large across the bar, float64 (2, 2)."""
+    along = points_px[-1] - points_px[0]
+    along = along / np.linalg.norm(along)
+    return ACROSS * np.eye(2) + (1 - ACROSS) * np.outer(along, along)
+
+
 def scene(world: World, rng: np.random.Generator) -> Scene:
     """A scene with errors of the sigmas that are stated."""
     pitch, roll, heading = rng.uniform(0, 6), rng.normal(0, 1), rng.uniform(0, 360)
@@ -118,12 +127,13 @@ def scene(world: World, rng: np.random.Generator) -> Scene:
         stands = rotation @ (sight * far) + ALONG[:, None] * axis
         points, _ = project_bars(stands, np.zeros(3), rotation, true)
         shift = own_shift(points, SPEC) @ rng.normal(size=2)
-        points = points + rng.normal(0, POINT_PX, points.shape) + shift + shaken
+        points = points + rng.normal(0, POINT_PX, points.shape) @ uneven(points) + shift + shaken
         place, turn, length = world.survey
         arm = stands - stands.mean(0)
         said = stands + rng.normal(0, place, 3) + np.cross(rng.normal(0, turn, 3), arm)
         said = said + rng.normal(0, math.hypot(length, SPEC.stretch_share)) * arm
-        views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey, PIXEL_PX))
+        sigma_px = np.full(16, POINT_PX)
+        views.append(BarView(number, said, points, sigma_px, world.survey, PIXEL_PX, across=ACROSS))
     off = rng.normal(0, world.attitude_deg, 3)
     known = world.attitude_deg
     told = {
@@ -213,7 +223,7 @@ def known_by_points(seen: Scene) -> Floats:
         own[:, :, 2] = math.hypot(length, SPEC.stretch_share) * np.einsum("nij,nj->ni", by, arm)
         own[:, :, 3:6] = place * by
         own[:, :, 6:] = turn * np.cross(arm[:, None], by)
-        parts.append((rows * weight).reshape(-1, 6 + shared))
+        parts.append((np.linalg.inv(uneven(view.points_px)) @ rows * weight).reshape(-1, 6 + shared))
     rows = np.concatenate(parts)
     whole = rows.T @ rows
     whole[7:, 7:] += np.eye(shared - 1)
@@ -384,8 +394,9 @@ def drive(world: World, rng: np.random.Generator, spec: PositionSpec) -> tuple[l
             slow[:] = fade * slow + math.sqrt(1 - fade**2) * rng.normal(0, PIXEL_PX, (16, 2))
             points, _ = project_bars(stands, state[:3], rotation, true)
             shift = own_shift(points, spec) @ rng.normal(size=2)
-            points = points + slow + rng.normal(0, NOISE_PX, points.shape) + shift + shaken
-            views.append(BarView(number, said, points, np.full(16, POINT_PX), world.survey, PIXEL_PX))
+            off_px = (slow + rng.normal(0, NOISE_PX, points.shape)) @ uneven(points)
+            points, sigma_px = points + off_px + shift + shaken, np.full(16, POINT_PX)
+            views.append(BarView(number, said, points, sigma_px, world.survey, PIXEL_PX, across=ACROSS))
         found = solve_pose(views, CAMERA, told, spec, sigma)
         if isinstance(found, Pose):
             fixes.append(
