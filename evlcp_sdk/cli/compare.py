@@ -1,6 +1,6 @@
 """`evlcp compare`."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
@@ -10,22 +10,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, complain, console, echo, make_executor
+from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
-    from rich.table import Table as Grid
-
     from evlcp_sdk.study.compare.table import Comparison, Table
     from evlcp_sdk.study.compare.variants import Variant
 
 __all__ = ["compare", "register"]
 
 _SQLITE = b"SQLite format 3\0"
-_PIPE_WIDTH = 200
-_GAP = 2
-
-_Column = Sequence[tuple[str, bool]]
-"""Its heading and its cells, and whether each is the best."""
 
 
 @dataclass(frozen=True)
@@ -203,48 +197,14 @@ def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
 
 def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
     out = console()
-    if not out.is_terminal:
-        # A pipe has no width that a table should be cut to.
-        out.width = _PIPE_WIDTH
     for one in comparison.tables:
         out.print(one.name, style="bold")
         head, lines = one.cells()
-        columns = list(zip([(title, False) for title in head], *lines, strict=True))
-        # Of more columns than the screen is wide, the others stand below, with the variants again.
-        for part in _parts(columns, out.width):
-            out.print(_grid(part))
-            out.print()
+        # The best have a mark behind them.
+        print_table(out, head, [[(t if best else f"{t} ", best) for t, best in line] for line in lines])
+        out.print()
     for note in comparison.notes:
         out.print(note, style="yellow")
     out.print(comparison.legend, style="dim")
     if paths:
         out.print(f"written: {', '.join(map(str, paths))}", style="dim")
-
-
-def _parts(columns: Sequence[_Column], width: int) -> Iterator[list[_Column]]:
-    """Columns that fit side by side, the first of all in front of each."""
-    names, *others = columns
-    part = [names]
-    for column in others:
-        if len(part) > 1 and _width([*part, column]) > width:
-            yield part
-            part = [names]
-        part.append(column)
-    yield part
-
-
-def _width(columns: Iterable[_Column]) -> int:
-    return sum(max(len(text) for text, _ in column) + _GAP for column in columns)
-
-
-def _grid(columns: Sequence[_Column]) -> "Grid":
-    """A table of columns, each with its heading first; the best in bold type."""
-    from rich.table import Table as Grid
-    from rich.text import Text
-
-    grid = Grid(box=None, pad_edge=False, header_style="dim")
-    for number, column in enumerate(columns):
-        grid.add_column(column[0][0], justify="right" if number else "left", no_wrap=True)
-    for row in zip(*(column[1:] for column in columns), strict=True):
-        grid.add_row(*(Text(text, "bold") if best else f"{text} " for text, best in row))
-    return grid

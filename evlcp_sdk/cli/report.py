@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, console, echo
+from evlcp_sdk.cli._tables import print_table
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.campaign.summary import Summary
     from evlcp_sdk.study.tally import Tally
 
 __all__ = ["register", "report", "show_paper", "show_positions", "show_series"]
-
-_PIPE_WIDTH = 200
 
 
 def register(app: typer.Typer) -> None:
@@ -84,7 +83,7 @@ def report(
 
 def show_series(summary: "Summary") -> None:
     """Print BER, RMSE and gross errors of every series, a row a segment."""
-    _print_table(*_series_table(summary))
+    _print(*_series_table(summary), names=2)
 
 
 def show_positions(summary: "Summary") -> None:
@@ -92,7 +91,7 @@ def show_positions(summary: "Summary") -> None:
     head, rows = _positions_table(summary)
     if rows:
         console().print()
-        _print_table(head, rows)
+        _print(head, rows, names=1)
 
 
 def show_paper(summary: "Summary") -> None:
@@ -100,7 +99,7 @@ def show_paper(summary: "Summary") -> None:
     head, rows = _paper_table(summary)
     if rows:
         console().print()
-        _print_table(head, rows)
+        _print(head, rows, names=3)
 
 
 def as_markdown(summary: "Summary") -> str:
@@ -168,16 +167,5 @@ def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
     return ["figure", "distance", "series", "paper", "here", "95 %", "verdict"], rows
 
 
-def _print_table(head: list[str], rows: list[list[str]]) -> None:
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    for number, name in enumerate(head):
-        table.add_column(name, justify="left" if number < 2 else "right", no_wrap=True)
-    for row in rows:
-        table.add_row(*row)
-    out = console()
-    if not out.is_terminal:
-        # A pipe has no width that a table should be cut to.
-        out.width = _PIPE_WIDTH
-    out.print(table)
+def _print(head: list[str], rows: list[list[str]], names: int) -> None:
+    print_table(console(), head, [[(text, False) for text in row] for row in rows], names)
