@@ -96,15 +96,22 @@ def solve_pose(
     fits: list[tuple[str, Pose]] = []
     unsure = []
     most = max(tests.values(), default=0.0)
-    for name, other in _without(problem, sigma):
-        if tests.get(name, most) < _HOPELESS * most and most > _FAR:
-            continue
-        again = other if isinstance(other, Refusal) else _explained(other)
-        if isinstance(again, Pose):
-            fits.append((name, again))
-        elif again is not None:
-            # It may be this part; without it there is no position that would tell.
-            unsure.append(name)
+    likely: list[tuple[str, Problem | Refusal]] = []
+    others: list[tuple[str, Problem | Refusal]] = []
+    for part in _without(problem, sigma):
+        hopeless = tests.get(part[0], most) < _HOPELESS * most and most > _FAR
+        (others if hopeless else likely).append(part)
+    # Where nothing fits without one, or several do, the tests may be of a fit that has gone astray.
+    for parts in (likely, others):
+        if len(fits) == 1:
+            break
+        for name, other in parts:
+            again = other if isinstance(other, Refusal) else _explained(other)
+            if isinstance(again, Pose):
+                fits.append((name, again))
+            elif again is not None:
+                # It may be this part; without it there is no position that would tell.
+                unsure.append(name)
     names = [name for name, _ in fits]
     if "heading" in names:
         fits = [fit for fit in fits if fit[0] != "attitude"]
