@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import echo
+from evlcp_sdk.cli._common import complain, echo
 
 if TYPE_CHECKING:
     from datetime import datetime
@@ -42,6 +42,7 @@ __all__ = [
     "clock_zero_of",
     "json_lines_of",
     "plan_of",
+    "say_alike",
     "sinks_of",
 ]
 
@@ -171,6 +172,17 @@ def clock_of(pps: int | None, zero: "datetime | None") -> "datetime | PulseClock
     from evlcp_sdk.utc import PulseClock
 
     return zero if pps is None else PulseClock(pps, zero)
+
+
+def say_alike(links: "Sequence[Link]") -> None:
+    """Say on stderr, before anything is read, which links a receiver cannot tell apart."""
+    if len(links) < 2:
+        return
+    from evlcp_sdk.link.several import named_links
+    from evlcp_sdk.results.doubts import alike_doubts
+
+    for doubt in alike_doubts(named_links(links)):
+        complain(f"warning: {doubt}")
 
 
 def plan_of(

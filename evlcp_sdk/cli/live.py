@@ -33,6 +33,7 @@ from evlcp_sdk.cli._receiving import (
     clock_zero_of,
     json_lines_of,
     plan_of,
+    say_alike,
     sinks_of,
 )
 from evlcp_sdk.cli._summary import delays_text, show
@@ -198,6 +199,7 @@ def live(
     lines = json_lines_of(json_lines, [url], as_json=as_json)
     registry = Registry.load()
     links = load_links(link_files, overrides or [], registry)
+    say_alike(links)
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
     attitude = attitude_of(attitude_file, (heading_deg, pitch_deg, roll_deg), sigmas)
     zero = clock_zero_of(clock_zero)

@@ -45,6 +45,7 @@ from evlcp_sdk.cli._receiving import (
     clock_zero_of,
     json_lines_of,
     plan_of,
+    say_alike,
     sinks_of,
 )
 from evlcp_sdk.cli._summary import show
@@ -183,6 +184,7 @@ def receive(
     jobs = _jobs(recordings, out, lines)
     registry = Registry.load()
     links = load_links(link_files, overrides or [], registry)
+    say_alike(links)
     if link_mode is LinkMode.AUTO:
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")

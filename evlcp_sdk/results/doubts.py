@@ -20,6 +20,7 @@ __all__ = [
     "Doubt",
     "LinkPart",
     "Seen",
+    "alike_doubts",
     "codewords_never",
     "notes_of",
     "other_codewords",
@@ -250,7 +251,7 @@ def warnings_of_links(
         placing: Name of the link that says what is wrong with them.
     """
     found = [*saturation(seen), *_dropped(counts, seen), *_room(counts)]
-    found += _alike(links)
+    found += alike_doubts({name: part.link for name, part in links.items()})
     if not tally.transmitters:
         return found + list(_frames(counts))
     for name, part in links.items():
@@ -267,9 +268,9 @@ def warnings_of_links(
     return found
 
 
-def _alike(links: Mapping[str, LinkPart]) -> Iterator[Doubt]:
-    """Links of which nothing on air tells one from the other."""
-    for one, other in alike_links({name: part.link for name, part in links.items()}):
+def alike_doubts(links: Mapping[str, Link]) -> Iterator[Doubt]:
+    """Links of which nothing on air tells one from the other, by name: known before anything is read."""
+    for one, other in alike_links(links):
         yield Doubt(
             "alike-links",
             f"what one of the links '{one}' and '{other}' sends, the other may read: the rates are alike,"

@@ -18,6 +18,10 @@ at its limit: chips, and the noise of their number, change it by more."""
 _LEAST_MS = 10
 """Milliseconds with events below which chance may be taken for a limit."""
 
+_LEAST_EVENTS = 1000
+"""Events of a millisecond below which none is a limit: no sensor's readout is as slow as 1 Mev/s, and a few
+lights that blink evenly send as many in each."""
+
 _BIN = 0.005
 """Width of the bins of events in a millisecond, as a share."""
 
@@ -74,8 +78,9 @@ class ReadoutTally:
     @property
     def at_limit(self) -> bool:
         """Whether the readout was at its limit."""
-        share, _ = self.capped()
-        return int(self._hist.sum()) >= _LEAST_MS and share >= _CAPPED_SHARE
+        share, events = self.capped()
+        several = int(self._hist.sum()) >= _LEAST_MS and events >= _LEAST_EVENTS
+        return several and share >= _CAPPED_SHARE
 
     @property
     def capped_ms(self) -> int:

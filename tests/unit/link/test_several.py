@@ -4,6 +4,7 @@ from pathlib import Path
 
 import pytest
 
+from evlcp_sdk.cli._receiving import say_alike
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import alike_links, load_links, named_links
@@ -79,3 +80,16 @@ def test_links_alike_are_warned_of_before_anything_is_read(tmp_path: Path) -> No
     (told,) = warnings_of_links(RunTally({}), {}, parts, seen=Seen())
     assert told.code == "alike-links"
     assert "'lamp' and 'off'" in told.text
+
+
+def test_links_alike_are_said_on_stderr_before_anything_is_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for name, idle in (("lamp", ""), ("off", "idle = 'off'")):
+        (tmp_path / f"{name}.toml").write_text(ONE_LED + TOLD.format(rate=3125.0) + idle)
+    links = load_links([tmp_path / "lamp.toml", tmp_path / "off.toml"])
+    say_alike(links)
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("evlcp: warning: what one of the links 'lamp' and 'off' sends, the other may read")
+    say_alike(links[:1])
+    assert not capsys.readouterr().err

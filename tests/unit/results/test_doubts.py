@@ -225,12 +225,13 @@ def test_a_beacon_that_says_another_length() -> None:
 
 
 def test_a_readout_at_its_limit() -> None:
-    """3000 events in each millisecond, against 3000 on average."""
+    """3000 events in each millisecond, against 3000 on average, and a lamp that blinks evenly."""
     rng = np.random.default_rng(4)
     for many, capped in (
         (np.full(300, 3000), True),
         (rng.poisson(3000, 300), False),
         (rng.poisson(20, 300), False),
+        (np.full(300, 20), False),
     ):
         t_us = np.sort(np.concatenate([1000 * i + rng.integers(0, 1000, n) for i, n in enumerate(many)]))
         readout = ReadoutTally()
