@@ -390,6 +390,8 @@ _WIDEST = 2.0
 
 def _ranging_of(bar: BarLayout, pairs: bool) -> str:
     """Id of the ranging that fits a layout best."""
+    if not bar.apart:
+        return "none"
     # From side to side `joint-scale` measures nothing: of low columns far apart, that is what counts.
     high_m = max((len(clusters) * pitch_m for clusters, pitch_m in bar.even_columns), default=0.0)
     if pairs and high_m > 0 and bar.width_m <= _WIDEST * high_m:

@@ -144,7 +144,8 @@ class LedTable:
     """Any LEDs: one row each, in any order; clusters of any size, counted from 0.
 
     Raises:
-        ConfigError: There are none or more than 65536, a number lies beyond 100 m, or a cluster has no LED.
+        ConfigError: There are none or more than 65536, a number lies beyond 100 m, a cluster has no LED, or
+            one is behind another.
     """
 
     leds: Annotated[
@@ -175,6 +176,18 @@ class LedTable:
             raise ConfigError(
                 f"bar.leds: no LED of cluster {missing}: expected clusters 0 to {max(clusters)}, all of them"
             )
+
+        places: dict[int, set[tuple[int, ...]]] = {}
+        for led in self.leds:
+            places.setdefault(led[3], set()).add(tuple(round(value * 1e6) for value in led[:2]))
+        seen: dict[frozenset[tuple[int, ...]], int] = {}
+        for k in sorted(clusters):
+            first = seen.setdefault(frozenset(places[k]), k)
+            if first != k:
+                raise ConfigError(
+                    f"bar.leds: cluster {k} is behind cluster {first}, LED by LED: expected clusters that a"
+                    " camera in front sees beside one another"
+                )
 
     def placed(self) -> Leds:
         """Where the LEDs stand, and their clusters."""
@@ -266,6 +279,16 @@ class BarLayout:
     def cluster_centres_m(self) -> Floats:
         """Cluster centres (x right, y down) as one looks at them from the front, m, float64 (K, 2)."""
         return self.cluster_positions_m()[:, :2]
+
+    @property
+    def apart(self) -> bool:
+        """Whether centres of clusters are seen beside one another, and are not all at one place.
+
+        >>> ring = [(0.1, 0.0, 0.0, 1), (-0.1, 0.0, 0.0, 1)]
+        >>> BarLayout(LedTable(((0.0, 0.0, 0.0, 0), *ring))).apart
+        False
+        """
+        return bool(np.ptp(self.cluster_centres_m(), axis=0).max() > _SAME_M)
 
     @cached_property
     def alike(self) -> bool:

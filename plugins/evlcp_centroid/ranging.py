@@ -53,7 +53,7 @@ class CentroidRanging(Ranging):
                 f"ranging 'centroid' uses {max(left, 0)} of {bar.clusters} clusters (skip_outer ="
                 f" {skip}), expected at least min_clusters = {least}"
             )
-        if not np.ptp(centres, 0).any():
+        if not bar.apart:
             raise ConfigError("ranging 'centroid' needs clusters apart: use 'none' for this layout")
         layout = centres[:, 0] + 1j * centres[:, 1]
         i, j = np.triu_indices(bar.clusters, 1)

@@ -131,8 +131,8 @@ class PocRanging(Ranging):
         # The scale that all clusters agree on shows which ones are out of place.
         i, j = np.triu_indices(bar.clusters, 1)
         apart = np.hypot(*(centres[j] - centres[i]).T)
-        if not bar.alike or not apart.max() > 0:
-            instead = ROLES["ranging"].default_for(bar) if apart.max() > 0 else "none"
+        if not (bar.alike and bar.apart):
+            instead = ROLES["ranging"].default_for(bar)
             raise ConfigError(
                 "ranging 'poc' compares images of clusters, which have to be alike and apart: use"
                 f" '{instead}' for this layout"

@@ -87,6 +87,14 @@ def test_the_default_ranging_fits_the_layout() -> None:
     # A ring's clusters of two LEDs are turned; two clusters that are not alike say too little.
     assert chosen == {"grid": "poc", "columns": "poc", "ring": "centroid", "table": "none", "one": "none"}
     assert ROLES["ranging"].default_for(BarLayout(LedRing())) == "poc"
+    # Three rings about one centre: nothing is between them.
+    rings = [
+        [r * x, r * y, 0.0, k]
+        for k, r in enumerate((0.1, 0.2, 0.3))
+        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
+    ]
+    around = BarLayout.of_table({"shape": "table", "leds": rings})
+    assert (around.apart, ROLES["ranging"].default_for(around)) == (False, "none")
     assert ROLES["ranging"].default_for(BarLayout()) == "joint-scale"
     assert ROLES["ranging"].default_for(BarLayout(LedColumns())) == "joint-scale"
     assert ROLES["ranging"].default_for(BarLayout(LedColumns(apart_m=1.2))) == "poc"
@@ -166,6 +174,10 @@ def test_a_fault_of_a_csv_file_is_one_line(text: str, said: str, tmp_path: Path)
         (
             {"shape": "table", "leds": [[0, 0, 0, 1]]},
             "bar.leds: no LED of cluster 0: expected clusters 0 to 1",
+        ),
+        (
+            {"shape": "table", "leds": [[0, 0, 0, 0], [0.1, 0, 0, 1], [0, 0, 0.3, 2]]},
+            "bar.leds: cluster 2 is behind cluster 0, LED by LED: expected clusters that a camera in front",
         ),
         ({"shape": "table", "leds": [[0, 0, 200, 0]]}, "bar.leds.0: z = 200: expected -100 to 100 m"),
         ({"shape": "table", "leds": [[0, 0, 0, -1]]}, "bar.leds.0: cluster = -1: expected 0 to 65535"),
