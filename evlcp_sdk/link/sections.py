@@ -133,7 +133,7 @@ class PositionSpec:
     ] = 13.0
     stretch_share: Annotated[
         float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
-    ] = 0.00012
+    ] = 0.0001
     bend_sigma_px: Annotated[
         float,
         Field(
