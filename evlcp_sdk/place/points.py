@@ -36,6 +36,10 @@ _PIXEL_WORTH = 3
 """Of how many squares the error within pixels is worth, beside the 13 that 16 points about a line show."""
 
 
+_LEAST = 0.1
+"""Of errors across a bar in those along it: points without an error show none."""
+
+
 class SeenPoints(NamedTuple):
     """A bar's image points.
 
@@ -148,23 +152,32 @@ def points_at(
         drawn[k] = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
     sigma = np.hypot(wider * drawn, pixel_px)
     usual = math.sqrt(float(np.nanmean(drawn**2))) if np.isfinite(drawn).any() else math.nan
-    off_px2, many = _beside(found)
-    shown = math.sqrt((_PIXEL_WORTH * pixel_px**2 + _ALIKE * off_px2) / (_PIXEL_WORTH + many))
-    across = math.hypot(max(aside * usual, shown), early_px) / math.hypot(wider * usual, pixel_px)
+    along, off_line = math.hypot(wider * usual, pixel_px), _beside(found)
+    across = 1.0
+    if along > 0 and off_line is not None:
+        off_px2, many = off_line
+        shown = math.sqrt((_PIXEL_WORTH * pixel_px**2 + _ALIKE * off_px2) / (_PIXEL_WORTH + many))
+        across = max(math.hypot(max(aside * usual, shown), early_px) / along, _LEAST)
     return SeenPoints(found, sigma, pixel_px, shift_px, between, early_px, across)
 
 
-def _beside(points: Floats) -> tuple[float, int]:
-    """By how much points (K, 2) are beside a line that may bend: the sum of squares, and its freedom."""
+def _beside(points: Floats) -> tuple[float, int] | None:
+    """By how much points (K, 2) are off_line a line that may bend: the sum of squares, and its freedom.
+
+    None where they are too few to tell, or in no line: half of what is from one to the next beside it.
+    """
     points = points[np.isfinite(points[:, 0])]
     axis = points[-1] - points[0]
     if len(points) < 5 or not axis.any():
-        return 0.0, 0
-    axis = axis / np.linalg.norm(axis)
+        return None
+    size = float(np.linalg.norm(axis))
+    axis = axis / size
     along, across = points @ axis, points @ np.array([-axis[1], axis[0]])
     along -= along.mean()
     modes, _ = np.linalg.qr(np.stack([np.ones(len(along)), along, along**2], 1))
     rest = across - modes @ (modes.T @ across)
+    if np.abs(rest).max() > 0.5 * size / len(points):
+        return None
     return float(rest @ rest), len(along) - 3
 
 
@@ -186,8 +199,8 @@ def _scatter(t: Floats, shapes: Floats, sigma: Floats) -> tuple[float, float]:
     """By how much a bar's shape scatters about a straight line in time, in what its points' sigmas say.
 
     By its linear and square terms; what errors of neighbouring points have in common is in these, and nearly
-    all that a pose hangs on. Along the bar at least 1; across, where a line is seen better than where it is
-    parted, what is usual counts, too.
+    all that a pose hangs on. Along the bar at least 1; across it may be less, as a line is seen better than
+    where it is parted.
 
     Args:
         t: float64 (n,).

@@ -116,6 +116,21 @@ def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None
     assert 1.0 < said_px2[1] / there[1] < 1.5
 
 
+def test_a_layout_that_is_no_line_errs_alike_in_all_directions() -> None:
+    turn = 2 * np.pi * np.arange(16) / 16
+    ring = np.array([300.0, 200.0]) + 60.0 * np.stack([np.cos(turn), np.sin(turn)], 1)
+    found = points_at(frames(np.repeat(ring[None], 9, 0), 0.1), 0.0, 36_000.0, 16, SPEC)
+    assert found is not None
+    assert found.across == 1.0
+
+
+def test_points_without_an_error_are_not_exact_across() -> None:
+    exact = replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
+    found = points_at(frames(np.repeat(BAR_PX[None], 9, 0), 0.1), 0.0, 36_000.0, 16, exact)
+    assert found is not None
+    assert found.across == pytest.approx(0.1)
+
+
 def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
     """Brute force: means of trapezoids seen once a pixel, at all places and of many widths."""
     columns, places = np.arange(-12, 13), np.linspace(0, 1, 50, endpoint=False)
