@@ -92,15 +92,15 @@ def rows_of(what: str, distance_m: float, seed: int, duration_s: float, drive: i
             )
     rows = []
     spec = PositionSpec(pixel_sigma_px=1.0, early_sigma_us=1.0)
-    period_us = BarKind.of(LINK).packet_us
+    period_us, layout_m = BarKind.of(LINK).packet_us, LINK.bar.cluster_positions_m()
     for seen in frames.values():
         seen.sort(key=lambda frame: frame.points_t_us)
         first, last = seen[0].points_t_us, seen[-1].points_t_us
         for number in range(math.ceil(first / period_us), math.floor(last / period_us) + 1):
             t_us = number * period_us
-            points = points_at(seen, t_us, period_us, LINK.bar.clusters, spec)
+            points = points_at(seen, t_us, period_us, layout_m, spec)
             if points is not None:
-                stated = points_at(seen, t_us, period_us, LINK.bar.clusters, LINK.position)
+                stated = points_at(seen, t_us, period_us, layout_m, LINK.position)
                 assert stated is not None
                 true_px = true_points(simulation, t_us, points.points_px)
                 rows.append(row_of(points, stated, true_px, (what, seed, drive, t_us)))

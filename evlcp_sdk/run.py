@@ -868,7 +868,7 @@ def _seen_at(
         for number, seen in frames.items():
             name = link_of[number]
             link = placing[name]
-            points = points_at(seen, pose.t_us, periods[name], link.bar.clusters, link.position)
+            points = points_at(seen, pose.t_us, periods[name], link.bar.cluster_positions_m(), link.position)
             if points is not None:
                 found[-1][number] = points
     times = [pose.t_us for pose in poses]

@@ -60,7 +60,11 @@ def _grid(columns: Sequence[_Column], names: int) -> "Table":
 
     grid = Table(box=None, pad_edge=False, header_style="dim")
     for number, column in enumerate(columns):
-        grid.add_column(column[0][0], justify="left" if number < names else "right", no_wrap=True)
+        if number < names:
+            # A name longer than the screen goes on in the next line; a figure stands whole.
+            grid.add_column(column[0][0], overflow="fold")
+        else:
+            grid.add_column(column[0][0], justify="right", no_wrap=True)
     for row in zip(*(column[1:] for column in columns), strict=True):
         grid.add_row(*(Text(text, "bold" if best else "") for text, best in row))
     return grid

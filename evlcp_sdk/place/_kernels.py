@@ -1141,8 +1141,8 @@ def shared(enu_m: Array, points_px: Array, seen: Array, usual: Array, sigma: Arr
     columns, of both, of rows. Its sigma is `usual[0]` across the bar, and along it `usual[1]` with a share of
     the length, `usual[2]`; of a layout that is no line, the latter in all directions. The whole is as long
     as from one of its clusters to the farthest other, and a cluster's own part; its image is so by what is
-    seen of it. The last, of columns, of both, of rows, make a point's errors even in all directions, where
-    those across a line are `usual[4]` of those along it.
+    seen of it. The last, of columns, of both, of rows, make a point's errors even in all directions and of
+    sigma 1, where those across a line are `usual[4]` of those along it; of no line, all are, if that is more.
     """
     everything = np.ones(len(seen), np.bool_)
     i, j = _ends(enu_m, seen)
@@ -1151,21 +1151,24 @@ def shared(enu_m: Array, points_px: Array, seen: Array, usual: Array, sigma: Arr
     dx, dy = points_px[j, 0] - points_px[i, 0], points_px[j, 1] - points_px[i, 1]
     size = math.hypot(dx, dy)
     along = math.hypot(usual[1], usual[2] * size * share)
-    across, even = (usual[0], usual[4]) if size > 0 else (along, 1.0)
     ax, ay = (dx / size, dy / size) if size > 0 else (1.0, 0.0)
     # Half a cluster beside the line from end to end is no error of a point in it.
-    aside = 0.5 * size * share / len(seen)
+    aside, line = 0.5 * size * share / len(seen), size > 0
     for k in range(len(seen)):
         if seen[k]:
             off = (points_px[k, 0] - points_px[i, 0]) * ay - (points_px[k, 1] - points_px[i, 1]) * ax
-            across, even = (along, 1.0) if abs(off) > aside else (across, even)
+            line = line and abs(off) <= aside
+    across = usual[0] if line else along
+    # Of a layout that is no line, what is shown of one direction holds for all.
+    sideways = 1 / usual[4] if line else 1 / max(usual[4], 1.0)
+    longways = 1.0 if line else sideways
     sigma[2] = math.hypot(sigma[2], usual[3])
     sigma[3] = across + (along - across) * ax * ax
     sigma[4] = (along - across) * ax * ay
     sigma[5] = across + (along - across) * ay * ay
-    sigma[6] = (1 + (even - 1) * ax * ax) / even
-    sigma[7] = (even - 1) * ax * ay / even
-    sigma[8] = (1 + (even - 1) * ay * ay) / even
+    sigma[6] = sideways + (longways - sideways) * ax * ax
+    sigma[7] = (longways - sideways) * ax * ay
+    sigma[8] = sideways + (longways - sideways) * ay * ay
 
 
 @njit(cache=True, nogil=True)

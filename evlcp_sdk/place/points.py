@@ -35,9 +35,14 @@ drives, by night and by day, with a lens's wings and without, turning."""
 _PIXEL_WORTH = 3
 """Of how many squares the error within pixels is worth, beside the 13 that 16 points about a line show."""
 
-
 _LEAST = 0.1
 """Of errors across a bar in those along it: points without an error show none."""
+
+_FEWEST = 2
+"""Degrees of freedom below which points show nothing of their errors."""
+
+_SAME = 1e-6
+"""Share of a layout's extent below which its clusters are in a line, or in a plane."""
 
 
 class SeenPoints(NamedTuple):
@@ -90,7 +95,7 @@ def _interpolation(t: Floats) -> Floats:
 
 
 def points_at(
-    frames: Sequence[Frame], t_us: float, period_us: float, clusters: int, spec: PositionSpec
+    frames: Sequence[Frame], t_us: float, period_us: float, layout_m: Floats, spec: PositionSpec
 ) -> SeenPoints | None:
     """A bar's image points at a time between its frames.
 
@@ -98,15 +103,15 @@ def points_at(
     between the frames next to the time. Sigmas along the bar are those that the frames state, or, where its
     length and bend scatter more from frame to frame, as they do where the readout is late, what these show;
     with the error within pixels, as far as the image has not moved over others. Across, they are the larger
-    of how much lean and bend scatter and of how far the points are beside a line, as frames that are wrong
-    together do not scatter. What a thin bar's frames do not show of where in a pixel it is, is apart, as all
-    points share it; so is by how much a moving image is seen early or late.
+    of how much lean and bend scatter and of how far the points are off the bar's layout, as frames that are
+    wrong together do not scatter. What a thin bar's frames do not show of where in a pixel it is, is apart,
+    as all points share it; so is by how much a moving image is seen early or late.
 
     Args:
         frames: With points, in order of time.
         t_us: Camera clock, us.
         period_us: Frames within half of it, before and after, count, us.
-        clusters: Clusters of a bar.
+        layout_m: Where its clusters are in it, m, float64 (K, 3).
         spec: Least number of points, the error within pixels, and that in time.
 
     Returns:
@@ -142,6 +147,7 @@ def points_at(
     line = _line(dt)
     early_px = spec.early_sigma_us * float(np.linalg.norm(line[1] @ places))
     pixel_px = math.hypot(spec.pixel_sigma_px * _left(line[0], places), early_px)
+    clusters = len(layout_m)
     found, drawn = np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
     for k in range(clusters):
         seen = np.isfinite(shapes[:, k, 0])
@@ -152,33 +158,37 @@ def points_at(
         drawn[k] = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
     sigma = np.hypot(wider * drawn, pixel_px)
     usual = math.sqrt(float(np.nanmean(drawn**2))) if np.isfinite(drawn).any() else math.nan
-    along, off_line = math.hypot(wider * usual, pixel_px), _beside(found)
-    across = 1.0
-    if along > 0 and off_line is not None:
-        off_px2, many = off_line
+    along, across = math.hypot(wider * usual, pixel_px), 1.0
+    if along > 0:
+        off_px2, many = _off(found, layout_m)
         shown = math.sqrt((_PIXEL_WORTH * pixel_px**2 + _ALIKE * off_px2) / (_PIXEL_WORTH + many))
-        across = max(math.hypot(max(aside * usual, shown), early_px) / along, _LEAST)
+        across = max(math.hypot(max(aside * usual, shown), early_px) / along, _LEAST if many else 1.0)
     return SeenPoints(found, sigma, pixel_px, shift_px, between, early_px, across)
 
 
-def _beside(points: Floats) -> tuple[float, int] | None:
-    """By how much points (K, 2) are off_line a line that may bend: the sum of squares, and its freedom.
+def _off(points: Floats, layout_m: Floats) -> tuple[float, int]:
+    """By how much points (K, 2) are off their layout (K, 3) across it: sum of squares, degrees of freedom.
 
-    None where they are too few to tell, or in no line: half of what is from one to the next beside it.
+    Their places across are fitted by a square polynomial of those in the layout, which takes in how it leans
+    and turns, perspective, and the lens. Both 0 where that leaves too few to tell.
     """
-    points = points[np.isfinite(points[:, 0])]
+    seen = np.isfinite(points[:, 0])
+    points, at = points[seen], layout_m[seen] - layout_m[seen].mean(0)
     axis = points[-1] - points[0]
-    if len(points) < 5 or not axis.any():
-        return None
-    size = float(np.linalg.norm(axis))
-    axis = axis / size
-    along, across = points @ axis, points @ np.array([-axis[1], axis[0]])
-    along -= along.mean()
-    modes, _ = np.linalg.qr(np.stack([np.ones(len(along)), along, along**2], 1))
+    if not (axis.any() and at.any()):
+        return 0.0, 0
+    at = at / np.abs(at).max()
+    squares = (at[:, :, None] * at[:, None]).reshape(len(at), 9)
+    modes, size, _ = np.linalg.svd(
+        np.concatenate([np.ones((len(at), 1)), at, squares], 1), full_matrices=False
+    )
+    modes = modes[:, size > _SAME * size[0]]
+    many = len(at) - modes.shape[1]
+    if many < _FEWEST:
+        return 0.0, 0
+    across = points @ np.array([-axis[1], axis[0]]) / np.linalg.norm(axis)
     rest = across - modes @ (modes.T @ across)
-    if np.abs(rest).max() > 0.5 * size / len(points):
-        return None
-    return float(rest @ rest), len(along) - 3
+    return float(rest @ rest), many
 
 
 def _line(t: Floats) -> Floats:

@@ -196,7 +196,7 @@ class Positioner:
         here: LocalAxes | None = None
         for number, frames in sorted(self._frames.items()):
             kind = self._kinds[self._links[number]]
-            points = points_at(frames, t_us, kind.packet_us, kind.bar.clusters, self._spec)
+            points = points_at(frames, t_us, kind.packet_us, kind.bar.cluster_positions_m(), self._spec)
             if points is None:
                 continue
             views.append(number)

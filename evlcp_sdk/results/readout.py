@@ -20,7 +20,7 @@ _LEAST_MS = 10
 
 _LEAST_EVENTS = 1000
 """Events of a millisecond below which none is a limit: no sensor's readout is as slow as 1 Mev/s, and a few
-lights that blink evenly send as many in each."""
+lights that blink evenly send the same number in each."""
 
 _BIN = 0.005
 """Width of the bins of events in a millisecond, as a share."""

@@ -6,15 +6,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.points import points_at, unseen_px
+from evlcp_sdk.place.points import SeenPoints, points_at, unseen_px
 from evlcp_sdk.values import Frame, Range, SoftSymbols
 
 SPEC = PositionSpec(pixel_sigma_px=0.08)
+EXACT = replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
 SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 T_US = (np.arange(9) - 4.3) * 3600.0
 BAR_PX = np.stack([np.full(16, 300.0), 200.0 + 8.0 * np.arange(16)], 1)
+LINE_M = np.stack([np.zeros(16), 0.06 * np.arange(16), np.zeros(16)], 1)
 LEVER = (np.arange(16) - 7.5) / 7.5
 
 
@@ -46,7 +49,7 @@ def trials(
         pixel = np.einsum("ij,jkl->ikl", root, rng.normal(0, pixel_px, (9, 16, 2)))
         points = BAR_PX + course + pixel + rng.normal(0, white_px, (9, 16, 2))
         points[:, :, 0] += 60.0 * LEVER * rng.normal(0, lean, 9)[:, None]
-        found = points_at(frames(points, stated_px), 0.0, 36_000.0, 16, SPEC)
+        found = points_at(frames(points, stated_px), 0.0, 36_000.0, LINE_M, SPEC)
         assert found is not None
         error = found[0] - BAR_PX
         errors.append(error - error.mean(0))
@@ -101,11 +104,11 @@ def test_a_bar_that_leans_otherwise_in_each_frame_is_less_sure() -> None:
 @pytest.mark.parametrize("across_px", [0.02, 0.06, 0.18])
 def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None:
     """White errors of another size across than along: said within a factor of what there is, safe side."""
-    rng, spec = np.random.default_rng(4), replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
+    rng = np.random.default_rng(4)
     errors, said = [], []
     for _ in range(300):
         points = BAR_PX + rng.normal(0, [across_px, 0.06], (9, 16, 2))
-        found = points_at(frames(points, 0.06), 0.0, 36_000.0, 16, spec)
+        found = points_at(frames(points, 0.06), 0.0, 36_000.0, LINE_M, EXACT)
         assert found is not None
         error = found.points_px - BAR_PX
         errors.append((error - error.mean(0)).T)
@@ -116,17 +119,49 @@ def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None
     assert 1.0 < said_px2[1] / there[1] < 1.5
 
 
-def test_a_layout_that_is_no_line_errs_alike_in_all_directions() -> None:
-    turn = 2 * np.pi * np.arange(16) / 16
-    ring = np.array([300.0, 200.0]) + 60.0 * np.stack([np.cos(turn), np.sin(turn)], 1)
-    found = points_at(frames(np.repeat(ring[None], 9, 0), 0.1), 0.0, 36_000.0, 16, SPEC)
+def seen_as(layout_m: NDArray[np.float64], noise_px: float, seed: int) -> SeenPoints:
+    """A layout some 50 m ahead, turned and leaning, with errors that all frames share."""
+    rng = np.random.default_rng(seed)
+    turned = layout_m @ Rotation.from_euler("xyz", [25.0, 20.0, 10.0], degrees=True).as_matrix().T
+    image = 640.0 + 7000.0 * turned[:, :2] / (50.0 + turned[:, 2:])
+    points = image + rng.normal(0, noise_px, image.shape)
+    found = points_at(frames(np.repeat(points[None], 9, 0), 0.06), 0.0, 36_000.0, layout_m, EXACT)
+    assert found is not None
+    return found
+
+
+@pytest.mark.parametrize("shape", ["line", "columns", "ring"])
+def test_a_layouts_own_form_and_its_perspective_are_no_errors(shape: str) -> None:
+    """Columns 2 cm beside one another are a line to a fit, and 3 px beside it; a ring is none."""
+    turn, k = 2 * np.pi * np.arange(16) / 16, np.arange(16)
+    places = {
+        "line": (np.zeros(16), 0.06 * k),
+        "columns": (0.02 * (k % 2), 0.06 * k),
+        "ring": (0.4 * np.cos(turn), 0.4 * np.sin(turn)),
+    }[shape]
+    layout_m = np.stack([*places, np.zeros(16)], 1)
+    exact = seen_as(layout_m, 0.0, 0)
+    assert exact.across * exact.sigma_px.mean() < 0.003
+    # What stands over all frames does not scatter, and is shown.
+    squares = [
+        (found.across * found.sigma_px.mean()) ** 2
+        for seed in range(200)
+        for found in [seen_as(layout_m, 0.05, seed)]
+    ]
+    assert 1.2 < np.mean(squares) / 0.05**2 < 2.2
+
+
+def test_too_few_clusters_show_nothing_of_their_errors() -> None:
+    few = replace(EXACT, min_points=2)
+    seen = [replace(frame, points_px=frame.points_px[:4], points_sigma_px=frame.points_sigma_px[:4])
+            for frame in frames(np.repeat(BAR_PX[None], 9, 0), 0.1)]  # fmt: skip
+    found = points_at(seen, 0.0, 36_000.0, LINE_M[:4], few)
     assert found is not None
     assert found.across == 1.0
 
 
 def test_points_without_an_error_are_not_exact_across() -> None:
-    exact = replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
-    found = points_at(frames(np.repeat(BAR_PX[None], 9, 0), 0.1), 0.0, 36_000.0, 16, exact)
+    found = points_at(frames(np.repeat(BAR_PX[None], 9, 0), 0.1), 0.0, 36_000.0, LINE_M, EXACT)
     assert found is not None
     assert found.across == pytest.approx(0.1)
 
@@ -149,10 +184,10 @@ def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
 def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: float, most: float) -> None:
     points = BAR_PX + T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
     seen = [replace(frame, points_flank_px=0.6) for frame in frames(points, 0.1)]
-    found = points_at(seen, 0.0, 36_000.0, 16, SPEC)
+    found = points_at(seen, 0.0, 36_000.0, LINE_M, SPEC)
     assert found is not None
     assert least - 1e-9 <= found.shift_px / unseen_px(0.6) <= most + 1e-9
-    unknown = points_at(frames(points, 0.1), 0.0, 36_000.0, 16, SPEC)
+    unknown = points_at(frames(points, 0.1), 0.0, 36_000.0, LINE_M, SPEC)
     assert unknown is not None
     assert unknown.shift_px == 0.0
 
@@ -160,7 +195,7 @@ def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: fl
 def test_a_moving_image_is_seen_early_or_late_by_its_speed() -> None:
     for px_per_ms in (0.0, 2.0, 6.0):
         points = BAR_PX + T_US[:, None, None] / 1000.0 * np.array([0.6, -0.8]) * px_per_ms
-        found = points_at(frames(points, 0.1), 0.0, 36_000.0, 16, replace(SPEC, early_sigma_us=15.0))
+        found = points_at(frames(points, 0.1), 0.0, 36_000.0, LINE_M, replace(SPEC, early_sigma_us=15.0))
         assert found is not None
         assert found.early_px == pytest.approx(0.015 * px_per_ms, abs=1e-12)
 
@@ -174,7 +209,7 @@ def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> Non
             replace(frame, points_t_us=t, points_px=at)
             for frame, t, at in zip(frames(points, 0.1), t_us.tolist(), points, strict=True)
         ]
-        found = points_at(seen, 0.0, 40_000.0, 16, SPEC)
+        found = points_at(seen, 0.0, 40_000.0, LINE_M, SPEC)
         assert found is not None
         midway = 1e-16 * 0.5625 * 3600.0**4
         off = abs(found.points_px[:, 0].mean() - 300.0)

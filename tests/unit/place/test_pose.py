@@ -13,8 +13,9 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.failed import failed_bar
 from evlcp_sdk.place.judgement import Pose
-from evlcp_sdk.place.observations import BarView, project_bars
+from evlcp_sdk.place.observations import BarView, Problem, project_bars
 from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
 from evlcp_sdk.place.refusals import REFUSALS, Refusal
 from evlcp_sdk.place.starts import three_point_poses
@@ -44,13 +45,16 @@ def bar(
 def views(
     bars: list[NDArray[np.float64]], position: NDArray[np.float64], rotation: NDArray[np.float64],
     rng: np.random.Generator | None = None, noise_px: float = 0.3, camera: CameraModel = CAMERA,
+    across: float = 1.0,
 ) -> list[BarView]:  # fmt: skip
     seen = []
     for i, enu in enumerate(bars):
         points, _ = project_bars(enu, position, rotation, camera)
         if rng is not None:
-            points = points + rng.normal(0, noise_px, points.shape)
-        seen.append(BarView(i, enu, points, np.full(len(enu), noise_px)))
+            way = (points[-1] - points[0]) / np.linalg.norm(points[-1] - points[0])
+            off = rng.normal(0, noise_px, points.shape)
+            points = points + across * off + (1 - across) * np.outer(off @ way, way)
+        seen.append(BarView(i, enu, points, np.full(len(enu), noise_px), across=across))
     return seen
 
 
@@ -257,18 +261,18 @@ SURVEY = (0.05, math.radians(0.3), 0.002)
 
 def drawn(
     rng: np.random.Generator, places: list[tuple[float, float, float]], known: Attitude | None,
-    survey: tuple[float, float, float], focal: float,
+    survey: tuple[float, float, float], focal: float, across: float = 1.0,
 ) -> tuple[list[BarView], Attitude | None, CameraSigma]:  # fmt: skip
     """A camera at the origin that looks up, with every error drawn from its stated sigma."""
     true = dataclasses.replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + focal * rng.normal()))
     spec, seen = PositionSpec(), []
-    for view in views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng, 0.1, true):
+    for view in views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng, 0.1, true, across):
         arm = view.enu_m - view.enu_m.mean(0)
         said = view.enu_m + rng.normal(0, survey[0], 3) + np.cross(rng.normal(0, survey[1], 3), arm)
         said = said + rng.normal(0, survey[2]) * arm
         said = said + rng.normal(0, spec.stretch_share) * arm
         points = view.points_px + own_shift(view.points_px, spec, rng)
-        seen.append(BarView(view.transmitter, said, points, view.sigma_px, survey))
+        seen.append(dataclasses.replace(view, enu_m=said, points_px=points, survey=survey))
     told = None
     if known is not None:
         # A bias of each angle, an offset in time that moves all of them, and noise.
@@ -299,7 +303,7 @@ def test_every_error_that_is_stated_is_in_the_covariance(
     rng = np.random.default_rng(11)
     squares, parts = [], np.zeros((3, 3))
     while len(squares) < 120:
-        seen, told, sigma = drawn(rng, places, known, survey, focal)
+        seen, told, sigma = drawn(rng, places, known, survey, focal, across=0.5)
         found = solve_pose(seen, CAMERA, told, None, sigma)
         if isinstance(found, Refusal):
             # Two bars on gravity and a survey of 5 cm leave metres along an arc.
@@ -356,6 +360,37 @@ def test_a_bar_that_is_left_out_stands_where_its_image_says() -> None:
     low, high = stats.chi2.interval(0.999, 3 * len(squares)) / np.array(len(squares))
     assert len(squares) > 25
     assert low < np.mean(squares) < high
+
+
+@pytest.mark.parametrize("across", [0.3, 1.0, 2.0])
+def test_where_a_left_out_bar_stands_is_the_weighted_fit_of_its_points(across: float) -> None:
+    """Generalized least squares with the points' whole covariance, along the bar and across."""
+    rng, spec = np.random.default_rng(34), PositionSpec()
+    known = Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
+    seen, told, sigma = drawn(rng, THREE, known, (0.0, 0.0, 0.0), 0.0, across)
+    moved = dataclasses.replace(seen[1], enu_m=seen[1].enu_m - np.array([0.3, -0.4, 0.2]))
+    pose = solved(solve_pose(seen, CAMERA, told, spec))
+    exact = dataclasses.replace(pose, covariance=np.zeros_like(pose.covariance))
+    problem = Problem.of([seen[0], moved, seen[2]], CAMERA, told, spec, sigma)
+    assert isinstance(problem, Problem)
+    found = failed_bar(problem, 1, exact, 99.0, 5)
+    way = moved.points_px[-1] - moved.points_px[0]
+    size = float(np.linalg.norm(way))
+    way = way / size
+    beside = np.eye(2) - np.outer(way, way)
+    shift = spec.shared_along_px**2 + (spec.shared_share * size * 16 / 15) ** 2
+    each = 0.1**2 * (np.outer(way, way) + across**2 * beside)
+    whole = np.kron(np.eye(16), each)
+    whole += np.kron(np.ones((16, 16)), shift * np.outer(way, way) + spec.shared_sigma_px**2 * beside)
+    off_m = np.zeros(3)
+    for _ in range(6):
+        points, slope = project_bars(moved.enu_m + off_m, pose.enu_m, pose.rotation, CAMERA)
+        by_place = -slope[:, :, :3].reshape(-1, 3)
+        weighted = np.linalg.solve(whole, by_place)
+        information = by_place.T @ weighted
+        off_m = off_m + np.linalg.solve(information, weighted.T @ (moved.points_px - points).ravel())
+    np.testing.assert_allclose(found.off_m, off_m, atol=1e-5)
+    np.testing.assert_allclose(found.covariance_m2, np.linalg.inv(information), rtol=1e-3, atol=1e-9)
 
 
 def test_an_attitude_that_disagrees_is_left_out_by_name() -> None:
