@@ -6,6 +6,7 @@ bound whatever ranging there is. `frame_bound` reads these quantities from the f
 of bars, one even column of clusters; `plane_bound` takes any layout.
 """
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -25,8 +26,21 @@ __all__ = ["cramer_rao_sigma_m", "frame_bound", "lean_sigma_deg"]
 
 _NONE = Range(float("nan"), float("nan"), 0)
 
-_CORE_SHARE = 0.3
-"""Of the rows of the widest column: columns lit in fewer show stray cells beside the bar."""
+_MOVES_PX = 3.0
+"""How far a value's boundaries may lie from a steady motion before data must speak."""
+
+_VEIL = 0.3
+"""Share of the brightest column's light that is a veil, or beside the bar."""
+
+_USUAL_PX, _USUALLY = 0.35, 0.5
+"""Width of a boundary by lens and pixel, and how far its log may lie from that before data must speak: where
+all boundaries lie between two pixels they say nothing of it."""
+
+_NOISE = 0.1
+"""Of a row's value, in full values, when that is weighed."""
+
+_LEAST_FREE = 0.1
+"""Of a row's residual; a row that decides a parameter by itself says nothing of the noise."""
 
 _LEAST_BOUNDARIES = 3
 """Boundaries without which spacing, position and drift cannot be separated."""
@@ -66,6 +80,9 @@ def cramer_rao_sigma_m(
         gain: Share of a full value that is seen.
         shift_px: Where the bar lies on the pixel grid, px.
 
+    Returns:
+        Infinite where no pixel sees a boundary move, as each falls between two of them and is sharp.
+
     Raises:
         ConfigError: A quantity that must be positive is not, or the bar is another layout.
 
@@ -79,7 +96,7 @@ def cramer_rao_sigma_m(
         camera, bar, codebook, distance_m, symbols, blur_px=blur_px, noise=noise, gain=gain, shift_px=shift_px
     )
     information = columns / noise**2 * (slopes[:4] @ slopes[:4].T)
-    return float(distance_m * np.sqrt(np.linalg.inv(information)[0, 0]) / spacing)
+    return distance_m * _least_error(information, 0) / spacing
 
 
 def lean_sigma_deg(
@@ -127,7 +144,16 @@ def lean_sigma_deg(
     )
     slopes = np.stack([*slopes[:4], slopes[4] * spacing * _spacing_m(bar) / distance_m])
     information = columns / noise**2 * (slopes @ slopes.T)
-    return float(np.degrees(np.sqrt(np.linalg.inv(information)[4, 4])))
+    return float(np.degrees(_least_error(information, 4)))
+
+
+def _least_error(information: Array, which: int) -> float:
+    """Bound of one unknown, all others unknown, too; infinite where no pixel shows it."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    alike = information * np.outer(scale, scale)
+    if not np.linalg.cond(alike) < 1 / np.finfo(np.float64).eps:
+        return math.inf
+    return float(scale[which] * np.sqrt(np.linalg.inv(alike)[which, which]))
 
 
 def _frame_slopes(
@@ -153,7 +179,7 @@ def _frame_slopes(
     codes = codes_of(codebook, np.asarray(symbols, np.int64))
     clusters, values = codes.shape
     rows = _rows(2 * int(spacing * clusters / 2 + 4))
-    fit = np.array([spacing, shift_px, 0.0, gain, blur_px, 0.0])
+    fit = np.array([spacing, shift_px, 0.0, gain, np.log(blur_px), 0.0, 0.0, 0.0])
     offset, when = np.zeros(values), _when(values)
     nearest = _nearest(fit, clusters, rows, offset, when)
     _, slopes = _model(fit, codes, nearest, rows, offset, when)
@@ -168,10 +194,11 @@ def frame_bound(
     """A function that gives, as sigma, the bound of a frame.
 
     Blur, gain and noise of the bound are those of the frame: its values are fitted by the boundaries' model
-    (least squares over spacing, position, drift, gain, blur and an offset between positive and negative
-    events), and what is left over is the noise. Neither truth nor any algorithm is needed. The noise is taken
-    as Gaussian and alike in all pixels, and the pixels of a row weigh alike; an error that several frames
-    share is not seen.
+    (least squares over spacing, position, drift, gain, blur, an offset between positive and negative events,
+    shifts by a step's sign and by values that are repeated, and a motion of each value), and what is left
+    over is the noise. It is that of the rows that say where boundaries lie: each weighs with the square of
+    its slope, and with the leverage that the fit has on it. Neither truth nor any algorithm is needed. The
+    noise is taken as Gaussian and independent; an error that several frames share is not seen.
 
     Args:
         camera: For the spacing in the image.
@@ -196,7 +223,7 @@ def frame_bound(
         place = _place(view.presence)
         if place is None:
             return _NONE
-        upright, at_row, seen, width = place
+        upright, at_row, seen = place
         behind = codebook.edge_chips
         sums, offset = view.sums[behind], (view.offset_px[:, behind - 1] + view.offset_px[:, behind]) / 2
         light = view.presence.pixels.sum(0)
@@ -206,14 +233,14 @@ def frame_bound(
         k = np.flatnonzero(seen)
         tilt, left = _line(light)
         spacing, first = theilslopes(at_row[k], k)[:2]
-        values, columns = _row_values(sums, tilt, left, width / 2, full_events)
+        values, columns = _row_values(sums, light, tilt, left, full_events)
         codes = codes_of(codebook, view.soft.symbols)
         rows, down = _rows(sums.shape[1]), offset[1]
         centre = first + spacing * (len(codes) - 1) / 2 - (sums.shape[1] - 1) / 2
         if spacing < 0:
             # A bar upside down: mirror it.
             values, down, spacing, centre = values[:, ::-1], -down, -spacing, -centre
-        start = np.array([spacing, centre, 0.0, 0.5, 0.5, 0.0])
+        start = np.array([spacing, centre, 0.0, 0.5, np.log(_USUAL_PX), 0.0, 0.0, 0.0])
         found = _fit(start, codes, values, seen, rows, down, _when(len(values)))
         if found is None:
             return _NONE
@@ -225,27 +252,36 @@ def frame_bound(
             codebook,
             distance_m,
             view.soft.symbols,
-            blur_px=float(fit[4]),
+            blur_px=float(np.exp(fit[4])),
             noise=noise * float(np.sqrt(columns)),
             columns=columns,
             gain=float(fit[3]),
             shift_px=float(fit[1]),
         )
+        if not math.isfinite(sigma_m):
+            return _NONE
         return Range(distance_m, sigma_m, int((seen[1:] & seen[:-1]).sum()))
 
     return bound
 
 
 def _row_values(
-    sums: NDArray[np.int16], tilt: float, left: float, half_width: float, full_events: float
+    sums: NDArray[np.int16], light: NDArray[np.float32], tilt: float, left: float, full_events: float
 ) -> tuple[Array, float]:
-    """Mean of each row's clipped sums in the chips behind edges (edges, rows); columns of a row."""
+    """Mean of each row's clipped sums in the chips behind edges (edges, rows); columns of a row.
+
+    Columns weigh by their light beyond the veil that a lens or a halo lays beside the bar.
+    """
     row, column = np.ogrid[: sums.shape[1], : sums.shape[2]]
-    inside = np.abs(column - (left + tilt * row)) < half_width
+    beside = np.floor(column - (left + tilt * row) + 0.5).astype(np.int64)
+    beside -= beside.min()
+    many = np.maximum(np.bincount(beside.ravel()), 1)
+    lit = np.bincount(beside.ravel(), np.maximum(light, 0).ravel()) / many
+    weight = np.maximum(lit - _VEIL * lit.max(), 0.0)[beside]
     clipped: Array = np.clip(sums.astype(np.float64) / full_events, -1.0, 1.0)
-    number = inside.sum(1)
-    values: Array = np.where(inside, clipped, 0.0).sum(2) / np.maximum(number, 1)
-    return values, float(number.mean())
+    total = np.maximum(weight.sum(1), 1e-12)
+    values: Array = (weight * clipped).sum(2) / total
+    return values, float(np.median(total**2 / np.maximum((weight**2).sum(1), 1e-12)))
 
 
 def _spacing_m(bar: BarLayout) -> float:
@@ -284,21 +320,29 @@ def _counts(nearest: NDArray[np.int64], seen: NDArray[np.bool_]) -> NDArray[np.b
 def _model(
     fit: Array, codes: Array, nearest: NDArray[np.int64], rows: Array, offset: Array, when: Array
 ) -> tuple[Array, Array]:
-    """Expected values (values, rows), and their slopes by `fit` (6, values, rows).
+    """Expected values (values, rows), and their slopes by `fit` (8, values, rows).
 
-    `fit` is spacing, centre, drift, gain, blur and offset of the values; boundary b between clusters b - 1
-    and b of K lies at spacing * (b - K / 2) from a centre that moves by drift within the frame.
+    `fit` is spacing, centre, drift, gain, log of the blur, offset of the values, shift by sign and by repeat;
+    boundary b between clusters b - 1 and b of K lies at spacing * (b - K / 2) from a centre that moves by
+    drift within the frame, shifted to one side where it steps up and to the other where it steps down, and
+    into a cluster that repeats its last value.
     """
     clusters = len(codes)
     b = np.clip(nearest, 1, clusters - 1)
     apart = b - clusters / 2
     value = np.arange(codes.shape[1])[:, None]
-    z = (rows - (offset + fit[1] + fit[2] * when)[:, None] - fit[0] * apart) / fit[4]
     step = codes[b, value] - codes[b - 1, value]
+    sign = np.sign(step)
+    repeats = np.zeros(codes.shape)
+    repeats[:, 1:] = codes[:, 1:] == codes[:, :-1]
+    again = repeats[b - 1, value] - repeats[b, value]
+    shift = fit[6] * sign + fit[7] * again
+    width = np.exp(fit[4])
+    z = (rows - (offset + fit[1] + fit[2] * when)[:, None] - fit[0] * apart - shift) / width
     level = codes[b - 1, value] + step * ndtr(z)
-    steep = fit[3] * step * np.exp(-z * z / 2) / np.sqrt(2 * np.pi) / fit[4]
-    slopes = [-steep * apart, -steep, -steep * when[:, None], level, -steep * z]
-    return fit[3] * level + fit[5], np.stack([*slopes, np.ones_like(level)])
+    steep = fit[3] * step * np.exp(-z * z / 2) / np.sqrt(2 * np.pi) / width
+    slopes = [-steep * apart, -steep, -steep * when[:, None], level, -steep * z * width, np.ones_like(level)]
+    return fit[3] * level + fit[5], np.stack([*slopes, -steep * sign, -steep * again])
 
 
 def _fit(
@@ -314,26 +358,47 @@ def _fit(
     # Rows keep their boundary while the fit moves: those that might change it are far from any.
     nearest = _nearest(start, len(codes), rows, offset, when)
     counts = _counts(nearest, seen)
-    if counts.sum() <= len(start):
+    values_of_row = np.nonzero(counts)[0]
+    known = len(start)
+    if counts.sum() <= known + len(when):
         return None
+
+    # What is likely beforehand, as further rows.
+    usual = np.zeros(known + len(when))
+    usual[4] = np.log(_USUAL_PX)
+    prior = np.zeros(known + len(when))
+    prior[4], prior[known:] = _NOISE / _USUALLY, _NOISE / _MOVES_PX
 
     def residuals(fit: Array) -> Array:
-        return (_model(fit, codes, nearest, rows, offset, when)[0] - values)[counts]
+        fitted = _model(fit[:known], codes, nearest, rows, offset + fit[known:], when)[0]
+        return np.concatenate([(fitted - values)[counts], prior * (fit - usual)])
 
     def slopes(fit: Array) -> Array:
-        return _model(fit, codes, nearest, rows, offset, when)[1][:, counts].T
+        by = _model(fit[:known], codes, nearest, rows, offset + fit[known:], when)[1][:, counts].T
+        own = np.where(values_of_row[:, None] == np.arange(len(when)), by[:, 1:2], 0.0)
+        return np.vstack([np.hstack([by, own]), np.diag(prior)])
 
-    found = least_squares(residuals, start, slopes, method="lm", x_scale=[0.1, 1, 1, 1, 0.3, 1])
-    variance = 2 * found.cost / (counts.sum() - len(start))
-    spacing, blur = found.x[0], found.x[4]
-    seen_well = found.x[3] > LEAST_GAIN and blur > 0 and abs(spacing / start[0] - 1) < MOST_OFF
-    if not (found.success and seen_well and variance > 0):
+    scale = np.concatenate([[0.1, 1, 1, 1, 0.3, 1, 0.1, 0.1], np.full(len(when), 0.1)])
+    begin = np.concatenate([start, np.zeros(len(when))])
+    found = least_squares(residuals, begin, slopes, method="lm", x_scale=scale)
+    spacing, blur = found.x[0], np.exp(found.x[4])
+    seen_well = found.x[3] > LEAST_GAIN and blur < spacing and abs(spacing / start[0] - 1) < MOST_OFF
+    if not (found.success and seen_well):
         return None
-    return found.x, float(np.sqrt(variance))
+    many = int(counts.sum())
+    by = slopes(found.x)
+    # What a fit leaves over is smaller where it follows: by its leverage.
+    leverage = (np.linalg.qr(by)[0] ** 2).sum(1)[:many]
+    left = found.fun[:many] ** 2 / np.maximum(1 - leverage, _LEAST_FREE)
+    weight = by[:many, 0] ** 2
+    variance = float((weight * left).sum() / max(float(weight.sum()), 1e-300))
+    if not variance > 0:
+        return None
+    return found.x[:known], float(np.sqrt(variance))
 
 
-def _place(presence: PresenceMap) -> tuple[bool, Array, NDArray[np.bool_], int] | None:
-    """How a bar lies: upright or not, the clusters' middles along it, which are seen, its width, px.
+def _place(presence: PresenceMap) -> tuple[bool, Array, NDArray[np.bool_]] | None:
+    """How a bar lies: upright or not, the clusters' middles along it, which are seen.
 
     None where too few clusters are seen.
     """
@@ -346,9 +411,7 @@ def _place(presence: PresenceMap) -> tuple[bool, Array, NDArray[np.bool_], int] 
         # Medians are robust against stray cells.
         middle[:, k] = np.median(np.nonzero(selected[k]), axis=1) * grid + (grid - 1) / 2
     upright = bool(np.ptp(middle[0][seen]) >= np.ptp(middle[1][seen]))
-    across = selected.any(0).sum(0 if upright else 1)
-    width = grid * int((across >= _CORE_SHARE * across.max()).sum())
-    return upright, middle[0 if upright else 1], seen, width
+    return upright, middle[0 if upright else 1], seen
 
 
 def _line(light: NDArray[np.float32]) -> tuple[float, float]:

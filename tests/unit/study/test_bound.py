@@ -89,8 +89,15 @@ def view_of(
     upside_down: bool = False,
     across: bool = False,
     dark: tuple[int, ...] = (),
+    moves_px: float = 0.0,
+    by_sign_px: float = 0.0,
+    noisier: float = 1.0,
 ) -> FrameView:
-    """A frame of a bar of `COLUMNS` pixels: the model's values and Gaussian noise, `FULL` events a value."""
+    """A frame of a bar of `COLUMNS` pixels: the model's values and Gaussian noise, `FULL` events a value.
+
+    In each value the bar has moved by chance, `moves_px`; steps up and down are shifted against each other;
+    rows away from steps are `noisier`.
+    """
     spacing = LINK.camera.focal_px * 0.06 / distance_m
     height, width = 2 * int(spacing * K / 2 + 8), 20
     symbols = rng.integers(0, 64, K)
@@ -100,12 +107,18 @@ def view_of(
     codes[list(dark)] = 0
     shift = rng.uniform(-0.5, 0.5)
     rows = np.arange(height) - (height - 1) / 2 - shift
-    cdf = norm.cdf((rows[:, None] - spacing * (np.arange(K + 1) - K / 2)) / blur_px)
-    level = 0.5 * (cdf[:, :-1] - cdf[:, 1:]) @ codes
+    # Steps from each cluster to the next, (K + 1, values); before the first and after the last is nothing.
+    steps = np.diff(codes, axis=0, prepend=0, append=0)
+    moved = moves_px * rng.normal(size=codes.shape[1]) if moves_px else np.zeros(codes.shape[1])
+    at = spacing * (np.arange(K + 1) - K / 2)[:, None] + by_sign_px * np.sign(steps) + moved
+    beyond = (rows - at[..., None]) / blur_px
+    level = 0.5 * (steps[..., None] * norm.cdf(beyond)).sum(0)
+    stepping = (steps[..., None] * (np.abs(beyond) < 2.5)).any(0)
     sums = np.zeros((32, height, width))
     bar = slice(width // 2 - COLUMNS // 2, width // 2 + COLUMNS // 2)
-    sums[1::2, :, bar] = level.T[:, :, None]
-    sums[1::2, :, bar] += rng.normal(0, noise, sums[1::2, :, bar].shape)
+    sums[1::2, :, bar] = level[:, :, None]
+    spread = noise * np.where(stepping, 1.0, noisier)[:, :, None]
+    sums[1::2, :, bar] += spread * rng.normal(size=sums[1::2, :, bar].shape)
     selected = np.zeros((K, height // 2, width // 2), bool)
     pixels = np.zeros((K, height, width), np.float32)
     for k in set(range(K)) - set(dark):
@@ -140,6 +153,31 @@ def test_statistics_come_from_the_frames(distance_m: float, blur_px: float) -> N
     assert np.mean(sigmas) == pytest.approx(np.mean(wanted), rel=0.03)
     # 60 errors tell a spread to 9 %: three of these.
     assert np.std(errors) == pytest.approx(np.mean(wanted), rel=0.27)
+
+
+@pytest.mark.parametrize(
+    "how", [{"moves_px": 0.15}, {"by_sign_px": 0.08}, {"noisier": 2.0}], ids=["moves", "by sign", "noisier"]
+)
+def test_what_says_nothing_of_the_boundaries_is_no_noise_of_theirs(how: dict[str, float]) -> None:
+    noise, rng = 0.1, np.random.default_rng(3)
+    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook, full_events=FULL)
+    sigmas, wanted = [], []
+    for _ in range(40):
+        view = view_of(60.0, noise, rng, **how)
+        sigmas.append(measure(view).sigma_m)
+        given = {"blur_px": 0.45, "noise": noise, "columns": COLUMNS, "gain": 0.5}
+        where = (LINK.camera, LINK.bar, LINK.codebook, 60.0, view.soft.symbols)
+        wanted.append(cramer_rao_sigma_m(*where, **given))
+    assert np.mean(sigmas) == pytest.approx(np.mean(wanted), rel=0.05)
+
+
+def test_boundaries_between_pixels_that_are_sharp_say_nothing() -> None:
+    spacing_px = 8.0
+    where = {"distance_m": LINK.camera.focal_px * 0.06 / spacing_px, "noise": 0.1}
+    assert bound(blur_px=0.003, **where) == np.inf
+    assert bound(blur_px=0.3, **where) < np.inf
+    # Where they fall on pixels, those see them.
+    assert bound(blur_px=0.1, shift_px=0.5, **where) < np.inf
 
 
 @pytest.mark.parametrize("how", [{"upside_down": True}, {"across": True}, {"dark": (5,)}], ids=str)
