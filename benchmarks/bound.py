@@ -2,9 +2,9 @@
 
     python benchmarks/bound.py [RECORDING ...]
 
-Without names, all recordings of one bar in `../shared/recordings/road` and one folder up. Printed are the RMSE
-of the default link, the row `Cramer-Rao bound` of `evlcp compare`, their ratio, and by how much it may be off by
-chance (1/sqrt(2n) of it for n frames whose errors are independent; they are less so). 15 seconds.
+Without names, all recordings of one bar in `../shared/recordings/road` and one folder up. Printed are the
+RMSE of the default link, the row `Cramer-Rao bound` of `evlcp compare`, their ratio, and by how much it may
+be off by chance (1/sqrt(2n) of it for n frames whose errors are independent; they are less so). 15 seconds.
 """
 
 import argparse
