@@ -337,11 +337,17 @@ class Bend:
         off: How far each lies off, along the bar, in what a lean of sine 1 moves the boundary at place 1,
             which is spacing_px * spacing_m / distance_m pixels; a lean moves others by place^2. float64 (n,).
         weight: Inverse variances of these, up to a factor that all share; 0 where unseen, float64 (n,).
+        wave: How far each seems off, in the same, for every pixel by which a boundary a quarter of a pixel
+            beyond the middle of one seems off: the sine of its place on the pixels. None where the ranging
+            does not know. float64 (n,).
+        wave_m: How far the distance is off for it, m.
     """
 
     place: NDArray[np.float64]
     off: NDArray[np.float64]
     weight: NDArray[np.float64]
+    wave: NDArray[np.float64] | None = None
+    wave_m: float = 0.0
 
 
 @dataclass(frozen=True)

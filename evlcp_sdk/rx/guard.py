@@ -232,6 +232,9 @@ class Guard:
             shape = np.shape(found.bend.place)
             for name in ("place", "off", "weight"):
                 self.expect_array(getattr(found.bend, name), f"bend.{name}", shape, "f")
+            if found.bend.wave is not None:
+                self.expect_array(found.bend.wave, "bend.wave", shape, "f")
+            self.expect_number(found.bend.wave_m, "bend.wave_m", -_FARTHEST_M, _FARTHEST_M)
             if len(shape) != 1:
                 self.refuse(f"bend.place of shape {shape}", "one number a boundary")
 

@@ -1,6 +1,6 @@
 """Where a bar's clusters lie, the values of its rows, and the fit of its boundaries: compiled."""
 
-from math import exp, sqrt
+from math import exp, sin, sqrt
 from typing import Any
 
 import numpy as np
@@ -651,9 +651,10 @@ def leftovers(
 ) -> tuple[float, float, float]:
     """What a fit leaves: shifts of each boundary and of each value, and each row's score.
 
-    `by_boundary` (2, K + 1) and `by_value` (2, values) take the shift of the centre, px, and its information,
-    in units of the variance of one value; `scores` (rows, 7) the slopes times the residuals, clipped to
-    `huber`, over a row's values, which share one pixel phase and so one error.
+    `by_boundary` (3, K + 1) and `by_value` (2, values) take the shift of the centre, px, and its information,
+    in units of the variance of one value; `by_boundary` also the sine of the boundary's places on the pixels,
+    0 in the middle of one, mean over its values; `scores` (rows, 7) the slopes times the residuals, clipped
+    to `huber`, over a row's values, which share one pixel phase and so one error.
 
     Returns:
         Mean square of the clipped residuals, sum of the squares of residuals, and of the values.
@@ -661,20 +662,22 @@ def leftovers(
     clusters, values = codes.shape
     gain, width = fit[3], blur * exp(fit[4])
     scale, steepest = (profile.shape[1] - 1) / (_REACH * width), gain / width
-    for a in range(2):
-        for b in range(clusters + 1):
+    for b in range(clusters + 1):
+        for a in range(3):
             by_boundary[a, b] = 0.0
-        for i in range(values):
-            by_value[a, i] = 0.0
+    for i in range(values):
+        by_value[0, i] = by_value[1, i] = 0.0
     for v in range(seen_values.shape[1]):
         for a in range(_FITTED):
             scores[v, a] = 0.0
     steps, seen = _steps_of(codes, first, last, offset, when, seen_values)
-    work = np.empty(_COLUMNS * _MANY)
+    work, told = np.empty(_COLUMNS * _MANY), np.empty(_MANY)
     noise, spent, all_squares, count = 0.0, 0.0, 0.0, 0
     for block in range(len(steps)):
         column = steps[block]
         _begin(column, fit, work)
+        for j in range(_MANY):
+            told[j] = 0.0
         for r in range(seen.shape[1]):
             _levels(column, float(r), scale, steepest, dim, profile, work)
             for j in range(_MANY):
@@ -700,8 +703,12 @@ def leftovers(
                 scores[v, 4] += pull * (work[_AT + j] + r)
                 scores[v, 5] += pull * column[_SIDE + j]
                 scores[v, 6] += pull * column[_AGAIN + j]
+                told[j] += steep * steep
+        for j in range(_MANY):
+            by_boundary[2, int(column[_BOUNDARY + j])] -= told[j] * sin(2 * np.pi * work[_AT + j])
     for b in range(clusters + 1):
-        by_boundary[0, b] /= max(by_boundary[1, b], 1e-12)
+        for a in (0, 2):
+            by_boundary[a, b] /= max(by_boundary[1, b], 1e-12)
     for i in range(values):
         by_value[0, i] /= max(by_value[1, i], 1e-12)
     return noise / max(count, 1), spent, all_squares
@@ -824,7 +831,7 @@ def fit_bar(
     `search` are steps of a fit, fits after the first, and tolerances of these and of the last; `limits` are
     the least number of boundaries, how far one may lie off in standard deviations and in any case, px, and
     the share of the values' energy that a fit explains at the least. From `fit`, which is changed;
-    `by_boundary` (2, K + 1) takes what `leftovers` says of it.
+    `by_boundary` (3, K + 1) takes what `leftovers` says of it.
 
     Returns:
         Variance of the spacing, px2: mean of that by rows as observations (sandwich estimator) and that by

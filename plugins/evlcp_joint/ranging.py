@@ -159,7 +159,7 @@ class JointScaleRanging(Ranging):
         limits = least, _OUTLIER, _LEAST_OUTLIER_PX, _LEAST_EXPLAINED
 
         def measure(view: FrameView) -> Range:
-            by_boundary = np.empty((2, clusters + 1))
+            by_boundary = np.empty((3, clusters + 1))
             spacing_px, sigma_px, tilt = _kernels.measure_column(
                 view.presence.selected,
                 view.presence.grid_px,
@@ -183,13 +183,16 @@ class JointScaleRanging(Ranging):
             distance = camera.distance_m(spacing_m, spacing_px * stretch)
             late_chips = (len(view.sums) - 2 * pilots.shape[1]) / 2
             one_px = spacing_m * spacing_px * stretch / distance
-            off, weight = by_boundary[:, 1:-1]
+            off, weight, wave = by_boundary[:, 1:-1]
+            # A wave in the boundaries' places, 1 px high, makes the spacing so much larger.
+            apart = weight * (boundaries - weight @ boundaries / weight.sum())
+            wider = float(apart @ wave) / float(apart @ boundaries) / spacing_px
             return Range(
                 distance,
                 distance * sigma_px / spacing_px,
                 int(np.count_nonzero(weight)),
                 late_chips,
-                Bend(boundaries.copy(), off / one_px, weight * one_px**2),
+                Bend(boundaries.copy(), off / one_px, weight * one_px**2, wave / one_px, -distance * wider),
             )
 
         return measure

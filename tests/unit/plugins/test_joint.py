@@ -333,13 +333,17 @@ def test_leftovers_are_by_boundary_value_and_row(seed: int) -> None:
     b, i, v = twin.cells(twin.fit)[:, :3].astype(int).T
     r = twin.seen[i, v] - twin.cells(twin.fit)[:, 3]
     j, clipped = twin.slopes(), np.clip(r, -0.5, 0.5)
-    by_boundary, by_value, scores = np.empty((2, K + 1)), np.empty((2, 6)), np.empty((90, 7))
+    by_boundary, by_value, scores = np.empty((3, K + 1)), np.empty((2, 6)), np.empty((90, 7))
     noise, spent, squares = _kernels.leftovers(
         *twin.args, 0.5, twin.seen, twin.fit, by_boundary, by_value, scores
     )
     assert noise == pytest.approx((clipped**2).mean(), rel=1e-4)
     assert spent == pytest.approx((r**2).sum(), rel=1e-4)
     assert squares == pytest.approx((twin.seen[i, v] ** 2).sum())
+    turns = np.array([np.sin(2 * np.pi * twin.place(twin.fit, *at)) for at in zip(b, i, strict=True)])
+    for n in np.unique(b):
+        own = b == n
+        assert by_boundary[2, n] == pytest.approx(np.average(turns[own], weights=j[1, own] ** 2), abs=2e-3)
     for got, which in ((by_boundary, b), (by_value, i)):
         for n in range(got.shape[1]):
             own = which == n
@@ -570,14 +574,14 @@ def test_rounds_of_fits(seed: int) -> None:
     # One boundary is out of line, and the bar shakes.
     seen[:, v[b == 5]] = rng.normal(0, 0.5, seen[:, v[b == 5]].shape)
     profile, start = _profile(SHARE), twin.fit * [1.003, 1, 1, 1, 1, 1, 1]
-    fit, by_boundary = start.copy(), np.empty((2, K + 1))
+    fit, by_boundary = start.copy(), np.empty((3, K + 1))
     variance = _kernels.fit_bar(
         twin.codes, twin.known, twin.offset, twin.when, profile, BLUR, DIM, 0.5, PRIOR, seen,
         (12, 2, 1e-3, 1e-5), (6, 4.0, 0.25, 0.3), fit, by_boundary,
     )  # fmt: skip
     known, moved, want = twin.known, twin.offset, start.copy()
     by, by_value, scores, normal = (
-        np.empty((2, K + 1)),
+        np.empty((3, K + 1)),
         np.empty((2, 6)),
         np.empty((110, 7)),
         np.empty((7, 7)),
@@ -664,7 +668,7 @@ def test_a_bar_is_read_upright(spacing: float) -> None:
 
 def fit_of(codes, known, dim, values, start):
     """The fit of a frame's values, of boundaries .45 px wide without tails, and where they lie off it."""
-    fit, by_boundary = start.copy(), np.empty((2, K + 1))
+    fit, by_boundary = start.copy(), np.empty((3, K + 1))
     variance = _kernels.fit_bar(
         codes, known, np.zeros(16), (np.arange(16) + 0.5) / 16 - 0.5, _profile(1.0), 0.45, dim, 9.0, _PRIOR,
         values, (12, 2, 1e-3, 1e-5), (6, 4.0, 0.25, 0.3), fit, by_boundary,
@@ -706,12 +710,35 @@ def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
     known = np.ones((K + 1, 16), np.bool_)
     known[[0, K]] = False
     start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    fit, (off, weight) = fit_of(codes, known, 1.0, values, start)
+    fit, (off, weight, _) = fit_of(codes, known, 1.0, values, start)
     assert fit[0] == pytest.approx(spacing, rel=2e-5)
     # The prior takes up to a tenth of them.
     assert_allclose(fit[5:], [0.04, 0.05], rtol=0.12)
     assert (weight > 0).all()
     assert np.abs(off).max() < 0.005
+
+
+def test_a_wave_of_the_pixels_shows_in_the_boundaries() -> None:
+    """Boundaries seem off by 0.02 px times the sine of their place on the pixels."""
+    rng, rows, spacing = np.random.default_rng(8), 150, 8 + 1 / 15
+    codes = np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1).astype(np.float64)
+    known = np.ones((K + 1, 16), np.bool_)
+    known[[0, K]] = False
+    at, b = np.arange(rows), np.arange(1, K) - K / 2
+    places = (rows - 1) / 2 + 0.2 + spacing * b
+    seem = places + 0.02 * np.sin(2 * np.pi * places)
+    share = norm.cdf((at[:, None] - seem) / 0.45)
+    values = 0.6 * (codes[0] + share @ np.diff(codes, axis=0)).T
+    start = np.array([1.001 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
+    fit, (off, weight, wave) = fit_of(codes, known, 1.0, values, start)
+    assert_allclose(wave, np.sin(2 * np.pi * places), atol=0.2)
+    # What a straight line through the wave does not take up is left, and that it takes up is the spacing's.
+    terms = np.stack([np.ones(K - 1), b], 1)
+    line = np.linalg.lstsq(terms * np.sqrt(weight)[:, None], wave * np.sqrt(weight))[0]
+    # The fit takes some of it for what its own wave makes of boundaries that are half a pixel wide.
+    assert_allclose(off, 0.02 * (wave - terms @ line), atol=0.005)
+    assert np.corrcoef(off, wave - terms @ line)[0, 1] > 0.98
+    assert fit[0] - spacing == pytest.approx(0.02 * line[1], rel=0.25)
 
 
 def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.ndarray]:

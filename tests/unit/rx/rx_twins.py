@@ -284,16 +284,27 @@ def newest_on_parabola(past, speed_weight, bend_weight, worth, outlier):
     return path[1], inverse[1, 1], newest / weight[-1]
 
 
-def bend_of(place, sums, least):
+def bend_of(place, sums, least, wave, variance):
     """By `lstsq`, weighted."""
     use = sums[1] > least * sums[1].max()
     place, weight = place[use], sums[1, use]
-    off = sums[0, use] / weight
+    off, one = (sums[0, use] - wave * sums[2, use]) / weight, sums[2, use] / weight
     terms = np.stack([place**2, np.ones(len(place)), place], 1)
     root = np.sqrt(weight)
     path = np.linalg.lstsq(terms * root[:, None], off * root)[0]
     left = (weight * (off - terms @ path) ** 2).sum() / (len(place) - 5)
-    return path[0], np.linalg.inv((terms.T * weight) @ terms)[0, 0] * left
+    by_wave = np.linalg.lstsq(terms * root[:, None], one * root)[0][0]
+    return path[0], np.linalg.inv((terms.T * weight) @ terms)[0, 0] * left + variance * by_wave**2
+
+
+def wave_of(place, off, weight, wave, least):
+    """What is left by `lstsq`, weighted."""
+    use = weight > least * weight.max()
+    terms, root = np.stack([place**2, np.ones(len(place)), place], 1)[use], np.sqrt(weight[use])
+    both = np.stack([wave, off], 1)[use] * root[:, None]
+    left = both - (terms * root[:, None]) @ np.linalg.lstsq(terms * root[:, None], both)[0]
+    squares = left.T @ left
+    return np.array([squares[0, 0], squares[0, 1], squares[1, 1], use.sum() - 3])
 
 
 def farthest_off(selected, grid, on, turn):

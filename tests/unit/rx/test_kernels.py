@@ -558,10 +558,27 @@ def test_bend_of_boundaries(seed, n):
     off = 0.01 * place**2 + 0.3 - 0.02 * place + rng.normal(0, 0.1, n)
     if n > 8:
         weight[3] = 1.0
-    sums = np.stack([weight * off, weight])
-    got = _kernels.bend_of(place, sums, 0.1)
-    assert_allclose(got, twins.bend_of(place, sums, 0.1), rtol=1e-6)
-    assert np.isnan(_kernels.bend_of(place[:5], sums[:, :5], 0.1)).all()
+    wave = np.sin(7 * place)
+    sums = np.stack([weight * (off + 0.2 * wave), weight, weight * wave])
+    for height in ((0.0, 0.0), (0.2, 0.01)):
+        got = _kernels.bend_of(place, sums, 0.1, *height)
+        assert_allclose(got, twins.bend_of(place, sums, 0.1, *height), rtol=1e-6)
+    assert np.isnan(_kernels.bend_of(place[:5], sums[:, :5], 0.1, 0.0, 0.0)).all()
+
+
+@pytest.mark.parametrize("n", [4, 8, 15])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_wave_in_boundaries(seed, n):
+    rng = np.random.default_rng(seed)
+    place, weight = np.arange(n) - (n - 1) / 2, rng.uniform(50, 100, n)
+    if n > 8:
+        weight[3] = 1.0
+    off, wave = rng.normal(0, 1, (2, n))
+    out = np.array([1.0, 2.0, 3.0, 4.0])
+    _kernels.wave_of(place, off, weight, wave, 0.1, out)
+    assert_allclose(out - [1, 2, 3, 4], twins.wave_of(place, off, weight, wave, 0.1), rtol=1e-6)
+    _kernels.wave_of(place[:3], off[:3], weight[:3], wave[:3], 0.1, before := out.copy())
+    assert_allclose(before, out)
 
 
 @pytest.mark.parametrize("grid", [1, 2, 3])
