@@ -20,7 +20,7 @@ from evlcp_sdk.plugin.roles import Corrected, Filter, Tracker
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
-from evlcp_sdk.values import Range, SoftSymbols, SyncLock
+from evlcp_sdk.values import Bend, Range, SoftSymbols, SyncLock
 
 LINK = load_link(overrides=["tracking.id=kalman"])
 EVENTS = ideal_events(LINK, IdealBar(random_symbols(LINK, 2)))
@@ -239,6 +239,11 @@ def but(**changes: Any) -> Callable[[Any], Any]:
     return lambda found: replace(found, **changes)
 
 
+def bent(**changes: Any) -> Callable[[Any], Any]:
+    """What it says of a lean, of three boundaries, is so."""
+    return but(bend=replace(Bend(*np.ones((3, 3))), **changes))
+
+
 def spoilt(name: str, value: float, kind: Any = None) -> Callable[[Any], Any]:
     """One value of an array is another."""
 
@@ -287,6 +292,8 @@ ODD: list[tuple[str, Callable[[Any], Any], str]] = [
     ("ranging", but(pairs="many"), "pairs = 'many', expected a number"),
     ("ranging", but(late_chips=math.nan), "late_chips = nan, expected a number"),
     ("ranging", but(bend=3), "int, expected Bend"),
+    ("ranging", bent(wave=np.zeros(2)), r"bend.wave of shape \(2,\), expected \(3,\)"),
+    ("ranging", bent(wave_m=math.nan), r"bend.wave_m = nan, expected a number"),
     ("tracking", lambda found: (found[0] * math.nan, found[1]), r"values \[nan"),
     ("tracking", lambda found: (found[0][:0], found[1]), r"values of shape \(0,\), expected"),
     ("tracking", lambda found: (found[0].tolist(), found[1]), "values of type list"),
