@@ -651,10 +651,10 @@ def leftovers(
 ) -> tuple[float, float, float]:
     """What a fit leaves: shifts of each boundary and of each value, and each row's score.
 
-    `by_boundary` (3, K + 1) and `by_value` (2, values) take the shift of the centre, px, and its information,
-    in units of the variance of one value; `by_boundary` also the sine of the boundary's places on the pixels,
-    0 in the middle of one, mean over its values; `scores` (rows, 7) the slopes times the residuals, clipped
-    to `huber`, over a row's values, which share one pixel phase and so one error.
+    `by_boundary` (2 or 3, K + 1) and `by_value` (2, values) take the shift of the centre, px, and its
+    information, in units of the variance of one value; a third row the sine of the boundary's places on the
+    pixels, 0 in the middle of one, mean over its values; `scores` (rows, 7) the slopes times the residuals,
+    clipped to `huber`, over a row's values, which share one pixel phase and so one error.
 
     Returns:
         Mean square of the clipped residuals, sum of the squares of residuals, and of the values.
@@ -663,7 +663,7 @@ def leftovers(
     gain, width = fit[3], blur * exp(fit[4])
     scale, steepest = (profile.shape[1] - 1) / (_REACH * width), gain / width
     for b in range(clusters + 1):
-        for a in range(3):
+        for a in range(len(by_boundary)):
             by_boundary[a, b] = 0.0
     for i in range(values):
         by_value[0, i] = by_value[1, i] = 0.0
@@ -704,11 +704,14 @@ def leftovers(
                 scores[v, 5] += pull * column[_SIDE + j]
                 scores[v, 6] += pull * column[_AGAIN + j]
                 told[j] += steep * steep
-        for j in range(_MANY):
-            by_boundary[2, int(column[_BOUNDARY + j])] -= told[j] * sin(2 * np.pi * work[_AT + j])
+        if len(by_boundary) > 2:
+            for j in range(_MANY):
+                if told[j] > 0:
+                    turned = told[j] * sin(2 * np.pi * work[_AT + j])
+                    by_boundary[2, int(column[_BOUNDARY + j])] -= turned
     for b in range(clusters + 1):
-        for a in (0, 2):
-            by_boundary[a, b] /= max(by_boundary[1, b], 1e-12)
+        for a in range(len(by_boundary)):
+            by_boundary[a, b] /= max(by_boundary[1, b], 1e-12) if a != 1 else 1.0
     for i in range(values):
         by_value[0, i] /= max(by_value[1, i], 1e-12)
     return noise / max(count, 1), spent, all_squares
@@ -852,7 +855,9 @@ def fit_bar(
     for i in range(values):
         moved[i], own[i] = offset[i], 0.0
     spent, squares = 0.0, 0.0
+    rough = np.empty((2, boundaries))
     for left in range(rounds, -1, -1):
+        shifts = rough if left else by_boundary
         tolerance = close if left else exact
         if not solve(
             codes,
@@ -885,21 +890,21 @@ def fit_bar(
             huber,
             seen_values,
             fit,
-            by_boundary,
+            shifts,
             by_value,
             scores,
         )
         used = 0
         for b in range(boundaries):
-            if by_boundary[1, b] > 0:
-                sizes[used] = abs(by_boundary[0, b])
+            if shifts[1, b] > 0:
+                sizes[used] = abs(shifts[0, b])
                 used += 1
         if used < least:
             return np.nan
         if left:
             most = max(outlier * 1.4826 * _median(sizes, used), least_outlier)
             for b in range(boundaries):
-                if abs(by_boundary[0, b]) > most:
+                if abs(shifts[0, b]) > most:
                     for i in range(values):
                         counted[b, i] = False
             for i in range(values):
