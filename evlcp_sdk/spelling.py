@@ -3,7 +3,7 @@
 import difflib
 from collections.abc import Sequence
 
-__all__ = ["counted", "nearest"]
+__all__ = ["counted", "hinted", "nearest", "unhinted"]
 
 
 def counted(number: int, what: str) -> str:
@@ -24,3 +24,21 @@ def nearest(word: str, known: Sequence[str], kind: str = "known") -> str:
     near = difflib.get_close_matches(word, known, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else ""
     return f"{hint} ({kind}: {', '.join(known) or 'none'})"
+
+
+def hinted(what: str, role: str, id: str) -> str:
+    """A fault of an algorithm, and the command that finds it.
+
+    >>> hinted("pilots algorithm 'mine': gave 3 codes", "pilots", "mine")
+    "pilots algorithm 'mine': gave 3 codes; try: evlcp check pilots mine"
+    """
+    return f"{what}; try: evlcp check {role} {id}"
+
+
+def unhinted(what: str, role: str, id: str) -> str:
+    """The fault alone, where that command is what was run.
+
+    >>> unhinted("gave 3 codes; try: evlcp check pilots mine", "pilots", "mine")
+    'gave 3 codes'
+    """
+    return what.replace(hinted("", role, id), "")

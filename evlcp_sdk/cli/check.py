@@ -88,6 +88,8 @@ def _check_link(link_file: str | None, overrides: Sequence[str], as_json: bool) 
     link = load_link(link_file, overrides)
     found: list[tuple[str, Verdict]] = []
     for role, outcome in check_link(link):
+        if role != "link":
+            outcome = _alone(outcome, role, link.table[role]["id"])
         if not as_json and role not in [other for other, _ in found]:
             head = "the link" if role == "link" else f"{role} '{link.table[role]['id']}'"
             console().print(head, style="bold")
@@ -117,8 +119,9 @@ def _check_one(
 ) -> None:
     import json
 
-    from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.errors import ConfigError, EvlcpError
     from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.spelling import unhinted
     from evlcp_sdk.testing import check as hold
     from evlcp_sdk.testing import laws_of
 
@@ -131,8 +134,12 @@ def _check_one(
         if not equals:
             raise ConfigError(f"--excuse {text}: expected LAW=REASON")
         reasons[law.strip()] = reason.strip()
-    link = _link(role, id, link_file, overrides, registry)
-    outcomes = hold(role, link.algorithm(role), reasons, link)
+    try:
+        link = _link(role, id, link_file, overrides, registry)
+        algorithm = link.algorithm(role)
+    except EvlcpError as fault:
+        raise type(fault)(unhinted(str(fault), role, id)) from fault
+    outcomes = [_alone(outcome, role, id) for outcome in hold(role, algorithm, reasons, link)]
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     if as_json:
         echo(
@@ -201,6 +208,15 @@ def _link(
             except ConfigError:
                 changed["bar"] = dict(ONE_CLUSTER)
     return resolve(changed, registry, source=link_file or "", overridden=overridden)
+
+
+def _alone(outcome: "Verdict", role: str, id: str) -> "Verdict":
+    """Without the hint to run what has just been run."""
+    from dataclasses import replace
+
+    from evlcp_sdk.spelling import unhinted
+
+    return replace(outcome, detail=unhinted(outcome.detail, role, id))
 
 
 def _show(outcomes: "Sequence[Verdict]", width: int) -> None:

@@ -38,7 +38,7 @@ from evlcp_sdk.plugin.roles import (
 from evlcp_sdk.scene.bar import BarLayout, read_leds
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.specs import SpecError, build, parse_value, read_toml, shown
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.spelling import hinted, nearest
 
 __all__ = ["Link", "load_link", "resolve", "with_leds"]
 
@@ -416,7 +416,7 @@ def _codes_of_roles(parts: Mapping[str, Any], table: Mapping[str, Mapping[str, A
     except ConfigError as fault:
         role = "modulation" if str(fault).startswith("codebook codewords") else "pilots"
         id = table[role]["id"]
-        raise ConfigError(f"{role} algorithm '{id}': {fault}; try: evlcp check {role} {id}") from fault
+        raise ConfigError(hinted(f"{role} algorithm '{id}': {fault}", role, id)) from fault
     with _named("modulation", table):
         _check_alphabet(codebook)
     return codebook
@@ -454,7 +454,7 @@ def _named(role: str, table: Mapping[str, Mapping[str, Any]]) -> Iterator[None]:
         raise
     except (Exception, SystemExit) as fault:
         id, what = table[role]["id"], f"{type(fault).__name__}: {fault}".splitlines()[0]
-        raise PluginError(f"{role} algorithm '{id}': {what}; try: evlcp check {role} {id}") from fault
+        raise PluginError(hinted(f"{role} algorithm '{id}': {what}", role, id)) from fault
 
 
 def _parse_override(text: str) -> tuple[str, str, Any]:

@@ -18,6 +18,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.late import Late
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.spelling import hinted
 from evlcp_sdk.values import Bend, PresenceMap, Range, SoftSymbols, SyncLock
 
 if TYPE_CHECKING:
@@ -57,8 +58,7 @@ class Guard:
         # To exit is not an algorithm's to decide; to interrupt is the user's.
         passes: list[type[BaseException]] = [PluginError, KeyboardInterrupt]
         self._passes = (*passes, ConfigError) if may_refuse else tuple(passes)
-        self._who = f"{role} algorithm '{id}'"
-        self._hint = f"try: evlcp check {role} {id}"
+        self._role, self._id = role, id
 
     def __enter__(self) -> None:
         return None
@@ -70,7 +70,7 @@ class Guard:
             last = traceback.extract_tb(trace)[-1]
             what = f"{type(fault).__name__}: {_shown(str, fault)}".splitlines()[0]
             where = f"{Path(last.filename).name}, line {last.lineno}"
-            raise PluginError(f"{self._who}: {what} ({where}); {self._hint}") from fault
+            raise PluginError(self._said(f": {what} ({where})")) from fault
 
     def refuse(self, gave: str, expected: str) -> NoReturn:
         """Say what an algorithm gave, and what was expected.
@@ -78,7 +78,10 @@ class Guard:
         Raises:
             PluginError: With both.
         """
-        raise PluginError(f"{self._who}: gave {gave}, expected {expected}; {self._hint}")
+        raise PluginError(self._said(f": gave {gave}, expected {expected}"))
+
+    def _said(self, what: str) -> str:
+        return hinted(f"{self._role} algorithm '{self._id}'{what}", self._role, self._id)
 
     def expect(self, found: object, kind: type) -> None:
         """Check what an algorithm gave.
