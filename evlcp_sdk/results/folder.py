@@ -31,6 +31,7 @@ class ResultFolder:
         self.folder = folder
         self._files = tuple(dict.fromkeys((*files, SUMMARY)))
         self._used: set[str] = set()
+        self._opened: set[str] = set()
         self._outputs = Outputs()
         self._made = not folder.exists()
         try:
@@ -53,27 +54,34 @@ class ResultFolder:
         """A text file, UTF-8, line ends as written; it is closed with the folder.
 
         Raises:
-            ValueError: It is not among the files that a run may leave.
+            ValueError: It is not among the files that a run may leave, or was opened before.
             OutputError: It cannot be written.
             OSError: Likewise.
         """
-        return self._outputs.open(self._place(name))
+        return self._outputs.open(self._once(name))
 
     def open_binary(self, name: str) -> BinaryIO:
         """A binary file; it is closed with the folder.
 
         Raises:
-            ValueError: It is not among the files that a run may leave.
+            ValueError: It is not among the files that a run may leave, or was opened before.
             OutputError: It cannot be written.
             OSError: Likewise.
         """
-        return self._outputs.open_binary(self._place(name))
+        return self._outputs.open_binary(self._once(name))
 
     def _place(self, name: str) -> Path:
         if name not in self._files:
             raise ValueError(f"'{name}' is not among the files of its record")
         self._used.add(name)
         return self.folder / name
+
+    def _once(self, name: str) -> Path:
+        if name in self._opened:
+            raise ValueError(f"'{name}' was opened before")
+        place = self._place(name)
+        self._opened.add(name)
+        return place
 
     def digests(self) -> dict[str, dict[str, Any]]:
         """Size in bytes and SHA-256 of each file, by name; they are closed.

@@ -72,6 +72,13 @@ class Stray(Sink):
         folder.open("stray.txt")
 
 
+class Twice(Sink):
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        folder.open("failing.txt")
+        folder.open_binary("failing.txt")
+
+
 class NoSink:
     pass
 
@@ -104,6 +111,7 @@ def bring(name: str, target: str, *files: str, **more: Any) -> object:
             r"evlcp_stage_finished\(\) of a plugin: KeyError: '.*' \(test_sinks.py, line \d+\)",
         ),
         ("strays", f"{__name__}:Stray", r"sink 'strays' of .*: 'stray.txt' is not among the files"),
+        ("twice", f"{__name__}:Twice", r"sink 'twice' of .*: ValueError: 'failing.txt' was opened before"),
         ("none", f"{__name__}:NoSink", r"sink 'none' of .*: .*:NoSink is not a Sink"),
         ("away", f"{__name__}:Away", r"sink 'away' of .*: cannot import .*:Away"),
         ("gone", "no_such_module:Sink", r"sink 'gone' of .*: cannot import no_such_module:Sink"),
