@@ -20,7 +20,7 @@ from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.values import Frame, Heard, Range, Region, SyncLock
+from evlcp_sdk.values import Frame, Heard, Packet, Range, Region, SyncLock
 
 __all__ = ["HeardFraming"]
 
@@ -157,8 +157,12 @@ class HeardFraming:
                     self._judged.end(listener.packets)
                     del self._listeners[region.id]
 
-    def disclaim(self, place: Region) -> int:
+    def disclaim(self, place: Region, packet: Packet) -> int:
         """Nothing: a framing says what it receives, not what it rejects."""
+        return 0
+
+    def disown(self, number: int) -> int:
+        """Nothing, likewise."""
         return 0
 
     def close(self) -> None:

@@ -27,7 +27,7 @@ from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, sight_of
-from evlcp_sdk.values import Frame, FrameView, Range, Region, SyncLock, changed
+from evlcp_sdk.values import Frame, FrameView, Packet, Range, Region, SyncLock, changed
 
 __all__ = ["PacketFraming"]
 
@@ -135,7 +135,8 @@ class PacketFraming:
         self._echoes = judged.echoes
         self._judged = judged
         self._joined: set[int] = set()
-        self._ended: deque[tuple[tuple[float, float], int]] = deque(maxlen=_MOST_ENDED)
+        self._ended: deque[tuple[tuple[float, float], float, int]] = deque(maxlen=_MOST_ENDED)
+        self._rejected_by: dict[int, int] = {}
         self._due: deque[Followed] = deque()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
@@ -165,9 +166,11 @@ class PacketFraming:
                 continue
             self._transmitters.forget(transmitter, step.end_us)
             if region.released:
-                self.counts["regions_released"] += 1
                 self._end(transmitter, step.end_us)
-                self._transmitters.release(transmitter)
+                # Its last frames may have shown that it is a part of another.
+                if region.id not in self._joined:
+                    self.counts["regions_released"] += 1
+                    self._transmitters.release(transmitter)
 
     @property
     def due_us(self) -> float:
@@ -205,17 +208,40 @@ class PacketFraming:
                 self._regions.drop(region)
                 self._let_go(region)
 
-    def disclaim(self, place: Region) -> int:
-        """Count no frame that was rejected in a place that is another link's; return how many they were."""
+    def disclaim(self, place: Region, packet: Packet) -> int:
+        """Count no frame that was rejected in a place that is another link's; return how many they were.
+
+        Args:
+            place: The other's, and its size.
+            packet: Whose frames say where it was when.
+        """
         many = 0
+
+        def was_there(t_us: float, place_px: tuple[float, float]) -> bool:
+            then = min(packet.frames, key=lambda frame: abs(frame.t_us - t_us))
+            here = changed(place, x_px=place_px[0], y_px=place_px[1])
+            return same_place(here, changed(place, x_px=then.x_px, y_px=then.y_px))
+
         for transmitter in self._transmitters.alive:
-            if same_place(transmitter.region.latest, place):
+            latest = transmitter.region.latest
+            if transmitter.rejected and was_there(latest.t_us, (latest.x_px, latest.y_px)):
                 many += transmitter.rejected
                 transmitter.rejected = 0
         for one in list(self._ended):
-            if same_place(changed(place, x_px=one[0][0], y_px=one[0][1]), place):
+            place_px, t_us, rejected = one
+            if was_there(t_us, place_px):
                 self._ended.remove(one)
-                many += one[1]
+                many += rejected
+        self.counts["frames_rejected"] -= many
+        return many
+
+    def disown(self, number: int) -> int:
+        """Count no frame that was rejected where a packet was another link's; return how many they were."""
+        many = self._rejected_by.pop(number, 0)
+        for transmitter in self._transmitters.alive:
+            if transmitter.number == number:
+                many += transmitter.rejected
+                transmitter.rejected = 0
         self.counts["frames_rejected"] -= many
         return many
 
@@ -463,7 +489,7 @@ class PacketFraming:
     def _find_parts(self, region: Followed, t_us: float) -> None:
         """Look among the regions that ended for parts of a bar whose first frame is read."""
         for one in list(self._ended):
-            place_px, rejected = one
+            place_px, _, rejected = one
             if _is_part(region, t_us, place_px):
                 self._ended.remove(one)
                 self._was_part(rejected)
@@ -472,13 +498,21 @@ class PacketFraming:
         """Decode what a region that has ended still shows; its last packet is over."""
         seen_us = transmitter.region.latest.t_us + self._step_us
         self._decode_due(transmitter, min(now_us - self._tail_us, seen_us))
+        if transmitter.region.id in self._joined:
+            return
+        if transmitter.number is not None and transmitter.rejected:
+            # One that was out of sight has the number that it had.
+            before = self._rejected_by.get(transmitter.number, 0)
+            self._rejected_by[transmitter.number] = before + transmitter.rejected
+            if len(self._rejected_by) > _MOST_ENDED:
+                del self._rejected_by[min(self._rejected_by)]
         if transmitter.number is None and transmitter.rejected:
             place_px = transmitter.region.positions.place_at(seen_us)
             bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
             if any(_is_part(bar, seen_us, place_px) for bar in bars):
                 self._was_part(transmitter.rejected)
             else:
-                self._ended.append((place_px, transmitter.rejected))
+                self._ended.append((place_px, seen_us, transmitter.rejected))
         self._judged.end(transmitter.packets)
 
 

@@ -186,10 +186,11 @@ class LinkListener:
     def refuse(self, packet: Packet) -> None:
         """Count a packet that another link fits better."""
         self._of_others += len(packet.frames)
+        self._rejected_of_others += self._framing.disown(packet.transmitter)
 
-    def disclaim(self, place: Region) -> None:
+    def disclaim(self, place: Region, packet: Packet) -> None:
         """Count frames that were rejected in another link's place apart from those that no link reads."""
-        self._rejected_of_others += self._framing.disclaim(place)
+        self._rejected_of_others += self._framing.disclaim(place, packet)
 
     def close(self) -> None:
         """End the stream: what messages still lack is missing."""

@@ -11,10 +11,12 @@ from hypothesis import strategies as st
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
+from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.contest import explained_us
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.simulated import simulate
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
 
@@ -187,3 +189,26 @@ def test_what_a_packet_explains_is_the_time_of_symbols_that_are_right() -> None:
     frame = Frame(0, 0, 0, 0.0, soft, Range(np.nan, np.nan, 0), None, 0.0, 0.0)
     packet = Packet(0, 0, 0.0, 100.0, (frame,), 10)
     assert explained_us(packet, form) == pytest.approx(14.5 * form.frame_chips * 100.0)
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed: int, tmp_path: Path) -> None:
+    """A link of one cluster reads each part of a bar as a lamp, until the bar holds its place.
+
+    In the second scene a region's last frames show that it is a part of another.
+    """
+    (tmp_path / "lamp.toml").write_text(
+        "[bar]\nrows = 1\ncolumns = 1\ncluster_rows = 1\ncluster_columns = 1\n[ranging]\nid = 'none'\n"
+    )
+    (tmp_path / "scene.toml").write_text(
+        f"name = 'two'\nduration_s = 0.15\nseed = {seed}\n[motion]\ndistance_m = 40.0\n"
+        "[[bars]]\nx_m = -1.0\n[[bars]]\nx_m = 1.5\nlink = 'lamp.toml'\n"
+    )
+    simulate(tmp_path / "scene.toml").save(tmp_path / "two.raw")
+    lamp = replace(load_link(tmp_path / "lamp.toml"), name="lamp")
+    summary = receive_to_folder(tmp_path / "two.raw", None, [BAR, lamp])
+    of_lamp = summary["links"]["lamp"]["counts"]
+    assert of_lamp["frames"] > 30
+    assert of_lamp["frames_of_others"] > 100
+    assert of_lamp["frames_rejected"] < 10
+    assert not summary["warnings"]
