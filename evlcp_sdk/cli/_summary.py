@@ -36,9 +36,7 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
                 _erased(t),
                 _or_dash(t["quality"], "{:.2f}"),
                 _or_dash(t["clock_ppm"], "{:+.0f} ppm"),
-                _or_dash(t["distance_first_m"], "{:.2f}")
-                + " to "
-                + _or_dash(t["distance_last_m"], "{:.2f} m"),
+                _distances(t["distance_first_m"], t["distance_last_m"]),
             )
         out.print(table)
     for t in summary["transmitters"]:
@@ -152,6 +150,17 @@ def _positions(told: Mapping[str, Any]) -> str:
     for how in told["sites_contradicted"].values():
         text += f"; left out: {how}"
     return text
+
+
+def _distances(first_m: float | None, last_m: float | None) -> str:
+    """First and last distance.
+
+    >>> _distances(49.4, 48.86), _distances(None, None)
+    ('49.40 to 48.86 m', '-')
+    """
+    if first_m is None and last_m is None:
+        return "-"
+    return _or_dash(first_m, "{:.2f}") + " to " + _or_dash(last_m, "{:.2f} m")
 
 
 def _messages(counts: Mapping[str, int]) -> str:
