@@ -778,7 +778,8 @@ def _cut_off(box: Box, bar: Box, others: list[Box]) -> Box:
     """A box around a bar without what belongs to others beside, above or below it.
 
     Where they seem to overlap, one of them is not where it should be, as two bars do not stand in one place;
-    one that reaches over the middle is one in another column or row, which cuts nothing off.
+    one that reaches over the middle is one in another column or row, which cuts nothing off. Nor is a box cut
+    of which others on two sides would leave nothing: most of them are parts of one bar.
     """
     left, top, right, bottom = box
     for other in others:
@@ -796,7 +797,7 @@ def _cut_off(box: Box, bar: Box, others: list[Box]) -> Box:
                 right = min(right, other[0])
             else:
                 left = max(left, other[2])
-    return left, top, right, bottom
+    return (left, top, right, bottom) if left < right and top < bottom else box
 
 
 def _outgrown(followed: Followed) -> tuple[float, float, float, float]:

@@ -191,15 +191,16 @@ def test_what_a_packet_explains_is_the_time_of_symbols_that_are_right() -> None:
     assert explained_us(packet, form) == pytest.approx(14.5 * form.frame_chips * 100.0)
 
 
+LAMP_TABLE = "[bar]\nrows = 1\ncolumns = 1\ncluster_rows = 1\ncluster_columns = 1\n[ranging]\nid = 'none'\n"
+
+
 @pytest.mark.parametrize("seed", [0, 2])
 def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed: int, tmp_path: Path) -> None:
     """A link of one cluster reads each part of a bar as a lamp, until the bar holds its place.
 
     In the second scene a region's last frames show that it is a part of another.
     """
-    (tmp_path / "lamp.toml").write_text(
-        "[bar]\nrows = 1\ncolumns = 1\ncluster_rows = 1\ncluster_columns = 1\n[ranging]\nid = 'none'\n"
-    )
+    (tmp_path / "lamp.toml").write_text(LAMP_TABLE)
     (tmp_path / "scene.toml").write_text(
         f"name = 'two'\nduration_s = 0.15\nseed = {seed}\n[motion]\ndistance_m = 40.0\n"
         "[[bars]]\nx_m = -1.0\n[[bars]]\nx_m = 1.5\nlink = 'lamp.toml'\n"
@@ -212,3 +213,32 @@ def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed: int, tmp_path:
     assert of_lamp["frames_of_others"] > 100
     assert of_lamp["frames_rejected"] < 10
     assert not summary["warnings"]
+
+
+def test_parts_of_bars_on_two_sides_of_one_take_nothing_off_it(tmp_path: Path) -> None:
+    """A link of one cluster takes each part of two bars for a lamp, some of them between others."""
+    (tmp_path / "lamp.toml").write_text(LAMP_TABLE)
+    (tmp_path / "scene.toml").write_text(
+        "name='r'\n"
+        "duration_s=0.12\n"
+        "seed=575705\n"
+        "[motion]\n"
+        "distance_m=40.1\n"
+        "speed_mps=12.4\n"
+        "[[bars]]\n"
+        "x_m=-0.40\n"
+        "y_m=0.89\n"
+        "start_chip=75\n"
+        "[[bars]]\n"
+        "x_m=0.34\n"
+        "y_m=-0.87\n"
+        "start_chip=61\n"
+        "covered=[0,1,2,3,8]\n"
+        "[[bars]]\n"
+        "x_m=2.42\n"
+        "y_m=-0.99\n"
+        "link='lamp.toml'\n"
+    )
+    simulate(tmp_path / "scene.toml").save(tmp_path / "lamps.raw")
+    lamp = replace(load_link(tmp_path / "lamp.toml"), name="lamp")
+    assert receive_to_folder(tmp_path / "lamps.raw", None, [lamp])["status"] == "complete"
