@@ -119,7 +119,7 @@ def _check_one(
 ) -> None:
     import json
 
-    from evlcp_sdk.errors import ConfigError, EvlcpError
+    from evlcp_sdk.errors import ConfigError, PluginError
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.spelling import unhinted
     from evlcp_sdk.testing import check as hold
@@ -137,7 +137,7 @@ def _check_one(
     try:
         link = _link(role, id, link_file, overrides, registry)
         algorithm = link.algorithm(role)
-    except EvlcpError as fault:
+    except (ConfigError, PluginError) as fault:
         raise type(fault)(unhinted(str(fault), role, id)) from fault
     outcomes = [_alone(outcome, role, id) for outcome in hold(role, algorithm, reasons, link)]
     failed = sum(outcome.status == "failed" for outcome in outcomes)

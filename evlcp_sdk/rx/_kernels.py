@@ -1618,78 +1618,83 @@ def newest_on_parabola(
 
 
 @njit(cache=True, nogil=True)
-def bend_of(
-    place: Array, sums: Array, least: float, wave: float, wave_variance: float
-) -> tuple[float, float]:
-    """Bend of a parabola through boundaries, and its variance by their scatter about it; NaN of too few.
+def _about_parabola(
+    place: Array, weight: Array, off: Array, least: float, right: Array, inverse: Array
+) -> int:
+    """Weighted least squares of a parabola: right sides (k, 3) for what lies off, (k, n), and the inverse.
 
-    `place` (n,) are where they are, `sums` (3, n) what lies off, weighted, the weights, and what a wave of 1
-    would be; those of less than `least` of the heaviest are passed over. The wave is `wave` with a variance.
+    `off` is weighted. Boundaries of less than `least` of the heaviest weight are passed over; returns how
+    many are not, 0 where they are too few or lie on one place.
     """
-    heaviest = sums[1].max()
-    n = 0
-    normal, right, waves, inverse = np.zeros((3, 3)), np.zeros(3), np.zeros(3), np.empty((3, 3))
-    for i in range(place.size):
-        if sums[1, i] > least * heaviest:
-            terms = place[i] ** 2, 1.0, place[i]
-            n += 1
-            for a in range(3):
-                right[a] += terms[a] * (sums[0, i] - wave * sums[2, i])
-                waves[a] += terms[a] * sums[2, i]
-                for b in range(3):
-                    normal[a, b] += sums[1, i] * terms[a] * terms[b]
-    # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
-    if n - 3 < 3 or not inverted(normal, _ROUNDING, inverse):
-        return np.nan, np.nan
-    path = np.zeros(3)
-    for a in range(3):
-        for b in range(3):
-            path[a] += inverse[a, b] * right[b]
-    left = 0.0
-    for i in range(place.size):
-        if sums[1, i] > least * heaviest:
-            off = (sums[0, i] - wave * sums[2, i]) / sums[1, i]
-            off -= path[0] * place[i] ** 2 + path[1] + path[2] * place[i]
-            left += sums[1, i] * off * off
-    by_wave = 0.0
-    for a in range(3):
-        by_wave += inverse[0, a] * waves[a]
-    return path[0], inverse[0, 0] * left / (n - 3 - 2) + wave_variance * by_wave * by_wave
-
-
-@njit(cache=True, nogil=True)
-def wave_of(place: Array, off: Array, weight: Array, wave: Array, least: float, out: Array) -> None:
-    """What boundaries say of a wave in them that no parabola makes: added to `out` (4,).
-
-    That is sum of the squares of `wave`, of its products with `off`, of the squares of `off`, and degrees of
-    freedom, all of what is left of them when the parabola is taken out that fits best; weighted. Boundaries
-    of less than `least` of the heaviest weight are passed over.
-    """
-    heaviest = weight.max()
-    n = 0
-    normal, right, inverse = np.zeros((3, 3)), np.zeros((2, 3)), np.empty((3, 3))
-    squares = np.zeros(3)
+    heaviest, n = weight.max(), 0
+    normal = np.zeros((3, 3))
+    right[:] = 0.0
     for i in range(place.size):
         if weight[i] > least * heaviest:
             terms = place[i] ** 2, 1.0, place[i]
             n += 1
             for a in range(3):
-                right[0, a] += weight[i] * terms[a] * wave[i]
-                right[1, a] += weight[i] * terms[a] * off[i]
+                for k in range(len(off)):
+                    right[k, a] += terms[a] * off[k, i]
                 for b in range(3):
                     normal[a, b] += weight[i] * terms[a] * terms[b]
-            squares[0] += weight[i] * wave[i] * wave[i]
-            squares[1] += weight[i] * wave[i] * off[i]
-            squares[2] += weight[i] * off[i] * off[i]
-    if n - 3 < 1 or not inverted(normal, _ROUNDING, inverse):
+    return n if n > 3 and inverted(normal, _ROUNDING, inverse) else 0
+
+
+@njit(cache=True, nogil=True)
+def bend_of(
+    place: Array, sums: Array, least: float, wave: float, wave_variance: float
+) -> tuple[float, float]:
+    """Bend of a parabola through boundaries, and its variance by their scatter about it; NaN of too few.
+
+    `place` (n,) are where they are, `sums` (3, n) the weights, what lies off and what a wave of 1 would be,
+    both weighted; those of less than `least` of the heaviest are passed over. The wave is `wave` with a
+    variance.
+    """
+    right, inverse = np.empty((2, 3)), np.empty((3, 3))
+    weight = sums[0]
+    n = _about_parabola(place, weight, sums[1:], least, right, inverse)
+    # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
+    if n - 3 < 3:
+        return np.nan, np.nan
+    path, by_wave = np.zeros(3), 0.0
+    for b in range(3):
+        by_wave += inverse[0, b] * right[1, b]
+        for a in range(3):
+            path[a] += inverse[a, b] * (right[0, b] - wave * right[1, b])
+    left, heaviest = 0.0, weight.max()
+    for i in range(place.size):
+        if weight[i] > least * heaviest:
+            off = (sums[1, i] - wave * sums[2, i]) / weight[i]
+            off -= path[0] * place[i] ** 2 + path[1] + path[2] * place[i]
+            left += weight[i] * off * off
+    return path[0], inverse[0, 0] * left / (n - 3 - 2) + wave_variance * by_wave * by_wave
+
+
+@njit(cache=True, nogil=True)
+def wave_of(place: Array, sums: Array, least: float, out: Array) -> None:
+    """What a frame's boundaries say of a wave in them that no parabola makes: added to `out` (4,).
+
+    That is the sum of the squares of the wave, of its products with what lies off, of the squares of that,
+    and degrees of freedom, all of what is left when the parabola is taken out that fits best; weighted.
+    `place`, `sums` and `least` as of `bend_of`.
+    """
+    right, inverse = np.empty((2, 3)), np.empty((3, 3))
+    weight = sums[0]
+    n = _about_parabola(place, weight, sums[1:], least, right, inverse)
+    if n == 0:
         return
+    heaviest = weight.max()
+    for i in range(place.size):
+        if weight[i] > least * heaviest:
+            out[0] += sums[2, i] * sums[2, i] / weight[i]
+            out[1] += sums[2, i] * sums[1, i] / weight[i]
+            out[2] += sums[1, i] * sums[1, i] / weight[i]
     for a in range(3):
         for b in range(3):
-            squares[0] -= right[0, a] * inverse[a, b] * right[0, b]
-            squares[1] -= right[0, a] * inverse[a, b] * right[1, b]
-            squares[2] -= right[1, a] * inverse[a, b] * right[1, b]
-    for k in range(3):
-        out[k] += squares[k]
+            out[0] -= right[1, a] * inverse[a, b] * right[1, b]
+            out[1] -= right[1, a] * inverse[a, b] * right[0, b]
+            out[2] -= right[0, a] * inverse[a, b] * right[0, b]
     out[3] += n - 3
 
 

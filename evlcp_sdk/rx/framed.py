@@ -20,7 +20,7 @@ from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.values import Frame, Heard, Packet, Range, Region, SyncLock
+from evlcp_sdk.values import Frame, Heard, Range, Region, SyncLock
 
 __all__ = ["HeardFraming"]
 
@@ -157,7 +157,7 @@ class HeardFraming:
                     self._judged.end(listener.packets)
                     del self._listeners[region.id]
 
-    def disclaim(self, place: Region, packet: Packet) -> int:
+    def disclaim(self, place: Region) -> int:
         """Nothing: a framing says what it receives, not what it rejects."""
         return 0
 

@@ -27,7 +27,7 @@ from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, sight_of
-from evlcp_sdk.values import Frame, FrameView, Packet, Range, Region, SyncLock, changed
+from evlcp_sdk.values import Frame, FrameView, Range, Region, SyncLock, changed
 
 __all__ = ["PacketFraming"]
 
@@ -135,7 +135,7 @@ class PacketFraming:
         self._echoes = judged.echoes
         self._judged = judged
         self._joined: set[int] = set()
-        self._ended: deque[tuple[tuple[float, float], float, int]] = deque(maxlen=_MOST_ENDED)
+        self._ended: deque[tuple[tuple[float, float], int]] = deque(maxlen=_MOST_ENDED)
         self._rejected_by: dict[int, int] = {}
         self._due: deque[Followed] = deque()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
@@ -208,30 +208,17 @@ class PacketFraming:
                 self._regions.drop(region)
                 self._let_go(region)
 
-    def disclaim(self, place: Region, packet: Packet) -> int:
-        """Count no frame that was rejected in a place that is another link's; return how many they were.
-
-        Args:
-            place: The other's, and its size.
-            packet: Whose frames say where it was when.
-        """
+    def disclaim(self, place: Region) -> int:
+        """Count no frame that was rejected in a place that is another link's; return how many they were."""
         many = 0
-
-        def was_there(t_us: float, place_px: tuple[float, float]) -> bool:
-            then = min(packet.frames, key=lambda frame: abs(frame.t_us - t_us))
-            here = changed(place, x_px=place_px[0], y_px=place_px[1])
-            return same_place(here, changed(place, x_px=then.x_px, y_px=then.y_px))
-
         for transmitter in self._transmitters.alive:
-            latest = transmitter.region.latest
-            if transmitter.rejected and was_there(latest.t_us, (latest.x_px, latest.y_px)):
+            if same_place(transmitter.region.latest, place):
                 many += transmitter.rejected
                 transmitter.rejected = 0
         for one in list(self._ended):
-            place_px, t_us, rejected = one
-            if was_there(t_us, place_px):
+            if same_place(changed(place, x_px=one[0][0], y_px=one[0][1]), place):
                 self._ended.remove(one)
-                many += rejected
+                many += one[1]
         self.counts["frames_rejected"] -= many
         return many
 
@@ -489,7 +476,7 @@ class PacketFraming:
     def _find_parts(self, region: Followed, t_us: float) -> None:
         """Look among the regions that ended for parts of a bar whose first frame is read."""
         for one in list(self._ended):
-            place_px, _, rejected = one
+            place_px, rejected = one
             if _is_part(region, t_us, place_px):
                 self._ended.remove(one)
                 self._was_part(rejected)
@@ -512,7 +499,7 @@ class PacketFraming:
             if any(_is_part(bar, seen_us, place_px) for bar in bars):
                 self._was_part(transmitter.rejected)
             else:
-                self._ended.append((place_px, seen_us, transmitter.rejected))
+                self._ended.append((place_px, transmitter.rejected))
         self._judged.end(transmitter.packets)
 
 

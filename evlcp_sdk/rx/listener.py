@@ -188,9 +188,9 @@ class LinkListener:
         self._of_others += len(packet.frames)
         self._rejected_of_others += self._framing.disown(packet.transmitter)
 
-    def disclaim(self, place: Region, packet: Packet) -> None:
+    def disclaim(self, place: Region) -> None:
         """Count frames that were rejected in another link's place apart from those that no link reads."""
-        self._rejected_of_others += self._framing.disclaim(place, packet)
+        self._rejected_of_others += self._framing.disclaim(place)
 
     def close(self) -> None:
         """End the stream: what messages still lack is missing."""

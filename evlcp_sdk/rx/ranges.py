@@ -60,9 +60,9 @@ _WAVE_WORTH = 4.0
 """Frames that err alike, as they show the bar in about the same place on the pixels."""
 
 _WAVE_SHARE, _WAVE_REST_PX = 0.6, 0.03
-"""Share of the wave that distances have, and by how much that is off (sigma): over 26 recordings the slope
-of their errors over what a wave of 1 px makes was 0.2 of it where pixels are blind for long, else 0.8, as
-rows far off a fit hardly pull it."""
+"""Share of the wave that distances have, and by how much that is off (sigma): rows far off a fit hardly pull
+it. `benchmarks/wave.py` finds 0.35 in recordings of an independent generator, and 0.85 in rendered ones where
+the wave is higher; off by 0.01 to 0.05 px."""
 
 _LEAST_WEIGHT = 0.1
 """Of the heaviest boundary: below, one is not seen."""
@@ -76,8 +76,8 @@ class Ranges:
 
     Attributes:
         past: Time (s), distance (m) and variance (m2) of each, oldest first, float64 (n, 3).
-        bend: Sum of the boundaries' bends, beyond what the attitude explains, of their weights, and of what
-            the pixels' wave would make of them, float64 (3, n); empty without any.
+        bend: Sum of the boundaries' weights, of their bends, beyond what the attitude explains, and of what
+            the pixels' wave would make of them, both weighted, float64 (3, n); empty without any.
         bend_s: When that was, s.
         told: The attitude gave how the bar leans then.
         wave: Sums that say how high the pixels' wave is, of `_kernels.wave_of`, float64 (4,).
@@ -129,11 +129,16 @@ class RangeKeeper:
         if not (0 < distance_m < math.inf and 0 <= sigma_m < math.inf):
             return state, measured
         t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
-        faded, wave, height, unsure_m = 0.0, state.wave, (0.0, _WAVE_PX**2), 0.0
+        bend, bend_s, told, wave = state.bend, state.bend_s, state.told, state.wave
+        height, unsure_m = (0.0, _WAVE_PX**2), 0.0
         if measured.bend is not None:
-            if state.bend.size:
-                faded = math.exp(-max(t_s - state.bend_s, 0.0) / _TILT_MEMORY_S)
-            wave, height = _wave(state.wave * faded, measured.bend)
+            faded = math.exp(-max(t_s - bend_s, 0.0) / _TILT_MEMORY_S) if bend.size else 0.0
+            new = _weighed(measured.bend, sight.sine)
+            wave = wave * faded
+            _kernels.wave_of(measured.bend.place, new, _LEAST_WEIGHT, wave)
+            height = _height(wave)
+            goes_on = bend.shape == new.shape and told == (sight.sine is not None)
+            bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.sine is not None
             distance_m -= _WAVE_SHARE * height[0] * measured.bend.wave_m
             # The ranging's sigma is of boundaries with the wave.
             sigma_m *= math.sqrt(_left_over(wave, height[0]))
@@ -149,9 +154,6 @@ class RangeKeeper:
         distance_m -= speed_m_s * late_s
         # What is not known of the wave is alike in many frames: their scatter does not show it.
         variance += speed_variance * late_s**2 + unsure_m**2
-        bend, bend_s, told = state.bend, state.bend_s, state.told
-        if measured.bend is not None:
-            bend, bend_s, told = _add(state, faded, measured.bend, sight.sine), t_s, sight.sine is not None
         length, length_variance = self._leaning(bend, height, measured.bend, sight)
         variance = variance * length**2 + distance_m**2 * length_variance
         found = Range(distance_m * length, math.sqrt(variance), measured.pairs)
@@ -193,17 +195,23 @@ def _smooth(past: Floats) -> tuple[float, float, float]:
     )
 
 
-def _wave(sums: Floats, bend: Bend) -> tuple[Floats, tuple[float, float]]:
-    """Sums with a frame's boundaries; by them, how high the pixels' wave is, px, and the variance of that."""
-    sums = sums.copy()
-    if bend.wave is not None:
-        _kernels.wave_of(bend.place, bend.off, bend.weight, bend.wave, _LEAST_WEIGHT, sums)
-    squares, products, left, freedom = sums
+def _weighed(bend: Bend, sine: float | None) -> Floats:
+    """Weights of a frame's boundaries, and what lies off and the wave by these, without the known lean."""
+    off = bend.off if sine is None else bend.off - sine * bend.place**2
+    sums = np.empty((3, len(off)))
+    sums[0], sums[1] = bend.weight, bend.weight * off
+    sums[2] = 0.0 if bend.wave is None else bend.weight * bend.wave
+    return sums
+
+
+def _height(wave: Floats) -> tuple[float, float]:
+    """How high the pixels' wave is, px, and the variance of that, by what frames show and what is likely."""
+    squares, products, left, freedom = wave
     if not (squares > 0 and freedom > 1):
-        return sums, (0.0, _WAVE_PX**2)
+        return 0.0, _WAVE_PX**2
     noise = _WAVE_WORTH * max(left - products**2 / squares, 1e-12 * squares) / (freedom - 1)
     variance = 1 / (squares / noise + _WAVE_PX**-2)
-    return sums, (products / noise * variance, variance)
+    return products / noise * variance, variance
 
 
 def _left_over(wave: Floats, height_px: float) -> float:
@@ -212,17 +220,6 @@ def _left_over(wave: Floats, height_px: float) -> float:
     if not left > 0:
         return 1.0
     return float(min(max(1 - height_px * (2 * products - height_px * squares) / left, 0.0), 1.0))
-
-
-def _add(state: Ranges, faded: float, bend: Bend, sine: float | None) -> Floats:
-    """Sums with a frame's bend, without that of the known lean; older ones fade."""
-    off = bend.off if sine is None else bend.off - sine * bend.place**2
-    new = np.empty((3, len(off)))
-    new[0], new[1] = bend.weight * off, bend.weight
-    new[2] = 0.0 if bend.wave is None else bend.weight * bend.wave
-    if state.bend.shape != new.shape or state.told != (sine is not None):
-        return new
-    return np.asarray(new + state.bend * faded)
 
 
 def _parabola(bend: Bend, sums: Floats, wave: tuple[float, float]) -> tuple[float, float] | None:

@@ -218,7 +218,7 @@ class Receiver:
             packets += given
             for other in self._listeners:
                 if other is not listener:
-                    other.disclaim(one.place, one.packet)
+                    other.disclaim(one.place)
         return packets
 
 

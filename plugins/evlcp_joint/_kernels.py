@@ -710,8 +710,8 @@ def leftovers(
                     turned = told[j] * sin(2 * np.pi * work[_AT + j])
                     by_boundary[2, int(column[_BOUNDARY + j])] -= turned
     for b in range(clusters + 1):
-        for a in range(len(by_boundary)):
-            by_boundary[a, b] /= max(by_boundary[1, b], 1e-12) if a != 1 else 1.0
+        for a in range(0, len(by_boundary), 2):
+            by_boundary[a, b] /= max(by_boundary[1, b], 1e-12)
     for i in range(values):
         by_value[0, i] /= max(by_value[1, i], 1e-12)
     return noise / max(count, 1), spent, all_squares

@@ -286,9 +286,9 @@ def newest_on_parabola(past, speed_weight, bend_weight, worth, outlier):
 
 def bend_of(place, sums, least, wave, variance):
     """By `lstsq`, weighted."""
-    use = sums[1] > least * sums[1].max()
-    place, weight = place[use], sums[1, use]
-    off, one = (sums[0, use] - wave * sums[2, use]) / weight, sums[2, use] / weight
+    use = sums[0] > least * sums[0].max()
+    place, weight = place[use], sums[0, use]
+    off, one = (sums[1, use] - wave * sums[2, use]) / weight, sums[2, use] / weight
     terms = np.stack([place**2, np.ones(len(place)), place], 1)
     root = np.sqrt(weight)
     path = np.linalg.lstsq(terms * root[:, None], off * root)[0]
