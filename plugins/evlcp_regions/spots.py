@@ -57,6 +57,13 @@ _MOST_VEILED = 4
 _LARGE_PX = 64.0
 """Three lights so near one another that none is much brighter are places of one that is larger, as a bar."""
 
+_BESIDE_PX = 48.0
+"""How far apart neighbours among the places of one light are at the most: lights are at least 24 px apart, so
+that between places further from one another there is room for one more."""
+
+_PART_US = 100_000.0
+"""How long a light is still taken for a place of a larger one: such places wander, and come and go."""
+
 _FAINTER = 1.5
 """How much brighter a light is than those that come later and are but scattered by the lens, or its trail:
 places of a large light are about as bright as one another, and seen at about one time."""
@@ -126,6 +133,7 @@ class _Spot:
         alike: Products of its events and a brighter light's by lag, and the squares of either: see `_alike`.
         turns: Its turns beside a much brighter light, at one place beside it.
         off_px: Where that is: (right, down) of the brighter light.
+        part_us: When it was seen last that it is a place of a larger light, us.
     """
 
     id: int
@@ -143,6 +151,7 @@ class _Spot:
     alike: tuple[float, ...] = ()
     turns: int = 0
     off_px: tuple[float, float] = (0.0, 0.0)
+    part_us: float = -math.inf
 
 
 @dataclass(frozen=True)
@@ -207,10 +216,11 @@ class _SpotDetector:
             moved.append(replace(spot, id=next_id, own=not veil))
             regions.append(self._region(moved[-1], spot.x_px, spot.y_px, now_us))
             next_id += 1
+        moved = _with_parts(moved, now_us)
         single = [
             region
             for region, spot in zip(regions, moved, strict=True)
-            if spot.own and now_us - spot.found_us >= _YOUNG_US and not _is_part(spot, moved)
+            if spot.own and now_us - spot.found_us >= _YOUNG_US and spot.turned_us - spot.part_us > _PART_US
         ]
         return _State(tuple(moved), cells, next_id), single
 
@@ -430,19 +440,34 @@ def _dimmest(spots: Sequence[_Spot], new: _Spot, most: int) -> list[_Spot]:
     return [new] if least.burst >= new.burst else [least]
 
 
-def _is_part(spot: _Spot, spots: Sequence[_Spot]) -> bool:
-    """Whether it is a place of a larger light."""
-    beside = [
-        other
-        for other in spots
-        if other.id != spot.id
+def _with_parts(spots: Sequence[_Spot], now_us: float) -> list[_Spot]:
+    """Lights with when each was seen to be a place of a larger one, by itself or as a neighbour of one."""
+    seen_us = [
+        now_us if sum(_is_beside(spot, other, _LARGE_PX) for other in spots) >= 2 else spot.part_us
+        for spot in spots
+    ]
+    # From one to the next: the ends of a large light have a neighbour on one side only.
+    for k in sorted(range(len(spots)), key=lambda k: -seen_us[k]):
+        waiting = [k]
+        while waiting:
+            part = waiting.pop()
+            for j, spot in enumerate(spots):
+                if seen_us[j] < seen_us[part] and _is_beside(spot, spots[part], _BESIDE_PX):
+                    seen_us[j] = seen_us[part]
+                    waiting.append(j)
+    return [replace(spot, part_us=then) for spot, then in zip(spots, seen_us, strict=True)]
+
+
+def _is_beside(spot: _Spot, other: _Spot, reach_px: float) -> bool:
+    """Whether another light is as near and as bright as a place of one light that both are of."""
+    return (
+        other.id != spot.id
         and other.own
-        and _apart(spot.x_px, spot.y_px, other) < _LARGE_PX
+        and _apart(spot.x_px, spot.y_px, other) < reach_px
         and other.burst < _VEIL * spot.burst
         and spot.burst < _VEIL * other.burst
         and not (other.found_us > spot.found_us + _YOUNG_US and spot.burst > _FAINTER * other.burst)
-    ]
-    return len(beside) >= 2
+    )
 
 
 def _apart(x_px: float, y_px: float, spot: _Spot) -> float:

@@ -146,3 +146,33 @@ def test_a_framing_names_what_finds_its_lights() -> None:
     assert resolve({}).table["detection"] == {"id": "rhythm"}
     both = resolve({"bar": ONE, "framing": {"id": "uart"}, "detection": {"id": "whole"}})
     assert both.table["detection"]["id"] == "whole"
+
+
+def beside_one_another(rng: np.random.Generator, places: dict[int, tuple[float, float]]) -> Events:
+    """Lights of their own edges so many rows below the shaking place, from a time to a time, s."""
+    parts = []
+    for down, (from_s, until_s) in places.items():
+        one = events_of(rng, 10_000.0, 0.3, 60, 0.0)
+        part = one[(one.t_us >= from_s * 1e6) & (one.t_us < until_s * 1e6)]
+        parts.append(Events.of(part.t_us, part.x, part.y + down, part.p))
+    return together(*parts)
+
+
+def test_a_large_light_is_one_though_its_places_come_and_go() -> None:
+    """The ends have a neighbour on one side; then one in the middle is lost, and that has one less."""
+    places = {0: (0.0, 0.18), 40: (0.0, 0.18), 80: (0.0, 0.1), 120: (0.0, 0.18)}
+    found = regions_of(link_of(10_000.0), beside_one_another(np.random.default_rng(4), places), 0.3)
+    assert not any(regions for _, regions in found)
+
+
+def test_lights_that_stood_beside_others_are_given_when_these_are_gone() -> None:
+    events = beside_one_another(np.random.default_rng(4), {36: (0.0, 0.3), 0: (0.0, 0.06), 72: (0.0, 0.06)})
+    found = regions_of(link_of(10_000.0), events, 0.3)
+    assert not any(regions for start, regions in found if start < 150_000)
+    assert places_of(found, 190_000, 0) == 1
+
+
+def test_two_lights_beside_one_another_are_two() -> None:
+    events = beside_one_another(np.random.default_rng(4), {0: (0.0, 0.3), 36: (0.0, 0.3)})
+    found = regions_of(link_of(10_000.0), events, 0.3)
+    assert all(len(regions) == 2 for start, regions in found if start > 30_000)

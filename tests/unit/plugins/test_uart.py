@@ -14,6 +14,7 @@ from evlcp_uart.characters import Characters, Parity
 from evlcp_uart.framing import Uart, read_characters
 from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, TICKS, Light
 
+import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.compose import compose
@@ -586,6 +587,18 @@ def test_pair_codes_without_a_parity_to_fail_are_none_of_characters(seed: int) -
     levels = np.stack([values, 1 - values], 1).ravel().tolist()
     light = seen(rng, levels, 100.0, late_us=(20.0, 30.0), noise_hz=100.0)
     assert read_characters(light.t_us, light.p, 10_000.0, Uart(8, "none", 1)) == []
+
+
+@pytest.mark.parametrize(
+    "framing", [{}, {"parity": "even"}, {"data_bits": 7, "parity": "even", "stop_bits": 2}]
+)
+def test_a_bar_in_view_is_no_light_of_characters(framing: dict[str, Any], demo_raw: Path) -> None:
+    """By a link at the bar's own rate of chips; nor is it ever taken for one, which costs much time."""
+    one = {"rows": 1, "columns": 1, "cluster_rows": 1, "cluster_columns": 1}
+    link = resolve({"bar": one, "framing": {"id": "uart"} | framing, "air": {"frames_per_packet": 100}})
+    with evlcp.receive(demo_raw, [link]) as packets:
+        assert list(packets) == []
+        assert packets.counts["regions_opened"] == 0
 
 
 def test_characters_of_one_polarity_are_not_said_to_be_sure() -> None:
