@@ -30,9 +30,6 @@ _PLACES = np.empty(64, np.int64)
 """Place of the only bit of a word, by the upper bits of its product with a de Bruijn sequence."""
 _PLACES[[(0x03F79D71B4CB0A89 << k & (1 << 64) - 1) >> 58 for k in range(64)]] = np.arange(64)
 
-_AHEAD = 16
-"""Draws made together: a pixel takes some sixty in a block of time, and needs the noise of every second."""
-
 NOISE_LIMIT = 4.0
 """Where the normal distribution of every draw is cut off, standard deviations."""
 
@@ -111,7 +108,7 @@ def _run_piece_followed(
     out_cross: Array,
     n: int,
 ) -> tuple[float, float, float, float, float, int, int, int]:
-    """Do as `_run_pieces` in one piece, with a low-pass filter between receptor and comparator.
+    """Let one pixel see a light, as in `_run_piece`, with a low-pass filter between receptor and comparator.
 
     The receptor is exact; between its values, as near to one another as they must be for a ramp to hit the
     middle between them to 0.002, the filter is solved for ramps. `reference` and `z` are log signals.
@@ -202,23 +199,39 @@ def _run_piece_followed(
     return u_end, z, reference, t_ready, t_last_out, armed, draw, n
 
 
-@njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _decay(ages: Array, bits: Array, out: Array, n: int) -> None:
-    """Write exp(-age) for the first `n` ages, 0 beyond 60, so that the loop is one of vector instructions.
+LANES = 128
+"""Most pixels that pass through time together: what is done for each is a loop of vector instructions."""
 
-    `bits` is an int64 view of `out`. Accurate to some units of the last place.
+_EVEN = 4
+"""Lanes are filled up to a multiple of this, the numbers in a vector, so that no loop has a rest."""
+
+# A batch's room: rows of LANES numbers, each of which begins here. Rows with constant places in one array are
+# what the compiler knows to be apart. Of every pixel, and with _M_ of those that may fire in a piece of time:
+_X, _Y, _NOW, _U, _REFERENCE, _READY, _LAST_OUT, _ON, _OFF, _FOLLOWER, _ARMED = range(0, 11 * LANES, LANES)
+_REST, _END, _KEPT, _AGE, _NEW, _AROUND, _TOTAL = range(11 * LANES, 18 * LANES, LANES)
+_ALONG, _ACROSS, _ROW_PART, _NODE_PART = range(18 * LANES, 22 * LANES, LANES)
+_M_U, _M_REST, _M_END, _M_REFERENCE, _M_READY, _M_LAST_OUT = range(22 * LANES, 28 * LANES, LANES)
+_M_ON, _M_OFF, _M_AGE, _M_KEPT, _M_SHIFT, _M_FATE = range(28 * LANES, 34 * LANES, LANES)
+_M_RATIO, _M_SPARE, _M_TAU, _M_LATER, _M_CROSS = range(34 * LANES, 39 * LANES, LANES)
+_M_NOW, _M_REQUEST, _ROOM = range(39 * LANES, 42 * LANES, LANES)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _decay(f: Array, bits: Array, ages: int, out: int, n: int) -> None:
+    """Write exp(-age) for `n` ages from f[ages] on to f[out] and on, 0 beyond 60; the ages are overwritten.
+
+    `bits` is an int64 view of `f`. Accurate to 1e-14. Each loop is one of vector
+    instructions.
     """
     # Adding this puts the nearest integer into the lowest bits of a float64.
     magic = 6755399441055744.0
     for i in range(n):
-        out[i] = min(ages[i], 700.0) * 1.4426950408889634 + magic
+        f[out + i] = min(f[ages + i], 700.0) * 1.4426950408889634 + magic
     for i in range(n):
-        age = min(ages[i], 700.0)
-        k = out[i] - magic
+        age = min(f[ages + i], 700.0)
+        k = f[out + i] - magic
         r = (k * 0.693147180369123816490 - age) + k * 1.90821492927058770002e-10
-        p = 1.0 / 6227020800.0
-        p = p * r + 1.0 / 479001600.0
-        p = p * r + 1.0 / 39916800.0
+        p = 1.0 / 39916800.0
         p = p * r + 1.0 / 3628800.0
         p = p * r + 1.0 / 362880.0
         p = p * r + 1.0 / 40320.0
@@ -230,36 +243,51 @@ def _decay(ages: Array, bits: Array, out: Array, n: int) -> None:
         p = p * r + 0.5
         p = p * r + 1.0
         p = p * r + 1.0
-        ages[i] = p if age <= 60.0 else 0.0
+        f[ages + i] = p if age <= 60.0 else 0.0
     for i in range(n):
-        bits[i] = (1023 << 52) - (bits[i] << 52)
+        bits[out + i] = (1023 << 52) - (bits[out + i] << 52)
     for i in range(n):
-        out[i] *= ages[i]
+        f[out + i] *= f[ages + i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _logarithm(f: Array, bits: Array, of: int, spare: int, n: int) -> None:
+    """Overwrite `n` numbers from f[of] on with their logarithms, any value where one is not positive."""
+    for i in range(n):
+        # The exponent as the lowest bits of 2^52.
+        bits[spare + i] = (bits[of + i] >> 52) & 0x7FF | 0x4330000000000000
+        bits[of + i] = bits[of + i] & 0xFFFFFFFFFFFFF | 0x3FF0000000000000
+    for i in range(n):
+        m = f[of + i]
+        k = f[spare + i] - (4503599627370496.0 + 1023.0)
+        above = m > 1.4142135623730951
+        m = 0.5 * m if above else m
+        k = k + 1.0 if above else k
+        s = (m - 1.0) / (m + 1.0)
+        z = s * s
+        p = 2.0 / 15.0
+        p = p * z + 2.0 / 13.0
+        p = p * z + 2.0 / 11.0
+        p = p * z + 2.0 / 9.0
+        p = p * z + 2.0 / 7.0
+        p = p * z + 2.0 / 5.0
+        p = p * z + 2.0 / 3.0
+        p = p * z + 2.0
+        f[of + i] = k * 0.693147180369123816490 + (k * 1.90821492927058770002e-10 + p * s)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def _draw_ahead(key: Any, draw: int, shifts: Array, shift: Array, fate: Array) -> None:
-    """Write what draws from this one on give: the factor of noise, and the number that may lose an event."""
-    first = key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03)
-    for i in range(shift.size):
-        word = _mix(first + np.uint64(i) * np.uint64(0xD1B54A32D192ED03))
-        shift[i] = _table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
-        fate[i] = float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _run_pieces(
-    pieces: int,
-    t_us: Array,
-    light: Array,
-    draws: Array,
-    room: Array,
-    room_bits: Array,
-    ahead: Array,
-    s: Array,
-    c: Array,
-    code: int,
-    key: Any,
+def _run_piece(
+    lanes: int,
+    t_us: float,
+    until: float,
+    f: Array,
+    bits: Array,
+    key: Array,
+    draw: Array,
+    code: Array,
+    which: Array,
+    kind: Array,
     quantiles: Array,
     shifts: Array,
     sensor: Array,
@@ -268,116 +296,124 @@ def _run_pieces(
     out_cross: Array,
     n: int,
 ) -> int:
-    """Let one pixel see light[i] from t_us[i] to t_us[i + 1]; write its events, return how many there are.
+    """Let pixels see their light from `t_us` to `until`; write their events behind `n`, return how many then.
 
     With u = exp(-y) the receptor is u(t) = 1/I + (u0 - 1/I) exp(-I t / Q), which is monotonic; so a threshold
-    is crossed in a piece when u at its end lies beyond, and the time follows from one logarithm. `shifts`
-    are the quantiles of the factor by which noise moves both thresholds. One word of random bits a draw, from
-    the pixel's `key`: the upper half decides on the noise, the lower on whether the event goes missing.
-    `draws[i]` draws pass as piece i begins. `room` float64 (3, pieces or more) is overwritten, `room_bits` is
-    its int64 view; `ahead` float64 (2, n) is room for n draws, which are made together by vector
-    instructions. `s` and `c` are the pixel's state and counters.
+    is crossed in a piece when u at its end lies beyond, and the time follows from one logarithm. A pixel is
+    blind as long as `_READY` is not past. The pixels that may fire, or see again, are picked, and their next
+    events are computed together, until there are none. `shifts` are the quantiles of the factor by which
+    noise moves both thresholds. One word of random bits a draw, from the pixel's key: the upper half decides
+    on the noise, the lower on whether the event goes missing.
+
+    `f` holds the rows of a batch, `bits` is its int64 view; `which` and `kind`, int64 (LANES,), are room.
     """
     charge, refractory = sensor[0], sensor[1]
     delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
-    miss_on, miss_off = sensor[5], sensor[6]
-    on_factor, off_factor = s[ON_FACTOR], s[OFF_FACTOR]
-    widest_on = on_factor * sensor[8]
-    widest_off = off_factor / sensor[8]
-    u_base, reference = s[U_BASE], s[REFERENCE]
-    t_ready, t_last_out = s[T_READY], s[T_LAST_OUT]
-    draw, armed = c[DRAW], c[ARMED]
+    miss_on, miss_off, widest = sensor[5], sensor[6], sensor[8]
     if sensor[12] > 0.0:
-        z = s[FOLLOWER]
-        for i in range(pieces):
-            draw += draws[i]
-            if t_us[i + 1] > t_us[i]:
-                u_base, z, reference, t_ready, t_last_out, armed, draw, n = _run_piece_followed(
-                    t_us[i + 1], light[i], u_base, t_us[i], z, reference, t_ready, t_last_out, armed, draw,
-                    on_factor, off_factor, code, key, quantiles, shifts, sensor, out_t, out_code,
-                    out_cross, n,
-                )  # fmt: skip
-        s[FOLLOWER] = z
-        pieces = 0
+        for i in range(lanes):
+            (
+                f[_U + i], f[_FOLLOWER + i], f[_REFERENCE + i], f[_READY + i], f[_LAST_OUT + i], armed,
+                draw[i], n,
+            ) = _run_piece_followed(
+                until, f[_NOW + i], f[_U + i], t_us, f[_FOLLOWER + i], f[_REFERENCE + i], f[_READY + i],
+                f[_LAST_OUT + i], int(f[_ARMED + i]), draw[i], f[_ON + i], f[_OFF + i], code[i], key[i],
+                quantiles, shifts, sensor, out_t, out_code, out_cross, n,
+            )  # fmt: skip
+            f[_ARMED + i] = armed
+        return n
     per_charge = 1.0 / charge
-    shift_ahead, fate_ahead = ahead[0], ahead[1]
-    drawn = draw - shift_ahead.size
-    ages, kept = room[0], room[1]
-    for i in range(pieces):
-        ages[i] = light[i] * per_charge * (t_us[i + 1] - t_us[i])
-    _decay(ages, room_bits[1], kept, pieces)
-    rests = room[2]
-    for i in range(pieces):
-        rests[i] = 1.0 / light[i]
-    for i in range(pieces):
-        rest = rests[i]
-        draw += draws[i]
-        u_end = rest + (u_base - rest) * kept[i]
-        if armed != 0 and u_end > reference * widest_on and u_end < reference * widest_off:
-            u_base = u_end
-            continue
-        t_base, until = t_us[i], t_us[i + 1]
-        tau = charge * rest
-        blind = u_event = -1.0
-        while until > t_base:
-            if armed == 0:
-                if t_ready >= until:
-                    break
-                # An event's delay may outlast a piece, never their order: t_ready is not before t_base.
-                if u_event >= 0.0:
-                    if blind < 0.0:
-                        blind = math.exp(-min(refractory / tau, 700.0))
-                    reference = rest + (u_event - rest) * blind
-                else:
-                    ages_ready = (t_ready - t_base) / tau
-                    reference = rest if ages_ready > 60.0 else rest + (u_base - rest) * math.exp(-ages_ready)
-                armed = 1
-                draw += 1
-            if u_end > reference * widest_on and u_end < reference * widest_off:
-                break
-            k = draw - drawn
-            if k >= shift_ahead.size:
-                drawn, k = draw, 0
-                _draw_ahead(key, draw, shifts, shift_ahead, fate_ahead)
-            shift = shift_ahead[np.uint64(k)]
-            low = reference * on_factor * shift
-            high = reference * off_factor * shift
-            t = max(t_base, t_ready)
-            level = -1.0
-            if u_end <= low:
-                on = 1
-                if u_base > low:
-                    level = low
-            elif u_end >= high:
-                on = 0
-                if u_base < high:
-                    level = high
-            else:
-                break
-            u_event = -1.0
-            if level >= 0.0:
-                crossed = t_base + math.log((u_base - rest) / (level - rest)) * tau
-                if crossed >= t:
-                    t = crossed
-                    u_event = level
-            t = min(t, until)
-            armed = 0
-            t_ready = t + refractory
-            late = delay_on if on else delay_off
+    span = until - t_us
+    for i in range(lanes):
+        f[_REST + i] = 1.0 / f[_NOW + i]
+        f[_AGE + i] = f[_NOW + i] * per_charge * span
+    _decay(f, bits, _AGE, _KEPT, lanes)
+    for i in range(lanes):
+        end = f[_REST + i] + (f[_U + i] - f[_REST + i]) * f[_KEPT + i]
+        f[_END + i] = end
+        reference, ready = f[_REFERENCE + i], f[_READY + i]
+        on = end <= reference * f[_ON + i] * widest
+        off = end * widest >= reference * f[_OFF + i]
+        kind[i] = 1 if (ready < until) & ((ready >= t_us) | on | off) else 0
+    m = 0
+    for i in range(lanes):
+        which[np.uint64(m)] = i
+        m += kind[i]
+    while m > 0:
+        # Loops over a multiple of the vectors' length have no rest to do one by one.
+        even = (m + _EVEN - 1) // _EVEN * _EVEN
+        for a in range(m, even):
+            which[a] = which[0]
+        for a in range(even):
+            i = which[a]
+            f[_M_U + a] = f[_U + i]
+            f[_M_NOW + a] = f[_NOW + i]
+            f[_M_REST + a] = f[_REST + i]
+            f[_M_END + a] = f[_END + i]
+            f[_M_REFERENCE + a] = f[_REFERENCE + i]
+            f[_M_READY + a] = f[_READY + i]
+            f[_M_LAST_OUT + a] = f[_LAST_OUT + i]
+            f[_M_ON + a] = f[_ON + i]
+            f[_M_OFF + a] = f[_OFF + i]
+        for a in range(even):
+            f[_M_AGE + a] = max(f[_M_READY + a] - t_us, 0.0) * per_charge * f[_M_NOW + a]
+        _decay(f, bits, _M_AGE, _M_KEPT, even)
+        for a in range(m):
+            i = which[a]
+            draw[i] += int(f[_M_READY + a] >= t_us)
+            word = _mix(key[i] + np.uint64(draw[i]) * np.uint64(0xD1B54A32D192ED03))
+            f[_M_SHIFT + a] = _table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
+            f[_M_FATE + a] = float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10
             if jitter > 0.0:
-                late = max(0.0, late + jitter * hash_normal(key, 0, draw, 2, quantiles))
-            request = max(t + late, t_last_out + refractory)
-            t_last_out = request
+                f[_M_LATER + a] = jitter * hash_normal(key[i], 0, draw[i], 2, quantiles)
+        for a in range(even):
+            u, rest, end, shift = f[_M_U + a], f[_M_REST + a], f[_M_END + a], f[_M_SHIFT + a]
+            again = rest + (u - rest) * f[_M_KEPT + a]
+            before = f[_M_REFERENCE + a]
+            reference = again if f[_M_READY + a] >= t_us else before
+            low = reference * f[_M_ON + a] * shift
+            high = reference * f[_M_OFF + a] * shift
+            on = end <= low
+            level = low if on else high
+            f[_M_RATIO + a] = (u - rest) / (level - rest)
+            # Where it is beyond the threshold from the first, there is no way to it.
+            beyond = (on & (u <= low)) | ((end >= high) & (u >= high))
+            f[_M_TAU + a] = 0.0 if beyond else charge * rest
+            f[_M_REFERENCE + a] = reference
+            f[_M_ON + a] = 1.0 if on else 0.0
+            f[_M_OFF + a] = 1.0 if end >= high else 0.0
+        _logarithm(f, bits, _M_RATIO, _M_SPARE, even)
+        for a in range(even):
+            ready, out, end = f[_M_READY + a], f[_M_LAST_OUT + a], f[_M_END + a]
+            on, fires = f[_M_ON + a] > 0.0, (f[_M_ON + a] > 0.0) | (f[_M_OFF + a] > 0.0)
+            t = max(ready, t_us)
+            t = min(max(t_us + f[_M_RATIO + a] * f[_M_TAU + a], t), until)
+            late = max((delay_on if on else delay_off) + f[_M_LATER + a], 0.0)
+            request = max(t + late, out + refractory)
+            ready = t + refractory if fires else ready
+            f[_M_CROSS + a] = t
+            f[_M_REQUEST + a] = request
+            f[_M_READY + a] = ready
+            f[_M_LAST_OUT + a] = request if fires else out
+            sent = fires & (f[_M_FATE + a] >= (miss_on if on else miss_off))
+            kind[a] = (1 if on else 0) | (2 if sent else 0) | (4 if fires & (ready < until) else 0)
+        more = 0
+        for a in range(m):
+            i, what = which[a], kind[a]
+            f[_REFERENCE + i] = f[_M_REFERENCE + a]
+            f[_READY + i] = f[_M_READY + a]
+            f[_LAST_OUT + i] = f[_M_LAST_OUT + a]
             # What is missed is written over; that is quicker than a branch which cannot be foreseen.
-            out_t[n] = request
-            out_code[n] = code + on
+            out_t[np.uint64(n)] = f[_M_REQUEST + a]
+            out_code[np.uint64(n)] = code[i] + (what & 1)
             if out_cross.size:
-                out_cross[n] = t
-            n += int(fate_ahead[np.uint64(k)] >= (miss_on if on else miss_off))
-        u_base = u_end
-    s[U_BASE], s[REFERENCE] = u_base, reference
-    s[T_READY], s[T_LAST_OUT] = t_ready, t_last_out
-    c[DRAW], c[ARMED] = draw, armed
+                out_cross[np.uint64(n)] = f[_M_CROSS + a]
+            n += (what >> 1) & 1
+            which[np.uint64(more)] = i
+            more += what >> 2
+        m = more
+    for i in range(lanes):
+        f[_U + i] = f[_END + i]
     return n
 
 
@@ -390,16 +426,28 @@ def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tup
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _rest(light: float, t_us: float, followed: bool, s: Array, c: Array) -> None:
+def _rest(light: float, followed: bool, f: Array, i: int) -> None:
     """Put a pixel at rest in a light, armed."""
-    s[U_BASE], s[LIGHT], s[FOLLOWER], s[T_READY] = 1.0 / light, light, math.log(light), t_us
-    s[REFERENCE] = s[FOLLOWER] if followed else s[U_BASE]
-    c[ARMED] = 1
+    f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = light, 1.0 / light, math.log(light)
+    f[_READY + i], f[_ARMED + i] = -1e18, 1.0
+    f[_REFERENCE + i] = f[_FOLLOWER + i] if followed else f[_U + i]
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _leave_empty(begin: int, end: int, f: Array, key: Array, draw: Array, code: Array) -> None:
+    """Fill lanes without a pixel with one that never fires."""
+    for i in range(begin, end):
+        f[_X + i] = f[_Y + i] = f[_NEW + i] = 0.0
+        f[_NOW + i] = f[_U + i] = f[_REFERENCE + i] = f[_ARMED + i] = 1.0
+        f[_READY + i] = f[_LAST_OUT + i] = -1e18
+        f[_ON + i], f[_OFF + i], f[_FOLLOWER + i] = 0.0, 1e300, 0.0
+        key[i], draw[i], code[i] = np.uint64(0), 0, 0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def run_given_light(
-    pixel: int,
+    first: int,
+    last: int,
     edge_us: Array,
     light: Array,
     end_us: float,
@@ -411,24 +459,36 @@ def run_given_light(
     out_code: Array,
     out_cross: Array,
 ) -> int:
-    """Run one pixel, at rest in light[0], through light[i] from edge_us[i] on; return how many events."""
-    pieces = light.size
-    s, c = np.empty(9), np.zeros(3, np.int64)
-    s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
-    _rest(light[0], edge_us[0], sensor[12] > 0.0, s, c)
-    s[T_LAST_OUT] = -1e18
-    key = _key_of(seed, pixel)
-    t_us = np.empty(pieces + 1)
-    t_us[:pieces] = edge_us[:pieces]
-    t_us[pieces] = end_us
-    draws = np.ones(pieces, np.int64)
-    room = np.empty((3, pieces))
-    return int(
-        _run_pieces(
-            pieces, t_us, light, draws, room, room.view(np.int64), np.empty((2, _AHEAD)), s, c, 0, key,
-            quantiles, shifts, sensor, out_t, out_code, out_cross, 0,
-        )
-    )  # fmt: skip
+    """Run pixels [first, last), at most `LANES`, at rest in light[0], through light[i] from edge_us[i] on.
+
+    Returns how many events there are; a code is the pixel's number << 1 | polarity.
+    """
+    f = np.zeros(_ROOM)
+    bits = f.view(np.int64)
+    key, draw = np.empty(LANES, np.uint64), np.empty(LANES, np.int64)
+    code, which, kind = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    followed = sensor[12] > 0.0
+    lanes = last - first
+    if not followed:
+        lanes = (lanes + _EVEN - 1) // _EVEN * _EVEN
+    _leave_empty(last - first, lanes, f, key, draw, code)
+    for i in range(last - first):
+        key[i], draw[i], code[i] = _key_of(seed, first + i), 0, (first + i) << 1
+        f[_ON + i], f[_OFF + i] = pixel_factors(seed, first + i, sensor, quantiles)
+        f[_LAST_OUT + i] = -1e18
+        _rest(light[0], followed, f, i)
+    n = 0
+    for j in range(light.size):
+        until = edge_us[j + 1] if j + 1 < light.size else end_us
+        for i in range(lanes):
+            f[_NOW + i] = light[j]
+            draw[i] += 1
+        if until > edge_us[j]:
+            n = _run_piece(
+                lanes, edge_us[j], until, f, bits, key, draw, code, which, kind, quantiles, shifts, sensor,
+                out_t, out_code, out_cross, n,
+            )  # fmt: skip
+    return n
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -457,112 +517,75 @@ def texture_at(field: Array, u: float, v: float) -> float:
     return float(top + a * (low - top))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _place(x: float, y: float, origin: Array, axis: Array, along: Array, across: Array) -> None:
-    """Write where a pixel is from a strip's first end, along it and to its right, in each pose, px."""
-    for p in range(along.size):
-        dx, dy = x - origin[0, p], y - origin[1, p]
-        along[p] = dx * axis[0, p] + dy * axis[1, p]
-        across[p] = dx * axis[1, p] - dy * axis[0, p]
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _place(lanes: int, f: Array, x: float, y: float, axis_x: float, axis_y: float) -> None:
+    """Write where pixels are from a strip's first end (x, y), along it and to its right, px."""
+    for i in range(lanes):
+        dx, dy = f[_X + i] - x, f[_Y + i] - y
+        f[_ALONG + i] = dx * axis_x + dy * axis_y
+        f[_ACROSS + i] = dx * axis_y - dy * axis_x
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def _near_weights(
-    along: Array,
-    across: Array,
-    strip_px: Array,
+    lanes: int,
+    f: Array,
+    strip_px: float,
     edges: Array,
     gain: float,
     table: Array,
     scale: float,
     reach: float,
     rows: Array,
-    row_part: Array,
     nodes: Array,
-    node_part: Array,
     beside: Array,
     weight: Array,
 ) -> None:
-    """Write how much light each of a strip's clusters gives a pixel in each pose, when it shines.
+    """Write how much light each of a strip's clusters gives each pixel, when it shines.
 
-    `edges` (clusters + 1, poses) are where they start and end along it, px; `table` is that of `strip_table`,
-    followed for `reach` px. `rows` and `nodes`, int32, `row_part` and `node_part`, all (poses,), and `beside`
-    (clusters + 1, poses) are overwritten; `weight` (clusters, poses) is the result, W/m2.
+    `edges` (clusters + 1,) are where they start and end along it, px; `table` is that of `strip_table`,
+    followed for `reach` px. `rows` and `nodes`, int32 (LANES,), and `beside`, float64
+    (LANES * (clusters + 1),), are overwritten; `weight` is the result, W/m2, cluster by cluster float64
+    (LANES * clusters,).
     """
-    poses = along.size
     columns = table.shape[1]
     flat = table.reshape(-1)
     most = table.shape[0] - 1
-    for p in range(poses):
-        aside = abs(across[p])
+    for i in range(lanes):
+        aside = abs(f[_ACROSS + i])
         side = most * aside / (aside + scale)
         row = min(np.int32(side), np.int32(most - 1))
-        row_part[p] = side - row
-        rows[p] = row * columns
+        f[_ROW_PART + i] = side - row
+        rows[i] = row * columns
     half = 0.5 * (columns - 1)
     below = np.uint64(columns)
     one = np.uint64(1)
-    for b in range(edges.shape[0]):
+    for b in range(edges.size):
         # Apart, the first loop is one of vector instructions.
-        for p in range(poses):
-            z = along[p] - edges[b, p]
+        edge = edges[b]
+        for i in range(lanes):
+            z = f[_ALONG + i] - edge
             at = half + half * z / (abs(z) + scale)
             node = min(np.int32(at), np.int32(columns - 2))
-            node_part[p] = at - node
-            nodes[p] = rows[p] + node
-        for p in range(poses):
-            k = np.uint64(nodes[p])
-            low = flat[k] + node_part[p] * (flat[k + one] - flat[k])
+            f[_NODE_PART + i] = at - node
+            nodes[i] = rows[i] + node
+        first = np.uint64(b * LANES)
+        for i in range(lanes):
+            k = np.uint64(nodes[i])
+            low = flat[k] + f[_NODE_PART + i] * (flat[k + one] - flat[k])
             k += below
-            high = flat[k] + node_part[p] * (flat[k + one] - flat[k])
-            beside[b, p] = low + row_part[p] * (high - low)
-    for b in range(weight.shape[0]):
-        for p in range(poses):
+            high = flat[k] + f[_NODE_PART + i] * (flat[k + one] - flat[k])
+            beside[first + np.uint64(i)] = low + f[_ROW_PART + i] * (high - low)
+    for b in range(edges.size - 1):
+        first, behind = np.uint64(b * LANES), np.uint64((b + 1) * LANES)
+        for i in range(lanes):
             seen = (
-                (edges[b + 1, p] > along[p] - reach)
-                & (edges[b, p] < along[p] + reach)
-                & (abs(across[p]) < reach + 0.5 * strip_px[p])
+                (f[_ALONG + i] > edges[b] - reach)
+                & (f[_ALONG + i] < edges[b + 1] + reach)
+                & (abs(f[_ACROSS + i]) < reach + 0.5 * strip_px)
             )
-            weight[b, p] = gain * (beside[b, p] - beside[b + 1, p]) if seen else 0.0
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_near(weight: Array, levels: Array, pose: Array, light: Array) -> None:
-    """Add the light of clusters (clusters, entries) that weigh (clusters, poses), each entry in its pose."""
-    for b in range(weight.shape[0]):
-        for j in range(light.size):
-            light[j] += weight[b, np.uint64(pose[j])] * levels[b, j]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _add_halo(far: float, low: Array, high: Array, between: float, light: Array) -> None:
-    """Add the light of a halo between two places of its grid."""
-    for j in range(light.size):
-        light[j] += far * (low[j] + between * (high[j] - low[j]))
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _find_pieces(
-    t: Array, total: Array, switched: Array, first: int, t_us: Array, light: Array, draws: Array
-) -> int:
-    """Write when the light changes by more than `LIGHT_STEP`, from entry `first` on; return the last piece.
-
-    The first piece is there; a change at the time of a piece's begin is its own.
-    """
-    piece = 0
-    now = light[0]
-    begin = t_us[0]
-    for j in range(first, t.size):
-        if abs(total[j] - now) <= LIGHT_STEP * now:
-            continue
-        now = total[j]
-        if t[j] > begin:
-            piece += 1
-            begin = t_us[piece] = t[j]
-            draws[piece] = 0
-        light[piece] = now
-        draws[piece] += switched[j]
-    return piece
+            share = beside[first + np.uint64(i)] - beside[behind + np.uint64(i)]
+            weight[first + np.uint64(i)] = gain * share if seen else 0.0
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
@@ -570,26 +593,20 @@ def run_pixels(
     first: int,
     last: int,
     pixels: Array,
+    batches: Array,
     masks: Array,
     width: int,
     state: Array,
     counters: Array,
     block: int,
-    begin_us: float,
     end_us: float,
-    own_first: Array,
-    own_t: Array,
-    own_pose: Array,
-    own_switched: Array,
-    own_shade: Array,
-    own_begins: Array,
+    line_t: Array,
+    line_kind: Array,
+    line_pose: Array,
+    line_shade: Array,
+    line_row: Array,
     levels: Array,
     halo: Array,
-    line_t: Array,
-    line_pose: Array,
-    line_switched: Array,
-    line_shade: Array,
-    line_own: Array,
     origin: Array,
     axis: Array,
     bounds: Array,
@@ -606,7 +623,6 @@ def run_pixels(
     near_reach: Array,
     wide_table: Array,
     wide_per_px: Array,
-    wiped: bool,
     turn_px: Array,
     texture_every: int,
     field: Array,
@@ -619,20 +635,16 @@ def run_pixels(
     out_code: Array,
     most_events: int,
 ) -> tuple[int, int]:
-    """Run pixels [first, last) through one block of time; return (next pixel, number of events).
+    """Run batches [first, last) of pixels through one block of time; return (next batch, number of events).
 
-    It ends early, at a pixel for which the output might have no room. Bit i of `masks[j]` says that source i
-    lights pixel j.
+    It ends early, at a batch for which the output might have no room. Batch j is pixels[batches[j]] up to
+    pixels[batches[j + 1]], `LANES` at the most; bit i of `masks[j]` says that source i lights them.
 
-    The light on a pixel is constant between the entries of a time line, the first at `begin_us`. A source has
-    one of its own, entries [own_first[i], own_first[i + 1]) of the flat `own_` arrays: when the image moves,
-    when the share of all light that passes changes, and when it switches. `own_pose` is the image's pose from
-    then on, `own_shade` that share, `own_switched` 1 where it is a switch; `levels` (clusters, entries) are
-    those of its clusters, `halo` (halos, places, entries) is the light of each halo on a grid along the
-    strip, as a share of full light. `own_begins` (sources + 1, poses + 1) is the entry with which a pose
-    begins, from the source's first. The last line is one without a source. The `line_` arrays are one line of
-    all entries, `line_own` (sources, entries) the entry of each source's own line, from its first, that holds
-    then.
+    The light on a pixel is constant between the entries of a time line, the first where the block begins:
+    when the image moves (`line_kind` -2), when the share of all light that passes changes (-1), and when the
+    source of this number switches. `line_pose` is the image's pose from then on, `line_shade` that share, `line_row`
+    (sources, entries) the row of `levels` (rows, clusters) that a source shows; `halo` (halos, rows, places)
+    is its light in each halo on a grid along the strip, as a share of full light.
 
     (source, pose) arrays say where each strip is: `origin` (2, sources, poses), its first end, px; `axis`,
     the unit vector along it; `bounds` (sources, clusters + 1, poses), where its clusters start and end along
@@ -642,141 +654,161 @@ def run_pixels(
     is in the pose in the middle, or follows it every `halo_every[q]` poses where that is not 0. `background`
     is (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
     """
-    sources = gain.size
-    halos = halo_share.size
-    poses = turn_px.shape[0]
-    halfway = poses // 2
+    sources, halos, poses = gain.size, halo_share.size, turn_px.shape[0]
+    most = levels.shape[1]
+    entries = line_t.size
     followed = sensor[12] > 0.0
+    f = np.zeros(_ROOM)
+    bits = f.view(np.int64)
+    key, draw = np.empty(LANES, np.uint64), np.empty(LANES, np.int64)
+    code, which, kind = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    rows, nodes = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
+    beside = np.empty(LANES * (most + 1))
     none = np.empty(0)
-    along, across = np.empty((sources, poses)), np.empty((sources, poses))
-    rows, row_part = np.empty(poses, np.int32), np.empty(poses)
-    nodes, node_part = np.empty(poses, np.int32), np.empty(poses)
-    beside = np.empty((levels.shape[0] + 1, poses))
-    weight = np.empty((levels.shape[0], poses))
-    around = np.empty(poses)
-    part = np.empty(own_t.size)
-    lit = np.zeros(sources + 1, np.int64)
-    room = np.empty((3, line_t.size + 1))
-    room_bits = room.view(np.int64)
-    ahead = np.empty((2, _AHEAD))
-    total = np.empty(line_t.size)
-    t_us, light = np.empty(line_t.size + 2), np.empty(line_t.size + 1)
-    draws = np.empty(line_t.size + 1, np.int64)
-    lowest, highest = np.empty((sources, levels.shape[0] + 1)), np.empty((sources, levels.shape[0] + 1))
-    for g in range(sources):
-        for b in range(clusters[g] + 1):
-            lowest[g, b], highest[g, b] = bounds[g, b].min(), bounds[g, b].max()
+    mine = np.empty(entries + 1, np.int64)
+    lit = np.empty(sources, np.int64)
+    # Of each source that shines: its clusters within reach, their weights, and its light on the pixels.
+    low, high, shown = np.empty(sources, np.int64), np.empty(sources, np.int64), np.empty(sources, np.int64)
+    weight = np.empty((sources, LANES * most))
+    part = np.empty((sources, LANES))
+    far, between = np.empty((sources, halos, LANES)), np.empty((sources, halos, LANES))
+    place = np.empty((sources, halos, LANES), np.int64)
+    wide = np.empty((sources, halos, LANES))
     n = 0
     for j in range(first, last):
-        if n + most_events > out_t.size:
+        if n + LANES * most_events > out_t.size:
             return j, n
-        pixel = pixels[j]
-        mask = masks[j]
-        code = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
-        y = float(pixel // width)
-        x = float(pixel % width)
-        s = state[pixel]
-        c = counters[pixel]
-        new = c[BLOCK] != block - 1
-        c[BLOCK] = block
-        if new and s[ON_FACTOR] == 0.0:
-            s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
-            s[T_LAST_OUT] = -1e18
+        begin, count, mask = batches[j], batches[j + 1] - batches[j], masks[j]
+        lanes = count if followed else (count + _EVEN - 1) // _EVEN * _EVEN
+        _leave_empty(count, lanes, f, key, draw, code)
+        for i in range(count):
+            pixel = pixels[begin + i]
+            s, c = state[pixel], counters[pixel]
+            code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
+            key[i] = _key_of(seed, pixel)
+            f[_X + i], f[_Y + i] = pixel % width, pixel // width
+            new = c[BLOCK] != block - 1
+            f[_NEW + i] = 1.0 if new else 0.0
+            if new and s[ON_FACTOR] == 0.0:
+                s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
+                s[T_LAST_OUT] = -1e18
+            f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = s[ON_FACTOR], s[OFF_FACTOR], s[T_LAST_OUT]
+            f[_U + i], f[_REFERENCE + i], f[_READY + i] = s[U_BASE], s[REFERENCE], s[T_READY]
+            f[_NOW + i], f[_FOLLOWER + i], f[_ARMED + i] = s[LIGHT], s[FOLLOWER], float(c[ARMED])
+            draw[i] = c[DRAW]
         shining = 0
         for g in range(sources):
             if (mask >> np.uint64(g)) & np.uint64(1):
                 lit[shining] = g
                 shining += 1
-        now = 0.0
-        for p in range(poses):
-            if p % texture_every == 0:
-                now = background[1] + background[0] * texture_at(field, x + turn_px[p, 0], y + turn_px[p, 1])
-            around[p] = now
-        for a in range(shining):
-            g = lit[a]
-            begin, end = own_first[g], own_first[g + 1]
-            mine = part[begin:end]
-            mine[:] = 0.0
-            _place(x, y, origin[:, g], axis[:, g], along[g], across[g])
-            reach = near_reach[g]
-            nearest, furthest, beyond = along[g, 0], along[g, 0], False
-            for p in range(poses):
-                nearest, furthest = min(nearest, along[g, p]), max(furthest, along[g, p])
-                beyond |= abs(across[g, p]) < reach + 0.5 * strip_px[g, p]
-            if beyond:
-                k = 0
-                while k < clusters[g] and highest[g, k + 1] <= nearest - reach:
-                    k += 1
-                m = k
-                while m < clusters[g] and lowest[g, m] < furthest + reach:
-                    m += 1
-                if m > k:
-                    _near_weights(
-                        along[g], across[g], strip_px[g], bounds[g, k : m + 1], gain[g] * near_share,
-                        near_tables[g], near_scale[g], reach, rows, row_part, nodes, node_part,
-                        beside[: m - k + 1],
-                        weight[: m - k],
-                    )  # fmt: skip
-                    _add_near(weight[: m - k], levels[k:m, begin:end], own_pose[begin:end], mine)
-            for q in range(halos):
-                every = poses if halo_every[q] == 0 else halo_every[q]
-                for pose in range(0, poses, every):
-                    seen = halfway if halo_every[q] == 0 else pose
-                    half = 0.5 * strip_px[g, seen]
-                    far = (
-                        gain[g]
-                        * halo_share[q]
-                        * (
-                            _step(wide_table[q], wide_per_px[q], across[g, seen] + half)
-                            - _step(wide_table[q], wide_per_px[q], across[g, seen] - half)
-                        )
-                    )
-                    at = (along[g, seen] - halo_first[q]) * halo_per_px[q]
-                    at = min(max(at, 0.0), halo.shape[1] - 1.001)
-                    i = int(at)
-                    start, stop = own_begins[g, pose], own_begins[g, min(pose + every, poses)]
-                    _add_halo(
-                        far, halo[q, i, begin + start : begin + stop],
-                        halo[q, i + 1, begin + start : begin + stop], at - i, mine[start:stop],
-                    )  # fmt: skip
-        # The pieces of time in which its light stays as it is.
-        if shining > 1:
-            entries = line_t.size
-            when, switched, pose_of, shade = line_t, line_switched, line_pose, line_shade
-            for e in range(entries):
-                total[e] = around[np.uint64(line_pose[e])]
+        own = 0
+        for e in range(entries):
+            if line_kind[e] < 0 or (mask >> np.uint64(line_kind[e])) & np.uint64(1):
+                mine[own] = e
+                own += 1
+        pose = -1
+        for q in range(own):
+            e = mine[q]
+            t_us = line_t[e]
+            until = line_t[mine[q + 1]] if q + 1 < own else end_us
+            moved = line_pose[e] != pose
+            pose = line_pose[e]
+            if moved and pose % texture_every == 0:
+                for i in range(lanes):
+                    now = texture_at(field, f[_X + i] + turn_px[pose, 0], f[_Y + i] + turn_px[pose, 1])
+                    f[_AROUND + i] = background[1] + background[0] * now
+            for i in range(lanes):
+                f[_TOTAL + i] = f[_AROUND + i]
             for a in range(shining):
                 g = lit[a]
-                begin = own_first[g]
-                for e in range(entries):
-                    total[e] += part[np.uint64(begin + line_own[g, e])]
-        else:
-            g = lit[0] if shining == 1 else sources
-            begin, end = own_first[g], own_first[g + 1]
-            entries = end - begin
-            when, switched = own_t[begin:end], own_switched[begin:end]
-            pose_of, shade = own_pose[begin:end], own_shade[begin:end]
-            if shining == 1:
-                for e in range(entries):
-                    total[e] = around[np.uint64(pose_of[e])] + part[np.uint64(begin + e)]
-            else:
-                for e in range(entries):
-                    total[e] = around[np.uint64(pose_of[e])]
-        if wiped:
-            for e in range(entries):
-                if shade[e] != 1.0:
-                    total[e] = background[1] + shade[e] * (total[e] - background[1])
-        t_us[0], light[0], draws[0] = begin_us, s[LIGHT], 0
-        if new:
-            _rest(total[0], begin_us, followed, s, c)
-            light[0], draws[0] = total[0], 1
-        piece = _find_pieces(when, total, switched, int(new), t_us, light, draws)
-        t_us[piece + 1] = end_us
-        n = _run_pieces(
-            piece + 1, t_us, light, draws, room, room_bits, ahead, s, c, code, _key_of(seed, pixel),
-            quantiles, shifts, sensor, out_t, out_code, none, n,
-        )  # fmt: skip
-        s[T_BASE], s[LIGHT] = end_us, light[piece]
+                row = line_row[g, e]
+                switched = q == 0 or row != shown[a]
+                shown[a] = row
+                stale = switched
+                for h in range(halos):
+                    every = halo_every[h]
+                    follows = moved and (pose == 0 if every == 0 else pose % every == 0)
+                    if follows:
+                        at = poses // 2 if every == 0 else pose
+                        _place(lanes, f, origin[0, g, at], origin[1, g, at], axis[0, g, at], axis[1, g, at])
+                        half = 0.5 * strip_px[g, at]
+                        for i in range(lanes):
+                            across = _step(wide_table[h], wide_per_px[h], f[_ACROSS + i] + half)
+                            across -= _step(wide_table[h], wide_per_px[h], f[_ACROSS + i] - half)
+                            far[a, h, i] = gain[g] * halo_share[h] * across
+                            node = (f[_ALONG + i] - halo_first[h]) * halo_per_px[h]
+                            node = min(max(node, 0.0), halo.shape[2] - 1.001)
+                            place[a, h, i] = int(node)
+                            between[a, h, i] = node - int(node)
+                    if follows or switched:
+                        stale = True
+                        for i in range(lanes):
+                            k = np.uint64(place[a, h, i])
+                            left, right = halo[h, row, k], halo[h, row, k + np.uint64(1)]
+                            wide[a, h, i] = far[a, h, i] * (left + between[a, h, i] * (right - left))
+                if moved:
+                    _place(
+                        lanes, f, origin[0, g, pose], origin[1, g, pose], axis[0, g, pose], axis[1, g, pose]
+                    )
+                    nearest = furthest = f[_ALONG]
+                    beyond = False
+                    reach = near_reach[g]
+                    for i in range(count):
+                        nearest, furthest = min(nearest, f[_ALONG + i]), max(furthest, f[_ALONG + i])
+                        beyond |= abs(f[_ACROSS + i]) < reach + 0.5 * strip_px[g, pose]
+                    k = 0
+                    while k < clusters[g] and bounds[g, k + 1, pose] <= nearest - reach:
+                        k += 1
+                    m = k
+                    while beyond and m < clusters[g] and bounds[g, m, pose] < furthest + reach:
+                        m += 1
+                    low[a], high[a] = k, m
+                    if m > k:
+                        _near_weights(
+                            lanes, f, strip_px[g, pose], bounds[g, k : m + 1, pose], gain[g] * near_share,
+                            near_tables[g], near_scale[g], reach, rows, nodes, beside, weight[a],
+                        )  # fmt: skip
+                if moved or stale:
+                    for i in range(lanes):
+                        part[a, i] = 0.0
+                    for b in range(low[a], high[a]):
+                        level = levels[row, b]
+                        if level != 0.0:
+                            of = (b - low[a]) * LANES
+                            for i in range(lanes):
+                                part[a, i] += weight[a, of + i] * level
+                    for h in range(halos):
+                        for i in range(lanes):
+                            part[a, i] += wide[a, h, i]
+                for i in range(lanes):
+                    f[_TOTAL + i] += part[a, i]
+            shade = line_shade[e]
+            if shade != 1.0:
+                for i in range(lanes):
+                    f[_TOTAL + i] = background[1] + shade * (f[_TOTAL + i] - background[1])
+            if q == 0:
+                for i in range(count):
+                    if f[_NEW + i] > 0.0:
+                        _rest(f[_TOTAL + i], followed, f, i)
+                        draw[i] += 1
+            redraw = int(line_kind[e] >= 0)
+            for i in range(lanes):
+                total, now = f[_TOTAL + i], f[_NOW + i]
+                changes = abs(total - now) > LIGHT_STEP * now
+                f[_NOW + i] = total if changes else now
+                draw[i] += redraw if changes else 0
+            if until > t_us:
+                n = _run_piece(
+                    lanes, t_us, until, f, bits, key, draw, code, which, kind, quantiles, shifts, sensor,
+                    out_t, out_code, none, n,
+                )  # fmt: skip
+        for i in range(count):
+            pixel = pixels[begin + i]
+            s, c = state[pixel], counters[pixel]
+            s[U_BASE], s[T_BASE], s[REFERENCE] = f[_U + i], end_us, f[_REFERENCE + i]
+            s[T_READY], s[T_LAST_OUT] = f[_READY + i], f[_LAST_OUT + i]
+            s[LIGHT], s[FOLLOWER] = f[_NOW + i], f[_FOLLOWER + i]
+            c[DRAW], c[ARMED], c[BLOCK] = draw[i], int(f[_ARMED + i]), block
     return last, n
 
 

@@ -141,7 +141,7 @@ class _Halo:
         return found
 
 
-def _time_lines(
+def _time_line(
     starts_us: Floats,
     wiped_us: Floats,
     shade: Floats,
@@ -150,7 +150,7 @@ def _time_lines(
     halos_of: list[list[Floats]],
     most: int,
 ) -> tuple[NDArray[Any], ...]:
-    """When the light changes in a block: a line of each source and one without, and one of all.
+    """When the light changes in a block, and what the sources show then.
 
     Args:
         starts_us: When each pose begins, the block's begin first, float64 (poses,).
@@ -162,42 +162,43 @@ def _time_lines(
         most: Clusters of the source with the most.
 
     Returns:
-        The arguments of `run_pixels` from `own_first` to `line_own`.
+        The arguments of `run_pixels` from `line_t` to `halo`.
     """
-    poses, sources = len(starts_us), len(switches)
-    moves = np.concatenate([starts_us[1:], wiped_us])
-    when = np.concatenate([starts_us[:1], moves, *switches])
+    sources = len(switches)
+    when = np.concatenate([starts_us[:1], starts_us[1:], wiped_us, *switches])
     # What an entry is: a pose, a wiper's step, or a switch of the source of this number.
-    kind = np.repeat(np.arange(-2, sources), [poses, len(wiped_us), *map(len, switches)])
+    kind = np.repeat(np.arange(-2, sources), [len(starts_us), len(wiped_us), *map(len, switches)])
     order = np.argsort(when, kind="stable")
     when, kind = when[order], kind[order]
-    pose, wipes = np.cumsum(kind == -2) - 1, np.cumsum(kind == -1)
-    all_own = np.empty((sources, len(when)), np.int64)
-    parts: list[NDArray[np.int64]] = []
-    begins = np.empty((sources + 1, poses + 1), np.int64)
-    rows: list[NDArray[np.int64]] = []
-    for i in range(sources + 1):
-        mine = (kind < 0) | (kind == i)
-        part = np.flatnonzero(mine)
-        begins[i] = np.append(np.flatnonzero(kind[part] == -2), len(part))
-        if i < sources:
-            all_own[i] = np.cumsum(mine) - 1
-            rows.append(np.cumsum(kind[part] == i))
-        parts.append(part)
-    own = np.concatenate(parts)
-    first = np.cumsum([0, *map(len, parts)])
-    levels = np.zeros((most, len(own)))
+    counts = [len(levels) for levels in levels_of]
+    row = np.cumsum(kind == np.arange(sources)[:, None], axis=1)
+    row += np.cumsum([0, *counts])[:-1, None]
+    levels = np.zeros((sum(counts), most))
     places = max((h.shape[1] for of in halos_of for h in of), default=1) + 1
-    halo = np.zeros((len(halos_of), places, len(own)))
-    for i, row in enumerate(rows):
-        levels[:, first[i] : first[i + 1]] = levels_of[i][row].T
+    halo = np.zeros((len(halos_of), sum(counts), places))
+    begin = 0
+    for i, count in enumerate(counts):
+        levels[begin : begin + count, : levels_of[i].shape[1]] = levels_of[i]
         for q, of in enumerate(halos_of):
-            halo[q, : of[i].shape[1], first[i] : first[i + 1]] = of[i][row].T
-    switched = (kind >= 0).astype(np.int64)
-    return (
-        *(first, when[own], pose[own], switched[own], shade[wipes[own]], begins, levels, halo),
-        *(when, pose, switched, shade[wipes], all_own),
-    )
+            halo[q, begin : begin + count, : of[i].shape[1]] = of[i]
+        begin += count
+    pose, wipes = np.cumsum(kind == -2) - 1, np.cumsum(kind == -1)
+    return when, kind, pose, shade[wipes], row, levels, halo
+
+
+def _batches(
+    pixels: NDArray[np.int32], masks: NDArray[np.uint64]
+) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.uint64]]:
+    """Put together pixels that the same sources light: pixels, where each batch begins, its sources."""
+    if not len(pixels):
+        return pixels, np.zeros(1, np.int64), masks
+    if (masks != masks[0]).any():
+        order = np.argsort(masks, kind="stable")
+        pixels, masks = pixels[order], masks[order]
+    cuts = np.flatnonzero(masks[1:] != masks[:-1]) + 1
+    edges = [0, *cuts.tolist(), len(pixels)]
+    begins = np.concatenate([np.arange(a, b, _kernels.LANES) for a, b in pairwise(edges)])
+    return pixels, np.append(begins, len(pixels)), masks[begins]
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +206,7 @@ class _Block:
     """Everything about a block of time that all pixels share: the arguments of `run_pixels`."""
 
     pixels: NDArray[np.int32]
+    batches: NDArray[np.int64]
     masks: NDArray[np.uint64]
     shared: tuple[Any, ...]
 
@@ -366,12 +368,13 @@ class Simulation:
             return []
         most = int((end_us - begin_us) / self.scene.sensor.refr_us) + 8
         parts = 1 if self._threads == 1 else _PARTS * self._threads
-        cuts = np.linspace(0, len(block.pixels), parts + 1).astype(int)
+        cuts = np.linspace(0, len(block.masks), parts + 1).astype(int)
 
         def run(first: int, last: int) -> list[_Requests]:
             found = []
             while first < last:
-                t, code = np.empty(max(_ROOM, most)), np.empty(max(_ROOM, most), np.int32)
+                size = max(_ROOM, _kernels.LANES * most)
+                t, code = np.empty(size), np.empty(size, np.int32)
                 room: tuple[Any, ...] = (
                     self._key,
                     self._quantiles,
@@ -381,8 +384,8 @@ class Simulation:
                     code,
                     most,
                 )
-                state = (self.scene.camera.width, self._state, self._counters, number, begin_us, end_us)
-                arguments = (block.pixels, block.masks, *state, *block.shared, *room)
+                state = (self.scene.camera.width, self._state, self._counters, number, end_us)
+                arguments = (block.pixels, block.batches, block.masks, *state, *block.shared, *room)
                 first, n = _kernels.run_pixels(first, last, *arguments)
                 found.append((t[:n], code[:n]))
             return found
@@ -466,21 +469,21 @@ class Simulation:
             near[i] = strip_table(blur, float(strip_px[poses // 2]), near_scale[i], _NEAR_NODES)
             when, levels = source.switches(begin_us, end_us)
             switches.append(when)
-            levels_of.append(np.pad(levels, ((0, 0), (0, most - k))))
+            levels_of.append(levels)
             cut = bounds[i, : k + 1, poses // 2]
             for one, of in zip(self._halos, halos_of, strict=True):
                 of.append(levels @ one.along(cut))
         shared = (
-            *_time_lines(starts, wiped_us, shade, switches, levels_of, halos_of, most),
+            *_time_line(starts, wiped_us, shade, switches, levels_of, halos_of, most),
             origin, axis, bounds, strips, clusters, gain,
             np.array([-one.reach_px for one in self._halos]), np.array([one.per_px for one in self._halos]),
             np.array([one.share for one in self._halos]), np.array([one.every for one in self._halos]),
             self._near_share, near, near_scale, near_reach, np.stack([one.table for one in self._halos]),
-            np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]), scene.wiper.share > 0,
-            turn, self._texture_every, self._texture,
+            np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]), turn,
+            self._texture_every, self._texture,
             np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
         )  # fmt: skip
-        return _Block(pixels, masks, shared)
+        return _Block(*_batches(pixels, masks), shared)
 
     def seen(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
         """Where a source's clusters start and end in the image, and their depths; see `project`."""

@@ -72,15 +72,17 @@ def pixel_events(
     light = np.ascontiguousarray(light_w_m2, np.float64)
     quantiles = quantile_table()
     shifts = np.exp(sensor.noise_ln * quantiles)
-    room = int((end_us - edges[0]) / sensor.refr_us) + 8
+    room = (int((end_us - edges[0]) / sensor.refr_us) + 8) * min(pixels, _kernels.LANES)
     request, code, cross = np.empty(room), np.empty(room, np.int32), np.empty(room)
     found = []
-    for pixel in range(pixels):
+    for first in range(0, pixels, _kernels.LANES):
         n = _kernels.run_given_light(
-            pixel, edges, light, end_us, seed_key(seed), quantiles, shifts, sensor_vector(sensor), request,
-            code, cross,
+            first, min(first + _kernels.LANES, pixels), edges, light, end_us, seed_key(seed), quantiles,
+            shifts, sensor_vector(sensor), request, code, cross,
         )  # fmt: skip
-        found.append((np.full(n, pixel), request[:n].copy(), cross[:n].copy(), code[:n] % 2 == 1))
+        pixel = code[:n].astype(np.int64) >> 1
+        order = np.argsort(pixel, kind="stable")
+        found.append((pixel[order], request[order], cross[order], code[order] % 2 == 1))
     return PixelEvents(*(np.concatenate(column) for column in zip(*found, strict=True)))
 
 

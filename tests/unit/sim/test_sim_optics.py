@@ -131,26 +131,26 @@ def test_all_the_light_of_a_strip_arrives() -> None:
 def test_the_kernel_looks_up_what_the_table_says() -> None:
     table = strip_table(blur_of(50.0, LensSpec(), CAMERA), 0.7, 1.9, 64)
     rng = np.random.default_rng(1)
-    across, along = rng.normal(0, 5, 200), rng.normal(0, 20, 200)
+    pixels = 100
+    across, along = rng.normal(0, 5, pixels), rng.normal(0, 20, pixels)
     along[0] = 1e20
     expected = table_at(table, 1.9, across, along)
-    # One cluster that begins here and ends at infinity, each place a pose.
-    poses = len(along)
-    edges = np.array([np.zeros(poses), np.full(poses, 1e30)])
-    weight = np.empty((1, poses))
-    room = (np.empty(poses, np.int32), np.empty(poses), np.empty(poses, np.int32), np.empty(poses))
-    _kernels._near_weights.py_func(
-        along, across, np.full(poses, 0.7), edges, 3.0, table, 1.9, 1e40, *room, np.empty((2, poses)), weight
-    )
-    np.testing.assert_allclose(weight[0], 3.0 * expected, rtol=0, atol=1e-11)
+    # One cluster that begins here and ends at infinity.
+    edges = np.array([0.0, 1e30])
+    lanes = np.zeros(_kernels._ROOM)
+    lanes[_kernels._ALONG : _kernels._ALONG + pixels] = along
+    lanes[_kernels._ACROSS : _kernels._ACROSS + pixels] = across
+    room = np.empty(pixels, np.int32), np.empty(pixels, np.int32), np.empty(2 * _kernels.LANES)
+    weight = np.empty(_kernels.LANES)
+    look_up = _kernels._near_weights.py_func
+    look_up(pixels, lanes, 0.7, edges, 3.0, table, 1.9, 1e40, *room, weight)
+    np.testing.assert_allclose(weight[:pixels], 3.0 * expected, rtol=0, atol=1e-11)
     # What is further away than it is followed is not there.
-    _kernels._near_weights.py_func(
-        along, across, np.full(poses, 0.7), edges, 3.0, table, 1.9, 6.0, *room, np.empty((2, poses)), weight
-    )
+    look_up(pixels, lanes, 0.7, edges, 3.0, table, 1.9, 6.0, *room, weight)
     near = (np.abs(across) < 6.35) & (along > -6.0)
     assert near.any()
     assert not near.all()
-    np.testing.assert_allclose(weight[0], np.where(near, 3.0 * expected, 0.0), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(weight[:pixels], np.where(near, 3.0 * expected, 0.0), rtol=0, atol=1e-11)
 
 
 def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:

@@ -109,6 +109,20 @@ def test_nothing_below_the_threshold_and_the_s_curve_at_it() -> None:
     assert step_response(IDEAL, IDEAL.th_on + 1e-6, pixels=3) == 1
 
 
+@pytest.mark.parametrize("tau_us", [0.0, 5.0])
+def test_pixels_do_not_depend_on_those_beside_them(tau_us: float) -> None:
+    rng = np.random.default_rng(2)
+    edges, light = np.arange(40) * 100.0, rng.uniform(0.02, 50.0, 40)
+    sensor = replace(SENSOR, tau_sf_us=tau_us, jitter_us=2.0)
+    together = pixel_events(sensor, edges, light, 4e3, pixels=_kernels.LANES + 3)
+    for pixels in (1, 2, 5, _kernels.LANES):
+        fewer = pixel_events(sensor, edges, light, 4e3, pixels=pixels)
+        n = len(fewer.pixel)
+        assert n == np.searchsorted(together.pixel, pixels)
+        for a, b in zip(vars(together).values(), vars(fewer).values(), strict=True):
+            assert np.array_equal(a[:n], b)
+
+
 def test_an_interval_is_a_refractory_time_or_more() -> None:
     for refractory in (3.0, 10.0, 50.0):
         sensor = replace(SENSOR, refr_us=refractory, jitter_us=3.0)
