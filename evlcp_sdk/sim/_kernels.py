@@ -642,9 +642,9 @@ def run_pixels(
 
     The light on a pixel is constant between the entries of a time line, the first where the block begins:
     when the image moves (`line_kind` -2), when the share of all light that passes changes (-1), and when the
-    source of this number switches. `line_pose` is the image's pose from then on, `line_shade` that share, `line_row`
-    (sources, entries) the row of `levels` (rows, clusters) that a source shows; `halo` (halos, rows, places)
-    is its light in each halo on a grid along the strip, as a share of full light.
+    source of this number switches. `line_pose` is the image's pose from then on, `line_shade` that share,
+    `line_row` (sources, entries) the row of `levels` (rows, clusters) that a source shows; `halo` (halos,
+    rows, places) is its light in each halo on a grid along the strip, as a share of full light.
 
     (source, pose) arrays say where each strip is: `origin` (2, sources, poses), its first end, px; `axis`,
     the unit vector along it; `bounds` (sources, clusters + 1, poses), where its clusters start and end along
