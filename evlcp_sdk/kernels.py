@@ -28,7 +28,7 @@ from functools import cached_property, wraps
 from multiprocessing.connection import Connection, Pipe
 from pathlib import Path
 from types import ModuleType
-from typing import Any, NoReturn, TypeVar
+from typing import TYPE_CHECKING, Any, NoReturn, TypeVar
 
 import llvmlite
 import llvmlite.binding
@@ -43,6 +43,9 @@ from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 
 from evlcp_sdk.signals import ENDING
+
+if TYPE_CHECKING:
+    from evlcp_sdk.compiling import Whole
 
 __all__ = ["njit", "pack"]
 
@@ -224,6 +227,10 @@ class _Cache:
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The kernel for a signature; None where it is to be compiled here."""
+        within = _WHOLE is not None and not _WHOLE.is_it(*self._place)
+        if within and self._place[1].startswith("_"):
+            # It is kept as a part of others.
+            return None
         args, _ = normalize_signature(sig)  # type: ignore[no-untyped-call]
         found = _PACKED.find(*self._place, args, target_context)
         if found is not None or self._folder is None:
@@ -233,13 +240,13 @@ class _Cache:
             with trigger_event("numba:compile"):
                 compiled = _COMPILER.compile(*self._place, sig)
             found = self._folder.load_overload(sig, target_context) if compiled else None
-        if found is None and self._lock():
+        if found is None and not within and self._lock():
             found = self._folder.load_overload(sig, target_context)
         return found
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a kernel that was compiled here."""
-        if self._folder is not None:
+        if self._folder is not None and (_WHOLE is None or _WHOLE.is_it(*self._place)):
             self._folder.save_overload(sig, data)  # type: ignore[no-untyped-call]
 
     def kept(self, target_context: Any) -> Iterator[tuple[Any, tuple[Any, ...]]]:
@@ -461,6 +468,10 @@ class _Compiler:
 
 
 _COMPILER = _Compiler()
+
+_WHOLE: "Whole | None" = None
+"""In a child: the kernel that is to be kept; it keeps no other."""
+
 register("numba:compile", _Patience())  # type: ignore[no-untyped-call]
 
 
@@ -476,11 +487,19 @@ def _serve(pipe: Connection) -> NoReturn:
         # To look through what the parent has would copy it; what compiling leaves is looked at less often.
         gc.freeze()
         gc.set_threshold(100_000)
+        from evlcp_sdk import compiling
+
+        whole = compiling.Whole()
+        global _WHOLE
+        _WHOLE = whole if compiling.prepare(whole) else None
         most_pages = _resident_pages() + (_GROWN_MB << 20) // os.sysconf("SC_PAGE_SIZE")
         while pipe.poll(_IDLE_S):
             module, name, sig = pipe.recv()
             kernel = getattr(importlib.import_module(module), name, None)
             if kernel is not None:
+                whole.place = module, name
+                # As a part of another it has nothing to be called by.
+                kernel.overloads.pop(tuple(sig), None)
                 with suppress(Exception):
                     kernel.compile(sig)
             pipe.send(kernel is not None)

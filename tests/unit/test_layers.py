@@ -9,7 +9,7 @@ import pytest
 SDK = Path(__file__).parents[2] / "evlcp_sdk"
 
 LAYERS = (
-    {"errors", "files", "kernels", "late", "pace", "printable", "signals", "specs", "spelling"},
+    {"compiling", "errors", "files", "kernels", "late", "pace", "printable", "signals", "specs", "spelling"},
     {"air"},
     {"values", "scene", "clock", "utc", "_kernels"},
     {"plugin"},

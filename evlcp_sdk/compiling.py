@@ -1,0 +1,337 @@
+"""Compiling kernels in half the time: for a process that compiles and never calls what it compiled.
+
+Numba makes each function that a kernel calls a kernel of its own: optimized, turned into code, loaded. The
+child of `evlcp_sdk.kernels` only writes whole kernels into files. So what is called within one is handed to
+it as it is, and all is optimized together, once. Besides, Numba writes much that LLVM removes again, each
+line of it by the interpreter, and asks again and again what it knows: here it writes and asks less. What is
+compiled computes the same: no operation on numbers changes, nor the order of any.
+
+All this replaces parts of Numba that it promises nobody. `prepare` does so only for versions that it was
+tried with; by another one kernels are compiled as Numba does by itself, in twice the time.
+"""
+
+import sys
+from typing import Any
+
+import llvmlite.ir
+import numba
+from llvmlite.binding import Linkage, ffi
+from llvmlite.ir import instructions
+from numba import _dynfunc  # type: ignore[attr-defined]
+from numba.core import analysis, cgutils, codegen, cpu, ir, lowering, types
+from numba.core.runtime.context import NRTContext
+from numba.core.types.functions import BaseFunction
+from numba.cpython import slicing
+from numba.np import arrayobj
+
+__all__ = ["Whole", "prepare"]
+
+_TRIED = ("0.68.",)
+"""Versions of Numba whose parts are known to be what is replaced here."""
+
+
+class Whole:
+    """The kernel that is to be kept, with the functions in it: what is made ready for calls from Python.
+
+    Attributes:
+        place: Its module and name; None where there is none at the moment.
+    """
+
+    def __init__(self) -> None:
+        self.place: tuple[str, str] | None = None
+
+    def is_it(self, module: str, name: str) -> bool:
+        """Whether a function is the kernel."""
+        return self.place == (module, name)
+
+
+def prepare(whole: Whole) -> bool:
+    """Replace what takes long; whether that was done. It is for good: no kernel can be called afterwards."""
+    if not numba.__version__.startswith(_TRIED):
+        return False
+    _keep_calls_within(whole)
+    _resolve_once()
+    _list_variables_quickly()
+    _count_references_of_arrays_alone()
+    _read_fields_of_values()
+    _write_no_detours()
+    # Whoever wants to know of LLVM's lock costs more than it.
+    ffi.lib._lock._cblist.clear()
+    return True
+
+
+def _keep_calls_within(whole: Whole) -> None:
+    """Functions are linked as they are written, and only the kernel that is kept is optimized and emitted."""
+
+    def simplify(self: Any, module: Any) -> None:
+        module.data_layout = self._codegen._data_layout
+        for function in module.functions:
+            if not function.is_declaration:
+                # As much as it takes to see which references need no counting.
+                passes, builder = self._codegen._function_pass_manager(opt=1)
+                passes.run(function, builder)
+
+    def link(self: Any) -> None:
+        self._raise_if_finalized()
+        for library in dict.fromkeys(self._linking_libraries):
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(library._get_module_for_linking(), preserve=True)
+        self._finalize_dynamic_globals()
+        self._finalized = True
+
+    def emitted(self: Any) -> tuple[str, str, tuple[bytes, bytes]]:
+        self._ensure_finalized()
+        # Another kernel may call it, too.
+        module, self._final_module = self._final_module, self._final_module.clone()
+        self._optimize_final_module_of(module)
+        code = self._codegen._tm.emit_object(module)
+        for function in module.functions:
+            if not function.is_declaration and function.linkage == Linkage.external:
+                function.linkage = "linkonce_odr"
+        return self.name, "object", (code, module.as_bitcode())
+
+    def optimize(self: Any, module: Any) -> None:
+        cheap = {"loop_vectorize": False, "slp_vectorize": False, "opt": 0, "cost": "cheap"}
+        for options in (cheap, {}):
+            passes, builder = self._codegen._module_pass_manager(**options)
+            passes.run(module, builder)
+
+    def not_callable(_: Any, library: Any, description: Any, environment: Any) -> Any:
+        name = description.qualname.split(".")[-1]
+        return _dynfunc.make_function(description.lookup_module(), name, "", 0, environment, (library,))
+
+    wrap = cpu.CPUContext.create_cpython_wrapper
+
+    def wrap_whole(self: Any, library: Any, description: Any, *of: Any, **options: Any) -> None:
+        if whole.is_it(description.modname, description.qualname):
+            wrap(self, library, description, *of, **options)
+
+    library: Any = codegen.JITCodeLibrary
+    library._optimize_functions = simplify
+    library._optimize_final_module_of = optimize
+    library.finalize = link
+    library.serialize_using_object_code = emitted
+    context: Any = cpu.CPUContext
+    context.get_executable = not_callable
+    context.create_cpython_wrapper = wrap_whole
+    context.create_cfunc_wrapper = lambda *_, **__: None
+
+
+def _resolve_once() -> None:
+    """What a function of Numba's gives for types of arguments is worked out once, with all its overloads."""
+    resolve = BaseFunction.get_call_type
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:
+        if kws:
+            return resolve(self, context, args, kws)
+        known = self.__dict__.setdefault("_evlcp_known", {})
+        found = known.get(tuple(args))
+        if found is None:
+            found = known[tuple(args)] = resolve(self, context, args, kws)
+        return found
+
+    function: Any = BaseFunction
+    function.get_call_type = get_call_type
+
+
+def _list_variables_quickly() -> None:
+    """The variables of instructions, asked for after each pass: plain types first, what is common first."""
+    plain = {str, int, float, bool, type(None), ir.Loc}
+
+    def of_all(values: Any) -> list[Any]:
+        found: list[Any] = []
+        for value in values:
+            kind = type(value)
+            if kind is ir.Var:
+                found.append(value)
+            elif kind not in plain:
+                found += listed(None, value)
+        return found
+
+    def listed(_: Any, value: Any) -> list[Any]:
+        if isinstance(value, ir.Var):
+            return [value]
+        if isinstance(value, ir.Inst):
+            return value.list_vars()  # type: ignore[no-any-return]
+        if isinstance(value, dict):
+            return of_all(value.values())
+        return of_all(value) if isinstance(value, list | tuple) else []
+
+    def used_and_defined(blocks: Any) -> Any:
+        used: dict[int, set[str]] = {offset: set() for offset in blocks}
+        defined: dict[int, set[str]] = {offset: set() for offset in blocks}
+        for offset, block in blocks.items():
+            uses, defines = used[offset], defined[offset]
+            for statement in block.body:
+                if type(statement) in analysis.ir_extension_usedefs:
+                    analysis.ir_extension_usedefs[type(statement)](statement, uses, defines)
+                    continue
+                names = {variable.name for variable in statement.list_vars()}
+                if isinstance(statement, ir.Assign):
+                    value, target = statement.value, statement.target.name
+                    if target not in {variable.name for variable in of_all((value,))}:
+                        defines.add(target)
+                uses |= names - defines
+        return analysis._use_defs_result(usemap=used, defmap=defined)
+
+    instruction: Any = ir.Inst
+    assignment: Any = ir.Assign
+    expression: Any = ir.Expr
+    instruction._rec_list_vars = listed
+    assignment.list_vars = lambda self: of_all((self.value, self.target))
+    expression.list_vars = lambda self: of_all(self._kws.values())
+    analysis.compute_use_defs = used_and_defined
+
+
+def _write_no_detours() -> None:
+    """What was put into a structure is not taken from it again, nor twice; no index is times 1, or plus 0."""
+    builder: Any = llvmlite.ir.IRBuilder
+    extract, constant, insertion = builder.extract_value, llvmlite.ir.Constant, instructions.InsertValue
+
+    def extract_value(self: Any, whole: Any, index: Any, name: str = "") -> Any:
+        path = [index] if isinstance(index, int) else index
+        if len(path) != 1:
+            return extract(self, whole, index, name)
+        at = path[0]
+        while type(whole) is insertion and len(whole.indices) == 1:
+            if whole.indices[0] == at:
+                return whole.value
+            whole = whole.aggregate
+        taken = whole.__dict__.setdefault("_taken", {})
+        before = taken.get(at)
+        follows = self._anchor == len(self._block.instructions)
+        if before is None or before.parent is not self._block or not follows:
+            before = taken[at] = extract(self, whole, at, name)
+        return before
+
+    def without(neutral: int, operate: Any) -> Any:
+        def operated(self: Any, one: Any, other: Any, name: str = "", flags: Any = ()) -> Any:
+            for a, b in ((one, other), (other, one)):
+                if type(a) is constant and a.constant == neutral and a.type == b.type:
+                    return b
+            return operate(self, one, other, name, flags)
+
+        return operated
+
+    fix = slicing.fix_index
+
+    def fix_index(builder: Any, index: Any, size: Any) -> Any:
+        known = type(index) is constant and isinstance(index.constant, int) and index.constant >= 0
+        return index if known else fix(builder, index, size)
+
+    builder.extract_value = extract_value
+    builder.mul, builder.add = without(1, builder.mul), without(0, builder.add)
+    slicing.fix_index = fix_index
+
+
+def _count_references_of_arrays_alone() -> None:
+    """Where references are counted, only what holds one is taken apart; a number that ends is left alone."""
+    holds: dict[Any, bool] = {}
+
+    def held_by(context: Any, kind: Any) -> bool:
+        found = holds.get(kind)
+        if found is None:
+            found = holds[kind] = context.data_model_manager[kind].contains_nrt_meminfo()
+        return found
+
+    def counted(self: Any, builder: Any, kind: Any, value: Any) -> list[tuple[Any, Any]]:
+        if not held_by(self._context, kind):
+            return []
+        model = self._context.data_model_manager[kind]
+        found = [(kind, model.get_nrt_meminfo(builder, value))] if model.has_nrt_meminfo() else []
+        for member, get in model.traverse(builder):
+            if held_by(self._context, member):
+                found += counted(self, builder, member, get(value))
+        return found
+
+    delete = lowering.Lower.delvar
+
+    def end(self: Any, name: str) -> None:
+        kind = self.typeof(name)
+        if self._disable_sroa_like_opt or held_by(self.context, kind):
+            delete(self, name)
+            return
+        if name not in self._blk_local_varmap:
+            self._singly_assigned_vars.discard(name)
+        self._alloca_var(name, kind)
+
+    runtime: Any = NRTContext
+    runtime.get_meminfos = counted
+    lower: Any = lowering.Lower
+    lower.delvar = end
+
+
+def _read_fields_of_values() -> None:
+    """Arrays, ranges and what else is a structure are read without a copy in memory for each time.
+
+    Fields are taken from the value as long as none is set and nobody asks for a place in memory; then the
+    value is put there, where the structure was made, as this may be in a branch of what follows.
+    """
+    structure: Any = cgutils._StructProxy
+    begin, load = structure.__init__, structure.__getitem__
+
+    def made(self: Any, context: Any, builder: Any, value: Any = None, ref: Any = None) -> None:
+        if value is None or ref is not None:
+            begin(self, context, builder, value=value, ref=ref)
+            return
+        self._context, self._builder = context, builder
+        self._datamodel = context.data_model_manager[self._fe_type]
+        self._be_type = self._get_be_type(self._datamodel)
+        if value.type != self._be_type:
+            raise AssertionError(f"bad value type: expected {self._be_type}, got {value.type}")
+        block, at = builder._block, builder._anchor
+        self._read, self._behind = value, (block, block.instructions[at - 1] if at else None)
+
+    def stored(self: Any) -> Any:
+        builder, (block, last) = self._builder, self._behind
+        here, at, before = builder._block, builder._anchor, len(builder._block.instructions)
+        with builder.goto_entry_block():
+            place = builder.alloca(self._be_type)
+        behind = [one for one in (last, place) if one is not None and one.parent is block]
+        builder._block = block
+        builder._anchor = max((block.instructions.index(one) + 1 for one in behind), default=0)
+        builder.store(self._read, place)
+        builder._block, builder._anchor = here, at + len(here.instructions) - before
+        return place
+
+    def attribute(self: Any, name: str) -> Any:
+        if name in ("_value", "_outer_ref") and "_read" in self.__dict__:
+            self._value = self._outer_ref = stored(self)
+            del self._read, self._behind
+            return self._value
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return self[self._datamodel.get_field_position(name)]
+
+    def field(self: Any, index: int) -> Any:
+        value = self.__dict__.get("_read")
+        return load(self, index) if value is None else self._builder.extract_value(value, index)
+
+    def whole(self: Any) -> Any:
+        value = self.__dict__.get("_read")
+        return self._builder.load(self._outer_ref) if value is None else value
+
+    proxy: Any = cgutils.ValueStructProxy
+    proxy.__init__, proxy.__getattr__, proxy.__getitem__, proxy._getvalue = made, attribute, field, whole
+
+    make, arrays = arrayobj.make_array, {}
+
+    def shape(self: Any) -> Any:
+        if "_read" in self.__dict__:
+            return field(self, self._datamodel.get_field_position("shape"))
+        place, sizes = self._get_ptr_by_name("shape"), []
+        for axis in range(self._fe_type.ndim):
+            sizes.append(self._builder.load(cgutils.gep_inbounds(self._builder, place, 0, axis)))
+            arrayobj.mark_positive(self._builder, sizes[-1])
+        return cgutils.pack_array(self._builder, sizes) if sizes else attribute(self, "shape")
+
+    def make_array(kind: Any) -> Any:
+        if type(kind) is not types.Array:
+            return make(kind)
+        if kind not in arrays:
+            arrays[kind] = type("Array", (cgutils.create_struct_proxy(kind),), {"shape": property(shape)})
+        return arrays[kind]
+
+    for module in [m for name, m in sys.modules.items() if name.startswith("numba.")]:
+        if getattr(module, "make_array", None) is make:
+            vars(module)["make_array"] = make_array
