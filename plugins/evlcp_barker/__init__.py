@@ -14,7 +14,7 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
         "synchronization",
         "barker",
         "evlcp_barker.synchronization:BarkerSync",
-        2,
+        3,
         "sliding preamble correlation",
     )
     yield Algorithm("pilots", "barker13", "evlcp_barker.pilots:Barker13Pilots", 1, "shifted Barker-13 words")

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.air.codebook import Codebook, are_pairs, edges_of_chips
+from evlcp_barker.bound import due_chips, guard_chips, least_correlation
+from evlcp_sdk.air.codebook import Codebook, are_pairs
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.late import Late
@@ -21,10 +22,6 @@ else:
     _kernels = Late("evlcp_barker._kernels")
 
 __all__ = ["BarkerSync"]
-
-_GUARD_CHIPS = 3
-"""A correlation peak stands alone within this distance: a Manchester-coded preamble has its high sidelobes
-one and two chips away."""
 
 _TIMING_SIGMA_US = 2.0
 """Least spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
@@ -61,18 +58,20 @@ class BarkerSync(Synchronization):
     behind the bar adds events to some of them. The clock's rate is all but constant and within a bound;
     latency wanders with the light, and jumps where the light does. A measurement far from its prediction is
     a jump of the latency and says nothing of the rate.
+
+    From which correlation on it is a preamble follows from the codes: see `evlcp_barker.bound`.
     """
 
     steps_per_chip: Annotated[int, Field(ge=4, le=100, description="Correlation steps in a chip.")] = 10
     min_correlation: Annotated[
         float,
         Field(
-            gt=0,
+            ge=0,
             lt=1,
-            description="Normalised correlation that makes a preamble, which has 0.7 or more; half as much"
-            " where it stands out, 6 times the rms of a packet's others.",
+            description="Normalised correlation that makes a preamble; half as much where it stands out, 6"
+            " times the rms of a packet's others. 0: by the codebook, 0.5 for the built-in one.",
         ),
-    ] = 0.5
+    ] = 0.0
     min_events: Annotated[int, Field(ge=26, description="Events of a preamble that counts as detected.")] = (
         100
     )
@@ -173,13 +172,14 @@ class BarkerSynchronizer:
         # Events come behind edges, and late ones agree with the chip that they come in.
         self._chips = 2.0 * codebook.preamble - 1
         self._pair = 2 if are_pairs(codebook.preamble) else 1
-        self._due = np.ones(len(self._chips), np.bool_)
-        if self._pair == 1:
-            self._due[1:] = edges_of_chips(codebook.preamble) != 0
+        self._due = due_chips(codebook.preamble)
         self._bin_us = packet.chip_us / spec.steps_per_chip
         self._rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
         if not len(self._rising):
             raise ConfigError("synchronization 'barker': a preamble without a rise finds no time")
+        self._least = spec.min_correlation or least_correlation(codebook, packet.frames, packet.pilot_every)
+        # A correlation peak stands alone within this distance.
+        self._guard_chips = guard_chips(codebook.preamble, self._least)
 
     def init(self) -> SyncState:
         """State before the first event."""
@@ -191,7 +191,7 @@ class BarkerSynchronizer:
         """Count events, correlate what is complete, give a lock for each preamble (see `Synchronizer`)."""
         n = self._spec.steps_per_chip
         span = n * len(self._chips)
-        guard = n * _GUARD_CHIPS
+        guard = n * self._guard_chips
         until_bin = int(until_us // self._bin_us)
         if state.first_bin is None:
             # A preamble starts with a dark chip: the first event may already be the edge at its end.
@@ -228,16 +228,14 @@ class BarkerSynchronizer:
                 rho,
                 enough,
             )
-            if 2 * top >= self._spec.min_correlation:
+            if 2 * top >= self._least:
                 lags_found = np.empty(len(enough), np.int64)
-                many = _kernels.peaks(
-                    rho, lo, guard, enough, _OUTSTANDS, self._spec.min_correlation, lags_found
-                )
+                many = _kernels.peaks(rho, lo, guard, enough, _OUTSTANDS, self._least, lags_found)
                 for lag in lags_found[:many].tolist():
                     found = self._refine(lag, counts, state.first_bin, float(rho[lag]))
+                    before = clock
                     clock, stray = self._accept(clock, stray, found)
-                    if stray is None:
-                        assert clock is not None
+                    if clock is not None and clock is not before:
                         locks.append(self._lock(clock, found.quality))
             lo = lags - guard
         else:

@@ -448,9 +448,19 @@ def sum_worth(
 def learn_worth(
     sums: Array, codes: Array, probability: Array, grid: int, most: int, prior: float, out: Array
 ) -> None:
-    """`log_ratio` of what `count_pairs` finds, `out` (2 most + 1, 2 most + 1)."""
-    counts = np.zeros((2, 2 * most + 1, 2 * most + 1))
+    """`log_ratio` of what `count_pairs` finds, `out` (2 most + 1, 2 most + 1).
+
+    A pilot of one value throughout, as that of a lone cluster, says nothing of the other: what comes with it
+    is taken to be the same with all signs changed.
+    """
+    side = 2 * most + 1
+    counts = np.zeros((2, side, side))
     count_pairs(sums[: 2 * codes.shape[1]], codes, probability, grid, most, counts)
+    for value in range(2):
+        if counts[value].sum() == 0:
+            for a in range(side):
+                for b in range(side):
+                    counts[value, a, b] = counts[1 - value, side - 1 - a, side - 1 - b]
     log_ratio(counts, prior, out)
 
 

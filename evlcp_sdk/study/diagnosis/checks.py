@@ -7,7 +7,6 @@ from typing import Literal
 
 import numpy as np
 
-from evlcp_sdk.air.codebook import are_pairs
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.doubts import Seen, codewords_never, saturation
 from evlcp_sdk.results.tallies import RunTally
@@ -515,17 +514,13 @@ def _preamble(facts: Facts) -> Check:
             "record some packets: the next preamble may come after the end",
         )
     if not heard:
-        synchronization = facts.link.table["synchronization"]
-        # Light that stays for chips wakes late events in them, and fewer that tell.
-        low = not are_pairs(facts.link.codebook.preamble) and "min_correlation" in synchronization
         return Check(
             "preamble",
             "fail",
             "no-preamble",
             f"none detected in {regions} region{'s' * (regions != 1)}",
             "compare pilots.id, its parameters and air.chip_rate_hz with the transmitter's: `evlcp config` at"
-            " both ends" + low * "; a preamble that is no pair code may correlate less: try --set"
-            " synchronization.min_correlation=0.3",
+            " both ends",
         )
     return Check(
         "preamble", "pass", "preamble", f"{heard} detected in {regions} region{'s' * (regions != 1)}"

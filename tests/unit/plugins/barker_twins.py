@@ -100,3 +100,17 @@ def events_of(
     keep = (p > 0) | (rng.random(len(t)) >= missing_off)
     order = np.argsort(t[keep], kind="stable")
     return t[keep][order], p[keep][order]
+
+
+def answers_of(chips, slow):
+    """Negative and positive events by chip, (2, n), of clusters that blink as `chips` (n, K), by plain loops.
+
+    A pixel answers an edge by ln((k + 2) / (k + 1)) events in the k-th chip behind it, or at once.
+    """
+    counts = np.zeros((2, len(chips)))
+    for lit in chips.T:
+        k = 0
+        for n, on in enumerate(lit):
+            k = 0 if n == 0 or on != lit[n - 1] else k + 1
+            counts[on, n] += np.log((k + 2) / (k + 1)) if slow else float(k == 0)
+    return counts

@@ -1,12 +1,13 @@
 """Barker codes and packet synchronization, on events whose timing is known."""
 
 from dataclasses import astuple, replace
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import barker_twins as twins
 import numpy as np
 import pytest
 from evlcp_barker import _kernels
+from evlcp_barker.bound import due_chips, guard_chips, least_correlation, preamble_share
 from evlcp_barker.pilots import Barker13Pilots
 from evlcp_barker.synchronization import BarkerSync
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
@@ -174,6 +175,138 @@ def test_times_of_a_preamble(lag, pair, off):
     found = _kernels.refine(counts, lag, chips, steps, pair, rising)
     assert_allclose(found, twins.refine(counts, lag, chips, steps, pair, rising), rtol=1e-9, atol=1e-12)
     assert np.isnan(found[2]) == (not off)
+
+
+# From which correlation on it is a preamble
+
+
+def book_of(preamble, clusters=CLUSTERS, modulation="wh4x2"):
+    return Codebook("own", preamble, WhPilots().codes(clusters), PROFILES[modulation].codewords())
+
+
+SLOW = {f"chips of {n}": np.repeat(chips_of_values(BARKER13), n) for n in (2, 3, 4)}
+OWN = SLOW | {
+    "return to zero": np.stack([chips_of_values(BARKER13)[1::2], np.zeros(13, np.uint8)], 1).ravel(),
+    "pulses of three": np.array([*map(int, "001001010100001100100010010001100010001")], np.uint8),
+    "without return": np.array([*map(int, "1111100110100100001010111011000")], np.uint8),
+}
+
+
+@pytest.mark.parametrize("modulation", PROFILES)
+@pytest.mark.parametrize("pilots", [WhPilots(), Barker13Pilots()])
+def test_pair_codes_of_four_clusters_and_more_need_half(pilots, modulation):
+    words = PROFILES[modulation].codewords()
+    for clusters in (4, 8, 16, 26):
+        book = Codebook("own", pilots.preamble(), pilots.codes(clusters), words)
+        assert least_correlation(book, FRAMES, 1) == 0.5
+    # What one cluster sends resembles the preamble: nothing cancels.
+    lone = Codebook("own", pilots.preamble(), pilots.codes(1), words)
+    assert least_correlation(lone, FRAMES, 1) == 0.7
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_the_share_that_tells_is_that_of_answers_behind_edges(name):
+    """Chip by chip, by hand: an answer ln((k + 2) / (k + 1)) in the k-th chip of a run."""
+    told = lost = 0.0
+    for _, run in groupby(OWN[name].tolist()):
+        first, *late = [np.log((k + 2) / (k + 1)) for k, _ in enumerate(run)]
+        told, lost = told + first, lost + sum(late)
+    assert preamble_share(OWN[name]) == pytest.approx(told / (told + lost))
+
+
+@pytest.mark.parametrize("clusters", [1, 4, CLUSTERS])
+@pytest.mark.parametrize("name", OWN)
+def test_a_preamble_passes_and_other_codes_do_not(name, clusters):
+    """Both as bad as can be: the preamble on slow pixels, the others on pixels that answer at once."""
+    book = book_of(OWN[name], clusters)
+    rng = np.random.default_rng(7)
+    chips = np.concatenate(
+        [
+            packet_chips(rng.integers(0, 64, (FRAMES, clusters)), book)
+            for _ in range(8 if clusters > 1 else 40)
+        ]
+    )
+    packet = PacketFormat.of(book, FRAMES).packet_chips
+    signs, due = 2.0 * book.preamble - 1, due_chips(book.preamble)
+    least = least_correlation(book, FRAMES, 1)
+    reached = {}
+    for answers in ("slow", "quick"):
+        counts = twins.answers_of(chips, answers == "slow")
+        rho = twins.correlate(counts, signs, due, 1, 0, counts.shape[1] - len(signs) + 1)
+        at = np.arange(len(rho)) % packet
+        own = np.minimum(at, packet - at)
+        reached[answers] = rho[own == 0].min(), (rho[own > 3] > least).mean()
+    assert least < 0.75 * reached["slow"][0]
+    # A lone cluster may say what is all but the preamble: then poor ones must still pass.
+    most = pytest.approx(0.7 * preamble_share(book.preamble))
+    assert max(share for _, share in reached.values()) < 1e-3 or (clusters == 1 and least == most)
+    if name in SLOW:
+        assert least == pytest.approx(0.5 * preamble_share(book.preamble))
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_shifts_of_a_preamble_are_within_its_guard(name):
+    code = OWN[name]
+    dark = np.zeros(len(code) - 1, np.uint8)
+    counts = twins.answers_of(np.concatenate([[0], code, dark, [0]])[:, None], slow=False)[
+        :, 1 : len(code) + 1
+    ]
+    counts = np.pad(counts, [(0, 0), (len(code), len(code))])
+    lags = 2 * len(code) + 1
+    rho = twins.correlate(counts, 2.0 * code - 1, due_chips(code), 1, 0, lags)
+    least = 0.5 * preamble_share(code)
+    guard = guard_chips(code, least)
+    away = np.abs(np.arange(lags) - len(code))
+    assert rho[away > guard].max() < least
+    assert guard == 3 or (rho[away == guard] >= least).any()
+
+
+def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():
+    """Its shifts, and what agrees with it less than it does itself, are none."""
+    code = np.array([*map(int, "100110000100000110100100011")], np.uint8)
+    slots = np.eye(10, dtype=np.uint8)[::2]
+    places = np.array([[(a + n * b + n * n * b) % 5 for n in range(6)] for b in range(3) for a in range(4)])
+    words = slots[np.stack(np.meshgrid(range(5), range(5), indexing="ij"), -1).reshape(-1, 2)]
+    book = Codebook("sparse", code, slots[places].reshape(12, -1), words.reshape(25, -1))
+    packet = PacketFormat.of(book, 7)
+    rng = np.random.default_rng(0)
+    symbols = rng.integers(0, 16, (4, 7, 12))
+    t, p = twins.events_of(np.concatenate([packet_chips(one, book) for one in symbols]), rng, START_US)
+    sync = BarkerSync().compile(book, packet)
+    state, locks = sync.init(), []
+    for until in range(0, int(t[-1]) + 9000, 1000):
+        inside = (t >= until - 1000) & (t < until)
+        state, found = sync.step(state, t[inside], p[inside], until)
+        locks += found
+    apart = packet.packet_chips * twins.CHIP_US
+    assert_allclose([lock.packet_t_us for lock in locks], START_US + apart * np.arange(4), atol=50)
+
+
+def test_what_agrees_less_than_the_lock_repeats_none():
+    """Data of one cluster, off the grid of its preambles."""
+    rng = np.random.default_rng(1)
+    book = book_of(WhPilots().preamble(), 1)
+    chips = np.concatenate([packet_chips(rng.integers(0, 64, (FRAMES, 1)), book) for _ in range(12)])
+    t, p = twins.events_of(chips, rng, START_US, per_edge=6)
+    sync = BarkerSync(min_correlation=0.5).compile(book, FORMAT)
+    _, locks = sync.step(sync.init(), t, p, int(t[-1]) + 5000)
+    starts = [lock.packet_t_us for lock in locks]
+    assert len(starts) >= 12
+    assert len({round(start / 10) for start in starts}) == len(starts)
+
+
+def test_a_bound_that_is_given_counts():
+    """Half of the events are noise: a third of them tells."""
+    book = book_of(SLOW["chips of 2"])
+    packet = PacketFormat.of(book, FRAMES)
+    rng = np.random.default_rng(2)
+    chips = packet_chips(rng.integers(0, 64, (FRAMES, CLUSTERS)), book)
+    bar = twins.events_of(chips, rng, START_US)
+    n = len(bar[0])
+    t, p = among(bar, rng.integers(0, bar[0][-1], n), rng.integers(0, 2, n))
+    for least, many in ((0.0, 1), (0.2, 1), (0.5, 0)):
+        sync = BarkerSync(min_correlation=least).compile(book, packet)
+        assert len(sync.step(sync.init(), t, p, int(t[-1]) + 5000)[1]) == many
 
 
 # Timing

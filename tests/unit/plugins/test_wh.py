@@ -195,6 +195,19 @@ def test_steps_that_are_called_as_one():
     assert_array_equal(llr[1], llr[0])
 
 
+@pytest.mark.parametrize("value", [-1, 1])
+def test_a_pilot_of_one_value_says_of_the_other_the_same_with_signs_changed(value):
+    rng = np.random.default_rng(0)
+    sums, cells = random_sums(rng, (16, 12, 8)), np.ones((1, 6, 4), np.float32)
+    codes, counts, worth = np.full((1, 8), value), np.zeros((2, 7, 7)), np.empty((7, 7))
+    _kernels.count_pairs(sums, codes, cells, 2, 3, counts)
+    known = int(value > 0)
+    assert not counts[1 - known].any()
+    counts[1 - known] = counts[known, ::-1, ::-1]
+    _kernels.learn_worth(sums, codes, cells, 2, 3, 1.0, worth)
+    assert_allclose(worth, twins.log_ratio(counts, 1.0), rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("reach", [1, 3])
 def test_what_clusters_say_off_their_places(seed, reach):

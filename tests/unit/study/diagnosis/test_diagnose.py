@@ -177,16 +177,6 @@ def test_a_framing_without_a_preamble_is_judged_by_its_frames(code: str) -> None
     assert (trial.changes, trial.frames > 10) == ((), not code)
 
 
-@pytest.mark.parametrize(("pilots", "low"), [("wh", False), ("wh-dimmed", True)])
-def test_a_preamble_of_no_pair_code_may_need_a_lower_bound(pilots: str, low: bool) -> None:
-    link = load_link(overrides=[f"pilots.id={pilots}"])
-    counts = {"preambles": 0, "regions_opened": 1, "frames": 0, "frames_rejected": 0}
-    checks = checks_of(Facts(link, 10**6, Seen(0.0, 2e5), (BAR,), None, counts, RunTally(link.packet)))
-    (one,) = [one for one in checks if one.stage == "preamble"]
-    assert one.code == "no-preamble"
-    assert ("synchronization.min_correlation=0.3" in one.next_step) == low
-
-
 def test_rate_is_measured_without_a_link() -> None:
     survey = LightSurvey(1280, 720)
     with rendered(("air.chip_rate_hz=6250",)) as source:
