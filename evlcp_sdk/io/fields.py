@@ -10,7 +10,16 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.io.writers import LAST_TIME_US
 
-__all__ = ["Fields", "RowError", "TimeUnit", "fields_of", "fields_of_values", "polarities", "time_unit"]
+__all__ = [
+    "Fields",
+    "RowError",
+    "TimeUnit",
+    "fields_of",
+    "fields_of_values",
+    "polarities",
+    "time_unit",
+    "unit_of",
+]
 
 UNITS_US: Final = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 
@@ -20,14 +29,19 @@ _UNITS: Final = {
     "us": "us|µs|μs|usecs?|micros|microseconds?",
     "ns": "ns|nsecs?|nanos|nanoseconds?",
 }
+_UNIT: Final = re.compile(
+    "(?:in )?(?:" + "|".join(f"(?P<{unit}>{words})" for unit, words in _UNITS.items()) + ")"
+)
+_BRACKETS: Final = re.compile(r"(.*?)[ _.]*[(\[]([^()\[\]]*)[)\]]")
+_WITH_UNIT: Final = re.compile(r"(.+?)(?:[ _.]in)?(?:[ _.]+|[ _.]*/[ ]?)([^ _./]+)")
+_SHORT_UNIT: Final = re.compile(r"(.+?)(ms|us|ns)")
 _TIME: Final = re.compile(
-    r"(?:events?[ _.]?)?(?:t|ts|times?|timestamps?|time[ _]stamps?)[ _.]?[(\[/]?[ ]?"
-    + f"(?:{'|'.join(f'(?P<{unit}>{words})' for unit, words in _UNITS.items())})?"
-    + r"[)\]]?"
+    r"(?:(?:events?|elapsed)[ _.]?)?(?:t|ts|times?|timestamps?|time[ _]stamps?)(?:[ _.]events?)?"
 )
 _NAMES: Final = {
     "p": re.compile(
-        r"(?:events?[ _.]?)?(?:p|ps|pol|pols|polarity|polarities|on|on[ _/]?off|sign|value|level)"
+        r"(?:events?[ _.]?|is[ _.]?)?(?:p|ps|pol|pols|polarity|polarities|on|on[ _/]?off|signs?|value|level"
+        r"|type|state|change|brightness[ _.]change)(?:[ _.]events?)?"
     ),
     "x": re.compile(r"(?:events?[ _.]?)?(?:x|xs|x[ _]?px|col|column)"),
     "y": re.compile(r"(?:events?[ _.]?)?(?:y|ys|y[ _]?px|row|line)"),
@@ -35,12 +49,23 @@ _NAMES: Final = {
 _EVENT: Final = ("event", "events")
 """Polarities by this name, where no other column is: signs of events beside their times."""
 
-_ON: Final = frozenset({"1", "+1", "true", "t", "on", "pos", "positive", "+", "up", "rise"})
-_OFF: Final = frozenset({"0", "-1", "false", "f", "off", "neg", "negative", "-", "down", "fall"})
+_PAIRS: Final = (
+    *(("1", "0"), ("+1", "-1"), ("true", "false"), ("t", "f"), ("on", "off"), ("cd_on", "cd_off")),
+    *(("pos", "neg"), ("p", "n"), ("+", "-"), ("positive", "negative"), ("up", "down"), ("rise", "fall")),
+    *(("rising", "falling"), ("high", "low"), ("increase", "decrease"), ("brighter", "darker")),
+)
+_ON: Final = frozenset(on for on, _ in _PAIRS)
+_OFF: Final = frozenset(off for _, off in _PAIRS)
 
 LEAST_RATE_HZ: Final = 20.0
 MOST_RATE_HZ: Final = 5e7
 """Events a second of pixels that see a blinking light: with fewer, or more, the unit is another."""
+
+_LEAST_SPAN_S: Final = 0.1
+_LEAST_COUNTED_S: Final = 0.01
+_SURE_RATE_HZ: Final = (200.0, 2e6)
+"""How long a list is at least, how long one of whole numbers, and what surely comes of pixels that see a
+light: where a list would be shorter, or have more, its times were rounded to a thousand times as coarse."""
 
 _EPOCH_S: Final = (0.9e9, 4.2e9)
 """Seconds since 1970 of a clock of today's computers: from 1998 to 2103."""
@@ -132,6 +157,11 @@ class Fields:
         """Numbers of the columns: time, polarity, and x and y where there are places."""
         return (self.time, self.polarity, *(self.places or ()))
 
+    def behind(self, many: int) -> "Fields":
+        """The same behind so many other columns."""
+        places = (self.places[0] + many, self.places[1] + many) if self.places else None
+        return Fields(self.time + many, self.polarity + many, places, self.unit)
+
 
 def fields_of(names: Sequence[str]) -> Fields | None:
     """The columns of a list of events by their names; None where they do not say time and polarity.
@@ -145,25 +175,54 @@ def fields_of(names: Sequence[str]) -> Fields | None:
     >>> fields_of(["a", "b"]) is None
     True
     """
-    plain = [name.strip().strip("\"'").strip().lower() for name in names]
-    times = [(k, match) for k, name in enumerate(plain) if (match := _TIME.fullmatch(name))]
-    found = {key: [k for k, name in enumerate(plain) if word.fullmatch(name)] for key, word in _NAMES.items()}
+    plain = [_plain(name) for name in names]
+    times = [(k, said) for k, name in enumerate(plain) if (said := _as_time(name)) is not None]
+    bare = [match[1] if (match := _BRACKETS.fullmatch(name)) else name for name in plain]
+    found = {key: [k for k, name in enumerate(bare) if word.fullmatch(name)] for key, word in _NAMES.items()}
     # `t` and `p` before longer names that may mean something else.
     if len(times) > 1:
-        times = [one for one in times if plain[one[0]] in ("t", "ts", "time", "timestamp")]
-    of_p = found["p"] or [k for k, name in enumerate(plain) if name in _EVENT]
+        times = [one for one in times if bare[one[0]] in ("t", "ts", "time", "timestamp")]
+    of_p = found["p"] or [k for k, name in enumerate(bare) if name in _EVENT]
     if len(of_p) > 1:
-        of_p = [k for k in of_p if plain[k] in ("p", "pol", "polarity")]
+        of_p = [k for k in of_p if bare[k] in ("p", "pol", "polarity")]
     if len(times) != 1 or len(of_p) != 1:
         return None
-    (time, match), (polarity,) = times[0], of_p
+    (time, unit), (polarity,) = times[0], of_p
     places = (found["x"][0], found["y"][0]) if len(found["x"]) == len(found["y"]) == 1 else None
-    unit = next((unit for unit in _UNITS if match[unit]), None)
-    return Fields(time, polarity, places, unit)
+    return Fields(time, polarity, places, unit or None)
+
+
+def unit_of(name: str) -> str | None:
+    """The unit that a word says, perhaps in brackets; None where it says none.
+
+    >>> unit_of("[microseconds]"), unit_of("p")
+    ('us', None)
+    """
+    match = _UNIT.fullmatch(_plain(name).strip("()[]").strip())
+    return next((unit for unit in _UNITS if match[unit]), None) if match else None
+
+
+def _plain(name: str) -> str:
+    return name.strip().strip("\"'").strip().lower()
+
+
+def _as_time(name: str) -> str | None:
+    """The unit that a name of times says, empty for none; None where it is of something else."""
+    if _TIME.fullmatch(name):
+        return ""
+    for form in (_BRACKETS, _WITH_UNIT, _SHORT_UNIT):
+        match = form.fullmatch(name)
+        if match and _TIME.fullmatch(match[1]):
+            unit = unit_of(match[2])
+            return unit if unit or form is not _BRACKETS else ""
+    # A unit alone; `s` may be a sign.
+    return unit_of(name) if len(name) > 1 else None
 
 
 def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
-    """The columns of a table without names, by what is in them: two, or four with places.
+    """The columns of a table without names, by what is in them: two, or four with places, or one more.
+
+    One more may number the rows, or be the same in all.
 
     Polarities are two values at most, times rise or have decimals; None where that does not tell them apart.
 
@@ -173,6 +232,16 @@ def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
     >>> fields_of_values([np.array([1, 0, 1]), np.array([7, 9, 12])])
     Fields(time=1, polarity=0, places=None, unit=None)
     """
+    if len(columns) in (3, 5):
+        # One that counts the rows, or is the same in all, says nothing.
+        kept = [k for k, column in enumerate(columns) if not _counts_rows(column)]
+        if len(kept) == len(columns):
+            kept = [k for k, column in enumerate(columns) if (column != column[0]).any()]
+        found = fields_of_values([columns[k] for k in kept]) if len(kept) == len(columns) - 1 else None
+        if found is None:
+            return None
+        places = (kept[found.places[0]], kept[found.places[1]]) if found.places else None
+        return Fields(kept[found.time], kept[found.polarity], places)
     signs = [k for k, column in enumerate(columns) if _are_signs(column)]
     if len(columns) == 2:
         if not signs:
@@ -204,6 +273,10 @@ def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
     return Fields(times[0], signs[0], (x, y))
 
 
+def _counts_rows(values: NDArray[Any]) -> bool:
+    return values.dtype.kind in "iuf" and len(values) > 2 and bool((np.diff(values.astype(float)) == 1).all())
+
+
 def _are_signs(values: NDArray[Any]) -> bool:
     if values.dtype.kind == "b":
         return True
@@ -212,16 +285,19 @@ def _are_signs(values: NDArray[Any]) -> bool:
     return bool(np.isin(values, (-1, 0, 1)).all())
 
 
-def time_unit(times: NDArray[Any], named: str | None) -> TimeUnit:
+def time_unit(times: NDArray[Any], named: str | None, share: float = 1.0) -> TimeUnit:
     """The unit of times: the one that their column's name says, or else what cameras do.
 
     A camera counts microseconds, whole ones: nanoseconds of one are multiples of 1000, milliseconds have
     three decimals, seconds six. A unit by which less than 20 or more than 50 million events come a second is
-    another one. Times since 1970 say their unit by themselves.
+    another one. Times since 1970 say their unit by themselves. Where a list would be over in an instant, or
+    its events come by the million, and would not in a unit a thousand times as long, its times were rounded
+    to milliseconds.
 
     Args:
         times: The first ones, in any order, int64 or float64 (n,).
         named: The unit of the name; None for none.
+        share: Of all times, those that these are.
 
     >>> time_unit(np.array([0.000125, 0.000893, 0.00131]), None).name
     's'
@@ -229,6 +305,8 @@ def time_unit(times: NDArray[Any], named: str | None) -> TimeUnit:
     'us'
     >>> time_unit(np.array([1_600_000_000_125_000, 1_600_000_000_893_100]), None).name
     'us'
+    >>> time_unit(np.array([0.125, 0.126, 0.131] * 100), None).name
+    's'
     """
     if named is not None:
         return TimeUnit(named, "as its column says")
@@ -240,6 +318,12 @@ def time_unit(times: NDArray[Any], named: str | None) -> TimeUnit:
 
     def likely(unit: str) -> bool:
         return LEAST_RATE_HZ <= rate_hz(unit) <= MOST_RATE_HZ
+
+    def rounded(unit: str, longer: str, least_s: float) -> bool:
+        """Whether the longer of two units is likelier, though by it times are of whole milliseconds."""
+        least_hz, most_hz = _SURE_RATE_HZ
+        short = span * UNITS_US[unit] * 1e-6 < least_s * share
+        return span > 0 and (short or rate_hz(unit) > most_hz) and least_hz <= rate_hz(longer) <= most_hz
 
     for unit in UNITS_US:
         # Whole microseconds of twenty minutes on are no seconds of today: those lie near one another.
@@ -255,13 +339,17 @@ def time_unit(times: NDArray[Any], named: str | None) -> TimeUnit:
     if times.dtype.kind != "f" or (inside == np.round(inside)).all():
         whole = inside - inside[:1]
         if span > 0 and (whole % 1000 == 0).all() and rate_hz("ns") <= MOST_RATE_HZ:
+            if rounded("ns", "us", _LEAST_SPAN_S):
+                return TimeUnit("us", "guessed: whole numbers, multiples of 1000, too close for ns", others)
             return TimeUnit("ns", "guessed: whole numbers, all multiples of 1000", others)
-        if rate_hz("us") > MOST_RATE_HZ:
-            return TimeUnit("ns", "guessed: whole numbers, too close for us", others)
+        if rounded("us", "ms", _LEAST_COUNTED_S):
+            return TimeUnit("ms", "guessed: whole numbers, too close for us", others)
         if not likely("us") and likely("ns"):
             return TimeUnit("ns", "guessed: whole numbers, too far apart for us", others)
         return TimeUnit("us", "guessed: whole numbers", others)
     decimals = 3 if np.abs(inside * 1e3 - np.round(inside * 1e3)).max() < 1e-4 else 6
+    if decimals == 3 and rounded("ms", "s", _LEAST_SPAN_S):
+        return TimeUnit("s", "guessed: 3 decimals, too close for ms", others)
     tried = ("ms", "us") if decimals == 3 else ("s", "ms", "us")
     for unit in tried:
         if rate_hz(unit) >= LEAST_RATE_HZ:

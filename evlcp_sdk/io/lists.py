@@ -4,6 +4,8 @@ What is not said (which column is what, the unit of the times) is guessed from n
 source's header says how.
 """
 
+import codecs
+import csv
 import gzip
 import itertools
 import re
@@ -11,6 +13,7 @@ import zipfile
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import IO, Any, Final, Literal
@@ -29,6 +32,7 @@ from evlcp_sdk.io.fields import (
     fields_of_values,
     polarities,
     time_unit,
+    unit_of,
 )
 from evlcp_sdk.io.tables import COLUMNS, CSV_HEADER, DAMAGE, NpzColumn, said, show
 from evlcp_sdk.io.urls import flag, split_options
@@ -47,8 +51,11 @@ MOST_WAITING: Final = 1 << 20
 
 _PLACES: Final = 1 << 16
 _COMMENTS: Final = (b"#", b"%", b"//")
-_SEPARATORS: Final = (b";", b"\t", b",")
+_SEPARATORS: Final = (b";", b"\t", b"|", b",")
 _DECIMAL_COMMA: Final = re.compile(rb"(?<=\d),(?=\d)")
+_UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
+_TITLES: Final = 10
+"""Lines that may stand above a table: a title, what recorded it, `sep=;`."""
 _TEXT: Final = re.compile(rb"[\t\r\n -~\x80-\xff]+")
 _NPY: Final = b"\x93NUMPY"
 _MAT: Final = b"MATLAB "
@@ -92,9 +99,10 @@ def _unit(text: str) -> str:
 class ListSource(EventSource):
     """A table of times and polarities of events, and of places where it has them.
 
-    CSV (`,` `;` tab or blanks, plain or gzipped, `#` `%` `//` before comments), NPZ and MAT of arrays, of
-    one structured or (n, 2) or (n, 4) array, and NPY of such a one. Columns are known by their names, or
-    else by their values. The unit of the times is the one that the name says (`t_us`, `time [ms]`), or else
+    CSV (`,` `;` `|` tab or blanks, UTF-8 or UTF-16, plain or gzipped, `#` `%` `//` before comments, up to
+    ten lines of titles above), NPZ and MAT of arrays, of one structured or (n, 2) or (n, 4) array, and NPY of
+    such a one. Columns are known by their names, or else by their values. The unit of the times is the one
+    that the name says (`t_us`, `time [ms]`), or a line of units below the names, or else
     guessed, see `time_unit`; `header` says which, and why. Without places every event is of pixel (0, 0).
     Rows may be in any order as far as a million of them go; they are sorted, and counted.
 
@@ -136,7 +144,9 @@ class ListSource(EventSource):
             self._pieces = iter(()) if first is None else itertools.chain((first,), pieces)
             times = np.empty(0, np.int64) if first is None else first[0][:LOOKED_AT]
             named = unit if unit is not None else (self._fields.unit if self._fields else None)
-            self._unit = time_unit(times, named)
+            # Of the first piece, those that are looked at; of the file, the first piece.
+            seen = len(times) / len(first[0]) if first is not None and len(first[0]) else 1.0
+            self._unit = time_unit(times, named, seen * min(self._position / max(size, 1), 1.0))
             if unit is not None:
                 self._unit = TimeUnit(unit, "as told")
             self._sieve = Sieve(self._where, None, None)
@@ -162,6 +172,9 @@ class ListSource(EventSource):
         zipped = raw.read(2) == b"\x1f\x8b"
         raw.seek(0)
         file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if zipped else raw
+        if not zipped and raw.read(2) in _UTF_16:
+            file = codecs.EncodedFile(raw, "utf-8", "utf-16")
+        raw.seek(0)
         text = file.read(PIECE_BYTES)
         table = _Text(text, self._fields)
         if table.fields is None:
@@ -193,15 +206,19 @@ class ListSource(EventSource):
     def _npz(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
         archive = stack.enter_context(zipfile.ZipFile(target))
         names = [member.removesuffix(".npy") for member in archive.namelist()]
-        if self._fields is None and (len(names) == 1 or fields_of(names) is None):
+        fields = self._fields or fields_of(names) or _fields_of_two(target, archive)
+        if self._fields is None and (len(names) == 1 or fields is None):
             for name in sorted(names, key=len):
                 if _is_table(archive, f"{name}.npy"):
                     break
             else:
                 raise InputError(f"{target}: found the arrays {', '.join(sorted(names))}, expected t and p")
             return self._table(_Array(target, stack.enter_context(archive.open(f"{name}.npy"))))
-        fields = self._fields = self._fields or fields_of(names)
         assert fields is not None
+        if fields.places and any(_is_scalar(archive, f"{names[k]}.npy") for k in fields.places):
+            # Where the pixels are, not a place of each event.
+            fields = replace(fields, places=None)
+        self._fields = fields
         if max(fields.which) >= len(names):
             raise InputError(f"{target}: found {len(names)} arrays, expected {max(fields.which) + 1}")
         columns = [
@@ -247,6 +264,7 @@ class ListSource(EventSource):
 
     def _mat(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
         arrays = _mat_arrays(target)
+        self._position = target.stat().st_size
         names = list(arrays)
         if (fields := self._fields or fields_of(names)) is not None and max(fields.which) < len(names):
             columns = [_flat(arrays[names[k]]) for k in fields.which]
@@ -387,7 +405,7 @@ def is_list(path: Path) -> bool:
         if kind == "NPZ":
             with zipfile.ZipFile(path) as archive:
                 names = [member.removesuffix(".npy") for member in archive.namelist()]
-                if fields_of(names) is None:
+                if fields_of(names) is None and _fields_of_two(path, archive) is None:
                     return any(_is_table(archive, name) for name in archive.namelist())
             return not set(COLUMNS) <= set(names)
         with path.open("rb") as file:
@@ -399,9 +417,29 @@ def is_list(path: Path) -> bool:
         if isinstance(error, OSError) and not isinstance(error, gzip.BadGzipFile):
             raise
         return False
+    if start.startswith(_UTF_16):
+        start = start[: len(start) // 2 * 2].decode("utf-16", "replace").encode()
     if start.removeprefix(b"\xef\xbb\xbf").split(b"\n")[0].strip() == CSV_HEADER:
         return False
     return _TEXT.fullmatch(start) is not None and _Text(start, None).fields is not None
+
+
+def _fields_of_two(path: Path, archive: zipfile.ZipFile) -> Fields | None:
+    """Which of two arrays without telling names are times and polarities, by their values."""
+    names = [member.removesuffix(".npy") for member in archive.namelist()]
+    if len(names) != 2:
+        return None
+    try:
+        with ExitStack() as stack:
+            columns = [NpzColumn(path, archive, name, stack, kinds="iufbUS", bounded=False) for name in names]
+            return fields_of_values([column.take(LOOKED_AT) for column in columns])
+    except InputError:
+        return None
+
+
+def _is_scalar(archive: zipfile.ZipFile, name: str) -> bool:
+    with archive.open(name) as member:
+        return _npy_header(member)[0] == ()
 
 
 def _is_table(archive: zipfile.ZipFile, name: str) -> bool:
@@ -537,7 +575,8 @@ class _Array:
     def fields(self) -> Fields | None:
         """Which column is what, by their names, or else by the first rows."""
         self._ahead = self._read(LOOKED_AT)
-        return fields_of(self._dtype.names) if self._dtype.names else fields_of_values(self._ahead)
+        named = fields_of(self._dtype.names) if self._dtype.names else None
+        return named or fields_of_values(self._ahead)
 
     def take(self, rows: int) -> list[NDArray[Any]]:
         """The next rows of every column."""
@@ -579,25 +618,52 @@ class _Text:
             if line.strip()
         ]
         self.line, self.heading = data[0] if data else (1, lines[0] if lines else b"")
-        sample = [line for _, line in data[:256]]
-        self._separator = _separator(sample)
+        self._separator = _separator([line for _, line in data[:256]])
         self.is_named = False
         self.fields = fields
-        head = self.cells(self.heading)
-        if data and not any(_is_number(cell) for cell in head) and fields_of(head) is not None:
-            self.is_named = True
-            self.fields = fields or fields_of(head)
-        elif fields is None and data:
-            named = next((found for text in above[::-1] if (found := self._said(text, len(head)))), None)
-            self.fields = named or self._shown(sample)
-        elif (
-            fields is not None
-            and data
-            and not _is_number(head[fields.time] if len(head) > fields.time else "")
-        ):
-            self.is_named = True
+        if fields is not None and data:
+            self.line, _ = _first_number(data, fields.time, self)
+        elif data:
+            for top in range(min(_TITLES, len(data))):
+                found = self._told([line for _, line in data[top:]], above)
+                if found is not None:
+                    self.fields, self.is_named, units = found
+                    self.line, self.heading = data[top + units] if top + units < len(data) else data[top]
+                    break
+                if top + 1 < len(data) and self._is_like(data[top][1], data[top + 1][1]):
+                    break
         self.first = self.line + self.is_named
         self.line = self.first if self.fields is not None else self.line
+
+    def _told(self, lines: list[bytes], above: list[bytes]) -> tuple[Fields, bool, int] | None:
+        """Which is what, if a table begins with these lines.
+
+        Returns:
+            The columns; whether the first line names them; and how many lines of units follow that.
+        """
+        head = self.cells(lines[0])
+        if not any(_is_number(cell) for cell in head):
+            named = fields_of(head)
+            if named is None:
+                return None
+            second = self.cells(lines[1]) if len(lines) > 1 else []
+            unit = unit_of(second[named.time]) if len(second) > max(named.which) else None
+            units = unit is not None
+            if unit:
+                named = replace(named, unit=named.unit or unit)
+            rows = [self.cells(line) for line in lines[1 + units : 9]]
+            if rows and all(len(row) == len(head) + 1 for row in rows):
+                # Without a name for the numbers of rows, as R writes it.
+                named = named.behind(1)
+            return named, True, int(units)
+        above_it = next((found for text in above[::-1] if (found := self._said(text, len(head)))), None)
+        shown = above_it or self._shown(lines[:256])
+        return None if shown is None else (shown, False, 0)
+
+    def _is_like(self, line: bytes, following: bytes) -> bool:
+        """Whether a line is a row as the next one is: no title then, and not to be passed over."""
+        cells = self.cells(line)
+        return len(cells) == len(self.cells(following)) and any(_is_number(cell) for cell in cells)
 
     def _said(self, text: bytes, many: int) -> Fields | None:
         for cells in (self.cells(text), re.split(r"[,;\s]+", text.decode("utf-8", "replace"))):
@@ -629,12 +695,11 @@ class _Text:
             # As older programs write a micro sign.
             text = line.decode("latin-1").strip()
         if self._separator == b" ":
-            return [self._plain(cell) for cell in text.split()]
-        return [self._plain(cell) for cell in text.split(self._separator.decode())]
-
-    def _plain(self, cell: str) -> str:
-        cell = cell.strip().strip("\"'").strip()
-        return cell if self._separator == b"," else re.sub(r"(?<=\d),(?=\d)", ".", cell)
+            return [_plain(cell) for cell in text.split()]
+        mark = self._separator.decode()
+        if '"' in text:
+            return [_plain(cell) for cell in next(csv.reader([text], delimiter=mark, skipinitialspace=True))]
+        return [_plain(cell) for cell in text.split(mark)]
 
     def rows(
         self, lines: list[bytes], first: int, last_is_cut: bool, fault: Callable[[int, str], InputError]
@@ -712,6 +777,19 @@ class _Text:
         except ValueError:
             return _is_number(cells[self.fields.polarity])
         return True
+
+
+def _plain(cell: str) -> str:
+    """A cell without quotes, and with a point where it has a comma."""
+    return re.sub(r"(?<=\d),(?=\d)", ".", cell.strip().strip("\"'").strip())
+
+
+def _first_number(data: list[tuple[int, bytes]], time: int, text: "_Text") -> tuple[int, bytes]:
+    """The first of some lines, with their numbers, that has a number for its time; else the very first."""
+    rows = (
+        (k, line) for k, line in data if len(cells := text.cells(line)) > time and _is_number(cells[time])
+    )
+    return next(rows, data[0])
 
 
 def _separator(lines: list[bytes]) -> bytes:

@@ -346,7 +346,10 @@ class CsvSource(EventSource):
             raise
         if header[0].removeprefix(b"\xef\xbb\xbf").rstrip(b"\r") != CSV_HEADER:
             self.close()
-            raise InputError(f"{path}: line 1: found {show(header[0])}, expected '{CSV_HEADER.decode()}'")
+            raise InputError(
+                f"{path}: line 1: found {show(header[0])}, expected '{CSV_HEADER.decode()}', or names of"
+                " times and polarities, such as t and p (list:PATH?columns=t,p says which they are)"
+            )
         self._text = header[2]
         self._line = 2
 

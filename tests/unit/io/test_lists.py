@@ -175,6 +175,85 @@ def test_lists_as_people_write_them(name: str, tmp_path: Path) -> None:
         np.testing.assert_array_equal(events.p, P)
 
 
+MORE = {
+    "ts is a time, and no seconds": text(T_US, P, head="ts,p"),
+    "unit in words": text(T_US, P, head="time in microseconds,polarity"),
+    "a unit for a name": text(T_S, P, head="seconds,pol", form="%.6f"),
+    "units of polarity": text(T_US, P, head="t [us],p [0/1]"),
+    "what polarity is": text(T_US, P, head="t (us),polarity (1=ON 0=OFF)"),
+    "t of events": text(T_US, P, head="t_event,p_event"),
+    "a state": text(T_US, P, head="t,is_on"),
+    "elapsed": text(T_US * 1e-3, P, head="elapsed_ms,event_type", form="%.3f"),
+    "numbers of rows, no heading": text(np.arange(3000), T_US, P),
+    "numbers of rows from 1": text(np.arange(1, 3001), T_S, SIGNS, mark=" ", form="%.6f"),
+    "the same throughout, no heading": text(T_US, P, np.full(3000, 7)),
+    "as R writes it": text(np.arange(1, 3001), T_US, P, head='"t" "p"', mark=" "),
+    "commas in quoted names": text(T_US, P, head='"time, us","polarity, 0 or 1"').replace("time, us", "t_us"),
+    "decimal commas in quotes": "t,p\n"
+    + "".join(f'"{t:.6f}",{p}\n'.replace(".", ",") for t, p in zip(T_S, P, strict=True)),
+    "bars": text(T_US, P, head="t|p", mark="|"),
+    "a spreadsheet's hint": "sep=;\n" + text(T_US, P, head="t;p", mark=";"),
+    "a title": "LED 1, 30 m\n\n" + text(T_US, P, head="t,p"),
+    "a title and no names": "LED 1\n" + text(T_US, P),
+    "the sensor's size": "1280 720\n" + text(T_US, X, Y, P, mark=" "),
+    "a line of units": text(T_US * 1e-3, P, head="time,polarity\n[ms],[0/1]", form="%.3f"),
+    "rising and falling": text(T_US, np.where(P == 1, "rising", "falling"), head="t,edge type").replace(
+        "edge ", ""
+    ),
+}
+
+
+@pytest.mark.parametrize("name", MORE)
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_headings_of_many_kinds(name: str, encoding: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(MORE[name], encoding)
+    with open_source(tmp_path / "a.csv") as source:
+        events, _ = source.read()
+    np.testing.assert_array_equal(events.t_us, T_US)
+    np.testing.assert_array_equal(events.p, P)
+
+
+def test_a_first_row_that_is_wrong_is_no_title(tmp_path: Path) -> None:
+    for first in ("17,3", "nine,1", "17,2,5"):
+        (tmp_path / "a.csv").write_text("t,p\n" + first + "\n" + text(T_US, P))
+        with pytest.raises(InputError, match="line 2"), open_source(tmp_path / "a.csv") as source:
+            source.read()
+    (tmp_path / "b.csv").write_text("17,3\n" + text(T_US, P))
+    with pytest.raises(InputError, match="line 1: found '17,3'"):
+        open_source(tmp_path / "b.csv")
+
+
+@pytest.mark.parametrize("many", [1, 40])
+@pytest.mark.parametrize("form", ["%.3f s", "%.6f s", "%.0f ms", "%.1f ms", "%.0f us", "%.0f ns"])
+@pytest.mark.parametrize("first_us", [0, 37_123_000, 259_200_012_000])
+def test_times_to_the_millisecond_say_their_unit(many: int, form: str, first_us: int, tmp_path: Path) -> None:
+    """Characters of eleven bits at 504 bit/s, a few events or many an edge: 4 s that would be 4 ms."""
+    rng = np.random.default_rng(0)
+    edges = np.cumsum(rng.integers(1, 4, 1000)) * 1e6 / 504
+    rounded = (
+        np.sort(np.rint((edges[:, None] + rng.exponential(200, (1000, many + 1))) / 1000).ravel()) * 1000
+    )
+    rounded = rounded.astype(np.int64) + first_us
+    shape, unit = form.split()
+    factor = {"s": 1e-6, "ms": 1e-3, "us": 1.0, "ns": 1e3}[unit]
+    rows = "".join(f"{shape % (t * factor)},{k % 2}\n" for k, t in enumerate(rounded.tolist()))
+    (tmp_path / "a.csv").write_text("t,p\n" + rows)
+    with open_source(tmp_path / "a.csv") as source:
+        np.testing.assert_array_equal(source.read()[0].t_us, rounded)
+        assert "guessed" in source.header["time"]
+
+
+def test_two_arrays_without_names_and_where_the_pixels_are(tmp_path: Path) -> None:
+    np.savez(tmp_path / "a.npz", P, T_S)
+    np.savez(tmp_path / "b.npz", t=T_US, p=P, x=5, y=6)
+    np.save(tmp_path / "c.npy", np.rec.fromarrays([P, T_US]))
+    for name in ("a.npz", "b.npz", "c.npy"):
+        with open_source(tmp_path / name) as source:
+            events, _ = source.read()
+        np.testing.assert_array_equal(events.t_us, T_US)
+        np.testing.assert_array_equal(events.p, P)
+
+
 PLACED = {
     "x,y,t,p": text(X, Y, T_US, P, head="x,y,t,p"),
     "t x y p": text(T_S, X, Y, P, mark=" ", form="%.9f"),
