@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -64,14 +65,23 @@ def airy_blur(unit_px: float, other_px: float) -> Blur:
         unit_px: Wavelength times f-number, px.
         other_px: Sigma of the Gaussian, px.
     """
+    sigma, share = _airy_pattern(unit_px)
+    return Blur(np.hypot(sigma * unit_px, other_px), share)
+
+
+@lru_cache(16)
+def _airy_pattern(unit_px: float) -> tuple[Floats, Floats]:
+    """Sigmas, wavelengths times f-number, and shares of its Gaussians; a scene asks for it in every block."""
     wings = max(1, 1 + math.floor(math.log2(WIDEST_WING_PX / (FIRST_WING_SIGMA * unit_px))))
     sigma = FIRST_WING_SIGMA * 2.0 ** np.arange(wings)
     share = WING_SHARE / sigma
     # The wings that are left out have as much together as the widest of the others.
     share[-1] *= 2
-    sigma = np.append(CORE_SIGMA, sigma)
-    share = np.append(1 - share.sum(), share)
-    return Blur(np.hypot(sigma * unit_px, other_px), np.asarray(share, np.float64))
+    all_sigma: Floats = np.append(CORE_SIGMA, sigma)
+    all_share = np.asarray(np.append(1 - share.sum(), share), np.float64)
+    for table in (all_sigma, all_share):
+        table.setflags(write=False)
+    return all_sigma, all_share
 
 
 def _integral(z: Floats, sigma: Floats | float) -> Floats:

@@ -18,13 +18,16 @@ ON_FACTOR, OFF_FACTOR, U_BASE, T_BASE, REFERENCE, T_READY, T_LAST_OUT, LIGHT, FO
 the log signal behind the source follower, where that has a time constant."""
 
 DRAW, ARMED, BLOCK = range(3)
-"""Columns of a pixel's counters."""
+"""Columns of a pixel's counters; BLOCK is 2 more than the last block in which it was active, 0 for none."""
 
 LIGHT_STEP = 1e-3
 """Relative change of a pixel's light that is not worth a new piece: the light stays until it is more."""
 
 COLUMN_BITS = 12
 """A request's code is (row << COLUMN_BITS | column) << 1 | polarity."""
+
+_SERVED = -2
+"""Instead of a request's follower: it waits no longer."""
 
 _PLACES = np.empty(64, np.int64)
 """Place of the only bit of a word, by the upper bits of its product with a de Bruijn sequence."""
@@ -687,7 +690,7 @@ def run_pixels(
             code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
             key[i] = _key_of(seed, pixel)
             f[_X + i], f[_Y + i] = pixel % width, pixel // width
-            new = c[BLOCK] != block - 1
+            new = c[BLOCK] != block + 1
             f[_NEW + i] = 1.0 if new else 0.0
             if new and s[ON_FACTOR] == 0.0:
                 s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
@@ -756,16 +759,16 @@ def run_pixels(
                     for i in range(count):
                         nearest, furthest = min(nearest, f[_ALONG + i]), max(furthest, f[_ALONG + i])
                         beyond |= abs(f[_ACROSS + i]) < reach + 0.5 * strip_px[g, pose]
-                    k = 0
-                    while k < clusters[g] and bounds[g, k + 1, pose] <= nearest - reach:
-                        k += 1
-                    m = k
+                    b = 0
+                    while b < clusters[g] and bounds[g, b + 1, pose] <= nearest - reach:
+                        b += 1
+                    m = b
                     while beyond and m < clusters[g] and bounds[g, m, pose] < furthest + reach:
                         m += 1
-                    low[a], high[a] = k, m
-                    if m > k:
+                    low[a], high[a] = b, m
+                    if m > b:
                         _near_weights(
-                            lanes, f, strip_px[g, pose], bounds[g, k : m + 1, pose], gain[g] * near_share,
+                            lanes, f, strip_px[g, pose], bounds[g, b : m + 1, pose], gain[g] * near_share,
                             near_tables[g], near_scale[g], reach, rows, nodes, beside, weight[a],
                         )  # fmt: skip
                 if moved or stale:
@@ -808,7 +811,7 @@ def run_pixels(
             s[U_BASE], s[T_BASE], s[REFERENCE] = f[_U + i], end_us, f[_REFERENCE + i]
             s[T_READY], s[T_LAST_OUT] = f[_READY + i], f[_LAST_OUT + i]
             s[LIGHT], s[FOLLOWER] = f[_NOW + i], f[_FOLLOWER + i]
-            c[DRAW], c[ARMED], c[BLOCK] = draw[i], int(f[_ARMED + i]), block
+            c[DRAW], c[ARMED], c[BLOCK] = draw[i], int(f[_ARMED + i]), block + 2
     return last, n
 
 
@@ -879,20 +882,23 @@ def sort_events(t: Array, code: Array, out_t: Array, out_code: Array) -> None:
     for i in range(n):
         key = int((t[i] - first) * scale)
         low[(key & 2047) + 1] += 1
-        high[(key >> 11) + 1] += 1
+        high[(key >> 11 & 2047) + 1] += 1
     for b in range(2047):
         low[b + 1] += low[b]
         high[b + 1] += high[b]
     half_t, half_code = np.empty(n, t.dtype), np.empty(n, code.dtype)
     for i in range(n):
         b = int((t[i] - first) * scale) & 2047
-        half_t[low[b]] = t[i]
-        half_code[low[b]] = code[i]
+        # A place without a sign is not looked at for being negative.
+        k = np.uint64(low[b])
+        half_t[k] = t[i]
+        half_code[k] = code[i]
         low[b] += 1
     for i in range(n):
-        b = int((half_t[i] - first) * scale) >> 11
-        out_t[high[b]] = half_t[i]
-        out_code[high[b]] = half_code[i]
+        b = (int((half_t[i] - first) * scale) >> 11) & 2047
+        k = np.uint64(high[b])
+        out_t[k] = half_t[i]
+        out_code[k] = half_code[i]
         high[b] += 1
     for i in range(1, n):
         when, what = out_t[i], out_code[i]
@@ -908,16 +914,17 @@ def sort_events(t: Array, code: Array, out_t: Array, out_code: Array) -> None:
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def drop_blind(t: Array, code: Array, last_us: Array, width: int, refractory_us: float) -> int:
-    """Drop, in place, events of pixels that are still blind from their last one; return how many stay."""
+def drop_blind(t: Array, code: Array, blind_us: Array, width: int, refractory_us: float) -> int:
+    """Drop, in place, events of pixels that are blind until `blind_us`; return how many stay."""
     kept = 0
     for i in range(t.size):
-        pixel = (code[i] >> (COLUMN_BITS + 1)) * width + ((code[i] >> 1) & ((1 << COLUMN_BITS) - 1))
-        # The smallest part of a us stands for the rounding of sums.
-        if t[i] - last_us[pixel] >= refractory_us - 1e-6:
-            last_us[pixel] = t[i]
-            t[kept] = t[i]
-            code[kept] = code[i]
+        what = code[i]
+        pixel = np.uint64((what >> (COLUMN_BITS + 1)) * width + ((what >> 1) & ((1 << COLUMN_BITS) - 1)))
+        if t[i] >= blind_us[pixel]:
+            # The smallest part of a us stands for the rounding of sums.
+            blind_us[pixel] = t[i] + (refractory_us - 1e-6)
+            t[np.uint64(kept)] = t[i]
+            code[np.uint64(kept)] = what
             kept += 1
     return kept
 
@@ -949,20 +956,17 @@ def read_out(
     Returns:
         (events written, events over the cap, requests of waiting pixels, requests left).
     """
-    head = np.full(height, -1, np.int64)
-    tail = np.full(height, -1, np.int64)
-    follow = np.full(t.size, -1, np.int64)
-    served = np.zeros(t.size, np.bool_)
+    # The first and the last request of each row that waits, and after each the next one of its row.
+    head, tail = np.full(height, -1, np.int32), np.empty(height, np.int32)
+    follow = np.empty(t.size, np.int32)
     # One bit a row that waits.
     waits = np.zeros((height >> 6) + 1, np.uint64)
+    hold = pending.size > 0
+    columns = (1 << COLUMN_BITS) - 1
     free, at_row = memory[0], int(memory[1])
     window, used = int(memory[2]), int(memory[3])
     window_end = (window + 1) * cap_window_us
-    n = 0
-    dropped = 0
-    held = 0
-    waiting = 0
-    i = 0
+    n = dropped = held = waiting = i = 0
     while True:
         if waiting == 0:
             if i >= t.size:
@@ -971,21 +975,23 @@ def read_out(
         if free >= safe_us:
             break
         while i < t.size and t[i] <= free:
-            y = code[i] >> (COLUMN_BITS + 1)
-            if pending.size:
-                x = (code[i] >> 1) & ((1 << COLUMN_BITS) - 1)
-                if pending[y, x]:
-                    served[i] = True
+            row = code[i] >> (COLUMN_BITS + 1)
+            if hold:
+                x = (code[i] >> 1) & columns
+                if pending[row, x]:
+                    follow[i] = _SERVED
                     held += 1
                     i += 1
                     continue
-                pending[y, x] = True
+                pending[row, x] = True
+            y = np.uint64(row)
             if head[y] < 0:
                 head[y] = i
-                waits[y >> 6] |= np.uint64(1) << np.uint64(y & 63)
+                waits[y >> np.uint64(6)] |= np.uint64(1) << (y & np.uint64(63))
             else:
-                follow[tail[y]] = i
+                follow[np.uint64(tail[y])] = i
             tail[y] = i
+            follow[i] = -1
             waiting += 1
             i += 1
         at_row += 1
@@ -1003,33 +1009,36 @@ def read_out(
             window_end = (window + 1) * cap_window_us
             used = 0
         begin = n
-        k = head[at_row]
-        head[at_row] = -1
+        next_one = int(head[np.uint64(at_row)])
+        head[np.uint64(at_row)] = -1
         waits[word] ^= lowest
-        while k >= 0:
+        while next_one >= 0:
+            k = np.uint64(next_one)
+            next_one = int(follow[k])
+            follow[k] = _SERVED
+            what = code[k]
+            x = (what >> 1) & columns
             waiting -= 1
-            served[k] = True
-            if pending.size:
-                pending[at_row, (code[k] >> 1) & ((1 << COLUMN_BITS) - 1)] = False
+            if hold:
+                pending[at_row, x] = False
             if cap > 0 and used >= cap:
                 dropped += 1
-            else:
-                used += 1
-                x = (code[k] >> 1) & ((1 << COLUMN_BITS) - 1)
-                j = n
-                while j > begin and out_x[j - 1] > x:
-                    out_t[j], out_x[j], out_y[j], out_p[j] = stamp, out_x[j - 1], at_row, out_p[j - 1]
-                    j -= 1
-                out_t[j], out_x[j], out_y[j], out_p[j] = stamp, x, at_row, code[k] & 1
-                n += 1
-            k = follow[k]
+                continue
+            used += 1
+            j = n
+            while j > begin and out_x[np.uint64(j - 1)] > x:
+                out_x[np.uint64(j)], out_p[np.uint64(j)] = out_x[np.uint64(j - 1)], out_p[np.uint64(j - 1)]
+                j -= 1
+            out_x[np.uint64(j)], out_p[np.uint64(j)] = x, what & 1
+            out_t[np.uint64(n)], out_y[np.uint64(n)] = stamp, at_row
+            n += 1
     left = 0
-    for k in range(t.size):
-        if not served[k]:
-            if pending.size:
-                pending[code[k] >> (COLUMN_BITS + 1), (code[k] >> 1) & ((1 << COLUMN_BITS) - 1)] = False
-            t[left] = t[k]
-            code[left] = code[k]
+    for m in range(t.size):
+        if m >= i or follow[m] != _SERVED:
+            if hold:
+                pending[code[m] >> (COLUMN_BITS + 1), (code[m] >> 1) & columns] = False
+            t[left] = t[m]
+            code[left] = code[m]
             left += 1
     memory[0], memory[1], memory[2], memory[3] = free, at_row, window, used
     return n, dropped, held, left

@@ -373,8 +373,9 @@ class StripLight:
         when, levels = self.bar.switches(begin_us, end_us)
         if self.direct:
             when, levels = self.bar.cover(when, levels, begin_us, end_us)
-        # A dark part is the column behind the last cluster's.
-        return when, np.pad(levels, ((0, 0), (0, 1)))[:, self.clusters]
+        shown = levels[:, self.clusters]
+        shown[:, self.clusters < 0] = 0.0
+        return when, shown
 
 
 def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:

@@ -14,7 +14,7 @@ from evlcp_sdk.scene.optics import Blur, airy_blur, step
 from evlcp_sdk.sim.leds import LitStrip
 from evlcp_sdk.sim.scene import BarSpec, LensSpec
 
-__all__ = ["blur_of", "blur_sigma_px", "led_light_w_m2", "step_table", "strip_profiles", "strip_table"]
+__all__ = ["blur_of", "blur_sigma_px", "led_light_w_m2", "step_table", "strip_table"]
 
 Floats = NDArray[np.float64]
 
@@ -109,17 +109,6 @@ def strip_table(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> Flo
     return table
 
 
-def strip_profiles(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> tuple[Floats, Floats]:
-    """The light across an endless strip, and that before the end of one, in its middle; see `strip_table`.
-
-    Returns:
-        float64 (nodes + 1,) each: by the distance from the middle, and by that before the end, 0 to infinity.
-    """
-    across, before = _strip_parts(blur, strip_px, scale_px, nodes)
-    ahead = np.append(np.full((len(before), 1), 0.5), before[:, ::-1], axis=1)
-    return blur.share @ across, (blur.share * across[:, 0]) @ ahead
-
-
 def _strip_parts(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> tuple[Floats, Floats]:
     """Of each Gaussian, across float64 (n, nodes + 1), and along before an edge, far to near, (n, nodes)."""
     u = np.arange(nodes) / nodes
@@ -127,4 +116,10 @@ def _strip_parts(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> tu
     z = np.append(scale_px * u / (1 - u), 1e6 * scale_px)
     sigma = blur.sigma_px[:, None]
     half = strip_px / 2
-    return step(z + half, sigma) - step(z - half, sigma), step(-z[:0:-1], sigma)
+    steps = step(np.concatenate([z + half, z - half, -z[:0:-1]]), sigma)
+    right, left, before = (
+        steps[:, : nodes + 1],
+        steps[:, nodes + 1 : 2 * nodes + 2],
+        steps[:, 2 * nodes + 2 :],
+    )
+    return right - left, before

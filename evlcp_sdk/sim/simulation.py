@@ -18,7 +18,7 @@ from evlcp_sdk.scene.optics import Blur
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.light import Source, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.optics import blur_of, step_table, strip_profiles, strip_table
+from evlcp_sdk.sim.optics import blur_of, step_table, strip_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
 from evlcp_sdk.values import Events
 
@@ -254,7 +254,6 @@ class Simulation:
         size = scene.camera.width * scene.camera.height
         self._state = np.zeros((size, 9))
         self._counters = np.zeros((size, 3), np.int64)
-        self._counters[:, _kernels.BLOCK] = -2
         hot = np.empty(size, np.int64)
         self._hot = hot[: _kernels.find_hot_pixels(size, scene.sensor.hot_share, self._key, hot)].copy()
         self._halos = [_Halo.of(scene.lens.halo, scene.lens.halo_px, 0)]
@@ -425,7 +424,7 @@ class Simulation:
             wiped_us, shade = wiper_switches(scene.wiper, begin_us, end_us)
         lightest = float(shade.max())
         darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._darkest_texture * shade.min())
-        shown: list[tuple[Source, Floats, Floats, Blur]] = []
+        shown: list[tuple[Source, Floats, Floats, Blur, Floats]] = []
         marked: list[NDArray[np.int64]] = []
         for source in self._sources:
             place, depth = self.seen(source, position, attitude)
@@ -436,10 +435,12 @@ class Simulation:
             blur = blur_of(float(middle_depth[len(middle_depth) // 2]), lens, camera, source.blur_px)
             least = ACTIVITY_FLOOR * max(darkest, sensor.charge_us_w_m2 / source.longest_us)
             light = source.light_w_m2 * lightest
-            lit = self._lit_pixels(place, float(strip_px.max()), blur, light, least)
+            scale = _NEAR_SCALE * float(blur.sigma_px[0])
+            near = strip_table(blur, float(strip_px[len(strip_px) // 2]), scale, _NEAR_NODES)
+            lit = self._lit_pixels(place, float(strip_px.max()), near, scale, light, least)
             if len(lit):
                 marked.append(lit)
-                shown.append((source, place, strip_px, blur))
+                shown.append((source, place, strip_px, blur, near))
         around = scene.background.around_px
         if not shown and around < camera.width:
             return None
@@ -453,12 +454,12 @@ class Simulation:
         origin, axis = np.empty((2, g, poses)), np.empty((2, g, poses))
         bounds, strips = np.zeros((g, most + 1, poses)), np.empty((g, poses))
         clusters, gain = np.empty(g, np.int64), np.empty(g)
-        near = np.empty((g, _NEAR_NODES + 1, 2 * _NEAR_NODES + 1))
+        tables = np.empty((g, _NEAR_NODES + 1, 2 * _NEAR_NODES + 1))
         near_scale, near_reach = np.empty(g), np.empty(g)
         switches: list[Floats] = []
         levels_of: list[Floats] = []
         halos_of: list[list[Floats]] = [[] for _ in self._halos]
-        for i, (source, place, strip_px, blur) in enumerate(shown):
+        for i, (source, place, strip_px, blur, near) in enumerate(shown):
             k = source.strip.clusters
             vector = place[:, -1] - place[:, 0]
             axis[:, i] = vector.T / np.hypot(*vector.T)
@@ -466,7 +467,7 @@ class Simulation:
             bounds[i, : k + 1] = ((place - place[:, :1]) * axis[:, i].T[:, None]).sum(-1).T
             strips[i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
             near_scale[i], near_reach[i] = _NEAR_SCALE * blur.sigma_px[0], blur.reach_px
-            near[i] = strip_table(blur, float(strip_px[poses // 2]), near_scale[i], _NEAR_NODES)
+            tables[i] = near
             when, levels = source.switches(begin_us, end_us)
             switches.append(when)
             levels_of.append(levels)
@@ -478,7 +479,7 @@ class Simulation:
             origin, axis, bounds, strips, clusters, gain,
             np.array([-one.reach_px for one in self._halos]), np.array([one.per_px for one in self._halos]),
             np.array([one.share for one in self._halos]), np.array([one.every for one in self._halos]),
-            self._near_share, near, near_scale, near_reach, np.stack([one.table for one in self._halos]),
+            self._near_share, tables, near_scale, near_reach, np.stack([one.table for one in self._halos]),
             np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]), turn,
             self._texture_every, self._texture,
             np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
@@ -514,17 +515,25 @@ class Simulation:
         return every, found
 
     def _lit_pixels(
-        self, place: Floats, strip_px: float, blur: Blur, light_w_m2: float, least_w_m2: float
+        self,
+        place: Floats,
+        strip_px: float,
+        near: Floats,
+        scale_px: float,
+        light_w_m2: float,
+        least_w_m2: float,
     ) -> NDArray[np.int64]:
-        """Pixels, row by row, that a source lights by `least_w_m2` or more at any pose."""
+        """Pixels, row by row, that a source lights by `least_w_m2` or more at any pose.
+
+        `near` is its `strip_table`, with this scale.
+        """
         nothing = np.empty(0, np.int64)
         z = np.arange(0, self._wide_reach, 0.25)
         half = strip_px / 2
-        scale = _NEAR_SCALE * float(blur.sigma_px[0])
-        beside, before = strip_profiles(blur, strip_px, scale, _NEAR_NODES)
-        node, nodes = _NEAR_NODES * z / (z + scale), np.arange(_NEAR_NODES + 1)
-        across = self._near_share * np.interp(node, nodes, beside)
-        along = self._near_share * np.interp(node, nodes, before)
+        node, nodes = _NEAR_NODES * z / (z + scale_px), np.arange(_NEAR_NODES + 1)
+        # The light across an endless strip, and that before the end of one, in its middle.
+        across = self._near_share * np.interp(node, nodes, near[:, -1])
+        along = self._near_share * np.interp(node, nodes, near[0, _NEAR_NODES::-1])
         for halo in self._halos:
             part = halo.step(z + half) - halo.step(z - half)
             across += halo.share * part
@@ -577,7 +586,7 @@ class _Served:
         self._early_us = early_us
         self._later: list[_Requests] = []
         self._queue: _Requests = (np.empty(0), np.empty(0, np.int32))
-        self._last_us = np.full(camera.width * camera.height, -1e18)
+        self._blind_us = np.zeros(camera.width * camera.height)
         self._memory = np.array([-1e18, -1.0, -1.0, 0.0])
         self._pending = np.zeros((camera.height, camera.width) if sensor.hold else (0, 0), bool)
         self._noise_from_us = 0.0
@@ -599,7 +608,7 @@ class _Served:
         _kernels.sort_events(t, code, out_t, out_code)
         cut = len(out_t) if over else int(np.searchsorted(out_t, safe))
         self._later = [(out_t[cut:].copy(), out_code[cut:].copy())]
-        kept = _kernels.drop_blind(out_t[:cut], out_code[:cut], self._last_us, camera.width, sensor.refr_us)
+        kept = _kernels.drop_blind(out_t[:cut], out_code[:cut], self._blind_us, camera.width, sensor.refr_us)
         t = np.concatenate([self._queue[0], out_t[:kept]])
         code = np.concatenate([self._queue[1], out_code[:kept]])
         n = len(t)
@@ -614,7 +623,8 @@ class _Served:
         simulation.count("dropped_blind", cut - kept + held)
         simulation.count("events", written)
         simulation.count("dropped_by_rate_cap", dropped)
-        columns[0][:written] += simulation.scene.t0_us
+        if simulation.scene.t0_us:
+            columns[0][:written] += simulation.scene.t0_us
         return Events(columns[0][:written], columns[1][:written], columns[2][:written], columns[3][:written])
 
 
