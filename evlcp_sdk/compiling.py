@@ -24,13 +24,13 @@ from numba.core.types.functions import BaseFunction
 from numba.cpython import slicing
 from numba.np import arrayobj
 
-__all__ = ["Whole", "prepare"]
+__all__ = ["KeptKernel", "prepare"]
 
 _TRIED = ("0.68.",)
 """Versions of Numba whose parts are known to be what is replaced here."""
 
 
-class Whole:
+class KeptKernel:
     """The kernel that is to be kept, with the functions in it: what is made ready for calls from Python.
 
     Attributes:
@@ -45,11 +45,11 @@ class Whole:
         return self.place == (module, name)
 
 
-def prepare(whole: Whole) -> bool:
+def prepare(kept: KeptKernel) -> bool:
     """Replace what takes long; whether that was done. It is for good: no kernel can be called afterwards."""
     if not numba.__version__.startswith(_TRIED):
         return False
-    _keep_calls_within(whole)
+    _keep_calls_within(kept)
     _resolve_once()
     _list_variables_quickly()
     _count_references_of_arrays_alone()
@@ -60,7 +60,7 @@ def prepare(whole: Whole) -> bool:
     return True
 
 
-def _keep_calls_within(whole: Whole) -> None:
+def _keep_calls_within(kept: KeptKernel) -> None:
     """Functions are linked as they are written, and only the kernel that is kept is optimized and emitted."""
 
     def simplify(self: Any, module: Any) -> None:
@@ -102,8 +102,8 @@ def _keep_calls_within(whole: Whole) -> None:
 
     wrap = cpu.CPUContext.create_cpython_wrapper
 
-    def wrap_whole(self: Any, library: Any, description: Any, *of: Any, **options: Any) -> None:
-        if whole.is_it(description.modname, description.qualname):
+    def wrap_kept(self: Any, library: Any, description: Any, *of: Any, **options: Any) -> None:
+        if kept.is_it(description.modname, description.qualname):
             wrap(self, library, description, *of, **options)
 
     library: Any = codegen.JITCodeLibrary
@@ -113,7 +113,7 @@ def _keep_calls_within(whole: Whole) -> None:
     library.serialize_using_object_code = emitted
     context: Any = cpu.CPUContext
     context.get_executable = not_callable
-    context.create_cpython_wrapper = wrap_whole
+    context.create_cpython_wrapper = wrap_kept
     context.create_cfunc_wrapper = lambda *_, **__: None
 
 

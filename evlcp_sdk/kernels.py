@@ -45,7 +45,7 @@ from numba.core.sigutils import normalize_signature
 from evlcp_sdk.signals import ENDING
 
 if TYPE_CHECKING:
-    from evlcp_sdk.compiling import Whole
+    from evlcp_sdk.compiling import KeptKernel
 
 __all__ = ["njit", "pack"]
 
@@ -227,7 +227,7 @@ class _Cache:
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """The kernel for a signature; None where it is to be compiled here."""
-        within = _WHOLE is not None and not _WHOLE.is_it(*self._place)
+        within = _KEPT is not None and not _KEPT.is_it(*self._place)
         if within and self._place[1].startswith("_"):
             # It is kept as a part of others.
             return None
@@ -246,7 +246,7 @@ class _Cache:
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep a kernel that was compiled here."""
-        if self._folder is not None and (_WHOLE is None or _WHOLE.is_it(*self._place)):
+        if self._folder is not None and (_KEPT is None or _KEPT.is_it(*self._place)):
             self._folder.save_overload(sig, data)  # type: ignore[no-untyped-call]
 
     def kept(self, target_context: Any) -> Iterator[tuple[Any, tuple[Any, ...]]]:
@@ -469,7 +469,7 @@ class _Compiler:
 
 _COMPILER = _Compiler()
 
-_WHOLE: "Whole | None" = None
+_KEPT: "KeptKernel | None" = None
 """In a child: the kernel that is to be kept; it keeps no other."""
 
 register("numba:compile", _Patience())  # type: ignore[no-untyped-call]
@@ -489,15 +489,15 @@ def _serve(pipe: Connection) -> NoReturn:
         gc.set_threshold(100_000)
         from evlcp_sdk import compiling
 
-        whole = compiling.Whole()
-        global _WHOLE
-        _WHOLE = whole if compiling.prepare(whole) else None
+        kept = compiling.KeptKernel()
+        global _KEPT
+        _KEPT = kept if compiling.prepare(kept) else None
         most_pages = _resident_pages() + (_GROWN_MB << 20) // os.sysconf("SC_PAGE_SIZE")
         while pipe.poll(_IDLE_S):
             module, name, sig = pipe.recv()
             kernel = getattr(importlib.import_module(module), name, None)
             if kernel is not None:
-                whole.place = module, name
+                kept.place = module, name
                 # As a part of another it has nothing to be called by.
                 kernel.overloads.pop(tuple(sig), None)
                 with suppress(Exception):

@@ -126,5 +126,5 @@ def test_kernels_of_the_child_give_the_same_bits(tmp_path: Path) -> None:
 def test_another_version_of_numba_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
     resolve = compiling.BaseFunction.get_call_type
     monkeypatch.setattr(compiling.numba, "__version__", "0.99.0")
-    assert not compiling.prepare(compiling.Whole())
+    assert not compiling.prepare(compiling.KeptKernel())
     assert compiling.BaseFunction.get_call_type is resolve
