@@ -57,6 +57,7 @@ class EdgeSeparation(Separation):
         # Log-likelihood ratio of an answer to an edge is this much more than half of it if they agree.
         half, apart = (agree + disagree) / 2, (agree - disagree) / 2
         norm = np.maximum(np.abs(edges).sum(1), 1)
+        edges32 = edges.astype(np.float32)
 
         def separate(sums: NDArray[np.int16]) -> PresenceMap:
             _, height, width = sums.shape
@@ -71,7 +72,9 @@ class EdgeSeparation(Separation):
             probability = probability.reshape(len(chips), rows, columns).astype(np.float32)
             probability[:, seen < self.min_answers] = 0
             selected = probability >= self.min_probability
-            pixels = np.tensordot(edges, np.sign(sums[1:]).astype(np.int64), 1) / norm[:, None, None]
+            # Sums of ones are exact in float32, and floats are multiplied by BLAS.
+            told = edges32 @ np.sign(sums[1:]).astype(np.float32).reshape(n, -1)
+            pixels = told.reshape(-1, height, width).astype(np.float64) / norm[:, None, None]
             near = ndimage.binary_dilation(selected, np.ones((1, 3, 3), np.bool_))
             pixels = np.where(to_pixels(near, self.grid_px, height, width), np.maximum(pixels, 0), 0)
             return PresenceMap(probability, self.grid_px, selected, pixels.astype(np.float32))

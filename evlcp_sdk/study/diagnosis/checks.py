@@ -494,8 +494,9 @@ def _focus(facts: Facts) -> Check:
             "focus",
             "doubt" if facts.reads else "fail",
             "defocus",
-            f"{said}: the light of each cluster covers its neighbours",
-            _SHARPER,
+            f"{said}: the light of each cluster covers its neighbours, or the layout is another one",
+            f"{_SHARPER}; if the picture is sharp, compare [bar] with the transmitter's: `evlcp config` at"
+            " both ends",
         )
     return Check("focus", "pass", "focus", said)
 

@@ -177,6 +177,16 @@ def test_a_framing_without_a_preamble_is_judged_by_its_frames(code: str) -> None
     assert (trial.changes, trial.frames > 10) == ((), not code)
 
 
+def test_a_panel_looks_like_a_bar_out_of_focus_and_is_said_to_be_one_perhaps() -> None:
+    counts = {"preambles": 0, "regions_opened": 1, "frames": 0, "frames_rejected": 0}
+    panel = replace(BAR, wide_px=51.0, high_px=77.0)
+    checks = checks_of(Facts(LINK, 10**6, Seen(0.0, 2e5), (panel,), None, counts, RunTally(LINK.packet)))
+    (one,) = [one for one in checks if one.stage == "focus"]
+    assert (one.code, one.verdict) == ("defocus", "fail")
+    assert "layout is another one" in one.said
+    assert "compare [bar] with the transmitter's" in one.next_step
+
+
 def test_rate_is_measured_without_a_link() -> None:
     survey = LightSurvey(1280, 720)
     with rendered(("air.chip_rate_hz=6250",)) as source:
