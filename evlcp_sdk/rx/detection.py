@@ -275,7 +275,9 @@ class RegionFollower:
     def ahead(self, start_us: int, until_us: int, events: Events, meant: Collection[int]) -> Iterator[None]:
         """Let some regions have what there is so far of a time step, and their places by that.
 
-        Behind it, all is as if the step had not begun, but for what frames showed in the meantime.
+        They have the events of the whole image, of which a frame takes those in its own: to select them takes
+        longer, and they are selected with the whole step. Behind it, all is as if the step had not begun, but
+        for what frames showed in the meantime.
 
         Args:
             start_us: Start of the step, us.
@@ -283,22 +285,24 @@ class RegionFollower:
             events: Those in it, in order; they come again with the whole step.
             meant: Numbers of regions that are alive, of known size.
         """
-        self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
-        late = 2 * (until_us - start_us) >= self._spec.step_us
-        boxes = self._boxes(start_us + self._spec.step_us / 2, ())
         seen_us = until_us - self._age_us
-        for followed, box, own in zip(self.alive, boxes, self._own(boxes), strict=True):
-            if followed.id not in meant:
-                continue
-            followed.add(start_us, select(events, box))
-            # Nearer to the place before it, another says little of where the region goes.
-            if late and (place := self._glance(followed, own, until_us)):
-                followed.positions.append(place)
+        for followed in self.alive:
+            if followed.id in meant:
+                followed.pieces.append((start_us, events))
+        # Nearer to the place before it, another says little of where the region goes.
+        if 2 * (until_us - start_us) >= self._spec.step_us:
+            self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
+            boxes = self._boxes(start_us + self._spec.step_us / 2, ())
+            for followed, own in zip(self.alive, self._own(boxes), strict=True):
+                if followed.id in meant and (place := self._glance(followed, own, until_us)):
+                    followed.positions.append(place)
         self._recent.append((start_us, events))
         yield
         self._recent.pop()
         for followed in self.alive:
-            if followed.pieces and followed.pieces[-1][0] == start_us:
+            if followed.pieces and followed.pieces[-1][1] is events:
+                followed.pieces.pop()
+            elif followed.pieces and followed.pieces[-1][0] == start_us:
                 followed.take_back()
             if followed.latest.t_us == seen_us:
                 followed.positions.take_back()
