@@ -24,11 +24,19 @@ from evlcp_sdk.study.match import match
 from evlcp_sdk.study.measure import bar_tallies
 from evlcp_sdk.study.tally import Tally
 
+_PANEL = [
+    "bar.rows=16",
+    "bar.columns=16",
+    "bar.led_pitch_m=0.02",
+    "bar.cluster_rows=4",
+    "bar.cluster_columns=4",
+]
+_DIMMED = ["modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed"]
 LINKS: dict[str, list[str]] = {
     "the default": [],
     "NRZ, 8b/10b-like codewords": ["modulation.id=nrz"],
     "4-PPM": ["modulation.id=ppm"],
-    "25 % dimmed pair codes": ["modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed"],
+    "25 % dimmed pair codes": _DIMMED,
     "ring of 12 LEDs": ["bar.shape=ring"],
     "two columns, .5 m apart": ["bar.shape=columns"],
     "two columns, 1.2 m apart": ["bar.shape=columns", "bar.apart_m=1.2", "bar.rows=24"],
@@ -38,13 +46,9 @@ LINKS: dict[str, list[str]] = {
         "bar.led_pitch_m=0.04",
         "bar.cluster_rows=3",
     ],
-    "panel of 4 x 4 clusters": [
-        "bar.rows=16",
-        "bar.columns=16",
-        "bar.led_pitch_m=0.02",
-        "bar.cluster_rows=4",
-        "bar.cluster_columns=4",
-    ],
+    "panel of 4 x 4 clusters": _PANEL,
+    "the same panel, NRZ": [*_PANEL, "modulation.id=nrz"],
+    "the same panel, dimmed": [*_PANEL, *_DIMMED],
 }
 PAIRS: dict[str, tuple[list[str], list[str]]] = {
     "a bar, and one of wh8 beside": ([], ["modulation.id=wh8"]),

@@ -7,6 +7,7 @@ any chips: what a camera sees of them are their edges.
 
 import hashlib
 import json
+from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -46,6 +47,8 @@ _NEIGHBOURS = 256
 Values = NDArray[np.int8]
 Chips = NDArray[np.uint8]
 
+_CODES = "preamble", "pilots", "codewords"
+
 
 def hadamard(order: int) -> Values:
     """Sylvester's Hadamard matrix in natural order, int8 (order, order).
@@ -83,6 +86,12 @@ def are_pairs(chips: ArrayLike) -> bool:
     """
     c = np.asarray(chips)
     return c.shape[-1] % 2 == 0 and bool((c[..., 0::2] != c[..., 1::2]).all())
+
+
+def codes_of_chips(preamble: ArrayLike, pilots: ArrayLike, codewords: ArrayLike) -> frozenset[str]:
+    """Which of the codes, by these names, are no pair codes."""
+    codes = zip(_CODES, (preamble, pilots, codewords), strict=True)
+    return frozenset(name for name, code in codes if not are_pairs(code))
 
 
 def edges_of_chips(chips: ArrayLike) -> Values:
@@ -198,31 +207,32 @@ class Codebook:
         return 1 << self.bits_per_symbol
 
     @cached_property
+    def of_chips(self) -> frozenset[str]:
+        """Which of its codes, `preamble`, `pilots` and `codewords`, are no pair codes."""
+        return codes_of_chips(self.preamble, self.pilots, self.codewords)
+
+    @cached_property
     def pairs(self) -> bool:
         """Whether all codes are pair codes."""
-        return all(are_pairs(code) for code in (self.preamble, self.pilots, self.codewords))
+        return not self.of_chips
 
-    def require_pairs(self, role: str, name: str, other: str) -> None:
+    def require_pairs(self, role: str, name: str, other: str, codes: Collection[str] = _CODES) -> None:
         """Refuse codes that an algorithm cannot read, which takes pair codes only.
 
         Args:
             role: Its role.
             name: Its id.
             other: Id of one that takes any.
+            codes: Those that it reads.
 
         Raises:
             ConfigError: A code is none.
         """
-        for code, chips in (
-            ("preamble", self.preamble),
-            ("pilots", self.pilots),
-            ("codewords", self.codewords),
-        ):
-            if not are_pairs(chips):
-                raise ConfigError(
-                    f"{role} '{name}' reads pair codes, chips 01 or 10 each, and the {code} are others; try"
-                    f" {role}.id = '{other}'"
-                )
+        for code in (name for name in codes if name in self.of_chips):
+            raise ConfigError(
+                f"{role} '{name}' reads pair codes, chips 01 or 10 each, and the {code} are others; try"
+                f" {role}.id = '{other}'"
+            )
 
     @property
     def edge_every(self) -> int:
@@ -242,6 +252,16 @@ class Codebook:
     def codeword_edges(self) -> Values:
         """The same of each symbol, int8 (S, n)."""
         return self._edges(self.codewords)
+
+    @cached_property
+    def pilot_values(self) -> Values:
+        """Values of the pilots, -1 and 1, int8 (K, n); n is 0 where they are no pair codes."""
+        return _values(self.pilots)
+
+    @cached_property
+    def codeword_values(self) -> Values:
+        """The same of the symbols' codewords, int8 (S, n)."""
+        return _values(self.codewords)
 
     @cached_property
     def edge_chips(self) -> NDArray[np.int64]:
@@ -377,6 +397,13 @@ class Codebook:
                 "",
             ]
         )
+
+
+def _values(chips: Chips) -> Values:
+    values = edges_of_chips(chips)[:, ::2] if are_pairs(chips) else np.empty((len(chips), 0), np.int8)
+    values = np.ascontiguousarray(values)
+    values.setflags(write=False)
+    return values
 
 
 def _text(chips: Chips) -> str:

@@ -8,12 +8,12 @@ before anything runs, so that the resolved table alone reproduces a result. See 
 import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field, is_dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, overload
 
-from evlcp_sdk.air.codebook import Codebook, are_pairs
+from evlcp_sdk.air.codebook import Codebook, codes_of_chips
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, PluginError, UnknownAlgorithmError
@@ -283,7 +283,7 @@ def resolve(
     built: dict[str, Any] = {}
     resolved: dict[str, dict[str, Any]] = {}
     revisions: dict[str, int] = {}
-    pairs = True
+    of_chips: frozenset[str] = frozenset()
     # A framing says which roles there are, and what finds its transmitters.
     for section in sorted(known, key=lambda name: (name in ROLES, name != "framing")):
         keys = table.get(section, {})
@@ -300,7 +300,7 @@ def resolve(
         if section in _SPECS:
             cls = _SPECS[section]
         else:
-            usual = ROLES[section].default_for(built.get("bar"), pairs)
+            usual = ROLES[section].default_for(built.get("bar"), of_chips)
             if section == "detection" and framing is not None and framing.detection:
                 usual = framing.detection
             head["id"] = name = keys.pop("id", usual)
@@ -327,7 +327,7 @@ def resolve(
                     plain = head | asdict(built[section])
             resolved[section] = json.loads(json.dumps(plain))
             if section == "modulation":
-                pairs = _pairs(built)
+                of_chips = _of_chips(built)
         except SpecError as refused:
             for path, text in refused.faults:
                 fault(section, path[0], "".join(f".{part}" for part in path[1:]) + text)
@@ -432,17 +432,15 @@ def _unused(framing: str) -> str:
     return f": no step of framing '{framing}', which has its own; leave it out"
 
 
-def _pairs(built: Mapping[str, Any]) -> bool:
-    """Whether pilots and codewords are pair codes, as far as they are known and good."""
-    if not {"bar", "pilots", "modulation"} <= set(built):
-        return True
-    try:
-        pilots = built["pilots"]
-        codes = pilots.preamble(), pilots.codes(built["bar"].clusters), built["modulation"].codewords()
-        return all(are_pairs(code) for code in codes)
-    except (Exception, SystemExit):
+def _of_chips(built: Mapping[str, Any]) -> frozenset[str]:
+    """Which codes are no pair codes, as far as they are known and good."""
+    if {"bar", "pilots", "modulation"} <= set(built):
         # What is wrong with them is said where the codebook is made.
-        return True
+        with suppress(Exception, SystemExit):
+            pilots = built["pilots"]
+            codes = pilots.codes(built["bar"].clusters), built["modulation"].codewords()
+            return codes_of_chips(pilots.preamble(), *codes)
+    return frozenset()
 
 
 @contextmanager

@@ -9,7 +9,8 @@ synchronization keeps state, and that state is explicit.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections import Counter
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol
@@ -357,7 +358,7 @@ class Role:
         verb: What it does, in one line.
         default_of_chips: Id of it for codes that are not pair codes, which the default refuses; None where
             that one takes all codes.
-        by_layout: Id of it for a known bar, and whether its codes are pair codes, in place of both; None
+        by_layout: Id of it for a known bar, and which of its codes are no pair codes, in place of both; None
             where that does not depend on the bar.
     """
 
@@ -366,39 +367,41 @@ class Role:
     default: str
     verb: str
     default_of_chips: str | None = None
-    by_layout: Callable[[BarLayout, bool], str] | None = None
+    by_layout: Callable[[BarLayout, Collection[str]], str] | None = None
 
-    def default_for(self, bar: BarLayout | None, pairs: bool = True) -> str:
+    def default_for(self, bar: BarLayout | None, of_chips: Collection[str] = ()) -> str:
         """Id of the algorithm where the link names none, for its bar; None for one that is not known.
 
         Args:
             bar: The link's.
-            pairs: Whether its codes are pair codes.
+            of_chips: Which of its codes are no pair codes, see `Codebook.of_chips`.
 
         >>> from evlcp_sdk.scene.bar import BarLayout, LedGrid
         >>> [ROLES["ranging"].default_for(BarLayout(LedGrid(96, columns))) for columns in (1, 2)]
         ['joint-scale', 'joint-scale']
         """
         if bar is not None and self.by_layout is not None:
-            return self.by_layout(bar, pairs)
-        return self.default if pairs or self.default_of_chips is None else self.default_of_chips
+            return self.by_layout(bar, of_chips)
+        return self.default_of_chips if of_chips and self.default_of_chips is not None else self.default
 
 
 _WIDEST = 2.0
 """Widths of a layout, in heights of its columns, up to which these tell the distance better."""
 
 
-def _ranging_of(bar: BarLayout, pairs: bool) -> str:
+def _ranging_of(bar: BarLayout, of_chips: Collection[str]) -> str:
     """Id of the ranging that fits a layout best."""
     if not bar.apart:
         return "none"
     # From side to side `joint-scale` measures nothing: of low columns far apart, that is what counts.
     high_m = max((len(clusters) * pitch_m for clusters, pitch_m in bar.even_columns), default=0.0)
-    if pairs and high_m > 0 and bar.width_m <= _WIDEST * high_m:
+    if "pilots" not in of_chips and high_m > 0 and bar.width_m <= _WIDEST * high_m:
         return "joint-scale"
-    if bar.clusters >= 2 and bar.alike:
+    # Those with light on the same sides look too large in the same way.
+    same_sides = max(Counter(bar.sides.tolist()).values())
+    if same_sides >= 2 and bar.alike:
         return "poc"
-    return "centroid" if bar.clusters >= 3 else "none"
+    return "centroid" if same_sides >= 3 else "none"
 
 
 ROLES: Mapping[str, Role] = MappingProxyType(

@@ -34,6 +34,8 @@ _MOST_M = 100.0
 """Farther from the centre stands no LED of one transmitter."""
 
 _SAME_M = 1e-9
+_GAPLESS = 3.0
+"""Dark gaps between clusters, in widths of an LED, over which their light goes on."""
 
 Floats = NDArray[np.float64]
 Leds = tuple[Floats, NDArray[np.int64]]
@@ -301,6 +303,31 @@ class BarLayout:
         order = np.lexsort((*off.T, which))
         forms = off[order].reshape(len(count), count[0], 3)
         return bool((np.abs(forms - forms[0]) <= 1).all())
+
+    @cached_property
+    def sides(self) -> NDArray[np.int64]:
+        """On which sides of each cluster light goes on in another one, int64 (K,).
+
+        The sum of 1 above, 2 below, 4 on the left and 8 on the right. To any other side a cluster looks
+        larger than it is, as blur has no neighbour's light to share pixels with. Light goes on over gaps of
+        up to three LEDs' width: some pixels of a bar 50 m away, which is what blur and wings fill.
+
+        >>> BarLayout(LedGrid(18)).sides.tolist(), BarLayout(LedGrid(3, 2, cluster_rows=1)).sides.tolist()
+        ([2, 3, 1], [10, 6, 11, 7, 9, 5])
+        """
+        place, which = self._leds
+        centres = self.cluster_centres_m()
+        size = np.array([np.ptp(place[which == k, :2], axis=0) for k in range(self.clusters)])
+        most = (1 + _GAPLESS) * self.shape.led_m
+        found = np.zeros(self.clusters, np.int64)
+        off = centres[None] - centres[:, None]
+        for axis, (before, after) in ((1, (1, 2)), (0, (4, 8))):
+            along, across = off[..., axis], off[..., 1 - axis]
+            gap = np.abs(along) - (size[:, None, axis] + size[None, :, axis]) / 2
+            touches = (np.abs(across) <= _SAME_M) & (np.abs(along) > _SAME_M) & (gap <= most)
+            found += before * (touches & (along < 0)).any(1)
+            found += after * (touches & (along > 0)).any(1)
+        return found
 
     @property
     def in_even_line(self) -> bool:

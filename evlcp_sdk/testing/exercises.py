@@ -108,7 +108,7 @@ def _of_chips(link: Link, kept: str) -> Link:
     """The link with the defaults for codes of any chips where it has those for pair codes."""
     registry = Registry.load()
     for name, role in ROLES.items():
-        usual, other = role.default_for(link.bar), role.default_for(link.bar, pairs=False)
+        usual, other = role.default_for(link.bar), role.default_for(link.bar, link.codebook.of_chips)
         if usual != other and name != kept and link.table.get(name, {}).get("id") == usual:
             link = link.with_algorithm(name, registry.load_class(name, other)(), id=other)
     return link

@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
@@ -22,15 +23,18 @@ _NONE = Range(float("nan"), float("nan"), 0)
 class CentroidRanging(Ranging):
     """Similarity (shift, turn, scale) that brings the layout to the centres of gravity best.
 
-    Each cluster's centre is the mean of its map, whatever its LEDs. From a start by medians, clusters far
-    from the fit, by more than three times the median, are left out. Sigma is that of the least squares.
+    Each cluster's centre is the mean of its map, whatever its LEDs. To a side where it has no neighbour it
+    looks larger than it is: those count that have neighbours on the same sides as most have. From a start by
+    medians, clusters far from the fit, by more than three times the median, are left out. Sigma is that of
+    the least squares.
     """
 
     skip_outer: Annotated[
         int,
         Field(
             ge=0,
-            description="Seen clusters left out at each end of a line: an outer edge has no neighbour.",
+            description="Seen clusters left out at each end of a line: an outer edge has no neighbour. With"
+            " 0, all clusters of other layouts count, too.",
         ),
     ] = 1
     min_clusters: Annotated[
@@ -46,7 +50,8 @@ class CentroidRanging(Ranging):
         centres = bar.cluster_centres_m()
         in_line = np.linalg.matrix_rank(centres - centres.mean(0), tol=1e-9) < 2
         skip = self.skip_outer if in_line else 0
-        left = bar.clusters - 2 * skip
+        same = _like_most(bar.sides) if self.skip_outer and not in_line else np.ones(bar.clusters, np.bool_)
+        left = int(same.sum()) - 2 * skip
         least = max(min(self.min_clusters, left), 3)
         if left < least:
             raise ConfigError(
@@ -63,7 +68,7 @@ class CentroidRanging(Ranging):
             maps = view.presence.pixels.astype(np.float64)
             weight = maps.sum((1, 2))
             # The outermost of what is seen may be cut off by what hides the others.
-            seen = np.flatnonzero(weight > 0)
+            seen = np.flatnonzero((weight > 0) & same)
             seen = seen[skip : len(seen) - skip]
             if len(seen) < least:
                 return _NONE
@@ -99,3 +104,8 @@ class CentroidRanging(Ranging):
             return Range(distance, distance * float(np.sqrt(variance / power)) / size, kept)
 
         return measure
+
+
+def _like_most(sides: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Which clusters have neighbours on the same sides as most have, bool (K,)."""
+    return np.asarray(sides == np.bincount(sides).argmax())

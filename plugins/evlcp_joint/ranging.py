@@ -92,6 +92,8 @@ class JointScaleRanging(Ranging):
     whose symbol is not known are left out. There is no distance where the fit leaves the cells, or does not
     explain the values.
 
+    The pilots have to be pair codes. Of a frame whose codewords are others, its pilot alone is read.
+
     Of a layout of several even columns, each gives a distance, and these are averaged by their boundaries;
     where they differ by more than their sigmas say, sigma is as much larger. From side to side nothing is
     measured: a panel that is turned away looks narrower, but not lower.
@@ -126,13 +128,14 @@ class JointScaleRanging(Ranging):
         """Precompute for a bar of one column or more.
 
         Raises:
-            ConfigError: The layout has no even column of three clusters or more.
+            ConfigError: The layout has no even column of three clusters or more, or pilots are no pair codes.
         """
         if not bar.even_columns:
             raise ConfigError(
-                "ranging 'joint-scale' needs an even column of three clusters or more; " + _instead(bar)
+                "ranging 'joint-scale' needs an even column of three clusters or more; "
+                + _instead(bar, codebook)
             )
-        codebook.require_pairs("ranging", "joint-scale", "poc")
+        codebook.require_pairs("ranging", "joint-scale", "poc", codes=("pilots",))
         measures = [self._of_column(camera, codebook, *column) for column in bar.even_columns]
         if len(measures) == 1 and len(bar.even_columns[0][0]) == bar.clusters:
             return measures[0]
@@ -149,8 +152,8 @@ class JointScaleRanging(Ranging):
     ) -> Measure:
         """What measures one column by the views of its clusters alone."""
         clusters, least = len(column), min(self.min_boundaries, len(column) - 1)
-        pilots = codebook.pilot_edges[column].astype(np.float64)
-        words = codebook.codeword_edges.astype(np.float64)
+        pilots = codebook.pilot_values[column].astype(np.float64)
+        words = codebook.codeword_values.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
 
         when = (np.arange(n := pilots.shape[1] + words.shape[1]) + 0.5) / n - 0.5
@@ -158,13 +161,15 @@ class JointScaleRanging(Ranging):
         search = _STEPS, _ROUNDS, _CLOSE, _EXACT
         limits = least, _OUTLIER, _LEAST_OUTLIER_PX, _LEAST_EXPLAINED
 
+        chips = 2 * len(when)
+
         def measure(view: FrameView) -> Range:
             by_boundary = np.empty((3, clusters + 1))
             spacing_px, sigma_px, tilt = _kernels.measure_column(
                 view.presence.selected,
                 view.presence.grid_px,
-                view.sums,
-                view.offset_px,
+                view.sums[:chips],
+                np.ascontiguousarray(view.offset_px[:, :chips]),
                 view.soft.symbols,
                 pilots,
                 words,
@@ -181,7 +186,7 @@ class JointScaleRanging(Ranging):
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
             stretch = math.hypot(1.0, tilt)
             distance = camera.distance_m(spacing_m, spacing_px * stretch)
-            late_chips = (len(view.sums) - 2 * pilots.shape[1]) / 2
+            late_chips = (chips - 2 * pilots.shape[1]) / 2
             one_px = spacing_m * spacing_px * stretch / distance
             off, weight, wave = by_boundary[:, 1:-1]
             # A wave in the boundaries' places, 1 px high, makes the spacing so much larger.
@@ -244,8 +249,8 @@ def _together(parts: Sequence[Range]) -> Range:
     return Range(mean, sigma_m, int(pairs.sum()), parts[0].late_chips)
 
 
-def _instead(bar: BarLayout) -> str:
+def _instead(bar: BarLayout, codebook: Codebook) -> str:
     """The ranging for a layout that this one refuses, if any is."""
     if bar.clusters < 2:
         return "no ranging measures the distance of one cluster: use 'none' for this layout"
-    return f"use '{ROLES['ranging'].default_for(bar)}' for this layout"
+    return f"use '{ROLES['ranging'].default_for(bar, codebook.of_chips)}' for this layout"

@@ -25,6 +25,10 @@ _CYCLES = 0.5
 amplitude is still 2 / pi of the peak. The noise of a phase is inverse to the amplitude, and all phases weigh
 the same."""
 
+_RIM_PX = 0.2
+"""How far off the shift of two clusters of a panel is in all frames alike: the halo around it has fewer rows
+and columns of clusters between it and them than in a long bar. `benchmarks/links.py` has such a panel."""
+
 
 def phase_only_correlation(
     images: NDArray[np.float32],
@@ -59,6 +63,8 @@ def phase_only_correlation(
 class PocRanging(Ranging):
     """Phase-only correlation between the maps of cluster pairs, L = f S / (l' a) (arXiv 2510.17203).
 
+    Pairs are of clusters that have neighbours on the same sides: to any other side a cluster looks larger
+    than it is, which shifts the end of a bar by a third of a pixel, and the rim of a panel by one.
     Of a bar with hidden ends, the clusters that are seen count as if they were all.
     A pair whose clusters lie a spacing off the scale that all clusters agree on is left out first.
     The shift of each pair comes from the Dirichlet kernel that fits the correlation's peak best. A shift
@@ -83,7 +89,8 @@ class PocRanging(Ranging):
         int,
         Field(
             ge=0,
-            description="Seen clusters left out at each end, of four or more: edges have no neighbour.",
+            description="Seen clusters left out at each end of a line: edges have no neighbour. With 0, all"
+            " clusters are compared, whatever sides their neighbours are on.",
         ),
     ] = 1
     min_spacing: Annotated[
@@ -124,21 +131,30 @@ class PocRanging(Ranging):
         if not self.clusters:
             # Which are outermost follows from what is seen.
             used = np.arange(bar.clusters)
-        skip = 0 if self.clusters else self._skip(bar.clusters)
+        all_count = bool(self.clusters) or self.skip_outer == 0
+        skip = self._skip(bar.clusters) if bar.in_even_line and not all_count else 0
         centres = bar.cluster_centres_m()
         a, b = np.triu_indices(len(used), 1)
+        if not all_count:
+            same = bar.sides[used[a]] == bar.sides[used[b]]
+            a, b = a[same], b[same]
         pairs = used[a], used[b], np.hypot(*(centres[used[b]] - centres[used[a]]).T)
         # The scale that all clusters agree on shows which ones are out of place.
         i, j = np.triu_indices(bar.clusters, 1)
         apart = np.hypot(*(centres[j] - centres[i]).T)
+        instead = f"use '{ROLES['ranging'].default_for(bar, codebook.of_chips)}' for this layout"
         if not (bar.alike and bar.apart):
-            instead = ROLES["ranging"].default_for(bar)
             raise ConfigError(
-                "ranging 'poc' compares images of clusters, which have to be alike and apart: use"
-                f" '{instead}' for this layout"
+                f"ranging 'poc' compares images of clusters, which have to be alike and apart: {instead}"
+            )
+        if not len(a):
+            raise ConfigError(
+                "ranging 'poc' compares clusters that have neighbours on the same sides, as an edge without"
+                f" one looks further out; here no two are: {instead}"
             )
         neighbour = float(apart[apart > 0].min())
 
+        rim_px = _RIM_PX if (bar.sides & 3).any() and (bar.sides & 12).any() else 0.0
         all_pairs = i, j, apart
         clusters = np.arange(bar.clusters)
         inner = np.isin(clusters, used[skip : len(used) - skip])
@@ -192,7 +208,8 @@ class PocRanging(Ranging):
                 self.drop_extremes,
                 self.outlier_iqr,
             )
-            return Range(float(mean), float(sigma), int(kept))
+            off = rim_px / (px_per_m * float(apart_m.mean()))
+            return Range(float(mean), math.hypot(sigma, mean * off), int(kept))
 
         return measure
 

@@ -1,6 +1,7 @@
 """Rangings on bars of few clusters: what one refuses, another takes where its message says so."""
 
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ LAYOUTS = {
         "bar.shape=table",
         "bar.leds=[[0, 0, 0, 0], [0, 0.1, 0, 0], [0.3, 0, 0, 1], [0, 0.4, 0, 2], [1, 1, 0, 3]]",
     ),
+    "two lamps": ("bar.shape=table", "bar.leds=[[0, 0, 0, 0], [0.3, 0, 0, 1]]"),
     "three LEDs": ("bar.shape=table", "bar.leds=[[0, 0, 0, 0], [0.3, 0, 0, 1], [0, 0.2, 0, 2]]"),
 }
 RANGINGS = [entry.algorithm.id for entry in Registry.load().installed("ranging")]
@@ -34,9 +36,9 @@ def link_with(layout: str, *overrides: str) -> Link:
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_a_link_that_names_no_ranging_measures_its_bar(layout: str) -> None:
     link = link_with(layout)
-    wanted = {"1 clusters": "none", "2 clusters": "poc", "not alike": "centroid"}.get(
-        layout, "poc" if layout in ("one row of two", "ring", "three LEDs") else "joint-scale"
-    )
+    # Of two clusters beside one another, each has light on its other side: both look further out.
+    beside = {"1 clusters": "none", "2 clusters": "none", "one row of two": "none", "not alike": "centroid"}
+    wanted = beside.get(layout, "poc" if layout in ("ring", "three LEDs", "two lamps") else "joint-scale")
     assert link.table["ranging"]["id"] == wanted
     link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
 
@@ -80,14 +82,47 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str
             "1 clusters",
             "needs an even column of three clusters or more; .* of one cluster: use 'none' for this layout$",
         ),
-        ("2 clusters", "needs .* or more; use 'poc' for this layout$"),
+        ("2 clusters", "needs .* or more; use 'none' for this layout$"),
         ("ring", "needs .* or more; use 'poc' for this layout$"),
-        ("one row of two", "needs .* or more; use 'poc' for this layout$"),
+        ("two lamps", "needs .* or more; use 'poc' for this layout$"),
+        ("one row of two", "needs .* or more; use 'none' for this layout$"),
     ],
 )
 def test_joint_scale_says_what_works_instead(layout: str, said: str) -> None:
     link = link_with(layout, "ranging.id=joint-scale")
     with pytest.raises(ConfigError, match=said):
+        link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+
+
+@pytest.mark.parametrize("layout", ["2 clusters", "3 clusters", "one row of two"])
+def test_poc_compares_no_clusters_whose_edges_differ(layout: str) -> None:
+    link = link_with(layout, "ranging.id=poc")
+    other = "joint-scale" if layout == "3 clusters" else "none"
+    with pytest.raises(ConfigError, match=f"here no two are: use '{other}' for this layout$"):
+        link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+    told = link_with(layout, "ranging.id=poc", "ranging.skip_outer=0")
+    told.algorithm("ranging").compile(told.camera, told.bar, told.codebook)
+
+
+@pytest.mark.parametrize("modulation", ["nrz", "ppm"])
+def test_joint_scale_reads_pilots_where_codewords_are_no_pair_codes(modulation: str) -> None:
+    link = link_with("16 clusters", f"modulation.id={modulation}")
+    measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
+    view = ideal_view(link.codebook, np.arange(16))
+    found, true_m = measure(view), link.camera.distance_m(0.06, 8)
+    assert found.distance_m == pytest.approx(true_m, rel=1e-3)
+    # It is measured in the pilot's middle, and what comes behind says nothing.
+    assert found.late_chips == 0
+    info = view.sums.copy()
+    info[len(link.codebook.pilots[0]) :] *= -1
+    assert measure(replace(view, sums=info)) == found
+
+
+def test_joint_scale_refuses_pilots_of_other_codes() -> None:
+    link = link_with(
+        "16 clusters", "modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed", "ranging.id=joint-scale"
+    )
+    with pytest.raises(ConfigError, match=r"the pilots are others; try ranging\.id = 'poc'"):
         link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
 
 

@@ -361,8 +361,8 @@ def test_distance_of_ideal_images(bar, blob, tolerance, tilt_deg, band):
     assert_allclose(found, distances, rtol=tolerance)
     assert (np.diff(found) > 0).all()
     assert max(r.sigma_m for r in got) < tolerance * 100
-    # Of 28; extremes and outliers are dropped.
-    assert min(r.pairs for r in got) >= 16
+    # Of 28, and of 9 of the panel; extremes and outliers are dropped.
+    assert min(r.pairs for r in got) >= (16 if bar is BAR else 5)
 
 
 def test_a_horizontal_bar_is_a_bar():

@@ -84,8 +84,9 @@ def test_a_link_s_table_comes_back(table: dict[str, Any], tmp_path: Path) -> Non
 
 def test_the_default_ranging_fits_the_layout() -> None:
     chosen = {name: ROLES["ranging"].default_for(BarLayout.of_table(table)) for name, table in TABLES.items()}
-    # A ring's clusters of two LEDs are turned; two clusters that are not alike say too little.
-    assert chosen == {"grid": "poc", "columns": "poc", "ring": "centroid", "table": "none", "one": "none"}
+    # Of two by two clusters, each looks larger to other sides; a ring's clusters of two LEDs are turned; two
+    # clusters that are not alike say too little.
+    assert chosen == {"grid": "none", "columns": "poc", "ring": "centroid", "table": "none", "one": "none"}
     assert ROLES["ranging"].default_for(BarLayout(LedRing())) == "poc"
     # Three rings about one centre: nothing is between them.
     rings = [
@@ -98,6 +99,32 @@ def test_the_default_ranging_fits_the_layout() -> None:
     assert ROLES["ranging"].default_for(BarLayout()) == "joint-scale"
     assert ROLES["ranging"].default_for(BarLayout(LedColumns())) == "joint-scale"
     assert ROLES["ranging"].default_for(BarLayout(LedColumns(apart_m=1.2))) == "poc"
+
+
+def test_the_default_ranging_reads_the_codes() -> None:
+    """`joint-scale` reads pilots alone where codewords are no pair codes, `poc` any."""
+    panel = BarLayout(LedGrid(16, 16, cluster_rows=4, cluster_columns=4))
+    for bar in (BarLayout(), panel):
+        assert ROLES["ranging"].default_for(bar, {"preamble", "codewords"}) == "joint-scale"
+        assert ROLES["ranging"].default_for(bar, {"pilots"}) == "poc"
+    assert resolve({"modulation": {"id": "nrz"}}).table["ranging"]["id"] == "joint-scale"
+    dimmed = {"modulation": {"id": "wh4x2-dimmed"}, "pilots": {"id": "wh-dimmed"}}
+    assert resolve(dimmed).table["ranging"]["id"] == "poc"
+
+
+def test_sides_say_where_light_goes_on() -> None:
+    # 1 above, 2 below, 4 left, 8 right.
+    assert BarLayout().sides.tolist() == [2, *[3] * 14, 1]
+    panel = BarLayout(LedGrid(6, 6, 0.02, 2, 2)).sides.reshape(3, 3)
+    assert panel.tolist() == [[10, 14, 6], [11, 15, 7], [9, 13, 5]]
+    # Clusters six times as high as wide touch above and beside.
+    assert BarLayout(LedGrid(12, 2, 0.01, 6)).sides.tolist() == [10, 6, 9, 5]
+    # Columns half a metre apart do not; nor do LEDs of a ring, nor lamps with gaps of two LEDs.
+    assert BarLayout(LedColumns(2, 0.5, 18)).sides.tolist() == [2, 3, 1] * 2
+    assert not BarLayout(LedRing(12, 0.1)).sides.any()
+    for gap_m, sides in ((0.005, [2, 3, 1]), (0.02, [0, 0, 0])):
+        lamps = [[0.0, 0.01 * i + gap_m * (i // 3), 0.0, i // 3] for i in range(9)]
+        assert BarLayout.of_table({"shape": "table", "leds": lamps}).sides.tolist() == sides
 
 
 def test_even_columns_are_found_in_any_order() -> None:
