@@ -360,7 +360,9 @@ def test_distance_of_ideal_images(bar, blob, tolerance, tilt_deg, band):
     found = np.array([r.distance_m for r in got])
     assert_allclose(found, distances, rtol=tolerance)
     assert (np.diff(found) > 0).all()
-    assert max(r.sigma_m for r in got) < tolerance * 100
+    # Of a panel, they have the rim's, a fifth of a pixel; its clusters are 4 cm apart.
+    rim_m = 0.0 if bar is BAR else 0.2 * distances**2 / (CAMERA.focal_px * 0.04)
+    assert (np.array([r.sigma_m for r in got]) < tolerance * 100 + rim_m).all()
     # Of 28, and of 9 of the panel; extremes and outliers are dropped.
     assert min(r.pairs for r in got) >= (16 if bar is BAR else 5)
 
