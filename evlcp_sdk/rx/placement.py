@@ -44,6 +44,10 @@ _LEAST_LIGHT = 0.25
 In recordings hidden clusters have up to 0.04, and the dimmest that is seen, 180 m away or in a shaking
 camera, 0.58."""
 
+_MIRRORED = 1.1
+"""How much more a mirror image explains than the layout itself: of a single column or row in view both
+explain as much but for rounding, of all else one hardly half of what the other does."""
+
 _EDGE = 0.5
 """Share of the likeliest distance from the axis below which cells are no longer the line's: its width at half
 maximum. A lens' halo shows the clusters around, one here and another there, at up to a third."""
@@ -297,7 +301,7 @@ def _voted(blobs: _Blobs, layout: Layout, slack_px: float, before: Placement | N
             _LEAST_SPACING_PX,
             scale,
         )
-        if score > best_score:
+        if score > best_score * (_MIRRORED if mirrored else 1):
             s, shift = _kernels.refined_similarity(
                 blobs.at, blobs.cluster, blobs.cells, at_m, layout.spacing_m, slack_px, scale, s, shift
             )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import hadamard
 from evlcp_sdk.rx.placement import layout_of, lit, masked, placements
-from evlcp_sdk.scene.bar import BarLayout, LedGrid
+from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid
 from evlcp_sdk.values import PresenceMap
 
 CENTRES = BarLayout().cluster_centres_m()
@@ -208,6 +208,23 @@ def test_a_panel_and_its_mirror_image(conj: bool) -> None:
     assert np.abs(found.scale - scale) < 6
     places = found.places(layout)
     assert np.abs(places[1] - places[0]) == pytest.approx(300 * 0.08, rel=0.03)
+
+
+@pytest.mark.parametrize("column", [0, 1])
+def test_one_column_of_two_is_not_taken_for_the_other_in_a_mirror(column: int) -> None:
+    """It looks the same in both; in an image the layout then stands on the other side."""
+    centres = BarLayout(LedColumns(columns=2, apart_m=2.0, rows=48)).cluster_centres_m()
+    layout = layout_of(centres)
+    rng = np.random.default_rng(column)
+    hidden = [*range(8 - 8 * column, 16 - 8 * column)]
+    found = []
+    for _ in range(24):
+        scale = 120 * np.exp(0.01j * rng.normal())
+        shift = complex(24, 60) + complex(*rng.uniform(-1, 1, 2)) - scale * (2 * column - 1)
+        shown = covered(drawn(centres, (scale, shift), size=(48, 120)), hidden)
+        found += placements(shown, layout)[:1]
+    assert len(found) == 24
+    assert not any(one.mirrored for one in found)
 
 
 def test_one_cluster_is_where_its_cells_are() -> None:
