@@ -11,6 +11,7 @@ tried with; by another one kernels are compiled as Numba does by itself, in twic
 """
 
 import sys
+from functools import cache
 from typing import Any
 
 import llvmlite.ir
@@ -18,7 +19,20 @@ import numba
 from llvmlite.binding import Linkage, ffi
 from llvmlite.ir import instructions
 from numba import _dynfunc  # type: ignore[attr-defined]
-from numba.core import analysis, cgutils, codegen, cpu, ir, lowering, types
+from numba.core import (
+    analysis,
+    cgutils,
+    codegen,
+    cpu,
+    ir,
+    lowering,
+    postproc,
+    transforms,
+    types,
+    utils,
+)
+from numba.core.base import BaseContext
+from numba.core.compiler_machinery import PassManager
 from numba.core.runtime.context import NRTContext
 from numba.core.types.functions import BaseFunction
 from numba.cpython import slicing
@@ -51,6 +65,8 @@ def prepare(kept: KeptKernel) -> bool:
         return False
     _keep_calls_within(kept)
     _resolve_once()
+    _look_up_once()
+    _follow_lives_when_asked()
     _list_variables_quickly()
     _count_references_of_arrays_alone()
     _read_fields_of_values()
@@ -132,6 +148,54 @@ def _resolve_once() -> None:
 
     function: Any = BaseFunction
     function.get_call_type = get_call_type
+
+
+def _look_up_once() -> None:
+    """What says the same each time: signatures of Python functions, sizes of types, what passes rely on."""
+    functions: Any = utils
+    functions.pysignature = cache(functions.pysignature)
+    measure, analyse = BaseContext.get_abi_sizeof, PassManager.dependency_analysis
+    sizes: dict[str, int] = {}
+    analyses: dict[tuple[Any, ...], Any] = {}
+
+    def size(self: Any, kind: Any) -> int:
+        name = str(kind)
+        if name not in sizes:
+            sizes[name] = measure(self, kind)
+        return sizes[name]
+
+    def relied_on(self: Any) -> Any:
+        passes = tuple(one for one, _ in self.passes)
+        if passes not in analyses:
+            analyses[passes] = analyse(self)
+        return analyses[passes]
+
+    context: Any = BaseContext
+    context.get_abi_sizeof = size
+    manager: Any = PassManager
+    manager.dependency_analysis = relied_on
+
+
+def _follow_lives_when_asked() -> None:
+    """Which variables live where is worked out for the pass that ends them, not after each that moves some.
+
+    `VariableLifetime` works it out when it is asked for; what is left out is where generators are taken up.
+    """
+    follow = postproc.PostProcessor.run
+
+    def run(self: Any, emit_dels: bool = False, extend_lifetimes: bool = False) -> None:
+        function = self.func_ir
+        if function.is_generator:
+            follow(self, emit_dels, extend_lifetimes)
+            return
+        function.blocks = transforms.canonicalize_cfg(function.blocks)
+        function.variable_lifetime = postproc.VariableLifetime(function.blocks)
+        function.generator_info = None
+        if emit_dels:
+            self._insert_var_dels(extend_lifetimes=extend_lifetimes)
+
+    processor: Any = postproc.PostProcessor
+    processor.run = run
 
 
 def _list_variables_quickly() -> None:

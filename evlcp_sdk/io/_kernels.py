@@ -472,7 +472,7 @@ def decode_evt3(
     while i < len(words) and n <= len(t) - BURST and m < len(trigger_t):
         while state[DOUBT] and i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
             start = i
-            i, count = _pack_evt3(words, i, i + 1, at, state, tally, packed, BURST)
+            i, count = _pack_evt3(words, i, i + 1, at, state, tally, packed, int64(BURST))
             for _ in range(count):
                 _note(tally, int64(TIME_DOUBTFUL), at + 2 * start)
             if i == start:

@@ -1964,7 +1964,8 @@ def slope_of_rows(
         return np.nan, np.nan
     # A median of pairs: blocks with a part of the bar hidden, or another's light, are outliers.
     slopes = np.empty(n * n)
-    pairs = 0
+    # A literal 0 would make a median of its own.
+    pairs: Any = np.int64(0)
     for i in range(n):
         for j in range(i + 1, n):
             if at[j] - at[i] > (at[n - 1] - at[0]) / 3:
