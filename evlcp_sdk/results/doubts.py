@@ -885,8 +885,8 @@ def _blocks(counts: Mapping[str, int]) -> Iterator[Doubt]:
         yield Doubt(
             "blocks-unread",
             f"none of {tried} packets has a block that can be read, though {alike} of them repeat others",
-            "another error correction than error-correction.id; if no messages are sent, say"
-            " messages.decode = false",
+            "another error correction than error-correction.id, or frames taken from another place in the"
+            " packet than they were sent in; if no messages are sent, say messages.decode = false",
         )
 
 

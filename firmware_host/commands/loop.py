@@ -101,13 +101,13 @@ def _scene(step: Mapping[str, Any]) -> str:
 
 
 def _receiver(step: Mapping[str, Any]) -> str:
-    if step["distance_m"] is None:
+    if not step["frames"]:
         return f"{step['result']}; {step['frames_sent']} frames were sent"
     share = step["bit_errors"] / step["bits"] if step["bits"] else 0.0
     return (
         f"{step['frames']} of {step['frames_sent']} frames, {step['bit_errors']} of {step['bits']} bits wrong"
-        f" (BER {share:.2g}); distance {step['distance_m']:.2f} m"
-    )
+        f" (BER {share:.2g})"
+    ) + ("" if step["distance_m"] is None else f"; distance {step['distance_m']:.2f} m")
 
 
 def _text(step: Mapping[str, Any]) -> str:

@@ -9,6 +9,7 @@ import pytest
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import random_symbols, symbol_chips
+from firmware_host.commands.loop import _receiver
 from firmware_host.emulators import simulated
 from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.loop import light_of
@@ -89,6 +90,14 @@ def test_without_a_compiler_it_says_what_to_install(
     done = evlcp("loop", "-o", tmp_path / "out")
     assert done.code == 1
     assert done.err == "evlcp: cc is missing: apt-get install --no-install-recommends gcc libc6-dev make\n"
+
+
+def test_wrong_bits_are_said_of_a_light_without_a_distance_too() -> None:
+    step = {"result": "1 transmitter", "frames": 9, "frames_sent": 10, "bits": 72, "bit_errors": 36}
+    said = "9 of 10 frames, 36 of 72 bits wrong (BER 0.5)"
+    assert _receiver(step | {"distance_m": None}) == said
+    assert _receiver(step | {"distance_m": 30.0}) == f"{said}; distance 30.00 m"
+    assert _receiver(step | {"frames": 0, "distance_m": None}) == "1 transmitter; 10 frames were sent"
 
 
 def test_light_is_what_the_symbols_say() -> None:
