@@ -17,8 +17,9 @@ __all__ = ["SYNCHRONIZATION", "TRACKING"]
 
 _PACKETS = 4
 _STEP_US = 1500
-_RATE_CHIPS = 0.0104
-"""Error of the clock rate over a packet, in chips: 30 ppm of the default packet's 346 chips."""
+_RATE_CHIPS = 0.02
+"""Error of the clock rate over a packet, in chips: a fiftieth moves no edge; 58 ppm of the default packet's
+346 chips. Of few pixels and short packets the events' own scatter leaves up to half of it."""
 _SAME_US = 1e-9
 """Relative: 0.1 ns in the times of these recordings."""
 _FRAME_US = 3200.0

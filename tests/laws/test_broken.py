@@ -580,7 +580,7 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
         (
             "finds-time",
             locks_changed(lambda lock: replace(lock, chip_us=lock.chip_us * 1.0001)),
-            "within 30 ppm",
+            "within 58 ppm",
         ),
         ("finds-time", stepping(lambda inner, state, *given: (state, [])), "one lock a packet"),
         ("any-split", stepping(amnesic), "the same locks from events fed"),
