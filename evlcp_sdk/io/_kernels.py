@@ -262,14 +262,18 @@ def _pack_evt3(
     while i < end and n + uintp(BURST) <= uintp(room):
         if i >= odd_until and i + RUN_WORDS <= end and n + RUN_WORDS <= uintp(room):
             # Which of the three it is cannot be predicted, so nothing branches on it: each puts its bits in
-            # the packed event and writes that, and only an ADDR_X moves on.
+            # the packed event and writes that, and only an ADDR_X moves on. Two at a time: what comes of both
+            # needs not wait for what comes of the first.
             if _are_common(words, i):
-                for k in range(RUN_WORDS):
-                    w = int64(words[i + k])
-                    kind = uintp(w >> 12)
-                    event = (event & KEEP[kind]) | ((w & 0xFFF) << SHIFT[kind])
+                for k in range(uintp(0), RUN_WORDS, uintp(2)):
+                    v, w = int64(words[i + k]), int64(words[i + k + ONE])
+                    first, second = uintp(v >> 12), uintp(w >> 12)
+                    put, keep = (v & 0xFFF) << SHIFT[first], KEEP[second]
+                    packed[n] = (event & KEEP[first]) | put
+                    n += EVENTS[first]
+                    event = (event & (KEEP[first] & keep)) | ((put & keep) | (w & 0xFFF) << SHIFT[second])
                     packed[n] = event
-                    n += EVENTS[kind]
+                    n += EVENTS[second]
                 i += RUN_WORDS
                 continue
             odd_until = i + RUN_WORDS
@@ -329,15 +333,20 @@ def _unpack_evt3(
     """
     row, end = uintp(first), uintp(count)
     right = bottom = uint16(0)
-    for k in range(end):
-        t[row + k] = base + (packed[k] >> PACKED_LOW)
+    bits = uint32(0)
     for k in range(end):
         e = uint32(packed[k])
+        bits |= e
+        t[row + k] = base + (packed[k] >> PACKED_LOW)
         p[row + k] = (e >> PACKED_POLARITY) & 1
-        x[row + k] = (e & 0x7FF) | ((e >> PACKED_CARRY) & 0xF) << 11
+        x[row + k] = e & 0x7FF
         y[row + k] = (e >> PACKED_ROW) & 0x87FF
         right = max(right, x[row + k])
         bottom = max(bottom, y[row + k])
+    if (bits >> PACKED_CARRY) & 0xF:
+        for k in range(end):
+            x[row + k] |= ((packed[k] >> PACKED_CARRY) & 0xF) << 11
+            right = max(right, x[row + k])
     back = t[row] - last if count else int64(0)
     for k in range(ONE, end):
         # Its sign is set by any step back.

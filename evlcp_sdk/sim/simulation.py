@@ -45,7 +45,7 @@ _NEAR_NODES = 64
 _NEAR_SCALE = 5.0
 _WIDE_NODES = 1025
 _ROOM = 1 << 17
-_PARTS = 4  # a thread, of the pixels of a block
+_PARTS = 6  # a thread, of the pixels of a block
 _TEXTURE_SIZE = 512
 _MASK64 = 2**64 - 1
 
@@ -319,13 +319,11 @@ class Simulation:
                 if end < end_us:
                     ahead = pool.submit(self._prepare, *spans[number + 1][1:])
                 running = [pool.submit(job) for job in self._jobs(number, block, begin, end)]
+                # Whoever takes the events works beside the pixels.
+                if behind is not None:
+                    yield from self._given(behind.result(), begin)
                 signal = [part for one in running for part in one.result()]
-                last = behind
-                if last is not None:
-                    last.result()
                 behind = pool.submit(served.of, number, end, signal)
-                if last is not None:
-                    yield from self._given(last.result(), begin)
             if behind is not None:
                 yield from self._given(behind.result(), end_us)
 
@@ -366,8 +364,11 @@ class Simulation:
         if block is None:
             return []
         most = int((end_us - begin_us) / self.scene.sensor.refr_us) + 8
-        parts = 1 if self._threads == 1 else _PARTS * self._threads
-        cuts = np.linspace(0, len(block.masks), parts + 1).astype(int)
+        cuts = [0, len(block.masks)]
+        if self._threads > 1:
+            # Ever smaller, so that all threads are done at about the same time.
+            left = (1 - 0.5 / self._threads) ** np.arange(_PARTS * self._threads)
+            cuts = (len(block.masks) * np.append(1 - left, 1)).astype(int).tolist()
 
         def run(first: int, last: int) -> list[_Requests]:
             found = []
@@ -389,7 +390,7 @@ class Simulation:
                 found.append((t[:n], code[:n]))
             return found
 
-        return [partial(run, int(a), int(b)) for a, b in pairwise(cuts) if a < b]
+        return [partial(run, a, b) for a, b in pairwise(cuts) if a < b]
 
     def _moves(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
         """When the image has moved by a step: starts and middles of the poses, us, float64 (n,)."""
