@@ -1,4 +1,4 @@
-"""Compiling kernels in half the time: for a process that compiles and never calls what it compiled.
+"""Compiling kernels in less than half the time: for a process that compiles and never calls what it compiled.
 
 Numba makes each function that a kernel calls a kernel of its own: optimized, turned into code, loaded. The
 child of `evlcp_sdk.kernels` only writes whole kernels into files. So what is called within one is handed to
@@ -7,7 +7,7 @@ line of it by the interpreter, and asks again and again what it knows: here it w
 compiled computes the same: no operation on numbers changes, nor the order of any.
 
 All this replaces parts of Numba that it promises nobody. `prepare` does so only for versions that it was
-tried with; by another one kernels are compiled as Numba does by itself, in twice the time.
+tried with; by another one kernels are compiled as Numba does by itself, in two to three times the time.
 """
 
 import sys

@@ -51,7 +51,7 @@ __all__ = ["njit", "pack"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
-_GROWN_MB = 200
+_GROWN_MB = 250
 """How much a child may grow before another takes its place, which compiles some helpers once more."""
 
 _LONG_S = 2.0
