@@ -8,6 +8,7 @@ the stream has a log-likelihood of each context of a bit; a character is worth w
 sequence of characters and pauses is found as a whole.
 """
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 
@@ -116,6 +117,13 @@ _MEMORY = 0.97
 _SELDOM = 8
 """Stretches in one of which light is looked for where there is none."""
 
+_BUNCH_EVENTS, _BUNCH_TICKS = 6.0, TICKS // 2
+"""Events of a tick from which on those of ticks some way apart are bunches of a readout, and how far these
+are apart at the most: edges are further."""
+
+_GRAINS = 24
+"""Differences of times that show how coarse these are: those of finer ones are all even in 1e-7 of cases."""
+
 _LOST = 8
 """Stretches with events and without a character after which the light is learned anew."""
 
@@ -152,6 +160,11 @@ class CharacterState:
         seen: First tick of which is known whether it has events; one before that may be a character's.
         light: What is known of the light; None before that.
         dark: Stretches with events and without a character since the last one.
+        grain_us: Greatest common divisor of what the first times differ by, us: 1 but for coarse ones.
+        grains: Differences of which that is known.
+        grain_at: Tick of the last of them; None as long as there are too few.
+        last_us: Time of the last event; None before the first.
+        spread: Ticks over which the events of one are spread, as their times are no better known.
         tried: Stretches with events in which light was looked for, or might have been, in vain.
         blocks: Blocks of the next stretch.
         given: What was counted so far.
@@ -163,6 +176,11 @@ class CharacterState:
     seen: int = 0
     light: Light | None = None
     dark: int = 0
+    grain_us: int = 0
+    grains: int = 0
+    grain_at: int | None = None
+    last_us: int | None = None
+    spread: int = 1
     tried: int = 0
     blocks: int = 1
     given: dict[str, int] = field(
@@ -273,7 +291,17 @@ class CharacterDecoder:
         # Times rise: none is before the grid.
         inside = ticks >= 0
         np.add.at(counts, (p[inside].astype(np.int64), ticks[inside]), 1)
-        return replace(state, first=first, counts=counts)
+        state = replace(state, first=first, counts=counts)
+        return self._grained(state, t_us) if len(t_us) and state.grain_at is None else state
+
+    def _grained(self, state: CharacterState, t_us: NDArray[np.int64]) -> CharacterState:
+        """With how coarse times are."""
+        apart = np.diff(t_us, prepend=t_us[0] if state.last_us is None else state.last_us)
+        steps = np.flatnonzero(apart)[: _GRAINS - state.grains]
+        grain_us = math.gcd(state.grain_us, int(np.gcd.reduce(apart[steps])) if len(steps) else 0)
+        grains = state.grains + len(steps)
+        at = int(t_us[steps[-1]] * TICKS // self.bit_us) if grains == _GRAINS else None
+        return replace(state, grain_us=grain_us, grains=grains, grain_at=at, last_us=int(t_us[-1]))
 
     def _decode(
         self, state: CharacterState, due: int, last: bool = False
@@ -283,6 +311,13 @@ class CharacterDecoder:
         first, light = state.first, state.light
         # No more than that, however much there is: any split of the stream gives the same.
         counts = state.counts[:, : due + self._ahead]
+        spread = state.spread
+        if light is None:
+            spread = _bunches(counts[:, :due])
+            # What is known only later, is not known yet in whatever pieces events come.
+            if state.grain_at is not None and state.grain_at < first + due:
+                spread = max(spread, round(state.grain_us * TICKS / self.bit_us))
+        counts = _spread(counts, min(spread, TICKS))
         end = counts.shape[1] - (0 if last else _TAIL)
         # A character may go on behind what is known.
         counts = np.pad(counts, ((0, 0), (0, self._length + 2 * _TAIL)))
@@ -340,8 +375,17 @@ class CharacterDecoder:
                     light, dark = None, 0
         # A copy, so that what is done is not held.
         rest = state.counts[:, due:].copy()
-        return CharacterState(
-            first + due, rest, first + start, state.seen, light, dark, tried, blocks, given
+        return replace(
+            state,
+            first=first + due,
+            counts=rest,
+            start=first + start,
+            light=light,
+            dark=dark,
+            spread=spread,
+            tried=tried,
+            blocks=blocks,
+            given=given,
         ), found
 
     def _places(self, light: Light) -> NDArray[np.int64]:
@@ -705,6 +749,42 @@ class CharacterDecoder:
             self.characters.likelihoods(words), 1
         ) - self.characters.data_bits * np.log(2)
         return float(told.sum() + beside[len(places) :, -1].sum())
+
+
+def _bunches(counts: NDArray[np.int32]) -> int:
+    """How many ticks the bunches are apart in which a camera reads events out; 1 where it does not.
+
+    Args:
+        counts: Events of each tick, OFF and ON, int32 (2, n).
+    """
+    total = counts.sum(0)
+    at = np.flatnonzero(total)
+    many, apart = total[at], np.diff(at)
+    near = apart <= _BUNCH_TICKS
+    if not near.any() or (many * many).sum() < _BUNCH_EVENTS * many.sum():
+        return 1
+    weights = np.minimum(many[:-1], many[1:])[near]
+    order = np.argsort(apart[near], kind="stable")
+    half = np.searchsorted(np.cumsum(weights[order]), weights.sum() / 2)
+    return int(apart[near][order][half])
+
+
+def _spread(counts: NDArray[np.int32], ticks: int) -> NDArray[np.int32]:
+    """Events of each tick spread evenly over so many about it, as whole ones; int32 (2, n)."""
+    if ticks < 2:
+        return counts
+    n = counts.shape[1]
+    total = np.pad(np.cumsum(counts, 1, dtype=np.int64), ((0, 0), (ticks, ticks)), mode="edge")
+    total[:, :ticks] = 0
+    means = np.cumsum(np.pad(total, ((0, 0), (1, 0))), 1)
+    later = ticks // 2 + ticks
+    until = (
+        means[:, later + 1 : later + 1 + n] - means[:, later + 1 - ticks : later + 1 - ticks + n]
+    ) // ticks
+    # What would lie beyond the ends stays inside.
+    until[:, -1] = total[:, -1]
+    found: NDArray[np.int32] = np.diff(until, axis=1, prepend=0).astype(np.int32)
+    return found
 
 
 def _around(values: NDArray[np.float64]) -> NDArray[np.float64]:

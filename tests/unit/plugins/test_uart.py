@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
+from evlcp_uart.decoder import _bunches, _spread
 from evlcp_uart.framing import Uart, read_characters
 from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, TICKS, Light
 
@@ -124,6 +125,55 @@ def test_a_list_is_read_from_its_first_character_wherever_time_begins(first_us: 
     assert [c.value for c in found] == sent
     # It may start up to a bit before, as nothing was seen of the time before.
     assert -BIT_504_US <= found[0].t_us - first_us <= BIT_504_US / TICKS
+
+
+@pytest.mark.parametrize(
+    ("rate_hz", "events", "late_us", "grain_us"),
+    [
+        (504.0, (40.0, 30.0), (60.0, 110.0), 500),
+        (504.0, (12.0, 12.0), (60.0, 110.0), 500),
+        (3125.0, (500.0, 400.0), (190.0, 230.0), 100),
+        (3125.0, (500.0, 400.0), (190.0, 230.0), 90),
+        (10_000.0, (60.0, 50.0), (25.0, 30.0), 25),
+    ],
+)
+def test_times_that_are_coarse_are_read_in_any_pieces(
+    rate_hz: float, events: tuple[float, float], late_us: tuple[float, float], grain_us: int
+) -> None:
+    """As a list rounds them, or a camera reads its events out in bunches that shift against the bits."""
+    sent = np.random.default_rng(1).integers(0, 128, 120)
+    bit_us = 1e6 / rate_hz * 1.002
+    light = seen(
+        np.random.default_rng(9), levels_of(sent, 7, "even", 2), bit_us, events=events, late_us=late_us
+    )
+    t_us, p = (light.t_us // grain_us + 1) * grain_us, light.p
+    uart = Uart(7, "even", 2)
+    found = read_characters(t_us, p, rate_hz, uart)
+    starts = 20_000 + 11 * bit_us * np.arange(len(sent))
+    at = {int(np.abs(starts - one.t_us).argmin()): one.value for one in found}
+    assert len(at) == len(found) >= len(sent) - 1
+    assert sum((value ^ int(sent[k])).bit_count() for k, value in at.items()) <= 1
+    decoder = uart.decoder(rate_hz)
+    state, again = decoder.init(), []
+    for k in range(0, len(t_us), 37):
+        state, more = decoder.step(state, t_us[k : k + 37], p[k : k + 37], int(t_us[k : k + 37][-1]))
+        again += more
+    again += decoder.close(state)[1]
+    assert [(one.t_us, one.value) for one in again] == [(one.t_us, one.value) for one in found]
+
+
+def test_events_are_spread_evenly_and_none_is_lost() -> None:
+    rng = np.random.default_rng(0)
+    counts = np.zeros((2, 400), np.int32)
+    counts[:, 3::5] = rng.poisson(30, (2, 80))
+    assert _bunches(counts) == 5
+    assert _bunches(rng.poisson(8, (2, 400)).astype(np.int32)) == 1
+    for ticks in (1, 2, 5, 8, 16):
+        found = _spread(counts, ticks)
+        assert (found.sum(1) == counts.sum(1)).all()
+        assert found.min() >= 0
+        box = np.cumsum(np.convolve(counts[0], np.ones(ticks) / ticks))[ticks // 2 :][:400]
+        assert np.abs(np.cumsum(found[0]) - box)[:-ticks].max() < 1.01
 
 
 @pytest.mark.parametrize("seed", [12, 22])
