@@ -173,7 +173,7 @@ class ListSource(EventSource):
         raw.seek(0)
         file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if zipped else raw
         if not zipped and raw.read(2) in _UTF_16:
-            file = codecs.EncodedFile(raw, "utf-8", "utf-16")
+            file = codecs.EncodedFile(raw, "utf-8", "utf-16", "replace")
         raw.seek(0)
         text = file.read(PIECE_BYTES)
         table = _Text(text, self._fields)
@@ -698,7 +698,12 @@ class _Text:
             return [_plain(cell) for cell in text.split()]
         mark = self._separator.decode()
         if '"' in text:
-            return [_plain(cell) for cell in next(csv.reader([text], delimiter=mark, skipinitialspace=True))]
+            try:
+                cells = next(csv.reader([text], delimiter=mark, skipinitialspace=True))
+            except csv.Error:
+                # A cell that is no end of, or bytes that are no text.
+                cells = text.split(mark)
+            return [_plain(cell) for cell in cells]
         return [_plain(cell) for cell in text.split(mark)]
 
     def rows(

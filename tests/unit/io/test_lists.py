@@ -1,6 +1,7 @@
 """Lists of times and polarities without places."""
 
 import gzip
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -241,6 +242,18 @@ def test_times_to_the_millisecond_say_their_unit(many: int, form: str, first_us:
     with open_source(tmp_path / "a.csv") as source:
         np.testing.assert_array_equal(source.read()[0].t_us, rounded)
         assert "guessed" in source.header["time"]
+
+
+def test_text_that_is_none_is_refused_or_read_and_ends_in_no_fault(tmp_path: Path) -> None:
+    whole = text(T_US, P, head="t,p").encode("utf-16")
+    for damaged in (
+        whole[:2001],
+        whole[:2000] + b"\x00\xd8" + whole[2000:],
+        b't,p\n"' + b"9" * 200_000 + b"\n",
+    ):
+        (tmp_path / "a.csv").write_bytes(damaged)
+        with suppress(InputError), open_source(tmp_path / "a.csv") as source:
+            source.read()
 
 
 def test_two_arrays_without_names_and_where_the_pixels_are(tmp_path: Path) -> None:
