@@ -135,8 +135,8 @@ class PacketFraming:
         self._echoes = judged.echoes
         self._judged = judged
         self._joined: set[int] = set()
-        self._ended: deque[tuple[tuple[float, float], int]] = deque(maxlen=_MOST_ENDED)
-        self._rejected_by: dict[int, int] = {}
+        self._ended: deque[tuple[tuple[float, float], int, int]] = deque(maxlen=_MOST_ENDED)
+        self._unread_by: dict[int, tuple[int, int]] = {}
         self._due: deque[Followed] = deque()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
@@ -209,28 +209,31 @@ class PacketFraming:
                 self._let_go(region)
 
     def disclaim(self, place: Region) -> int:
-        """Count no frame that was rejected in a place that is another link's; return how many they were."""
-        many = 0
+        """Count no frame that was not read in a place that is another link's; return how many they were."""
+        rejected = unread = 0
         for transmitter in self._transmitters.alive:
             if same_place(transmitter.region.latest, place):
-                many += transmitter.rejected
-                transmitter.rejected = 0
+                rejected, unread = rejected + transmitter.rejected, unread + transmitter.unread
+                transmitter.rejected = transmitter.unread = 0
         for one in list(self._ended):
             if same_place(changed(place, x_px=one[0][0], y_px=one[0][1]), place):
                 self._ended.remove(one)
-                many += one[1]
-        self.counts["frames_rejected"] -= many
-        return many
+                rejected, unread = rejected + one[1], unread + one[2]
+        return self._disclaimed(rejected, unread)
 
     def disown(self, number: int) -> int:
-        """Count no frame that was rejected where a packet was another link's; return how many they were."""
-        many = self._rejected_by.pop(number, 0)
+        """Count no frame that was not read where a packet was another link's; return how many they were."""
+        rejected, unread = self._unread_by.pop(number, (0, 0))
         for transmitter in self._transmitters.alive:
             if transmitter.number == number:
-                many += transmitter.rejected
-                transmitter.rejected = 0
-        self.counts["frames_rejected"] -= many
-        return many
+                rejected, unread = rejected + transmitter.rejected, unread + transmitter.unread
+                transmitter.rejected = transmitter.unread = 0
+        return self._disclaimed(rejected, unread)
+
+    def _disclaimed(self, rejected: int, unread: int) -> int:
+        self.counts["frames_rejected"] -= rejected
+        self.counts["frames_unread"] -= unread
+        return rejected + unread
 
     def close(self) -> None:
         """End the stream: decode what the regions still show."""
@@ -299,6 +302,7 @@ class PacketFraming:
                     self._lit_in(transmitter, due)
                 self.counts[found] += 1
                 transmitter.rejected += found == "frames_rejected"
+                transmitter.unread += found == "frames_unread"
                 continue
             self._take(transmitter, due, found)
 
@@ -334,7 +338,7 @@ class PacketFraming:
         distance, points, centre_px, sight = _NO_RANGE, _NO_POINTS, look.centre_px, BarSight()
         if due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
-            distance = self._measured(FrameView(look.sums, look.offset_px, look.presence, read))
+            distance = self._measured(FrameView(look.sums, look.offset_px, self._looker.whole(look), read))
             points_px, sigma_px, flank_px = self._find_points(
                 look.presence, look.placement, look.sums[: self._packet.pilot_chips]
             )
@@ -464,22 +468,23 @@ class PacketFraming:
         if region in self._transmitters:
             transmitter = self._transmitters[region]
             self.counts["regions_released"] += 1
-            self._was_part(transmitter.rejected)
+            self._was_part(transmitter.rejected, transmitter.unread)
             self._judged.end(transmitter.packets)
             self._transmitters.release(transmitter)
 
-    def _was_part(self, rejected: int) -> None:
+    def _was_part(self, rejected: int, unread: int) -> None:
         """Count the frames that a part of a bar could not show apart from those that no bar shows."""
         self.counts["frames_rejected"] -= rejected
-        self.counts["frames_of_parts"] += rejected
+        self.counts["frames_unread"] -= unread
+        self.counts["frames_of_parts"] += rejected + unread
 
     def _find_parts(self, region: Followed, t_us: float) -> None:
         """Look among the regions that ended for parts of a bar whose first frame is read."""
         for one in list(self._ended):
-            place_px, rejected = one
+            place_px, rejected, unread = one
             if _is_part(region, t_us, place_px):
                 self._ended.remove(one)
-                self._was_part(rejected)
+                self._was_part(rejected, unread)
 
     def _end(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""
@@ -487,19 +492,20 @@ class PacketFraming:
         self._decode_due(transmitter, min(now_us - self._tail_us, seen_us))
         if transmitter.region.id in self._joined:
             return
-        if transmitter.number is not None and transmitter.rejected:
+        rejected, unread = transmitter.rejected, transmitter.unread
+        if transmitter.number is not None and rejected + unread:
             # One that was out of sight has the number that it had.
-            before = self._rejected_by.get(transmitter.number, 0)
-            self._rejected_by[transmitter.number] = before + transmitter.rejected
-            if len(self._rejected_by) > _MOST_ENDED:
-                del self._rejected_by[min(self._rejected_by)]
-        if transmitter.number is None and transmitter.rejected:
+            before = self._unread_by.get(transmitter.number, (0, 0))
+            self._unread_by[transmitter.number] = before[0] + rejected, before[1] + unread
+            if len(self._unread_by) > _MOST_ENDED:
+                del self._unread_by[min(self._unread_by)]
+        if transmitter.number is None and rejected + unread:
             place_px = transmitter.region.positions.place_at(seen_us)
             bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
             if any(_is_part(bar, seen_us, place_px) for bar in bars):
-                self._was_part(transmitter.rejected)
+                self._was_part(rejected, unread)
             else:
-                self._ended.append((place_px, transmitter.rejected))
+                self._ended.append((place_px, rejected, unread))
         self._judged.end(transmitter.packets)
 
 

@@ -16,7 +16,7 @@ from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
 from evlcp_sdk.rx.spread import Spread, neighbours
-from evlcp_sdk.values import Events, PresenceMap, SyncLock
+from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed
 
 if TYPE_CHECKING:
     from evlcp_sdk.rx import _kernels
@@ -200,6 +200,27 @@ class Looker:
         left, right, top, bottom = left - right_px, right + right_px, top - down_px, bottom + down_px
         x, y = look.corner_px
         return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
+
+    def whole(self, look: Look) -> PresenceMap:
+        """What a frame shows, without the clusters that the edge of the sensor cuts.
+
+        They would be measured by what is left of them, nearer to the others than they are: those whose
+        middle is nearer to it than half a spacing. A line of clusters stays as it is.
+        """
+        if self._layout.line or look.placement.scale == 0:
+            return look.presence
+        places, right_px, down_px = self._spots(look, look.placement)
+        x, y = places.real + look.corner_px[0], places.imag + look.corner_px[1]
+        width, height = self._sensor_px
+        cut = (x < right_px) | (x > width - 1 - right_px) | (y < down_px) | (y > height - 1 - down_px)
+        if not cut.any():
+            return look.presence
+        presence = look.presence
+        images = {name: getattr(presence, name) for name in ("probability", "selected", "pixels", "prior")}
+        kept = {name: image.copy() for name, image in images.items() if image is not None}
+        for image in kept.values():
+            image[cut] = 0
+        return changed(presence, **kept)
 
     def lit_rows(self, look: Look) -> tuple[float, float] | None:
         """Upper and lower edge of the clusters that a frame shows, from the whole bar's centre, px.

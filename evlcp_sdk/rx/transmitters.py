@@ -47,6 +47,7 @@ class Transmitter:
         pilot: The newest pilot, None where it showed no bar.
         said: Number of the newest frame that was decoded, on the grid, and its symbols.
         rejected: Frames due that were rejected.
+        unread: Frames due that showed their clusters, and no symbol that is sure.
         behind: Frames that are due wait for the next step.
         tried: Number of the newest frame on the grid that was not given as soon as it was due.
         lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
@@ -63,6 +64,7 @@ class Transmitter:
     pilot: Pilot | None = None
     said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
     rejected: int = 0
+    unread: int = 0
     behind: bool = False
     tried: int = -1
     lit_us: float | None = None
