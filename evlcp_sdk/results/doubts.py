@@ -35,6 +35,9 @@ _MOST_IDS = 5
 _TOLD_SIGMAS = 3.0
 """Sigmas beyond which what a drive tells is hinted at."""
 
+_MANY_CHARACTERS, _ALIKE_SHARE = 50, 0.95
+"""Of so many characters, no such share is one and the same in a text, nor in any data that says much."""
+
 _FEW_FRAMES = 10
 """Frames of a packet by default: of fewer, nothing is said."""
 
@@ -698,6 +701,7 @@ def _codewords(
     if link.characters_on_air and not one.blocks:
         # Of characters a text has few.
         yield from _turned_bits(number, one, link)
+        yield from _one_character(number, one, link)
         return
     never = codewords_never(one, link)
     if not never:
@@ -750,6 +754,20 @@ def _turned_bits(number: int, one: TransmitterTally, link: Link) -> Iterator[Dou
             f"{own[0]:.0%} of its characters are printable, and {other[0]:.0%} if their bits come the other"
             " way round",
             "compare framing.first_bit with the transmitter",
+            number,
+        )
+
+
+def _one_character(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+    """Characters that are all the same, as those of a lamp are that blinks once in a character's time."""
+    value = max(one.values, key=one.values.__getitem__, default=0)
+    if one.given >= _MANY_CHARACTERS and one.values[value] > _ALIKE_SHARE * one.given:
+        digits = (link.codebook.bits_per_symbol + 3) // 4
+        yield Doubt(
+            "one-character",
+            f"{one.values[value]} of its {one.given} characters are 0x{value:0{digits}x}: a lamp that blinks"
+            " once in a character's time reads like that",
+            "look where it stands in the picture",
             number,
         )
 

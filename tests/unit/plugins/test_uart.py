@@ -620,6 +620,31 @@ def test_what_a_list_has_wrong_is_said(tmp_path: Path, evlcp: Callable[..., Any]
     assert "events are ON: when the light goes off is not seen" in on["text"]
 
 
+def test_a_lamp_that_reads_as_one_character_is_said(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    """A period of ten bits, half of it dark: 8N1 reads 0xF0 for ever. A text with blanks is none."""
+    lists = {
+        "lamp": [1, *[0, 0, 0, 0, 0, 1, 1, 1, 1, 1] * 120],
+        "text": levels_of(np.frombuffer(b"to be or not" * 10, np.uint8), 8, "none", 1),
+    }
+    for name, levels in lists.items():
+        _write_list(tmp_path / "list.csv", seen(np.random.default_rng(3), levels, 320.0))
+        command = ["receive", f"{tmp_path}/list.csv", "-o", f"{tmp_path}/{name}", "--set", "framing.id=uart"]
+        for key, value in {
+            "framing.data_bits": 8,
+            "framing.parity": "none",
+            "framing.stop_bits": 1,
+            "detection.id": "whole",
+            "air.chip_rate_hz": 3125.0,
+            "bar.rows": 6,
+        }.items():
+            command += ["--set", f"{key}={value}"]
+        assert evlcp(*command).code == 0
+    said = {name: json.loads((tmp_path / name / "summary.json").read_text())["warnings"] for name in lists}
+    (lamp,) = (one for one in said["lamp"] if one["code"] == "one-character")
+    assert "characters are 0xf0: a lamp that blinks once in a character's time" in lamp["text"]
+    assert said["text"] == []
+
+
 def test_a_clear_light_of_another_code_is_none_of_characters() -> None:
     """Pair codes at the rate of bits, as those of a bar: an edge in the middle of each pair."""
     rng = np.random.default_rng(0)
