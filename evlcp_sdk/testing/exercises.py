@@ -29,6 +29,7 @@ __all__ = [
     "filters_of",
     "heard_of",
     "link_of",
+    "link_of_one_cluster",
     "subject_of",
     "symbols_of",
 ]
@@ -70,7 +71,8 @@ def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
 
 
 @cache
-def _of_one_cluster() -> Link:
+def link_of_one_cluster() -> Link:
+    """The default link, with a bar of one cluster."""
     return resolve({"bar": ONE_CLUSTER})
 
 
@@ -95,7 +97,7 @@ def link_of(subject: Subject, **air: Any) -> Link:
         try:
             subject.algorithm.codebook(link.bar.clusters)
         except ConfigError:
-            link = _of_one_cluster()
+            link = link_of_one_cluster()
     if subject.role == "pilots":
         compiled(lambda: subject.algorithm.codes(link.bar.clusters))
     link = link.with_algorithm(subject.role, subject.algorithm, id=subject.id)
