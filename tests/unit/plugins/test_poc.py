@@ -5,6 +5,7 @@ from pathlib import Path
 import numpy as np
 import poc_twins as twins
 import pytest
+from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
 from evlcp_poc.ranging import PocRanging, _blob_band, phase_only_correlation
 from hypothesis import given, settings
@@ -489,6 +490,20 @@ def test_a_pair_weighs_by_its_spacing(power):
     weights = 15**power, 8**power
     assert both.pairs == 2
     assert both.distance_m == pytest.approx(np.average([long, short], weights=weights), rel=1e-6)
+
+
+def test_centroid_leaves_out_the_rim_of_a_panel():
+    """Clusters of the rim look further out than they are; the inner four tell the scale."""
+    maps = image_of(PANEL, 30)
+    moved = maps.copy()
+    for side, axis, px in ((1, 1, -1), (2, 1, 1), (4, 2, -1), (8, 2, 1)):
+        rim = PANEL.sides & side == 0
+        assert rim.sum() == 4
+        moved[rim] = np.roll(moved[rim], px, axis=axis)
+    inner, every = (CentroidRanging(skip_outer=n).compile(CAMERA, PANEL, LINK.codebook) for n in (1, 0))
+    assert inner(view_of(moved)) == inner(view_of(maps))
+    assert inner(view_of(maps)).distance_m == pytest.approx(30, rel=5e-3)
+    assert every(view_of(moved)).distance_m < 0.97 * every(view_of(maps)).distance_m
 
 
 def test_two_clusters_are_one_pair():
