@@ -239,6 +239,11 @@ class Codebook:
         """Chips from one edge that tells codes apart to the next; the first comes after one chip."""
         return 2 if self.pairs else 1
 
+    @property
+    def chips_after(self) -> int:
+        """Chips after a codeword whose first edge its decoding reads: 1, but 0 of pair codes."""
+        return 0 if self.pairs else 1
+
     @cached_property
     def pilot_edges(self) -> Values:
         """What pixels of each cluster see in a pilot, 1 on, -1 off, 0 nothing, int8 (K, n).

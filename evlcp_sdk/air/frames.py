@@ -14,7 +14,15 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 
-__all__ = ["PacketFormat", "bits_of_symbols", "info_words", "packet_chips", "pilot_words", "symbols_of_bits"]
+__all__ = [
+    "PacketFormat",
+    "bits_of_symbols",
+    "chips_behind",
+    "info_words",
+    "packet_chips",
+    "pilot_words",
+    "symbols_of_bits",
+]
 
 
 @dataclass(frozen=True)
@@ -128,6 +136,24 @@ def packet_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -
     for frame, row in enumerate(s):
         parts += [pilot, info[row].T] if frame % pilot_every == 0 else [info[row].T]
     return np.concatenate(parts)
+
+
+def chips_behind(codebook: Codebook, packet: PacketFormat, frame: int) -> NDArray[np.int8]:
+    """The chip that each cluster sends right after a frame of a packet, int8 (K,); -1 where it may be either.
+
+    A pilot follows, or the next frame's codeword, or a preamble. After the last packet it is dark, so a
+    preamble that begins lit says nothing.
+
+    >>> book = Codebook("demo", np.array([0, 1]), np.array([[1, 0], [0, 1]]), np.array([[0, 1], [1, 1]]))
+    >>> packet = PacketFormat.of(book, frames=3, pilot_every=2)
+    >>> [chips_behind(book, packet, frame).tolist() for frame in range(3)]
+    [[-1, -1], [1, 0], [0, 0]]
+    """
+    last = frame + 1 == packet.frames
+    if not last and packet.has_pilot(frame + 1):
+        return codebook.pilots[:, 0].astype(np.int8)
+    first = {0, int(codebook.preamble[0])} if last else set(codebook.codewords[:, 0].tolist())
+    return np.full(codebook.clusters, first.pop() if len(first) == 1 else -1, np.int8)
 
 
 def _words(chips: NDArray[np.uint8]) -> NDArray[np.uint16]:

@@ -66,8 +66,10 @@ class Decode(Protocol):
     def __call__(self, presence: PresenceMap, sums: NDArray[np.int16], /) -> SoftSymbols:
         """Presence and a frame's polarity sums, pilot then info, int16 (chips, height, width) -> symbols.
 
-        For codes that are no pair codes a third argument follows: the chip that each cluster sent before the
-        info segment, int8 (K,), -1 where it is not known. In a pair code the first edge says nothing new.
+        For codes that are no pair codes two more arguments follow: the chip that each cluster sends before
+        the info segment and the one after it, int8 (K,) each, -1 where it is not known; and `sums` has the
+        chip after it, too, behind the edge that ends its last chip. In a pair code these edges say nothing
+        new.
         """
 
 

@@ -222,7 +222,7 @@ class HeardFraming:
             lock = SyncLock(one.packet_t_us, one.chip_us, 0.0, 0.0, 1.0)
             number = one.packet * self._packet.frames + one.frame
             due = DueFrame(
-                number, one.packet, one.frame, chips, False, one.packet_t_us, one.t_us, end_us, lock
+                number, one.packet, one.frame, chips, False, one.packet_t_us, one.t_us, end_us, lock, end_us
             )
             light = listener.events / len(heard)
             self._judged.add(listener.packets, due, Sighting(frame, light, self._codebook.clusters, False))

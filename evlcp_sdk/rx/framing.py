@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import edges_of_chips
-from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.air.frames import PacketFormat, chips_behind
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.belief import believed, still_lit
@@ -117,7 +117,9 @@ class PacketFraming:
         self._steps = steps
         self._regions = regions
         self._name = name
-        self._transmitters = Transmitters(link.packet, self._step_us, limits, numbers)
+        self._transmitters = Transmitters(
+            link.packet, self._step_us, limits, numbers, link.codebook.chips_after
+        )
         self._looker = Looker(
             link.packet,
             link.regions,
@@ -129,6 +131,7 @@ class PacketFraming:
         self._codebook = link.codebook
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
         self._unknown.setflags(write=False)
+        self._behind = [chips_behind(link.codebook, link.packet, n) for n in range(link.packet.frames)]
         self._rows = RowDelays(link.codebook.preamble)
         edges = edges_of_chips(link.codebook.pilots).astype(np.int64)
         self._find_points = points_finder(layout_of(centres_m), edges, link.codebook.edge_every)
@@ -331,7 +334,9 @@ class PacketFraming:
             self._regions.drop(transmitter.region)
             self._let_go(transmitter.region)
             return "frames_rejected"
-        read = self._steps.decode(look.presence, look.sums, self._before(transmitter, due))
+        read = self._steps.decode(
+            look.presence, look.sums_and_next, self._before(transmitter, due), self._behind[due.index]
+        )
         transmitter.said = due.number, read.symbols
         lit = still_lit(look.sums, look.presence, self._packet.pilot_chips, self._codebook.least_activity)
         soft = believed(read, look.placement.seen & lit)
@@ -429,7 +434,7 @@ class PacketFraming:
             # Within half of the seam, motion in the frame is known as well as by its next look.
             if off_px == 0 or (whole and off_px <= self._seam_px / 2):
                 break
-            self._regions.gather(region, due.start_us, due.end_us)
+            self._regions.gather(region, due.start_us, due.read_us)
         if most_px > self._seam_px / 2:
             self._regions.gather(region)
         if look is None:

@@ -23,6 +23,7 @@ class DueFrame:
         start_us: Start of its first chip, us.
         end_us: When the events of its last edge end, us.
         lock: What these times come from.
+        read_us: When those of the chips after it that are read with it end, too, us.
     """
 
     number: int
@@ -34,6 +35,7 @@ class DueFrame:
     start_us: float
     end_us: float
     lock: SyncLock
+    read_us: float
 
 
 @dataclass
@@ -42,12 +44,14 @@ class PacketGrid:
 
     Attributes:
         format: Lengths of a packet's parts.
+        chips_after: Chips after a frame that are read with it (`Codebook.chips_after`).
         lock: The newest lock; None before the first.
         packet: Number of the lock's packet, counted from the first that may have a frame here.
         frame: Next frame to decode, counted from that packet's first.
     """
 
     format: PacketFormat
+    chips_after: int = 0
     lock: SyncLock | None = None
     packet: int = 0
     frame: int = 0
@@ -92,15 +96,15 @@ class PacketGrid:
 
     @property
     def due_us(self) -> float:
-        """When the events of the next frame's last edge end, us; infinite before a lock."""
-        return math.inf if self.lock is None else self._next(self.lock).end_us
+        """When the next frame can be read, us; infinite before a lock."""
+        return math.inf if self.lock is None else self._next(self.lock).read_us
 
     def due(self, until_us: float) -> DueFrame | None:
-        """The next frame, if it lies before a time with the events after its last edge."""
+        """The next frame, if it lies before a time with all events that are read with it."""
         if self.lock is None:
             return None
         frame = self._next(self.lock)
-        return frame if frame.end_us <= until_us else None
+        return frame if frame.read_us <= until_us else None
 
     def _next(self, lock: SyncLock) -> DueFrame:
         """The next frame; asked for again and again before it is due."""
@@ -113,8 +117,11 @@ class PacketGrid:
         chips = self.format.frame_chips if has_pilot else self.format.info_chips
         late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
         end_us = start_us + chips * lock.chip_us + late_us
+        read_us = end_us + self.chips_after * lock.chip_us
         packet_us = start_us - self.format.frame_start_chip(index) * lock.chip_us
-        frame = DueFrame(self.frame, number, index, chips, has_pilot, packet_us, start_us, end_us, lock)
+        frame = DueFrame(
+            self.frame, number, index, chips, has_pilot, packet_us, start_us, end_us, lock, read_us
+        )
         self._known = lock, self.packet, self.frame, frame
         return frame
 

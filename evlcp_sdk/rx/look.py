@@ -59,6 +59,7 @@ class Look:
     Attributes:
         sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
         offset_px: The rest of the motion in them, float64 (2, chips), px.
+        sums_and_next: The same sums and those of the chips after the frame (`Codebook.chips_after`).
         presence: Where the clusters are, in their footprints only.
         placement: Where the image shows the layout.
         others: Other instances of it in the image.
@@ -71,6 +72,7 @@ class Look:
 
     sums: NDArray[np.int16]
     offset_px: NDArray[np.float64]
+    sums_and_next: NDArray[np.int16]
     presence: PresenceMap
     placement: Placement
     others: tuple[Placement, ...]
@@ -116,9 +118,12 @@ class Looker:
         self._pilots = codebook.pilots.astype(np.int64)
         self._edges = codebook.pilot_edges.astype(np.int64)
         self._every = codebook.edge_every
+        self._after = codebook.chips_after
         self._separate = separate
         self._sensor_px = sensor_px
-        self._halves: NDArray[np.float64] = np.arange(packet.frame_chips, dtype=np.float64) + 0.5
+        self._halves: NDArray[np.float64] = (
+            np.arange(packet.frame_chips + self._after, dtype=np.float64) + 0.5
+        )
 
     def look(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> tuple[Look | None, Pilot | None]:
         """Look at a frame.
@@ -132,7 +137,7 @@ class Looker:
             The frame, None if it does not show its clusters; and the newest pilot that showed the bar.
         """
         lock, packet = due.lock, self._packet
-        middles = due.start_us + self._halves[: due.chips] * lock.chip_us
+        middles = due.start_us + self._halves[: due.chips + self._after] * lock.chip_us
         x, y = region.positions.at(np.asarray(middles, np.float64))
         middle = min(due.chips, packet.pilot_chips) // 2
         if due.has_pilot:
@@ -141,7 +146,7 @@ class Looker:
             return None, pilot
         else:
             size = pilot.size_px
-        pieces = [e for t, e in region.pieces if t < due.end_us and t + self._spec.step_us > due.start_us]
+        pieces = [e for t, e in region.pieces if t < due.read_us and t + self._spec.step_us > due.start_us]
         sums, offset_px = polarity_sums(pieces, lock, due.start_us, (x, y), size)
         spread = None
         if due.has_pilot:
@@ -161,6 +166,7 @@ class Looker:
             assert pilot is not None
             sums = np.concatenate([pilot.sums, sums])
             offset_px = np.concatenate([pilot.offset_px, offset_px], axis=1)
+        chips = len(sums) - self._after
         # The image shows the pilot's mean, read from the chips behind edges that tell codes apart: it lies
         # where these were looked for in the mean, however much the region's track trembles between chips.
         told = slice(1, packet.pilot_chips, self._every)
@@ -172,7 +178,15 @@ class Looker:
         corner_px = (centre_x - (size[0] - 1) / 2 - rest_x, centre_y - (size[1] - 1) / 2 - rest_y)
         middle_us = float(middles[middle]) - lock.chip_us / 2
         look = Look(
-            sums, offset_px, pilot.presence, pilot.placement, pilot.others, corner_px, middle_us, spread
+            sums[:chips],
+            offset_px[:, :chips],
+            sums,
+            pilot.presence,
+            pilot.placement,
+            pilot.others,
+            corner_px,
+            middle_us,
+            spread,
         )
         return look, pilot
 

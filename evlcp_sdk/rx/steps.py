@@ -176,13 +176,20 @@ class Steps:
         self._announcer.lap("separation", presence)
         return presence
 
-    def decode(self, presence: PresenceMap, sums: NDArray[np.int16], before: NDArray[np.int8]) -> SoftSymbols:
+    def decode(
+        self,
+        presence: PresenceMap,
+        sums: NDArray[np.int16],
+        before: NDArray[np.int8],
+        after: NDArray[np.int8],
+    ) -> SoftSymbols:
         """What the clusters say, from the polarity sums of pilot and info, int16 (chips, height, width).
 
-        The chips sent before the info segment matter to codes that are no pair codes.
+        To codes that are no pair codes the chips sent before and after the info segment matter, and the sums
+        have the one after it, too.
         """
         guard = self._guards["decoding"]
-        more = () if self._codebook.pairs else (before,)
+        more = () if self._codebook.pairs else (before, after)
         with guard:
             soft = self._decode(presence, sums, *more)
         guard.expect_symbols(soft, self._codebook)

@@ -78,6 +78,7 @@ class Transmitters:
         step_us: Length of a time step, us.
         limits: How many are remembered.
         numbers: Where their numbers come from; None for 0, 1, 2...
+        chips_after: Chips after a frame that are read with it.
     """
 
     def __init__(
@@ -86,8 +87,10 @@ class Transmitters:
         step_us: int,
         limits: Limits = LIMITS,
         numbers: Iterator[int] | None = None,
+        chips_after: int = 0,
     ) -> None:
         self._packet = packet
+        self._chips_after = chips_after
         self._remembered = limits.remembered
         self._step_us = step_us
         self._alive: dict[int, Transmitter] = {}
@@ -112,7 +115,7 @@ class Transmitters:
 
     def open(self, region: Followed, sync: Any, distance: Any) -> None:
         """Take a new region, with the first states of its synchronization and its distance filter."""
-        packets, grid = PacketAssembler(self._packet.frames), PacketGrid(self._packet)
+        packets, grid = PacketAssembler(self._packet.frames), self._grid()
         self._alive[region.id] = Transmitter(region, sync, packets, grid, distance)
 
     def adopt(self, transmitter: Transmitter, lock: SyncLock) -> bool:
@@ -153,9 +156,12 @@ class Transmitters:
             transmitter.number, transmitter.first = lost.number, lost.first
             transmitter.distance = lost.distance
             transmitter.packets, lost.packets = lost.packets, transmitter.packets
-            transmitter.grid, lost.grid = lost.grid, PacketGrid(self._packet)
+            transmitter.grid, lost.grid = lost.grid, self._grid()
             return True
         return False
+
+    def _grid(self) -> PacketGrid:
+        return PacketGrid(self._packet, self._chips_after)
 
     def in_step(self, transmitter: Transmitter) -> list[Transmitter]:
         """Others that have shown no frame yet either, whose packets stand on the same times.

@@ -1,7 +1,8 @@
 """Laws of what looks at images: separation, decoding, ranging."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -150,14 +151,27 @@ def decoding_shapes(subject: Subject) -> None:
 def decoding_inverts(subject: Subject) -> None:
     """Hold the law."""
     for book, decode in _decoders(subject):
+        whole: Callable[..., SoftSymbols] = decode
         presence = ideal_presence(book.clusters)
         n, k = len(book.codewords), book.clusters
         for first in range(0, n, k):
             symbols = (first + np.arange(k)) % n
-            got = decode(presence, ideal_sums(book, symbols)).symbols
-            wrong = np.flatnonzero(got != symbols)
-            told = f"symbol {symbols[wrong[0]]}, got {got[wrong[0]]}" if wrong.size else ""
-            expect(not wrong.size, f"profile {book.profile}: {told}")
+            for what, given in _as_received(book, symbols):
+                got = whole(presence, *given).symbols
+                wrong = np.flatnonzero(got != symbols)
+                told = f"symbol {symbols[wrong[0]]}{what}, got {got[wrong[0]]}" if wrong.size else ""
+                expect(not wrong.size, f"profile {book.profile}: {told}")
+
+
+def _as_received(book: Codebook, symbols: NDArray[np.int64]) -> Iterator[tuple[str, tuple[Any, ...]]]:
+    """What the receiver gives a decoding beside the presence; of codes of chips, what is sent around it, too."""
+    if book.pairs:
+        yield "", (ideal_sums(book, symbols),)
+        return
+    before = book.pilots[:, -1].astype(np.int8)
+    for value, what in ((-1, ""), (0, " before a dark chip"), (1, " before a lit chip")):
+        after = np.full(book.clusters, value, np.int8)
+        yield what, (ideal_sums(book, symbols, after=np.maximum(after, 0)), before, after)
 
 
 def llr_agrees(subject: Subject) -> None:

@@ -30,6 +30,7 @@ def ideal_sums(
     codebook: Codebook,
     symbols: ArrayLike,
     *,
+    after: ArrayLike | None = None,
     cluster_px: int = 8,
     width_px: int = 6,
     offset_px: tuple[int, int] = (0, 0),
@@ -42,6 +43,7 @@ def ideal_sums(
     Args:
         codebook: The codes.
         symbols: What the clusters say, top first, (K,).
+        after: The chip that each cluster sends after the frame, (K,); the sums then have it, too.
         cluster_px: Spacing of the clusters, px.
         width_px: Width of the bar, px.
         offset_px: Where the bar stands off the image's middle, (right, down), px.
@@ -51,6 +53,8 @@ def ideal_sums(
     """
     words = codebook.codewords[np.asarray(symbols, np.int64)]
     chips = np.concatenate([codebook.pilots, words], axis=1)
+    if after is not None:
+        chips = np.concatenate([chips, np.asarray(after, np.uint8)[:, None]], axis=1)
     edges = np.diff(chips.astype(np.int16), axis=1, prepend=0)
     # Row K is dark: what pixels of no cluster, -1, show.
     edges = np.concatenate([edges, np.zeros((1, edges.shape[1]), np.int16)])

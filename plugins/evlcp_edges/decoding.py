@@ -7,21 +7,26 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.air.codebook import Codebook, edges_of_chips
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols
 
 __all__ = ["EdgeDecoding"]
 
+_SURE = 5.0
+"""Log odds of a codeword from which its cluster teaches the others: one of 150 such is another."""
+
 
 @dataclass(frozen=True)
 class EdgeDecoding(Decoding):
-    """Likelihood of every codeword, by how many events pixels have at a rise, at a fall and where nothing is.
+    """Likelihood of every codeword, by how many events pixels have behind each pair and triple of chips.
 
-    Pilots are known, so each frame shows how often each polarity sum comes with which edge, and with which
-    one in the chip before, whose late events it may hold: histograms over the pixels of all clusters. A
-    codeword's log-likelihood is the sum of those of its edges, over its chips and the pixels, weighted by
-    presence. The edge before its first chip counts where it is known what was sent before it.
+    Pilots are known, so each frame shows how often each polarity sum comes in a chip, by what was sent in it
+    and in the two before, whose late events it may hold: histograms over the pixels of all clusters. A
+    codeword's log-likelihood is the sum over its chips and the pixels, weighted by presence. The edges before
+    its first chip and after its last count where it is known what is sent there. Then all is read once more:
+    a cluster that was read surely teaches the others what its codeword's chips look like, which pilots need
+    not hold and which are as near in time as can be.
     """
 
     max_events: Annotated[
@@ -33,6 +38,14 @@ class EdgeDecoding(Decoding):
     prior_count: Annotated[
         float, Field(gt=0, description="Observations added to every cell of the histograms.")
     ] = 1.0
+    pair_count: Annotated[
+        float,
+        Field(
+            gt=0,
+            description="Pixels of which a pair of chips speaks for each triple that ends in it: of the"
+            " hundreds behind a triple, few err by themselves.",
+        ),
+    ] = 300.0
     independent_pixels: Annotated[
         float,
         Field(
@@ -45,30 +58,38 @@ class EdgeDecoding(Decoding):
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
         pilot_chips = codebook.pilots.shape[1]
-        pilots = edges_of_chips(codebook.pilots)
-        words = codebook.codewords.astype(np.int64)
-        # Behind what is not known, behind a dark chip and behind a lit one: (3, symbols, chips).
-        kinds = np.stack([_kinds(words, before) for before in (-1, 0, 1)])
+        pilots = _kinds(codebook.pilots, -1, -1)[:, :-1]
+        # Between what is not known, a dark chip and a lit one: (3, 3, symbols, chips and the one after).
+        ends = (-1, 0, 1)
+        words = np.array([[_kinds(codebook.codewords, before, after) for after in ends] for before in ends])
         most, carried = self.max_events, 2**codebook.bits_per_symbol
         bits = (np.arange(carried)[:, None] >> np.arange(codebook.bits_per_symbol - 1, -1, -1) & 1).astype(
             bool
         )
-        chip = np.arange(words.shape[1])
 
         def decode(
-            presence: PresenceMap, sums: NDArray[np.int16], before: NDArray[np.int8] | None = None
+            presence: PresenceMap,
+            sums: NDArray[np.int16],
+            before: NDArray[np.int8] | None = None,
+            after: NDArray[np.int8] | None = None,
         ) -> SoftSymbols:
-            presence = presence.informed()
             clipped = np.clip(sums, -most, most).astype(np.int64) + most
-            weight = _weights(presence, self.min_weight)
-            table = self._learned(weight, clipped[1:pilot_chips], pilots)
-            # What each cluster's pixels say of each kind in each chip: (K, chips, kinds).
-            said = _weighted(weight, clipped[pilot_chips:], table)
-            behind = np.full(len(said), -1) if before is None else before
-            fit = np.stack(
-                [one[chip, kinds[b + 1]].sum(1) for one, b in zip(said, behind.tolist(), strict=True)]
+            shown, seen = _histograms(
+                presence.informed(), clipped, 2 * most + 1, self.min_weight, pilot_chips
             )
-            fit *= self.independent_pixels
+            unknown = np.full(len(seen), -1, np.int8)
+            behind, ahead = (unknown if sent is None else sent for sent in (before, after))
+            # Of each cluster's codewords, (K, symbols, info chips that there are).
+            kinds = words[behind + 1, ahead + 1, :, : seen.shape[1]]
+            taught = _counted(pilots, shown[:, :pilot_chips])
+            fit = self._fit(seen, kinds, taught.sum(0, keepdims=True))
+            if len(fit) > 1:
+                second, first = np.partition(fit, -2, axis=1)[:, -2:].T
+                said = np.take_along_axis(kinds, fit.argmax(1)[:, None, None], 1)[:, 0]
+                said[first - second < _SURE] = 0
+                own = _counted(said, shown[:, pilot_chips:])
+                # None is taught by itself: what it was taken for would seem likelier.
+                fit = self._fit(seen, kinds, (taught + own).sum(0) - own)
             symbols = fit.argmax(1)
             llr = np.empty((len(fit), bits.shape[1]), np.float32)
             for bit in range(bits.shape[1]):
@@ -80,82 +101,89 @@ class EdgeDecoding(Decoding):
 
         return decode
 
-    def _learned(
-        self, weight: "list[_Pixels]", pilot: NDArray[np.int64], edges: NDArray[np.int8]
+    def _fit(
+        self, seen: NDArray[np.float64], kinds: NDArray[np.int64], counts: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Log-likelihood of each polarity sum by its kind, float64 (13, sums)."""
-        side = 2 * self.max_events + 1
-        # By the edge before, by the edge.
-        counts = np.zeros((3, 3, side))
-        for pixels, code in zip(weight, edges, strict=True):
-            shown = pixels.share > 0.5
-            share = pixels.share[shown]
-            for chip in range(1, len(code)):
-                seen = pilot[chip][pixels.v[shown], pixels.u[shown]]
-                counts[code[chip - 1] + 1, code[chip] + 1] += np.bincount(seen, share, side)
+        """Log-likelihood of each codeword of each cluster, float64 (K, symbols).
+
+        Args:
+            seen: Histograms of each cluster's pixels by chip, float64 (K, chips, sums).
+            kinds: Kind of each chip of its codewords, int64 (K, symbols, chips).
+            counts: Histograms by kind for each cluster, or one for all, float64 (K or 1, 13, sums).
+        """
+        # What each cluster's pixels say of each kind in each chip: (K, chips, kinds).
+        said = seen @ self._log_shares(counts).transpose(0, 2, 1)
+        each = np.take_along_axis(said[:, None], kinds[..., None], 3)
+        fit: NDArray[np.float64] = each.sum((2, 3)) * self.independent_pixels
+        return fit
+
+    def _log_shares(self, counts: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Log-likelihood of each polarity sum by its kind: histograms, float64 (n, 13, sums), to the same."""
+        triples = counts[:, 5:].reshape(len(counts), 2, 4, -1)
+        pairs = counts[:, 1:5] + triples.sum(1)
+        alike = _shares(pairs.sum(1, keepdims=True), 1 / pairs.shape[-1])
+        of_pair = _shares(pairs, alike)[:, None]
+        of_triple = _shares(triples + self.pair_count * of_pair, of_pair)
+        shares = np.concatenate([of_pair[:, 0], of_triple.reshape(len(counts), 8, -1)], 1)
         # What comes with all alike is worth the same: each histogram's prior is as large as it is itself.
-        prior = self.prior_count * 9 / max(float(counts.sum()), 1e-9)
-        of_edge = _log_shares(counts.sum(0), prior)
-        of_both = _log_shares(counts.reshape(9, side), prior).reshape(3, 3, side)
-        # A kind that no pilot has is like all of its edge.
-        of_both = np.where(counts.sum(-1, keepdims=True) > 0, of_both, of_edge)
-        return np.concatenate([np.zeros((1, side)), of_edge, of_both.reshape(9, side)])
+        prior = self.prior_count * 9 / np.maximum(pairs.sum((1, 2)), 1e-9)[:, None, None]
+        logs = np.log((shares + prior) / (1 + shares.shape[-1] * prior))
+        return np.concatenate([np.zeros_like(logs[:, :1]), logs], 1)
 
 
-@dataclass(frozen=True, eq=False)
-class _Pixels:
-    """A cluster's pixels: rows, columns, and presence probability of each."""
-
-    v: NDArray[np.int64]
-    u: NDArray[np.int64]
-    share: NDArray[np.float64]
-
-
-def _log_shares(counts: NDArray[np.float64], prior: float) -> NDArray[np.float64]:
-    """Log of each histogram's shares, with a prior in every cell, as a share of the histogram."""
-    many = counts.sum(1, keepdims=True)
-    each = prior * np.where(many > 0, many, 1.0)
-    shares: NDArray[np.float64] = np.log((counts + each) / (many + counts.shape[1] * each))
-    return shares
-
-
-def _kinds(words: NDArray[np.int64], before: int) -> NDArray[np.int64]:
-    """Kind of each chip of codewords behind a chip, int64 (symbols, chips).
-
-    0: nothing is known of its edge; 1 to 3: its edge is -1, 0, +1; 4 to 12: the same behind one of -1, 0, +1.
-    """
-    edges = np.diff(words, axis=1)
-    kinds = np.zeros(words.shape, np.int64)
-    kinds[:, 1:] = 2 + edges
-    kinds[:, 2:] = 4 + 3 * (edges[:, :-1] + 1) + edges[:, 1:] + 1
-    if before >= 0:
-        first = words[:, 0] - before
-        kinds[:, 0] = 2 + first
-        if words.shape[1] > 1:
-            kinds[:, 1] = 4 + 3 * (first + 1) + edges[:, 0] + 1
-    return kinds
-
-
-def _weights(presence: PresenceMap, least: float) -> list[_Pixels]:
-    """The pixels of each cluster."""
-    grid = presence.grid_px
-    found = []
-    for image in presence.probability:
-        r, c = np.nonzero(image >= least)
-        v = (r[:, None, None] * grid + np.arange(grid)[:, None] + np.zeros(grid, np.int64)).ravel()
-        u = (c[:, None, None] * grid + np.zeros(grid, np.int64)[:, None] + np.arange(grid)).ravel()
-        found.append(_Pixels(v, u, image[r, c].astype(np.float64).repeat(grid * grid)))
+def _shares(counts: NDArray[np.float64], without: NDArray[np.float64] | float) -> NDArray[np.float64]:
+    """Histograms as shares; those without any observation are like others."""
+    many = counts.sum(-1, keepdims=True)
+    found: NDArray[np.float64] = np.where(many > 0, counts / np.where(many > 0, many, 1.0), without)
     return found
 
 
-def _weighted(
-    weight: list[_Pixels], sums: NDArray[np.int64], table: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """What the table says of each cluster's pixels, (chips, height, width) -> float64 (K, chips, kinds)."""
-    side = table.shape[1]
-    found = []
-    for pixels in weight:
-        seen = sums[:, pixels.v, pixels.u]
-        counts = np.stack([np.bincount(row, pixels.share, side) for row in seen])
-        found.append(counts @ table.T)
-    return np.stack(found)
+def _kinds(words: NDArray[np.uint8], before: int, after: int) -> NDArray[np.int64]:
+    """Kind of each chip of codewords and of the one after them, int64 (symbols, chips + 1).
+
+    0: it or the chip before it is not known; 1 to 4: both are, 00, 01, 10, 11; 5 to 12: so is the one before
+    these, 000 to 111. What is sent before and after them is 0, 1, or -1 for not known.
+    """
+    sent = np.pad(words.astype(np.int64), ((0, 0), (2, 1)), constant_values=-1)
+    sent[:, 1], sent[:, -1] = before, after
+    oldest, older, newest = sent[:, :-2], sent[:, 1:-1], sent[:, 2:]
+    pair, triple = 1 + 2 * older + newest, 5 + 4 * oldest + 2 * older + newest
+    return np.where((older < 0) | (newest < 0), 0, np.where(oldest < 0, pair, triple))
+
+
+def _counted(kinds: NDArray[np.int64], histograms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum histograms, float64 (K, chips, sums), by the kind of their chips: float64 (K, 13, sums)."""
+    counts = np.zeros((len(kinds), 13, histograms.shape[-1]))
+    np.add.at(counts, (np.arange(len(kinds))[:, None], kinds), histograms)
+    counts[:, 0] = 0
+    return counts
+
+
+def _histograms(
+    presence: PresenceMap, sums: NDArray[np.int64], side: int, least: float, pilot_chips: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """How often each polarity sum comes in each chip, by presence.
+
+    Returns:
+        Of the pixels that show a cluster rather than not, in all chips, float64 (K, chips, side); and of all
+        from the least presence on, in the chips behind the pilot.
+    """
+    grid = presence.grid_px
+    clusters, chips = len(presence.probability), len(sums)
+    shown, seen = np.empty((clusters, chips, side)), np.empty((clusters, chips - pilot_chips, side))
+    for k, image in enumerate(presence.probability):
+        r, c = np.nonzero(image >= least)
+        v = (r[:, None, None] * grid + np.arange(grid)[:, None] + np.zeros(grid, np.int64)).ravel()
+        u = (c[:, None, None] * grid + np.zeros(grid, np.int64)[:, None] + np.arange(grid)).ravel()
+        share = image[r, c].astype(np.float64).repeat(grid * grid)
+        values = sums[:, v, u]
+        shown[k] = _by_chip(values[:, share > 0.5], share[share > 0.5], side)
+        seen[k] = _by_chip(values[pilot_chips:], share, side)
+    return shown, seen
+
+
+def _by_chip(values: NDArray[np.int64], share: NDArray[np.float64], side: int) -> NDArray[np.float64]:
+    """Histogram of each row of values, int64 (chips, n), weighted: float64 (chips, side)."""
+    rows = values + side * np.arange(len(values))[:, None]
+    many = np.bincount(rows.ravel(), np.tile(share, len(values)), side * len(values))
+    return many.astype(np.float64).reshape(len(values), side)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from evlcp_barker.synchronization import BarkerSync
 from evlcp_centroid.ranging import CentroidRanging
+from evlcp_edges.decoding import EdgeDecoding
 from evlcp_kalman.tracking import KalmanTracking
 from evlcp_polar.correction import Polar
 from evlcp_regions.detection import Whole
@@ -18,7 +19,7 @@ from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from pydantic import Field
 
-from evlcp_sdk.air.codebook import chips_of_values
+from evlcp_sdk.air.codebook import Codebook, chips_of_values
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import (
@@ -337,6 +338,14 @@ class OneOrder(Separation):
         return WhCorrelation().compile(load_link().codebook)
 
 
+class TwoInputs(EdgeDecoding):
+    """It is not told what stands around a codeword."""
+
+    def compile(self, codebook: Codebook) -> Any:
+        inner = super().compile(codebook)
+        return lambda presence, sums: inner(presence, sums)
+
+
 def numbered(soft: Any) -> Any:
     return replace(soft, llr=soft.llr * np.arange(1, len(soft.llr) + 1, dtype=np.float32)[:, None])
 
@@ -609,6 +618,7 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
             decoding(after(lambda s: replace(s, symbols=s.symbols ^ 1))),
             "profile raw8: symbol 0, got 1",
         ),
+        ("inverts", TwoInputs(), "2 positional arguments but 4 were given"),
         ("llr-agrees", decoding(after(lambda s: replace(s, llr=-s.llr))), "llr > 0 where a bit is 0"),
         ("permutes", decoding(after(numbered)), "llr in the order"),
         ("knows-nothing", decoding(after(lambda s: replace(s, llr=s.llr + 5))), "llr of 0"),

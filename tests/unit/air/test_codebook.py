@@ -16,6 +16,7 @@ from evlcp_sdk.air.codebook import Codebook, chips_of_values, hadamard
 from evlcp_sdk.air.frames import (
     PacketFormat,
     bits_of_symbols,
+    chips_behind,
     info_words,
     packet_chips,
     pilot_words,
@@ -73,6 +74,26 @@ def test_a_sparse_packet_is_the_full_one_without_some_pilots(profile: str, frame
         begin = form.frame_start_chip(f)
         at = 26 + 32 * f + (0 if form.has_pilot(f) else 16)
         assert kept[begin : begin + 16].tolist() == full[at : at + 16].tolist()
+
+
+@pytest.mark.parametrize(("frames", "every"), [(10, 1), (10, 4), (9, 4), (1, 1)])
+@pytest.mark.parametrize("preamble", [[0, 1, 1], [1, 1, 0]])
+@pytest.mark.parametrize("first", [[0, 1], [0, 0]])
+def test_what_follows_a_frame_is_what_is_on_air(
+    frames: int, every: int, preamble: list[int], first: list[int]
+) -> None:
+    words = np.array([[first[0], 1, 0], [first[1], 0, 1]])
+    book = Codebook("x", np.array(preamble), np.array([[1, 0, 1], [0, 1, 1]]), words)
+    form = PacketFormat.of(book, frames, pilot_every=every)
+    rng = np.random.default_rng(frames)
+    packets = [packet_chips(rng.integers(0, 2, (frames, 2)), book, every) for _ in range(20)]
+    # The last packet is followed by dark.
+    chips = np.concatenate([*packets, np.zeros((1, 2), np.uint8)])
+    starts = np.arange(20)[:, None] * form.packet_chips
+    for frame in range(frames):
+        behind = chips[starts + form.frame_start_chip(frame + 1)].reshape(20, 2).astype(np.int8)
+        alike = (behind == behind[0]).all(0)
+        assert chips_behind(book, form, frame).tolist() == np.where(alike, behind[0], -1).tolist()
 
 
 @pytest.mark.parametrize(

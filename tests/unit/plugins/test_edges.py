@@ -96,66 +96,110 @@ def test_presence_is_bayes_rule_over_edges(seed: int) -> None:
     assert (found.selected == (found.probability >= 0.5)).all()
 
 
-def kind_of(word: list[int], chip: int, before: int) -> tuple[int | None, int | None]:
-    """Edge before and at a chip; None where it is not known."""
-    sent = [None if before < 0 else before, *word]
-
-    def edge(at: int) -> int | None:
-        if at < 1 or sent[at] is None or sent[at - 1] is None:
-            return None
-        return int(sent[at]) - int(sent[at - 1])  # type: ignore[arg-type]
-
-    return edge(chip), edge(chip + 1)
+Histogram = list[float]
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_decoding_is_the_likeliest_word(seed: int) -> None:
+def spelled(word: list[int], chip: int, before: int, after: int) -> str:
+    """The chip of a word and the two before it as far as they are known, "" where no edge is: "01", "101"."""
+    sent = ["?" if c < 0 else str(c) for c in (-1, before, *word, after)]
+    last = "".join(sent[chip : chip + 3])
+    return "" if "?" in last[1:] else last.lstrip("?")
+
+
+def logs_of(histograms: dict[str, Histogram], counted: float) -> dict[str, Histogram]:
+    """Log-likelihood of each sum behind each two and three chips, of histograms of these."""
+    pairs = [one for key, one in histograms.items() if len(key) == 2]
+    everything = [sum(column) for column in zip(*pairs, strict=True)]
+    prior = 9 / sum(everything)
+
+    def share(counts: Histogram, without: Histogram) -> Histogram:
+        return [c / sum(counts) for c in counts] if sum(counts) else without
+
+    alike = share(everything, everything)
+    found = {}
+    for pair in ("00", "01", "10", "11"):
+        found[pair] = share(histograms[pair], alike)
+        for oldest in "01":
+            counts = [c + counted * s for c, s in zip(histograms[oldest + pair], found[pair], strict=True)]
+            found[oldest + pair] = share(counts, alike)
+    many = len(alike)
+    return {key: [math.log((s + prior) / (1 + many * prior)) for s in one] for key, one in found.items()}
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_decoding_is_the_likeliest_word_as_pilots_and_the_others_teach(seed: int) -> None:
     rng = np.random.default_rng(seed)
     words = Ppm(4, 1).codewords()
     book = Codebook("x", np.array(PREAMBLE), PILOTS, words)
-    symbols = rng.integers(0, 4, 3)
-    sums = ideal_sums(book, symbols, missing=0.3, seed=seed)
+    symbols, before, after = rng.integers(0, 4, 3), [1, 0, -1], [0, -1, 1]
+    sums = ideal_sums(book, symbols, after=np.maximum(after, 0), missing=0.3, seed=seed)
     sums += rng.integers(-1, 2, sums.shape).astype(np.int16)
+    # Of some too little is seen to teach others.
+    sums[7:, 17:] = rng.integers(-1, 2, sums[7:, 17:].shape)
     shown = ideal_presence(3)
     presence = PresenceMap(0.9 * shown.probability, shown.grid_px, shown.selected, shown.pixels)
-    before = np.array([1, 0, -1], np.int8)
-    soft = EdgeDecoding(max_events=2, prior_count=1.0).compile(book)(presence, sums, before)
+    decode = EdgeDecoding(max_events=2, pair_count=40, independent_pixels=0.07).compile(book)
+    soft = decode(presence, sums, np.array(before, np.int8), np.array(after, np.int8))
 
     clip = np.clip(sums, -2, 2).astype(int)
     pixels = [np.argwhere(p.repeat(2, 0).repeat(2, 1) > 0.5) for p in presence.probability]
-    both: dict[tuple[int, int], list[float]] = {}
-    for k, code in enumerate(PILOTS.tolist()):
-        for chip in range(2, 7):
-            key = code[chip - 1] - code[chip - 2], code[chip] - code[chip - 1]
-            counts = both.setdefault(key, [0.0] * 5)
-            for v, u in pixels[k]:
-                counts[clip[chip, v, u] + 2] += 0.9
-    single = {e: [sum(c[i] for key, c in both.items() if key[1] == e) for i in range(5)] for e in (-1, 0, 1)}
 
-    total = sum(map(sum, both.values()))
+    def taught(cluster: int, said: list[tuple[str, int]]) -> dict[str, Histogram]:
+        """Histograms by what was sent in a cluster's chips: (spelled, number)."""
+        found = {"".join(key): [0.0] * 5 for n in (2, 3) for key in itertools.product("01", repeat=n)}
+        for key, chip in said:
+            for v, u in pixels[cluster] if key else ():
+                for one in {key, key[-2:]}:
+                    found[one][clip[chip, v, u] + 2] += 0.9
+        return found
 
-    def logs(tables: dict) -> dict:  # type: ignore[type-arg]
-        out = {}
-        for key, counts in tables.items():
-            prior = sum(counts) * 9 / total
-            out[key] = [math.log((c + prior) / (sum(counts) + 5 * prior)) for c in counts]
-        return out
+    def added(*many: dict[str, Histogram]) -> dict[str, Histogram]:
+        return {key: [sum(c) for c in zip(*(one[key] for one in many), strict=True)] for key in many[0]}
 
-    of_both, of_edge = logs(both), logs(single)
-    for k in range(3):
-        fits = []
+    def fits(k: int, counts: dict[str, Histogram]) -> list[float]:
+        logs = logs_of(counts, 40)
+        found = []
         for word in words.tolist():
-            fit = 0.0
-            for chip in range(4):
-                last, edge = kind_of(word, chip, int(before[k]))
-                if edge is None:
-                    continue
-                table = of_edge[edge] if last is None else of_both.get((last, edge), of_edge[edge])
-                fit += 0.25 * sum(0.9 * table[clip[7 + chip, v, u] + 2] for v, u in pixels[k])
-            fits.append(fit)
-        assert soft.symbols[k] == int(np.argmax(fits))
-        best = [max(fits[:2]) - max(fits[2:]), max(fits[0], fits[2]) - max(fits[1], fits[3])]
+            keys = [spelled(word, chip, before[k], after[k]) for chip in range(5)]
+            terms = [
+                0.9 * logs[key][clip[7 + chip, v, u] + 2]
+                for chip, key in enumerate(keys)
+                for v, u in (pixels[k] if key else ())
+            ]
+            found.append(0.07 * sum(terms))
+        return found
+
+    pilots = [
+        taught(k, [(spelled(code, c, -1, -1), c) for c in range(7)]) for k, code in enumerate(PILOTS.tolist())
+    ]
+    own, sure = [], []
+    for k in range(3):
+        first = fits(k, added(*pilots))
+        best, second = sorted(first)[:-3:-1]
+        sure.append(best - second >= 5)
+        word = words.tolist()[int(np.argmax(first))]
+        said = [(spelled(word, c, before[k], after[k]), 7 + c) for c in range(5)] if sure[-1] else []
+        own.append(taught(k, said))
+    assert 0 < sum(sure) < 3
+    for k in range(3):
+        fit = fits(k, added(*pilots, *(one for other, one in enumerate(own) if other != k)))
+        assert soft.symbols[k] == int(np.argmax(fit))
+        best = [max(fit[:2]) - max(fit[2:]), max(fit[0], fit[2]) - max(fit[1], fit[3])]
         np.testing.assert_allclose(soft.llr[k], best, rtol=1e-4, atol=1e-3)
+
+
+@pytest.mark.parametrize("last", [0, 1])
+def test_the_last_chip_is_read_by_the_edge_that_ends_it(last: int) -> None:
+    book = Codebook("x", np.array(PREAMBLE), PILOTS, np.array([[0, 1, 0, 0], [0, 1, 0, 1]]))
+    sums = ideal_sums(book, [last] * 3, after=[1 - last] * 3, missing=0.5)
+    # Nothing is seen of the last chip itself.
+    sums[10] = 0
+    unknown, after = (np.full(3, value, np.int8) for value in (-1, 1 - last))
+    soft = EdgeDecoding().compile(book)(ideal_presence(3), sums, unknown, after)
+    assert soft.symbols.tolist() == [last] * 3
+    assert (np.abs(soft.llr) > 15).all()
+    blind = EdgeDecoding().compile(book)(ideal_presence(3), sums, unknown, unknown)
+    assert blind.symbols.tolist() == [0] * 3
 
 
 SCENES = {

@@ -81,6 +81,20 @@ def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat) -> No
 
 
 @pytest.mark.parametrize("form", FORMATS)
+def test_a_frame_is_read_with_the_chip_after_it(form: PacketFormat) -> None:
+    plain, longer = PacketGrid(form), PacketGrid(form, chips_after=1)
+    for grid in (plain, longer):
+        grid.restart(lock_of(form, 0, delay_us=35.0), ZERO_US)
+    due = plain.due(math.inf)
+    assert due is not None
+    assert (plain.due_us, longer.due_us) == pytest.approx((due.end_us, due.end_us + CHIP_US))
+    assert longer.due(due.end_us + CHIP_US - 1) is None
+    late = longer.due(due.end_us + CHIP_US + 1)
+    assert late is not None
+    assert (late.start_us, late.end_us, late.chips) == (due.start_us, due.end_us, due.chips)
+
+
+@pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("late_us", [-90.0, 0.0, 90.0])
 def test_a_lock_near_the_grid_moves_it_and_keeps_the_numbers(form: PacketFormat, late_us: float) -> None:
     grid = PacketGrid(form)
