@@ -164,7 +164,7 @@ def decoding_inverts(subject: Subject) -> None:
 
 
 def _as_received(book: Codebook, symbols: NDArray[np.int64]) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    """What the receiver gives a decoding beside the presence; of codes of chips, what is sent around it, too."""
+    """What the receiver gives a decoding beside the presence; of codes of chips, what is around it, too."""
     if book.pairs:
         yield "", (ideal_sums(book, symbols),)
         return
