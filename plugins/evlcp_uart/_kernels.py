@@ -15,15 +15,8 @@ Column = NDArray[Any]
 _NOTHING = 30.0
 """Nats by which what is less likely is left out: 1e-13 of it, against a doubt of a thousandth."""
 
-
-@njit(cache=True, nogil=True)
-def _log_sum(a: float, b: float) -> float:
-    """The logarithm of the sum of two numbers, from their logarithms."""
-    if a < b:
-        a, b = b, a
-    if b < a - 40 or b == -np.inf:
-        return a
-    return a + math.log1p(math.exp(b - a))
+_AT_ONCE = 64
+"""Ticks of which words are followed side by side, as a processor adds several numbers at once."""
 
 
 @njit(cache=True, nogil=True)
@@ -34,7 +27,8 @@ def bit_evidence(
 
     Args:
         counts: Events of each tick, OFF and ON, int32 (2, n).
-        logs: Logarithm of the mean events of each tick of a window, by context, float64 (C, 2, W).
+        logs: Logarithm of the mean events of each tick of a window, by polarity, tick and context, each
+            counted as `share`, float64 (2, W, C).
         gains: Logarithms of the gains that a window may have, float64 (J,).
         means: What a window costs by context and gain: its mean events, each counted as `share`, less the
             logarithm of the gain's share, float64 (C, J).
@@ -42,42 +36,55 @@ def bit_evidence(
         doubt: Probability that a window is of no context.
         out: Of each tick that has W of them before the end, float64 (n - W + 1, C).
     """
-    contexts, _, width = logs.shape
-    strengths = len(gains)
-    alike = np.empty(contexts)
-    said = np.empty((contexts, strengths))
+    _, width, contexts = logs.shape
+    # What the gains make of a context depends on how many events there are, not on when they come.
+    many = np.zeros(len(out), np.int64)
+    for s in range(len(out)):
+        for m in range(width):
+            many[s] += counts[0, s + m] + counts[1, s + m]
+    of_gains = np.empty((many.max() + 1 if len(out) else 0, contexts))
+    is_known = np.zeros(len(of_gains), np.bool_)
+    said = np.empty(contexts)
     least = math.log(doubt)
     for s in range(len(out)):
-        alike[:] = 0.0
-        events = 0
+        events = many[s]
+        if s and not events and not many[s - 1]:
+            out[s] = out[s - 1]
+            continue
+        if not is_known[events]:
+            _sums_over_gains(share * events * gains, means, of_gains[events])
+            is_known[events] = True
+        for c in range(contexts):
+            said[c] = of_gains[events, c]
         for polarity in range(2):
             for m in range(width):
                 k = counts[polarity, s + m]
                 if k:
-                    events += k
                     for c in range(contexts):
-                        alike[c] += k * logs[c, polarity, m]
+                        said[c] += k * logs[polarity, m, c]
+        top = said[0]
         for c in range(contexts):
-            for j in range(strengths):
-                said[c, j] = share * (alike[c] + events * gains[j]) - means[c, j]
-        top = said[0, 0]
+            top = max(top, said[c])
         for c in range(contexts):
-            for j in range(strengths):
-                top = max(top, said[c, j])
-        largest = 0.0
-        for c in range(contexts):
-            total = 0.0
-            for j in range(strengths):
-                # What is less is nothing beside the doubt; most gains of a bright light are.
-                if said[c, j] > top - _NOTHING:
-                    total += math.exp(said[c, j] - top)
-            out[s, c] = total
-            largest = max(largest, total)
-        for c in range(contexts):
-            out[s, c] = math.log((1 - doubt) * out[s, c] / largest + doubt) if out[s, c] > 0.0 else least
+            # What is less is nothing beside the doubt.
+            near = said[c] > top - _NOTHING
+            out[s, c] = math.log((1 - doubt) * math.exp(said[c] - top) + doubt) if near else least
         last = out[s, contexts - 1]
         for c in range(contexts):
             out[s, c] -= last
+
+
+@njit(cache=True, nogil=True)
+def _sums_over_gains(worths: Column, means: Column, out: Column) -> None:
+    """Logarithm of the sum over gains, of each context."""
+    for c in range(len(out)):
+        top = -np.inf
+        for j in range(len(worths)):
+            top = max(top, worths[j] - means[c, j])
+        total = 0.0
+        for j in range(len(worths)):
+            total += math.exp(worths[j] - means[c, j] - top)
+        out[c] = top + math.log(total)
 
 
 @njit(cache=True, nogil=True)
@@ -99,55 +106,91 @@ def character_scores(
         out: Of every tick, float64 (m,), with m + the last place <= n.
     """
     fair = -bits * math.log(2.0)
-    states = np.empty((2, evidence.shape[1] // 2, 2))
-    for s in range(len(out)):
-        total = _character_score(evidence, places, bits, parity, True, s, states)
+    n, contexts = evidence.shape
+    said = np.ascontiguousarray(evidence.T)
+    # Sums are of likelihoods, of which the greatest of a tick is 1: of no word they are too small to be told.
+    tops = np.empty(0 if likeliest else n)
+    likely = np.empty((contexts, len(tops)))
+    for s in range(len(tops)):
+        tops[s] = evidence[s].max()
+        for c in range(contexts):
+            likely[c, s] = math.exp(evidence[s, c] - tops[s])
+    # A state is the parity of the ones so far and the last bits.
+    states = np.empty((2, 2, contexts // 2, _AT_ONCE))
+    sums = np.empty(_AT_ONCE)
+    for first in range(0, len(out), _AT_ONCE):
+        some = out[first : first + _AT_ONCE]
+        _words(said, places, bits, parity, True, first, states, some)
         # The mean over all words matters only where a character may be.
-        if not likeliest and total > 0:
-            total = _character_score(evidence, places, bits, parity, False, s, states)
-        still = 0.0
-        for b in range(len(places)):
-            still += evidence[s + places[b], 0]
-        out[s] = total + fair - max(still, 0.0)
+        if not likeliest and some.max() > 0:
+            _words(likely, places, bits, parity, False, first, states, sums[: len(some)])
+            for k in range(len(some)):
+                if some[k] > 0:
+                    some[k] = math.log(sums[k])
+                    for place in places:
+                        some[k] += tops[first + k + place]
+        for k in range(len(some)):
+            still = 0.0
+            for place in places:
+                still += said[0, first + k + place]
+            some[k] += fair - max(still, 0.0)
 
 
 @njit(cache=True, nogil=True)
-def _character_score(
-    evidence: Column, places: Column, bits: int, parity: int, likeliest: bool, s: int, states: Column
-) -> float:
-    """The likeliest word, or the sum over all, at one tick; `states` is room to work in."""
-    # A state is the last bits and the parity of the ones so far; before the start bit there was mark.
-    known_bits = states.shape[1]
-    states[:] = -np.inf
-    states[0, known_bits - 2, 0] = evidence[s, 2 * known_bits - 2]
+def _words(
+    said: Column,
+    places: Column,
+    bits: int,
+    parity: int,
+    likeliest: bool,
+    first: int,
+    states: Column,
+    out: Column,
+) -> None:
+    """The likeliest word at some ticks by log-likelihoods, or the sum of all words' likelihoods.
+
+    Args:
+        said: Of every context and tick, float64 (C, n).
+        places: Ticks from the start of a character to each of its bits, int64 (bits on air,).
+        bits: Data bits.
+        parity: 0 none, 1 odd, 2 even.
+        likeliest: The likeliest word, not the sum.
+        first: The first of the ticks.
+        states: Room to work in, float64 (2, 2, C / 2, >= m).
+        out: Of each of the ticks, float64 (m,).
+    """
+    known = states.shape[2]
+    n = len(out)
+    none = -np.inf if likeliest else 0.0
+    states[0] = none
+    # Before the start bit there was mark.
+    states[0, 0, known - 2, :n] = said[2 * known - 2, first : first + n]
     now = 0
     for b in range(1, len(places)):
-        at = s + places[b]
-        is_data = b <= bits
-        is_parity = parity > 0 and b == bits + 1
-        for state in range(known_bits):
-            for odd in range(2):
-                states[1 - now, state, odd] = -np.inf
-        for state in range(known_bits):
-            for odd in range(2):
-                before = states[now, state, odd]
-                if before == -np.inf:
-                    continue
-                for bit in range(2):
-                    if not is_data and bit != (((odd + parity) & 1) if is_parity else 1):
-                        continue
-                    context = 2 * state + bit
-                    value = before + evidence[at, context]
-                    to, ones = context & (known_bits - 1), (odd ^ bit) if is_data else odd
-                    known = states[1 - now, to, ones]
-                    states[1 - now, to, ones] = max(known, value) if likeliest else _log_sum(known, value)
-        now = 1 - now
-    total = -np.inf
-    for state in range(known_bits):
+        at = first + places[b]
         for odd in range(2):
-            value = states[now, state, odd]
-            total = max(total, value) if likeliest else _log_sum(total, value)
-    return total
+            for to in range(known):
+                new = states[1 - now, odd, to, :n]
+                bit = to & 1
+                if b > bits and bit != ((odd + parity) & 1 if parity and b == bits + 1 else 1):
+                    new[:] = none
+                    continue
+                was = odd ^ bit if b <= bits else odd
+                one, other = states[now, was, to >> 1, :n], states[now, was, (to + known) >> 1, :n]
+                of_one, of_other = said[to, at : at + n], said[to + known, at : at + n]
+                if likeliest:
+                    for k in range(n):
+                        new[k] = max(one[k] + of_one[k], other[k] + of_other[k])
+                else:
+                    for k in range(n):
+                        new[k] = one[k] * of_one[k] + other[k] * of_other[k]
+        now = 1 - now
+    out[:] = none
+    for odd in range(2):
+        for state in range(known):
+            for k in range(n):
+                value = states[now, odd, state, k]
+                out[k] = max(out[k], value) if likeliest else out[k] + value
 
 
 @njit(cache=True, nogil=True)

@@ -401,7 +401,8 @@ class CharacterDecoder:
 
         counts = stretch.counts
         found = np.empty((counts.shape[1] - TICKS + 1, CONTEXTS))
-        _kernels.bit_evidence(counts, light.logs, LOG_GAINS, light.means, light.share, DOUBT, found)
+        logs = np.ascontiguousarray(light.share * light.logs.transpose(1, 2, 0))
+        _kernels.bit_evidence(counts, logs, LOG_GAINS, light.means, light.share, DOUBT, found)
         # What there was before the first event, or behind the last, nothing tells.
         found[: max(stretch.seen - EARLY, 0)] = 0
         found[max(stretch.end, 0) :] = 0

@@ -348,7 +348,8 @@ def test_evidence_of_a_bit_is_the_likelihood_of_its_counts() -> None:
     gains, shares, doubt = np.array([0.5, 2.0]), np.array([0.3, 0.7]), 0.01
     costs = rates.sum((1, 2))[:, None] * gains - np.log(shares)
     out = np.empty((50 - 8 + 1, 3))
-    _kernels.bit_evidence(counts, np.log(rates), np.log(gains), costs, 1.0, doubt, out)
+    logs = np.log(rates).transpose(1, 2, 0).copy()
+    _kernels.bit_evidence(counts, logs, np.log(gains), costs, 1.0, doubt, out)
     for s in range(len(out)):
         window = counts[:, s : s + 8]
         likely = np.zeros(3)
