@@ -38,6 +38,7 @@ MOTION_STEP_PX = 0.1
 _CELL_US = 1000.0
 _CELLS = 4
 _BLOCK_US = _CELLS * _CELL_US
+_STRETCH = 8  # blocks
 _MOST_MOVES = 40
 _MOST_MOVES_STRUCK = 400
 _BLOOM_EVERY = 8  # poses
@@ -202,6 +203,36 @@ def _batches(
 
 
 @dataclass(frozen=True, eq=False)
+class _Stretch:
+    """How the camera and the sources move and switch in some blocks of time, worked out at once for all.
+
+    Attributes:
+        begin_us: When it begins.
+        end_us: When it ends.
+        starts_us: When each pose begins, float64 (poses,).
+        attitude: The camera's in the middle of each pose, float64 (poses, 3), radians.
+        seen: Of each source, places and depths by pose; see `project`.
+        sent: Of each source, when it switches and its levels; see `Source.switches`.
+        wiped: The same of the wiper; see `wiper_switches`.
+    """
+
+    begin_us: float
+    end_us: float
+    starts_us: Floats
+    attitude: Floats
+    seen: list[tuple[Floats, Floats]]
+    sent: list[tuple[Floats, Floats]]
+    wiped: tuple[Floats, Floats]
+
+
+def _part(changes: tuple[Floats, Floats], begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+    """Of times of change, with what holds before, between and after them, those inside a block."""
+    when, held = changes
+    first, last = np.searchsorted(when, begin_us, "right"), np.searchsorted(when, end_us, "left")
+    return when[first:last], held[first : last + 1]
+
+
+@dataclass(frozen=True, eq=False)
 class _Block:
     """Everything about a block of time that all pixels share: the arguments of `run_pixels`."""
 
@@ -265,6 +296,7 @@ class Simulation:
         self._wide_reach = max(halo.reach_px for halo in self._halos)
         self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
         self._done_us = 0.0
+        self._stretch: _Stretch | None = None
 
     def _check_ahead(self) -> None:
         centres = np.array([bar.centre_m for bar in self.bars]).reshape(-1, 3)
@@ -401,10 +433,14 @@ class Simulation:
         moved = np.abs(turned).max((1, 2)) * self.scene.camera.focal_px
         if len(self._ends_m):
             place, depth = project(self._ends_m, position, attitude, self.scene.camera)
-            shown = (depth > NEAREST_M).all(0) & (np.abs(place) < 4 * self.scene.camera.width).all((0, 2))
-            if shown.any():
-                step = np.diff(place[:, shown].reshape(len(t), 3, -1, 2), axis=1)
-                moved = np.maximum(moved, np.hypot(step[..., 0], step[..., 1]).max((1, 2)))
+            shown = (depth > NEAREST_M) & (np.abs(place) < 4 * self.scene.camera.width).all(2)
+            # An end counts in the blocks in which it is in view all the time.
+            blocks = np.arange(0, len(t), _CELLS)
+            counts = np.logical_and.reduceat(shown.reshape(len(t), 3, -1).all(1), blocks)
+            step = np.diff(place.reshape(len(t), 3, -1, 2), axis=1)
+            length = np.hypot(step[..., 0], step[..., 1]).max(1)
+            seen = np.where(counts[np.arange(len(t)) // _CELLS], length, 0.0)
+            moved = np.maximum(moved, seen.max(1))
         most = _MOST_MOVES_STRUCK if self.scene.motion.pothole_s else _MOST_MOVES
         moves = np.clip(np.ceil(2 * moved / MOTION_STEP_PX), 1, most).astype(int)
         starts = np.concatenate(
@@ -413,22 +449,43 @@ class Simulation:
         middles = 0.5 * (starts + np.append(starts[1:], end_us))
         return starts, middles
 
+    def _stretch_at(self, begin_us: float) -> _Stretch:
+        """The stretch of time with the block that begins then."""
+        if self._stretch is None or not self._stretch.begin_us <= begin_us < self._stretch.end_us:
+            # A pothole moves the image so often that one block is enough to work out together.
+            blocks = 1 if self.scene.motion.pothole_s else _STRETCH
+            end_us = min(begin_us + blocks * _BLOCK_US, self.scene.duration_s * 1e6)
+            starts, middles = self._moves(begin_us, end_us)
+            position, attitude = self.path.at(middles)
+            wiped = np.empty(0), np.ones(1)
+            if self.scene.wiper.share > 0:
+                wiped = wiper_switches(self.scene.wiper, begin_us, end_us)
+            self._stretch = _Stretch(
+                begin_us,
+                end_us,
+                starts,
+                attitude,
+                [self.seen(source, position, attitude) for source in self._sources],
+                [source.switches(begin_us, end_us) for source in self._sources],
+                wiped,
+            )
+        return self._stretch
+
     def _prepare(self, begin_us: float, end_us: float) -> _Block | None:
         """Where the sources are in a block, how they switch, and which pixels they may excite."""
         scene = self.scene
         camera, lens, sensor = scene.camera, scene.lens, scene.sensor
-        starts, middles = self._moves(begin_us, end_us)
-        position, attitude = self.path.at(middles)
+        stretch = self._stretch_at(begin_us)
+        of_block = slice(*np.searchsorted(stretch.starts_us, (begin_us, end_us)))
+        starts, attitude = stretch.starts_us[of_block], stretch.attitude[of_block]
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
-        wiped_us, shade = np.empty(0), np.ones(1)
-        if scene.wiper.share > 0:
-            wiped_us, shade = wiper_switches(scene.wiper, begin_us, end_us)
+        wiped_us, shade = _part(stretch.wiped, begin_us, end_us)
         lightest = float(shade.max())
         darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._darkest_texture * shade.min())
-        shown: list[tuple[Source, Floats, Floats, Blur, Floats]] = []
+        shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Blur, Floats]] = []
         marked: list[NDArray[np.int64]] = []
-        for source in self._sources:
-            place, depth = self.seen(source, position, attitude)
+        for source, (places, depths), sent in zip(self._sources, stretch.seen, stretch.sent, strict=True):
+            place, depth = places[of_block], depths[of_block]
             if depth.min() <= NEAREST_M:
                 continue
             middle_depth = depth.mean(1)
@@ -441,13 +498,13 @@ class Simulation:
             lit = self._lit_pixels(place, float(strip_px.max()), near, scale, light, least)
             if len(lit):
                 marked.append(lit)
-                shown.append((source, place, strip_px, blur, near))
+                shown.append((source, sent, place, strip_px, blur, near))
         around = scene.background.around_px
         if not shown and around < camera.width:
             return None
         pixels, masks = _merge(marked)
         if around > 0:
-            pixels, masks = self._with_background(pixels, masks, [place for _, place, *_ in shown])
+            pixels, masks = self._with_background(pixels, masks, [place for _, _, place, *_ in shown])
 
         g = len(shown)
         most = max((source.strip.clusters for source, *_ in shown), default=1)
@@ -460,7 +517,7 @@ class Simulation:
         switches: list[Floats] = []
         levels_of: list[Floats] = []
         halos_of: list[list[Floats]] = [[] for _ in self._halos]
-        for i, (source, place, strip_px, blur, near) in enumerate(shown):
+        for i, (source, sent, place, strip_px, blur, near) in enumerate(shown):
             k = source.strip.clusters
             vector = place[:, -1] - place[:, 0]
             axis[:, i] = vector.T / np.hypot(*vector.T)
@@ -469,7 +526,7 @@ class Simulation:
             strips[i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
             near_scale[i], near_reach[i] = _NEAR_SCALE * blur.sigma_px[0], blur.reach_px
             tables[i] = near
-            when, levels = source.switches(begin_us, end_us)
+            when, levels = _part(sent, begin_us, end_us)
             switches.append(when)
             levels_of.append(levels)
             cut = bounds[i, : k + 1, poses // 2]
@@ -604,14 +661,17 @@ class _Served:
         self._noise_from_us = end_us if over else safe
         simulation.count("signal_events", sum(len(t) for t, _ in signal))
         parts = [*self._later, *signal, noise]
-        t, code = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
-        out_t, out_code = np.empty_like(t), np.empty_like(code)
-        _kernels.sort_events(t, code, out_t, out_code)
-        cut = len(out_t) if over else int(np.searchsorted(out_t, safe))
-        self._later = [(out_t[cut:].copy(), out_code[cut:].copy())]
-        kept = _kernels.drop_blind(out_t[:cut], out_code[:cut], self._blind_us, camera.width, sensor.refr_us)
-        t = np.concatenate([self._queue[0], out_t[:kept]])
-        code = np.concatenate([self._queue[1], out_code[:kept]])
+        old_t, old_code = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        # What waits from before comes first.
+        waiting = len(self._queue[0])
+        t, code = (np.empty(waiting + len(one), one.dtype) for one in (old_t, old_code))
+        t[:waiting], code[:waiting] = self._queue
+        new_t, new_code = t[waiting:], code[waiting:]
+        _kernels.sort_events(old_t, old_code, new_t, new_code)
+        cut = len(new_t) if over else int(np.searchsorted(new_t, safe))
+        self._later = [(new_t[cut:].copy(), new_code[cut:].copy())]
+        kept = _kernels.drop_blind(new_t[:cut], new_code[:cut], self._blind_us, camera.width, sensor.refr_us)
+        t, code = t[: waiting + kept], code[: waiting + kept]
         n = len(t)
         columns = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
         cap = round(sensor.cap_mev_s * sensor.cap_window_us)

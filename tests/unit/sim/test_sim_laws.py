@@ -24,8 +24,10 @@ from evlcp_sdk.sim import (
     load_scene,
     scene_of_truth,
     simulate,
+    simulation,
     truth_of,
 )
+from evlcp_sdk.sim.scene import WiperSpec
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.values import Events
@@ -58,6 +60,19 @@ def test_threads_pieces_and_runs_do_not_matter() -> None:
     assert max(map(len, pieces)) == 777
     assert same(events, Events.concat(pieces))
     assert not same(events, every(SHORT, seed=1))
+
+
+@pytest.mark.parametrize("blocks", [1, 3])
+def test_how_many_blocks_are_worked_out_together_does_not_matter(
+    blocks: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bar = replace(SHORT.bars[0], cover_s=((0.004, 0.0135, 0, 4),))
+    wiper = WiperSpec(share=0.8, at_s=0.003, lasts_s=0.012)
+    scene = replace(SHORT, bars=(bar, *SHORT.bars[1:]), wiper=wiper, duration_s=0.0145)
+    events = every(scene)
+    assert len(events) > 30_000
+    monkeypatch.setattr(simulation, "_STRETCH", blocks)
+    assert same(events, every(scene))
 
 
 def test_a_longer_scene_begins_with_the_shorter() -> None:
