@@ -202,7 +202,7 @@ def _run_piece_followed(
     return u_end, z, reference, t_ready, t_last_out, armed, draw, n
 
 
-LANES = 128
+LANES = 192
 """Most pixels that pass through time together: what is done for each is a loop of vector instructions."""
 
 _EVEN = 4
@@ -216,7 +216,7 @@ _ALONG, _ACROSS, _ROW_PART, _NODE_PART = range(18 * LANES, 22 * LANES, LANES)
 _M_U, _M_REST, _M_END, _M_REFERENCE, _M_READY, _M_LAST_OUT = range(22 * LANES, 28 * LANES, LANES)
 _M_ON, _M_OFF, _M_AGE, _M_KEPT, _M_SHIFT, _M_FATE = range(28 * LANES, 34 * LANES, LANES)
 _M_RATIO, _M_SPARE, _M_TAU, _M_LATER, _M_CROSS = range(34 * LANES, 39 * LANES, LANES)
-_M_NOW, _M_REQUEST, _ROOM = range(39 * LANES, 42 * LANES, LANES)
+_M_LEVEL, _M_REQUEST, _ROOM = range(39 * LANES, 42 * LANES, LANES)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -290,6 +290,7 @@ def _run_piece(
     draw: Array,
     code: Array,
     which: Array,
+    again: Array,
     kind: Array,
     quantiles: Array,
     shifts: Array,
@@ -303,12 +304,14 @@ def _run_piece(
 
     With u = exp(-y) the receptor is u(t) = 1/I + (u0 - 1/I) exp(-I t / Q), which is monotonic; so a threshold
     is crossed in a piece when u at its end lies beyond, and the time follows from one logarithm. A pixel is
-    blind as long as `_READY` is not past. The pixels that may fire, or see again, are picked, and their next
-    events are computed together, until there are none. `shifts` are the quantiles of the factor by which
+    blind as long as `_READY` is not past. Those that see again are picked, those that may fire for the noise
+    that is the most, and of them those that do; their next events are computed together, until there are
+    none. `shifts` are the quantiles of the factor by which
     noise moves both thresholds. One word of random bits a draw, from the pixel's key: the upper half decides
     on the noise, the lower on whether the event goes missing.
 
-    `f` holds the rows of a batch, `bits` is its int64 view; `which` and `kind`, int64 (LANES,), are room.
+    `f` holds the rows of a batch, `bits` is its int64 view; `which`, `again` and `kind`, int64 (LANES,), are
+    room.
     """
     charge, refractory = sensor[0], sensor[1]
     delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
@@ -337,84 +340,123 @@ def _run_piece(
         reference, ready = f[_REFERENCE + i], f[_READY + i]
         on = end <= reference * f[_ON + i] * widest
         off = end * widest >= reference * f[_OFF + i]
-        kind[i] = 1 if (ready < until) & ((ready >= t_us) | on | off) else 0
-    m = 0
+        kind[i] = 1 if (ready < t_us) & (on | off) else (2 if (ready >= t_us) & (ready < until) else 0)
+    m = blind = 0
     for i in range(lanes):
         which[np.uint64(m)] = i
-        m += kind[i]
-    while m > 0:
+        m += kind[i] & 1
+    for i in range(lanes):
+        again[np.uint64(blind)] = i
+        blind += kind[i] >> 1
+    while True:
+        # Those that see again in this piece, and of them those that may fire.
+        even = (blind + _EVEN - 1) // _EVEN * _EVEN
+        for a in range(blind, even):
+            again[a] = again[0]
+        for a in range(even):
+            i = again[a]
+            f[_M_U + a] = f[np.uint64(_U + i)]
+            f[_M_REST + a] = f[np.uint64(_REST + i)]
+            f[_M_END + a] = f[np.uint64(_END + i)]
+            f[_M_ON + a] = f[np.uint64(_ON + i)]
+            f[_M_OFF + a] = f[np.uint64(_OFF + i)]
+            f[_M_AGE + a] = (f[np.uint64(_READY + i)] - t_us) * per_charge * f[np.uint64(_NOW + i)]
+        _decay(f, bits, _M_AGE, _M_KEPT, even)
+        for a in range(even):
+            rest, end = f[_M_REST + a], f[_M_END + a]
+            reference = rest + (f[_M_U + a] - rest) * f[_M_KEPT + a]
+            f[_M_REFERENCE + a] = reference
+            on = end <= reference * f[_M_ON + a] * widest
+            off = end * widest >= reference * f[_M_OFF + a]
+            kind[a] = 1 if on | off else 0
+        for a in range(blind):
+            i = again[a]
+            f[np.uint64(_REFERENCE + i)] = f[_M_REFERENCE + a]
+            draw[np.uint64(i)] += 1
+            which[np.uint64(m)] = i
+            m += kind[a]
+        if m == 0:
+            break
         # Loops over a multiple of the vectors' length have no rest to do one by one.
         even = (m + _EVEN - 1) // _EVEN * _EVEN
         for a in range(m, even):
             which[a] = which[0]
         for a in range(even):
-            i = which[a]
-            f[_M_U + a] = f[_U + i]
-            f[_M_NOW + a] = f[_NOW + i]
-            f[_M_REST + a] = f[_REST + i]
-            f[_M_END + a] = f[_END + i]
-            f[_M_REFERENCE + a] = f[_REFERENCE + i]
-            f[_M_READY + a] = f[_READY + i]
-            f[_M_LAST_OUT + a] = f[_LAST_OUT + i]
-            f[_M_ON + a] = f[_ON + i]
-            f[_M_OFF + a] = f[_OFF + i]
+            k = np.uint64(which[a])
+            word = _mix(key[k] + np.uint64(draw[k]) * np.uint64(0xD1B54A32D192ED03))
+            bits[_M_SPARE + a] = np.int64(word)
+        # Half a word becomes the lowest bits of 2^52.
         for a in range(even):
-            f[_M_AGE + a] = max(f[_M_READY + a] - t_us, 0.0) * per_charge * f[_M_NOW + a]
-        _decay(f, bits, _M_AGE, _M_KEPT, even)
+            bits[_M_SHIFT + a] = (bits[_M_SPARE + a] >> 32) & 0xFFFFFFFF | 0x4330000000000000
+            bits[_M_FATE + a] = bits[_M_SPARE + a] & 0xFFFFFFFF | 0x4330000000000000
+        for a in range(even):
+            f[_M_SHIFT + a] = (f[_M_SHIFT + a] - 4503599627370496.0) * 2.3283064365386963e-10
+            f[_M_FATE + a] = (f[_M_FATE + a] - 4503599627370496.0) * 2.3283064365386963e-10
+        # By itself, so that many parts of the table are on their way at once.
+        for a in range(even):
+            f[_M_SHIFT + a] = _table_at(shifts, f[_M_SHIFT + a])
+        # Those that fire move to the front.
+        fires = 0
         for a in range(m):
             i = which[a]
-            draw[i] += int(f[_M_READY + a] >= t_us)
-            word = _mix(key[i] + np.uint64(draw[i]) * np.uint64(0xD1B54A32D192ED03))
-            f[_M_SHIFT + a] = _table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
-            f[_M_FATE + a] = float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10
-            if jitter > 0.0:
-                f[_M_LATER + a] = jitter * hash_normal(key[i], 0, draw[i], 2, quantiles)
-        for a in range(even):
-            u, rest, end, shift = f[_M_U + a], f[_M_REST + a], f[_M_END + a], f[_M_SHIFT + a]
-            again = rest + (u - rest) * f[_M_KEPT + a]
-            before = f[_M_REFERENCE + a]
-            reference = again if f[_M_READY + a] >= t_us else before
-            low = reference * f[_M_ON + a] * shift
-            high = reference * f[_M_OFF + a] * shift
+            reference, end = f[np.uint64(_REFERENCE + i)], f[np.uint64(_END + i)]
+            low = reference * f[np.uint64(_ON + i)] * f[_M_SHIFT + a]
+            high = reference * f[np.uint64(_OFF + i)] * f[_M_SHIFT + a]
             on = end <= low
-            level = low if on else high
+            f[_M_LEVEL + fires] = low if on else high
+            f[_M_ON + fires] = 1.0 if on else 0.0
+            f[_M_FATE + fires] = f[_M_FATE + a]
+            which[np.uint64(fires)] = i
+            fires += int(on | (end >= high))
+        if fires == 0:
+            break
+        even = (fires + _EVEN - 1) // _EVEN * _EVEN
+        for a in range(fires, even):
+            which[a] = which[0]
+        for a in range(even):
+            i = which[a]
+            f[_M_U + a] = f[np.uint64(_U + i)]
+            f[_M_REST + a] = f[np.uint64(_REST + i)]
+            f[_M_READY + a] = f[np.uint64(_READY + i)]
+            f[_M_LAST_OUT + a] = f[np.uint64(_LAST_OUT + i)]
+        if jitter > 0.0:
+            for a in range(fires):
+                k = np.uint64(which[a])
+                f[_M_LATER + a] = jitter * hash_normal(key[k], 0, draw[k], 2, quantiles)
+        for a in range(even):
+            u, rest, level = f[_M_U + a], f[_M_REST + a], f[_M_LEVEL + a]
             f[_M_RATIO + a] = (u - rest) / (level - rest)
             # Where it is beyond the threshold from the first, there is no way to it.
-            beyond = (on & (u <= low)) | ((end >= high) & (u >= high))
+            beyond = (u <= level) if f[_M_ON + a] > 0.0 else (u >= level)
             f[_M_TAU + a] = 0.0 if beyond else charge * rest
-            f[_M_REFERENCE + a] = reference
-            f[_M_ON + a] = 1.0 if on else 0.0
-            f[_M_OFF + a] = 1.0 if end >= high else 0.0
         _logarithm(f, bits, _M_RATIO, _M_SPARE, even)
         for a in range(even):
-            ready, out, end = f[_M_READY + a], f[_M_LAST_OUT + a], f[_M_END + a]
-            on, fires = f[_M_ON + a] > 0.0, (f[_M_ON + a] > 0.0) | (f[_M_OFF + a] > 0.0)
+            ready, on = f[_M_READY + a], f[_M_ON + a] > 0.0
             t = max(ready, t_us)
             t = min(max(t_us + f[_M_RATIO + a] * f[_M_TAU + a], t), until)
             late = max((delay_on if on else delay_off) + f[_M_LATER + a], 0.0)
-            request = max(t + late, out + refractory)
-            ready = t + refractory if fires else ready
+            ready = t + refractory
             f[_M_CROSS + a] = t
-            f[_M_REQUEST + a] = request
+            f[_M_REQUEST + a] = max(t + late, f[_M_LAST_OUT + a] + refractory)
             f[_M_READY + a] = ready
-            f[_M_LAST_OUT + a] = request if fires else out
-            sent = fires & (f[_M_FATE + a] >= (miss_on if on else miss_off))
-            kind[a] = (1 if on else 0) | (2 if sent else 0) | (4 if fires & (ready < until) else 0)
-        more = 0
-        for a in range(m):
+            sent = f[_M_FATE + a] >= (miss_on if on else miss_off)
+            kind[a] = (1 if on else 0) | (2 if sent else 0) | (4 if ready < until else 0)
+        blind = 0
+        for a in range(fires):
             i, what = which[a], kind[a]
-            f[_REFERENCE + i] = f[_M_REFERENCE + a]
-            f[_READY + i] = f[_M_READY + a]
-            f[_LAST_OUT + i] = f[_M_LAST_OUT + a]
+            f[np.uint64(_READY + i)] = f[_M_READY + a]
+            f[np.uint64(_LAST_OUT + i)] = f[_M_REQUEST + a]
             # What is missed is written over; that is quicker than a branch which cannot be foreseen.
             out_t[np.uint64(n)] = f[_M_REQUEST + a]
-            out_code[np.uint64(n)] = code[i] + (what & 1)
+            out_code[np.uint64(n)] = code[np.uint64(i)] + (what & 1)
             if out_cross.size:
                 out_cross[np.uint64(n)] = f[_M_CROSS + a]
             n += (what >> 1) & 1
-            which[np.uint64(more)] = i
-            more += what >> 2
-        m = more
+            again[np.uint64(blind)] = i
+            blind += what >> 2
+        m = 0
+        if blind == 0:
+            break
     for i in range(lanes):
         f[_U + i] = f[_END + i]
     return n
@@ -469,7 +511,8 @@ def run_given_light(
     f = np.zeros(_ROOM)
     bits = f.view(np.int64)
     key, draw = np.empty(LANES, np.uint64), np.empty(LANES, np.int64)
-    code, which, kind = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    code, kind = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    which, again = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     followed = sensor[12] > 0.0
     lanes = last - first
     if not followed:
@@ -488,8 +531,8 @@ def run_given_light(
             draw[i] += 1
         if until > edge_us[j]:
             n = _run_piece(
-                lanes, edge_us[j], until, f, bits, key, draw, code, which, kind, quantiles, shifts, sensor,
-                out_t, out_code, out_cross, n,
+                lanes, edge_us[j], until, f, bits, key, draw, code, which, again, kind, quantiles, shifts,
+                sensor, out_t, out_code, out_cross, n,
             )  # fmt: skip
     return n
 
@@ -664,7 +707,8 @@ def run_pixels(
     f = np.zeros(_ROOM)
     bits = f.view(np.int64)
     key, draw = np.empty(LANES, np.uint64), np.empty(LANES, np.int64)
-    code, which, kind = np.empty(LANES, np.int64), np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    code, kind = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
+    which, again = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
     rows, nodes = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
     beside = np.empty(LANES * (most + 1))
     none = np.empty(0)
@@ -802,8 +846,8 @@ def run_pixels(
                 draw[i] += redraw if changes else 0
             if until > t_us:
                 n = _run_piece(
-                    lanes, t_us, until, f, bits, key, draw, code, which, kind, quantiles, shifts, sensor,
-                    out_t, out_code, none, n,
+                    lanes, t_us, until, f, bits, key, draw, code, which, again, kind, quantiles, shifts,
+                    sensor, out_t, out_code, none, n,
                 )  # fmt: skip
         for i in range(count):
             pixel = pixels[begin + i]
@@ -959,6 +1003,8 @@ def read_out(
     # The first and the last request of each row that waits, and after each the next one of its row.
     head, tail = np.full(height, -1, np.int32), np.empty(height, np.int32)
     follow = np.empty(t.size, np.int32)
+    # What is read out together.
+    together = np.empty(t.size, np.int64)
     # One bit a row that waits.
     waits = np.zeros((height >> 6) + 1, np.uint64)
     hold = pending.size > 0
@@ -1008,30 +1054,35 @@ def read_out(
             window = stamp // cap_window_us
             window_end = (window + 1) * cap_window_us
             used = 0
-        begin = n
         next_one = int(head[np.uint64(at_row)])
         head[np.uint64(at_row)] = -1
         waits[word] ^= lowest
+        count = 0
         while next_one >= 0:
             k = np.uint64(next_one)
             next_one = int(follow[k])
             follow[k] = _SERVED
             what = code[k]
-            x = (what >> 1) & columns
             waiting -= 1
             if hold:
-                pending[at_row, x] = False
+                pending[at_row, (what >> 1) & columns] = False
             if cap > 0 and used >= cap:
                 dropped += 1
                 continue
             used += 1
-            j = n
-            while j > begin and out_x[np.uint64(j - 1)] > x:
-                out_x[np.uint64(j)], out_p[np.uint64(j)] = out_x[np.uint64(j - 1)], out_p[np.uint64(j - 1)]
-                j -= 1
-            out_x[np.uint64(j)], out_p[np.uint64(j)] = x, what & 1
-            out_t[np.uint64(n)], out_y[np.uint64(n)] = stamp, at_row
-            n += 1
+            # By column, then in the order in which they came; without a branch, which could not be foreseen.
+            it = ((what >> 1) & columns) << 32 | count << 1 | what & 1
+            for j in range(count):
+                other = together[np.uint64(j)]
+                together[np.uint64(j)] = min(other, it)
+                it = max(other, it)
+            together[np.uint64(count)] = it
+            count += 1
+        for j in range(count):
+            it = together[np.uint64(j)]
+            k = np.uint64(n + j)
+            out_t[k], out_x[k], out_y[k], out_p[k] = stamp, it >> 32, at_row, it & 1
+        n += count
     left = 0
     for m in range(t.size):
         if m >= i or follow[m] != _SERVED:
