@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_uart.characters import Characters
-from evlcp_uart.light import CONTEXTS, DOUBT, EARLY, LOG_GAINS, TICKS, Light, guesses
+from evlcp_uart.light import CONTEXTS, DOUBT, EARLY, LOG_GAINS, TICKS, Light, guesses, log_sums
 
 __all__ = ["CLOCK_SHARE", "Character", "CharacterDecoder", "CharacterState"]
 
@@ -210,6 +210,11 @@ class Stretch:
     start: int
     seen: int
     end: int
+
+    @property
+    def windows(self) -> NDArray[np.int32]:
+        """The events of a bit that begins at each tick, int32 (n - TICKS + 1, 2, TICKS), a view."""
+        return np.lib.stride_tricks.sliding_window_view(self.counts, TICKS, 1).transpose(1, 0, 2)
 
 
 @dataclass(frozen=True)
@@ -439,7 +444,7 @@ class CharacterDecoder:
         after_pause = after_idle - (np.log(pause / _PAUSE_TICKS) if pause else 0.0)
         # The first bit of a pause has the stop bits before it, and any before these.
         contexts = np.arange((2 << self.characters.stop_bits) - 1, CONTEXTS, 2 << self.characters.stop_bits)
-        tails = np.logaddexp.reduce(evidence[:, contexts], 1) - np.log(len(contexts))
+        tails = log_sums(evidence[:, contexts]) - np.log(len(contexts))
         starts, worth = _kernels.best_path(
             scores, tails, length, stretch.start, _NEAR, after_idle, after_one, _JITTER, pause, after_pause
         )
@@ -477,6 +482,7 @@ class CharacterDecoder:
         values = self.characters.likelihoods(evidence[starts[:, None] + places]).argmax(1)
         logs = light.logs - np.log(light.rates.mean((0, 2)))[None, :, None]
         logs = logs[self.characters.contexts[values]]
+        seen = stretch.windows
         found = starts.copy()
         breaks = np.flatnonzero(np.abs(np.diff(starts) - length) > _NEAR + 1) + 1
         shifts = np.arange(-_NEAR - 1, _NEAR + 2)
@@ -484,8 +490,8 @@ class CharacterDecoder:
             begun = starts[run] - length * np.arange(len(run))
             mean = _around(begun[:, None])[:, 0] / _around(np.ones((len(run), 1)))[:, 0]
             at = np.rint(mean + length * np.arange(len(run))).astype(np.int64)[:, None] + shifts
-            windows = np.clip(at[:, :, None] + places, 0, most)[..., None] + np.arange(TICKS)
-            told = np.einsum("pnsbt,nbpt->ns", stretch.counts[:, windows], logs[run], optimize=True)
+            windows = seen[np.clip(at[:, :, None] + places, 0, most)].reshape(len(run), len(shifts), -1)
+            told = (windows @ logs[run].reshape(len(run), -1, 1))[..., 0]
             best = at[np.arange(len(run)), _around(told).argmax(1)]
             found[run] = np.clip(best, 0, len(evidence) - 1 - int(places[-1]))
         return found
@@ -544,7 +550,7 @@ class CharacterDecoder:
         contexts = np.stack([weights @ (of_words == context) for context in range(CONTEXTS)], 2)
         at = (places + shift).ravel()
         inside = (at >= 0) & (at + TICKS <= stretch.end) & (at + EARLY >= stretch.seen)
-        windows = stretch.counts[:, at[inside, None] + np.arange(TICKS)].transpose(1, 0, 2).astype(np.float64)
+        windows = stretch.windows[at[inside]].astype(np.float64)
         return windows, contexts.reshape(-1, CONTEXTS)[inside]
 
     def _begun(
@@ -743,12 +749,10 @@ class CharacterDecoder:
             marks = marks[(before < 0) | (marks >= starts[before] + self._length * light.rate)]
         places = (starts[:, None] + self._places(light)).ravel()
         at = np.concatenate([places, marks])
-        windows = stretch.counts[:, at[:, None] + np.arange(TICKS)].transpose(1, 0, 2).astype(np.float64)
+        windows = stretch.windows[at].astype(np.float64)
         beside = np.logaddexp(light.beside_mean(windows), np.log(DOUBT))
         words = beside[: len(places)].reshape(len(starts), bits, CONTEXTS)
-        told = np.logaddexp.reduce(
-            self.characters.likelihoods(words), 1
-        ) - self.characters.data_bits * np.log(2)
+        told = log_sums(self.characters.likelihoods(words)) - self.characters.data_bits * np.log(2)
         return float(told.sum() + beside[len(places) :, -1].sum())
 
 

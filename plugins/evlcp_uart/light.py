@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BEFORE", "CONTEXTS", "DOUBT", "EARLY", "GAINS", "TICKS", "Light", "guesses"]
+__all__ = ["BEFORE", "CONTEXTS", "DOUBT", "EARLY", "GAINS", "TICKS", "Light", "guesses", "log_sums"]
 
 TICKS = 16
 """Ticks of a bit."""
@@ -136,10 +136,12 @@ class Light:
 
     def said(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log-likelihood of windows, float64 (..., 2, TICKS), by context and gain, float64 (..., C, J)."""
-        alike = np.einsum("...pt,cpt->...c", windows, self.logs)
-        events = windows.sum((-2, -1))
-        found: NDArray[np.float64] = (alike[..., None] + events[..., None, None] * LOG_GAINS) * self.share
-        return found - self.means
+        flat = windows.reshape(*windows.shape[:-2], -1)
+        alike = np.einsum("...k,ck->...c", flat, self.share * self.logs.reshape(CONTEXTS, -1))
+        events = flat.sum(-1)
+        found: NDArray[np.float64] = (events[..., None] * (self.share * LOG_GAINS))[..., None, :] - self.means
+        found += alike[..., None]
+        return found
 
     def beside_mean(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log-likelihood of windows, float64 (n, 2, TICKS), of each context beside steady events, (n, C)."""
@@ -147,11 +149,10 @@ class Light:
         mean = np.einsum("c,cpt->p", share, self.rates)[:, None] / TICKS * np.ones(TICKS)
         gains = self.gains.sum(0) + _PRIOR_GAINS * _SHARES
         costs = mean.sum() * GAINS * self.share - np.log(gains / gains.sum())
-        alike = np.einsum("npt,pt->n", windows, np.log(mean))
-        said = self.share * (alike[:, None] + windows.sum((1, 2))[:, None] * LOG_GAINS) - costs
-        found: NDArray[np.float64] = np.logaddexp.reduce(self.said(windows), 2)
-        steady: NDArray[np.float64] = np.logaddexp.reduce(said, 1)
-        return found - steady[:, None]
+        flat = windows.reshape(len(windows), -1)
+        alike = np.einsum("nk,k->n", flat, np.log(mean).ravel())
+        said = self.share * (alike[:, None] + flat.sum(1)[:, None] * LOG_GAINS) - costs
+        return log_sums(self.said(windows)) - log_sums(said)[:, None]
 
     def told(self, windows: NDArray[np.float64], contexts: NDArray[np.float64]) -> float:
         """How much the events of bits tell of their contexts, in all: their mutual information.
@@ -161,8 +162,7 @@ class Light:
             contexts: How likely each is of each context, float64 (n, C).
         """
         said = self.said(windows)
-        top = said.max((1, 2))
-        likely = np.exp(said - top[:, None, None]).sum(2)
+        likely = np.einsum("ncj->nc", _likely(said))
         any_of = likely @ contexts.mean(0)
         told: float = (contexts * np.log(likely + 1e-300)).sum() - np.log(any_of + 1e-300).sum()
         return told
@@ -179,16 +179,16 @@ class Light:
             rate: Length of a bit against the nominal one.
         """
         said = self.said(windows)
-        gains = np.exp(said - said.max((1, 2))[:, None, None])
-        likely = gains.sum(2)
+        gains = _likely(said)
+        likely = np.einsum("ncj->nc", gains)
         # What is rather something else than a bit of that context teaches nothing of it.
         fits = (1 - DOUBT) * likely / likely.max(1, keepdims=True)
         contexts = contexts * fits / (fits + DOUBT)
-        gains *= (contexts / np.maximum(likely, 1e-300))[:, :, None]
+        of_gains = np.einsum("nc,ncj->cj", contexts / np.maximum(likely, 1e-300), gains)
         return Light(
             memory * self.events + np.einsum("nc,npt->cpt", contexts, windows),
-            memory * self.windows + (gains @ GAINS).sum(0),
-            memory * self.gains + gains.sum(0),
+            memory * self.windows + of_gains @ GAINS,
+            memory * self.gains + of_gains,
             rate,
             self.paused,
             inverted=self.inverted,
@@ -239,6 +239,20 @@ def guesses(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
                         # Bright pixels go on and on after an edge.
                         rates[context, on] += trail * (bits[2] == bits[1] == on) * events[on] / TICKS
                 yield Light(2 * rates, np.full(CONTEXTS, 2.0), shares)
+
+
+def log_sums(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Logarithms of sums along the last axis, from logarithms, of which one at least is finite."""
+    top = logs.max(-1, keepdims=True)
+    found: NDArray[np.float64] = np.log(np.einsum("...j->...", np.exp(logs - top))) + top[..., 0]
+    return found
+
+
+def _likely(said: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Likelihoods from their logarithms, float64 (n, C, J), the greatest of each window 1."""
+    top = said.reshape(len(said), -1).max(1)
+    likely: NDArray[np.float64] = np.exp(said - top[:, None, None])
+    return likely
 
 
 def _smooth(rates: NDArray[np.float64]) -> NDArray[np.float64]:
