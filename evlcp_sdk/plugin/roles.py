@@ -63,7 +63,9 @@ class Separate(Protocol):
 class Decode(Protocol):
     """What `Decoding.compile` returns."""
 
-    def __call__(self, presence: PresenceMap, sums: NDArray[np.int16], /) -> SoftSymbols:
+    def __call__(
+        self, presence: PresenceMap, sums: NDArray[np.int16], /, *around: Any, **none: Any
+    ) -> SoftSymbols:
         """Presence and a frame's polarity sums, pilot then info, int16 (chips, height, width) -> symbols.
 
         For codes that are no pair codes two more arguments follow: the chip that each cluster sends before

@@ -4,7 +4,7 @@ from evlcp_sdk.testing.decorator import conformance
 from evlcp_sdk.testing.law import InapplicableLawError, Law, LawError, Verdict
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.suite import check, laws_of
-from evlcp_sdk.testing.views import ideal_presence, ideal_soft, ideal_sums, ideal_view
+from evlcp_sdk.testing.views import ideal_frame, ideal_presence, ideal_soft, ideal_sums, ideal_view
 
 __all__ = [
     "IdealBar",
@@ -15,6 +15,7 @@ __all__ = [
     "check",
     "conformance",
     "ideal_events",
+    "ideal_frame",
     "ideal_presence",
     "ideal_soft",
     "ideal_sums",

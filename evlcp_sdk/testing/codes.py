@@ -8,7 +8,7 @@ from evlcp_sdk.air.frames import bits_of_symbols, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.testing.exercises import link_of
 from evlcp_sdk.testing.law import Law, Subject, expect
-from evlcp_sdk.testing.views import ideal_presence, ideal_sums
+from evlcp_sdk.testing.views import ideal_frame, ideal_presence, ideal_sums
 
 __all__ = ["MODULATION", "PILOTS"]
 
@@ -98,14 +98,13 @@ def codewords_come_back(subject: Subject) -> None:
     link = link_of(subject)
     book = link.codebook
     decode = link.algorithm("decoding").compile(book)
-    presence = ideal_presence(book.clusters)
     words, k = 2**book.bits_per_symbol, book.clusters
     for first in range(0, words, k):
         symbols = (first + np.arange(k)) % words
         bits = bits_of_symbols(symbols[None], book.bits_per_symbol)
         back = symbols_of_bits(bits, book.bits_per_symbol, book.clusters)[0]
         expect((back == symbols).all(), f"symbols {symbols.tolist()} from their bits, got {back.tolist()}")
-        soft = decode(presence, ideal_sums(book, symbols))
+        soft = decode(*ideal_frame(book, symbols))
         wrong = np.flatnonzero(soft.symbols != symbols)
         if wrong.size:
             k = wrong[0]

@@ -15,7 +15,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
-from evlcp_sdk.testing.views import ideal_presence, ideal_sums, ideal_view
+from evlcp_sdk.testing.views import ideal_frame, ideal_sums, ideal_view
 from evlcp_sdk.values import Events, Heard
 
 __all__ = [
@@ -247,7 +247,9 @@ def _separation(subject: Subject) -> Exercise:
 
 def _decoding(subject: Subject) -> Exercise:
     book = link_of(subject).codebook
-    inputs = (ideal_presence(book.clusters), ideal_sums(book, symbols_of(book), missing=0.1))
+    # Clusters of which it is not known what follows, that it is dark, that it is lit.
+    after = np.arange(book.clusters) % 3 - 1
+    inputs = ideal_frame(book, symbols_of(book), after=after, missing=0.1)
     return Exercise(inputs, lambda: _spread(compiled_subject(subject)))
 
 

@@ -1,8 +1,7 @@
 """Laws of what looks at images: separation, decoding, ranging."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +13,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Decode
 from evlcp_sdk.testing.exercises import compiled_subject, expect_column, link_of, symbols_of
 from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, compiled, expect
-from evlcp_sdk.testing.views import GRID_PX, ideal_presence, ideal_sums, ideal_view
+from evlcp_sdk.testing.views import GRID_PX, ideal_frame, ideal_presence, ideal_sums, ideal_view
 from evlcp_sdk.values import PresenceMap, Range, SoftSymbols
 
 __all__ = ["DECODING", "RANGING", "SEPARATION"]
@@ -23,6 +22,8 @@ _SPACINGS_PX = (4, 6, 8, 10, 12, 14)
 """Spacings of clusters: 108 m to 31 m with the default bar and camera."""
 _EXACT = 1e-3
 _SEEDS = 3
+_FOLLOWED = ((-1, ""), (0, " before a dark chip"), (1, " before a lit chip"))
+"""What is known of the chip after a frame."""
 
 
 def _array(value: object, dtype: type, shape: tuple[int, ...], name: str) -> None:
@@ -109,7 +110,7 @@ def separation_permutes(subject: Subject) -> None:
 
 
 def _decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
-    """The subject compiled for every modulation of the SDK that it takes, with the link's pilots.
+    """The subject compiled for the SDK's modulations and the link's that it takes, with the link's pilots.
 
     Raises:
         InapplicableLawError: It takes none.
@@ -117,16 +118,20 @@ def _decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
     taken = False
     registry = Registry.load()
     link = link_of(subject)
+    books = []
     for entry in registry.installed("modulation"):
         if entry.distribution == "evlcp-sdk":
             modulation = registry.load_class("modulation", entry.algorithm.id)()
-            book = link.with_algorithm("modulation", modulation, id=entry.algorithm.id).codebook
-            try:
-                decode = subject.algorithm.compile(book)
-            except ConfigError:
-                continue
-            taken = True
-            yield book, decode
+            books.append(link.with_algorithm("modulation", modulation, id=entry.algorithm.id).codebook)
+    if link.codebook not in books:
+        books.append(link.codebook)
+    for book in books:
+        try:
+            decode = subject.algorithm.compile(book)
+        except ConfigError:
+            continue
+        taken = True
+        yield book, decode
     if not taken:
         raise InapplicableLawError("refuses every profile")
 
@@ -134,7 +139,7 @@ def _decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
 def decoding_shapes(subject: Subject) -> None:
     """Hold the law."""
     for book, decode in _decoders(subject):
-        soft = decode(ideal_presence(book.clusters), ideal_sums(book, symbols_of(book), missing=0.4))
+        soft = decode(*ideal_frame(book, symbols_of(book), missing=0.4))
         expect(isinstance(soft, SoftSymbols), f"SoftSymbols, got {type(soft).__name__}")
         _array(soft.symbols, np.int64, (book.clusters,), "symbols")
         _array(soft.llr, np.float32, (book.clusters, book.bits_per_symbol), "llr")
@@ -151,27 +156,14 @@ def decoding_shapes(subject: Subject) -> None:
 def decoding_inverts(subject: Subject) -> None:
     """Hold the law."""
     for book, decode in _decoders(subject):
-        whole: Callable[..., SoftSymbols] = decode
-        presence = ideal_presence(book.clusters)
-        n, k = len(book.codewords), book.clusters
+        n, k = book.carrying, book.clusters
         for first in range(0, n, k):
             symbols = (first + np.arange(k)) % n
-            for what, given in _as_received(book, symbols):
-                got = whole(presence, *given).symbols
+            for after, what in _FOLLOWED[:1] if book.pairs else _FOLLOWED:
+                got = decode(*ideal_frame(book, symbols, after=after)).symbols
                 wrong = np.flatnonzero(got != symbols)
                 told = f"symbol {symbols[wrong[0]]}{what}, got {got[wrong[0]]}" if wrong.size else ""
                 expect(not wrong.size, f"profile {book.profile}: {told}")
-
-
-def _as_received(book: Codebook, symbols: NDArray[np.int64]) -> Iterator[tuple[str, tuple[Any, ...]]]:
-    """What the receiver gives a decoding beside the presence; of codes of chips, what is around it, too."""
-    if book.pairs:
-        yield "", (ideal_sums(book, symbols),)
-        return
-    before = book.pilots[:, -1].astype(np.int8)
-    for value, what in ((-1, ""), (0, " before a dark chip"), (1, " before a lit chip")):
-        after = np.full(book.clusters, value, np.int8)
-        yield what, (ideal_sums(book, symbols, after=np.maximum(after, 0)), before, after)
 
 
 def llr_agrees(subject: Subject) -> None:
@@ -180,7 +172,7 @@ def llr_agrees(subject: Subject) -> None:
         m = book.bits_per_symbol
         for seed in range(_SEEDS):
             symbols = symbols_of(book, seed)
-            soft = decode(ideal_presence(book.clusters), ideal_sums(book, symbols, missing=0.1, seed=seed))
+            soft = decode(*ideal_frame(book, symbols, missing=0.1, seed=seed))
             zero = (soft.symbols[:, None] >> np.arange(m - 1, -1, -1) & 1) == 0
             wrong = np.argwhere(((soft.llr > 0) != zero) & (soft.symbols[:, None] >= 0))
             if len(wrong):
@@ -196,13 +188,15 @@ def decoding_permutes(subject: Subject) -> None:
     """Hold the law."""
     book = link_of(subject).codebook
     order = np.random.default_rng(1).permutation(book.clusters)
-    presence = ideal_presence(book.clusters)
-    sums = ideal_sums(book, symbols_of(book), missing=0.4)
-    plain = compiled_subject(subject)(presence, sums)
+    after = np.arange(book.clusters) % 3 - 1
+    presence, sums, *around = ideal_frame(book, symbols_of(book), after=after, missing=0.4)
+    plain = compiled_subject(subject)(presence, sums, *around)
     other = PresenceMap(
         presence.probability[order], presence.grid_px, presence.selected[order], presence.pixels[order]
     )
-    turned = compiled(lambda: subject.algorithm.compile(_permuted(book, order)))(other, sums)
+    turned = compiled(lambda: subject.algorithm.compile(_permuted(book, order)))(
+        other, sums, *(sent[order] for sent in around)
+    )
     expect((turned.symbols == plain.symbols[order]).all(), "symbols in the order of the clusters")
     expect(
         np.allclose(turned.llr, plain.llr[order], rtol=1e-3, atol=1e-3), "llr in the order of the clusters"
@@ -212,20 +206,19 @@ def decoding_permutes(subject: Subject) -> None:
 def decodes_nothing(subject: Subject) -> None:
     """Hold the law."""
     book = link_of(subject).codebook
-    presence = ideal_presence(book.clusters)
+    presence, sums, *around = ideal_frame(book, symbols_of(book))
     dark = PresenceMap(
         np.zeros_like(presence.probability),
         presence.grid_px,
         np.zeros_like(presence.selected),
         np.zeros_like(presence.pixels),
     )
-    sums = ideal_sums(book, symbols_of(book))
     decode = compiled_subject(subject)
     for seen, given, what in (
         (dark, np.zeros_like(sums), "nothing at all"),
         (presence, np.zeros_like(sums), "no events"),
     ):
-        soft = decode(seen, given)
+        soft = decode(seen, given, *around)
         sure = float(np.abs(soft.llr).max())
         expect(sure < 1e-3, f"llr of 0 from {what}, got {sure:.3g}")
         expect(np.isfinite(soft.quality), f"a finite quality from {what}, got {soft.quality}")

@@ -1,12 +1,14 @@
 """Ideal images of a frame: what separation, decoding and ranging are given."""
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
-__all__ = ["GRID_PX", "ideal_presence", "ideal_soft", "ideal_sums", "ideal_view"]
+__all__ = ["GRID_PX", "ideal_frame", "ideal_presence", "ideal_soft", "ideal_sums", "ideal_view"]
 
 GRID_PX = 2
 """Side of a grid cell of an ideal presence map, px."""
@@ -79,6 +81,37 @@ def ideal_presence(
     pixels = shown == np.arange(clusters)[:, None, None]
     cells = pixels[:, ::GRID_PX, ::GRID_PX]
     return PresenceMap(cells.astype(np.float32), GRID_PX, cells.copy(), pixels.astype(np.float32))
+
+
+def ideal_frame(
+    codebook: Codebook,
+    symbols: ArrayLike,
+    *,
+    after: ArrayLike = -1,
+    missing: float = 0.0,
+    seed: int = 0,
+) -> tuple[Any, ...]:
+    """What the receiver gives a decoding for one ideal frame: `decode(*ideal_frame(book, symbols))`.
+
+    Args:
+        codebook: The codes.
+        symbols: What the clusters say, top first, (K,).
+        after: The chip that each cluster sends after the frame, (K,) or one for all, -1 where it is not
+            known; of codes that are no pair codes only.
+        missing: Share of the events that are missing.
+        seed: Of the missing events.
+
+    Returns:
+        The presence and the polarity sums; of codes that are no pair codes also the chips before the info
+        segment and after it, int8 (K,) each.
+    """
+    presence = ideal_presence(codebook.clusters)
+    if codebook.pairs:
+        return presence, ideal_sums(codebook, symbols, missing=missing, seed=seed)
+    before = codebook.pilots[:, -1].astype(np.int8)
+    behind = np.broadcast_to(np.asarray(after, np.int8), codebook.clusters).copy()
+    sums = ideal_sums(codebook, symbols, after=np.maximum(behind, 0), missing=missing, seed=seed)
+    return presence, sums, before, behind
 
 
 def ideal_soft(codebook: Codebook, symbols: ArrayLike) -> SoftSymbols:

@@ -11,15 +11,19 @@ from typing import Any
 import numpy as np
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
+from evlcp_edges.decoding import EdgeDecoding
+from numpy.typing import NDArray
 
 from evlcp_sdk import simulate
+from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.plugin.roles import ROLES, Filter, Ranging, Tracker, Tracking
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.roles import ROLES, Decode, Decoding, Filter, Modulation, Ranging, Tracker, Tracking
 from evlcp_sdk.testing import check, laws_of, suite
-from evlcp_sdk.testing.law import Law, Subject, Verdict
+from evlcp_sdk.testing.law import Law, Subject, Verdict, judge
 from evlcp_sdk.testing.links import LINK
 from evlcp_sdk.testing.trees import difference
+from evlcp_sdk.values import PresenceMap, SoftSymbols
 from firmware_host.board.bank import random_symbols
 
 Evlcp = Callable[..., Any]
@@ -275,6 +279,65 @@ def test_the_defaults_keep_their_laws_on_another_link(role: str) -> None:
     for outcome in check(role, link.algorithms[role], link=link):
         refused = outcome.status == "skipped" and "leaves every quantity as measured" in outcome.detail
         assert outcome.status == "ok" or refused, f"{outcome.law.name}: {outcome.detail}"
+
+
+class FourInputs(EdgeDecoding):
+    """Takes what the receiver gives of codes of chips, all of it, and no pair codes."""
+
+    def compile(self, codebook: Codebook) -> Decode:
+        if codebook.pairs:
+            raise ConfigError("decoding 'four-inputs': pair codes, expected others")
+        inner = super().compile(codebook)
+
+        def decode(
+            presence: PresenceMap, sums: NDArray[np.int16], before: NDArray[np.int8], after: NDArray[np.int8]
+        ) -> SoftSymbols:
+            return inner(presence, sums, before, after)
+
+        return decode
+
+
+class Forgetful(FourInputs):
+    """It writes into what it is told."""
+
+    def compile(self, codebook: Codebook) -> Decode:
+        inner = super().compile(codebook)
+
+        def decode(
+            presence: PresenceMap, sums: NDArray[np.int16], before: NDArray[np.int8], after: NDArray[np.int8]
+        ) -> SoftSymbols:
+            before[:] = -1
+            return inner(presence, sums, before, after)
+
+        return decode
+
+
+class FiveOfNine(Modulation):
+    """Words of nine chips, five of them lit."""
+
+    def codewords(self) -> NDArray[np.uint8]:
+        words = np.arange(512)[:, None] >> np.arange(8, -1, -1) & 1
+        return words[words.sum(1) == 5].astype(np.uint8)
+
+
+def _held(decoding: Decoding, link: Link) -> dict[str, tuple[str, str]]:
+    """What became of the laws of an algorithm alone, by their names."""
+    laws = [law for law in laws_of("decoding") if law not in LINK]
+    subject = Subject("decoding", decoding, link)
+    return {law.name: (one.status, one.detail) for law in laws for one in [judge(law, subject, {})]}
+
+
+def test_laws_give_a_decoding_of_chips_what_the_receiver_gives() -> None:
+    link = load_link(overrides=["modulation.id=nrz"])
+    link = link.with_algorithm("modulation", FiveOfNine(), id="five-of-nine")
+    whole = FourInputs()
+    assert {said for said in _held(whole, link).values() if said[0] != "ok"} == set()
+    with_it = link.with_algorithm("decoding", whole, id="whole")
+    came = next(law for law in laws_of("modulation") if law.name == "comes-back")
+    assert judge(came, Subject("modulation", FiveOfNine(), with_it), {}).status == "ok"
+    told = _held(Forgetful(), link)
+    assert told["inputs-kept"][0] == "failed"
+    assert "input[2]" in told["inputs-kept"][1]
 
 
 def test_a_law_sees_the_link_that_it_is_given() -> None:

@@ -224,23 +224,25 @@ def test_every_parameter_of_every_built_in_is_in_the_docs(role: str) -> None:
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_the_example_of_every_role_keeps_its_laws(role: str, workplace: Path) -> None:
-    (code,) = re.findall(r"^```python\n(.*?)^```$", section_of("roles", role), re.MULTILINE | re.DOTALL)
-    first = re.match(r"# (\w+)\.py\n", code)
-    assert first
-    (workplace / f"{first[1]}.py").write_text(code)
-    try:
-        module = importlib.import_module(first[1])
-        (cls,) = [
-            found
-            for found in vars(module).values()
-            if isinstance(found, type) and issubclass(found, ROLES[role].abstract)
-            if found.__module__ == first[1]
-        ]
-        for outcome in check(role, cls()):
-            assert outcome.status == "ok", f"{outcome.law.name}: {outcome.detail}"
-    finally:
-        sys.modules.pop(first[1], None)
+def test_the_examples_of_every_role_keep_its_laws(role: str, workplace: Path) -> None:
+    codes = re.findall(r"^```python\n(.*?)^```$", section_of("roles", role), re.MULTILINE | re.DOTALL)
+    assert codes
+    for code in codes:
+        first = re.match(r"# (\w+)\.py\n", code)
+        assert first
+        (workplace / f"{first[1]}.py").write_text(code)
+        try:
+            module = importlib.import_module(first[1])
+            (cls,) = [
+                found
+                for found in vars(module).values()
+                if isinstance(found, type) and issubclass(found, ROLES[role].abstract)
+                if found.__module__ == first[1]
+            ]
+            for outcome in check(role, cls()):
+                assert outcome.status == "ok", f"{outcome.law.name}: {outcome.detail}"
+        finally:
+            sys.modules.pop(first[1], None)
 
 
 @pytest.mark.parametrize("role", ROLES)
