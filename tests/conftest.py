@@ -31,6 +31,29 @@ settings.load_profile("same")
 typer.main.get_params_from_function = cache(typer.main.get_params_from_function)
 
 
+LONG = (
+    "tests/unit/test_site.py",
+    "tests/packaging",
+    "tests/firmware/test_board_qemu.py",
+    "tests/faults",
+    "tests/acceptance",
+    "tests/unit/plugins/test_uart.py",
+    "tests/unit/test_kernel_caches.py",
+    "tests/unit/study",
+    "tests/unit/rx",
+    "tests/firmware",
+)
+"""Files and folders with tests of 5 s and more, the longest first."""
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Several processes begin with what takes long: none is left with that when the others are done."""
+    if hasattr(config, "workerinput"):
+        items.sort(
+            key=lambda item: next((k for k, at in enumerate(LONG) if item.nodeid.startswith(at)), len(LONG))
+        )
+
+
 @dataclass(frozen=True)
 class Run:
     """How a command ended."""
