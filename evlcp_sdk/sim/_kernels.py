@@ -1,6 +1,7 @@
 """Pixels and readout, compiled.
 
-Every random number is a hash of (seed, pixel, number of the draw, purpose).
+Every random number is a hash of (seed, pixel, number of the draw, purpose). What runs pixels may round the
+sum of a product once instead of twice (`contract`), which takes half as many instructions.
 """
 
 import math
@@ -279,7 +280,7 @@ def _logarithm(f: Array, bits: Array, of: int, spare: int, n: int) -> None:
         f[of + i] = k * 0.693147180369123816490 + (k * 1.90821492927058770002e-10 + p * s)
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _run_piece(
     lanes: int,
     t_us: float,
@@ -489,7 +490,7 @@ def _leave_empty(begin: int, end: int, f: Array, key: Array, draw: Array, code: 
         key[i], draw[i], code[i] = np.uint64(0), 0, 0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def run_given_light(
     first: int,
     last: int,
@@ -572,7 +573,7 @@ def _place(lanes: int, f: Array, x: float, y: float, axis_x: float, axis_y: floa
         f[_ACROSS + i] = dx * axis_y - dy * axis_x
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _near_weights(
     lanes: int,
     f: Array,
@@ -634,7 +635,7 @@ def _near_weights(
             weight[first + np.uint64(i)] = gain * share if seen else 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def run_pixels(
     first: int,
     last: int,
