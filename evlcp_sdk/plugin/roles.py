@@ -9,7 +9,6 @@ synchronization keeps state, and that state is explicit.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections import Counter
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -401,11 +400,10 @@ def _ranging_of(bar: BarLayout, of_chips: Collection[str]) -> str:
     high_m = max((len(clusters) * pitch_m for clusters, pitch_m in bar.even_columns), default=0.0)
     if "pilots" not in of_chips and high_m > 0 and bar.width_m <= _WIDEST * high_m:
         return "joint-scale"
-    # Those with light on the same sides look too large in the same way.
-    same_sides = max(Counter(bar.sides.tolist()).values())
-    if same_sides >= 2 and bar.alike:
+    alike_sides = int(bar.alike_sides.sum())
+    if alike_sides >= 2 and bar.alike:
         return "poc"
-    return "centroid" if same_sides >= 3 else "none"
+    return "centroid" if alike_sides >= 3 else "none"
 
 
 ROLES: Mapping[str, Role] = MappingProxyType(

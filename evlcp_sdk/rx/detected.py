@@ -1,5 +1,6 @@
 """Regions that an algorithm of the role `detection` gives, followed as the receiver's own are."""
 
+import math
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,6 +18,11 @@ from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import Events, Region
 
 __all__ = ["DetectedRegions"]
+
+_BACKFILL_FRAMES = 4
+"""Frames kept from before a region was found, where these are longer than the steps of the receiver's own
+tracker: a slow light is known by its rhythm only, which takes edges of two characters, and its first one may
+have begun before."""
 
 
 class DetectedRegions:
@@ -38,9 +44,11 @@ class DetectedRegions:
         self._detector = detector
         self._limits = limits
         self._step_us = link.regions.step_us
+        frames_us = _BACKFILL_FRAMES * link.packet.frame_chips * link.packet.chip_us
+        self._most_recent = max(BACKFILL_STEPS, math.ceil(frames_us / self._step_us))
         with self._guard:
             self._state: Any = detector.init()
-        self._recent: deque[tuple[int, Events]] = deque(maxlen=BACKFILL_STEPS)
+        self._recent: deque[tuple[int, Events]] = deque(maxlen=self._most_recent)
         self._left: frozenset[int] = frozenset()
         self.alive: list[Followed] = []
         self.counts = {"regions_left_out": 0, "dropped_no_room": 0}
@@ -88,7 +96,7 @@ class DetectedRegions:
 
     def _remember(self, start_us: int, events: Events) -> None:
         """Keep a step's events, for regions that are found later, and what is before it within the limits."""
-        while self._recent and self._recent[0][0] <= start_us - BACKFILL_STEPS * self._step_us:
+        while self._recent and self._recent[0][0] <= start_us - self._most_recent * self._step_us:
             self._recent.popleft()
         self._recent.append((start_us, events))
         while sum(held_bytes(held) for _, held in self._recent) > self._limits.recent_bytes:

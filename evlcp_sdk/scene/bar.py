@@ -329,6 +329,15 @@ class BarLayout:
             found += after * (touches & (along > 0)).any(1)
         return found
 
+    @cached_property
+    def alike_sides(self) -> NDArray[np.bool_]:
+        """Which clusters have light on the same sides as most have, bool (K,): they look too large alike.
+
+        >>> BarLayout(LedGrid(24)).alike_sides.tolist()
+        [False, True, True, False]
+        """
+        return np.asarray(self.sides == np.bincount(self.sides).argmax())
+
     @property
     def in_even_line(self) -> bool:
         """Whether the clusters stand in one straight line, in order and evenly; one cluster does."""

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
@@ -50,7 +49,7 @@ class CentroidRanging(Ranging):
         centres = bar.cluster_centres_m()
         in_line = np.linalg.matrix_rank(centres - centres.mean(0), tol=1e-9) < 2
         skip = self.skip_outer if in_line else 0
-        same = _like_most(bar.sides) if self.skip_outer and not in_line else np.ones(bar.clusters, np.bool_)
+        same = bar.alike_sides if self.skip_outer and not in_line else np.ones(bar.clusters, np.bool_)
         left = int(same.sum()) - 2 * skip
         least = max(min(self.min_clusters, left), 3)
         if left < least:
@@ -104,8 +103,3 @@ class CentroidRanging(Ranging):
             return Range(distance, distance * float(np.sqrt(variance / power)) / size, kept)
 
         return measure
-
-
-def _like_most(sides: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Which clusters have neighbours on the same sides as most have, bool (K,)."""
-    return np.asarray(sides == np.bincount(sides).argmax())
