@@ -208,7 +208,7 @@ def loop(
     yield Step(
         "light",
         {
-            "leds": 8 * light.record.rows.shape[1],
+            "leds": len(link.bar.led_clusters()),
             "chips": len(light.chips),
             "chip_rate_hz": round(light.rate_hz, 3),
             "on_share": round(float(light.chips.mean()), 4),

@@ -87,8 +87,9 @@ def _board(step: Mapping[str, Any]) -> str:
 
 
 def _light(step: Mapping[str, Any]) -> str:
+    leds = "1 LED" if step["leds"] == 1 else f"{step['leds']} LEDs"
     return (
-        f"{step['leds']} LEDs, {step['chip_rate_hz']:g} chips a second, on for {step['on_share']:.0%} of the"
+        f"{leds}, {step['chip_rate_hz']:g} chips a second, on for {step['on_share']:.0%} of the"
         f" time; {step['chips']} chips watched, each what the message says"
     )
 

@@ -51,10 +51,11 @@ def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path
 
 
 def test_a_text_that_does_not_arrive_ends_with_1(evlcp, tmp_path: Path) -> None:
-    done = evlcp("loop", "--distance", "900", "--json", "-o", tmp_path)
+    done = evlcp("loop", "--distance", "900", "--set", "bar.rows=48", "--json", "-o", tmp_path)
     assert done.code == 1
     steps = [json.loads(line) for line in done.out.splitlines()]
     assert [step["step"] for step in steps] == ["message", "board", "light", "scene", "receiver", "text"]
+    assert steps[2]["leds"] == 48
     assert steps[-1]["as_sent"] is False
     assert steps[-1]["texts"] == []
     for step in steps:
