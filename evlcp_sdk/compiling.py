@@ -11,12 +11,14 @@ tried with; by another one kernels are compiled as Numba does by itself, in two 
 """
 
 import sys
+from collections import Counter, defaultdict
+from contextlib import nullcontext
 from functools import cache
 from typing import Any
 
 import llvmlite.ir
 import numba
-from llvmlite.binding import Linkage, ffi
+from llvmlite.binding import Linkage, ffi, parse_assembly
 from llvmlite.ir import instructions
 from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core import (
@@ -24,17 +26,22 @@ from numba.core import (
     cgutils,
     codegen,
     cpu,
+    errors,
+    inline_closurecall,
     ir,
     lowering,
     postproc,
     transforms,
+    typeinfer,
     types,
     utils,
 )
 from numba.core.base import BaseContext
-from numba.core.compiler_machinery import PassManager
+from numba.core.compiler_machinery import PassManager, _pass_registry
 from numba.core.runtime.context import NRTContext
 from numba.core.types.functions import BaseFunction
+from numba.core.typing.context import Context as TypingContext
+from numba.core.unsafe import eh
 from numba.cpython import slicing
 from numba.np import arrayobj
 
@@ -69,8 +76,12 @@ def prepare(kept: KeptKernel) -> bool:
     _follow_lives_when_asked()
     _list_variables_quickly()
     _count_references_of_arrays_alone()
+    _keep_values_of_variables()
     _read_fields_of_values()
     _write_no_detours()
+    _name_by_number()
+    _run_passes_alone()
+    _look_for_no_lists()
     # Whoever wants to know of LLVM's lock costs more than it.
     ffi.lib._lock._cblist.clear()
     return True
@@ -106,6 +117,13 @@ def _keep_calls_within(kept: KeptKernel) -> None:
                 function.linkage = "linkonce_odr"
         return self.name, "object", (code, module.as_bitcode())
 
+    def parse(self: Any, written: Any) -> None:
+        self._raise_if_finalized()
+        module = parse_assembly(str(written))
+        module.name = written.name
+        module.verify()
+        self.add_llvm_module(module)
+
     def optimize(self: Any, module: Any) -> None:
         cheap = {"loop_vectorize": False, "slp_vectorize": False, "opt": 0, "cost": "cheap"}
         for options in (cheap, {}):
@@ -123,6 +141,7 @@ def _keep_calls_within(kept: KeptKernel) -> None:
             wrap(self, library, description, *of, **options)
 
     library: Any = codegen.JITCodeLibrary
+    library.add_ir_module = parse
     library._optimize_functions = simplify
     library._optimize_final_module_of = optimize
     library.finalize = link
@@ -151,7 +170,10 @@ def _resolve_once() -> None:
 
 
 def _look_up_once() -> None:
-    """What says the same each time: signatures of Python functions, sizes of types, what passes rely on."""
+    """What says the same each time: signatures of Python functions, sizes of types, what passes rely on.
+
+    What Numba can compile is looked through again only when there is more of it.
+    """
     functions: Any = utils
     functions.pysignature = cache(functions.pysignature)
     measure, analyse = BaseContext.get_abi_sizeof, PassManager.dependency_analysis
@@ -170,8 +192,21 @@ def _look_up_once() -> None:
             analyses[passes] = analyse(self)
         return analyses[passes]
 
+    def when_more(refresh: Any) -> Any:
+        def refreshed(self: Any) -> None:
+            known = self._registries.items()
+            count = sum(len(getattr(one, name)) for one, reader in known for name in reader.registry_items)
+            if count != self.__dict__.get("_evlcp_count"):
+                refresh(self)
+                self._evlcp_count = count
+
+        return refreshed
+
     context: Any = BaseContext
     context.get_abi_sizeof = size
+    context.refresh = when_more(context.refresh)
+    typing: Any = TypingContext
+    typing.refresh = when_more(typing.refresh)
     manager: Any = PassManager
     manager.dependency_analysis = relied_on
 
@@ -288,23 +323,27 @@ def _write_no_detours() -> None:
     slicing.fix_index = fix_index
 
 
+_HOLDS: dict[Any, bool] = {}
+
+
+def _holds_references(context: Any, kind: Any) -> bool:
+    """Whether a value of a type is, or has, what references are counted of."""
+    found = _HOLDS.get(kind)
+    if found is None:
+        found = _HOLDS[kind] = context.data_model_manager[kind].contains_nrt_meminfo()
+    return found
+
+
 def _count_references_of_arrays_alone() -> None:
     """Where references are counted, only what holds one is taken apart; a number that ends is left alone."""
-    holds: dict[Any, bool] = {}
-
-    def held_by(context: Any, kind: Any) -> bool:
-        found = holds.get(kind)
-        if found is None:
-            found = holds[kind] = context.data_model_manager[kind].contains_nrt_meminfo()
-        return found
 
     def counted(self: Any, builder: Any, kind: Any, value: Any) -> list[tuple[Any, Any]]:
-        if not held_by(self._context, kind):
+        if not _holds_references(self._context, kind):
             return []
         model = self._context.data_model_manager[kind]
         found = [(kind, model.get_nrt_meminfo(builder, value))] if model.has_nrt_meminfo() else []
         for member, get in model.traverse(builder):
-            if held_by(self._context, member):
+            if _holds_references(self._context, member):
                 found += counted(self, builder, member, get(value))
         return found
 
@@ -312,7 +351,7 @@ def _count_references_of_arrays_alone() -> None:
 
     def end(self: Any, name: str) -> None:
         kind = self.typeof(name)
-        if self._disable_sroa_like_opt or held_by(self.context, kind):
+        if self._disable_sroa_like_opt or _holds_references(self.context, kind):
             delete(self, name)
             return
         if name not in self._blk_local_varmap:
@@ -323,6 +362,65 @@ def _count_references_of_arrays_alone() -> None:
     runtime.get_meminfos = counted
     lower: Any = lowering.Lower
     lower.delvar = end
+
+
+def _keep_values_of_variables() -> None:
+    """A variable that is set in one place, which all its uses come after, is its value, no place in memory.
+
+    Numba does so within a block. Where references are counted there is a place, too, to end what it has.
+    """
+    lower: Any = lowering.Lower
+    allocate, load, store = lower._alloca_var, lower.loadvar, lower.storevar
+
+    def find(self: Any) -> None:
+        blocks, function = self.func_ir.blocks, self.func_ir.func_id
+        self._singly_assigned_vars, self._blk_local_varmap = set(), {}
+        self._set_once, self._values = set(), {}
+        if function.is_generator or self._disable_sroa_like_opt:
+            return
+        known = analysis.compute_use_defs(blocks)
+        set_in: dict[str, set[int]] = defaultdict(set)
+        used_in: dict[str, set[int]] = defaultdict(set)
+        for found, by_block in ((set_in, known.defmap), (used_in, known.usemap)):
+            for label, names in by_block.items():
+                for name in names:
+                    found[name].add(label)
+        times = Counter(one.target.name for block in blocks.values() for one in block.find_insts(ir.Assign))
+        before = analysis.compute_cfg_from_blocks(blocks).dominators()
+        tried = any(_is_of_exceptions(one) for block in blocks.values() for one in block.body)
+        in_memory = analysis.must_use_alloca(blocks)
+        for name, labels in set_in.items():
+            if times[name] != 1 or name in in_memory:
+                continue
+            (label,) = labels
+            if not used_in[name]:
+                self._singly_assigned_vars.add(name)
+            elif not tried and all(label in before[use] and label < use for use in used_in[name]):
+                self._set_once.add(name)
+
+    def allocated(self: Any, name: str, kind: Any) -> None:
+        if name not in self._set_once or _holds_references(self.context, kind):
+            allocate(self, name, kind)
+
+    def loaded(self: Any, name: str) -> Any:
+        value = self._values.get(name)
+        return load(self, name) if value is None else value
+
+    def stored(self: Any, value: Any, name: str, argidx: Any = None) -> None:
+        once = name in self._set_once
+        if not once or _holds_references(self.context, self.typeof(name)):
+            store(self, value, name, argidx)
+        if once:
+            self._values[name] = value
+
+    lower._find_singly_assigned_variable = find
+    lower._alloca_var, lower.loadvar, lower.storevar = allocated, loaded, stored
+
+
+def _is_of_exceptions(statement: Any) -> bool:
+    """Whether a function may go on where something was raised."""
+    value = getattr(statement, "value", None)
+    return isinstance(value, ir.Global) and value.value is eh.exception_check
 
 
 def _read_fields_of_values() -> None:
@@ -399,3 +497,68 @@ def _read_fields_of_values() -> None:
     for module in [m for name, m in sys.modules.items() if name.startswith("numba.")]:
         if getattr(module, "make_array", None) is make:
             vars(module)["make_array"] = make_array
+
+
+def _name_by_number() -> None:
+    """Instructions are named by numbers: nobody reads their names, so none is looked for among others."""
+
+    def named(self: Any, _: str) -> None:
+        scope = self.parent.scope
+        scope.count = count = getattr(scope, "count", 0) + 1
+        # Arguments and blocks have other names.
+        self._name = f"~{count}"
+        self._reference = f'%"~{count}"'
+
+    def begin(
+        self: Any, parent: Any, kind: Any, opname: str, operands: Any, name: str = "", flags: Any = ()
+    ) -> None:
+        self.parent, self.type, self.opname, self.operands = parent, kind, opname, operands
+        self.flags, self.metadata = list(flags), {}
+        named(self, name)
+
+    instruction: Any = instructions.Instruction
+    instruction.__init__, instruction._set_name = begin, named
+    instruction.get_reference = lambda self: self._reference
+
+
+def _run_passes_alone() -> None:
+    """Passes run without what tells of them and of errors: what fails here the parent compiles again."""
+
+    def run_pass(self: Any, _: int, one: Any, state: Any) -> None:
+        one.analysis = self._analysis
+        changed = [step(state) for step in (one.run_initialization, one.run_pass, one.run_finalizer)]
+        if self._ENFORCING and _pass_registry.get(type(one)).mutates_CFG:
+            if any(changed):
+                postproc.PostProcessor(state.func_ir).run()
+            else:
+                state.func_ir.blocks = transforms.canonicalize_cfg(state.func_ir.blocks)
+
+    nothing = nullcontext()
+    for module in (errors, typeinfer, lowering):
+        vars(module)["new_error_context"] = lambda *_, **__: nothing
+    manager: Any = PassManager
+    manager._runPass = run_pass
+    fixer: Any = vars(errors)["WarningsFixer"]
+    fixer.catch_warnings = lambda *_, **__: nothing
+
+
+def _look_for_no_lists() -> None:
+    """Where no list is built and no function made, none is looked for that could be put in its place."""
+    closures: Any = inline_closurecall.InlineClosureCallPass
+    lists: Any = inline_closurecall.RewriteArrayOfConsts
+    inline, match = closures.run, lists.match
+
+    def run(self: Any) -> None:
+        if _has(self.func_ir, ("build_list", "make_function")):
+            inline(self)
+
+    def matches(self: Any, function: Any, *of: Any) -> Any:
+        return _has(function, ("build_list",)) and match(self, function, *of)
+
+    closures.run, lists.match = run, matches
+
+
+def _has(function: Any, operations: tuple[str, ...]) -> bool:
+    """Whether there is such an expression in a function."""
+    values = (getattr(one, "value", None) for block in function.blocks.values() for one in block.body)
+    return any(type(value) is ir.Expr and value.op in operations for value in values)

@@ -66,6 +66,30 @@ def mixed(images, weights, box, unit):
 
 
 @njit(cache=True, nogil=True)
+def built(values):
+    """Lists that become arrays, a function within, values set before a branch and used behind, an error."""
+
+    def smaller(a, b):
+        return a if a < b else b
+
+    squares = np.array([v * v for v in values])
+    ends = np.array([values[0], 2.0])
+    count, rest = values.size, values[1:]
+    found = 0
+    try:
+        if count > 3:
+            raise ValueError
+        found = 1
+    except Exception:
+        found = count
+    for i in range(count):
+        if i % 3 == 1:
+            rest = squares[i:]
+        found += int(rest[0] > smaller(squares[i], ends[1]))
+    return squares, ends, rest.sum(), found
+
+
+@njit(cache=True, nogil=True)
 def refused(n):
     if n < 0:
         raise ValueError("a count")
@@ -85,6 +109,7 @@ said = []
 images = rng.normal(size=(3, 8, 11)).astype(np.float32)
 said.extend(mine.mixed(images, rng.random(11), (2, 1, 9, 7), 0.3 - 1.7j))
 said.append(mine.sorted_up(rng.normal(size=9)))
+said.extend(mine.built(rng.normal(size=7)))
 try:
     mine.refused(-1)
 except ValueError as error:
@@ -120,7 +145,7 @@ def test_kernels_of_the_child_give_the_same_bits(tmp_path: Path) -> None:
     assert whole == by_itself
     assert whole.endswith("'a count', 3.0]")
     # Parts are kept with what they are a part of.
-    assert (files, more) == (3, 5)
+    assert (files, more) == (4, 6)
 
 
 def test_another_version_of_numba_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
