@@ -115,10 +115,11 @@ $(VENV)/.pip: | $(BIN)/python
 	$(BIN)/python -m pip install -q --upgrade 'pip>=25.1'
 	@touch $@
 
+# Most modules are never imported: Python compiles a module when it is, and keeps that.
 $(VENV)/.installed: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e '.[report]'
+	$(BIN)/python -m pip install -q --no-compile -e '.[report]'
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q -e '.[faery,parquet,pandas,cluster,report,mcap,live,sign,mp4,camera,ros,hdf5,docs,notebook]' --group dev
+	$(BIN)/python -m pip install -q --no-compile -e '.[faery,parquet,pandas,cluster,report,mcap,live,sign,mp4,camera,ros,hdf5,docs,notebook]' --group dev
 	@touch $@ $(VENV)/.installed
