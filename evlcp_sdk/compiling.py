@@ -323,15 +323,10 @@ def _write_no_detours() -> None:
     slicing.fix_index = fix_index
 
 
-_HOLDS: dict[Any, bool] = {}
-
-
+@cache
 def _holds_references(context: Any, kind: Any) -> bool:
     """Whether a value of a type is, or has, what references are counted of."""
-    found = _HOLDS.get(kind)
-    if found is None:
-        found = _HOLDS[kind] = context.data_model_manager[kind].contains_nrt_meminfo()
-    return found
+    return bool(context.data_model_manager[kind].contains_nrt_meminfo())
 
 
 def _count_references_of_arrays_alone() -> None:
