@@ -75,7 +75,9 @@ def ideal_events(
     """
     rng = np.random.default_rng(seed)
     chips = np.concatenate([packet_chips(s, link.codebook, link.packet.pilot_every) for s in bar.symbols])
-    edges = np.diff(chips.astype(np.int64), axis=0, prepend=0)
+    # It is dark before the first packet, and at rest after the last.
+    rest = link.algorithm("framing").rest() or 0
+    edges = np.diff(chips.astype(np.int64), axis=0, prepend=0, append=rest)
     chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
     clusters = link.codebook.clusters
     rows = round(clusters * bar.cluster_px)

@@ -98,6 +98,20 @@ def mean_squares(rho: Array, power: float, known: int, memory: int, out: Array) 
 
 
 @njit(cache=True, nogil=True)
+def raise_to_chance(counts: Array, span: int, first: int, squares: Array) -> None:
+    """Raise mean squares of correlations, from a lag on, to that of as many events of random sign, 1 / n.
+
+    Where light ends, windows of `span` bins hold fewer events than those that the mean squares are of.
+    """
+    seen = counts[:, first : first + span].sum()
+    for i in range(squares.size):
+        squares[i] = max(squares[i], 1 / max(seen, 1.0))
+        if first + i + span < counts.shape[1]:
+            for kind in range(2):
+                seen += counts[kind, first + i + span] - counts[kind, first + i]
+
+
+@njit(cache=True, nogil=True)
 def listen(
     t_us: Array,
     p: Array,
@@ -115,7 +129,8 @@ def listen(
     """Count events, correlate all bins but the last, and follow the mean square of the correlations.
 
     `bins` are the number of the first, its length, us, and from which to before which lag the mean squares,
-    `enough`, are wanted; `past` are `power`, `known` and `memory` of `mean_squares`. `rho` is for all lags.
+    `enough`, are wanted, which are no less than chance; `past` are `power`, `known` and `memory` of
+    `mean_squares`. `rho` is for all lags.
 
     Returns:
         The largest correlation, and what `mean_squares` gives.
@@ -123,6 +138,7 @@ def listen(
     count_bins(t_us, p, bins[0], bins[1], known, counts)
     top = correlate(counts[:, : counts.shape[1] - 1], chips, due, steps, min_events, rho)
     power, many = mean_squares(rho[bins[2] : bins[3]], past[0], past[1], past[2], enough)
+    raise_to_chance(counts, steps * chips.size, bins[2], enough)
     return top, power, many
 
 

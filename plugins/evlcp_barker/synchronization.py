@@ -44,7 +44,8 @@ _QUALITY_PACKETS = 8
 """Packets over which a lock's correlation is averaged."""
 
 _OUTSTANDS = 6.0
-"""A correlation so many times the rms of a packet's others is a preamble: random data reach 5 in 20 s."""
+"""A correlation so many times the rms of a packet's others is a preamble: random data reach 5 in 20 s. The
+rms is no less than one over the root of the events' number, which is that of random signs."""
 
 
 @dataclass(frozen=True)

@@ -39,6 +39,11 @@ def mean_squares(rho, memory):
     return np.array(out)
 
 
+def raise_to_chance(counts, span, first, squares):
+    seen = np.array([counts[:, lag : lag + span].sum() for lag in range(first, first + len(squares))])
+    return np.maximum(squares, 1 / np.maximum(seen, 1))
+
+
 def peaks(rho, first, guard, enough, outstands, least):
     """Lags that are enough and the first maximum of the lags about them."""
     wanted = np.clip(outstands * np.sqrt(enough), least / 2, least)

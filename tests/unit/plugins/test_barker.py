@@ -129,8 +129,39 @@ def test_listening_counts_correlates_and_follows_the_mean_square():
     _kernels.count_bins(t, p, 0, 11.25, known, want)
     top = _kernels.correlate(want[:, :800], chips, due, 10, 0, expected)
     assert found == (top, *_kernels.mean_squares(expected[20:520], *past, squares))
+    squares = twins.raise_to_chance(want[:, :800], 260, 20, squares)
     for one, other in ((counts, want), (rho, expected), (enough, squares)):
         assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("first", [0, 30, 41])
+def test_mean_squares_are_no_less_than_chance(first):
+    rng = np.random.default_rng(first)
+    counts = rng.poisson(np.linspace(3, 0, 100) ** 2 / 3, (2, 100)).astype(float)
+    squares = rng.uniform(0, 0.05, 60 - first)
+    want = twins.raise_to_chance(counts, 40, first, squares)
+    assert 0 < np.count_nonzero(want > squares) < len(want)
+    _kernels.raise_to_chance(counts, 40, first, squares)
+    assert_allclose(squares, want, rtol=1e-12)
+
+
+@pytest.mark.parametrize("rate_hz", [1e5, 5e5, 2e6])
+def test_noise_that_ends_at_once_is_no_preamble(rate_hz):
+    """Its last windows hold few events: one in twenty such ends stood out from the full ones before."""
+    rng = np.random.default_rng(7)
+    preamble = np.concatenate([[1, 0], chips_of_values(-np.array(BARKER13))])[:27]
+    pilots = np.array([rng.permutation(np.arange(19) % 2) for _ in range(8)])
+    book = Codebook("lit first", preamble, pilots, np.array([[1, 0, 1, 1, 0], [0, 1, 0, 0, 1]]))
+    listener = BarkerSync().compile(book, PacketFormat.of(book, 10))
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        many = int(rate_hz * 0.06)
+        t_us, p = np.sort(rng.integers(0, 60_000, many)), rng.integers(0, 2, many).astype(np.uint8)
+        state = listener.init()
+        for until_us in range(1500, 70_000, 1500):
+            one = slice(*np.searchsorted(t_us, [until_us - 1500, until_us]))
+            state, locks = listener.step(state, t_us[one], p[one], until_us)
+            assert not locks
 
 
 @pytest.mark.parametrize("seed", range(3))
