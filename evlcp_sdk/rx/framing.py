@@ -130,8 +130,9 @@ class PacketFraming:
         )
         self._codebook = link.codebook
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
-        self._unknown.setflags(write=False)
         self._behind = [chips_behind(link.codebook, link.packet, n) for n in range(link.packet.frames)]
+        for chips in (self._unknown, *self._behind):
+            chips.setflags(write=False)
         self._rows = RowDelays(link.codebook.preamble)
         edges = edges_of_chips(link.codebook.pilots).astype(np.int64)
         self._find_points = points_finder(layout_of(centres_m), edges, link.codebook.edge_every)

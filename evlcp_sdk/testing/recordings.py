@@ -88,12 +88,16 @@ def ideal_events(
     when, row, sign = (np.repeat(v, count) for v in (when, row, sign))
     column = np.tile(np.arange(count) % bar.width_px, len(when) // count)
     order = np.tile(np.arange(count) // bar.width_px, len(when) // count)
+    # What ends the last packet is drawn last: the same is seen of the packets, whatever follows them.
+    many = int(np.count_nonzero(when < len(chips)))
+    drawn = [(rng.normal(0, 4, n), rng.random(n)) for n in (many, len(when) - many)]
+    jitter_us, chance = (np.concatenate(one) for one in zip(*drawn, strict=True))
     t = bar.start_us + when * chip_us
-    t = t + np.where(sign > 0, delay_on_us, delay_off_us) + 12 * order + rng.normal(0, 4, len(t))
+    t = t + np.where(sign > 0, delay_on_us, delay_off_us) + 12 * order + jitter_us
     x, y = bar.centre(t)
     u = np.floor(x - bar.width_px / 2 + 0.5 + column)
     v = np.floor(y - rows / 2 + 0.5 + row)
-    keep = (rng.random(len(t)) >= missing) & (t >= 0)
+    keep = (chance >= missing) & (t >= 0)
     keep &= (u >= 0) & (v >= 0) & (u < link.camera.width) & (v < link.camera.height)
     t_us = np.floor(t[keep]).astype(np.int64) + t0_us
     first = np.argsort(t_us, kind="stable")
