@@ -19,10 +19,10 @@ from evlcp_sdk.values import Events, Region
 
 __all__ = ["DetectedRegions"]
 
-_BACKFILL_FRAMES = 4
+_BACKFILL_FRAMES = 2
 """Frames kept from before a region was found, where these are longer than the steps of the receiver's own
-tracker: a slow light is known by its rhythm only, which takes edges of two characters, and its first one may
-have begun before."""
+tracker: a slow light is known after its first character. Not more, as they are looked for where the light is
+when it is found, and a shaking camera has seen it elsewhere before."""
 
 
 class DetectedRegions:
