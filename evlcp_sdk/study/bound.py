@@ -11,6 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import least_squares
 from scipy.special import ndtr
 from scipy.stats import theilslopes
 
@@ -40,9 +41,6 @@ _NOISE = 0.1
 
 _LEAST_FREE = 0.1
 """Of a row's residual; a row that decides a parameter by itself says nothing of the noise."""
-
-_MOST_STEPS, _SAME = 200, 1e-8
-"""Steps of a fit, and the share by which the squares of one that is done no longer fall."""
 
 _LEAST_BOUNDARIES = 3
 """Boundaries without which spacing, position and drift cannot be separated."""
@@ -382,54 +380,21 @@ def _fit(
 
     scale = np.concatenate([[0.1, 1, 1, 1, 0.3, 1, 0.1, 0.1], np.full(len(when), 0.1)])
     begin = np.concatenate([start, np.zeros(len(when))])
-    found = _least_squares(residuals, slopes, begin, scale)
-    if found is None:
-        return None
-    fit, rest = found
-    spacing, blur = fit[0], np.exp(fit[4])
-    if not (fit[3] > LEAST_GAIN and blur < spacing and abs(spacing / start[0] - 1) < MOST_OFF):
+    found = least_squares(residuals, begin, slopes, method="lm", x_scale=scale)
+    spacing, blur = found.x[0], np.exp(found.x[4])
+    seen_well = found.x[3] > LEAST_GAIN and blur < spacing and abs(spacing / start[0] - 1) < MOST_OFF
+    if not (found.success and seen_well):
         return None
     many = int(counts.sum())
-    by = slopes(fit)
+    by = slopes(found.x)
     # What a fit leaves over is smaller where it follows: by its leverage.
     leverage = (np.linalg.qr(by)[0] ** 2).sum(1)[:many]
-    left = rest[:many] ** 2 / np.maximum(1 - leverage, _LEAST_FREE)
+    left = found.fun[:many] ** 2 / np.maximum(1 - leverage, _LEAST_FREE)
     weight = by[:many, 0] ** 2
     variance = float((weight * left).sum() / max(float(weight.sum()), 1e-300))
     if not variance > 0:
         return None
-    return fit[:known], float(np.sqrt(variance))
-
-
-def _least_squares(
-    residuals: Callable[[Array], Array], slopes: Callable[[Array], Array], begin: Array, scale: Array
-) -> tuple[Array, Array] | None:
-    """The parameters of the least squares from `begin` on, and their residuals; None where none is found.
-
-    Levenberg and Marquardt's steps by normal equations: of thousands of rows and some fifty parameters, in
-    units of `scale`, they take a half to a sixth of the time of a QR decomposition of all rows.
-    """
-    fit, rest = begin, residuals(begin)
-    damping = 1e-3
-    for _ in range(_MOST_STEPS):
-        by = slopes(fit)
-        information, toward = (by.T @ by) * np.outer(scale, scale), -(by.T @ rest) * scale
-        own = np.maximum(np.diag(information), 1.0)
-        while True:
-            step = np.linalg.solve(information + np.diag(damping * own), toward) * scale
-            after = residuals(fit + step)
-            was, now = float(rest @ rest), float(after @ after)
-            if now <= was:
-                break
-            damping *= 10
-            if not damping < 1e12:
-                return (fit, rest) if math.isfinite(was) else None
-        fit, rest = fit + step, after
-        # Where damping is strong, a step is short for that.
-        if was - now <= _SAME * was and damping < 1:
-            return fit, rest
-        damping = max(damping / 10, 1e-9)
-    return None
+    return found.x[:known], float(np.sqrt(variance))
 
 
 def _place(presence: PresenceMap) -> tuple[bool, Array, NDArray[np.bool_]] | None:

@@ -1,17 +1,14 @@
 """The Cramer-Rao bound: its laws, and its statistics from frames that follow the model."""
 
-import math
-
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 from scipy.stats import norm
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.study.bound import _least_squares, cramer_rao_sigma_m, frame_bound, lean_sigma_deg
+from evlcp_sdk.study.bound import cramer_rao_sigma_m, frame_bound, lean_sigma_deg
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 LINK = load_link()
@@ -209,24 +206,3 @@ def test_panels_have_that_of_the_plane_and_one_cluster_none() -> None:
         cramer_rao_sigma_m(CameraModel(), panel, LINK.codebook, 50.0, range(16), blur_px=0.4, noise=0.1)
     with pytest.raises(ConfigError, match="needs two clusters"):
         frame_bound(CameraModel(), BarLayout(LedGrid(rows=6)), LINK.codebook)
-
-
-def test_a_fit_is_where_minpack_finds_it() -> None:
-    """Of a decay and a parameter that nothing depends on, from afar; and None where nothing is a number."""
-    t = np.linspace(0, 3, 200)
-    values = 2.5 * np.exp(-1.3 * t) + np.random.default_rng(3).normal(0, 0.05, t.size)
-
-    def residuals(fit: np.ndarray) -> np.ndarray:
-        return fit[0] * np.exp(-fit[1] * t) - values
-
-    def slopes(fit: np.ndarray) -> np.ndarray:
-        decay = np.exp(-fit[1] * t)
-        return np.stack([decay, -fit[0] * t * decay, 0 * t], 1)
-
-    begin, scale = np.array([0.3, 6.0, 1.0]), np.array([1.0, 0.1, 1.0])
-    found = _least_squares(residuals, slopes, begin, scale)
-    want = least_squares(residuals, begin, slopes, method="lm", x_scale=scale)
-    assert found is not None
-    np.testing.assert_allclose(found[0], want.x, rtol=1e-5)
-    np.testing.assert_allclose(found[1], want.fun, atol=1e-5)
-    assert _least_squares(lambda fit: residuals(fit) * math.nan, slopes, begin, scale) is None
