@@ -18,8 +18,8 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.delays import LONGEST_ROW_US
 from evlcp_sdk.rx.detection import SAME_PX
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.look import Look
 from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.rx.placement import Placement
 from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet, changed
 
@@ -91,10 +91,10 @@ class Sighting:
     spread: Spread | None = None
 
     @classmethod
-    def of(cls, frame: Frame, look: Look) -> "Sighting":
-        """What a frame's image shows."""
-        placed, seen = look.placement, max(int(np.count_nonzero(look.placement.seen)), 1)
-        return cls(frame, placed.cells / seen, seen, placed.mirrored, look.spread)
+    def of(cls, frame: Frame, placed: Placement, spread: Spread | None) -> "Sighting":
+        """What a frame's image shows, by where it shows the layout."""
+        seen = max(int(np.count_nonzero(placed.seen)), 1)
+        return cls(frame, placed.cells / seen, seen, placed.mirrored, spread)
 
 
 def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:

@@ -7,11 +7,9 @@ from collections.abc import Callable, Collection, Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import edges_of_chips
-from evlcp_sdk.air.frames import PacketFormat, chips_behind
+from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.belief import believed, still_lit
 from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import SAME_PX, Followed, RegionFollower, same_place
@@ -20,19 +18,14 @@ from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.look import Look, Looker
-from evlcp_sdk.rx.placement import layout_of
-from evlcp_sdk.rx.points import points_finder
+from evlcp_sdk.rx.reading import FrameReader, Reading, Shown
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.lean import BarSight, sight_of
-from evlcp_sdk.values import Frame, FrameView, Range, Region, SyncLock, changed
+from evlcp_sdk.values import Frame, Region, SyncLock, changed
 
 __all__ = ["PacketFraming"]
-
-_NO_RANGE = Range(math.nan, math.nan, 0)
-_NO_POINTS = (np.empty((0, 2)), np.empty(0), math.nan)
 
 _TAIL_CHIPS = 0.5
 """A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
@@ -104,9 +97,6 @@ class PacketFraming:
         name: str = "",
         numbers: Iterator[int] | None = None,
     ) -> None:
-        centres_m = link.bar.cluster_centres_m()
-        self._camera = link.camera
-        self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
         self._attitude_at = attitude_at
         self._packet = link.packet
         self._step_us = link.regions.step_us
@@ -123,19 +113,16 @@ class PacketFraming:
         self._looker = Looker(
             link.packet,
             link.regions,
-            centres_m,
+            link.bar.cluster_centres_m(),
             link.codebook,
             self._steps.separate,
             (link.camera.width, link.camera.height),
         )
+        self._reader = FrameReader(link, steps, self._looker)
         self._codebook = link.codebook
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
-        self._behind = [chips_behind(link.codebook, link.packet, n) for n in range(link.packet.frames)]
-        for chips in (self._unknown, *self._behind):
-            chips.setflags(write=False)
+        self._unknown.setflags(write=False)
         self._rows = RowDelays(link.codebook.preamble)
-        edges = edges_of_chips(link.codebook.pilots).astype(np.int64)
-        self._find_points = points_finder(layout_of(centres_m), edges, link.codebook.edge_every)
         self._echoes = judged.echoes
         self._judged = judged
         self._joined: set[int] = set()
@@ -326,6 +313,13 @@ class PacketFraming:
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | str:
         """Read a frame; of one that is not given, the count that it belongs to."""
+        shown = self._shown(transmitter, due)
+        return (
+            shown if isinstance(shown, str) else self._told(transmitter, due, shown, self._reader.read(shown))
+        )
+
+    def _shown(self, transmitter: Transmitter, due: DueFrame) -> Shown | str:
+        """What is to be read of a frame; of one that does not show its clusters, the count it belongs to."""
         self._announcer.start()
         look = self._look(transmitter, due)
         if look is None:
@@ -335,22 +329,17 @@ class PacketFraming:
             self._regions.drop(transmitter.region)
             self._let_go(transmitter.region)
             return "frames_rejected"
-        read = self._steps.decode(
-            look.presence, look.sums_and_next, self._before(transmitter, due), self._behind[due.index]
-        )
-        transmitter.said = due.number, read.symbols
-        lit = still_lit(look.sums, look.presence, self._packet.pilot_chips, self._codebook.least_activity)
-        soft = believed(read, look.placement.seen & lit)
-        distance, points, centre_px, sight = _NO_RANGE, _NO_POINTS, look.centre_px, BarSight()
-        if due.has_pilot:
-            # Another distance of the same pilot, or other points, would say nothing new.
-            distance = self._measured(FrameView(look.sums, look.offset_px, self._looker.whole(look), read))
-            points_px, sigma_px, flank_px = self._find_points(
-                look.presence, look.placement, look.sums[: self._packet.pilot_chips]
-            )
-            points = points_px + look.corner_px, sigma_px, flank_px
-            centre_px = self._looker.centre(look, points[0])
-            sight = self._sight(points[:2], look.middle_us)
+        ranged = due.has_pilot and self._is_ranged()
+        attitude = self._attitude_at(self._clock.camera_us(look.middle_us)) if due.has_pilot else None
+        return Shown(look, due.index, due.has_pilot, self._before(transmitter, due), ranged, attitude)
+
+    def _told(
+        self, transmitter: Transmitter, due: DueFrame, shown: Shown, reading: Reading
+    ) -> Sighting | str:
+        """A frame by what was read of it; of one that is not given, the count that it belongs to."""
+        transmitter.said = due.number, reading.symbols
+        distance, soft = reading.distance, reading.soft
+        self.counts["frames_askew"] += reading.sight.askew
         if max(soft.symbols.tolist()) < 0 and (
             transmitter.number is None or not math.isfinite(distance.distance_m)
         ):
@@ -360,7 +349,7 @@ class PacketFraming:
             self._find_parts(transmitter.region, due.start_us)
         number = self._transmitters.number(transmitter)
         transmitter.distance, distance, filtered = self._steps.follow(
-            transmitter.distance, due.start_us, due.lock.chip_us, distance, sight
+            transmitter.distance, due.start_us, due.lock.chip_us, distance, reading.sight
         )
         if transmitter.first is None:
             transmitter.first = due.packet
@@ -372,25 +361,24 @@ class PacketFraming:
             soft=soft,
             range=distance,
             filtered=filtered,
-            x_px=centre_px[0],
-            y_px=centre_px[1],
-            points_px=points[0],
-            points_sigma_px=points[1],
-            points_flank_px=points[2],
-            points_t_us=look.middle_us,
+            x_px=reading.centre_px[0],
+            y_px=reading.centre_px[1],
+            points_px=reading.points_px,
+            points_sigma_px=reading.sigma_px,
+            points_flank_px=reading.flank_px,
+            points_t_us=shown.look.middle_us,
             echo_of=self._echoes.echo_of(number),
             link=self._name,
         )
         self._announcer.frame(frame)
-        return Sighting.of(frame, look)
+        return Sighting.of(frame, shown.look.placement, reading.spread)
 
-    def _measured(self, view: FrameView) -> Range:
-        """How far a bar is, where this frame's turn has come."""
+    def _is_ranged(self) -> bool:
+        """Whether the turn of a frame with a pilot has come to be ranged."""
         self._measurable += 1
-        if self._measurable % self.ranging_every:
-            self.counts["frames_not_ranged"] += 1
-            return _NO_RANGE
-        return self._steps.measure(view)
+        ranged = self._measurable % self.ranging_every == 0
+        self.counts["frames_not_ranged"] += not ranged
+        return ranged
 
     def _before(self, transmitter: Transmitter, due: DueFrame) -> NDArray[np.int8]:
         """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known.
@@ -406,14 +394,6 @@ class PacketFraming:
         if number != due.number - 1 or due.index == 0:
             return self._unknown
         return np.where(symbols >= 0, book.codewords[symbols, -1].astype(np.int8), np.int8(-1))
-
-    def _sight(self, points: tuple[NDArray[np.float64], NDArray[np.float64]], t_us: float) -> BarSight:
-        """Where a bar is seen, and how it leans; a panel has no direction, and counts as level."""
-        if not self._is_column:
-            return BarSight()
-        sight = sight_of(self._camera, *points, self._attitude_at(self._clock.camera_us(t_us)))
-        self.counts["frames_askew"] += sight.askew
-        return sight
 
     def _look(self, transmitter: Transmitter, due: DueFrame) -> Look | None:
         """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""

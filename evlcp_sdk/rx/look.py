@@ -15,7 +15,6 @@ from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
-from evlcp_sdk.rx.spread import Spread, neighbours
 from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed
 
 if TYPE_CHECKING:
@@ -67,7 +66,6 @@ class Look:
             `middle_us`.
         middle_us: Middle of the pilot, or of the info segment of a frame without one, where a chip starts: a
             chip's events show the image at its first edge.
-        spread: How light spreads in it; None of a frame without a pilot.
     """
 
     sums: NDArray[np.int16]
@@ -78,7 +76,6 @@ class Look:
     others: tuple[Placement, ...]
     corner_px: tuple[float, float]
     middle_us: float
-    spread: Spread | None = None
 
     @property
     def centre_px(self) -> tuple[float, float]:
@@ -111,11 +108,9 @@ class Looker:
         self._packet = packet
         self._spec = spec
         self._layout = layout_of(centres_m)
-        self._pairs = neighbours(self._layout)
         # Clusters in an even grid are one strip, however near it is.
         across_m = np.diff(np.sort(centres_m[:, 0]))
         self._apart = bool((across_m > (1 + _EVEN) * self._layout.spacing_m).any())
-        self._pilots = codebook.pilots.astype(np.int64)
         self._edges = codebook.pilot_edges.astype(np.int64)
         self._every = codebook.edge_every
         self._after = codebook.chips_after
@@ -148,7 +143,6 @@ class Looker:
             size = pilot.size_px
         pieces = [e for t, e in region.pieces if t < due.read_us and t + self._spec.step_us > due.start_us]
         sums, offset_px = polarity_sums(pieces, lock, due.start_us, (x, y), size)
-        spread = None
         if due.has_pilot:
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
             presence = self._separate(heard)
@@ -160,7 +154,6 @@ class Looker:
             presence, placement = lit(heard, self._edges, self._every, presence, found[0])
             if not np.count_nonzero(placement.seen):
                 return None, pilot
-            spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, placement)
             pilot = Pilot(due.number, size, heard, moved, presence, placement, tuple(found[1:]))
         else:
             assert pilot is not None
@@ -186,7 +179,6 @@ class Looker:
             pilot.others,
             corner_px,
             middle_us,
-            spread,
         )
         return look, pilot
 
