@@ -56,9 +56,9 @@ class Look:
     """A frame with the bar held still.
 
     Attributes:
-        sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
-        offset_px: The rest of the motion in them, float64 (2, chips), px.
-        sums_and_next: The same sums and those of the chips after the frame (`Codebook.chips_after`).
+        sums_and_next: Polarity sums of pilot and info segment, and of the chips after the frame
+            (`Codebook.chips_after`), int16 (chips, height, width).
+        offset_px: The rest of the motion in pilot and info segment, float64 (2, chips), px.
         presence: Where the clusters are, in their footprints only.
         placement: Where the image shows the layout.
         others: Other instances of it in the image.
@@ -68,14 +68,18 @@ class Look:
             chip's events show the image at its first edge.
     """
 
-    sums: NDArray[np.int16]
-    offset_px: NDArray[np.float64]
     sums_and_next: NDArray[np.int16]
+    offset_px: NDArray[np.float64]
     presence: PresenceMap
     placement: Placement
     others: tuple[Placement, ...]
     corner_px: tuple[float, float]
     middle_us: float
+
+    @property
+    def sums(self) -> NDArray[np.int16]:
+        """Polarity sums of pilot and info segment, int16 (chips, height, width)."""
+        return self.sums_and_next[: self.offset_px.shape[1]]
 
     @property
     def centre_px(self) -> tuple[float, float]:
@@ -171,9 +175,8 @@ class Looker:
         corner_px = (centre_x - (size[0] - 1) / 2 - rest_x, centre_y - (size[1] - 1) / 2 - rest_y)
         middle_us = float(middles[middle]) - lock.chip_us / 2
         look = Look(
-            sums[:chips],
-            offset_px[:, :chips],
             sums,
+            offset_px[:, :chips],
             pilot.presence,
             pilot.placement,
             pilot.others,
