@@ -113,15 +113,6 @@ def score_rises(
 
 
 @njit(cache=True, nogil=True)
-def all_within(values: Array, least: Any, most: Any) -> bool:
-    """Whether none of some values (n,) is NaN, less than `least` or more than `most`, of the same type."""
-    outside = False
-    for i in range(values.size):
-        outside |= not (values[i] >= least and values[i] <= most)
-    return not outside
-
-
-@njit(cache=True, nogil=True)
 def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: int) -> None:
     """In so many rows from the first on, round and round, set rises of `least` ticks ago or more to `age`."""
     then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK)
@@ -647,10 +638,11 @@ def areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
 
 
 @njit(cache=True, nogil=True)
-def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
+def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -> int:
     """Connected cells (8 neighbours) of each cluster, most first: mean column + row * 1j, cluster, number.
 
-    Of as many cells, in the order of clusters, rows and columns. It returns how many there are.
+    Means are those of pixels, `grid` to a cell's side. Of as many cells, in the order of clusters, rows and
+    columns. It returns how many there are.
     """
     clusters, rows, columns = selected.shape
     some = np.empty(at.size, np.complex128)
@@ -670,7 +662,7 @@ def blobs(selected: Array, at: Array, cluster: Array, cells: Array) -> int:
                 for i in range(count):
                     down += found[i, 0]
                     right += found[i, 1]
-                some[n] = complex(right / count, down / count)
+                some[n] = complex(right / count * grid + (grid - 1) / 2, down / count * grid + (grid - 1) / 2)
                 of[0, n], of[1, n] = k, count
                 n += 1
     # Where those of a number of cells begin, behind those with more.
@@ -790,6 +782,27 @@ def refined_similarity(
         s = cross / power
         shift = image_mean - s * layout_mean
     return s, shift
+
+
+@njit(cache=True, nogil=True)
+def voted_similarity(
+    at: Array,
+    cluster: Array,
+    cells: Array,
+    proposers: int,
+    layout: Array,
+    spacing: float,
+    slack: float,
+    least_spacing: float,
+    scale: complex,
+) -> tuple[float, complex, complex]:
+    """Score of the `best_similarity`, and its scale and shift as refined; a score of 0 for none."""
+    score, s, shift = best_similarity(
+        at, cluster, cells, proposers, layout, spacing, slack, least_spacing, scale
+    )
+    if score > 0:
+        s, shift = refined_similarity(at, cluster, cells, layout, spacing, slack, scale, s, shift)
+    return score, s, shift
 
 
 @njit(cache=True, nogil=True)
@@ -1812,16 +1825,17 @@ def cells_by_place(
     reach: float,
     half: float,
     seen: Array,
-) -> tuple[int, int, float]:
+) -> tuple[int, int, float, int]:
     """Which clusters are `seen` in their place (K,): by more cells than others are in it.
 
     A blob's cells are in place within `reach` of their cluster's; others stand in the nearest place, if that
     is within `half`.
 
     Returns:
-        How many places show cells, in how many their cluster is seen, and the cells of these.
+        How many places show cells, in how many their cluster is seen, the cells of these, and the cells that
+        are farther than `reach` from every place.
     """
-    in_place, out_of_place = np.zeros(places.size), np.zeros(places.size)
+    in_place, out_of_place, left = np.zeros(places.size), np.zeros(places.size), 0
     for i in range(at.size):
         if abs(at[i] - places[cluster[i]]) <= reach:
             in_place[cluster[i]] += cells[i]
@@ -1833,6 +1847,8 @@ def cells_by_place(
                 nearest, least = k, off
         if least <= half:
             out_of_place[nearest] += cells[i]
+        if least > reach:
+            left += cells[i]
     shown, many, total = 0, 0, 0.0
     for k in range(places.size):
         seen[k] = in_place[k] > out_of_place[k]
@@ -1840,22 +1856,7 @@ def cells_by_place(
         if seen[k]:
             many += 1
             total += in_place[k]
-    return shown, many, total
-
-
-@njit(cache=True, nogil=True)
-def out_of_reach(at: Array, cells: Array, places: Array, reach: float, left: Array) -> int:
-    """Mark blobs that are farther than `reach` from every place; how many cells they have."""
-    total = 0
-    for i in range(at.size):
-        left[i] = True
-        for place in places:
-            if abs(at[i] - place) <= reach:
-                left[i] = False
-                break
-        if left[i]:
-            total += cells[i]
-    return total
+    return shown, many, total, left
 
 
 @njit(cache=True, nogil=True)

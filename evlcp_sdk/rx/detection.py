@@ -265,7 +265,7 @@ class RegionFollower:
         seen = list(self.alive)
         gone = False
         for followed in seen:
-            followed.released |= end_us - followed.latest.t_us > spec.fade_us
+            followed.released |= end_us - followed.positions.latest.t_us > spec.fade_us
             gone |= followed.released
         if gone:
             self._let_go()
@@ -304,7 +304,7 @@ class RegionFollower:
                 followed.pieces.pop()
             elif followed.pieces and followed.pieces[-1][0] == start_us:
                 followed.take_back()
-            if followed.latest.t_us == seen_us:
+            if followed.positions.latest.t_us == seen_us:
                 followed.positions.take_back()
 
     def _glance(self, followed: Followed, box: Box, now_us: int) -> Region | None:
@@ -325,7 +325,7 @@ class RegionFollower:
             last = followed.positions.latest
             places.append((*self._expected(followed, t_us), last.width_px, last.height_px))
         boxes = [self._reach(*place) for place in places]
-        if all(followed.size_px for followed in self.alive):
+        if self._all_known():
             return boxes
         known = [_box_of(place) for place in taken]
         known += [_tight(*place) for place, one in zip(places, self.alive, strict=True) if one.size_px]
@@ -339,6 +339,8 @@ class RegionFollower:
 
         Rows of a bar below would be as good as its own, so that a region would move on to them.
         """
+        if len(boxes) < 2:
+            return boxes
         seam = self._spec.margin_px
         tight = [
             _grown(box, -seam) if one.size_px else None for box, one in zip(boxes, self.alive, strict=True)
@@ -349,6 +351,10 @@ class RegionFollower:
         return [
             box if bar is None else _cut_off(box, bar, bars) for box, bar in zip(boxes, tight, strict=True)
         ]
+
+    def _all_known(self) -> bool:
+        """Whether frames have shown the size of all."""
+        return None not in [followed.size_px for followed in self.alive]
 
     def _let_go(self) -> None:
         """Follow those no more that are released."""
@@ -361,7 +367,7 @@ class RegionFollower:
 
     def _select(self, events: Events, boxes: list[Box]) -> list[Events]:
         """The events of a step inside the box of each region; those that it listens to."""
-        if len(boxes) <= _FEW and all(followed.size_px for followed in self.alive):
+        if len(boxes) <= _FEW and self._all_known():
             return [select(events, box) for box in boxes]
         unknown = np.array([followed.size_px is None for followed in self.alive])
         return self._rhythm.select(events, np.array(boxes, np.int64), unknown)
@@ -652,8 +658,10 @@ class RegionFollower:
         """
         hits = self._hits
         merge = self._spec.merge_px
-        for followed in self.alive if rises >= self._spec.min_rises else ():
-            last = followed.latest
+        for followed in self.alive:
+            if rises < self._spec.min_rises:
+                break
+            last = followed.positions.latest
             reach = self._reach(last.x_px, last.y_px, last.width_px, last.height_px)
             rises -= _cleared(hits, reach if followed.size_px else _grown(reach, merge))
             if followed.outgrown is not None and end_us > followed.outgrown[4]:

@@ -93,7 +93,7 @@ class Sighting:
     @classmethod
     def of(cls, frame: Frame, placed: Placement, spread: Spread | None) -> "Sighting":
         """What a frame's image shows, by where it shows the layout."""
-        seen = max(int(np.count_nonzero(placed.seen)), 1)
+        seen = max(sum(placed.seen.tolist()), 1)
         return cls(frame, placed.cells / seen, seen, placed.mirrored, spread)
 
 

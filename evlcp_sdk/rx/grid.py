@@ -109,7 +109,7 @@ class PacketGrid:
     def _next(self, lock: SyncLock) -> DueFrame:
         """The next frame; asked for again and again before it is due."""
         known = self._known
-        if known is not None and known[0] is lock and known[1:3] == (self.packet, self.frame):
+        if known is not None and known[0] is lock and known[1] == self.packet and known[2] == self.frame:
             return known[3]
         start_us = self.start_us(self.frame)
         number, index = divmod(self.frame, self.format.frames)

@@ -156,7 +156,7 @@ class Looker:
                 return None, pilot
             presence = masked(presence, self._layout, found[0])
             presence, placement = lit(heard, self._edges, self._every, presence, found[0])
-            if not np.count_nonzero(placement.seen):
+            if True not in placement.seen.tolist():
                 return None, pilot
             pilot = Pilot(due.number, size, heard, moved, presence, placement, tuple(found[1:]))
         else:
@@ -237,7 +237,7 @@ class Looker:
         None where it shows both ends.
         """
         placement = look.placement
-        if placement.scale == 0 or placement.seen.all():
+        if placement.scale == 0 or False not in placement.seen.tolist():
             return None
         places, _, down_px = self._spots(look, placement)
         _, _, top, bottom = _kernels.bounds_of(places)

@@ -114,7 +114,7 @@ class _Blobs:
     cluster: NDArray[np.int64]
     cells: NDArray[np.int64]
 
-    def __getitem__(self, rows: NDArray[np.bool_] | NDArray[np.int64]) -> "_Blobs":
+    def __getitem__(self, rows: NDArray[np.int64]) -> "_Blobs":
         return _Blobs(self.at[rows], self.cluster[rows], self.cells[rows])
 
 
@@ -171,13 +171,13 @@ def placements(
     slack_px = presence.grid_px / 2
     found: list[Placement] = []
     while len(found) < _MOST:
-        best = None
+        best, cells = None, 0
         if before is not None and not found:
-            best = _voted(blobs, layout, slack_px, before)
+            best, cells = _voted(blobs, layout, slack_px, before)
         if best is None or best.chance > _MAX_CHANCE:
-            other = _voted(blobs, layout, slack_px, None)
+            other, its = _voted(blobs, layout, slack_px, None)
             if best is None or (other is not None and other.chance < best.chance):
-                best = other
+                best, cells = other, its
         if best is None:
             break
         if best.chance > _MAX_CHANCE and (found or best.seen.sum() < min_share * clusters):
@@ -185,15 +185,18 @@ def placements(
         if found and best.cells < _OTHER_CELLS * found[0].cells:
             break
         found.append(best)
-        # What a placement has not used up, neither in its clusters' places nor elsewhere in the bar.
-        left = np.empty(len(blobs.at), np.bool_)
-        reach = abs(best.scale) * layout.spacing_m / 2 + slack_px
-        cells = _kernels.out_of_reach(blobs.at, blobs.cells, best.places(layout), reach, left)
         # Most images show one bar; what is left of them needs no vote.
         if cells < _OTHER_CELLS * found[0].cells:
             break
-        blobs = blobs[left]
+        # What a placement has not used up, neither in its clusters' places nor elsewhere in the bar.
+        off = np.abs(blobs.at[:, None] - best.places(layout))
+        blobs = blobs[np.flatnonzero(off.min(1) > _reach(best.scale, layout, slack_px))]
     return found
+
+
+def _reach(scale: complex, layout: Layout, slack_px: float) -> float:
+    """How far around a cluster's place its cells are."""
+    return abs(scale) * layout.spacing_m / 2 + slack_px
 
 
 def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> PresenceMap:
@@ -278,19 +281,20 @@ def _blobs_of(presence: PresenceMap) -> _Blobs:
     selected = presence.selected
     most = int(np.count_nonzero(selected))
     at, cluster, cells = np.empty(most, np.complex128), np.empty(most, np.int64), np.empty(most, np.int64)
-    n = _kernels.blobs(selected, at, cluster, cells)
-    grid = presence.grid_px
-    return _Blobs(at[:n] * grid + (grid - 1) / 2 * (1 + 1j), cluster[:n], cells[:n])
+    n = _kernels.blobs(selected, presence.grid_px, at, cluster, cells)
+    return _Blobs(at[:n], cluster[:n], cells[:n])
 
 
-def _voted(blobs: _Blobs, layout: Layout, slack_px: float, before: Placement | None) -> Placement | None:
-    """The placement that most cells are for; None without blobs that could propose one."""
+def _voted(
+    blobs: _Blobs, layout: Layout, slack_px: float, before: Placement | None
+) -> tuple[Placement | None, int]:
+    """The placement that most cells are for, None without blobs that could propose one; the cells beside."""
     best_score, best = 0.0, None
     ways = (False,) if layout.line else (False, True)
     for mirrored in ways if before is None or layout.line else (before.mirrored,):
         at_m = _turned(layout, mirrored)
         scale = 0j if before is None else before.scale
-        score, s, shift = _kernels.best_similarity(
+        score, s, shift = _kernels.voted_similarity(
             blobs.at,
             blobs.cluster,
             blobs.cells,
@@ -302,12 +306,9 @@ def _voted(blobs: _Blobs, layout: Layout, slack_px: float, before: Placement | N
             scale,
         )
         if score > best_score * (_MIRRORED if mirrored else 1):
-            s, shift = _kernels.refined_similarity(
-                blobs.at, blobs.cluster, blobs.cells, at_m, layout.spacing_m, slack_px, scale, s, shift
-            )
             best_score, best = score, (s, shift, mirrored)
     if best is None:
-        return None
+        return None, 0
     s, shift, mirrored = best
     return _judged(blobs, layout, slack_px, s, shift, mirrored, 1 if before is not None else 2)
 
@@ -320,14 +321,13 @@ def _judged(
     shift: complex,
     mirrored: bool,
     proposed: int,
-) -> Placement:
-    """A similarity with what is in its place, and how likely that is by chance."""
+) -> tuple[Placement, int]:
+    """A similarity with what is in its place, and how likely that is by chance; the cells in no place."""
     clusters = len(layout.at_m)
     places = scale * _turned(layout, mirrored) + shift
-    spacing_px = abs(scale) * layout.spacing_m
-    reach = spacing_px / 2 + slack_px
+    spacing_px, reach = abs(scale) * layout.spacing_m, _reach(scale, layout, slack_px)
     seen = np.empty(clusters, np.bool_)
-    shown, many, cells = _kernels.cells_by_place(
+    shown, many, cells, left = _kernels.cells_by_place(
         blobs.at, blobs.cluster, blobs.cells, places, reach, spacing_px / 2, seen
     )
     # Where clusters are small, a cell stands in the place of two.
@@ -340,7 +340,7 @@ def _judged(
         mirrored = way.real + way.imag < 0
     placement = Placement(scale, shift, mirrored, seen, cells, chance)
     vars(placement)["_places"] = layout, places
-    return placement
+    return placement, left
 
 
 def _at_least(hits: int, of: int, odds: float) -> float:

@@ -67,7 +67,7 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
     def find(
         presence: PresenceMap, placement: Placement, heard: NDArray[np.int16]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        if np.count_nonzero(placement.seen) < 3:
+        if sum(placement.seen.tolist()) < 3:
             return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan
         points, ends = np.empty((clusters, 2)), np.empty(clusters)
         squares, flank_px = _kernels.place_clusters(
@@ -86,7 +86,7 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
             points,
             ends,
         )
-        seen = clusters - int(np.count_nonzero(np.isnan(ends)))
+        seen = sum(end == end for end in ends.tolist())
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)
         return points, variance**0.5 * (1 + (_OUTER - 1) * ends), flank_px

@@ -85,8 +85,8 @@ class Rhythm:
 
     A pixel's state holds when it last rose (17 bits of the clock's ticks), how often the same time came again
     (5 bits), the time between that and the rise before (4 bits), and its score (6 bits).
-    The clock of 17 bits goes round in an eighth of a second; rows are looked at in turn, all in a quarter of
-    that, so that no old rise looks young.
+    The clock of 17 bits goes round in an eighth of a second. Rows are looked at in turn, where rises so long
+    ago that all such times are alike become the youngest of these; and so soon that none looks young.
 
     Args:
         width: Columns of the sensor.
@@ -116,7 +116,10 @@ class Rhythm:
         self._min_score = min_score
         self._pixels = np.zeros((height, width), np.uint32)
         self._labels = np.zeros([(n - 1 >> _LABEL_SHIFT) + 1 for n in (height, width)], np.int16)
+        # No time that is looked up is longer; nor are rows looked at one by one after so long a gap.
         self._turn = _kernels.CLOCK_ROUND // 4
+        self._old = self._turn + self._turn // 8
+        self._every = _kernels.CLOCK_ROUND - self._turn - self._old
         self._row = 0
         self._seen: int | None = None
         self._open_us, self._taken, self._rises = -1, 0, 0
@@ -252,10 +255,10 @@ class Rhythm:
         passed = self._turn if self._seen is None else now - self._seen
         self._seen = now
         if passed >= self._turn:
-            _kernels.grow_old(self._pixels, 0, height, now, 0, 2 * self._turn)
+            _kernels.grow_old(self._pixels, 0, height, now, 0, self._old)
             return
-        many = -(-height * passed // self._turn)
-        _kernels.grow_old(self._pixels, self._row, many, now, 2 * self._turn, 2 * self._turn)
+        many = -(-height * passed // self._every)
+        _kernels.grow_old(self._pixels, self._row, many, now, self._old, self._old)
         self._row = (self._row + many) % height
 
 

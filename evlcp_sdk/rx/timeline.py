@@ -130,9 +130,9 @@ class Timeline:
                 due = due_us()
                 within = max(self._start_us, self._part_us) < due < self._start_us + self._step_us
                 self._due_us = math.ceil(due) if within else _LATER_US
-            part = int(t_us.searchsorted(self._due_us))
-            if part == end:
+            if self._due_us == _LATER_US or not end or t_us[-1] < self._due_us:
                 return
+            part = begin + int(t_us[begin:].searchsorted(self._due_us))
             self._part_us, self._due_us = self._due_us, None
             yield self._so_far(events[begin:part])
 

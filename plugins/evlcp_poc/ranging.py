@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,16 @@ from scipy import fft
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, Range
+
+if TYPE_CHECKING:
+    from evlcp_poc import _kernels
+else:
+    _kernels = Late("evlcp_poc._kernels")
 
 __all__ = ["PocRanging", "phase_only_correlation"]
 
@@ -47,8 +53,6 @@ def phase_only_correlation(
         second: Second image of each pair.
         most: Highest harmonics kept, down and across; None for all but Nyquist's, which have no phase.
     """
-    from evlcp_poc import _kernels
-
     _, height, width = images.shape
     phases = fft.rfft2(images)
     _kernels.unit_phases(phases)
@@ -161,8 +165,6 @@ class PocRanging(Ranging):
         least = min(self.min_pairs, max(_far(*pairs, inner, self.min_spacing), 1))
 
         def measure(view: FrameView) -> Range:
-            from evlcp_poc import _kernels
-
             maps = view.presence.pixels
             middle = np.empty((bar.clusters, 2), np.int64)
             which, whole_px = np.empty(len(a), np.int64), np.empty((len(a), 2))
@@ -182,7 +184,7 @@ class PocRanging(Ranging):
             if n < least or px_per_m <= 0:
                 return _NONE
             which, whole_px = which[:n], whole_px[:n]
-            first, second, apart_m = (part[which] for part in pairs)
+            first, second, apart_m = pairs[0][which], pairs[1][which], pairs[2][which]
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             neighbour_px = px_per_m * neighbour
             height = _cut_size(2 * neighbour_px + 8)
@@ -208,7 +210,7 @@ class PocRanging(Ranging):
                 self.drop_extremes,
                 self.outlier_iqr,
             )
-            off = rim_px / (px_per_m * float(apart_m.mean()))
+            off = rim_px / (px_per_m * (float(np.add.reduce(apart_m)) / n))
             return Range(float(mean), math.hypot(sigma, mean * off), int(kept))
 
         return measure
@@ -257,8 +259,6 @@ def _full_band(height: int, width: int) -> tuple[int, int]:
 
 def _blob_band(cuts: NDArray[np.float32]) -> tuple[int, int]:
     """Highest harmonics, down and across, that blobs fill; one at the least."""
-    from evlcp_poc import _kernels
-
     size = np.empty(2)
     _kernels.blob_size(cuts, size)
     down, across = (

@@ -1,15 +1,21 @@
 """What the info segment of each cluster says."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols
+
+if TYPE_CHECKING:
+    from evlcp_wh import _kernels
+else:
+    _kernels = Late("evlcp_wh._kernels")
 
 __all__ = ["WhTransform"]
 
@@ -33,8 +39,6 @@ class WhTransform(Decoding):
         pilot_chips, m = codebook.pilots.shape[1], codebook.bits_per_symbol
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-            from evlcp_wh import _kernels
-
             symbols = np.empty(len(presence.probability), np.int64)
             llr = np.empty((len(symbols), m), np.float32)
             explained = _kernels.transformed(

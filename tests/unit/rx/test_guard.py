@@ -17,7 +17,7 @@ from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Corrected, Filter, Tracker
-from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.guard import Guard, _all_within
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.values import Bend, Range, SoftSymbols, SyncLock
@@ -178,6 +178,19 @@ def test_faults_that_are_no_exceptions_or_have_no_words_are_named(fault: BaseExc
     says = f"^ranging algorithm 'joint-scale': {type(fault).__name__}: "
     with pytest.raises(PluginError, match=says), Guard(LINK, "ranging"):
         raise fault
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.float64, ">f4"])
+@pytest.mark.parametrize("least", [-1.0, 0.0])
+def test_values_within_bounds(least: float, kind: Any) -> None:
+    for bad in (None, np.nan, -np.nan, np.inf, -np.inf, 2.0, -1.5):
+        some = np.linspace(least, 1, 84).astype(kind).reshape(3, 7, 4)
+        some[0, 0, 0] = -0.0
+        if bad is not None:
+            some[1, 2, 3] = bad
+        assert _all_within(some, least, 1.0) == (bad is None)
+        assert _all_within(some[:, ::2, ::3], least, 1.0) == (bad is None)
+        assert _all_within(some[:0], least, 1.0)
 
 
 @pytest.mark.parametrize("digits", [400, 5000])
