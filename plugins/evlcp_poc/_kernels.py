@@ -174,38 +174,134 @@ def cut_maps(maps: Array, used: Array, middle: Array, out: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def unit_phases(spectra: Array) -> None:
-    """Divide spectra by their size, in place; what is far below the largest has no phase and becomes 0."""
-    n, height, width = spectra.shape
-    for k in range(n):
-        top = 0.0
-        for v in range(height):
-            for u in range(width):
-                z = spectra[k, v, u]
-                top = max(top, z.real * z.real + z.imag * z.imag)
-        least = 1e-10 * top
-        for v in range(height):
-            for u in range(width):
-                z = spectra[k, v, u]
-                power = z.real * z.real + z.imag * z.imag
-                if power > least:
-                    spectra[k, v, u] = z * np.float32(1 / np.sqrt(power))
-                else:
-                    spectra[k, v, u] = 0.0
+def _turns(size: int, most: int) -> Array:
+    """Cosine and sine of the turn of each place by each harmonic, float32 (2, size, most + 1)."""
+    out = np.empty((2, size, most + 1), np.float32)
+    angle = np.arange(size) * (2 * np.pi / size)
+    cosine, sine = np.cos(angle), np.sin(angle)
+    for i in range(size):
+        at = 0
+        for k in range(most + 1):
+            out[0, i, k], out[1, i, k] = cosine[at], sine[at]
+            at += i
+            at -= size if at >= size else 0
+    return out
 
 
 @njit(cache=True, nogil=True)
-def cross_spectra(phases: Array, first: Array, second: Array, most_y: int, most_x: int, out: Array) -> None:
-    """Conj(first) * second of pairs, harmonics up to `most_y` down and `most_x` across; 0 beyond."""
-    _, height, width = phases.shape
-    for q in range(first.size):
+def _add_turned(part: Array, cosine: float, sine: float, turned: Array) -> None:
+    """Add numbers (n,) by a cosine and a sine, `turned` (2, n)."""
+    by_cosine, by_sine = turned[0], turned[1]
+    for j in range(part.size):
+        by_cosine[j] += cosine * part[j]
+        by_sine[j] += sine * part[j]
+
+
+@njit(cache=True, nogil=True)
+def _both_ways(turned: Array, back: Array, forth: Array) -> None:
+    """Complex numbers turned back, and forth, by what `_add_turned` made; real parts come first."""
+    by_cosine, by_sine = turned[0], turned[1]
+    n = by_sine.size // 2
+    for j in range(n):
+        back[j], forth[j] = by_cosine[j] + by_sine[n + j], by_cosine[j] - by_sine[n + j]
+    for j in range(n, 2 * n):
+        back[j], forth[j] = by_cosine[j] - by_sine[j - n], by_cosine[j] + by_sine[j - n]
+
+
+@njit(cache=True, nogil=True)
+def unit_spectra(images: Array, most_y: int, most_x: int, out: Array) -> None:
+    """Spectra of images (n, height, width) over their size, up to a harmonic down and one across.
+
+    `out` is float32 (2 most_y + 1, 2, most_x + 1, n): from the harmonic -most_y down on, real and imaginary
+    parts. What is far below an image's largest has no phase and becomes 0. Most rows of a cut are dark: those
+    are passed over, and harmonics up and down come of the same sums.
+    """
+    n, height, width = images.shape
+    down, across = _turns(height, most_y), _turns(width, most_x)
+    half = (most_x + 1) * n
+    lines, pixel = np.zeros((height, 2 * half), np.float32), np.empty(n, np.float32)
+    lit = np.zeros(height, np.bool_)
+    for v in range(height):
+        for u in range(width):
+            some = False
+            for k in range(n):
+                pixel[k] = images[k, v, u]
+                some |= pixel[k] != 0
+            lit[v] |= some
+            for x in range(most_x + 1 if some else 0):
+                real, imaginary = lines[v, x * n : (x + 1) * n], lines[v, half + x * n : half + (x + 1) * n]
+                for k in range(n):
+                    real[k] += across[0, u, x] * pixel[k]
+                    imaginary[k] -= across[1, u, x] * pixel[k]
+    turned, by_harmonic = np.empty((2, 2 * half), np.float32), out.reshape(len(out), 2 * half)
+    for y in range(most_y + 1):
+        turned[:] = 0
         for v in range(height):
-            inside = min(v, height - v) <= most_y
-            for u in range(width):
-                if inside and u <= most_x:
-                    out[q, v, u] = phases[second[q], v, u] * np.conj(phases[first[q], v, u])
-                else:
-                    out[q, v, u] = 0.0
+            if lit[v]:
+                _add_turned(lines[v], down[0, v, y], down[1, v, y], turned)
+        _both_ways(turned, by_harmonic[most_y + y], by_harmonic[most_y - y])
+    top = np.zeros(n, np.float32)
+    for y in range(len(out)):
+        for x in range(most_x + 1):
+            real, imaginary = out[y, 0, x], out[y, 1, x]
+            for k in range(n):
+                top[k] = max(top[k], real[k] * real[k] + imaginary[k] * imaginary[k])
+    for y in range(len(out)):
+        for x in range(most_x + 1):
+            real, imaginary = out[y, 0, x], out[y, 1, x]
+            for k in range(n):
+                power = real[k] * real[k] + imaginary[k] * imaginary[k]
+                over = np.float32(1) / np.sqrt(power) if power > _NO_PHASE * top[k] else np.float32(0)
+                real[k] *= over
+                imaginary[k] *= over
+
+
+_NO_PHASE = np.float32(1e-10)
+"""Power, in the largest of a spectrum, below which there is no phase: that of rounding."""
+
+
+@njit(cache=True, nogil=True)
+def correlations(spectra: Array, first: Array, second: Array, far_y: int, far_x: int, out: Array) -> None:
+    """Transform conj(first) * second of pairs of `unit_spectra` back, `out` float32 (pairs, height, width).
+
+    Shifts up to `far_y` down and up, and `far_x` to each side, are written, others are left.
+    """
+    pairs, height, width = out.shape
+    most_y, most_x = len(spectra) // 2, spectra.shape[2] - 1
+    down, across = _turns(height, most_y), _turns(width, most_x)
+    half = (most_x + 1) * pairs
+    cross = np.empty((len(spectra), 2 * half), np.float32)
+    for y in range(len(spectra)):
+        for x in range(most_x + 1):
+            real, imaginary = spectra[y, 0, x], spectra[y, 1, x]
+            # Those across but the first stand for two, of which the other is the conjugate.
+            weight = np.float32((2 if x else 1) / (height * width))
+            for q in range(pairs):
+                a, b, c, d = real[first[q]], imaginary[first[q]], real[second[q]], imaginary[second[q]]
+                cross[y, x * pairs + q] = weight * (a * c + b * d)
+                cross[y, half + x * pairs + q] = weight * (a * d - b * c)
+    turned, rows = np.empty((2, 2 * half), np.float32), np.empty((2, 2 * half), np.float32)
+    even, odd = np.empty(pairs, np.float32), np.empty(pairs, np.float32)
+    for v in range(far_y + 1):
+        turned[:] = 0
+        for y in range(-most_y, most_y + 1):
+            sine = down[1, v, abs(y)]
+            _add_turned(cross[most_y + y], down[0, v, abs(y)], sine if y >= 0 else -sine, turned)
+        _both_ways(turned, rows[1], rows[0])
+        for way in range(2):
+            at = (height - v) % height if way else v
+            for u in range(far_x + 1):
+                even[:] = 0
+                odd[:] = 0
+                for x in range(most_x + 1):
+                    real = rows[way, x * pairs : (x + 1) * pairs]
+                    imaginary = rows[way, half + x * pairs : half + (x + 1) * pairs]
+                    for q in range(pairs):
+                        even[q] += across[0, u, x] * real[q]
+                        odd[q] += across[1, u, x] * imaginary[q]
+                for q in range(pairs):
+                    out[q, at, u] = even[q] - odd[q]
+                    out[q, at, (width - u) % width] = even[q] + odd[q]
 
 
 @njit(cache=True, nogil=True)
@@ -391,24 +487,35 @@ def robust_mean(
 
 @njit(cache=True, nogil=True)
 def paired_distance(
-    correlation: Array,
+    cuts: Array,
     band: tuple[int, int],
     reach: int,
     samples: int,
+    which: Array,
     whole_px: Array,
-    apart_m: Array,
+    pairs: tuple[Array, Array, Array],
     focal_px: float,
     power: float,
-    first: Array,
-    second: Array,
-    clusters: int,
     drop: int,
     iqr: float,
-) -> tuple[float, float, int]:
-    """Distance by pairs from their correlations and whole-pixel shifts: as `robust_mean` returns it, m."""
-    beyond_px = np.empty((len(first), 2))
+) -> tuple[float, float, int, float]:
+    """Distance by pairs of cuts of clusters, and their whole-pixel shifts: as `robust_mean` returns it, m.
+
+    `pairs` are first and second cluster, and spacing, m, of all, of which those of the numbers `which` (n,)
+    count; correlations hold harmonics up to those of `band`, and are looked at within `reach`. The mean
+    spacing comes last.
+    """
+    clusters, height, width = cuts.shape
+    first, second, apart_m = pairs[0][which], pairs[1][which], pairs[2][which]
+    spectra = np.empty((2 * band[0] + 1, 2, band[1] + 1, clusters), np.float32)
+    unit_spectra(cuts, band[0], band[1], spectra)
+    correlation = np.empty((which.size, height, width), np.float32)
+    far_y, far_x = min(reach + samples, height // 2), min(reach + samples, width // 2)
+    correlations(spectra, first, second, far_y, far_x, correlation)
+    beyond_px = np.empty((which.size, 2))
     pair_shifts(correlation, band[0], band[1], reach, samples, beyond_px)
     apart_px = whole_px + beyond_px
     length_px = np.hypot(apart_px[:, 0], apart_px[:, 1])
     distance_m = focal_px * apart_m / np.maximum(length_px, 1e-9)
-    return robust_mean(distance_m, apart_m**power, first, second, clusters, drop, iqr)
+    mean, sigma, kept = robust_mean(distance_m, apart_m**power, first, second, clusters, drop, iqr)
+    return mean, sigma, kept, apart_m.mean()

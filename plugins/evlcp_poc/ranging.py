@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
-from scipy import fft
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
@@ -41,7 +40,7 @@ def phase_only_correlation(
     first: NDArray[np.int64],
     second: NDArray[np.int64],
     most: tuple[int, int] | None = None,
-) -> NDArray[np.float64]:
+) -> NDArray[np.float32]:
     """Phase-only correlation of pairs of images, float32 (n, height, width) -> (pairs, height, width).
 
     The peak of a pair lies where its second image lies relative to its first (down, right), and has the shape
@@ -53,13 +52,12 @@ def phase_only_correlation(
         second: Second image of each pair.
         most: Highest harmonics kept, down and across; None for all but Nyquist's, which have no phase.
     """
-    _, height, width = images.shape
-    phases = fft.rfft2(images)
-    _kernels.unit_phases(phases)
-    cross = np.empty((len(first), *phases.shape[1:]), phases.dtype)
+    n, height, width = images.shape
     most_y, most_x = most or _full_band(height, width)
-    _kernels.cross_spectra(phases, first, second, most_y, most_x, cross)
-    out: NDArray[np.float64] = fft.irfft2(cross, (height, width), overwrite_x=True)
+    spectra = np.empty((2 * most_y + 1, 2, most_x + 1, n), np.float32)
+    _kernels.unit_spectra(images, most_y, most_x, spectra)
+    out = np.empty((len(first), height, width), np.float32)
+    _kernels.correlations(spectra, first, second, height // 2, width // 2, out)
     return out
 
 
@@ -163,6 +161,7 @@ class PocRanging(Ranging):
         clusters = np.arange(bar.clusters)
         inner = np.isin(clusters, used[skip : len(used) - skip])
         least = min(self.min_pairs, max(_far(*pairs, inner, self.min_spacing), 1))
+        focal_px = camera.focal_px
 
         def measure(view: FrameView) -> Range:
             maps = view.presence.pixels
@@ -183,8 +182,6 @@ class PocRanging(Ranging):
             )
             if n < least or px_per_m <= 0:
                 return _NONE
-            which, whole_px = which[:n], whole_px[:n]
-            first, second, apart_m = pairs[0][which], pairs[1][which], pairs[2][which]
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             neighbour_px = px_per_m * neighbour
             height = _cut_size(2 * neighbour_px + 8)
@@ -192,26 +189,22 @@ class PocRanging(Ranging):
             cuts = np.zeros((bar.clusters, height, width), np.float32)
             _kernels.cut_maps(maps, clusters, middle, cuts)
             most = _full_band(height, width) if self.band == "full" else _blob_band(cuts)
-            correlation = phase_only_correlation(cuts, first, second, most)
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
             reach = max(int(neighbour_px / 2), 2)
-            mean, sigma, kept = _kernels.paired_distance(
-                correlation,
+            mean, sigma, kept, apart_m = _kernels.paired_distance(
+                cuts,
                 most,
                 reach,
                 self.peak_samples,
-                whole_px,
-                apart_m,
-                camera.focal_px,
+                which[:n],
+                whole_px[:n],
+                pairs,
+                focal_px,
                 self.weight_power,
-                first,
-                second,
-                bar.clusters,
                 self.drop_extremes,
                 self.outlier_iqr,
             )
-            off = rim_px / (px_per_m * (float(np.add.reduce(apart_m)) / n))
-            return Range(float(mean), math.hypot(sigma, mean * off), int(kept))
+            return Range(mean, math.hypot(sigma, mean * (rim_px / (px_per_m * apart_m))), kept)
 
         return measure
 
@@ -269,5 +262,13 @@ def _blob_band(cuts: NDArray[np.float32]) -> tuple[int, int]:
 
 
 def _cut_size(least: float) -> int:
-    """An even length that transforms fast."""
-    return 2 * fft.next_fast_len(math.ceil(least / 2), real=True)
+    """An even length that transforms fast, as in the paper: its half has no factors but 2, 3 and 5."""
+    half = math.ceil(least / 2)
+    while True:
+        rest = half
+        for factor in (2, 3, 5):
+            while rest % factor == 0:
+                rest //= factor
+        if rest == 1:
+            return 2 * half
+        half += 1

@@ -7,7 +7,7 @@ import poc_twins as twins
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
-from evlcp_poc.ranging import PocRanging, _blob_band, phase_only_correlation
+from evlcp_poc.ranging import PocRanging, _blob_band, _cut_size, phase_only_correlation
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -105,24 +105,42 @@ def test_phase_only_correlation_takes_views():
     assert phase_only_correlation(images, pairs[0][:0], pairs[1][:0]).shape == (0, 12, 20)
 
 
-def test_what_has_no_phase_counts_for_nothing():
-    spectra = np.array([[[3 + 4j, 1e-5, 0], [0, -2e-3, 1j]], [[0, 0, 0], [0, 0, 0]]], np.complex64)
-    _kernels.unit_phases(spectra)
-    assert_allclose(spectra[0], [[0.6 + 0.8j, 0, 0], [0, -1, 1j]], rtol=1e-6)
-    assert not spectra[1].any()
-
-
-@pytest.mark.parametrize("most", [(3, 3), (2, 3), (3, 2), (2, 2), (1, 0)])
-def test_cross_spectra(most):
+@pytest.mark.parametrize("most", [(11, 9), (3, 2), (0, 4), (2, 0)])
+def test_unit_spectra(most):
     rng = np.random.default_rng(0)
-    phases = (rng.normal(size=(3, 6, 4)) + 1j * rng.normal(size=(3, 6, 4))).astype(np.complex64)
-    first, second = np.array([0, 2]), np.array([1, 1])
-    out = np.empty((2, 6, 4), np.complex64)
-    _kernels.cross_spectra(phases, first, second, *most, out)
-    want = phases[second] * phases[first].conj()
-    want[:, twins.harmonics(6) > most[0]] = 0
-    want[:, :, most[1] + 1 :] = 0
-    assert_allclose(out, want, rtol=1e-6)
+    images = (rng.random((3, 24, 20)) * (rng.random((3, 24, 1)) < 0.5)).astype(np.float32)
+    out = np.empty((2 * most[0] + 1, 2, most[1] + 1, 3), np.float32)
+    _kernels.unit_spectra(images, *most, out)
+    spectra = np.fft.rfft2(images.astype(float))
+    want = (spectra / np.abs(spectra))[:, np.arange(-most[0], most[0] + 1), : most[1] + 1]
+    assert_allclose(out[:, 0] + 1j * out[:, 1], want.transpose(1, 2, 0), atol=1e-5)
+
+
+def test_what_has_no_phase_counts_for_nothing():
+    images = np.ones((2, 6, 8), np.float32)
+    images[1] = 0
+    out = np.empty((5, 2, 4, 2), np.float32)
+    _kernels.unit_spectra(images, 2, 3, out)
+    assert out[2, 0, 0, 0] == 1
+    assert np.count_nonzero(out) == 1
+
+
+@pytest.mark.parametrize("far", [(0, 0), (1, 3), (6, 5), (12, 10)])
+def test_correlations_as_far_as_asked_for(far):
+    rng = np.random.default_rng(0)
+    images, pairs = rng.random((3, 24, 21)).astype(np.float32), (np.array([0, 2]), np.array([1, 1]))
+    spectra = np.empty((23, 2, 11, 3), np.float32)
+    _kernels.unit_spectra(images, 11, 10, spectra)
+    out = np.full((2, 24, 21), np.nan, np.float32)
+    _kernels.correlations(spectra, *pairs, *far, out)
+    near = [np.abs(np.fft.fftfreq(n, 1 / n)) <= most for n, most in zip((24, 21), far, strict=True)]
+    inside = np.broadcast_to(np.outer(*near), out.shape)
+    assert_array_equal(np.isfinite(out), inside)
+    assert_allclose(out[inside], phase_only_correlation(images, *pairs)[inside], atol=1e-7)
+
+
+def test_cuts_have_lengths_that_transform_fast():
+    assert [_cut_size(n) for n in (1, 5, 16.2, 25, 61)] == [2, 6, 18, 30, 64]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
@@ -214,15 +232,17 @@ def test_pairs_chosen_are_the_far_ones_of_inner_clusters(seed, skip, share):
 def test_a_distance_by_pairs(seed):
     rng = np.random.default_rng(seed)
     first, second, apart_m = twins.pairs_of(np.arange(5), np.arange(5) * 0.25)
-    correlation = rng.normal(size=(len(first), 12, 10))
-    whole_px = rng.uniform(10, 40, (len(first), 2))
-    got = _kernels.paired_distance(
-        correlation, (5, 4), 3, 2, whole_px, apart_m, 7000.0, 2.0, first, second, 5, 1, 1.5
-    )
-    beyond_px = np.empty((len(first), 2))
-    _kernels.pair_shifts(correlation, 5, 4, 3, 2, beyond_px)
+    cuts = rng.random((5, 12, 10)).astype(np.float32)
+    which = np.sort(rng.permutation(len(first))[:8])
+    whole_px = rng.uniform(10, 40, (8, 2))
+    pairs = first, second, apart_m
+    got = _kernels.paired_distance(cuts, (5, 4), 3, 2, which, whole_px, pairs, 7000.0, 2.0, 1, 1.5)
+    first, second, apart_m = first[which], second[which], apart_m[which]
+    beyond_px = np.empty((8, 2))
+    _kernels.pair_shifts(phase_only_correlation(cuts, first, second, (5, 4)), 5, 4, 3, 2, beyond_px)
     distance_m = 7000 * apart_m / np.linalg.norm(whole_px + beyond_px, axis=1)
-    assert_allclose(got, twins.robust_mean(distance_m, apart_m**2, first, second, 5, 1, 1.5), rtol=1e-9)
+    want = twins.robust_mean(distance_m, apart_m**2, first, second, 5, 1, 1.5)
+    assert_allclose(got, (*want, apart_m.mean()), rtol=1e-9)
 
 
 @pytest.mark.parametrize("clusters", [2, 3, 4, 14])
