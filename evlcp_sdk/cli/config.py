@@ -45,6 +45,7 @@ def config(
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.link.text import to_toml
     from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.rx.receiver import Receiver
 
     if digest + as_json + (codebook is not None) > 1:
         raise typer.BadParameter("give one of --digest, --json and --codebook", param_hint="--json")
@@ -52,7 +53,10 @@ def config(
     link = load_link(link_file, overrides or [], registry)
     if codebook is not None:
         echo(link.codebook.to_json() if codebook is CodebookForm.JSON else link.codebook.to_c())
-    elif digest:
+        return
+    # A receiver compiles its algorithms: what they refuse is said here, not at the first recording.
+    Receiver(link)
+    if digest:
         echo(link.digest)
     elif as_json:
         table = {

@@ -21,7 +21,7 @@ from evlcp_sdk.rx.look import Look, Looker
 from evlcp_sdk.rx.reading import FrameReader, Reading, Shown
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
+from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Missed, Transmitter, Transmitters
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.values import Frame, Region, SyncLock, changed
 
@@ -126,8 +126,8 @@ class PacketFraming:
         self._echoes = judged.echoes
         self._judged = judged
         self._joined: set[int] = set()
-        self._ended: deque[tuple[tuple[float, float], int, int]] = deque(maxlen=_MOST_ENDED)
-        self._unread_by: dict[int, tuple[int, int]] = {}
+        self._ended: deque[tuple[tuple[float, float], Missed]] = deque(maxlen=_MOST_ENDED)
+        self._missed_by: dict[int, Missed] = {}
         self._due: deque[Followed] = deque()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
@@ -201,30 +201,29 @@ class PacketFraming:
 
     def disclaim(self, place: Region) -> int:
         """Count no frame that was not read in a place that is another link's; return how many they were."""
-        rejected = unread = 0
+        missed = Missed()
         for transmitter in self._transmitters.alive:
             if same_place(transmitter.region.latest, place):
-                rejected, unread = rejected + transmitter.rejected, unread + transmitter.unread
-                transmitter.rejected = transmitter.unread = 0
+                missed, transmitter.missed = missed + transmitter.missed, Missed()
         for one in list(self._ended):
-            if same_place(changed(place, x_px=one[0][0], y_px=one[0][1]), place):
+            (x, y), ended = one
+            if same_place(changed(place, x_px=x, y_px=y), place):
                 self._ended.remove(one)
-                rejected, unread = rejected + one[1], unread + one[2]
-        return self._disclaimed(rejected, unread)
+                missed += ended
+        return self._disclaimed(missed)
 
     def disown(self, number: int) -> int:
         """Count no frame that was not read where a packet was another link's; return how many they were."""
-        rejected, unread = self._unread_by.pop(number, (0, 0))
+        missed = self._missed_by.pop(number, Missed())
         for transmitter in self._transmitters.alive:
             if transmitter.number == number:
-                rejected, unread = rejected + transmitter.rejected, unread + transmitter.unread
-                transmitter.rejected = transmitter.unread = 0
-        return self._disclaimed(rejected, unread)
+                missed, transmitter.missed = missed + transmitter.missed, Missed()
+        return self._disclaimed(missed)
 
-    def _disclaimed(self, rejected: int, unread: int) -> int:
-        self.counts["frames_rejected"] -= rejected
-        self.counts["frames_unread"] -= unread
-        return rejected + unread
+    def _disclaimed(self, missed: Missed) -> int:
+        self.counts["frames_rejected"] -= missed.rejected
+        self.counts["frames_unread"] -= missed.unread
+        return missed.total
 
     def close(self) -> None:
         """End the stream: decode what the regions still show."""
@@ -292,8 +291,7 @@ class PacketFraming:
                 if found != "frames_dark":
                     self._lit_in(transmitter, due)
                 self.counts[found] += 1
-                transmitter.rejected += found == "frames_rejected"
-                transmitter.unread += found == "frames_unread"
+                transmitter.missed += Missed(found == "frames_rejected", found == "frames_unread")
                 continue
             self._take(transmitter, due, found)
 
@@ -454,23 +452,21 @@ class PacketFraming:
         if region in self._transmitters:
             transmitter = self._transmitters[region]
             self.counts["regions_released"] += 1
-            self._was_part(transmitter.rejected, transmitter.unread)
+            self._was_part(transmitter.missed)
             self._judged.end(transmitter.packets)
             self._transmitters.release(transmitter)
 
-    def _was_part(self, rejected: int, unread: int) -> None:
+    def _was_part(self, missed: Missed) -> None:
         """Count the frames that a part of a bar could not show apart from those that no bar shows."""
-        self.counts["frames_rejected"] -= rejected
-        self.counts["frames_unread"] -= unread
-        self.counts["frames_of_parts"] += rejected + unread
+        self.counts["frames_of_parts"] += self._disclaimed(missed)
 
     def _find_parts(self, region: Followed, t_us: float) -> None:
         """Look among the regions that ended for parts of a bar whose first frame is read."""
         for one in list(self._ended):
-            place_px, rejected, unread = one
+            place_px, missed = one
             if _is_part(region, t_us, place_px):
                 self._ended.remove(one)
-                self._was_part(rejected, unread)
+                self._was_part(missed)
 
     def _end(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""
@@ -478,20 +474,19 @@ class PacketFraming:
         self._decode_due(transmitter, min(now_us - self._tail_us, seen_us))
         if transmitter.region.id in self._joined:
             return
-        rejected, unread = transmitter.rejected, transmitter.unread
-        if transmitter.number is not None and rejected + unread:
+        number, missed = transmitter.number, transmitter.missed
+        if number is not None and missed:
             # One that was out of sight has the number that it had.
-            before = self._unread_by.get(transmitter.number, (0, 0))
-            self._unread_by[transmitter.number] = before[0] + rejected, before[1] + unread
-            if len(self._unread_by) > _MOST_ENDED:
-                del self._unread_by[min(self._unread_by)]
-        if transmitter.number is None and rejected + unread:
+            self._missed_by[number] = self._missed_by.get(number, Missed()) + missed
+            if len(self._missed_by) > _MOST_ENDED:
+                del self._missed_by[min(self._missed_by)]
+        if number is None and missed:
             place_px = transmitter.region.positions.place_at(seen_us)
             bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
             if any(_is_part(bar, seen_us, place_px) for bar in bars):
-                self._was_part(rejected, unread)
+                self._was_part(missed)
             else:
-                self._ended.append((place_px, rejected, unread))
+                self._ended.append((place_px, missed))
         self._judged.end(transmitter.packets)
 
 

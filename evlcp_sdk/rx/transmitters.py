@@ -19,7 +19,7 @@ from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import Region, SyncLock
 
-__all__ = ["LOOKBACK_PACKETS", "Transmitter", "Transmitters"]
+__all__ = ["LOOKBACK_PACKETS", "Missed", "Transmitter", "Transmitters"]
 
 LOOKBACK_PACKETS = 2
 """Packets of events kept while there is no lock: one to find a preamble in, one to look back on."""
@@ -29,6 +29,35 @@ _REMEMBER_US = 1e6
 
 _UNSEEN_STEPS = 5
 """Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
+
+
+@dataclass(frozen=True)
+class Missed:
+    """How many frames that were due were not given; of several, they add up.
+
+    Attributes:
+        rejected: They did not show their clusters.
+        unread: They showed them, and no symbol that is sure.
+
+    >>> Missed(1, 0) + Missed(1, 2)
+    Missed(rejected=2, unread=2)
+    >>> bool(Missed())
+    False
+    """
+
+    rejected: int = 0
+    unread: int = 0
+
+    def __add__(self, other: "Missed") -> "Missed":
+        return Missed(self.rejected + other.rejected, self.unread + other.unread)
+
+    def __bool__(self) -> bool:
+        return self.total > 0
+
+    @property
+    def total(self) -> int:
+        """Of both kinds."""
+        return self.rejected + self.unread
 
 
 @dataclass
@@ -46,8 +75,7 @@ class Transmitter:
         rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
         said: Number of the newest frame that was decoded, on the grid, and its symbols.
-        rejected: Frames due that were rejected.
-        unread: Frames due that showed their clusters, and no symbol that is sure.
+        missed: Frames due that were not given.
         behind: Frames that are due wait for the next step.
         tried: Number of the newest frame on the grid that was not given as soon as it was due.
         lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
@@ -63,8 +91,7 @@ class Transmitter:
     rows: RowDelay = field(default_factory=RowDelay)
     pilot: Pilot | None = None
     said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
-    rejected: int = 0
-    unread: int = 0
+    missed: Missed = Missed()
     behind: bool = False
     tried: int = -1
     lit_us: float | None = None

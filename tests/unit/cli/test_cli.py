@@ -387,6 +387,17 @@ def test_config_prints_what_it_loads(evlcp: Evlcp, tmp_path: Path) -> None:
     assert evlcp("config", "--json", "--digest").code == 2
 
 
+def test_config_says_what_an_algorithm_refuses_of_the_link(evlcp: Evlcp) -> None:
+    wrong = "--set", "modulation.id=nrz", "--set", "decoding.id=wh-transform"
+    for form in ((), ("--digest",), ("--json",)):
+        done = evlcp("config", *wrong, *form)
+        assert (done.code, done.out) == (2, "")
+        assert "decoding 'wh-transform' reads pair codes" in done.err
+        assert "decoding.id = 'edges'" in done.err
+    # A transmitter needs no decoding.
+    assert json.loads(evlcp("config", *wrong, "--codebook", "json").out)["profile"] == "nrz"
+
+
 def test_examples_are_links(evlcp: Evlcp) -> None:
     examples = Path(__file__).parents[3] / "examples"
     default = evlcp("config", "--digest").out
