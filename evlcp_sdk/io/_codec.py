@@ -18,6 +18,9 @@ MAX_SIDE = 2048
 """Columns and rows that 11 bits can address."""
 
 
+NO_TRIGGERS = Triggers.empty()
+
+
 @dataclass(frozen=True)
 class Codec:
     """One encoding of events in words.
@@ -82,10 +85,12 @@ class Columns:
     def taken(self) -> tuple[Events, Triggers]:
         """Return what is filled, as views; as copies where it is little, so as not to hold all the room."""
         n, m = self.events, self.triggers
-        events = Events(self.t_us[:n], self.x[:n], self.y[:n], self.p[:n])
+        columns = self.t_us[:n], self.x[:n], self.y[:n], self.p[:n]
         if 2 * n < len(self.t_us):
-            events = Events(events.t_us.copy(), events.x.copy(), events.y.copy(), events.p.copy())
-        return events, Triggers(self.trigger_t_us[:m], self.channel[:m], self.value[:m])
+            columns = columns[0].copy(), columns[1].copy(), columns[2].copy(), columns[3].copy()
+        if not m:
+            return Events.as_is(*columns), NO_TRIGGERS
+        return Events.as_is(*columns), Triggers(self.trigger_t_us[:m], self.channel[:m], self.value[:m])
 
 
 class Decoder:
@@ -102,7 +107,9 @@ class Decoder:
         self._bounds = (width or MAX_SIDE, height or MAX_SIDE)
         self._state = np.zeros(_words.STATE_SLOTS, np.int64)
         self._state[_words.BASE] = _words.UNKNOWN_TIME
-        self._state[_words.PACKED] = _words.UNKNOWN_ROW << _words.PACKED_ROW
+        self._state[_words.PACKED] = (
+            _words.PACKED_TIME << _words.PACKED_LOW | _words.UNKNOWN_ROW << _words.PACKED_ROW
+        )
         self._state[_words.COLUMN] = _words.UNKNOWN_COLUMN
         self._tally = np.zeros((_words.TALLY_ROWS, 2), np.int64)
         self._kernel = codec.kernel(codec.decoder)
@@ -119,7 +126,7 @@ class Decoder:
         it takes more words, up to `LOOK_BYTES`, to believe the time, unless these are the `final` ones; and
         where words do not go on behind the last one, but some bytes later, which are used, too.
         """
-        used, out.events, out.triggers = self._kernel(
+        used, out.events, out.triggers, askew = self._kernel(
             words,
             at,
             *self._bounds,
@@ -136,9 +143,7 @@ class Decoder:
             out.triggers,
             final,
         )
-        askew = int(self._state[_words.ASKEW])
-        self._state[_words.ASKEW] = 0
-        return int(used) * self.codec.word.itemsize + askew
+        return int(used * self.codec.word.itemsize + askew)
 
     def finish(self, at: int, odd_bytes: int) -> None:
         """Take note of how the stream ends: at byte `at`, with `odd_bytes` that make no word."""

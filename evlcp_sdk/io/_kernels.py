@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.io._words import (
-    ASKEW,
     BASE,
     BEFORE_TIME,
     COLUMN,
@@ -34,6 +33,7 @@ from evlcp_sdk.io._words import (
     EVT3_VECT_12,
     EVT3_VECT_BASE_X,
     FOLLOWERS,
+    HIGH,
     LAST,
     LEVEL,
     LEVEL_WORDS,
@@ -44,10 +44,10 @@ from evlcp_sdk.io._words import (
     PACKED,
     PACKED_CARRY,
     PACKED_COLUMN,
-    PACKED_HIGH,
     PACKED_LOW,
     PACKED_POLARITY,
     PACKED_ROW,
+    PACKED_TIME,
     POLARITY,
     REALIGNED,
     RESERVED,
@@ -79,20 +79,26 @@ uint32: Any = np.uint32
 uintp: Any = np.uintp
 ONE = uintp(1)
 
-BLOCK_WORDS = 1024
+BLOCK_WORDS = 4096
 BURST = 12
-RUN_WORDS = uintp(64)
+RUN_WORDS = uintp(32)
+VECTOR_WORDS = uintp(4)
+VECTOR_COLUMNS = 32
 
 # How a word of the three types that make up most of a file changes the packed event: what to keep and where
-# to put its 12 bits.
+# to put it.
 COMMON = 1 << EVT3_ADDR_Y | 1 << EVT3_ADDR_X | 1 << EVT3_TIME_LOW
 KEEP = np.full(16, -1)
-SHIFT = np.zeros(16, int64)
-EVENTS = np.zeros(16, uintp)
+SHIFT = np.zeros(16, np.uint8)
+EVENTS = np.zeros(16, np.uint8)
 EVENTS[EVT3_ADDR_X] = 1
 KEEP[EVT3_ADDR_Y], SHIFT[EVT3_ADDR_Y] = ~(0xFFFF << PACKED_ROW), PACKED_ROW
 KEEP[EVT3_ADDR_X], SHIFT[EVT3_ADDR_X] = ~(0xFFFF << PACKED_COLUMN), PACKED_COLUMN
-KEEP[EVT3_TIME_LOW], SHIFT[EVT3_TIME_LOW] = ~(0xFFF << PACKED_LOW), PACKED_LOW
+KEEP[EVT3_TIME_LOW], SHIFT[EVT3_TIME_LOW] = ~(0xFFFF << PACKED_LOW), PACKED_LOW
+
+# Which bits of a byte are set, then which are not, and how many are.
+BITS = np.argsort(1 - (np.arange(256)[:, None] >> np.arange(8) & 1), axis=1, kind="stable").astype(np.uint8)
+BIT_COUNT = (np.arange(256)[:, None] >> np.arange(8) & 1).sum(axis=1).astype(np.uint8)
 
 
 @njit(cache=True, nogil=True)
@@ -223,7 +229,6 @@ def _realign(shift: Integer, here: Integer, state: Column, tally: Column) -> Non
     """Pass over bytes; what follows has no time before the next TIME_HIGH."""
     _note(tally, int64(REALIGNED), here)
     tally[REALIGNED, 0] += shift - 1
-    state[ASKEW] = shift
     state[DOUBT] = 1
     state[LEVEL] = here + shift
 
@@ -234,8 +239,8 @@ def _are_common(words: Column, start: Integer) -> Any:
     odd = uint16(0)
     for k in range(RUN_WORDS):
         w = words[start + k]
-        # Types 0, 2 and 6 are those below 8 that are even and have no bit 4 without bit 2.
-        odd |= uint16(w & uint16(0x9000)) | uint16(w & uint16(0x4000) & ~uint16(w << 1))
+        # Types 0, 2 and 6 are those below 8 that are even and not 4.
+        odd = max(odd, uint16((w >> 12) & 9), uint16((w >> 13) & 3 == 2))
     return odd == 0
 
 
@@ -248,53 +253,38 @@ def _pack_evt3(
     state: Column,
     tally: Column,
     packed: Column,
-    room: Integer,
+    first: Integer,
 ) -> tuple[Integer, Integer]:
     """Decode words start..stop to packed events, unchecked, up to the first that is not of the sensor's.
 
-    Those are all but events and times that go on by one at the most. It stops, too, where another word may
-    bring more than `room` events in all. Returns where it stopped and how many events there are.
+    Those are all but events and times that go on below the last TIME_HIGH. It stops, too, where `packed`,
+    filled from `first` on, may have no room for another word's events. What is written behind the last event
+    means nothing. Returns where it stopped and where the events end.
     """
-    event, column, polarity = state[PACKED], state[COLUMN], state[POLARITY]
+    event, column, polarity, high = state[PACKED], state[COLUMN], state[POLARITY], state[HIGH]
     left, vector_at = state[VECTOR_LEFT], state[VECTOR_AT]
-    i, end, n = uintp(start), uintp(stop), uintp(0)
+    i, end, n, room = uintp(start), uintp(stop), uintp(first), uintp(len(packed))
     odd_until = i
-    while i < end and n + uintp(BURST) <= uintp(room):
-        if i >= odd_until and i + RUN_WORDS <= end and n + RUN_WORDS <= uintp(room):
-            # Which of the three it is cannot be predicted, so nothing branches on it: each puts its bits in
-            # the packed event and writes that, and only an ADDR_X moves on. Two at a time: what comes of both
-            # needs not wait for what comes of the first.
+    while i < end and n + uintp(BURST) <= room:
+        if i >= odd_until and i + RUN_WORDS <= end and n + RUN_WORDS <= room:
+            # Which of the three it is cannot be predicted, so nothing branches on it: each is put in the
+            # packed event and writes that, and only an ADDR_X moves on.
             if _are_common(words, i):
-                for k in range(uintp(0), RUN_WORDS, uintp(2)):
-                    v, w = int64(words[i + k]), int64(words[i + k + ONE])
-                    first, second = uintp(v >> 12), uintp(w >> 12)
-                    put, keep = (v & 0xFFF) << SHIFT[first], KEEP[second]
-                    packed[n] = (event & KEEP[first]) | put
-                    n += EVENTS[first]
-                    event = (event & (KEEP[first] & keep)) | ((put & keep) | (w & 0xFFF) << SHIFT[second])
+                for k in range(RUN_WORDS):
+                    w = int64(words[i + k])
+                    kind = uintp(w >> 12)
+                    event = (event & KEEP[kind]) | (w << SHIFT[kind])
                     packed[n] = event
-                    n += EVENTS[second]
+                    n += uintp(EVENTS[kind])
                 i += RUN_WORDS
                 continue
             odd_until = i + RUN_WORDS
         w = int64(words[i])
         kind = uintp(w >> 12)
         if (COMMON >> kind) & 1:
-            event = (event & KEEP[kind]) | ((w & 0xFFF) << SHIFT[kind])
+            event = (event & KEEP[kind]) | (w << SHIFT[kind])
             packed[n] = event
-            n += EVENTS[kind]
-        elif kind in (EVT3_VECT_12, EVT3_VECT_8):
-            size = 12 if kind == EVT3_VECT_12 else 8
-            mask = w & ((1 << size) - 1)
-            rest = (event & KEEP[EVT3_ADDR_X]) | polarity << PACKED_POLARITY
-            k = column
-            while mask:
-                packed[n] = rest | (k & 0x7FF) | (k >> 11) << PACKED_CARRY
-                n += uintp(mask & 1)
-                mask >>= 1
-                k += 1
-            column = min(column + size, UNKNOWN_COLUMN)
-            left = max(left - 1, 0) if size == 12 else 0
+            n += uintp(EVENTS[kind])
         elif kind == EVT3_VECT_BASE_X:
             if left:
                 _note(tally, int64(VECTOR_CUT), vector_at)
@@ -302,10 +292,43 @@ def _pack_evt3(
             polarity = (w >> 11) & 1
             left = 3
             vector_at = at + 2 * int64(i)
-        elif kind == EVT3_TIME_HIGH and uintp((w & 0xFFF) - (event >> PACKED_HIGH)) <= ONE:
-            if w & 0xFFF != event >> PACKED_HIGH:
-                event = (event & 0xFFFFFFFF) | (w & 0xFFF) << PACKED_HIGH
-        else:
+            if (
+                column + VECTOR_COLUMNS <= 0x800
+                and i + VECTOR_WORDS <= end
+                and n + uintp(VECTOR_COLUMNS + 8) <= room
+                and words[i + ONE] >> 12 == EVT3_VECT_12
+                and words[i + ONE + ONE] >> 12 == EVT3_VECT_12
+                and words[i + ONE + ONE + ONE] >> 12 == EVT3_VECT_8
+            ):
+                # A whole vector, a byte of it at a time: eight events are written, those that are move on.
+                mask = int64(words[i + ONE]) & 0xFFF
+                mask |= (int64(words[i + ONE + ONE]) & 0xFFF) << 12
+                mask |= (int64(words[i + ONE + ONE + ONE]) & 0xFF) << 24
+                rest = (event & KEEP[EVT3_ADDR_X]) | EVT3_ADDR_X << PACKED_CARRY | (w & 0xFFF)
+                for _ in range(4):
+                    byte = uintp(mask & 0xFF)
+                    for k in range(uintp(8)):
+                        packed[n + k] = rest + int64(BITS[byte, k])
+                    n += uintp(BIT_COUNT[byte])
+                    rest += 8
+                    mask >>= 8
+                column += VECTOR_COLUMNS
+                left = 0
+                i += VECTOR_WORDS
+                continue
+        elif kind in (EVT3_VECT_12, EVT3_VECT_8):
+            size = 12 if kind == EVT3_VECT_12 else 8
+            mask = w & ((1 << size) - 1)
+            rest = (event & KEEP[EVT3_ADDR_X]) | polarity << PACKED_POLARITY
+            k = column
+            while mask:
+                packed[n] = rest | (k & 0x7FF) | (k >> 11 ^ EVT3_ADDR_X) << PACKED_CARRY
+                n += uintp(mask & 1)
+                mask >>= 1
+                k += 1
+            column = min(column + size, UNKNOWN_COLUMN)
+            left = max(left - 1, 0) if size == 12 else 0
+        elif kind != EVT3_TIME_HIGH or w & 0xFFF != high:
             break
         i += ONE
     state[PACKED], state[COLUMN], state[POLARITY] = event, column, polarity
@@ -315,43 +338,43 @@ def _pack_evt3(
 
 @njit(cache=True, nogil=True)
 def _unpack_evt3(
-    packed: Column,
-    count: Integer,
     base: Integer,
     t: Column,
     x: Column,
     y: Column,
     p: Column,
     first: Integer,
+    stop: Integer,
     width: Integer,
     height: Integer,
     last: Integer,
 ) -> Any:
-    """Write packed events to the columns from row `first` on.
+    """Spread the packed events first..stop of `t` over the columns; their TIME_LOW counts from `base`.
 
     Returns whether all of them are on the sensor and none is earlier than the one before.
     """
-    row, end = uintp(first), uintp(count)
+    start, end = uintp(first), uintp(stop)
+    origin = base - PACKED_TIME
+    for k in range(start, end):
+        e = t[k]
+        t[k] = origin + (e >> PACKED_LOW)
+        y[k] = uint16(e >> PACKED_ROW) & uint16(0x87FF)
+        x[k] = uint16(e)
+    # Loops that are short and of small numbers become vector instructions.
+    for k in range(start, end):
+        w = x[k] ^ uint16(EVT3_ADDR_X << PACKED_CARRY)
+        p[k] = (w >> PACKED_POLARITY) & 1
+        x[k] = uint16((w & uint16(0x7FF)) | ((w >> 1) & uint16(0x7800)))
     right = bottom = uint16(0)
-    bits = uint32(0)
-    for k in range(end):
-        e = uint32(packed[k])
-        bits |= e
-        t[row + k] = base + (packed[k] >> PACKED_LOW)
-        p[row + k] = (e >> PACKED_POLARITY) & 1
-        x[row + k] = e & 0x7FF
-        y[row + k] = (e >> PACKED_ROW) & 0x87FF
-        right = max(right, x[row + k])
-        bottom = max(bottom, y[row + k])
-    if (bits >> PACKED_CARRY) & 0xF:
-        for k in range(end):
-            x[row + k] |= ((packed[k] >> PACKED_CARRY) & 0xF) << 11
-            right = max(right, x[row + k])
-    back = t[row] - last if count else int64(0)
-    for k in range(ONE, end):
+    for k in range(start, end):
+        right = max(right, x[k])
+    for k in range(start, end):
+        bottom = max(bottom, y[k])
+    back = t[start] - last if start < end else int64(0)
+    for k in range(start + ONE, end):
         # Its sign is set by any step back.
-        back |= t[row + k] - t[row + k - ONE]
-    return (right < width and bottom < height and back >= 0) or count == 0
+        back |= t[k] - t[k - ONE]
+    return (right < width and bottom < height and back >= 0) or start == end
 
 
 @njit(cache=True, nogil=True)
@@ -441,7 +464,7 @@ def decode_evt3(
     value: Column,
     m: Integer,
     final: Any,
-) -> tuple[Integer, Integer, Integer]:
+) -> tuple[Integer, Integer, Integer, Integer]:
     """Decode EVT3 words until they run out, or the columns' room for 12 events or for a trigger does.
 
     Args:
@@ -464,10 +487,9 @@ def decode_evt3(
             confirm, within `LOOK_BYTES`.
 
     Returns:
-        Words used, events and triggers now in the columns. Where `state[ASKEW]` is not 0, the next word
-        starts so many bytes behind them.
+        Words used, events and triggers now in the columns, and how many bytes behind these words the next
+        one starts.
     """
-    packed = np.empty(BLOCK_WORDS * BURST, int64)
     i = 0
     if state[BASE] < 0:
         while i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
@@ -475,14 +497,14 @@ def decode_evt3(
             i += 1
         if i < len(words):
             state[BASE] = 0
-            state[PACKED] |= (int64(words[i]) & 0xFFF) << PACKED_HIGH
+            state[HIGH] = int64(words[i]) & 0xFFF
             i += 1
     askew = int64(0)
     while i < len(words) and n <= len(t) - BURST and m < len(trigger_t):
         while state[DOUBT] and i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
             start = i
-            i, count = _pack_evt3(words, i, i + 1, at, state, tally, packed, int64(BURST))
-            for _ in range(count):
+            i, until = _pack_evt3(words, i, i + 1, at, state, tally, t, n)
+            for _ in range(n, until):
                 _note(tally, int64(TIME_DOUBTFUL), at + 2 * start)
             if i == start:
                 kind = words[i] >> 12
@@ -497,14 +519,14 @@ def decode_evt3(
                 i += 1
         if askew or i == len(words):
             break
-        if state[DOUBT] and uintp((int64(words[i]) & 0xFFF) - (state[PACKED] >> PACKED_HIGH)) <= ONE:
+        if state[DOUBT] and int64(words[i]) & 0xFFF == state[HIGH]:
             state[DOUBT] = 0
         start, first = i, n
         stop = i + min(len(words) - i, BLOCK_WORDS)
-        i, count = _pack_evt3(words, start, stop, at, state, tally, packed, len(t) - n)
-        n += count
+        i, n = _pack_evt3(words, start, stop, at, state, tally, t, n)
         is_full = n > len(t) - BURST
-        if not _unpack_evt3(packed, count, state[BASE], t, x, y, p, first, width, height, state[LAST]):
+        base = state[BASE] + (state[HIGH] << 12)
+        if not _unpack_evt3(base, t, x, y, p, first, n, width, height, state[LAST]):
             n = _sift(words, start, at, t, x, y, p, first, n, width, height, state[LAST], tally)
         if n > first:
             state[LAST] = t[n - 1]
@@ -515,7 +537,7 @@ def decode_evt3(
         here = at + 2 * i
         if kind == EVT3_TIME_HIGH:
             high = w & 0xFFF
-            before = state[PACKED] >> PACKED_HIGH
+            before = state[HIGH]
             if (high - before) & 0xFFF > 1:
                 askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
                 if askew:
@@ -535,9 +557,10 @@ def decode_evt3(
                 if verdict == 2 and high > before:
                     state[BASE] -= 1 << 24
                 if high != before:
-                    state[PACKED] = (state[PACKED] & 0xFFFFFFFF) | high << PACKED_HIGH
+                    state[HIGH] = high
+                    state[PACKED] = (state[PACKED] & KEEP[EVT3_TIME_LOW]) | PACKED_TIME << PACKED_LOW
         elif kind == EVT3_EXT_TRIGGER:
-            clock = state[BASE] + (state[PACKED] >> PACKED_LOW)
+            clock = base - PACKED_TIME + (state[PACKED] >> PACKED_LOW)
             if clock < state[LAST]:
                 _note(tally, int64(TIME_BACKWARD), here)
             else:
@@ -555,7 +578,7 @@ def decode_evt3(
         _realign(askew, at + 2 * i, state, tally)
         state[PACKED] = (state[PACKED] & KEEP[EVT3_ADDR_Y]) | UNKNOWN_ROW << PACKED_ROW
         state[COLUMN], state[VECTOR_LEFT] = UNKNOWN_COLUMN, 0
-    return i, n, m
+    return i, n, m, max(askew, int64(0))
 
 
 @njit(cache=True, nogil=True)
@@ -576,7 +599,7 @@ def decode_evt2(
     value: Column,
     m: Integer,
     final: Any,
-) -> tuple[Integer, Integer, Integer]:
+) -> tuple[Integer, Integer, Integer, Integer]:
     """Decode EVT2 words (uint32) until they or the columns' room run out; as `decode_evt3`."""
     base, last, doubt = state[BASE], state[LAST], state[DOUBT]
     askew = int64(0)
@@ -645,7 +668,7 @@ def decode_evt2(
     state[BASE], state[LAST], state[DOUBT] = base, last, doubt
     if askew > 0:
         _realign(askew, at + 4 * i, state, tally)
-    return i, n, m
+    return i, n, m, max(askew, int64(0))
 
 
 @njit(cache=True, nogil=True)

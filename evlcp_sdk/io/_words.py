@@ -32,14 +32,14 @@ EVT2_TYPES: Final = 0b1100_0101_0000_0011
 # Slots of a decoder's state, int64. All of it; nothing else passes from one call to the next.
 BASE: Final = 0  # EVT3: 2^24 a rollover; EVT2: time of the last TIME_HIGH; UNKNOWN_TIME before the first, us
 LAST: Final = 1  # time of the last event or trigger given out, us
-PACKED: Final = 2  # EVT3 only, as all below: the last event with its time and row, see below
+PACKED: Final = 2  # EVT3 only, as all to VECTOR_AT: the last event with its time and row, see below
 COLUMN: Final = 3  # where the next vector word starts, or UNKNOWN_COLUMN or more
 POLARITY: Final = 4  # of the last VECT_BASE_X
 VECTOR_LEFT: Final = 5  # vector words still to come after the last VECT_BASE_X
 VECTOR_AT: Final = 6  # byte offset of that VECT_BASE_X
 DOUBT: Final = 7  # both: 1 behind a TIME_HIGH that is not believed
-ASKEW: Final = 8  # both: bytes to pass over before the next word
-LEVEL: Final = 9  # both: words before this byte offset are known not to stand askew
+LEVEL: Final = 8  # both: words before this byte offset are known not to stand askew
+HIGH: Final = 9  # EVT3 only: the last TIME_HIGH that is believed
 STATE_SLOTS: Final = 10
 
 # A step of TIME_HIGH by more than one is believed unless most of the next `FOLLOWERS` in so many bytes are
@@ -63,13 +63,14 @@ UNKNOWN_TIME: Final = -1
 UNKNOWN_ROW: Final = 0x8000
 UNKNOWN_COLUMN: Final = 0x7000
 
-# An EVT3 event in one integer: where each of its fields starts.
-PACKED_COLUMN: Final = 0  # 11 bits
+# An EVT3 event in one integer: the words that it comes from side by side, types and all, so that a word is
+# put in its place as it is. What of a vector's column exceeds 11 bits is in place of the type, with the type.
+PACKED_COLUMN: Final = 0  # ADDR_X: 11 bits, then the polarity, then the type
 PACKED_POLARITY: Final = 11
-PACKED_CARRY: Final = 12  # 4 bits: what of a column exceeds 11 bits, which a vector's may
-PACKED_ROW: Final = 16  # 16 bits, of which bit 11 means nothing
-PACKED_LOW: Final = 32  # 12 bits
-PACKED_HIGH: Final = 44  # 12 bits
+PACKED_CARRY: Final = 12
+PACKED_ROW: Final = 16  # ADDR_Y, of which bit 11 means nothing; its type is 0, with UNKNOWN_ROW 8
+PACKED_LOW: Final = 32  # TIME_LOW
+PACKED_TIME: Final = EVT3_TIME_LOW << 12  # what its type adds to the time
 
 # Rows of a decoder's tally, int64 (rows, 2): how many, and the byte offset of the first.
 BEFORE_TIME: Final = 0

@@ -357,7 +357,7 @@ class RawSource(EventSource):
                 if not used and self._is_pipe and not self._exhausted and (out.events or out.triggers):
                     return False
                 self._fill()
-            if not self._decoder.has_time and self._position - self._data_start > TIMELESS_BYTES:
+            if self._position - self._data_start > TIMELESS_BYTES and not self._decoder.has_time:
                 self._raise_timeless()
         return False
 

@@ -91,6 +91,30 @@ def test_runs_of_rows_columns_and_times_between_other_words_equal_the_twin():
         assert {kind: (loss.count, loss.first) for kind, loss in decoder.losses.items()} == twin.losses
 
 
+def test_whole_vectors_among_other_words_equal_the_twin():
+    rng = np.random.default_rng(6)
+    for capacity in (12, 39, 41, 90, 5000):
+        words = [0x8000, 0x6000]
+        low = 0
+        for _ in range(600):
+            choice = rng.integers(0, 8)
+            low += int(choice == 0)
+            words += [0x6000 | low] if choice == 0 else [0x0000 | int(rng.integers(0, 490))]
+            words += [0x2000 | int(x) for x in rng.integers(0, 1 << 12, rng.integers(0, 4)) & 0xA7F]
+            # Bases near the sensor's edge, near that of what 11 bits say, and beyond.
+            base = int(rng.choice([rng.integers(0, 600), 610, 630, 2016, 2017, 2040])) | int(choice & 1) << 11
+            masks = [int(mask) for mask in rng.integers(0, 1 << 12, 3) & rng.choice([0, 0x111, 0xFFF], 3)]
+            vector = [0x3000 | base, 0x4000 | masks[0], 0x4000 | masks[1], 0x5000 | (masks[2] & 0xFF)]
+            words += vector if choice != 7 else vector[: int(rng.integers(1, 4))]
+        array = np.array(words, "<u2")
+        events, _, decoder = decode("EVT3", array, [1000, 2003], capacity, at=100)
+        twin = TWINS["EVT3"](array.tobytes(), WIDTH, HEIGHT, 100)
+        assert len(twin.events) > 1000
+        assert {"outside_sensor", "vectors_cut"} <= set(twin.losses)
+        assert rows(events, ("t_us", "x", "y", "p")) == twin.events
+        assert {kind: (loss.count, loss.first) for kind, loss in decoder.losses.items()} == twin.losses
+
+
 def test_low_time_is_zero_after_time_high_changes_and_stays_when_it_is_repeated():
     words = np.array([0x8001, 0x6123, 0x8001, 0x0005, 0x2007, 0x8002, 0x2007], "<u2")
     events, _, _ = decode("EVT3", words, [])
