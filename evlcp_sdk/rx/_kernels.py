@@ -450,15 +450,15 @@ def add_polarity(
     chip_us: float,
     row_us: float,
     row_px: float,
-    shift_x: Array,
-    shift_y: Array,
+    shift: Array,
     sums: Array,
 ) -> None:
-    """Add events to polarity sums (chips, height, width); a shift is the sensor pixel of (0, 0) in a chip.
+    """Add events to polarity sums (chips, height, width); `shift` (2, chips): the sensor pixel of (0, 0).
 
     The starts hold in row `row_px` of the sensor; in each row after it, events come `row_us` later.
     """
     chips, height, width = sums.shape
+    shift_x, shift_y = shift[0], shift[1]
     upper = row_us * (shift_y.min() - row_px)
     lower = row_us * (shift_y.max() + height - row_px)
     first = np.searchsorted(t_us, min(start_on_us, start_off_us) + min(upper, lower))
@@ -1906,18 +1906,18 @@ def places_at(t_us: Array, places: Array, ahead: float, centre: Array) -> None:
 
 
 @njit(cache=True, nogil=True)
-def hold_still(x: Array, y: Array, width: int, height: int, shift: Array, rest: Array) -> float:
-    """Sensor pixel of an image's (0, 0) that holds a centre (chips,) in its middle, and what is left of it.
+def hold_still(centre: Array, width: int, height: int, shift: Array, rest: Array) -> float:
+    """Sensor pixel of an image's (0, 0) that holds a centre in its middle, and what is left of it.
 
-    `shift` and `rest` are (2, chips); the mean row of the centre is given back.
+    `centre`, `shift` and `rest` are (2, chips); the mean row of the centre is given back.
     """
-    total = 0.0
-    for c in range(x.size):
-        left, top = x[c] - (width - 1) / 2, y[c] - (height - 1) / 2
+    total, chips = 0.0, len(centre[0])
+    for c in range(chips):
+        left, top = centre[0, c] - (width - 1) / 2, centre[1, c] - (height - 1) / 2
         shift[0, c], shift[1, c] = int(np.rint(left)), int(np.rint(top))
         rest[0, c], rest[1, c] = left - shift[0, c], top - shift[1, c]
-        total += y[c]
-    return total / x.size
+        total += centre[1, c]
+    return total / chips
 
 
 @njit(cache=True, nogil=True)

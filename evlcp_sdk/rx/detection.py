@@ -548,8 +548,7 @@ class RegionFollower:
 
     def _expected(self, followed: Followed, t_us: float) -> tuple[float, float]:
         """Where a region's centre should be soon: by its filter, or else straight on."""
-        expected = self._position.predict(followed.filter, t_us) if self._position else None
-        if expected is None:
+        if self._position is None or (expected := self._position.predict(followed.filter, t_us)) is None:
             return followed.positions.expected(t_us)
         return float(expected[0][0]), float(expected[0][1])
 

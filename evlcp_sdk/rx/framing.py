@@ -168,8 +168,11 @@ class PacketFraming:
         """When the next frame can be decoded, us; infinite where that waits for the end of a time step."""
         if isinstance(self._regions, DetectedRegions):
             return math.inf
-        dues = [one.grid.due_us for one in self._transmitters.alive if _in_time(one)]
-        return min(dues, default=math.inf) + self._tail_us
+        due_us = math.inf
+        for one in self._transmitters.alive:
+            if _in_time(one):
+                due_us = min(due_us, one.grid.due_us)
+        return due_us + self._tail_us
 
     def ahead(self, step: TimeStep) -> None:
         """Decode the frames that are due in the part so far of a time step."""
@@ -238,7 +241,7 @@ class PacketFraming:
             self._transmitters.open(region, self._steps.sync_init(), self._steps.distance_init())
         transmitter = self._transmitters[region]
         for start_us, events in list(region.pieces) if new else [region.pieces[-1]]:
-            self.counts["events_in_regions"] += len(events)
+            self.counts["events_in_regions"] += events.t_us.size
             until_us = min(start_us + self._step_us, step.end_us)
             transmitter.sync, locks = self._steps.synchronize(transmitter.sync, events, until_us)
             for heard in locks:

@@ -136,17 +136,18 @@ class Looker:
             The frame, None if it does not show its clusters; and the newest pilot that showed the bar.
         """
         lock, packet = due.lock, self._packet
-        middles = due.start_us + self._halves[: due.chips + self._after] * lock.chip_us
-        x, y = region.positions.at(np.asarray(middles, np.float64))
+        middles: NDArray[np.float64] = due.start_us + self._halves[: due.chips + self._after] * lock.chip_us
+        centre_px = region.positions.at(middles)
         middle = min(due.chips, packet.pilot_chips) // 2
+        chip_us = float(middles[middle])
         if due.has_pilot:
-            size = self._size(*region.positions.size_at(middles[middle]))
+            size = self._size(*region.positions.size_at(chip_us))
         elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
             return None, pilot
         else:
             size = pilot.size_px
         pieces = [e for t, e in region.pieces if t < due.read_us and t + self._spec.step_us > due.start_us]
-        sums, offset_px = polarity_sums(pieces, lock, due.start_us, (x, y), size)
+        sums, offset_px = polarity_sums(pieces, lock, due.start_us, centre_px, size)
         if due.has_pilot:
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
             presence = self._separate(heard)
@@ -167,13 +168,18 @@ class Looker:
         # The image shows the pilot's mean, read from the chips behind edges that tell codes apart: it lies
         # where these were looked for in the mean, however much the region's track trembles between chips.
         told = slice(1, packet.pilot_chips, self._every)
-        rest_x, rest_y = (sum(rest) / len(rest) for rest in pilot.offset_px[:, told].tolist())
+        rests_x, rests_y = pilot.offset_px[:, told].tolist()
+        many = len(rests_x)
         if due.has_pilot:
-            centre_x, centre_y = (float(np.add.reduce(place)) / len(place) for place in (x[told], y[told]))
+            total_x, total_y = np.add.reduce(centre_px[:, told], 1).tolist()
+            centre_x, centre_y = total_x / many, total_y / many
         else:
-            centre_x, centre_y = float(x[middle]), float(y[middle])
-        corner_px = (centre_x - (size[0] - 1) / 2 - rest_x, centre_y - (size[1] - 1) / 2 - rest_y)
-        middle_us = float(middles[middle]) - lock.chip_us / 2
+            centre_x, centre_y = centre_px[:, middle].tolist()
+        corner_px = (
+            centre_x - (size[0] - 1) / 2 - sum(rests_x) / many,
+            centre_y - (size[1] - 1) / 2 - sum(rests_y) / many,
+        )
+        middle_us = chip_us - lock.chip_us / 2
         look = Look(
             sums,
             offset_px[:, :chips],
@@ -298,7 +304,7 @@ def polarity_sums(
     events: Iterable[Events],
     lock: SyncLock,
     start_us: float,
-    centre_px: tuple[NDArray[np.float64], NDArray[np.float64]],
+    centre_px: NDArray[np.float64],
     size_px: tuple[int, int],
 ) -> tuple[NDArray[np.int16], NDArray[np.float64]]:
     """Sum polarities (+1, -1) by chip and pixel, the bar held still in the middle to within half a pixel.
@@ -311,28 +317,28 @@ def polarity_sums(
         events: Pieces of the stream that hold the chips; events outside them are passed over.
         lock: Length of a chip, and the delays of positive and negative events, and by row.
         start_us: Start of the first chip, us.
-        centre_px: Column and row of the bar's centre in each chip, float64 (chips,) each, px.
+        centre_px: Column and row of the bar's centre in each chip, float64 (2, chips), px.
         size_px: (width, height) of the image, px.
     """
     width, height = size_px
-    chips = len(centre_px[0])
+    chips = centre_px.shape[1]
     shift, rest_px = np.empty((2, chips), np.int64), np.empty((2, chips))
     # Rows wait for the bar's own, wherever they are.
-    row_px = _kernels.hold_still(*centre_px, width, height, shift, rest_px)
+    row_px = _kernels.hold_still(centre_px, width, height, shift, rest_px)
     sums = np.zeros((chips, height, width), np.int16)
+    on_us, off_us = start_us + lock.delay_on_us, start_us + lock.delay_off_us
     for e in events:
         _kernels.add_polarity(
             e.t_us,
             e.x,
             e.y,
             e.p,
-            start_us + lock.delay_on_us,
-            start_us + lock.delay_off_us,
+            on_us,
+            off_us,
             lock.chip_us,
             lock.row_us,
             row_px,
-            shift[0],
-            shift[1],
+            shift,
             sums,
         )
     return sums, rest_px

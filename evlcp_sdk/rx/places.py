@@ -131,11 +131,11 @@ class Places:
         ahead = min((t_us - last.t_us) / (last.t_us - before_us), 1.0)
         return last.x_px + ahead * (last.x_px - x_px), last.y_px + ahead * (last.y_px - y_px)
 
-    def at(self, t_us: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centre (column, row) at times, interpolated; straight on for a little before and after, px."""
+    def at(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Centre (column, row) at times, float64 (2, n), px: interpolated, straight on for a little."""
         centre = np.empty((2, len(t_us)))
         _kernels.places_at(t_us, self._held(), _MOST_AHEAD_STEPS, centre)
-        return centre[0], centre[1]
+        return centre
 
     def place_at(self, t_us: float) -> tuple[float, float]:
         """The same as `at` for one time."""

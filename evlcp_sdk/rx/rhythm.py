@@ -156,7 +156,7 @@ class Rhythm:
             _SAME,
             cell_shift,
         )
-        self._taken = len(events)
+        self._taken = events.t_us.size
         if self._shared:
             self._kept = (start_us, len(events)), self._rises, hits.copy()
         return self._rises
@@ -264,7 +264,7 @@ class Rhythm:
 
 def select(events: Events, box: tuple[int, int, int, int]) -> Events:
     """Those inside a box (left, top, right, bottom), in no more memory than twice what they need."""
-    room = len(events) + 1
+    room = events.t_us.size + 1
     into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
     n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, *into)
     part = [column[:n] for column in into]

@@ -181,7 +181,7 @@ class Timeline:
         """Where each new time step starts among the events."""
         t_us, step_us = events.t_us, self._step_us
         first_us = max(self._grid_us(int(t_us[0])), start_us)
-        if int(t_us[-1]) - first_us > step_us * len(events):
+        if int(t_us[-1]) - first_us > step_us * t_us.size:
             # Sparse events: look at each instead of at each step.
             step = t_us // step_us
             before = np.concatenate([[start_us // step_us], step[:-1]])

@@ -297,7 +297,7 @@ def test_polarity_sums(seed, freeze):
     e = frozen(events, freeze)
     for row, shifts in product((0.0, row_us), (moving, still, jolted)):
         sums[:] = 0
-        _kernels.add_polarity(e.t_us, e.x, e.y, e.p, start_on, start_off, chip_us, row, row_px, *shifts, sums)
+        _kernels.add_polarity(e.t_us, e.x, e.y, e.p, start_on, start_off, chip_us, row, row_px, shifts, sums)
         want = twins.polarity_sums(events, start_on, start_off, chip_us, *shifts, shape, row, row_px)
         assert_array_equal(sums, want)
         assert sums.any()
@@ -633,7 +633,7 @@ def test_points_off_their_places(seed):
 def test_a_centre_is_held_in_the_middle(seed):
     x, y = np.random.default_rng(seed).uniform(-3, 1300, (2, 20))
     shift, rest = np.empty((2, 20), np.int64), np.empty((2, 20))
-    assert _kernels.hold_still(x, y, 18, 101, shift, rest) == pytest.approx(y.mean())
+    assert _kernels.hold_still(np.stack([x, y]), 18, 101, shift, rest) == pytest.approx(y.mean())
     corner = np.stack([x - 8.5, y - 50])
     assert_array_equal(shift, np.rint(corner))
     assert_allclose(rest, corner - np.rint(corner), atol=1e-12)

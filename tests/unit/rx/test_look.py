@@ -15,7 +15,7 @@ from evlcp_sdk.values import Events, SyncLock
 
 CHIPS, SIZE = 12, (8, 14)
 LOCK = SyncLock(packet_t_us=0, chip_us=100.25, delay_on_us=-20.5, delay_off_us=33.75, quality=1)
-STILL = np.full(CHIPS, 103.5), np.full(CHIPS, 206.5)
+STILL = np.repeat([[103.5], [206.5]], CHIPS, axis=1)
 
 
 def stream(seed, n=4000):
@@ -31,7 +31,7 @@ def one(t_us, p, x=103, y=206):
 @pytest.mark.parametrize("seed", range(4))
 def test_a_moving_bar_is_held_in_the_middle(seed):
     rng = np.random.default_rng(seed)
-    centre = 104 + rng.uniform(-5, 5, CHIPS), 207 + rng.uniform(-5, 5, CHIPS)
+    centre = np.array([[104], [207]]) + rng.uniform(-5, 5, (2, CHIPS))
     events = stream(seed)
     sums, offset = polarity_sums([events], LOCK, 1000.0, centre, SIZE)
     assert np.abs(offset).max() <= 0.5
@@ -49,7 +49,9 @@ def test_a_blob_that_moves_stays_where_it_is():
     x = 50 + 3 * np.arange(CHIPS)
     t = 1000 + 100 * np.arange(CHIPS) + 50
     lock = SyncLock(0, 100.0, 0.0, 0.0, 1)
-    sums, offset = polarity_sums([Events.of(t, x + 2, x - 3, x > 0)], lock, 1000.0, (x + 0.5, x + 0.5), SIZE)
+    sums, offset = polarity_sums(
+        [Events.of(t, x + 2, x - 3, x > 0)], lock, 1000.0, np.stack([x, x]) + 0.5, SIZE
+    )
     # The middle of the image is between its pixels 3 and 4, 6 and 7.
     assert_array_equal(np.argwhere(sums), [[c, 6 - 3, 3 + 2] for c in range(CHIPS)])
     assert_array_equal(offset, np.zeros((2, CHIPS)))
