@@ -147,6 +147,15 @@ def _blinks(state: int, now: int, span: int, least: int) -> bool:
 
 
 @njit(cache=True, nogil=True)
+def _mark_blinking(line: Array, now: int, span: int, least: int, blinks: Array, counts: Array) -> None:
+    """Which pixels of a line `_blinks`, 1 or 0, added to `counts`."""
+    for u in range(line.size):
+        blinks[u] = _blinks(line[u], now, span, least)
+    for u in range(line.size):
+        counts[u] += np.int32(blinks[u])
+
+
+@njit(cache=True, nogil=True)
 def measure_box(
     pixels: Array,
     box: tuple[int, int, int, int],
@@ -167,14 +176,15 @@ def measure_box(
         (pixels, mean column, first column, last column, upper edge, lower edge).
     """
     left, top, right, bottom = box
-    columns = np.zeros(right - left)
-    first_column, last_column = right, left
+    # Many pixels at a time: all of them first, then what they say.
+    blinks, counts = np.empty((bottom - top, right - left), np.uint8), np.zeros(right - left, np.int32)
     for v in range(top, bottom):
-        for u in range(left, right):
-            if _blinks(pixels[v, u], now, span, min_score):
-                columns[u - left] += 1
-                first_column = min(first_column, u)
-                last_column = max(last_column, u)
+        _mark_blinking(pixels[v, left:right], now, span, min_score, blinks[v - top], counts)
+    columns, first_column, last_column = np.empty(counts.size), right, left
+    for u in range(left, right):
+        columns[u - left] = counts[u - left]
+        if counts[u - left]:
+            first_column, last_column = min(first_column, u), u
     rows[:] = 0
     if last_column < first_column:
         return 0, 0.0, 0, 0, 0.0, 0.0
@@ -193,10 +203,15 @@ def measure_box(
             weighted += columns[i] * (left + i)
         column = weighted / best
     total, lit = 0, 0
+    near, far = left, right
+    while near < far and abs(near - column) > reach:
+        near += 1
+    while near < far and abs(far - 1 - column) > reach:
+        far -= 1
     for v in range(top, bottom):
         n = 0
-        for u in range(left, right):
-            n += _blinks(pixels[v, u], now, span, min_score) and abs(u - column) <= reach
+        for u in range(near - left, far - left):
+            n += blinks[v - top, u]
         rows[v - top] = n
         total += n
         lit += n > 0

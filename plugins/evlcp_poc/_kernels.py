@@ -219,20 +219,25 @@ def unit_spectra(images: Array, most_y: int, most_x: int, out: Array) -> None:
     n, height, width = images.shape
     down, across = _turns(height, most_y), _turns(width, most_x)
     half = (most_x + 1) * n
-    lines, pixel = np.zeros((height, 2 * half), np.float32), np.empty(n, np.float32)
+    lines, pixels = np.zeros((height, 2 * half), np.float32), np.empty((width, n), np.float32)
     lit = np.zeros(height, np.bool_)
     for v in range(height):
-        for u in range(width):
-            some = False
-            for k in range(n):
-                pixel[k] = images[k, v, u]
-                some |= pixel[k] != 0
-            lit[v] |= some
-            for x in range(most_x + 1 if some else 0):
-                real, imaginary = lines[v, x * n : (x + 1) * n], lines[v, half + x * n : half + (x + 1) * n]
+        some = False
+        for k in range(n):
+            line = images[k, v]
+            for u in range(width):
+                some |= line[u] != 0
+        lit[v] = some
+        for k in range(n if some else 0):
+            for u in range(width):
+                pixels[u, k] = images[k, v, u]
+        for x in range(most_x + 1 if some else 0):
+            real, imaginary = lines[v, x * n : (x + 1) * n], lines[v, half + x * n : half + (x + 1) * n]
+            for u in range(width):
+                pixel, cosine, sine = pixels[u], across[0, u, x], across[1, u, x]
                 for k in range(n):
-                    real[k] += across[0, u, x] * pixel[k]
-                    imaginary[k] -= across[1, u, x] * pixel[k]
+                    real[k] += cosine * pixel[k]
+                    imaginary[k] -= sine * pixel[k]
     turned, by_harmonic = np.empty((2, 2 * half), np.float32), out.reshape(len(out), 2 * half)
     for y in range(most_y + 1):
         turned[:] = 0
@@ -251,13 +256,17 @@ def unit_spectra(images: Array, most_y: int, most_x: int, out: Array) -> None:
             real, imaginary = out[y, 0, x], out[y, 1, x]
             for k in range(n):
                 power = real[k] * real[k] + imaginary[k] * imaginary[k]
-                over = np.float32(1) / np.sqrt(power) if power > _NO_PHASE * top[k] else np.float32(0)
+                # The operator would look for a 0 below, one number at a time.
+                over = np.divide(np.float32(power > _NO_PHASE * top[k]), np.sqrt(max(power, _TINY)))
                 real[k] *= over
                 imaginary[k] *= over
 
 
 _NO_PHASE = np.float32(1e-10)
 """Power, in the largest of a spectrum, below which there is no phase: that of rounding."""
+
+_TINY = np.float32(1e-37)
+"""Takes the place of a power of 0, whose root is divided by before it is known to have no phase."""
 
 
 @njit(cache=True, nogil=True)
@@ -277,11 +286,13 @@ def correlations(spectra: Array, first: Array, second: Array, far_y: int, far_x:
             # Those across but the first stand for two, of which the other is the conjugate.
             weight = np.float32((2 if x else 1) / (height * width))
             for q in range(pairs):
-                a, b, c, d = real[first[q]], imaginary[first[q]], real[second[q]], imaginary[second[q]]
+                # Unsigned, as indices below 0 would count from the end.
+                i, k = np.uint64(first[q]), np.uint64(second[q])
+                a, b, c, d = real[i], imaginary[i], real[k], imaginary[k]
                 cross[y, x * pairs + q] = weight * (a * c + b * d)
                 cross[y, half + x * pairs + q] = weight * (a * d - b * c)
     turned, rows = np.empty((2, 2 * half), np.float32), np.empty((2, 2 * half), np.float32)
-    even, odd = np.empty(pairs, np.float32), np.empty(pairs, np.float32)
+    even, odd = np.empty((2, far_x + 1, pairs), np.float32)
     for v in range(far_y + 1):
         turned[:] = 0
         for y in range(-most_y, most_y + 1):
@@ -290,18 +301,20 @@ def correlations(spectra: Array, first: Array, second: Array, far_y: int, far_x:
         _both_ways(turned, rows[1], rows[0])
         for way in range(2):
             at = (height - v) % height if way else v
-            for u in range(far_x + 1):
-                even[:] = 0
-                odd[:] = 0
-                for x in range(most_x + 1):
-                    real = rows[way, x * pairs : (x + 1) * pairs]
-                    imaginary = rows[way, half + x * pairs : half + (x + 1) * pairs]
+            even[:] = 0
+            odd[:] = 0
+            for x in range(most_x + 1):
+                real = rows[way, x * pairs : (x + 1) * pairs]
+                imaginary = rows[way, half + x * pairs : half + (x + 1) * pairs]
+                for u in range(far_x + 1):
+                    cosine, sine, of_cosine, of_sine = across[0, u, x], across[1, u, x], even[u], odd[u]
                     for q in range(pairs):
-                        even[q] += across[0, u, x] * real[q]
-                        odd[q] += across[1, u, x] * imaginary[q]
+                        of_cosine[q] += cosine * real[q]
+                        of_sine[q] += sine * imaginary[q]
+            for u in range(far_x + 1):
                 for q in range(pairs):
-                    out[q, at, u] = even[q] - odd[q]
-                    out[q, at, (width - u) % width] = even[q] + odd[q]
+                    out[q, at, u] = even[u, q] - odd[u, q]
+                    out[q, at, (width - u) % width] = even[u, q] + odd[u, q]
 
 
 @njit(cache=True, nogil=True)
