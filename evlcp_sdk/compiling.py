@@ -10,23 +10,28 @@ All this replaces parts of Numba that it promises nobody. `prepare` does so only
 tried with; by another one kernels are compiled as Numba does by itself, in two to three times the time.
 """
 
+import operator
 import sys
 from collections import Counter, defaultdict
+from collections.abc import Iterable
 from contextlib import nullcontext
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import llvmlite.ir
 import numba
+import numpy as np
 from llvmlite.binding import Linkage, ffi, parse_assembly
 from llvmlite.ir import instructions
 from numba import _dynfunc  # type: ignore[attr-defined]
 from numba.core import (
     analysis,
+    callconv,
     cgutils,
     codegen,
     cpu,
     errors,
+    imputils,
     inline_closurecall,
     ir,
     lowering,
@@ -38,11 +43,14 @@ from numba.core import (
 )
 from numba.core.base import BaseContext
 from numba.core.compiler_machinery import PassManager, _pass_registry
+from numba.core.registry import cpu_target
 from numba.core.runtime.context import NRTContext
 from numba.core.types.functions import BaseFunction
 from numba.core.typing.context import Context as TypingContext
+from numba.core.typing.templates import AbstractTemplate, signature
 from numba.core.unsafe import eh
-from numba.cpython import slicing
+from numba.cpython import builtins, rangeobj, slicing
+from numba.extending import intrinsic
 from numba.np import arrayobj
 
 __all__ = ["KeptKernel", "prepare"]
@@ -70,14 +78,21 @@ def prepare(kept: KeptKernel) -> bool:
     """Replace what takes long; whether that was done. It is for good: no kernel can be called afterwards."""
     if not numba.__version__.startswith(_TRIED):
         return False
+    cpu_target.typing_context.refresh()
+    cpu_target.target_context.refresh()
     _keep_calls_within(kept)
     _resolve_once()
     _look_up_once()
     _follow_lives_when_asked()
     _list_variables_quickly()
     _count_references_of_arrays_alone()
-    _keep_values_of_variables()
-    _read_fields_of_values()
+    tried: set[str] = set()
+    _keep_values_of_variables(tried)
+    _keep_structures_as_values()
+    _call_in_few_words(tried)
+    _count_down_ranges()
+    _ask_for_room_once()
+    _compare_in_place()
     _write_no_detours()
     _name_by_number()
     _run_passes_alone()
@@ -359,7 +374,7 @@ def _count_references_of_arrays_alone() -> None:
     lower.delvar = end
 
 
-def _keep_values_of_variables() -> None:
+def _keep_values_of_variables(functions_tried: set[str]) -> None:
     """A variable that is set in one place, which all its uses come after, is its value, no place in memory.
 
     Numba does so within a block. Where references are counted there is a place, too, to end what it has.
@@ -383,6 +398,8 @@ def _keep_values_of_variables() -> None:
         times = Counter(one.target.name for block in blocks.values() for one in block.find_insts(ir.Assign))
         before = analysis.compute_cfg_from_blocks(blocks).dominators()
         tried = any(_is_of_exceptions(one) for block in blocks.values() for one in block.body)
+        if tried:
+            functions_tried.add(self.fndesc.llvm_func_name)
         in_memory = analysis.must_use_alloca(blocks)
         for name, labels in set_in.items():
             if times[name] != 1 or name in in_memory:
@@ -418,22 +435,25 @@ def _is_of_exceptions(statement: Any) -> bool:
     return isinstance(value, ir.Global) and value.value is eh.exception_check
 
 
-def _read_fields_of_values() -> None:
-    """Arrays, ranges and what else is a structure are read without a copy in memory for each time.
+def _keep_structures_as_values() -> None:
+    """Arrays, ranges and what else is a structure are values, without a copy in memory for each time.
 
-    Fields are taken from the value as long as none is set and nobody asks for a place in memory; then the
-    value is put there, where the structure was made, as this may be in a branch of what follows.
+    Fields are set and taken as long as nobody sets one in a branch or asks for a place in memory; then the
+    value is put there, where it was set, as this may be in a branch of what follows.
     """
     structure: Any = cgutils._StructProxy
-    begin, load = structure.__init__, structure.__getitem__
+    begin, load, store = structure.__init__, structure.__getitem__, structure.__setitem__
+    refer = structure._make_refs
 
     def made(self: Any, context: Any, builder: Any, value: Any = None, ref: Any = None) -> None:
-        if value is None or ref is not None:
+        if ref is not None or (value is None and type(self)._make_refs is not refer):
             begin(self, context, builder, value=value, ref=ref)
             return
         self._context, self._builder = context, builder
         self._datamodel = context.data_model_manager[self._fe_type]
         self._be_type = self._get_be_type(self._datamodel)
+        if value is None:
+            value = llvmlite.ir.Constant(self._be_type, None)
         if value.type != self._be_type:
             raise AssertionError(f"bad value type: expected {self._be_type}, got {value.type}")
         block, at = builder._block, builder._anchor
@@ -442,8 +462,7 @@ def _read_fields_of_values() -> None:
     def stored(self: Any) -> Any:
         builder, (block, last) = self._builder, self._behind
         here, at, before = builder._block, builder._anchor, len(builder._block.instructions)
-        with builder.goto_entry_block():
-            place = builder.alloca(self._be_type)
+        place = _place(builder, self._be_type)
         behind = [one for one in (last, place) if one is not None and one.parent is block]
         builder._block = block
         builder._anchor = max((block.instructions.index(one) + 1 for one in behind), default=0)
@@ -464,12 +483,21 @@ def _read_fields_of_values() -> None:
         value = self.__dict__.get("_read")
         return load(self, index) if value is None else self._builder.extract_value(value, index)
 
+    def set_field(self: Any, index: int, value: Any) -> None:
+        whole, block = self.__dict__.get("_read"), self._builder._block
+        if whole is None or self._behind[0] is not block or value.type != self._be_type.elements[index]:
+            store(self, index, value)
+            return
+        self._read = self._builder.insert_value(whole, value, index)
+        self._behind = block, self._read
+
     def whole(self: Any) -> Any:
         value = self.__dict__.get("_read")
         return self._builder.load(self._outer_ref) if value is None else value
 
     proxy: Any = cgutils.ValueStructProxy
-    proxy.__init__, proxy.__getattr__, proxy.__getitem__, proxy._getvalue = made, attribute, field, whole
+    proxy.__init__, proxy.__getattr__, proxy._getvalue = made, attribute, whole
+    proxy.__getitem__, proxy.__setitem__ = field, set_field
 
     make, arrays = arrayobj.make_array, {}
 
@@ -492,6 +520,227 @@ def _read_fields_of_values() -> None:
     for module in [m for name, m in sys.modules.items() if name.startswith("numba.")]:
         if getattr(module, "make_array", None) is make:
             vars(module)["make_array"] = make_array
+
+
+def _place(builder: Any, kind: Any) -> Any:
+    """A place in memory for what is always put there before it is taken: it needs no zero."""
+    with builder.goto_entry_block():
+        return builder.alloca(kind)
+
+
+class _Status:
+    """What a call came back with: worked out where somebody asks."""
+
+    def __init__(self, builder: Any, code: Any, told: Any, kind: Any) -> None:
+        self.code = code
+        self._builder, self._told = builder, told
+        self._may_be_none = kind is types.none or isinstance(kind, types.Optional)
+
+    def _is(self, how: str, code: Any) -> Any:
+        return self._builder.icmp_signed(how, self.code, code)
+
+    @property
+    def excinfoptr(self) -> Any:
+        return self._builder.load(self._told)
+
+    @property
+    def is_none(self) -> Any:
+        return self._is("==", callconv.RETCODE_NONE)
+
+    @property
+    def is_error(self) -> Any:
+        failed = self._is("!=", callconv.RETCODE_OK)
+        return (
+            self._builder.and_(failed, self._is("!=", callconv.RETCODE_NONE)) if self._may_be_none else failed
+        )
+
+    @property
+    def is_ok(self) -> Any:
+        return self._builder.not_(self.is_error)
+
+    @property
+    def is_python_exc(self) -> Any:
+        return self._is("==", callconv.RETCODE_EXC)
+
+    @property
+    def is_stop_iteration(self) -> Any:
+        return self._is("==", callconv.RETCODE_STOPIT)
+
+    @property
+    def is_user_exc(self) -> Any:
+        return self._is(">=", callconv.RETCODE_USEREXC)
+
+
+def _call_in_few_words(tried: set[str]) -> None:
+    """What is called tells of errors where its caller does, so that a code is all that a call brings back.
+
+    `tried` are the functions that may go on where something was raised.
+    """
+    convention: Any = callconv.CPUCallConv
+    call, propagate = convention.call_function, convention.return_status_propagate
+    telling = llvmlite.ir.PointerType(callconv.excinfo_ptr_t)
+
+    def called(
+        self: Any, builder: Any, callee: Any, kind: Any, kinds: Any, args: Any, attrs: Any = None
+    ) -> tuple[Any, Any]:
+        own = builder.function.args
+        if attrs is not None or len(own) < 2 or own[1].type != telling:
+            return call(self, builder, callee, kind, kinds, args, attrs)  # type: ignore[no-any-return]
+        returned = self.get_return_type(kind).pointee
+        place = _place(builder, returned)
+        if kind is types.none or isinstance(kind, types.Optional):
+            builder.store(cgutils.get_null_value(returned), place)
+        args = self._get_arg_packer(kinds).as_arguments(builder, args)
+        code = builder.call(callee, [place, own[1], *args])
+        value = self.context.get_returned_value(builder, kind, builder.load(place))
+        return _Status(builder, code, own[1], kind), value
+
+    def passed_on(self: Any, builder: Any, status: Any) -> None:
+        if type(status) is _Status and builder.function.name not in tried:
+            self._return_errcode_raw(builder, status.code)
+        else:
+            propagate(self, builder, status)
+
+    convention.call_function, convention.return_status_propagate = called, passed_on
+
+    context: Any = BaseContext
+    give, take = context.get_return_value, context.get_returned_value
+
+    def same(self: Any, kind: Any) -> bool:
+        model = self.data_model_manager[kind]
+        return bool(model.get_return_type() == model.get_value_type())
+
+    def given(self: Any, builder: Any, kind: Any, value: Any) -> Any:
+        return value if same(self, kind) else give(self, builder, kind, value)
+
+    def taken(self: Any, builder: Any, kind: Any, value: Any) -> Any:
+        return value if same(self, kind) else take(self, builder, kind, value)
+
+    context.get_return_value, context.get_returned_value = given, taken
+
+
+def _count_down_ranges() -> None:
+    """A range that goes by 1 or -1 needs no division to know how often, and each step of it no branch."""
+    context = cpu_target.target_context
+
+    def lower(kind: Any, iterator: Any) -> None:
+        begin = context._defns["getiter"].find((kind,))
+
+        def began(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            state = context.make_helper(builder, kind, args[0])
+            start, stop, step = state.start, state.stop, state.step
+            if type(step) is not llvmlite.ir.Constant or step.constant not in (1, -1):
+                return begin(context, builder, signature, args)
+            left = builder.sub(stop, start) if step.constant == 1 else builder.sub(start, stop)
+            none = left.type(0)
+            left = builder.select(builder.icmp_signed(">", left, none), left, none)
+            found = context.make_helper(builder, iterator)
+            found.iter, found.count = _place(builder, left.type), _place(builder, left.type)
+            found.stop, found.step = stop, step
+            builder.store(start, found.iter)
+            builder.store(left, found.count)
+            return found._getvalue()
+
+        def followed(context: Any, builder: Any, _: Any, args: Any, result: Any) -> None:
+            state = context.make_helper(builder, iterator, args[0])
+            left, value = builder.load(state.count), builder.load(state.iter)
+            result.set_valid(builder.icmp_signed(">", left, left.type(0)))
+            result.yield_(value)
+            builder.store(builder.sub(left, left.type(1), flags=["nsw"]), state.count)
+            builder.store(builder.add(value, state.step), state.iter)
+
+        following = imputils.iternext_impl(imputils.RefType.BORROWED)(followed)
+        context.insert_func_defn([(began, "getiter", (kind,)), (following, "iternext", (iterator,))])
+
+    for kinds in rangeobj.range_impl_map.values():
+        lower(*kinds)
+
+
+def _resolve_first(function: Any, resolve: Any, lower: Any, counts: Iterable[int]) -> None:
+    """Lower calls of a function in place where `resolve` gives a type for those of its arguments."""
+    context, typing = cpu_target.target_context, cpu_target.typing_context
+    name = f"evlcp {function.__name__}"
+
+    class InPlace(AbstractTemplate):
+        key = name
+
+        def generic(self, args: Any, kws: Any) -> Any:
+            kind = None if kws else resolve(self.context, args)
+            return None if kind is None else signature(kind, *args)
+
+    found: Any = typing.resolve_value_type(function)
+    found.templates = (InPlace, *found.templates)
+    context.insert_func_defn([(lower, name, (types.Any,) * count) for count in counts])
+
+
+def _ask_for_room_once() -> None:
+    """Arrays are made where they are asked for: what is called gives memory, whatever is to be in it."""
+
+    def memory(_: Any, array: Any) -> Any:
+        def taken(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            found = context.make_helper(builder, signature.args[0], args[0]).meminfo
+            return imputils.impl_ret_borrowed(context, builder, signature.return_type, found)
+
+        return types.MemInfoPointer(types.voidptr)(array), taken
+
+    memory_of: Any = intrinsic(memory)
+
+    def room(shape: Any) -> Any:
+        # By name, which leads to what Numba makes arrays by.
+        return memory_of(np.empty(shape, dtype=np.uint8))
+
+    of: Any = arrayobj
+
+    def resolve(_: Any, args: Any) -> Any:
+        if not 1 <= len(args) <= 2:
+            return None
+        axes, kind = of.ty_parse_shape(args[0]), types.float64
+        if len(args) == 2 and not (isinstance(args[1], types.Function) and args[1].typing_key is float):
+            kind = of.ty_parse_dtype(args[1])
+        plain = isinstance(kind, types.Number | types.Boolean)
+        return types.Array(kind, axes, "C") if axes and plain else None
+
+    def made(zeros: bool, context: Any, builder: Any, wanted: Any, args: Any) -> Any:
+        kind, of_shape = wanted.return_type, wanted.args[0]
+        shape, kinds = args[:1], [of_shape]
+        if hasattr(of_shape, "types"):
+            kinds, shape = of_shape.types, cgutils.unpack_tuple(builder, args[0])
+        sizes = [context.cast(builder, size, one, types.intp) for size, one in zip(shape, kinds, strict=True)]
+        item = context.get_constant(types.intp, arrayobj.get_itemsize(context, kind))
+        asked = types.MemInfoPointer(types.voidptr)(types.UniTuple(types.intp, kind.ndim + 1))
+        meminfo = context.compile_internal(
+            builder, room, asked, (cgutils.pack_array(builder, [*sizes, item]),)
+        )
+        data = context.nrt.meminfo_data(builder, meminfo)
+        strides = [item]
+        for size in reversed(sizes[1:]):
+            strides.insert(0, builder.mul(strides[0], size))
+        if zeros:
+            cgutils.memset(builder, data, builder.mul(strides[0], sizes[0]), 0)
+        array = context.make_helper(builder, kind)
+        pointer = context.get_data_type(kind.dtype).as_pointer()
+        arrayobj.populate_array(array, builder.bitcast(data, pointer), sizes, strides, item, meminfo)
+        return array._getvalue()
+
+    _resolve_first(np.empty, resolve, partial(made, False), (1, 2))
+    _resolve_first(np.zeros, resolve, partial(made, True), (1, 2))
+
+
+def _compare_in_place() -> None:
+    """The greater and the less of numbers are chosen where they are asked for."""
+
+    def resolve(context: Any, args: Any) -> Any:
+        numbers = len(args) > 1 and all(isinstance(kind, types.Integer | types.Float) for kind in args)
+        return context.unify_types(*args) if numbers else None
+
+    def choose(better: Any) -> Any:
+        def chosen(context: Any, builder: Any, wanted: Any, args: Any) -> Any:
+            return builtins.do_minmax(context, builder, wanted.args, args, better)
+
+        return chosen
+
+    for function, better in ((max, operator.gt), (min, operator.lt)):
+        _resolve_first(function, resolve, choose(better), (2, 3, 4))
 
 
 def _name_by_number() -> None:
@@ -547,8 +796,8 @@ def _look_for_no_lists() -> None:
         if _has(self.func_ir, ("build_list", "make_function")):
             inline(self)
 
-    def matches(self: Any, function: Any, *of: Any) -> Any:
-        return _has(function, ("build_list",)) and match(self, function, *of)
+    def matches(self: Any, function: Any, block: Any, *of: Any) -> Any:
+        return any(block.find_exprs("build_list")) and match(self, function, block, *of)
 
     closures.run, lists.match = run, matches
 

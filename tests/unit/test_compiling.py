@@ -90,10 +90,28 @@ def built(values):
 
 
 @njit(cache=True, nogil=True)
+def counted(first, last, most, wide):
+    """Ranges up, down, by more and of nothing, lengths of them, the less and the greater of many, zeros."""
+    up, down, by_two = np.zeros(last), np.zeros((last, 2), np.int16), np.zeros((2, wide, 3), np.bool_)
+    for i in range(first, last):
+        up[i] = max(most, i, 2.5) - min(i, wide, most)
+    for i in range(last - 1, first, -1):
+        down[i] = max(i, wide), min(i - 2, wide)
+    for i in range(first, last, 2):
+        by_two[i % 2, i % wide] = True
+    for i in range(last, first):
+        up[i] = np.nan
+    empty = np.empty((0, wide), np.float32)
+    lengths = len(range(first, last)), len(range(last, first)), len(range(last, first, -1))
+    return up, down, by_two, empty, lengths, (max(np.nan, most), max(most, np.nan), min(np.nan, most), i)
+
+
+@njit(cache=True, nogil=True)
 def refused(n):
-    if n < 0:
+    """Errors raised here, in what is called, and where no array can be made."""
+    if n == -1:
         raise ValueError("a count")
-    return np.ones(n).sum()
+    return np.ones(n).sum() + np.zeros((n, 2)).size + counted(0, n, 1.0, 2)[0].sum()
 '''
 
 RUN = """
@@ -110,10 +128,12 @@ images = rng.normal(size=(3, 8, 11)).astype(np.float32)
 said.extend(mine.mixed(images, rng.random(11), (2, 1, 9, 7), 0.3 - 1.7j))
 said.append(mine.sorted_up(rng.normal(size=9)))
 said.extend(mine.built(rng.normal(size=7)))
-try:
-    mine.refused(-1)
-except ValueError as error:
-    said.append(str(error))
+said.extend(mine.counted(np.uint32(1), 7, -0.5, np.int16(4)))
+for count in (-1, -2, 1 << 61):
+    try:
+        mine.refused(count)
+    except (ValueError, MemoryError) as error:
+        said.append(str(error))
 said.append(mine.refused(3))
 print([one.tolist() if hasattr(one, "tolist") else one for one in said])
 print(len(list(Path(mine.__file__).parent.rglob("*.nbc"))))
@@ -143,9 +163,9 @@ def test_kernels_of_the_child_give_the_same_bits(tmp_path: Path) -> None:
     whole, files = said(tmp_path / "whole", "whole")
     by_itself, more = said(tmp_path / "by", "by itself")
     assert whole == by_itself
-    assert whole.endswith("'a count', 3.0]")
+    assert "'a count', 'negative dimensions not allowed', 'array is too big" in whole
     # Parts are kept with what they are a part of.
-    assert (files, more) == (4, 6)
+    assert (files, more) == (5, 8)
 
 
 def test_another_version_of_numba_is_left_as_it_is(monkeypatch: pytest.MonkeyPatch) -> None:
