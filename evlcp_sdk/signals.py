@@ -4,7 +4,6 @@ import signal
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass
 from types import FrameType
 
 __all__ = ["ENDING", "EndRequest", "Stopped", "heard_by", "interrupt", "stop_on_request", "waiting"]
@@ -41,12 +40,13 @@ def heard_by(handler: Handler, *numbers: signal.Signals) -> Iterator[Callable[[]
         restore()
 
 
-@dataclass
 class _Asked:
     """What a signal has said, and whether it may end a wait."""
 
-    asked: bool = False
-    waits: bool = False
+    # Dataclasses would take longer to import than all of this.
+    def __init__(self) -> None:
+        self.asked = False
+        self.waits = False
 
 
 class EndRequest:

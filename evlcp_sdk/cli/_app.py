@@ -1,12 +1,16 @@
 """What the `evlcp` command line consists of, plugins' commands included."""
 
+import importlib
+import inspect
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from copy import copy
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
+from typer.models import CommandInfo, TyperInfo
 
 from evlcp_sdk.cli._common import echo, hush, log_on_stderr
 from evlcp_sdk.cli._front import print_front
@@ -30,12 +34,63 @@ Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] fai
 """
 
 
+_OWN = (
+    "receive",
+    "live",
+    "serve",
+    "convert",
+    "video",
+    "info",
+    "diagnose",
+    "compare",
+    "simulate",
+    "score",
+    "sweep",
+    "report",
+    "demo",
+    "calibrate",
+    "survey",
+    "config",
+    "plugins",
+    "check",
+    "warm_up",
+)
+"""Modules of our own commands, each of which adds the one that it is named after."""
+
 _SOON = frozenset({"receive", "live"})
-"""Commands that need none of a plugin's, and would wait for these a tenth of their start."""
+"""Commands that need neither others nor a plugin's, and would wait for these a tenth of their start."""
 
 
 class _Commands(TyperGroup):
     """The commands; what Typer says of a wrong command line repeats it, and moves no cursor either."""
+
+    late: Mapping[str, CommandInfo | TyperInfo] = {}
+    """Those that are built when they are asked for, by name: to build all takes long."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        return list(self.late) or super().list_commands(ctx)
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        # Where there is none, Typer says which of all those built are like it.
+        for name in [cmd_name] if cmd_name in self.late else self.late:
+            if name not in self.commands:
+                self.commands[name] = _built(name, self.late[name])
+        return super().get_command(ctx, cmd_name)
+
+    def first_words(self, ctx: Any) -> list[tuple[str, str]]:
+        """Name and help of each command that is shown."""
+        rows = []
+        for name in self.list_commands(ctx):
+            info = self.late.get(name)
+            if isinstance(info, CommandInfo):
+                said = info.short_help or info.help or inspect.getdoc(info.callback)
+                hidden = info.hidden
+            else:
+                command = self.commands[name] if info is None else _built(name, _childless(info))
+                said, hidden = command.short_help or command.help, command.hidden
+            if not hidden:
+                rows.append((name, said or ""))
+        return rows
 
     def make_context(self, *args: Any, **more: Any) -> Any:
         with _printable_faults():
@@ -91,30 +146,44 @@ def _printable_faults() -> Iterator[None]:
         raise
 
 
-def make_app() -> typer.Typer:
-    """The command line with its own commands; plugins add theirs by `evlcp_register_commands`."""
-    from evlcp_sdk.cli import (
-        calibrate,
-        check,
-        compare,
-        config,
-        convert,
-        demo,
-        diagnose,
-        info,
-        live,
-        plugins,
-        receive,
-        report,
-        score,
-        serve,
-        simulate,
-        survey,
-        sweep,
-        video,
-        warm_up,
-    )
+def _built(name: str, info: CommandInfo | TyperInfo) -> Any:
+    """A command or group, as Typer builds it."""
+    alone = typer.Typer(rich_markup_mode="rich", pretty_exceptions_enable=False)
+    if isinstance(info, CommandInfo):
+        alone.registered_commands.append(info)
+    else:
+        alone.registered_groups.append(info)
+    return typer.main.get_group(alone).commands[name]
 
+
+def _childless(info: TyperInfo) -> TyperInfo:
+    """A group without its commands."""
+    group = copy(info)
+    group.typer_instance = copy(info.typer_instance)
+    if group.typer_instance is not None:
+        group.typer_instance.registered_commands = []
+        group.typer_instance.registered_groups = []
+    return group
+
+
+def _called_late(app: typer.Typer) -> Any:
+    """The command line to call, its commands built when they are asked for."""
+    bare = copy(app)
+    bare.registered_commands, bare.registered_groups = [], []
+    group = typer.main.get_command(bare)
+    assert isinstance(group, _Commands)
+    group.late = {_name(command): command for command in app.registered_commands} | {
+        group.name or "": group for group in app.registered_groups
+    }
+    return group
+
+
+def make_app(*modules: str) -> typer.Typer:
+    """The command line with its own commands; plugins add theirs by `evlcp_register_commands`.
+
+    Args:
+        modules: Of these of `_OWN` alone; none for all.
+    """
     app = typer.Typer(
         name="evlcp",
         cls=_Commands,
@@ -124,23 +193,8 @@ def make_app() -> typer.Typer:
         help=HELP,
     )
     app.callback()(_root)
-    first = (
-        receive,
-        live,
-        serve,
-        convert,
-        video,
-        info,
-        diagnose,
-        compare,
-        simulate,
-        score,
-        sweep,
-        report,
-        demo,
-    )
-    for module in (*first, calibrate, survey, config, plugins, check, warm_up):
-        module.register(app)
+    for module in modules or _OWN:
+        importlib.import_module(f"evlcp_sdk.cli.{module}").register(app)
     return app
 
 
@@ -164,12 +218,13 @@ def add_plugin_commands(app: typer.Typer, registry: "Registry") -> None:
 
 def _names(app: typer.Typer) -> set[str]:
     """Names of its commands and groups, as they are called."""
-    named = {command.name or _called(command.callback) for command in app.registered_commands}
+    named = {_name(command) for command in app.registered_commands}
     return named | {group.name or "" for group in app.registered_groups}
 
 
-def _called(function: Any) -> str:
-    return str(function.__name__).replace("_", "-")
+def _name(command: CommandInfo) -> str:
+    """How a command is called, as Typer has it."""
+    return command.name or str(getattr(command.callback, "__name__", "")).lower().replace("_", "-")
 
 
 def _fault_of(added: typer.Typer, known: set[str]) -> str | None:
@@ -213,7 +268,6 @@ def run() -> None:
 
     from evlcp_sdk.cli._complain import complain
     from evlcp_sdk.errors import PluginWarning
-    from evlcp_sdk.plugin.registry import Registry
 
     others = warnings.showwarning
     said = set()
@@ -231,7 +285,10 @@ def run() -> None:
         warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
         hush()
-        app = make_app()
-        if not _SOON & set(sys.argv[1:2]):
+        soon = _SOON & set(sys.argv[1:2])
+        app = make_app(*soon)
+        if not soon:
+            from evlcp_sdk.plugin.registry import Registry
+
             add_plugin_commands(app, Registry.load())
-        app()
+        _called_late(app)()

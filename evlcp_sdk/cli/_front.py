@@ -15,7 +15,7 @@ def print_front(group: Any, ctx: Any) -> None:
     """Print usage, help, options and commands of a group whose options are plain flags.
 
     Args:
-        group: The group, as Typer builds it; its help is Rich's markup.
+        group: The group, as Typer builds it, with `first_words` of its commands; its help is Rich's markup.
         ctx: Its context.
     """
     from rich.console import Group
@@ -37,10 +37,8 @@ def print_front(group: Any, ctx: Any) -> None:
         if not o.hidden
     ]
     _print_panel(out, "Options", options)
-    names = group.list_commands(ctx)
-    commands = [group.get_command(ctx, name) for name in names]
-    shown = [c for c in commands if not c.hidden]
-    _print_panel(out, "Commands", [(Text(c.name, "bold cyan"), c.short_help or c.help) for c in shown])
+    shown = group.first_words(ctx)
+    _print_panel(out, "Commands", [(Text(name, "bold cyan"), said) for name, said in shown])
 
 
 def _print_panel(out: Any, title: str, rows: list[tuple[Any, ...]]) -> None:

@@ -1,5 +1,7 @@
 """`evlcp calibrate`."""
 
+from __future__ import annotations
+
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -67,7 +69,7 @@ def calibrate(
         console().print(_toml(found, len(known)))
 
 
-def _table(found: "Calibrated") -> dict[str, Any]:
+def _table(found: Calibrated) -> dict[str, Any]:
     return {
         "camera": {name: getattr(found.camera, name) for name in found.sigma},
         "sigma": dict(found.sigma),
@@ -79,7 +81,7 @@ def _table(found: "Calibrated") -> dict[str, Any]:
     }
 
 
-def _toml(found: "Calibrated", poses: int) -> str:
+def _toml(found: Calibrated, poses: int) -> str:
     """The tables `[camera]` and `[camera_sigma]`; as comments what was not determined."""
     lines = [
         f"# {counted(found.views, 'view')}, {counted(found.points, 'point')},"

@@ -1,5 +1,7 @@
 """`evlcp check`."""
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Annotated
 
@@ -163,18 +165,16 @@ def _check_one(
     raise typer.Exit(1 if failed else 0)
 
 
-def _law(outcome: "Verdict") -> dict[str, str]:
+def _law(outcome: Verdict) -> dict[str, str]:
     law = outcome.law
     return {"law": law.name, "says": law.says, "status": outcome.status, "detail": outcome.detail}
 
 
-def _counted(outcomes: "Sequence[Verdict]") -> str:
+def _counted(outcomes: Sequence[Verdict]) -> str:
     return ", ".join(f"{n} {s}" for s in _STYLES if (n := sum(o.status == s for o in outcomes)))
 
 
-def _link(
-    role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: "Registry"
-) -> "Link":
+def _link(role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: Registry) -> Link:
     """The link with the algorithm in its role."""
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.link.resolve import load_link, resolve
@@ -210,7 +210,7 @@ def _link(
     return resolve(changed, registry, source=link_file or "", overridden=overridden)
 
 
-def _alone(outcome: "Verdict", role: str, id: str) -> "Verdict":
+def _alone(outcome: Verdict, role: str, id: str) -> Verdict:
     """Without the hint to run what has just been run."""
     from dataclasses import replace
 
@@ -219,7 +219,7 @@ def _alone(outcome: "Verdict", role: str, id: str) -> "Verdict":
     return replace(outcome, detail=unhinted(outcome.detail, role, id))
 
 
-def _show(outcomes: "Sequence[Verdict]", width: int) -> None:
+def _show(outcomes: Sequence[Verdict], width: int) -> None:
     from rich.text import Text
 
     out = console()

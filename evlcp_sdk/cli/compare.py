@@ -1,5 +1,7 @@
 """`evlcp compare`."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -120,7 +122,7 @@ def _is_campaign(url: str) -> bool:
         return False
 
 
-def _of_results(path: Path) -> "Comparison":
+def _of_results(path: Path) -> Comparison:
     from evlcp_sdk.study.campaign.store import Store
     from evlcp_sdk.study.campaign.summary import summarize
     from evlcp_sdk.study.compare.campaigns import of_campaign
@@ -135,7 +137,7 @@ def _of_recordings(
     link_files: Sequence[str] | None,
     overrides: Sequence[str],
     workers: int,
-) -> tuple[int, "Comparison"]:
+) -> tuple[int, Comparison]:
     from evlcp_sdk.errors import InterruptedRunError
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.study.compare.recordings import comparison_of
@@ -166,7 +168,7 @@ def _of_recordings(
     return code, comparison_of(ordered, variants, registry.versions())
 
 
-def _run(job: CompareJob, *, variants: "tuple[Variant, ...]") -> "Table":
+def _run(job: CompareJob, *, variants: tuple[Variant, ...]) -> Table:
     """Compare the variants on one recording, here or in a worker."""
     from evlcp_sdk.study.compare.recordings import compare_recording
 
@@ -185,7 +187,7 @@ def _bar(job: CompareJob) -> Iterator[Callable[[int, int | None], None]]:
         yield advance
 
 
-def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
+def _write(comparison: Comparison, paths: Sequence[Path]) -> None:
     from evlcp_sdk.files import Outputs
 
     texts = {".csv": comparison.to_csv, ".html": comparison.to_html, ".json": comparison.to_json}
@@ -195,7 +197,7 @@ def _write(comparison: "Comparison", paths: Sequence[Path]) -> None:
         outputs.commit()
 
 
-def _show(comparison: "Comparison", paths: Sequence[Path]) -> None:
+def _show(comparison: Comparison, paths: Sequence[Path]) -> None:
     out = console()
     for one in comparison.tables:
         out.print(one.name, style="bold")

@@ -1,5 +1,7 @@
 """`evlcp convert`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import Annotated
 

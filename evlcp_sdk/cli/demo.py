@@ -1,5 +1,7 @@
 """`evlcp demo`."""
 
+from __future__ import annotations
+
 import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -113,7 +115,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     console().print(f"written: {written}", style="dim")
 
 
-def show_drive(summary: "Summary") -> None:
+def show_drive(summary: Summary) -> None:
     """Print BER and RMSE of each segment of distance beside the paper's."""
     from rich.table import Table
 
@@ -186,7 +188,7 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     _show_score(found)
 
 
-def _show_score(found: "Mapping[str, Any]") -> None:
+def _show_score(found: Mapping[str, Any]) -> None:
     (bar,) = found["bars"]
     rmse = "-" if bar["rmse_m"] is None else f"{bar['rmse_m']:.3f} m"
     console().print(
@@ -195,7 +197,7 @@ def _show_score(found: "Mapping[str, Any]") -> None:
     )
 
 
-def _show_frames(frames: "Sequence[Frame]") -> None:
+def _show_frames(frames: Sequence[Frame]) -> None:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="dim")

@@ -1,5 +1,7 @@
 """`evlcp diagnose`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -74,7 +76,7 @@ _STYLES = {
 }
 
 
-def _show(found: "Diagnosis") -> None:
+def _show(found: Diagnosis) -> None:
     from rich.table import Table
     from rich.text import Text
 

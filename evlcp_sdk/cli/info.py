@@ -1,5 +1,7 @@
 """`evlcp info`."""
 
+from __future__ import annotations
+
 from typing import Annotated, Any
 
 import typer

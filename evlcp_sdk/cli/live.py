@@ -1,5 +1,7 @@
 """`evlcp live`."""
 
+from __future__ import annotations
+
 import json
 import threading
 from contextlib import contextmanager
@@ -264,7 +266,7 @@ def live(
 
 
 @contextmanager
-def _going_on(outlet: "Outlet", *, silent: bool) -> "Iterator[None]":
+def _going_on(outlet: Outlet, *, silent: bool) -> Iterator[None]:
     """A line on stderr that says how it goes, on a terminal only, and not between lines of JSON."""
     from rich.live import Live
 
@@ -289,7 +291,7 @@ def _going_on(outlet: "Outlet", *, silent: bool) -> "Iterator[None]":
         thread.join()
 
 
-def going_text(status: "LiveStatus") -> str:
+def going_text(status: LiveStatus) -> str:
     """How a live run goes, in a line."""
     from evlcp_sdk.live.budget import LEVELS
 
@@ -307,7 +309,7 @@ def going_text(status: "LiveStatus") -> str:
     return f"{text}; {shed}" if shed else text
 
 
-def _say_where(services: "Services") -> None:
+def _say_where(services: Services) -> None:
     """Say on stderr where to look, and what else is served."""
     if services.view is not None:
         complain(f"look on at {services.view.url}")

@@ -3,6 +3,8 @@
 It imports nothing that takes time before it can be interrupted.
 """
 
+from __future__ import annotations
+
 import gc
 import os
 import sys

@@ -1,5 +1,7 @@
 """`evlcp plugins`."""
 
+from __future__ import annotations
+
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -33,7 +35,7 @@ def plugins(as_json: Json = False) -> None:
     echo(json.dumps(table, indent=2) if as_json else _text(table))
 
 
-def table_of(registry: "Registry") -> dict[str, list[dict[str, Any]]]:
+def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:
     """What is installed, as `--json` prints it: roles, algorithms, broken plugins."""
     from collections import Counter
 

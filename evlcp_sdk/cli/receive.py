@@ -1,5 +1,7 @@
 """`evlcp receive`."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -76,7 +78,7 @@ class ReceiveJob:
 
     url: str
     folder: Path | None
-    link: "Link | None" = None
+    link: Link | None = None
 
 
 def register(app: typer.Typer) -> None:
@@ -251,7 +253,7 @@ def receive(
     raise typer.Exit(worst or DEGRADED * degraded or int(strict and warned))
 
 
-def _fitted(job: ReceiveJob, link: "Link", registry: "Registry") -> ReceiveJob:
+def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
     """A job with the link that fits its recording best; says which."""
     from evlcp_sdk.io.open import STDIN, open_source
     from evlcp_sdk.study.diagnosis.diagnose import infer_link
@@ -274,14 +276,14 @@ def _fitted(job: ReceiveJob, link: "Link", registry: "Registry") -> ReceiveJob:
 def _decode_job(
     job: ReceiveJob,
     *,
-    links: "tuple[Link, ...]",
-    plan: "PositionPlan | None",
-    attitude: "Attitude | AttitudeLog | None",
-    clock_zero: "datetime | None",
+    links: tuple[Link, ...],
+    plan: PositionPlan | None,
+    attitude: Attitude | AttitudeLog | None,
+    clock_zero: datetime | None,
     pps: int | None,
     sinks: tuple[str, ...],
     lines: LinePrinter | None,
-    here: "tuple[Registry, EndRequest] | None",
+    here: tuple[Registry, EndRequest] | None,
 ) -> dict[str, Any]:
     """Decode a recording here, with a bar; or, without `here`, quietly in a worker."""
     from evlcp_sdk.run import receive_to_folder, stop_on_request

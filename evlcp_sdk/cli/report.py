@@ -1,5 +1,7 @@
 """`evlcp report`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -81,12 +83,12 @@ def report(
             console().print(f"written: {out}, {folder}/*.png, *.svg", style="dim")
 
 
-def show_series(summary: "Summary") -> None:
+def show_series(summary: Summary) -> None:
     """Print BER, RMSE and gross errors of every series, a row a segment."""
     _print(*_series_table(summary), names=2)
 
 
-def show_positions(summary: "Summary") -> None:
+def show_positions(summary: Summary) -> None:
     """Print what became of positions, a row a series, where there are any."""
     head, rows = _positions_table(summary)
     if rows:
@@ -94,7 +96,7 @@ def show_positions(summary: "Summary") -> None:
         _print(head, rows, names=1)
 
 
-def show_paper(summary: "Summary") -> None:
+def show_paper(summary: Summary) -> None:
     """Print the paper's figures beside those of the campaign."""
     head, rows = _paper_table(summary)
     if rows:
@@ -102,7 +104,7 @@ def show_paper(summary: "Summary") -> None:
         _print(head, rows, names=3)
 
 
-def as_markdown(summary: "Summary") -> str:
+def as_markdown(summary: Summary) -> str:
     """The same tables as Markdown."""
     parts = []
     for head, rows in (_paper_table(summary), _positions_table(summary), _series_table(summary)):
@@ -113,7 +115,7 @@ def as_markdown(summary: "Summary") -> str:
     return "\n\n".join(parts)
 
 
-def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
+def _series_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
     from evlcp_sdk.study.intervals import Figure, measure
     from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
@@ -148,18 +150,18 @@ def _series_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
     return head + (["positions", "half, 95 % within, m", "NEES of 3"] if positions else []), rows
 
 
-def _within(tally: "Tally") -> str:
+def _within(tally: Tally) -> str:
     half, most = (tally.position_quantile_m(share) for share in (0.5, 0.95))
     return f"{half:.3f}, {most:.3f}" if tally.fixes else "-"
 
 
-def _positions_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
+def _positions_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
     from evlcp_sdk.study.campaign.report import POSITION_HEAD, position_rows
 
     return list(POSITION_HEAD), [list(row) for row in position_rows(summary)]
 
 
-def _paper_table(summary: "Summary") -> tuple[list[str], list[list[str]]]:
+def _paper_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
     from evlcp_sdk.study.campaign.report import comparison_rows
     from evlcp_sdk.study.campaign.summary import beside_paper
 

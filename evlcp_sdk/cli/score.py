@@ -1,5 +1,7 @@
 """`evlcp score`."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any

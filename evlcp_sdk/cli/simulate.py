@@ -1,5 +1,7 @@
 """`evlcp simulate`."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,5 +1,7 @@
 """`evlcp survey`."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -114,7 +116,7 @@ def survey(
             console().print(_line(bar))
 
 
-def _line(bar: "SurveyedBar") -> str:
+def _line(bar: SurveyedBar) -> str:
     site = bar.site
     kind = f" ({site.link})" if site.link else ""
     return (

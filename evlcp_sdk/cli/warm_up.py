@@ -1,5 +1,7 @@
 """`evlcp warm-up`."""
 
+from __future__ import annotations
+
 import typer
 
 from evlcp_sdk.cli._common import Json, console, echo

@@ -1,5 +1,7 @@
 """`evlcp board`: program and watch driver boards."""
 
+from __future__ import annotations
+
 import contextlib
 from dataclasses import replace
 from enum import StrEnum
@@ -232,16 +234,16 @@ def _beside_inventory(context: typer.Context, *allowed: str) -> None:
         )
 
 
-def _report(as_json: bool) -> "Callable[[Result], None]":
+def _report(as_json: bool) -> Callable[[Result], None]:
     """Prints the result of each board of an inventory."""
 
-    def report(result: "Result") -> None:
+    def report(result: Result) -> None:
         say(result.line, result.to_dict(), as_json)
 
     return report
 
 
-def _on_fleet(context: typer.Context, path: Path, as_json: bool, work: "Work", *allowed: str) -> None:
+def _on_fleet(context: typer.Context, path: Path, as_json: bool, work: Work, *allowed: str) -> None:
     """Do something with all boards of an inventory; ends with the exit code of the first that fails."""
     from firmware_host.board.fleet import raise_failures, read_entries, run_fleet
 
@@ -337,7 +339,7 @@ def start(
 def stop(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
     """Finish the packet, then dark."""
 
-    def work(board: "Board") -> None:
+    def work(board: Board) -> None:
         board.stop()
         board.wait_dark()
 
@@ -380,7 +382,7 @@ def _start_together(
 
 
 def _simple(
-    context: typer.Context, inventory: Path | None, as_json: bool, work: "Callable[[Board], Any]", state: str
+    context: typer.Context, inventory: Path | None, as_json: bool, work: Callable[[Board], Any], state: str
 ) -> None:
     """A request or two, after which a board, or all of an inventory, is in a state."""
     if inventory is None:
@@ -389,7 +391,7 @@ def _simple(
         say("", {"state": state}, as_json)
         return
 
-    def on_board(_: "Entry", board: "Board") -> tuple[str, dict[str, Any]]:
+    def on_board(_: Entry, board: Board) -> tuple[str, dict[str, Any]]:
         work(board)
         return state, {"state": state}
 
@@ -443,7 +445,7 @@ def status(
             _show(status_table(board.status()), as_json)
         return
 
-    def work(_: "Entry", board: "Board") -> tuple[str, dict[str, Any]]:
+    def work(_: Entry, board: Board) -> tuple[str, dict[str, Any]]:
         found = status_table(board.status())
         faults = f", faults {', '.join(found['faults'])}" if found["faults"] else ""
         return f"{found['state']}, {found['packets_sent']} packets sent{faults}", {"status": found}
@@ -483,7 +485,7 @@ def monitor(
 
 def _watch_fleet(
     path: Path,
-    entries: "list[Entry]",
+    entries: list[Entry],
     interval: float,
     count: int | None,
     reconnect: bool,
@@ -511,7 +513,7 @@ def _watch_fleet(
 
     ended, printing = threading.Event(), threading.Lock()
 
-    def one(entry: "Entry") -> None:
+    def one(entry: Entry) -> None:
         for seen in watch(
             partial(board_of, entry, path.parent), interval, count, reconnect, reconnect, ended
         ):
@@ -531,7 +533,7 @@ def _watch_fleet(
             ended.set()
 
 
-def _print_seen(seen: "StatusReply | Gone | Back | Unheard", which: dict[str, Any], as_json: bool) -> None:
+def _print_seen(seen: StatusReply | Gone | Back | Unheard, which: dict[str, Any], as_json: bool) -> None:
     """A line of `monitor`: of a board that is there on stdout, of one that goes and comes on stderr."""
     from evlcp_sdk.cli._complain import complain
     from firmware_host.board.monitor import Back, Gone, Unheard
@@ -623,7 +625,7 @@ def save(
     For example: [bold]evlcp board --port /dev/ttyUSB0 save --autostart[/]
     """
 
-    def work(_: "Entry | None", board: "Board") -> tuple[str, dict[str, Any]]:
+    def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
         reply = board.save(autostart)
         table = {"slot": reply.slot, "save_sequence": reply.save_sequence, "autostart": autostart}
         return f"saved in slot {reply.slot}, number {reply.save_sequence}", table

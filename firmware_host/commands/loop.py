@@ -1,5 +1,7 @@
 """`evlcp loop`: a text by an emulated board to a simulated camera, and back."""
 
+from __future__ import annotations
+
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path

@@ -1,5 +1,7 @@
 """`evlcp tx message` and `evlcp tx keygen`: messages to packets, chips and boards."""
 
+from __future__ import annotations
+
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -178,7 +180,7 @@ def message(
         with BoardLine(port, baud, key=board_key).open() as board:
             stream = board.stream(link, ahead)
 
-            def next_one(number: int) -> "Iterator[NDArray[np.int64]] | None":
+            def next_one(number: int) -> Iterator[NDArray[np.int64]] | None:
                 at_s = clock_s() + stream.delay_s
                 over = ends_s is not None and number and at_s > ends_s + every
                 if over or (count is not None and number >= count):

@@ -1,5 +1,7 @@
 """`evlcp board stream`: packets onto a board as they come."""
 
+from __future__ import annotations
+
 import contextlib
 from collections.abc import Iterable, Iterator
 from enum import StrEnum
@@ -88,7 +90,7 @@ def stream(
     say(said_of(started), table_of(started), as_json)
 
 
-def said_of(stream: "Stream") -> str:
+def said_of(stream: Stream) -> str:
     """What a stream did, for a person."""
     table = table_of(stream)
     said = f"{table['packets']} packets, {table['round_trips']:.2f} round trips a packet"
@@ -97,7 +99,7 @@ def said_of(stream: "Stream") -> str:
     return f"{said}, no underrun"
 
 
-def table_of(stream: "Stream") -> dict[str, Any]:
+def table_of(stream: Stream) -> dict[str, Any]:
     """The same as plain values."""
     return {
         "packets": stream.sent,
@@ -107,8 +109,8 @@ def table_of(stream: "Stream") -> dict[str, Any]:
 
 
 def _packets(
-    file: Path, link: "Link", coder: "BlockCoder | None", transmitter_id: int, repeat: int
-) -> "Iterator[Iterable[NDArray[np.int64]] | None]":
+    file: Path, link: Link, coder: BlockCoder | None, transmitter_id: int, repeat: int
+) -> Iterator[Iterable[NDArray[np.int64]] | None]:
     """Packets (frames, clusters) of each line as it comes; None while none does."""
     import json
     import time

@@ -1,5 +1,7 @@
 """`evlcp tx`: what a transmitter would send."""
 
+from __future__ import annotations
+
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -66,7 +68,7 @@ def frames(
     echo(_FORMS[form](table, link))
 
 
-def _words(codes: "NDArray[np.uint8]") -> list[str]:
+def _words(codes: NDArray[np.uint8]) -> list[str]:
     """Codes as words in hex, the last chip the least significant bit; empty ones of no chips."""
     from evlcp_sdk.air.codebook import word_of_chips
 
@@ -76,7 +78,7 @@ def _words(codes: "NDArray[np.uint8]") -> list[str]:
     return [f"{word_of_chips(code):0{width}x}" for code in codes]
 
 
-def _table(symbols: "NDArray[np.int64]", link: "Link") -> str:
+def _table(symbols: NDArray[np.int64], link: Link) -> str:
     pilots, info = _words(link.codebook.pilots), _words(link.codebook.codewords)
     none = "-".rjust(len(pilots[0]))
     lines = ["packet frame cluster symbol pilot info"]
@@ -88,7 +90,7 @@ def _table(symbols: "NDArray[np.int64]", link: "Link") -> str:
     return "\n".join(lines)
 
 
-def _hex(symbols: "NDArray[np.int64]", link: "Link") -> str:
+def _hex(symbols: NDArray[np.int64], link: Link) -> str:
     pilots, info = _words(link.codebook.pilots), _words(link.codebook.codewords)
     return "\n".join(
         " ".join(
@@ -99,7 +101,7 @@ def _hex(symbols: "NDArray[np.int64]", link: "Link") -> str:
     )
 
 
-def _c(symbols: "NDArray[np.int64]", link: "Link") -> str:
+def _c(symbols: NDArray[np.int64], link: Link) -> str:
     from evlcp_sdk.errors import ConfigError
 
     book = link.codebook
@@ -121,7 +123,7 @@ def _c(symbols: "NDArray[np.int64]", link: "Link") -> str:
     return "\n".join([*lines, "};"])
 
 
-def _json(symbols: "NDArray[np.int64]", link: "Link") -> str:
+def _json(symbols: NDArray[np.int64], link: Link) -> str:
     import json
 
     from firmware_host.board.symbols import symbols_table
