@@ -36,6 +36,7 @@ import numpy as np
 from road import Clock
 
 from evlcp_sdk.clock import CameraClock
+from evlcp_sdk.io import DEFAULT_MAX_EVENTS
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.rx import detection
 from evlcp_sdk.rx.framing import PacketFraming
@@ -45,7 +46,6 @@ from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.values import Events
 
-PIECE = 1 << 16
 PAPER = "ranging.id=poc", "decoding.id=wh-transform"
 COMMON = "every event", "the rest"
 EVEN = "selecting", "following"
@@ -103,8 +103,8 @@ def bars_beside(many: int, seconds: float) -> Events:
 def received(link: Link, events: Events) -> tuple[float, int]:
     """Processor time, s, to receive events; frames."""
     receiver, begin_s = Receiver(link), time.process_time()
-    for first in range(0, len(events), PIECE):
-        receiver.feed(events[first : first + PIECE])
+    for first in range(0, len(events), DEFAULT_MAX_EVENTS):
+        receiver.feed(events[first : first + DEFAULT_MAX_EVENTS])
     receiver.close()
     return time.process_time() - begin_s, receiver.counts["frames"]
 

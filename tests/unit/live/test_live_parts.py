@@ -182,10 +182,12 @@ class Counted(EventSource):
         self.live = live
         self.pieces: Iterator[int] = iter(range(1000))
         self.fault = fault
+        self.all_taken = threading.Event()
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         n = next(self.pieces, None)
         if n is None:
+            self.all_taken.set()
             if self.fault:
                 raise self.fault
             return None
@@ -195,9 +197,11 @@ class Counted(EventSource):
         pass
 
 
-def read_all(reader: Reader, wait_s: float) -> list[int]:
+def read_all(reader: Reader, source: Counted) -> list[int]:
+    """What a reader gives that has read all there is, or all that it may, before it is asked."""
     reader.start()
-    time.sleep(wait_s)
+    if source.live:
+        assert source.all_taken.wait(60)
     got = []
     while not reader.ended:
         piece = reader.take(0.05)
@@ -207,16 +211,19 @@ def read_all(reader: Reader, wait_s: float) -> list[int]:
 
 
 def test_a_file_waits_for_its_reader_and_a_camera_does_not() -> None:
-    reader = Reader(Counted(live=False), most_events=50)
-    assert read_all(reader, 0.05) == list(range(1000))
+    source = Counted(live=False)
+    reader = Reader(source, most_events=50)
+    assert read_all(reader, source) == list(range(1000))
     assert (reader.dropped, reader.fault) == (0, None)
-    reader = Reader(Counted(live=True), most_events=50)
-    got = read_all(reader, 0.2)
+    source = Counted(live=True)
+    reader = Reader(source, most_events=50)
+    got = read_all(reader, source)
     assert got == list(range(1000 - len(got), 1000))
     assert reader.dropped == 10 * (1000 - len(got)) > 0
     fault = InputError("unplugged")
-    reader = Reader(Counted(live=True, fault=fault))
-    assert len(read_all(reader, 0.0)) == 1000
+    source = Counted(live=True, fault=fault)
+    reader = Reader(source)
+    assert len(read_all(reader, source)) == 1000
     assert reader.fault is fault
 
 
