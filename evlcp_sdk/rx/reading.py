@@ -107,8 +107,9 @@ class FrameReader:
             PluginError: The decoding or the ranging fails, or gives what it may not.
         """
         look = shown.look
+        sums = look.sums
         soft = self._steps.decode(look.presence, look.sums_and_next, shown.before, self._behind[shown.index])
-        lit = still_lit(look.sums, look.presence, self._pilot_chips, self._least_activity)
+        lit = still_lit(sums, look.presence, self._pilot_chips, self._least_activity)
         given = believed(soft, look.placement.seen & lit)
         if not shown.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
@@ -118,8 +119,8 @@ class FrameReader:
         distance = _NO_RANGE
         if shown.ranged:
             whole = self._looker.whole(look)
-            distance = self._steps.measure(FrameView(look.sums, look.offset_px, whole, soft))
-        heard = look.sums[: self._pilot_chips]
+            distance = self._steps.measure(FrameView(sums, look.offset_px, whole, soft))
+        heard = sums[: self._pilot_chips]
         points_px, sigma_px, flank_px = self._find_points(look.presence, look.placement, heard)
         points_px = points_px + look.corner_px
         centre_px = self._looker.centre(look, points_px)
