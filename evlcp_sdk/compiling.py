@@ -419,9 +419,10 @@ def _keep_values_of_variables(functions_tried: set[str]) -> None:
         return load(self, name) if value is None else value
 
     def stored(self: Any, value: Any, name: str, argidx: Any = None) -> None:
-        once = name in self._set_once
-        if not once or _holds_references(self.context, self.typeof(name)):
-            store(self, value, name, argidx)
+        once, counted = name in self._set_once, _holds_references(self.context, self.typeof(name))
+        if not once or counted:
+            # Where nothing is counted, what was there is not looked at, as an argument's place is not.
+            store(self, value, name, argidx if counted else 0)
         if once:
             self._values[name] = value
 
