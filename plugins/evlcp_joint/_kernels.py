@@ -95,7 +95,8 @@ def straight(x: Array, y: Array) -> tuple[float, float]:
     """Slope and intercept of the line through the medians (Theil-Sen), robust against outliers."""
     n = x.size
     values = np.empty(max(n * (n - 1) // 2, n))
-    m = 0
+    # A literal 0 would make a median of its own.
+    m: Any = np.int64(0)
     for i in range(n):
         for j in range(i + 1, n):
             if abs(x[j] - x[i]) > 1e-9:
@@ -894,7 +895,7 @@ def fit_bar(
             by_value,
             scores,
         )
-        used = 0
+        used: Any = np.int64(0)
         for b in range(boundaries):
             if shifts[1, b] > 0:
                 sizes[used] = abs(shifts[0, b])
