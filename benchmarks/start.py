@@ -5,7 +5,8 @@
 Each command runs in a process of its own, and all its children count, orphans, too. Bytecode is kept, as that
 of an installed package is; an interpreter that does nothing stands beside. Warm: the kernels are kept by an
 earlier run. Cold: none are; tried once a checkout, as it takes long. Beside another checkout, both
-run in turn and the ratio of the least times is printed.
+run in turn, each by the interpreter of its own `.venv` if it has one, and the ratio of the least times is
+printed.
 """
 
 import argparse
@@ -32,7 +33,8 @@ def spent_s(checkout: Path, cache: Path, *arguments: str) -> float:
         "NUMBA_CACHE_DIR": str(cache),
     }
     silence = os.open(os.devnull, os.O_RDWR)
-    command = [sys.executable, "-P", "-c", code, *arguments]
+    own = checkout / ".venv" / "bin" / "python"
+    command = [str(own) if own.exists() else sys.executable, "-P", "-c", code, *arguments]
     files = [(os.POSIX_SPAWN_DUP2, silence, 1), (os.POSIX_SPAWN_DUP2, silence, 2)]
     first = os.posix_spawn(command[0], command, environment, file_actions=files)
     os.close(silence)

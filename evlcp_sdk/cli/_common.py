@@ -2,6 +2,7 @@
 
 import logging
 import os
+import sys
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated
 
@@ -33,6 +34,7 @@ __all__ = [
     "hush",
     "log_on_stderr",
     "make_executor",
+    "shows_bars",
 ]
 
 LinkFile = Annotated[
@@ -147,9 +149,18 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     return Processes(workers or os.cpu_count() or 1)
 
 
+def shows_bars() -> bool:
+    """Whether stderr may be a terminal for Rich, which takes a while to load."""
+    told = os.environ.get("FORCE_COLOR") or os.environ.get("TTY_COMPATIBLE")
+    return bool(told) or (sys.stderr is not None and sys.stderr.isatty())
+
+
 @contextmanager
 def bytes_bar(name: str) -> "Iterator[Advance]":
     """A bar by bytes read, on a terminal only; of what has no size it says how much, or how long it took."""
+    if not shows_bars():
+        yield lambda _done, _of: None
+        return
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
     err = console(stderr=True)

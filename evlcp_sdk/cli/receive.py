@@ -22,6 +22,7 @@ from evlcp_sdk.cli._common import (
     echo,
     hush,
     make_executor,
+    shows_bars,
 )
 from evlcp_sdk.cli._receiving import (
     AttitudeFile,
@@ -354,9 +355,12 @@ def _stem(url: str) -> str:
 @contextmanager
 def _recordings_bar(number: int) -> Iterator[Callable[[], None]]:
     """A bar by recordings, on a terminal only; none for 0."""
+    if not number or not shows_bars():
+        yield lambda: None
+        return
     from rich.progress import Progress
 
     err = console(stderr=True)
-    with Progress(console=err, transient=True, disable=not (number and err.is_terminal)) as bar:
+    with Progress(console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("recordings", total=number)
         yield lambda: bar.advance(task)

@@ -3,26 +3,29 @@
 import io
 import re
 from pathlib import Path
-from typing import Final
+from typing import TYPE_CHECKING, Final
 from urllib.parse import unquote
 
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
 from evlcp_sdk.files import Outputs, is_there
-from evlcp_sdk.io.bags import is_bag, open_bag
-from evlcp_sdk.io.camera import open_camera
 from evlcp_sdk.io.faery import FORMATS, FaerySource
-from evlcp_sdk.io.hdf5 import MAGIC, Hdf5Source, open_hdf5
-from evlcp_sdk.io.lists import SUFFIXES, ListSource, is_list, open_list
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
-from evlcp_sdk.io.ros import EventBagWriter
 from evlcp_sdk.io.streams import SCHEMES, open_stream
 from evlcp_sdk.io.tables import CSV_HEADER, CsvSource, CsvWriter, NpzSource, NpzWriter
 from evlcp_sdk.io.urls import flag, positive, split_options
 from evlcp_sdk.io.writers import EventWriter
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
+
+if TYPE_CHECKING:
+    from evlcp_sdk.io import bags, camera, hdf5, lists, ros
+else:
+    # What most runs do not read.
+    _late = ("bags", "camera", "hdf5", "lists", "ros")
+    bags, camera, hdf5, lists, ros = (Late(f"evlcp_sdk.io.{name}") for name in _late)
 
 __all__ = ["STDIN", "is_recording", "open_source", "open_writer", "read_events", "write_events"]
 
@@ -76,13 +79,13 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
     if scheme[1].lower() == "replay":
         return _open_replay(str(url), registry)
     if scheme[1].lower() == "bag":
-        return open_bag(str(url))
+        return bags.open_bag(str(url))
     if scheme[1].lower() == "hdf5":
-        return open_hdf5(str(url))
+        return hdf5.open_hdf5(str(url))
     if scheme[1].lower() == "list":
-        return open_list(str(url))
+        return lists.open_list(str(url))
     if scheme[1].lower() == "camera":
-        return open_camera(str(url))
+        return camera.open_camera(str(url))
     if scheme[1].lower() in SCHEMES:
         return open_stream(str(url))
     asked = sorted(registry.plugins("evlcp_open_events"))
@@ -152,29 +155,31 @@ def _open_file(path: Path | str) -> EventSource:
     target = Path(path)
     if target.suffix.lower() in FORMATS:
         return FaerySource(path)
-    if target.is_dir() and is_bag(target, b""):
-        return open_bag(target)
+    if target.is_dir() and bags.is_bag(target, b""):
+        return bags.open_bag(target)
     try:
         special = target.exists() and not target.is_file() and not target.is_dir()
         start = b"% " if special else _first_bytes(target)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
     suffix = _suffix(target)
-    if is_bag(target, start):
-        return open_bag(target)
-    if start.startswith(MAGIC):
-        return Hdf5Source(path)
-    if start.startswith(b"% ") and suffix not in SUFFIXES:
+    if start.startswith(b"% ") and suffix == ".raw":
+        return RawSource(path)
+    if bags.is_bag(target, start):
+        return bags.open_bag(target)
+    if start.startswith(hdf5.MAGIC):
+        return hdf5.Hdf5Source(path)
+    if start.startswith(b"% ") and suffix not in lists.SUFFIXES:
         return RawSource(path)
     if start.startswith(b"PK\x03\x04") or suffix == ".npz":
-        return ListSource(path) if start and is_list(target) else NpzSource(path)
+        return lists.ListSource(path) if start and lists.is_list(target) else NpzSource(path)
     if start.startswith(CSV_HEADER):
         return CsvSource(path)
     if start.startswith(b"\x1f\x8b") or suffix in (".csv", ".csv.gz"):
         # Of what is neither the list says more.
-        return ListSource(path) if start and is_list(target) else CsvSource(path)
-    if start and not special and is_list(target):
-        return ListSource(path)
+        return lists.ListSource(path) if start and lists.is_list(target) else CsvSource(path)
+    if start and not special and lists.is_list(target):
+        return lists.ListSource(path)
     return RawSource(path)  # which says what is wrong
 
 
@@ -232,7 +237,7 @@ def open_writer(
     if width is None or height is None:
         raise StreamError(f"{path}: sensor of {width}x{height}, expected a width and a height for {name}")
     if name == "BAG":
-        return EventBagWriter(path, width, height, outputs)
+        return ros.EventBagWriter(path, width, height, outputs)
     return RawWriter(path, width, height, CODECS[name], outputs)
 
 

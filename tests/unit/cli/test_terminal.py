@@ -104,6 +104,7 @@ def test_a_bar_has_no_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """With another thread, kernels would be compiled in this process, which takes 300 MB."""
     said = StringIO()
     screen = Console(file=said, force_terminal=True, width=80)
+    monkeypatch.setattr(_common, "shows_bars", lambda: True)
     monkeypatch.setattr(_common, "console", lambda stderr: screen)
     before = threading.active_count()
     with bytes_bar("night.raw") as advance:
