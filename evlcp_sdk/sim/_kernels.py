@@ -280,6 +280,22 @@ def _logarithm(f: Array, bits: Array, of: int, spare: int, n: int) -> None:
         f[of + i] = k * 0.693147180369123816490 + (k * 1.90821492927058770002e-10 + p * s)
 
 
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _fill(which: Array, n: int) -> int:
+    """Repeat the first of `n` lanes until there are a multiple of `_EVEN`; return how many are then."""
+    even = (n + _EVEN - 1) // _EVEN * _EVEN
+    for a in range(n, even):
+        which[a] = which[0]
+    return even
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _take(f: Array, row: int, which: Array, n: int, out: int) -> None:
+    """Write the numbers of `n` lanes in a row side by side."""
+    for a in range(n):
+        f[out + a] = f[np.uint64(row + which[a])]
+
+
 @njit(cache=True, nogil=True, error_model="numpy", fastmath={"contract"})
 def _run_piece(
     lanes: int,
@@ -351,17 +367,16 @@ def _run_piece(
         blind += kind[i] >> 1
     while True:
         # Those that see again in this piece, and of them those that may fire.
-        even = (blind + _EVEN - 1) // _EVEN * _EVEN
-        for a in range(blind, even):
-            again[a] = again[0]
+        even = _fill(again, blind)
+        _take(f, _U, again, even, _M_U)
+        _take(f, _REST, again, even, _M_REST)
+        _take(f, _END, again, even, _M_END)
+        _take(f, _ON, again, even, _M_ON)
+        _take(f, _OFF, again, even, _M_OFF)
+        _take(f, _READY, again, even, _M_READY)
+        _take(f, _NOW, again, even, _M_AGE)
         for a in range(even):
-            i = again[a]
-            f[_M_U + a] = f[np.uint64(_U + i)]
-            f[_M_REST + a] = f[np.uint64(_REST + i)]
-            f[_M_END + a] = f[np.uint64(_END + i)]
-            f[_M_ON + a] = f[np.uint64(_ON + i)]
-            f[_M_OFF + a] = f[np.uint64(_OFF + i)]
-            f[_M_AGE + a] = (f[np.uint64(_READY + i)] - t_us) * per_charge * f[np.uint64(_NOW + i)]
+            f[_M_AGE + a] = (f[_M_READY + a] - t_us) * per_charge * f[_M_AGE + a]
         _decay(f, bits, _M_AGE, _M_KEPT, even)
         for a in range(even):
             rest, end = f[_M_REST + a], f[_M_END + a]
@@ -378,10 +393,7 @@ def _run_piece(
             m += kind[a]
         if m == 0:
             break
-        # Loops over a multiple of the vectors' length have no rest to do one by one.
-        even = (m + _EVEN - 1) // _EVEN * _EVEN
-        for a in range(m, even):
-            which[a] = which[0]
+        even = _fill(which, m)
         for a in range(even):
             k = np.uint64(which[a])
             word = _mix(key[k] + np.uint64(draw[k]) * np.uint64(0xD1B54A32D192ED03))
@@ -396,30 +408,34 @@ def _run_piece(
         # By itself, so that many parts of the table are on their way at once.
         for a in range(even):
             f[_M_SHIFT + a] = _table_at(shifts, f[_M_SHIFT + a])
+        _take(f, _REFERENCE, which, even, _M_REFERENCE)
+        _take(f, _END, which, even, _M_END)
+        _take(f, _ON, which, even, _M_ON)
+        _take(f, _OFF, which, even, _M_OFF)
+        for a in range(even):
+            end = f[_M_END + a]
+            level = f[_M_REFERENCE + a] * f[_M_SHIFT + a]
+            low, high = level * f[_M_ON + a], level * f[_M_OFF + a]
+            on = end <= low
+            f[_M_LEVEL + a] = low if on else high
+            f[_M_ON + a] = 1.0 if on else 0.0
+            kind[a] = 1 if on | (end >= high) else 0
         # Those that fire move to the front.
         fires = 0
         for a in range(m):
-            i = which[a]
-            reference, end = f[np.uint64(_REFERENCE + i)], f[np.uint64(_END + i)]
-            low = reference * f[np.uint64(_ON + i)] * f[_M_SHIFT + a]
-            high = reference * f[np.uint64(_OFF + i)] * f[_M_SHIFT + a]
-            on = end <= low
-            f[_M_LEVEL + fires] = low if on else high
-            f[_M_ON + fires] = 1.0 if on else 0.0
-            f[_M_FATE + fires] = f[_M_FATE + a]
-            which[np.uint64(fires)] = i
-            fires += int(on | (end >= high))
+            k = np.uint64(fires)
+            f[np.uint64(_M_LEVEL) + k] = f[_M_LEVEL + a]
+            f[np.uint64(_M_ON) + k] = f[_M_ON + a]
+            f[np.uint64(_M_FATE) + k] = f[_M_FATE + a]
+            which[k] = which[a]
+            fires += kind[a]
         if fires == 0:
             break
-        even = (fires + _EVEN - 1) // _EVEN * _EVEN
-        for a in range(fires, even):
-            which[a] = which[0]
-        for a in range(even):
-            i = which[a]
-            f[_M_U + a] = f[np.uint64(_U + i)]
-            f[_M_REST + a] = f[np.uint64(_REST + i)]
-            f[_M_READY + a] = f[np.uint64(_READY + i)]
-            f[_M_LAST_OUT + a] = f[np.uint64(_LAST_OUT + i)]
+        even = _fill(which, fires)
+        _take(f, _U, which, even, _M_U)
+        _take(f, _REST, which, even, _M_REST)
+        _take(f, _READY, which, even, _M_READY)
+        _take(f, _LAST_OUT, which, even, _M_LAST_OUT)
         if jitter > 0.0:
             for a in range(fires):
                 k = np.uint64(which[a])
@@ -642,6 +658,7 @@ def run_pixels(
     pixels: Array,
     batches: Array,
     masks: Array,
+    strides: Array,
     width: int,
     state: Array,
     counters: Array,
@@ -685,7 +702,8 @@ def run_pixels(
     """Run batches [first, last) of pixels through one block of time; return (next batch, number of events).
 
     It ends early, at a batch for which the output might have no room. Batch j is pixels[batches[j]] up to
-    pixels[batches[j + 1]], `LANES` at the most; bit i of `masks[j]` says that source i lights them.
+    pixels[batches[j + 1]], `LANES` at the most; bit i of `masks[j]` says that source i lights them, and they
+    see where the sources are anew in every `strides[j]`-th pose only.
 
     The light on a pixel is constant between the entries of a time line, the first where the block begins:
     when the image moves (`line_kind` -2), when the share of all light that passes changes (-1), and when the
@@ -726,7 +744,7 @@ def run_pixels(
     for j in range(first, last):
         if n + LANES * most_events > out_t.size:
             return j, n
-        begin, count, mask = batches[j], batches[j + 1] - batches[j], masks[j]
+        begin, count, mask, stride = batches[j], batches[j + 1] - batches[j], masks[j], strides[j]
         lanes = count if followed else (count + _EVEN - 1) // _EVEN * _EVEN
         _leave_empty(count, lanes, f, key, draw, code)
         for i in range(count):
@@ -751,7 +769,12 @@ def run_pixels(
                 shining += 1
         own = 0
         for e in range(entries):
-            if line_kind[e] < 0 or (mask >> np.uint64(line_kind[e])) & np.uint64(1):
+            what = line_kind[e]
+            if what == -2:
+                takes = line_pose[e] % stride == 0
+            else:
+                takes = what == -1 or (mask >> np.uint64(what)) & np.uint64(1) != np.uint64(0)
+            if takes:
                 mine[own] = e
                 own += 1
         pose = -1
@@ -759,9 +782,12 @@ def run_pixels(
             e = mine[q]
             t_us = line_t[e]
             until = line_t[mine[q + 1]] if q + 1 < own else end_us
-            moved = line_pose[e] != pose
-            pose = line_pose[e]
-            if moved and pose % texture_every == 0:
+            before = pose
+            pose = line_pose[e] // stride * stride
+            moved = pose != before
+            # Where the sources are in the middle of these poses.
+            here = min(pose + stride // 2, poses - 1)
+            if before < 0 or pose // texture_every != before // texture_every:
                 for i in range(lanes):
                     now = texture_at(field, f[_X + i] + turn_px[pose, 0], f[_Y + i] + turn_px[pose, 1])
                     f[_AROUND + i] = background[1] + background[0] * now
@@ -775,9 +801,9 @@ def run_pixels(
                 stale = switched
                 for h in range(halos):
                     every = halo_every[h]
-                    follows = moved and (pose == 0 if every == 0 else pose % every == 0)
+                    follows = before < 0 or (every > 0 and pose // every != before // every)
                     if follows:
-                        at = poses // 2 if every == 0 else pose
+                        at = poses // 2 if every == 0 else here
                         _place(lanes, f, origin[0, g, at], origin[1, g, at], axis[0, g, at], axis[1, g, at])
                         half = 0.5 * strip_px[g, at]
                         for i in range(lanes):
@@ -796,24 +822,24 @@ def run_pixels(
                             wide[a, h, i] = far[a, h, i] * (left + between[a, h, i] * (right - left))
                 if moved:
                     _place(
-                        lanes, f, origin[0, g, pose], origin[1, g, pose], axis[0, g, pose], axis[1, g, pose]
+                        lanes, f, origin[0, g, here], origin[1, g, here], axis[0, g, here], axis[1, g, here]
                     )
                     nearest = furthest = f[_ALONG]
                     beyond = False
                     reach = near_reach[g]
                     for i in range(count):
                         nearest, furthest = min(nearest, f[_ALONG + i]), max(furthest, f[_ALONG + i])
-                        beyond |= abs(f[_ACROSS + i]) < reach + 0.5 * strip_px[g, pose]
+                        beyond |= abs(f[_ACROSS + i]) < reach + 0.5 * strip_px[g, here]
                     b = 0
-                    while b < clusters[g] and bounds[g, b + 1, pose] <= nearest - reach:
+                    while b < clusters[g] and bounds[g, b + 1, here] <= nearest - reach:
                         b += 1
                     m = b
-                    while beyond and m < clusters[g] and bounds[g, m, pose] < furthest + reach:
+                    while beyond and m < clusters[g] and bounds[g, m, here] < furthest + reach:
                         m += 1
                     low[a], high[a] = b, m
                     if m > b:
                         _near_weights(
-                            lanes, f, strip_px[g, pose], bounds[g, b : m + 1, pose], gain[g] * near_share,
+                            lanes, f, strip_px[g, here], bounds[g, b : m + 1, here], gain[g] * near_share,
                             near_tables[g], near_scale[g], reach, rows, nodes, beside, weight[a],
                         )  # fmt: skip
                 if moved or stale:
@@ -822,9 +848,9 @@ def run_pixels(
                     for b in range(low[a], high[a]):
                         level = levels[row, b]
                         if level != 0.0:
-                            of = (b - low[a]) * LANES
+                            of = np.uint64((b - low[a]) * LANES)
                             for i in range(lanes):
-                                part[a, i] += weight[a, of + i] * level
+                                part[a, i] += weight[a, of + np.uint64(i)] * level
                     for h in range(halos):
                         for i in range(lanes):
                             part[a, i] += wide[a, h, i]
@@ -896,17 +922,6 @@ def background_events(
             out_code[n] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1 | on
             n += 1
             k += 1
-    return n
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def find_hot_pixels(pixels: int, share: float, seed: Any, out: Array) -> int:
-    """Mark the hot pixels, each by its own hash; return how many."""
-    n = 0
-    for pixel in range(pixels):
-        if hash_uniform(seed, pixel, 0, 9) < share:
-            out[n] = pixel
-            n += 1
     return n
 
 

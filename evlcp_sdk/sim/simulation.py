@@ -39,6 +39,8 @@ _CELL_US = 1000.0
 _CELLS = 4
 _BLOCK_US = _CELLS * _CELL_US
 _STRETCH = 8  # blocks
+_FAR_PX = (3.0, 6.0, 12.0)  # whence the image moves twice as far before the light is computed anew
+_SAME_DEPTH = 0.0026  # of the depth
 _MOST_MOVES = 40
 _MOST_MOVES_STRUCK = 400
 _BLOOM_EVERY = 8  # poses
@@ -63,7 +65,7 @@ def sensor_vector(sensor: SensorSpec) -> Floats:
     )
 
 
-def quantile_table(nodes: int = 16_385) -> Floats:
+def quantile_table(nodes: int = 4097) -> Floats:
     """Quantiles of the normal distribution between its cut-offs, evenly spaced in probability."""
     edge = ndtr(-_kernels.NOISE_LIMIT)
     table: Floats = ndtri(edge + np.linspace(0, 1, nodes) * (1 - 2 * edge))
@@ -79,29 +81,38 @@ def _texture(scene: Scene) -> Floats:
     """Background light relative to its mean: a periodic log-normal field, float64 (512, 512)."""
     n = _TEXTURE_SIZE
     rng = np.random.default_rng([scene.seed, 0x7E])
-    frequency = np.hypot(np.fft.fftfreq(n)[:, None], np.fft.rfftfreq(n)[None, :])
-    spectrum = np.fft.rfft2(rng.normal(size=(n, n))) * np.exp(
-        -0.5 * (2 * math.pi * frequency * scene.background.texture_px / 2) ** 2
-    )
-    field = np.fft.irfft2(spectrum, s=(n, n))
-    field -= field.mean()
-    field *= scene.background.texture / field.std()
-    light = np.exp(field)
+    # White noise behind a Gaussian, drawn where that lets anything pass: within 9 of its sigmas.
+    sigma = 1 / (math.pi * scene.background.texture_px)
+    k = min(n // 2 - 1, math.ceil(9 * sigma * n))
+    rows = np.arange(-k, k + 1)
+    noise = rng.normal(size=(2, 2 * k + 1, k + 1))
+    passed = np.exp(-0.5 * (rows[:, None] ** 2 + rows[None, k:] ** 2) / (sigma * n) ** 2)
+    # Of the waves that do not change along a row each is drawn together with its own opposite.
+    passed[:, 0] *= math.sqrt(2)
+    spectrum = np.zeros((n, n // 2 + 1), complex)
+    spectrum[rows, : k + 1] = (noise[0] + 1j * noise[1]) * passed
+    log_light = np.fft.irfft2(spectrum, s=(n, n))
+    log_light -= log_light.mean()
+    log_light *= scene.background.texture / log_light.std()
+    light = np.exp(log_light)
     return np.ascontiguousarray(light / light.mean())
 
 
-def _merge(marked: list[NDArray[np.int64]]) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
-    """All pixels of several lists, sorted, each with the set of lists that it is in."""
+def _merge(
+    marked: list[NDArray[np.int64]], far: list[NDArray[np.uint8]]
+) -> tuple[NDArray[np.int32], NDArray[np.uint64], NDArray[np.uint8]]:
+    """All pixels of several lists, sorted, each with the lists that it is in and its least distance."""
     if not marked:
-        return np.empty(0, np.int32), np.empty(0, np.uint64)
-    pixels = np.concatenate(marked)
+        return np.empty(0, np.int32), np.empty(0, np.uint64), np.empty(0, np.uint8)
+    pixels, beyond = np.concatenate(marked), np.concatenate(far)
     bits = np.repeat(np.uint64(1) << np.arange(len(marked), dtype=np.uint64), [len(m) for m in marked])
     if len(marked) > 1:
         order = np.argsort(pixels, kind="stable")
-        pixels, bits = pixels[order], bits[order]
+        pixels, bits, beyond = pixels[order], bits[order], beyond[order]
         first = np.flatnonzero(np.append(True, pixels[1:] != pixels[:-1]))
         pixels, bits = pixels[first], np.bitwise_or.reduceat(bits, first)
-    return pixels.astype(np.int32), bits
+        beyond = np.minimum.reduceat(beyond, first)
+    return pixels.astype(np.int32), bits, beyond
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,18 +199,59 @@ def _time_line(
 
 
 def _batches(
-    pixels: NDArray[np.int32], masks: NDArray[np.uint64]
-) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.uint64]]:
-    """Put together pixels that the same sources light: pixels, where each batch begins, its sources."""
+    pixels: NDArray[np.int32], masks: NDArray[np.uint64], far: NDArray[np.uint8], most_poses: int
+) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.uint64], NDArray[np.int64]]:
+    """Put together pixels that the same sources light, about as near.
+
+    They see where the sources are anew after `most_poses` at the latest.
+
+    Returns:
+        The arguments of `run_pixels` from `pixels` to `strides`.
+    """
     if not len(pixels):
-        return pixels, np.zeros(1, np.int64), masks
+        return pixels, np.zeros(1, np.int64), masks, np.zeros(0, np.int64)
+    order = np.argsort(far, kind="stable")
+    pixels, masks, far = pixels[order], masks[order], far[order]
     if (masks != masks[0]).any():
         order = np.argsort(masks, kind="stable")
-        pixels, masks = pixels[order], masks[order]
+        pixels, masks, far = pixels[order], masks[order], far[order]
     cuts = np.flatnonzero(masks[1:] != masks[:-1]) + 1
     edges = [0, *cuts.tolist(), len(pixels)]
     begins = np.concatenate([np.arange(a, b, _kernels.LANES) for a, b in pairwise(edges)])
-    return pixels, np.append(begins, len(pixels)), masks[begins]
+    # The first of a batch is the nearest.
+    strides = np.minimum(np.int64(1) << far[begins].astype(np.int64), most_poses)
+    return pixels, np.append(begins, len(pixels)), masks[begins], strides
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """How a source looks while its depth hardly changes.
+
+    Attributes:
+        depth_m: That depth.
+        blur: The image of a point.
+        near: Its `strip_table`.
+        scale_px: The scale of that.
+        z_px: Distances from its middle across it, or from its end, px, float64 (n,).
+        across: Light of an endless strip so far from its middle, W/m2, float64 (n,).
+        along: Light in the middle of a strip so far before its end, W/m2, float64 (n,).
+        halos: Share of each cluster's light in each halo on a grid, float64 (clusters, places), halo by halo.
+    """
+
+    depth_m: float
+    blur: Blur
+    near: Floats
+    scale_px: float
+    z_px: Floats
+    across: Floats
+    along: Floats
+    halos: list[Floats]
+
+    def reach_px(self, least_w_m2: float) -> tuple[float, float]:
+        """How far across it and before its ends it gives so much light."""
+        across = self.z_px[self.across >= least_w_m2].max(initial=0)
+        along = self.z_px[self.along >= least_w_m2].max(initial=0)
+        return float(across), float(along)
 
 
 @dataclass(frozen=True, eq=False)
@@ -225,6 +277,13 @@ class _Stretch:
     wiped: tuple[Floats, Floats]
 
 
+def _between(slope: float, low: Floats, high: Floats) -> tuple[Floats, Floats]:
+    """From where to where a line with this slope through 0 is between two heights."""
+    # A level line is never, or always, between them; a slope of nothing stands for its own.
+    slope = math.copysign(max(abs(slope), 1e-9), slope)
+    return np.minimum(low / slope, high / slope), np.maximum(low / slope, high / slope)
+
+
 def _part(changes: tuple[Floats, Floats], begin_us: float, end_us: float) -> tuple[Floats, Floats]:
     """Of times of change, with what holds before, between and after them, those inside a block."""
     when, held = changes
@@ -239,6 +298,7 @@ class _Block:
     pixels: NDArray[np.int32]
     batches: NDArray[np.int64]
     masks: NDArray[np.uint64]
+    strides: NDArray[np.int64]
     shared: tuple[Any, ...]
 
 
@@ -285,18 +345,29 @@ class Simulation:
         size = scene.camera.width * scene.camera.height
         self._state = np.zeros((size, 9))
         self._counters = np.zeros((size, 3), np.int64)
-        hot = np.empty(size, np.int64)
-        self._hot = hot[: _kernels.find_hot_pixels(size, scene.sensor.hot_share, self._key, hot)].copy()
+        rng = np.random.default_rng([scene.seed, 0x40])
+        self._hot = rng.choice(size, rng.binomial(size, scene.sensor.hot_share), replace=False)
         self._halos = [_Halo.of(scene.lens.halo, scene.lens.halo_px, 0)]
         # A halo of few pixels follows the image; a wide one changes little while it moves for 4 ms.
         self._texture_every = max(1, round(scene.background.texture_step_px / MOTION_STEP_PX))
         if scene.lens.bloom > 0:
             self._halos.append(_Halo.of(scene.lens.bloom, scene.lens.bloom_px, _BLOOM_EVERY))
+        self._halo_grids = (
+            np.array([-one.reach_px for one in self._halos]),
+            np.array([one.per_px for one in self._halos]),
+            np.array([one.share for one in self._halos]),
+            np.array([one.every for one in self._halos]),
+        )
+        self._halo_tables = (
+            np.stack([one.table for one in self._halos]),
+            np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]),
+        )
         self._near_share = 1 - sum(halo.share for halo in self._halos)
         self._wide_reach = max(halo.reach_px for halo in self._halos)
         self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
         self._done_us = 0.0
         self._stretch: _Stretch | None = None
+        self._looks: dict[int, _Look] = {}
 
     def _check_ahead(self) -> None:
         centres = np.array([bar.centre_m for bar in self.bars]).reshape(-1, 3)
@@ -342,22 +413,27 @@ class Simulation:
                 ]
                 yield from self._given(served.of(number, end, signal), end)
             return
-        # While the pixels of a block run, the next is prepared and the last one's events are read out.
+        # While the pixels of a block run, the next is prepared; whichever thread finds no more of them reads
+        # out the last one's events, and is not waited for before the next one's pixels run.
         with ThreadPoolExecutor(self._threads) as pool:
             ahead = pool.submit(self._prepare, *spans[0][1:])
             behind: Future[Events] | None = None
+            waiting: list[_Requests] = []
             for number, begin, end in spans:
                 block = ahead.result()
                 if end < end_us:
                     ahead = pool.submit(self._prepare, *spans[number + 1][1:])
                 running = [pool.submit(job) for job in self._jobs(number, block, begin, end)]
+                events = behind.result() if behind is not None else None
+                if number > 0:
+                    behind = pool.submit(served.of, number - 1, begin, waiting)
                 # Whoever takes the events works beside the pixels.
-                if behind is not None:
-                    yield from self._given(behind.result(), begin)
-                signal = [part for one in running for part in one.result()]
-                behind = pool.submit(served.of, number, end, signal)
+                if events is not None:
+                    yield from self._given(events, begin - _BLOCK_US)
+                waiting = [part for one in running for part in one.result()]
             if behind is not None:
-                yield from self._given(behind.result(), end_us)
+                yield from self._given(behind.result(), spans[-1][1])
+            yield from self._given(served.of(len(spans) - 1, end_us, waiting), end_us)
 
     def _given(self, events: Events, end_us: float) -> Iterator[Events]:
         """The events up to `end_us`, if there are any."""
@@ -417,7 +493,15 @@ class Simulation:
                     most,
                 )
                 state = (self.scene.camera.width, self._state, self._counters, number, end_us)
-                arguments = (block.pixels, block.batches, block.masks, *state, *block.shared, *room)
+                arguments = (
+                    block.pixels,
+                    block.batches,
+                    block.masks,
+                    block.strides,
+                    *state,
+                    *block.shared,
+                    *room,
+                )
                 first, n = _kernels.run_pixels(first, last, *arguments)
                 found.append((t[:n], code[:n]))
             return found
@@ -449,6 +533,25 @@ class Simulation:
         middles = 0.5 * (starts + np.append(starts[1:], end_us))
         return starts, middles
 
+    def _look(self, source: Source, depth_m: float, strip_px: float, cuts_px: Floats) -> _Look:
+        """How a source looks at this depth, where its clusters start and end so far along it."""
+        scene = self.scene
+        blur = blur_of(depth_m, scene.lens, scene.camera, source.blur_px)
+        scale = _NEAR_SCALE * float(blur.sigma_px[0])
+        near = strip_table(blur, strip_px, scale, _NEAR_NODES)
+        z = np.arange(0, self._wide_reach, 0.25)
+        half = strip_px / 2
+        node, nodes = _NEAR_NODES * z / (z + scale), np.arange(_NEAR_NODES + 1)
+        across = self._near_share * np.interp(node, nodes, near[:, -1])
+        along = self._near_share * np.interp(node, nodes, near[0, _NEAR_NODES::-1])
+        for halo in self._halos:
+            part = halo.step(z + half) - halo.step(z - half)
+            across += halo.share * part
+            along += halo.share * part[0] * halo.step(-z)
+        light = source.light_w_m2
+        halos = [halo.along(cuts_px) for halo in self._halos]
+        return _Look(depth_m, blur, near, scale, z, light * across, light * along, halos)
+
     def _stretch_at(self, begin_us: float) -> _Stretch:
         """The stretch of time with the block that begins then."""
         if self._stretch is None or not self._stretch.begin_us <= begin_us < self._stretch.end_us:
@@ -474,7 +577,7 @@ class Simulation:
     def _prepare(self, begin_us: float, end_us: float) -> _Block | None:
         """Where the sources are in a block, how they switch, and which pixels they may excite."""
         scene = self.scene
-        camera, lens, sensor = scene.camera, scene.lens, scene.sensor
+        camera, sensor = scene.camera, scene.sensor
         stretch = self._stretch_at(begin_us)
         of_block = slice(*np.searchsorted(stretch.starts_us, (begin_us, end_us)))
         starts, attitude = stretch.starts_us[of_block], stretch.attitude[of_block]
@@ -482,29 +585,39 @@ class Simulation:
         wiped_us, shade = _part(stretch.wiped, begin_us, end_us)
         lightest = float(shade.max())
         darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._darkest_texture * shade.min())
-        shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Blur, Floats]] = []
+        shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Floats, Floats, _Look]] = []
         marked: list[NDArray[np.int64]] = []
-        for source, (places, depths), sent in zip(self._sources, stretch.seen, stretch.sent, strict=True):
+        beyond: list[NDArray[np.uint8]] = []
+        for number, source in enumerate(self._sources):
+            (places, depths), sent = stretch.seen[number], stretch.sent[number]
             place, depth = places[of_block], depths[of_block]
             if depth.min() <= NEAREST_M:
                 continue
             middle_depth = depth.mean(1)
             strip_px = camera.focal_px * source.strip.width_m / middle_depth
-            blur = blur_of(float(middle_depth[len(middle_depth) // 2]), lens, camera, source.blur_px)
+            vector = place[:, -1] - place[:, 0]
+            axis = vector / np.hypot(*vector.T)[:, None]
+            bounds = ((place - place[:, :1]) * axis[:, None]).sum(-1)
+            m = len(place) // 2
+            depth_m = float(middle_depth[m])
+            look = self._looks.get(number)
+            if look is None or abs(depth_m / look.depth_m - 1) > _SAME_DEPTH:
+                # That of a depth that it is on its way to, so that it is as often too near as too far.
+                nearer = 1 + _SAME_DEPTH * float(np.sign(middle_depth[0] - middle_depth[-1]))
+                look = self._look(source, depth_m / nearer, float(strip_px[m]) * nearer, bounds[m] * nearer)
+                self._looks[number] = look
             least = ACTIVITY_FLOOR * max(darkest, sensor.charge_us_w_m2 / source.longest_us)
-            light = source.light_w_m2 * lightest
-            scale = _NEAR_SCALE * float(blur.sigma_px[0])
-            near = strip_table(blur, float(strip_px[len(strip_px) // 2]), scale, _NEAR_NODES)
-            lit = self._lit_pixels(place, float(strip_px.max()), near, scale, light, least)
+            lit, far = self._lit_pixels(place, 0.5 * float(strip_px.max()), look, least / lightest)
             if len(lit):
                 marked.append(lit)
-                shown.append((source, sent, place, strip_px, blur, near))
+                beyond.append(far)
+                shown.append((source, sent, place, strip_px, axis, bounds, look))
         around = scene.background.around_px
         if not shown and around < camera.width:
             return None
-        pixels, masks = _merge(marked)
+        pixels, masks, far = _merge(marked, beyond)
         if around > 0:
-            pixels, masks = self._with_background(pixels, masks, [place for _, _, place, *_ in shown])
+            pixels, masks, far = self._with_background(pixels, masks, far, [one[2] for one in shown])
 
         g = len(shown)
         most = max((source.strip.clusters for source, *_ in shown), default=1)
@@ -517,32 +630,27 @@ class Simulation:
         switches: list[Floats] = []
         levels_of: list[Floats] = []
         halos_of: list[list[Floats]] = [[] for _ in self._halos]
-        for i, (source, sent, place, strip_px, blur, near) in enumerate(shown):
+        for i, (source, sent, place, strip_px, along, cuts, look) in enumerate(shown):
             k = source.strip.clusters
-            vector = place[:, -1] - place[:, 0]
-            axis[:, i] = vector.T / np.hypot(*vector.T)
+            axis[:, i] = along.T
             origin[:, i] = place[:, 0].T
-            bounds[i, : k + 1] = ((place - place[:, :1]) * axis[:, i].T[:, None]).sum(-1).T
+            bounds[i, : k + 1] = cuts.T
             strips[i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
-            near_scale[i], near_reach[i] = _NEAR_SCALE * blur.sigma_px[0], blur.reach_px
-            tables[i] = near
+            near_scale[i], near_reach[i] = look.scale_px, look.blur.reach_px
+            tables[i] = look.near
             when, levels = _part(sent, begin_us, end_us)
             switches.append(when)
             levels_of.append(levels)
-            cut = bounds[i, : k + 1, poses // 2]
-            for one, of in zip(self._halos, halos_of, strict=True):
-                of.append(levels @ one.along(cut))
+            for of, share in zip(halos_of, look.halos, strict=True):
+                of.append(levels @ share)
         shared = (
             *_time_line(starts, wiped_us, shade, switches, levels_of, halos_of, most),
             origin, axis, bounds, strips, clusters, gain,
-            np.array([-one.reach_px for one in self._halos]), np.array([one.per_px for one in self._halos]),
-            np.array([one.share for one in self._halos]), np.array([one.every for one in self._halos]),
-            self._near_share, tables, near_scale, near_reach, np.stack([one.table for one in self._halos]),
-            np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]), turn,
+            *self._halo_grids, self._near_share, tables, near_scale, near_reach, *self._halo_tables, turn,
             self._texture_every, self._texture,
             np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
         )  # fmt: skip
-        return _Block(*_batches(pixels, masks), shared)
+        return _Block(*_batches(pixels, masks, far, self._texture_every), shared)
 
     def seen(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
         """Where a source's clusters start and end in the image, and their depths; see `project`."""
@@ -555,8 +663,12 @@ class Simulation:
         return place + np.array(pane.shift_px), depth
 
     def _with_background(
-        self, pixels: NDArray[np.int32], masks: NDArray[np.uint64], places: list[Floats]
-    ) -> tuple[NDArray[np.int32], NDArray[np.uint64]]:
+        self,
+        pixels: NDArray[np.int32],
+        masks: NDArray[np.uint64],
+        far: NDArray[np.uint8],
+        places: list[Floats],
+    ) -> tuple[NDArray[np.int32], NDArray[np.uint64], NDArray[np.uint8]]:
         """Add the pixels around the sources on which only the background moves, in the order of pixels."""
         width, height = self.scene.camera.width, self.scene.camera.height
         around = self.scene.background.around_px
@@ -568,64 +680,53 @@ class Simulation:
         flat = marked.ravel()
         flat[pixels] = True
         every = np.flatnonzero(flat).astype(np.int32)
-        found = np.zeros(len(every), np.uint64)
-        found[np.searchsorted(every, pixels)] = masks
-        return every, found
+        found, near = np.zeros(len(every), np.uint64), np.zeros(len(every), np.uint8)
+        known = np.searchsorted(every, pixels)
+        found[known], near[known] = masks, far
+        return every, found, near
 
     def _lit_pixels(
-        self,
-        place: Floats,
-        strip_px: float,
-        near: Floats,
-        scale_px: float,
-        light_w_m2: float,
-        least_w_m2: float,
-    ) -> NDArray[np.int64]:
+        self, place: Floats, half_px: float, look: _Look, least_w_m2: float
+    ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
         """Pixels, row by row, that a source lights by `least_w_m2` or more at any pose.
 
-        `near` is its `strip_table`, with this scale.
+        Returns:
+            The pixels, and how many of `_FAR_PX` they are from the strip, which is twice `half_px` wide.
         """
-        nothing = np.empty(0, np.int64)
-        z = np.arange(0, self._wide_reach, 0.25)
-        half = strip_px / 2
-        node, nodes = _NEAR_NODES * z / (z + scale_px), np.arange(_NEAR_NODES + 1)
-        # The light across an endless strip, and that before the end of one, in its middle.
-        across = self._near_share * np.interp(node, nodes, near[:, -1])
-        along = self._near_share * np.interp(node, nodes, near[0, _NEAR_NODES::-1])
-        for halo in self._halos:
-            part = halo.step(z + half) - halo.step(z - half)
-            across += halo.share * part
-            along += halo.share * part[0] * halo.step(-z)
-        across *= light_w_m2
-        along *= light_w_m2
-        if across[0] < least_w_m2:
+        nothing = np.empty(0, np.int64), np.empty(0, np.uint8)
+        if look.across[0] < least_w_m2:
             return nothing
-        reach_across = float(z[across >= least_w_m2].max(initial=0)) + 0.5
-        reach_along = float(z[along >= least_w_m2].max(initial=0)) + 0.5
-        first, last = place[:, 0], place[:, -1]
+        reach_across, reach_along = (reach + 0.5 for reach in look.reach_px(least_w_m2))
         middle = place[len(place) // 2]
-        wander = max(float(np.abs(end - end[len(end) // 2]).max()) for end in (first, last))
-        reach = max(reach_across, reach_along) + wander
-        height, width = self.scene.camera.height, self.scene.camera.width
-        left, top = np.floor(np.minimum(middle[0], middle[-1]) - reach).astype(int)
-        right, low = np.ceil(np.maximum(middle[0], middle[-1]) + reach).astype(int) + 1
-        left, top, right, low = max(left, 0), max(top, 0), min(right, width), min(low, height)
-        if left >= right or top >= low:
-            return nothing
         vector = middle[-1] - middle[0]
         length = float(np.hypot(*vector))
         axis = vector / length
-        dx, dy = np.arange(left, right) - middle[0, 0], (np.arange(top, low) - middle[0, 1])[:, None]
-        s, n = dx * axis[0] + dy * axis[1], dx * axis[1] - dy * axis[0]
         # How far the strip wanders across itself and along itself, from its place in the middle pose.
         away = place[:, [0, -1]] - middle[[0, -1]]
-        wander_along = float(np.abs(away @ axis).max())
-        wander_across = float(np.abs(away @ np.array([axis[1], -axis[0]])).max())
-        inside = np.abs(n) <= reach_across + wander_across
-        inside &= (s >= -reach_along - wander_along) & (s <= length + reach_along + wander_along)
-        y, x = np.nonzero(inside)
-        found: NDArray[np.int64] = (y + top) * width + x + left
-        return found
+        along = reach_along + float(np.abs(away @ axis).max())
+        across = reach_across + float(np.abs(away @ np.array([axis[1], -axis[0]])).max())
+        height, width = self.scene.camera.height, self.scene.camera.width
+        reach = math.hypot(along, across)
+        top = max(math.floor(min(middle[0, 1], middle[-1, 1]) - reach), 0)
+        low = min(math.ceil(max(middle[0, 1], middle[-1, 1]) + reach) + 1, height)
+        if top >= low:
+            return nothing
+        rows = np.arange(top, low)
+        dy = rows - middle[0, 1]
+        beside = _between(axis[1], dy * axis[0] - across, dy * axis[0] + across)
+        within = _between(axis[0], -along - dy * axis[1], length + along - dy * axis[1])
+        first = np.ceil(np.maximum(beside[0], within[0]) + middle[0, 0]).clip(0, width).astype(int)
+        last = np.floor(np.minimum(beside[1], within[1]) + middle[0, 0]).clip(-1, width - 1).astype(int)
+        counts = np.maximum(last - first + 1, 0)
+        begins = np.cumsum(counts) - counts
+        x = np.repeat(first - begins, counts) + np.arange(counts.sum())
+        y = np.repeat(rows, counts)
+        dx, dy = x - middle[0, 0], y - middle[0, 1]
+        aside = np.abs(dx * axis[1] - dy * axis[0]) - half_px
+        ahead = np.abs(dx * axis[0] + dy * axis[1] - 0.5 * length) - 0.5 * length
+        away_px = np.maximum(aside, ahead)
+        far = sum(((away_px >= px).view(np.uint8) for px in _FAR_PX), np.zeros(len(x), np.uint8))
+        return y * width + x, far
 
 
 class _Served:

@@ -64,7 +64,7 @@ def test_motion_feedback_helps() -> None:
     """Motion that is left where regions are not followed well costs bits: half of them and more come back."""
     cut = ("motion.distance_m=90.0", "motion.vib_rate_rad_s=0.24", "duration_s=0.3")
     soft, feedback = (
-        received("fast-drive", (1, 3), cut, (f"decoding.id={id}",)) for id in ("ml-soft", "motion-feedback")
+        received("fast-drive", (6, 10), cut, (f"decoding.id={id}",)) for id in ("ml-soft", "motion-feedback")
     )
     assert soft.bit_errors >= 10
     assert feedback.bit_errors <= 0.5 * soft.bit_errors

@@ -75,6 +75,23 @@ def test_how_many_blocks_are_worked_out_together_does_not_matter(
     assert same(events, every(scene))
 
 
+def test_what_is_worked_out_anew_less_often_changes_next_to_no_event(monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = load_scene("drive-30kmh", {"motion.distance_m": 30.0, "duration_s": 0.04})
+    simulated = Simulation(scene)
+    block = simulated._prepare(0.0, 4000.0)
+    assert block is not None
+    # Pixels far beside the strip are most of them and see only every second to eighth pose.
+    assert set(block.strides.tolist()) == {1, 2, 4, 8}
+    coarse = every(scene)
+    monkeypatch.setattr(simulation, "_FAR_PX", ())
+    monkeypatch.setattr(simulation, "_SAME_DEPTH", 0.0)
+    fine = every(scene)
+    assert len(coarse) == pytest.approx(len(fine), rel=1e-3)
+    # By the distance from the bar, px: within four sigmas of as many events that are drawn apart.
+    counts = [np.histogram(abs(one.x - np.median(one.x)), (0, 3, 6, 12, 24))[0] for one in (coarse, fine)]
+    assert (abs(counts[0] - counts[1]) < 4 * np.sqrt(counts[1])).all()
+
+
 def test_a_longer_scene_begins_with_the_shorter() -> None:
     long, short = every(replace(SHORT, duration_s=0.04)), every(SHORT)
     until = 27_900  # whole blocks of time: the last one is prepared for its own length

@@ -61,7 +61,7 @@ def test_parts_of_a_near_bar_are_no_frames_of_another() -> None:
     day = {"background.light_w_m2": 1.0, "bars.0.led_w_m2": None, "sensor.hold": True, "sensor.refr_us": 20.0}
     summary = receive_to_folder(rendered((), 0.045, {**near, **day, "bars.0.x_m": -0.9}), None)
     counts = summary["counts"]
-    assert counts["frames"] == 9
+    assert counts["frames"] == 13
     assert (counts["frames_rejected"], counts["frames_of_parts"] >= 10) == (0, True)
     assert summary["warnings"] == []
 

@@ -54,7 +54,7 @@ def code_of(diagnosis: Diagnosis) -> str:
         ("far", {"motion.distance_m": 400.0}),
         ("no-negative", {"sensor.p_off_miss": 0.98}),
         ("refractory", {"sensor.refr_us": 300.0}),
-        ("dim", {"bars.0.led_w_m2": 0.1}),
+        ("dim", {"bars.0.led_w_m2": 0.15}),
         ("defocus", {"lens.focus_m": 3.0, "duration_s": 0.06, "bars.0.led_w_m2": 30.0}),
         ("saturated", {"sensor.cap_mev_s": 1.5}),
         ("dark", {"bars.0.x_m": 30.0}),
