@@ -18,7 +18,7 @@ from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.look import Look, Looker
-from evlcp_sdk.rx.reading import FrameReader, Reading, Shown
+from evlcp_sdk.rx.reading import FrameReader, ReadableFrame, Reading
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Missed, Transmitter, Transmitters
@@ -314,12 +314,12 @@ class PacketFraming:
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | str:
         """Read a frame; of one that is not given, the count that it belongs to."""
-        shown = self._shown(transmitter, due)
+        shown = self._readable(transmitter, due)
         return (
             shown if isinstance(shown, str) else self._told(transmitter, due, shown, self._reader.read(shown))
         )
 
-    def _shown(self, transmitter: Transmitter, due: DueFrame) -> Shown | str:
+    def _readable(self, transmitter: Transmitter, due: DueFrame) -> ReadableFrame | str:
         """What is to be read of a frame; of one that does not show its clusters, the count it belongs to."""
         self._announcer.start()
         look = self._look(transmitter, due)
@@ -332,10 +332,10 @@ class PacketFraming:
             return "frames_rejected"
         ranged = due.has_pilot and self._is_ranged()
         attitude = self._attitude_at(self._clock.camera_us(look.middle_us)) if due.has_pilot else None
-        return Shown(look, due.index, due.has_pilot, self._before(transmitter, due), ranged, attitude)
+        return ReadableFrame(look, due.index, due.has_pilot, self._before(transmitter, due), ranged, attitude)
 
     def _told(
-        self, transmitter: Transmitter, due: DueFrame, shown: Shown, reading: Reading
+        self, transmitter: Transmitter, due: DueFrame, shown: ReadableFrame, reading: Reading
     ) -> Sighting | str:
         """A frame by what was read of it; of one that is not given, the count that it belongs to."""
         transmitter.said = due.number, reading.symbols

@@ -19,14 +19,14 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, sight_of
 from evlcp_sdk.values import FrameView, Range, SoftSymbols
 
-__all__ = ["FrameReader", "Reading", "Shown"]
+__all__ = ["FrameReader", "ReadableFrame", "Reading"]
 
 _NO_RANGE = Range(math.nan, math.nan, 0)
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
 
 @dataclass(frozen=True, eq=False)
-class Shown:
+class ReadableFrame:
     """A frame that shows its clusters, and what its reading depends on beside.
 
     Attributes:
@@ -100,7 +100,7 @@ class FrameReader:
         for chips in self._behind:
             chips.setflags(write=False)
 
-    def read(self, shown: Shown) -> Reading:
+    def read(self, shown: ReadableFrame) -> Reading:
         """What a frame says.
 
         Raises:

@@ -91,7 +91,7 @@ RX = (
     {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges", "timeline"},
     {"contest", "detected", "points", "spread", "steps"},
     {"look"},
-    {"echoes", "transmitters"},
+    {"echoes", "reading", "transmitters"},
     {"framed", "framing"},
     {"listener"},
     {"receiver"},
