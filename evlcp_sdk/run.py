@@ -174,6 +174,9 @@ class Reception(Iterator[Packet]):
             try:
                 for events in _events_of(self.source, self._pulses):
                     yield from self.receiver.feed(events)
+            except PluginError:
+                yield from self.receiver.left
+                raise
             except InputError:
                 yield from self.receiver.close()
                 raise
@@ -492,9 +495,10 @@ def _run(
                 except StopIteration:
                     break
                 except PluginError as fault:
-                    if not given:
+                    if not given and not receiver.left:
                         raise
                     # What it has let through is kept; the receiver cannot be asked for more.
+                    writer.write(receiver.left)
                     status, error, broken = "failed", str(fault), fault
                     break
                 if len(events):

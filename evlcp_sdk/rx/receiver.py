@@ -46,6 +46,9 @@ class Receiver:
             with their packet until their transmitter holds its place; where another link takes that from it,
             the count `frames_withdrawn` has those told of packets that are not given. None for nobody.
 
+    Attributes:
+        left: Packets that were complete when an algorithm failed in the last `feed`, which did not give them.
+
     Raises:
         ConfigError: Links that cannot be received together, or nothing tells them apart.
 
@@ -97,6 +100,7 @@ class Receiver:
             wait_us = max(listener.patience_us for listener in self._listeners)
             self._contest = Contest(list(links.values()), wait_us, first.regions.step_us)
         self._closed = False
+        self.left: list[Packet] = []
 
     @property
     def lit_us(self) -> dict[int, tuple[float, float]]:
@@ -144,16 +148,17 @@ class Receiver:
 
         Raises:
             StreamError: The stream was closed, or a polarity is neither 0 nor 1.
+            PluginError: An algorithm failed; `left` has the packets that were complete by then.
         """
         if self._closed:
             raise StreamError("the receiver is closed: make a new one for a new stream")
         if len(events) and events.p.max() > 1:
             raise StreamError(f"events with polarity {events.p.max()}, expected 0 or 1")
-        return [
-            packet
-            for step in self._timeline.feed(events, self._waits, self._due_us)
-            for packet in self._run(step)
-        ]
+        self.left = []
+        for step in self._timeline.feed(events, self._waits, self._due_us):
+            self.left += self._run(step)
+        packets, self.left = self.left, []
+        return packets
 
     def close(self) -> list[Packet]:
         """End the stream; return the packets that were still incomplete."""

@@ -272,22 +272,22 @@ def test_check_finds_it(role: str, id: str, evlcp: Evlcp) -> None:
 def test_what_was_received_before_it_failed_is_kept(evlcp: Evlcp, lamp_raw: Path, tmp_path: Path) -> None:
     """Packets that were given before the fault are in the files, whose summary says why they end."""
     from evlcp_sdk.errors import PluginError
-    from evlcp_sdk.io import open_source
     from evlcp_sdk.link.resolve import resolve
-    from evlcp_sdk.run import receive_to_folder
+    from evlcp_sdk.run import receive, receive_to_folder
 
     def gives(n: int) -> Any:
         return at(n, heard(float(n), packet=n - 8)) if n < 40 else boom()
 
     link = resolve({"bar": LAMP, "air": AIR, "framing": {"id": "uart"}, "detection": {"id": "whole"}})
     link = link.with_algorithm("framing", made(Uart, compile=lambda *_: Steps(gives))(), id="mine")
-    source = open_source(str(lamp_raw))
-    chunks = source.chunks
-    source.chunks = lambda *_, **__: chunks(10_000)  # type: ignore[method-assign]
     with pytest.raises(PluginError, match="framing algorithm 'mine': KeyError: 'boom'"):
-        receive_to_folder(source, tmp_path / "out", link)
+        receive_to_folder(lamp_raw, tmp_path / "out", link)
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["status"] == "failed"
     assert summary["error"].startswith("framing algorithm 'mine': KeyError: 'boom'")
     rows = (tmp_path / "out" / "frames.csv").read_text().splitlines()
     assert 5 < len(rows) - 1 <= 32
+    reception, packets = receive(lamp_raw, link), []
+    with pytest.raises(PluginError, match="framing algorithm 'mine': KeyError: 'boom'"):
+        packets += reception
+    assert sum(len(packet.frames) for packet in packets) == len(rows) - 1
