@@ -18,7 +18,7 @@ receiver works on one core; the table says what its time goes to, and what two c
   regions apart, no waiting  the same, as if no region ever shaped another
   reading handed on          the second core reads what the first has looked at
   all but the rest halved    each piece of work above the rest takes half, however that were done
-  both cores at once         two processes that each receive all: what this machine's caches leave of two
+  both cores at once         two processes that each receive all: what this machine leaves of two (machine.py)
 
 What is exchanged costs nothing in these, and selecting and following are halved though each core would have
 to look at every event: no program gets there. Times are processor times, the least of the rounds; the last
@@ -26,13 +26,14 @@ row is by the wall clock and means something on an idle machine only.
 """
 
 import argparse
-import multiprocessing
+import statistics
 import time
 from collections import Counter
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
+from machine import two_to_one
 from road import Clock
 
 from evlcp_sdk.clock import CameraClock
@@ -125,30 +126,6 @@ def split_s(steps: list[Step]) -> tuple[float, float]:
     return waits_s, common_s + float(own_s.max())
 
 
-def _works(link: Link, events: Events, rounds: int, gate: Any) -> None:
-    received(link, events)
-    gate.wait()
-    for _ in range(rounds):
-        received(link, events)
-    gate.wait()
-
-
-def at_once_s(link: Link, events: Events, cores: int, rounds: int) -> float:
-    """Wall time, s, in which each of some processes receives all events once."""
-    context = multiprocessing.get_context("fork")
-    gate = context.Barrier(cores + 1)
-    workers = [context.Process(target=_works, args=(link, events, rounds, gate)) for _ in range(cores)]
-    for worker in workers:
-        worker.start()
-    gate.wait()
-    begin_s = time.perf_counter()
-    gate.wait()
-    spent_s = time.perf_counter() - begin_s
-    for worker in workers:
-        worker.join()
-    return spent_s / rounds
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--bars", type=int, default=4)
@@ -187,8 +164,8 @@ def main() -> None:
     for name, spent_s in ideal.items():
         ratio = whole_s / spent_s
         print(f"  {name:26} {ratio:5.2f}: {ratio * long_s / plain_s:.2f} x real time")
-    one_s, two_s = (at_once_s(link, events, cores, args.rounds) for cores in (1, 2))
-    print(f"  {'both cores at once':26} {2 * one_s / two_s:5.2f}")
+    at_once = statistics.median(two_to_one(lambda: received(link, events), args.rounds))
+    print(f"  {'both cores at once':26} {at_once:5.2f}")
 
 
 if __name__ == "__main__":
