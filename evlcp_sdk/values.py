@@ -44,6 +44,7 @@ __all__ = [
     "Trust",
     "arrow_table",
     "pandas_frame",
+    "plain",
 ]
 
 _COLUMNS = (
@@ -717,6 +718,7 @@ class Fix:
 
 
 _V = TypeVar("_V")
+_S = TypeVar("_S", bound=np.generic)
 
 
 def changed(value: _V, **fields: Any) -> _V:
@@ -724,6 +726,14 @@ def changed(value: _V, **fields: Any) -> _V:
     other = object.__new__(type(value))
     vars(other).update(vars(value), **fields)
     return other
+
+
+def plain(array: NDArray[_S]) -> NDArray[_S]:
+    """An array as kernels take it: writeable, its elements side by side; a copy where it is not.
+
+    For each other kind Numba would compile a kernel once more, which takes seconds.
+    """
+    return array if array.flags.carray else array.copy()
 
 
 def pandas_frame(columns: Mapping[str, Any]) -> "pandas.DataFrame":

@@ -107,7 +107,7 @@ class RowDelays:
         if blocks < _FEWEST_BLOCKS:
             return math.nan, math.nan
         reach = _STEPS + _STEPS // 2
-        step_us = lock.chip_us / _STEPS
+        step_us = float(lock.chip_us) / _STEPS
         top_px = centre_px - (height_px - 1) / 2
         start_us = np.array([lock.delay_off_us, lock.delay_on_us]) + lock.packet_t_us - reach * step_us
         first_us = float(start_us.min())

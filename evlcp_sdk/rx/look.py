@@ -15,7 +15,7 @@ from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
-from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed
+from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed, plain
 
 if TYPE_CHECKING:
     from evlcp_sdk.rx import _kernels
@@ -326,17 +326,19 @@ def polarity_sums(
     # Rows wait for the bar's own, wherever they are.
     row_px = _kernels.hold_still(centre_px, width, height, shift, rest_px)
     sums = np.zeros((chips, height, width), np.int16)
-    on_us, off_us = start_us + lock.delay_on_us, start_us + lock.delay_off_us
+    # Whatever kinds of numbers a synchronization gives.
+    on_us, off_us = float(start_us + lock.delay_on_us), float(start_us + lock.delay_off_us)
+    chip_us, row_us = float(lock.chip_us), float(lock.row_us)
     for e in events:
         _kernels.add_polarity(
-            e.t_us,
-            e.x,
-            e.y,
-            e.p,
+            plain(e.t_us),
+            plain(e.x),
+            plain(e.y),
+            plain(e.p),
             on_us,
             off_us,
-            lock.chip_us,
-            lock.row_us,
+            chip_us,
+            row_us,
             row_px,
             shift,
             sums,

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.late import Late
-from evlcp_sdk.values import Events
+from evlcp_sdk.values import Events, plain
 
 if TYPE_CHECKING:
     from evlcp_sdk.rx import _kernels
@@ -142,10 +142,10 @@ class Rhythm:
             self._open_us, self._taken, self._rises = start_us, 0, 0
             self._grow_old(start_us >> self._shift)
         self._rises += _kernels.score_rises(
-            events.t_us[self._taken :],
-            events.x[self._taken :],
-            events.y[self._taken :],
-            events.p[self._taken :],
+            plain(events.t_us[self._taken :]),
+            plain(events.x[self._taken :]),
+            plain(events.y[self._taken :]),
+            plain(events.p[self._taken :]),
             self._pixels,
             hits,
             self._kinds,
@@ -266,7 +266,8 @@ def select(events: Events, box: tuple[int, int, int, int]) -> Events:
     """Those inside a box (left, top, right, bottom), in no more memory than twice what they need."""
     room = events.t_us.size + 1
     into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
-    n = _kernels.select_box(events.t_us, events.x, events.y, events.p, box, *into)
+    columns = plain(events.t_us), plain(events.x), plain(events.y), plain(events.p)
+    n = _kernels.select_box(*columns, box, *into)
     part = [column[:n] for column in into]
     return Events.as_is(*(column.copy() for column in part) if 2 * n < room else part)
 

@@ -14,7 +14,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Synchronization
-from evlcp_sdk.values import SyncLock, changed
+from evlcp_sdk.values import SyncLock, changed, plain
 
 if TYPE_CHECKING:
     from evlcp_barker import _kernels
@@ -216,8 +216,8 @@ class BarkerSynchronizer:
             # Half of a packet's correlations are positive.
             memory = n * self._packet.packet_chips // 2
             top, power, known = _kernels.listen(
-                t_us,
-                p,
+                plain(t_us),
+                plain(p),
                 (state.first_bin, self._bin_us, lo, lags - guard),
                 state.counts,
                 self._chips,

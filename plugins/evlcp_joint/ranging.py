@@ -16,7 +16,7 @@ from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Bend, FrameView, Range, changed
+from evlcp_sdk.values import Bend, FrameView, Range, changed, plain
 
 if TYPE_CHECKING:
     from evlcp_joint import _kernels
@@ -166,11 +166,11 @@ class JointScaleRanging(Ranging):
         def measure(view: FrameView) -> Range:
             by_boundary = np.empty((3, clusters + 1))
             spacing_px, sigma_px, tilt = _kernels.measure_column(
-                view.presence.selected,
+                plain(view.presence.selected),
                 view.presence.grid_px,
-                view.sums[:chips],
-                np.ascontiguousarray(view.offset_px[:, :chips]),
-                view.soft.symbols,
+                plain(view.sums[:chips]),
+                plain(view.offset_px[:, :chips]),
+                plain(view.soft.symbols.astype(np.int64, copy=False)),
                 pilots,
                 words,
                 when,

@@ -14,7 +14,7 @@ from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import FrameView, Range
+from evlcp_sdk.values import FrameView, Range, plain
 
 if TYPE_CHECKING:
     from evlcp_poc import _kernels
@@ -164,7 +164,7 @@ class PocRanging(Ranging):
         focal_px = camera.focal_px
 
         def measure(view: FrameView) -> Range:
-            maps = view.presence.pixels
+            maps = plain(view.presence.pixels)
             middle = np.empty((bar.clusters, 2), np.int64)
             which, whole_px = np.empty(len(a), np.int64), np.empty((len(a), 2))
             px_per_m, n = _kernels.chosen_pairs(

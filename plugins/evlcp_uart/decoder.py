@@ -640,7 +640,7 @@ class CharacterDecoder:
         end = max(known, max(stretch.start, stretch.seen) + _TOLD_CHARACTERS * self._length)
         if end >= stretch.end:
             return stretch
-        counts = stretch.counts[:, : end + self._length + 2 * _TAIL]
+        counts = np.ascontiguousarray(stretch.counts[:, : end + self._length + 2 * _TAIL])
         return Stretch(counts, stretch.start, stretch.seen, end)
 
     def _found(self, stretch: "Stretch") -> tuple[Light | None, bool]:

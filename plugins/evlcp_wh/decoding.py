@@ -10,7 +10,7 @@ from pydantic import Field
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
-from evlcp_sdk.values import PresenceMap, SoftSymbols
+from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
 
 if TYPE_CHECKING:
     from evlcp_wh import _kernels
@@ -42,8 +42,8 @@ class WhTransform(Decoding):
             symbols = np.empty(len(presence.probability), np.int64)
             llr = np.empty((len(symbols), m), np.float32)
             explained = _kernels.transformed(
-                sums[pilot_chips:],
-                presence.probability,
+                plain(sums[pilot_chips:]),
+                plain(presence.probability),
                 presence.grid_px,
                 self.min_weight,
                 by_value,

@@ -10,7 +10,7 @@ from pydantic import Field
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
-from evlcp_sdk.values import PresenceMap, SoftSymbols
+from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
 
 if TYPE_CHECKING:
     from evlcp_wh import _kernels
@@ -111,7 +111,8 @@ def learned_worth(
     """
     worth = np.empty((2 * max_events + 1, 2 * max_events + 1))
     grid = presence.grid_px
-    _kernels.learn_worth(sums, pilots, presence.probability, grid, max_events, prior_count, worth)
+    seen = plain(presence.probability)
+    _kernels.learn_worth(plain(sums), pilots, seen, grid, max_events, prior_count, worth)
     return worth
 
 
@@ -140,9 +141,9 @@ def soft_symbols(
     clusters, bits = len(pilots), len(words).bit_length() - 1
     symbols, llr = np.empty(clusters, np.int64), np.empty((clusters, bits), np.float32)
     quality, least = _kernels.read_frame(
-        sums,
+        plain(sums),
         pilots,
-        presence.probability,
+        plain(presence.probability),
         presence.grid_px,
         min_weight,
         worth,

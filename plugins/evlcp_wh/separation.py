@@ -11,7 +11,7 @@ from pydantic import Field
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Separate, Separation
-from evlcp_sdk.values import PresenceMap
+from evlcp_sdk.values import PresenceMap, plain
 
 if TYPE_CHECKING:
     from evlcp_wh import _kernels
@@ -56,7 +56,7 @@ class WhCorrelation(Separation):
             cells = len(codes), rows, columns
             probability, selected = np.zeros(cells, np.float32), np.empty(cells, np.bool_)
             pixels = np.zeros((len(codes), height, width), np.float32)
-            _kernels.separated(sums, codes, self.grid_px, odds, least, probability, selected, pixels)
+            _kernels.separated(plain(sums), codes, self.grid_px, odds, least, probability, selected, pixels)
             return PresenceMap(probability, self.grid_px, selected, pixels)
 
         return separate
