@@ -24,8 +24,14 @@ DRAW, ARMED, BLOCK = range(3)
 LIGHT_STEP = 1e-3
 """Relative change of a pixel's light that is not worth a new piece: the light stays until it is more."""
 
-COLUMN_BITS = 12
+COLUMN_BITS = 13
 """A request's code is (row << COLUMN_BITS | column) << 1 | polarity."""
+
+CODE_BITS = 2 * COLUMN_BITS + 1
+"""A request is a word that sorts as a number: its ticks since a block began << CODE_BITS | its code."""
+
+TICKS = float(1 << 20)
+"""Ticks a us: of 1 ps, so that a word holds times of up to 65 ms before and after."""
 
 _SERVED = -2
 """Instead of a request's follower: it waits no longer."""
@@ -33,6 +39,9 @@ _SERVED = -2
 _PLACES = np.empty(64, np.int64)
 """Place of the only bit of a word, by the upper bits of its product with a de Bruijn sequence."""
 _PLACES[[(0x03F79D71B4CB0A89 << k & (1 << 64) - 1) >> 58 for k in range(64)]] = np.arange(64)
+
+_NEAREST = 6755399441055744.0
+"""Adding this puts the nearest integer into the lowest bits of a float64."""
 
 NOISE_LIMIT = 4.0
 """Where the normal distribution of every draw is cut off, standard deviations."""
@@ -221,63 +230,50 @@ _M_LEVEL, _M_REQUEST, _ROOM = range(39 * LANES, 42 * LANES, LANES)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _decay(f: Array, bits: Array, ages: int, out: int, n: int) -> None:
-    """Write exp(-age) for `n` ages from f[ages] on to f[out] and on, 0 beyond 60; the ages are overwritten.
-
-    `bits` is an int64 view of `f`. Accurate to 1e-14. Each loop is one of vector
-    instructions.
-    """
-    # Adding this puts the nearest integer into the lowest bits of a float64.
-    magic = 6755399441055744.0
-    for i in range(n):
-        f[out + i] = min(f[ages + i], 700.0) * 1.4426950408889634 + magic
-    for i in range(n):
-        age = min(f[ages + i], 700.0)
-        k = f[out + i] - magic
-        r = (k * 0.693147180369123816490 - age) + k * 1.90821492927058770002e-10
-        p = 1.0 / 39916800.0
-        p = p * r + 1.0 / 3628800.0
-        p = p * r + 1.0 / 362880.0
-        p = p * r + 1.0 / 40320.0
-        p = p * r + 1.0 / 5040.0
-        p = p * r + 1.0 / 720.0
-        p = p * r + 1.0 / 120.0
-        p = p * r + 1.0 / 24.0
-        p = p * r + 1.0 / 6.0
-        p = p * r + 0.5
-        p = p * r + 1.0
-        p = p * r + 1.0
-        f[ages + i] = p if age <= 60.0 else 0.0
-    for i in range(n):
-        bits[out + i] = (1023 << 52) - (bits[out + i] << 52)
-    for i in range(n):
-        f[out + i] *= f[ages + i]
+def _decay(age: float) -> float:
+    """exp(-age) to 1e-14, 0 beyond 60; no branch, no call, so a loop of it is one of vector instructions."""
+    within = min(age, 700.0)
+    whole = within * 1.4426950408889634 + _NEAREST
+    k = whole - _NEAREST
+    r = (k * 0.693147180369123816490 - within) + k * 1.90821492927058770002e-10
+    p = 1.0 / 39916800.0
+    p = p * r + 1.0 / 3628800.0
+    p = p * r + 1.0 / 362880.0
+    p = p * r + 1.0 / 40320.0
+    p = p * r + 1.0 / 5040.0
+    p = p * r + 1.0 / 720.0
+    p = p * r + 1.0 / 120.0
+    p = p * r + 1.0 / 24.0
+    p = p * r + 1.0 / 6.0
+    p = p * r + 0.5
+    p = p * r + 1.0
+    p = p * r + 1.0
+    power = np.int64((1023 << 52) - (np.float64(whole).view(np.int64) << 52)).view(np.float64)
+    return (p if age <= 60.0 else 0.0) * power
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
-def _logarithm(f: Array, bits: Array, of: int, spare: int, n: int) -> None:
-    """Overwrite `n` numbers from f[of] on with their logarithms, any value where one is not positive."""
-    for i in range(n):
-        # The exponent as the lowest bits of 2^52.
-        bits[spare + i] = (bits[of + i] >> 52) & 0x7FF | 0x4330000000000000
-        bits[of + i] = bits[of + i] & 0xFFFFFFFFFFFFF | 0x3FF0000000000000
-    for i in range(n):
-        m = f[of + i]
-        k = f[spare + i] - (4503599627370496.0 + 1023.0)
-        above = m > 1.4142135623730951
-        m = 0.5 * m if above else m
-        k = k + 1.0 if above else k
-        s = (m - 1.0) / (m + 1.0)
-        z = s * s
-        p = 2.0 / 15.0
-        p = p * z + 2.0 / 13.0
-        p = p * z + 2.0 / 11.0
-        p = p * z + 2.0 / 9.0
-        p = p * z + 2.0 / 7.0
-        p = p * z + 2.0 / 5.0
-        p = p * z + 2.0 / 3.0
-        p = p * z + 2.0
-        f[of + i] = k * 0.693147180369123816490 + (k * 1.90821492927058770002e-10 + p * s)
+def _logarithm(of: float) -> float:
+    """Natural logarithm, any value where `of` is not positive; without a branch or a call, as `_decay`."""
+    bits = np.float64(of).view(np.int64)
+    # The exponent as the lowest bits of 2^52.
+    raised = np.int64((bits >> 52) & 0x7FF | 0x4330000000000000).view(np.float64)
+    m = np.int64(bits & 0xFFFFFFFFFFFFF | 0x3FF0000000000000).view(np.float64)
+    k = raised - (4503599627370496.0 + 1023.0)
+    above = m > 1.4142135623730951
+    m = 0.5 * m if above else m
+    k = k + 1.0 if above else k
+    s = (m - 1.0) / (m + 1.0)
+    z = s * s
+    p = 2.0 / 15.0
+    p = p * z + 2.0 / 13.0
+    p = p * z + 2.0 / 11.0
+    p = p * z + 2.0 / 9.0
+    p = p * z + 2.0 / 7.0
+    p = p * z + 2.0 / 5.0
+    p = p * z + 2.0 / 3.0
+    p = p * z + 2.0
+    return k * 0.693147180369123816490 + (k * 1.90821492927058770002e-10 + p * s)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
@@ -348,12 +344,10 @@ def _run_piece(
     per_charge = 1.0 / charge
     span = until - t_us
     for i in range(lanes):
-        f[_REST + i] = 1.0 / f[_NOW + i]
-        f[_AGE + i] = f[_NOW + i] * per_charge * span
-    _decay(f, bits, _AGE, _KEPT, lanes)
-    for i in range(lanes):
-        end = f[_REST + i] + (f[_U + i] - f[_REST + i]) * f[_KEPT + i]
-        f[_END + i] = end
+        now = f[_NOW + i]
+        rest = 1.0 / now
+        end = rest + (f[_U + i] - rest) * _decay(now * per_charge * span)
+        f[_REST + i], f[_END + i] = rest, end
         reference, ready = f[_REFERENCE + i], f[_READY + i]
         on = end <= reference * f[_ON + i] * widest
         off = end * widest >= reference * f[_OFF + i]
@@ -376,11 +370,9 @@ def _run_piece(
         _take(f, _READY, again, even, _M_READY)
         _take(f, _NOW, again, even, _M_AGE)
         for a in range(even):
-            f[_M_AGE + a] = (f[_M_READY + a] - t_us) * per_charge * f[_M_AGE + a]
-        _decay(f, bits, _M_AGE, _M_KEPT, even)
-        for a in range(even):
             rest, end = f[_M_REST + a], f[_M_END + a]
-            reference = rest + (f[_M_U + a] - rest) * f[_M_KEPT + a]
+            kept = _decay((f[_M_READY + a] - t_us) * per_charge * f[_M_AGE + a])
+            reference = rest + (f[_M_U + a] - rest) * kept
             f[_M_REFERENCE + a] = reference
             on = end <= reference * f[_M_ON + a] * widest
             off = end * widest >= reference * f[_M_OFF + a]
@@ -442,15 +434,12 @@ def _run_piece(
                 f[_M_LATER + a] = jitter * hash_normal(key[k], 0, draw[k], 2, quantiles)
         for a in range(even):
             u, rest, level = f[_M_U + a], f[_M_REST + a], f[_M_LEVEL + a]
-            f[_M_RATIO + a] = (u - rest) / (level - rest)
-            # Where it is beyond the threshold from the first, there is no way to it.
-            beyond = (u <= level) if f[_M_ON + a] > 0.0 else (u >= level)
-            f[_M_TAU + a] = 0.0 if beyond else charge * rest
-        _logarithm(f, bits, _M_RATIO, _M_SPARE, even)
-        for a in range(even):
             ready, on = f[_M_READY + a], f[_M_ON + a] > 0.0
+            # Where it is beyond the threshold from the first, there is no way to it.
+            beyond = (u <= level) if on else (u >= level)
+            tau = 0.0 if beyond else charge * rest
             t = max(ready, t_us)
-            t = min(max(t_us + f[_M_RATIO + a] * f[_M_TAU + a], t), until)
+            t = min(max(t_us + _logarithm((u - rest) / (level - rest)) * tau, t), until)
             late = max((delay_on if on else delay_off) + f[_M_LATER + a], 0.0)
             ready = t + refractory
             f[_M_CROSS + a] = t
@@ -926,73 +915,95 @@ def background_events(
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def sort_events(t: Array, code: Array, out_t: Array, out_code: Array) -> None:
-    """Sort by (time, pixel): by 22 bits of the time in two rounds, then insertion of what is left."""
-    n = t.size
-    if n == 0:
-        return
-    first = t[0]
-    last = t[0]
-    for i in range(n):
-        first = min(first, t[i])
-        last = max(last, t[i])
-    scale = 4194303.0 / max(last - first, 1e-9)
-    low = np.zeros(2049, np.int64)
-    high = np.zeros(2049, np.int64)
-    for i in range(n):
-        key = int((t[i] - first) * scale)
-        low[(key & 2047) + 1] += 1
-        high[(key >> 11 & 2047) + 1] += 1
-    for b in range(2047):
-        low[b + 1] += low[b]
-        high[b + 1] += high[b]
-    half_t, half_code = np.empty(n, t.dtype), np.empty(n, code.dtype)
-    for i in range(n):
-        b = int((t[i] - first) * scale) & 2047
-        # A place without a sign is not looked at for being negative.
-        k = np.uint64(low[b])
-        half_t[k] = t[i]
-        half_code[k] = code[i]
-        low[b] += 1
-    for i in range(n):
-        b = (int((half_t[i] - first) * scale) >> 11) & 2047
-        k = np.uint64(high[b])
-        out_t[k] = half_t[i]
-        out_code[k] = half_code[i]
-        high[b] += 1
-    for i in range(1, n):
-        when, what = out_t[i], out_code[i]
-        if out_t[i - 1] < when:
-            continue
-        j = i
-        while j > 0 and (out_t[j - 1] > when or (out_t[j - 1] == when and out_code[j - 1] > what)):
-            out_t[j] = out_t[j - 1]
-            out_code[j] = out_code[j - 1]
-            j -= 1
-        out_t[j] = when
-        out_code[j] = what
+def as_words(t: Array, code: Array, begin_us: float, words: Array) -> None:
+    """Write requests as words, their times since `begin_us` to the nearest tick."""
+    for i in range(t.size):
+        ticks = np.float64((t[i] - begin_us) * TICKS + _NEAREST).view(np.int64)
+        words[i] = ticks << CODE_BITS | np.int64(code[i])
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _us_of(word: int, begin_us: float) -> float:
+    """When a request is, us."""
+    return begin_us + np.float64(word >> CODE_BITS) * (1.0 / TICKS)
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _row_of(word: int) -> Any:
+    """Row of a request; without a sign it is not looked at for being negative."""
+    return np.uint64(word >> (COLUMN_BITS + 1) & ((1 << COLUMN_BITS) - 1))
+
+
+@njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _column_of(word: int) -> Any:
+    """Column of a request."""
+    return np.uint64(word >> 1 & ((1 << COLUMN_BITS) - 1))
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def drop_blind(t: Array, code: Array, blind_us: Array, width: int, refractory_us: float) -> int:
-    """Drop, in place, events of pixels that are blind until `blind_us`; return how many stay."""
+def sort_words(words: Array, out: Array) -> None:
+    """Sort int64 words: by 22 bits of their range in two rounds, then insertion of what is left."""
+    n = words.size
+    if n == 0:
+        return
+    first = last = words[0]
+    for i in range(n):
+        first, last = min(first, words[i]), max(last, words[i])
+    drop = 0
+    while (last - first) >> drop >= 1 << 22:
+        drop += 1
+    shift, eleven, part = np.uint64(drop), np.uint64(11), np.uint64(2047)
+    low, high = np.zeros(2049, np.int64), np.zeros(2049, np.int64)
+    for i in range(n):
+        key = np.uint64(words[i] - first) >> shift
+        low[(key & part) + np.uint64(1)] += 1
+        high[(key >> eleven) + np.uint64(1)] += 1
+    for b in range(2047):
+        low[b + 1] += low[b]
+        high[b + 1] += high[b]
+    half = np.empty(n, words.dtype)
+    for i in range(n):
+        key = np.uint64(words[i] - first) >> shift & part
+        half[np.uint64(low[key])] = words[i]
+        low[key] += 1
+    for i in range(n):
+        key = np.uint64(half[i] - first) >> (shift + eleven)
+        out[np.uint64(high[key])] = half[i]
+        high[key] += 1
+    before = out[0]
+    for i in range(1, n):
+        word = out[i]
+        if word >= before:
+            before = word
+            continue
+        j = i
+        while j > 0 and out[j - 1] > word:
+            out[j] = out[j - 1]
+            j -= 1
+        out[j] = word
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def drop_blind(words: Array, begin_us: float, blind_us: Array, width: int, refractory_us: float) -> int:
+    """Drop, in place, requests of pixels that are blind until `blind_us`; return how many stay."""
     kept = 0
-    for i in range(t.size):
-        what = code[i]
-        pixel = np.uint64((what >> (COLUMN_BITS + 1)) * width + ((what >> 1) & ((1 << COLUMN_BITS) - 1)))
-        if t[i] >= blind_us[pixel]:
-            # The smallest part of a us stands for the rounding of sums.
-            blind_us[pixel] = t[i] + (refractory_us - 1e-6)
-            t[np.uint64(kept)] = t[i]
-            code[np.uint64(kept)] = what
+    for i in range(words.size):
+        word = words[i]
+        pixel = _row_of(word) * np.uint64(width) + _column_of(word)
+        t = _us_of(word, begin_us)
+        # What is dropped is written over.
+        words[np.uint64(kept)] = word
+        if t >= blind_us[pixel]:
+            # The smallest part of a us stands for the rounding of both times to ticks.
+            blind_us[pixel] = t + (refractory_us - 1e-6)
             kept += 1
     return kept
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def read_out(
-    t: Array,
-    code: Array,
+    words: Array,
+    begin_us: float,
     height: int,
     row_us: float,
     safe_us: float,
@@ -1005,107 +1016,106 @@ def read_out(
     out_y: Array,
     out_p: Array,
 ) -> tuple[int, int, int, int]:
-    """Serve requests row by row until `safe_us`; what is not served yet moves to the front of `t` and `code`.
+    """Serve requests row by row until `safe_us`; what is not served yet moves to the front of `words`.
 
     One row is served at a time, which takes `row_us` and takes all its requests along; the next is the next
     one below with a request, and after the last row the first. More than `cap` events in a window of
-    `cap_window_us` are dropped. `t` is sorted; `memory` holds (time when free, last row, number of the
-    window, events in it) and is updated. Where `pending`, bool (rows, columns), all False, has any room, a
-    pixel sends nothing while a request of its waits.
+    `cap_window_us` are dropped. `words` are sorted, their times since `begin_us`; `memory` holds (time when
+    free, last row, number of the window, events in it) and is updated. Where `pending`, bool (rows, columns),
+    all False, has any room, a pixel sends nothing while a request of its waits.
 
     Returns:
         (events written, events over the cap, requests of waiting pixels, requests left).
     """
-    # The first and the last request of each row that waits, and after each the next one of its row.
-    head, tail = np.full(height, -1, np.int32), np.empty(height, np.int32)
-    follow = np.empty(t.size, np.int32)
-    # What is read out together.
-    together = np.empty(t.size, np.int64)
+    size = words.size
+    # Behind each request the next one of its row that waits; a row's first stands behind the requests, and
+    # `tail` is where its next belongs.
+    follow, tail = np.empty(size + height, np.int32), np.empty(height, np.int32)
+    for i in range(height):
+        tail[i], follow[size + i] = size + i, -1
+    # What is read out: column, number in its row, polarity.
+    together = np.empty(size, np.int64)
     # One bit a row that waits.
     waits = np.zeros((height >> 6) + 1, np.uint64)
     hold = pending.size > 0
-    columns = (1 << COLUMN_BITS) - 1
     free, at_row = memory[0], int(memory[1])
     window, used = int(memory[2]), int(memory[3])
     window_end = (window + 1) * cap_window_us
     n = dropped = held = waiting = i = 0
+    due = _us_of(words[0], begin_us) if size else math.inf
     while True:
         if waiting == 0:
-            if i >= t.size:
+            if i >= size:
                 break
-            free = max(free, t[i])
+            free = max(free, due)
         if free >= safe_us:
             break
-        while i < t.size and t[i] <= free:
-            row = code[i] >> (COLUMN_BITS + 1)
-            if hold:
-                x = (code[i] >> 1) & columns
-                if pending[row, x]:
-                    follow[i] = _SERVED
-                    held += 1
-                    i += 1
-                    continue
-                pending[row, x] = True
-            y = np.uint64(row)
-            if head[y] < 0:
-                head[y] = i
-                waits[y >> np.uint64(6)] |= np.uint64(1) << (y & np.uint64(63))
+        while due <= free:
+            k = np.uint64(i)
+            y = _row_of(words[k])
+            if hold and pending[y, _column_of(words[k])]:
+                follow[k] = _SERVED
+                held += 1
             else:
+                if hold:
+                    pending[y, _column_of(words[k])] = True
                 follow[np.uint64(tail[y])] = i
-            tail[y] = i
-            follow[i] = -1
-            waiting += 1
+                follow[k] = -1
+                tail[y] = i
+                waits[y >> np.uint64(6)] |= np.uint64(1) << (y & np.uint64(63))
+                waiting += 1
             i += 1
+            due = _us_of(words[np.uint64(i)], begin_us) if i < size else math.inf
+        if waiting == 0:
+            continue
         at_row += 1
-        word = at_row >> 6
-        bits = waits[word] >> np.uint64(at_row & 63) << np.uint64(at_row & 63)
+        place = at_row >> 6
+        bits = waits[place] >> np.uint64(at_row & 63) << np.uint64(at_row & 63)
         while bits == np.uint64(0):
-            word = word + 1 if word + 1 < waits.size else 0
-            bits = waits[word]
+            place = place + 1 if place + 1 < waits.size else 0
+            bits = waits[place]
         lowest = bits & (~bits + np.uint64(1))
-        at_row = word << 6 | _PLACES[(lowest * np.uint64(0x03F79D71B4CB0A89)) >> np.uint64(58)]
+        waits[place] ^= lowest
+        at_row = place << 6 | _PLACES[(lowest * np.uint64(0x03F79D71B4CB0A89)) >> np.uint64(58)]
         free += row_us
         stamp = math.floor(free)
         if stamp >= window_end:
             window = stamp // cap_window_us
             window_end = (window + 1) * cap_window_us
             used = 0
-        next_one = int(head[np.uint64(at_row)])
-        head[np.uint64(at_row)] = -1
-        waits[word] ^= lowest
-        count = 0
+        y = np.uint64(at_row)
+        next_one = int(follow[np.uint64(size) + y])
+        tail[y], follow[np.uint64(size) + y] = size + at_row, -1
+        begin = n
         while next_one >= 0:
             k = np.uint64(next_one)
             next_one = int(follow[k])
             follow[k] = _SERVED
-            what = code[k]
+            what = words[k]
             waiting -= 1
             if hold:
-                pending[at_row, (what >> 1) & columns] = False
+                pending[y, _column_of(what)] = False
             if cap > 0 and used >= cap:
                 dropped += 1
                 continue
             used += 1
             # By column, then in the order in which they came; without a branch, which could not be foreseen.
-            it = ((what >> 1) & columns) << 32 | count << 1 | what & 1
-            for j in range(count):
+            it = np.int64(_column_of(what)) << 32 | (n - begin) << 1 | what & 1
+            for j in range(begin, n):
                 other = together[np.uint64(j)]
                 together[np.uint64(j)] = min(other, it)
                 it = max(other, it)
-            together[np.uint64(count)] = it
-            count += 1
-        for j in range(count):
-            it = together[np.uint64(j)]
-            k = np.uint64(n + j)
-            out_t[k], out_x[k], out_y[k], out_p[k] = stamp, it >> 32, at_row, it & 1
-        n += count
+            last = np.uint64(n)
+            together[last], out_t[last], out_y[last] = it, stamp, at_row
+            n += 1
+    for j in range(n):
+        out_x[j], out_p[j] = together[j] >> 32, together[j] & 1
     left = 0
-    for m in range(t.size):
+    for m in range(size):
         if m >= i or follow[m] != _SERVED:
             if hold:
-                pending[code[m] >> (COLUMN_BITS + 1), (code[m] >> 1) & columns] = False
-            t[left] = t[m]
-            code[left] = code[m]
+                pending[_row_of(words[m]), _column_of(words[m])] = False
+            words[left] = words[m]
             left += 1
     memory[0], memory[1], memory[2], memory[3] = free, at_row, window, used
     return n, dropped, held, left

@@ -729,6 +729,14 @@ class Simulation:
         return y * width + x, far
 
 
+def _since(words: NDArray[np.int64], later_us: float) -> NDArray[np.int64]:
+    """Requests as words since a block that began so much later."""
+    # What has waited for very long is no nearer than this, which a word still holds.
+    ticks = np.maximum((words >> _kernels.CODE_BITS) - int(later_us * _kernels.TICKS), -(1 << 35))
+    since: NDArray[np.int64] = ticks << _kernels.CODE_BITS | words & ((1 << _kernels.CODE_BITS) - 1)
+    return since
+
+
 class _Served:
     """What the readout makes of the pixels' requests, block by block of time.
 
@@ -743,8 +751,9 @@ class _Served:
         if sensor.jitter_us > 0:
             early_us = max(0.0, early_us - _kernels.NOISE_LIMIT * sensor.jitter_us)
         self._early_us = early_us
-        self._later: list[_Requests] = []
-        self._queue: _Requests = (np.empty(0), np.empty(0, np.int32))
+        self._begin_us = 0.0
+        # What was too late for the last block, and what waited at its end, since that began.
+        self._later, self._queue = np.empty(0, np.int64), np.empty(0, np.int64)
         self._blind_us = np.zeros(camera.width * camera.height)
         self._memory = np.array([-1e18, -1.0, -1.0, 0.0])
         self._pending = np.zeros((camera.height, camera.width) if sensor.hold else (0, 0), bool)
@@ -761,27 +770,35 @@ class _Served:
         noise = simulation.noise(number, self._noise_from_us, noise_to)
         self._noise_from_us = end_us if over else safe
         simulation.count("signal_events", sum(len(t) for t, _ in signal))
-        parts = [*self._later, *signal, noise]
-        old_t, old_code = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+        begin = number * _BLOCK_US
+        later, queue = (_since(words, begin - self._begin_us) for words in (self._later, self._queue))
+        self._begin_us = begin
+        parts = [later]
+        for when, code in (*signal, noise):
+            parts.append(np.empty(len(when), np.int64))
+            _kernels.as_words(when, code, begin, parts[-1])
+        unsorted = np.concatenate(parts)
         # What waits from before comes first.
-        waiting = len(self._queue[0])
-        t, code = (np.empty(waiting + len(one), one.dtype) for one in (old_t, old_code))
-        t[:waiting], code[:waiting] = self._queue
-        new_t, new_code = t[waiting:], code[waiting:]
-        _kernels.sort_events(old_t, old_code, new_t, new_code)
-        cut = len(new_t) if over else int(np.searchsorted(new_t, safe))
-        self._later = [(new_t[cut:].copy(), new_code[cut:].copy())]
-        kept = _kernels.drop_blind(new_t[:cut], new_code[:cut], self._blind_us, camera.width, sensor.refr_us)
-        t, code = t[: waiting + kept], code[: waiting + kept]
-        n = len(t)
+        waiting = len(queue)
+        words = np.empty(waiting + len(unsorted), np.int64)
+        words[:waiting] = queue
+        new = words[waiting:]
+        _kernels.sort_words(unsorted, new)
+        cut = len(new)
+        if not over:
+            cut = int(np.searchsorted(new, int((safe - begin) * _kernels.TICKS) << _kernels.CODE_BITS))
+        self._later = new[cut:].copy()
+        kept = _kernels.drop_blind(new[:cut], begin, self._blind_us, camera.width, sensor.refr_us)
+        words = words[: waiting + kept]
+        n = len(words)
         columns = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
         cap = round(sensor.cap_mev_s * sensor.cap_window_us)
         cap = max(cap, 1) if sensor.cap_mev_s > 0 else 0
         written, dropped, held, left = _kernels.read_out(
-            t, code, camera.height, sensor.t_row_us, safe, cap, sensor.cap_window_us, self._memory,
+            words, begin, camera.height, sensor.t_row_us, safe, cap, sensor.cap_window_us, self._memory,
             self._pending, *columns,
         )  # fmt: skip
-        self._queue = (t[:left].copy(), code[:left].copy())
+        self._queue = words[:left].copy()
         simulation.count("dropped_blind", cut - kept + held)
         simulation.count("events", written)
         simulation.count("dropped_by_rate_cap", dropped)

@@ -111,13 +111,14 @@ def latency_with_readout_us(sensor: SensorSpec, light_w_m2: float, side_px: int,
     )
     first = np.flatnonzero(np.append(True, np.diff(one.pixel) > 0))
     code = ((one.pixel[first] // side_px) << _kernels.COLUMN_BITS | one.pixel[first] % side_px) << 1 | 1
-    t, order = np.empty(len(first)), np.empty(len(first), np.int32)
-    _kernels.sort_events(one.request_us[first], code.astype(np.int32), t, order)
     n = len(first)
+    words, in_order = np.empty(n, np.int64), np.empty(n, np.int64)
+    _kernels.as_words(one.request_us[first], code.astype(np.int32), 0.0, words)
+    _kernels.sort_words(words, in_order)
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
     memory = np.array([-1e18, -1.0, -1.0, 0.0])
     _kernels.read_out(
-        t, order, side_px, sensor.t_row_us, np.inf, 0, 200, memory, np.zeros((0, 0), np.bool_), *out
+        in_order, 0.0, side_px, sensor.t_row_us, np.inf, 0, 200, memory, np.zeros((0, 0), np.bool_), *out
     )
     return float(out[0].mean() + 0.5)
 

@@ -202,10 +202,12 @@ def read_out(
 ) -> tuple[Events, int]:
     code = (((y << _kernels.COLUMN_BITS) | x) << 1 | 1).astype(np.int32)
     n = len(t)
+    words = np.empty(n, np.int64)
+    _kernels.as_words(t.astype(float), code, 0.0, words)
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
     memory = np.array([-1e18, -1.0, -1.0, 0.0])
     written, dropped, _, left = _kernels.read_out(
-        t.astype(float), code, 720, row_us, math.inf, cap, window, memory, np.zeros((0, 0), bool), *out
+        words, 0.0, 720, row_us, math.inf, cap, window, memory, np.zeros((0, 0), bool), *out
     )
     assert left == 0
     return Events(*(c[:written] for c in out)), dropped
@@ -220,6 +222,13 @@ def test_rows_are_read_one_after_another() -> None:
     assert events.x.tolist() == np.tile(np.arange(5), 100).tolist()
 
 
+def test_columns_of_the_widest_sensor_are_told_apart() -> None:
+    x = np.array([8191, 0, 4096, 1])
+    events, _ = read_out(np.full(4, 10.0), np.array([719, 718, 718, 719]), x, 1.0)
+    assert events.x.tolist() == [0, 4096, 1, 8191]
+    assert events.y.tolist() == [718, 718, 719, 719]
+
+
 def test_more_than_the_event_rate_limit_is_dropped() -> None:
     t = np.sort(np.random.default_rng(0).uniform(0, 1000, 5000))
     events, dropped = read_out(t, np.arange(5000) % 700, np.arange(5000) // 700, 0.0, cap=300)
@@ -232,11 +241,41 @@ def test_sorting_is_by_time_and_pixel() -> None:
     rng = np.random.default_rng(1)
     t = np.round(rng.uniform(0, 50, 3000), 1)
     code = rng.integers(0, 1000, 3000).astype(np.int32)
-    out_t, out_code = np.empty_like(t), np.empty_like(code)
-    _kernels.sort_events(t, code, out_t, out_code)
+    words, out = np.empty(3000, np.int64), np.empty(3000, np.int64)
+    _kernels.as_words(t, code, 20.0, words)
+    _kernels.sort_words(words, out)
     order = np.lexsort((code, t))
-    assert np.array_equal(out_t, t[order])
-    assert np.array_equal(out_code, code[order])
+    np.testing.assert_allclose((out >> _kernels.CODE_BITS) / _kernels.TICKS, t[order] - 20.0, atol=1e-6)
+    assert np.array_equal(out & ((1 << _kernels.CODE_BITS) - 1), code[order])
+    assert np.array_equal(out, np.sort(words))
+
+
+def test_a_pixel_is_blind_after_an_event_in_any_block() -> None:
+    rng = np.random.default_rng(2)
+    t = np.sort(rng.uniform(0, 8000, 4000))
+    row, column = rng.integers(0, 5, 4000) * 200, rng.integers(0, 5, 4000) * 200
+    code = ((row << _kernels.COLUMN_BITS | column) << 1).astype(np.int32)
+    blind, kept = np.zeros(1024**2), []
+    for begin in (0.0, 4000.0):
+        within = (t >= begin) & (t < begin + 4000.0)
+        words = np.empty(within.sum(), np.int64)
+        _kernels.as_words(t[within], code[within], begin, words)
+        n = _kernels.drop_blind(words, begin, blind, 1024, 30.0)
+        kept += list(
+            zip(
+                (words[:n] & ((1 << _kernels.CODE_BITS) - 1)).tolist(),
+                begin + (words[:n] >> _kernels.CODE_BITS) / _kernels.TICKS,
+                strict=True,
+            )
+        )
+    last: dict[int, float] = {}
+    expected = []
+    for when, what in zip(t.tolist(), code.tolist(), strict=True):
+        if when >= last.get(what, -1e9) + 30.0:
+            last[what] = when
+            expected.append((what, when))
+    assert 2000 < len(kept) < 3900
+    np.testing.assert_allclose(kept, expected, rtol=0, atol=1e-6)
 
 
 def test_random_numbers_are_those_of_a_normal_distribution() -> None:

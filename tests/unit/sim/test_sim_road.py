@@ -35,7 +35,7 @@ from evlcp_sdk.sim import (
     simulate,
     truth_of,
 )
-from evlcp_sdk.sim._kernels import COLUMN_BITS, read_out, texture_at
+from evlcp_sdk.sim._kernels import COLUMN_BITS, as_words, read_out, texture_at
 from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
@@ -419,15 +419,16 @@ def test_a_pixel_that_waits_for_the_readout_sends_no_other() -> None:
     assert 500 < len(want) < 2500
     for cuts in ([math.inf], [100.0, 101.5, 260.0, math.inf]):
         memory, pending, found, blind = np.array([-1e18, -1.0, -1.0, 0.0]), np.zeros((30, 8), bool), [], 0
-        code = ((y << COLUMN_BITS | x) << 1).astype(np.int32)
-        rest_t, rest_code, before = np.empty(0), np.empty(0, np.int32), 0.0
+        words = np.empty(3000, np.int64)
+        as_words(t, ((y << COLUMN_BITS | x) << 1).astype(np.int32), 0.0, words)
+        rest, before = words[:0], 0.0
         for safe in cuts:
             new = (t >= before) & (t < safe)
             before = safe
-            now_t, now_code = np.concatenate([rest_t, t[new]]), np.concatenate([rest_code, code[new]])
-            out = [np.empty(len(now_t), kind) for kind in (np.int64, np.uint16, np.uint16, np.uint8)]
-            n, _, held, left = read_out(now_t, now_code, 30, 1.3, safe, 0, 200, memory, pending, *out)
-            rest_t, rest_code = now_t[:left].copy(), now_code[:left].copy()
+            now = np.concatenate([rest, words[new]])
+            out = [np.empty(len(now), kind) for kind in (np.int64, np.uint16, np.uint16, np.uint8)]
+            n, _, held, left = read_out(now, 0.0, 30, 1.3, safe, 0, 200, memory, pending, *out)
+            rest = now[:left].copy()
             blind += held
             found += list(zip(*(out[i][:n].tolist() for i in (0, 2, 1)), strict=True))
             assert not pending.any()
