@@ -272,18 +272,8 @@ def _light(facts: Facts) -> Check:
     )
     if facts.reads:
         return _unread(facts) or Check("light", "pass", "light", _sources_said(facts))
-    if not facts.sources and facts.restless is not None:
-        left, top, right, bottom = facts.restless
-        return Check(
-            "light",
-            "fail",
-            "dim",
-            f"something flickers in columns {left} to {right}, rows {top} to {bottom}, without any rhythm:"
-            " light that is too weak for its chips, or something that moves",
-            _BRIGHTER,
-        )
     if not facts.sources:
-        return _dark(view)
+        return _without_rhythm(facts, view)
     bar = facts.bar
     if bar is None or _is_lamp(bar, facts):
         lamps = [one for one in facts.sources if one.kind == "lamp"]
@@ -299,7 +289,7 @@ def _light(facts: Facts) -> Check:
             )
         first = facts.sources[0]
         if first.kind != "code" and first.events < _SOME * facts.events:
-            return _dark(view)
+            return _without_rhythm(facts, view)
         said = f"{_sources_said(facts)}, but too rarely to recognise a code"
         long_px, wide_px = max(first.wide_px, first.high_px), min(first.wide_px, first.high_px)
         if wide_px > _BLURRED_SHARE * long_px:
@@ -358,7 +348,18 @@ def _is_lamp(source: LightSource, facts: Facts) -> bool:
     return facts.sources[0].kind == "lamp" or any(same)
 
 
-def _dark(view: str) -> Check:
+def _without_rhythm(facts: Facts, view: str) -> Check:
+    """What is said where nothing blinks that is worth a word."""
+    if facts.restless is not None:
+        left, top, right, bottom = facts.restless
+        return Check(
+            "light",
+            "fail",
+            "dim",
+            f"something flickers in columns {left} to {right}, rows {top} to {bottom}, without any rhythm:"
+            " light that is too weak for its chips, or something that moves",
+            _BRIGHTER,
+        )
     return Check(
         "light",
         "fail",

@@ -56,7 +56,19 @@ _MIN_SOURCE = 300
 
 _REGULAR = 0.6
 """Share of times that are the same number of periods, or one and two, above which a source repeats itself: of
-a code .4 are of two chips."""
+a code .4 are of two chips. Times that follow no rhythm reach it by chance, as six in ten of any are within .3
+of a whole number."""
+
+_FOLLOWED = 0.5
+"""Mean at a lamp's own rate from which it repeats itself. A pixel rises once a period only if its light
+changes by the threshold, .22 in ln, in half of it at the most. Noise of .03 to .06 then puts a rise off by a
+fourteenth to a seventh of a period, and a time between two by 1.4 times that, which leaves .82 to .45 of the
+mean, and more of light that changes by more. A pixel that sees few chips of a dim code rises with the longest
+ones; the hump of their times gives .2 to .4."""
+
+_TOO_HIGH = 0.15
+"""By how much of itself the rate that is measured may be above a lamp's: times that come sooner by chance let
+pass higher frequencies, and the lowest that is near the best is taken."""
 
 _NONE, _SOME = 0.1, 0.04
 """Share of times of one chip up to which, and of two, of three and of four from which, a source sends a code:
@@ -329,7 +341,12 @@ def _kind(times: NDArray[np.int64], rate_hz: float) -> Literal["code", "lamp", "
     """What sends rises so far apart."""
     periods = _TAU_US * rate_hz * 1e-6
     share = [times[np.abs(periods - k) < 0.3].sum() / times.sum() for k in range(1, 9)]
-    if max(*share, share[0] + share[1]) >= _REGULAR:
+    # What comes k periods apart again and again repeats itself at a k-th of the rate.
+    repeated = [k for k, of_times in enumerate(share, 1) if of_times >= _REGULAR]
+    if share[0] + share[1] >= _REGULAR:
+        repeated.append(1)
+    own_hz = np.outer(rate_hz * np.linspace(1 - _TOO_HIGH, 1, 16), 1 / np.array(repeated)).ravel()
+    if repeated and comb(times, own_hz).max() >= _FOLLOWED:
         return "lamp"
     return "code" if share[0] <= _NONE and min(share[1:4]) >= _SOME else "unclear"
 

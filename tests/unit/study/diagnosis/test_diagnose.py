@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from evlcp_sdk.cli._app import make_app
@@ -28,11 +29,13 @@ from tests.unit.study.campaign.browser import CHROMIUM, Browser
 LINK = load_link()
 
 
-def rendered(link: tuple[str, ...] = (), duration_s: float = 0.12, **changes: Any) -> SimulatedSource:
+def rendered(
+    link: tuple[str, ...] = (), duration_s: float = 0.12, seed: int = 3, **changes: Any
+) -> SimulatedSource:
     light = {"background.light_w_m2": 0.01, "bars.0.led_w_m2": 8.0}
     keys = {"duration_s": duration_s, **light, **changes}
     scene = load_scene("night", keys, link=load_link(overrides=link))
-    return simulate(scene, seed=3)
+    return simulate(scene, seed=seed)
 
 
 def found(link: tuple[str, ...] = (), duration_s: float = 0.12, **changes: Any) -> Diagnosis:
@@ -54,7 +57,9 @@ def code_of(diagnosis: Diagnosis) -> str:
         ("far", {"motion.distance_m": 400.0}),
         ("no-negative", {"sensor.p_off_miss": 0.98}),
         ("refractory", {"sensor.refr_us": 300.0}),
-        ("dim", {"bars.0.led_w_m2": 0.15}),
+        ("dim", {"bars.0.led_w_m2": 0.1}),
+        ("dim", {"bars.0.led_w_m2": 0.1, "seed": 5}),
+        ("dim", {"bars.0.led_w_m2": 0.08, "seed": 4}),
         ("defocus", {"lens.focus_m": 3.0, "duration_s": 0.06, "bars.0.led_w_m2": 30.0}),
         ("saturated", {"sensor.cap_mev_s": 1.5}),
         ("dark", {"bars.0.x_m": 30.0}),
@@ -185,6 +190,39 @@ def test_a_panel_looks_like_a_bar_out_of_focus_and_is_said_to_be_one_perhaps() -
     assert (one.code, one.verdict) == ("defocus", "fail")
     assert "layout is another one" in one.said
     assert "compare [bar] with the transmitter's" in one.next_step
+
+
+def survey_of(times_us: NDArray[np.float64]) -> LightSurvey:
+    """Of pixels that rise so far apart, and fall 40 us after each rise; float64 (pixels, rises)."""
+    rises_us = np.cumsum(np.round(np.maximum(times_us, 80.0)), 1).astype(np.int64)
+    pixel = np.broadcast_to(np.arange(len(rises_us))[:, None], rises_us.shape)
+    t_us = np.concatenate([rises_us.ravel(), rises_us.ravel() + 40])
+    order = np.argsort(t_us, kind="stable")
+    x, y = (np.tile(at.ravel(), 2)[order] for at in (pixel % 8, pixel // 8))
+    p = np.repeat([1, 0], rises_us.size)[order]
+    survey = LightSurvey(64, 64)
+    survey.feed(Events.of(t_us[order], x, y, p))
+    return survey
+
+
+@pytest.mark.parametrize("rate_hz", [100.0, 1000.0, 2375.0, 5000.0, 10_000.0])
+@pytest.mark.parametrize("late", [0.02, 0.1])
+def test_a_lamp_that_is_followed_is_one_at_any_rate(rate_hz: float, late: float) -> None:
+    """Each rise late by a share of a period, one in twenty missed."""
+    rng = np.random.default_rng(1)
+    at = np.cumsum(rng.geometric(0.95, (64, 101)), 1) + rng.normal(0, late, (64, 101))
+    (lamp,), _ = survey_of(np.diff(at, axis=1) * 1e6 / rate_hz).found()
+    assert lamp.kind == "lamp"
+    assert lamp.rate_hz == pytest.approx(rate_hz, rel=0.02 if late < 0.05 else 0.17)
+
+
+def test_rare_rises_of_a_dim_code_are_no_lamps() -> None:
+    """Four chips apart and more, late by a third of a chip: the hump of their times is no period."""
+    rng = np.random.default_rng(1)
+    chips = 3 + rng.geometric(0.5, (64, 100)) + rng.normal(0, 0.3, (64, 100))
+    sources, _ = survey_of(chips * 100.0).found()
+    assert sources
+    assert all(source.kind == "unclear" for source in sources)
 
 
 def test_rate_is_measured_without_a_link() -> None:
