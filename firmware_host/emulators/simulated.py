@@ -82,7 +82,7 @@ class SimulatedBoard:
     def sent(self) -> bytes:
         """Bytes the board has sent since the last call."""
         count = self._c.board_output(self._board, self._room, len(self._room))
-        return self._room.raw[:count]
+        return ctypes.string_at(self._room, count)
 
     def records(self) -> LedRecord:
         """LED outputs since the last call."""
