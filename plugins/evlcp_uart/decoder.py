@@ -521,7 +521,7 @@ class CharacterDecoder:
         if len(starts) < _LEAST_CHARACTERS:
             return light
         rate = self._rate(light, starts, evidence, memory)
-        windows, contexts = self._bits(stretch, light, starts, evidence)
+        windows, contexts = self._bits(stretch, light, starts, self._contexts(light, starts, evidence))
         light = light.learn(windows, contexts, memory, rate)
         apart = np.diff(starts) - self._length * light.rate
         late = apart[(np.abs(apart) > _NEAR + 1) & (apart < 2 * self._length)]
@@ -529,29 +529,34 @@ class CharacterDecoder:
         sums = [memory * old + new for old, new in zip(light.paused, paused, strict=True)]
         return replace(light, paused=(sums[0], sums[1], sums[2]))
 
+    def _contexts(
+        self, light: Light, starts: NDArray[np.int64], evidence: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """How likely each bit of characters that were read is of each context, float64 (bits, C)."""
+        likelihoods = self.characters.likelihoods(evidence[starts[:, None] + self._places(light)])
+        weights = np.exp(likelihoods - likelihoods.max(1, keepdims=True))
+        weights /= weights.sum(1, keepdims=True)
+        of_words = self.characters.contexts
+        contexts = np.stack([weights @ (of_words == context) for context in range(CONTEXTS)], 2)
+        return contexts.reshape(-1, CONTEXTS)
+
     def _bits(
         self,
         stretch: "Stretch",
         light: Light,
         starts: NDArray[np.int64],
-        evidence: NDArray[np.float64],
+        contexts: NDArray[np.float64],
         shift: int = 0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The bits of characters that were read, `shift` ticks later than they were.
+        """The bits of characters that were read, of contexts as told, `shift` ticks later than they were.
 
         Returns:
             Their events, float64 (n, 2, TICKS), and how likely each is of each context, float64 (n, C).
         """
-        places = starts[:, None] + self._places(light)
-        likelihoods = self.characters.likelihoods(evidence[places])
-        weights = np.exp(likelihoods - likelihoods.max(1, keepdims=True))
-        weights /= weights.sum(1, keepdims=True)
-        of_words = self.characters.contexts
-        contexts = np.stack([weights @ (of_words == context) for context in range(CONTEXTS)], 2)
-        at = (places + shift).ravel()
+        at = (starts[:, None] + self._places(light) + shift).ravel()
         inside = (at >= 0) & (at + TICKS <= stretch.end) & (at + EARLY >= stretch.seen)
         windows = stretch.windows[at[inside]].astype(np.float64)
-        return windows, contexts.reshape(-1, CONTEXTS)[inside]
+        return windows, contexts[inside]
 
     def _begun(
         self, stretch: "Stretch", light: Light, starts: NDArray[np.int64], evidence: NDArray[np.float64]
@@ -560,8 +565,9 @@ class CharacterDecoder:
         if len(starts) < _LEAST_CHARACTERS:
             return light
         found = []
+        known = self._contexts(light, starts, evidence)
         for shift in _SHIFTS:
-            windows, contexts = self._bits(stretch, light, starts, evidence, shift)
+            windows, contexts = self._bits(stretch, light, starts, known, shift)
             learned = light.learn(windows, contexts, 0.0, light.rate)
             found.append((learned.told(windows, contexts), learned))
         most = max(told for told, _ in found)

@@ -143,6 +143,27 @@ class Light:
         found += alike[..., None]
         return found
 
+    def of_context(
+        self, windows: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+        """Log-likelihood of windows by context, over gains, and how likely each gain is.
+
+        What the gains make of a window depends on how many events it has, not on when they come.
+
+        Args:
+            windows: Whole numbers of events, float64 (n, 2, TICKS).
+
+        Returns:
+            Log-likelihoods, float64 (n, C); of each number of events how likely each gain is, by context,
+            float64 (m, C, J); and which of these numbers a window has, int64 (n,).
+        """
+        flat = windows.reshape(len(windows), -1)
+        events, which = np.unique(flat.sum(1), return_inverse=True)
+        said = events[:, None, None] * (self.share * LOG_GAINS) - self.means
+        over = log_sums(said)
+        alike = np.einsum("nk,ck->nc", flat, self.share * self.logs.reshape(CONTEXTS, -1))
+        return alike + over[which], np.exp(said - over[..., None]), which
+
     def beside_mean(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log-likelihood of windows, float64 (n, 2, TICKS), of each context beside steady events, (n, C)."""
         share = self.windows / self.windows.sum()
@@ -152,7 +173,7 @@ class Light:
         flat = windows.reshape(len(windows), -1)
         alike = np.einsum("nk,k->n", flat, np.log(mean).ravel())
         said = self.share * (alike[:, None] + flat.sum(1)[:, None] * LOG_GAINS) - costs
-        return log_sums(self.said(windows)) - log_sums(said)[:, None]
+        return self.of_context(windows)[0] - log_sums(said)[:, None]
 
     def told(self, windows: NDArray[np.float64], contexts: NDArray[np.float64]) -> float:
         """How much the events of bits tell of their contexts, in all: their mutual information.
@@ -161,8 +182,7 @@ class Light:
             windows: Events of each bit, float64 (n, 2, TICKS).
             contexts: How likely each is of each context, float64 (n, C).
         """
-        said = self.said(windows)
-        likely = np.einsum("ncj->nc", _likely(said))
+        likely = _likely(self.of_context(windows)[0])
         any_of = likely @ contexts.mean(0)
         told: float = (contexts * np.log(likely + 1e-300)).sum() - np.log(any_of + 1e-300).sum()
         return told
@@ -178,13 +198,14 @@ class Light:
             memory: What all before counts.
             rate: Length of a bit against the nominal one.
         """
-        said = self.said(windows)
-        gains = _likely(said)
-        likely = np.einsum("ncj->nc", gains)
+        said, gains, which = self.of_context(windows)
+        likely = _likely(said)
         # What is rather something else than a bit of that context teaches nothing of it.
         fits = (1 - DOUBT) * likely / likely.max(1, keepdims=True)
         contexts = contexts * fits / (fits + DOUBT)
-        of_gains = np.einsum("nc,ncj->cj", contexts / np.maximum(likely, 1e-300), gains)
+        at = (which[:, None] * CONTEXTS + np.arange(CONTEXTS)).ravel()
+        by_events = np.bincount(at, contexts.ravel(), len(gains) * CONTEXTS).reshape(-1, CONTEXTS)
+        of_gains = np.einsum("mc,mcj->cj", by_events, gains)
         return Light(
             memory * self.events + np.einsum("nc,npt->cpt", contexts, windows),
             memory * self.windows + of_gains @ GAINS,
@@ -249,9 +270,8 @@ def log_sums(logs: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _likely(said: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Likelihoods from their logarithms, float64 (n, C, J), the greatest of each window 1."""
-    top = said.reshape(len(said), -1).max(1)
-    likely: NDArray[np.float64] = np.exp(said - top[:, None, None])
+    """Likelihoods from their logarithms, float64 (n, C), the greatest of each window 1."""
+    likely: NDArray[np.float64] = np.exp(said - said.max(1, initial=-np.inf, keepdims=True))
     return likely
 
 

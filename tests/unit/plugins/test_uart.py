@@ -4,6 +4,7 @@ import itertools
 import json
 import math
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,9 @@ import numpy as np
 import pytest
 from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
-from evlcp_uart.decoder import _bunches, _spread
+from evlcp_uart.decoder import Character, _bunches, _spread
 from evlcp_uart.framing import Uart, read_characters
-from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, TICKS, Light
+from evlcp_uart.light import BEFORE, CONTEXTS, DOUBT, GAINS, TICKS, Light
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
@@ -256,20 +257,29 @@ def test_any_format_is_read(data_bits: int, parity: Parity, stop_bits: int) -> N
     assert [c.value for c in found] == sent.tolist()
 
 
-@pytest.mark.parametrize(("events", "unseen"), [((2.5, 2.0), 0.0), ((4.0, 3.0), 0.03), ((8.0, 6.0), 0.01)])
+@cache
+def dim(events: tuple[float, float], unseen: float, many: int) -> tuple[np.ndarray, Events, list[Character]]:
+    """Characters that were sent by a dim light, what is seen of it, and those that are read."""
+    rng = np.random.default_rng(17)
+    sent = rng.integers(0, 128, many)
+    light = seen(rng, levels_of(sent, 7, "even", 2), DIM_BIT_US, events=events, unseen=unseen)
+    return sent, light, read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2))
+
+
+DIM_BIT_US = 323.2
+DIM = [((2.5, 2.0), 0.0, 300), ((4.0, 3.0), 0.03, 500), ((8.0, 6.0), 0.01, 300)]
+
+
+@pytest.mark.parametrize(("events", "unseen", "many"), DIM)
 def test_errors_are_those_of_a_receiver_that_knows_the_light(
-    events: tuple[float, float], unseen: float
+    events: tuple[float, float], unseen: float, many: int
 ) -> None:
     """Beside one that is told when each character starts, how late events are, and how many come."""
-    rng = np.random.default_rng(17)
-    sent = rng.integers(0, 128, 300)
-    bit_us = 323.2
-    levels = levels_of(sent, 7, "even", 2)
-    light = seen(rng, levels, bit_us, events=events, unseen=unseen)
-    found = read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2))
-    assert len(found) >= 298
+    bit_us = DIM_BIT_US
+    sent, light, found = dim(events, unseen, many)
+    assert len(found) >= many - 2
     starts = np.array([c.t_us for c in found])
-    nearest = [int(np.abs(starts - (20_000 + 40 + 11 * k * bit_us)).argmin()) for k in range(300)]
+    nearest = [int(np.abs(starts - (20_000 + 40 + 11 * k * bit_us)).argmin()) for k in range(many)]
     ours = wrong_bits([found[k].value for k in nearest], sent.tolist(), 7)
 
     # The ideal one: likelihoods of all words from the densities that made the events.
@@ -291,21 +301,18 @@ def test_errors_are_those_of_a_receiver_that_knows_the_light(
     words = np.array([levels_of(np.array([w]), 7, "even", 2) for w in range(128)])
     steps = np.diff(np.pad(words, ((0, 0), (1, 0)), constant_values=1), axis=1)
     ideal = []
-    for k in range(300):
+    for k in range(many):
         begin_us = 20_000 + 11 * k * bit_us
         fall = np.array([evidence(begin_us + j * bit_us, False) for j in range(11)])
         rise = np.array([evidence(begin_us + j * bit_us, True) for j in range(11)])
         ideal.append(int(((steps < 0) @ fall + (steps > 0) @ rise).argmax()))
     best = wrong_bits(ideal, sent.tolist(), 7)
     # Three standard deviations of the difference, at two wrong bits a wrong character.
-    assert ours <= 1.15 * best + 3 * math.sqrt(4 * best / 2100)
+    assert ours <= 1.15 * best + 3 * math.sqrt(4 * best / (7 * many))
 
 
 def test_llrs_tell_the_truth() -> None:
-    rng = np.random.default_rng(5)
-    sent = rng.integers(0, 128, 500)
-    events = seen(rng, levels_of(sent, 7, "even", 2), 320.0, events=(4.0, 3.0), unseen=0.03)
-    found = read_characters(events.t_us, events.p, 3125.0, Uart(7, "even", 2))
+    sent, _, found = dim(*DIM[1])
     assert len(found) == 500
     right = np.array([c.value for c in found]) == sent
     quality = np.array([c.quality for c in found])
@@ -388,6 +395,26 @@ def test_light_is_learned_as_it_is() -> None:
         gain = math.log(shares[context, j] / shares[context].sum())
         assert said[k, context, j] == pytest.approx(light.share * poisson + gain)
     assert light.told(windows, known) > light.told(windows, np.roll(known, 1, 1))
+
+
+def test_what_gains_make_of_windows_is_that_of_each_window_by_itself() -> None:
+    rng = np.random.default_rng(8)
+    rates = rng.gamma(0.5, 0.5, (CONTEXTS, 2, TICKS)) + 0.1
+    light = Light(5 * rates, np.full(CONTEXTS, 5.0), rng.gamma(1.0, 1.0, (CONTEXTS, len(GAINS))))
+    windows = rng.poisson(0.2 * rng.gamma(1.0, 1.0, 200)[:, None, None], (200, 2, TICKS)).astype(np.float64)
+    likely = np.exp(light.said(windows))
+    said, gains, which = light.of_context(windows)
+    np.testing.assert_allclose(said, np.log(likely.sum(2)))
+    np.testing.assert_allclose(gains[which], likely / likely.sum(2, keepdims=True))
+    known = rng.dirichlet(np.ones(CONTEXTS), 200)
+    fits = (1 - DOUBT) * likely.sum(2) / likely.sum(2).max(1, keepdims=True)
+    taught = known * fits / (fits + DOUBT)
+    learned = light.learn(windows, known, 0.5, 1.0)
+    of_gains = np.einsum("nc,ncj->cj", taught / likely.sum(2), likely)
+    np.testing.assert_allclose(learned.gains, 0.5 * light.gains + of_gains)
+    np.testing.assert_allclose(learned.events, 2.5 * rates + np.einsum("nc,npt->cpt", taught, windows))
+    told = (known * np.log(likely.sum(2))).sum() - np.log(likely.sum(2) @ known.mean(0)).sum()
+    assert light.told(windows, known) == pytest.approx(told)
 
 
 @pytest.mark.parametrize(
