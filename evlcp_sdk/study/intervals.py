@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from evlcp_sdk.study.tally import Tally
 
@@ -178,7 +178,7 @@ def ratio_interval(
         away = np.log(ratio[1:] / ratio[0]) / error[1:]
     away = away[np.isfinite(away)]
     tail = (1 - confidence) / 2
-    least = float(stats.t.isf(tail, n - 1))
+    least = -float(special.stdtrit(n - 1, tail))
     ends = np.quantile(away, [1 - tail, tail]) if len(away) else (0.0, 0.0)
     down, up = (min(max(end, least), _MOST_TAILS * least) for end in (float(ends[0]), -float(ends[1])))
     return float(ratio[0] * math.exp(-down * error[0])), float(ratio[0] * math.exp(up * error[0]))
@@ -194,8 +194,8 @@ def proportion_interval(hits: int, trials: int, confidence: float = 0.95) -> tup
     if not trials:
         return 0.0, 1.0
     tail = (1 - confidence) / 2
-    low = float(stats.beta.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
-    high = float(stats.beta.isf(tail, hits + 1, trials - hits)) if hits < trials else 1.0
+    low = float(special.betaincinv(hits, trials - hits + 1, tail)) if hits else 0.0
+    high = float(special.betainccinv(hits + 1, trials - hits, tail)) if hits < trials else 1.0
     return low, high
 
 
@@ -210,6 +210,6 @@ def rms_interval(rms: float, count: int, confidence: float = 0.95) -> tuple[floa
     tail = (1 - confidence) / 2
     squares = count * rms**2
     return (
-        math.sqrt(squares / float(stats.chi2.isf(tail, count))),
-        math.sqrt(squares / float(stats.chi2.ppf(tail, count))),
+        math.sqrt(squares / float(special.chdtri(count, tail))),
+        math.sqrt(squares / (2 * float(special.gammaincinv(count / 2, tail)))),
     )

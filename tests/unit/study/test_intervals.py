@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from scipy.stats import t
+from scipy.stats import beta, chi2, t
 
 from evlcp_sdk.study.intervals import (
     FEWEST_RECORDINGS,
@@ -118,3 +118,16 @@ def test_a_share_near_one_is_bounded_by_one() -> None:
     )
     assert lost.value == pytest.approx(1 - found.value)
     assert (lost.low, lost.high) == pytest.approx((1 - found.high, 1 - found.low))
+
+
+@pytest.mark.parametrize("confidence", [0.5, 0.95, 0.999])
+def test_exact_intervals_end_where_tails_of_their_distributions_begin(confidence: float) -> None:
+    tail = (1 - confidence) / 2
+    for hits, trials in ((0, 7), (1, 7), (6, 7), (7, 7), (3, 4000)):
+        low, high = proportion_interval(hits, trials, confidence)
+        assert low == pytest.approx(beta.ppf(tail, hits, trials - hits + 1) if hits else 0.0)
+        assert high == pytest.approx(beta.isf(tail, hits + 1, trials - hits) if hits < trials else 1.0)
+    for count in (1, 2, 40, 5000):
+        low, high = rms_interval(0.3, count, confidence)
+        assert chi2.sf(count * (0.3 / low) ** 2, count) == pytest.approx(tail)
+        assert chi2.cdf(count * (0.3 / high) ** 2, count) == pytest.approx(tail)
