@@ -1,6 +1,7 @@
 """Runs a command again and again, in forks, each with a fault of the disk: for `test_fault_injection.py`."""
 
 import ctypes
+import gc
 import io
 import json
 import os
@@ -56,6 +57,8 @@ def warm(*arguments: str) -> None:
 def run(arguments: tuple[str, ...], folder: Path, at: int = -1, how: str = "fails") -> Ended:
     """Run a command in a fork; its call number `at` below the folder fails."""
     inlet, outlet = os.pipe()
+    # A fork that looks through all that was there before copies it, page by page.
+    gc.freeze()
     pid = os.fork()
     if not pid:
         code: Any = 70
