@@ -1,12 +1,12 @@
-"""Processor time before there is something to see: version, help, a warm and a cold `receive`; Linux.
+"""Processor time before there is something to see: version, help, the first event, `receive`; Linux.
 
-    python benchmarks/start.py [--beside CHECKOUT] [--rounds 3]
+    python benchmarks/start.py [--beside CHECKOUT] [--rounds 3] [--warm]
 
 Each command runs in a process of its own, and all its children count, orphans, too. Bytecode is kept, as that
 of an installed package is; an interpreter that does nothing stands beside. Warm: the kernels are kept by an
-earlier run. Cold: none are; tried once a checkout, as it takes long. Beside another checkout, both
-run in turn, each by the interpreter of its own `.venv` if it has one, and the ratio of the least times is
-printed.
+earlier run. Cold: none are; tried once a checkout, as it takes long; `--warm` leaves it out. The first event:
+a recording that has no other, and its result. Beside another checkout, both run in turn, each by the
+interpreter of its own `.venv` if it has one. Printed are the least time and the median, and their ratios.
 """
 
 import argparse
@@ -16,6 +16,10 @@ import resource
 import sys
 import tempfile
 from pathlib import Path
+from statistics import median
+
+from evlcp_sdk.io import write_events
+from evlcp_sdk.values import Events
 
 ROOT = Path(__file__).parents[1]
 RECORDING = ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
@@ -53,31 +57,41 @@ def main() -> None:
     parser = argparse.ArgumentParser(description="Processor time of a start")
     parser.add_argument("--beside", type=Path, default=None)
     parser.add_argument("--rounds", type=int, default=3)
+    parser.add_argument("--warm", action="store_true")
     options = parser.parse_args()
     # Whoever compiles for a command that has ended is waited for, too.
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
     checkouts = [ROOT] + ([options.beside.resolve()] if options.beside else [])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
+        write_events(folder / "first.raw", Events.of([0], [640], [360], [1]), 1280, 720)
         receive = ("receive", str(RECORDING), "-o", str(folder / "out"))
         ways = {
             "receive, cold": receive,
             "receive": receive,
+            "first event": ("receive", str(folder / "first.raw"), "-o", str(folder / "out")),
             "--version": ("--version",),
             "--help": ("--help",),
             "nothing": (),
         }
         for way, arguments in ways.items():
-            least = [float("inf")] * len(checkouts)
-            if not way.startswith("receive"):
-                # Leaves its bytecode.
+            cold = way.endswith("cold")
+            if cold and options.warm:
+                continue
+            if not cold:
+                # Leaves its bytecode, and kernels.
                 for k, checkout in enumerate(checkouts):
                     spent_s(checkout, folder / str(k), *arguments)
-            for _ in range(1 if way.endswith("cold") else options.rounds):
+            spent: list[list[float]] = [[] for _ in checkouts]
+            for _ in range(1 if cold else options.rounds):
                 for k, checkout in enumerate(checkouts):
-                    least[k] = min(least[k], spent_s(checkout, folder / str(k), *arguments))
-            beside = f"  beside {least[1]:.2f} s: {least[1] / least[0]:.2f} times" if options.beside else ""
-            print(f"{way:<14} {least[0]:6.2f} s{beside}", flush=True)
+                    spent[k].append(spent_s(checkout, folder / str(k), *arguments))
+            said = ""
+            for name, found in (("least", list(map(min, spent))), ("median", list(map(median, spent)))):
+                own, *other = found
+                said += f"  {name} {own:.3f} s"
+                said += f", beside {other[0]:.3f} s: {other[0] / own:.2f} times" if other else ""
+            print(f"{way:<14}{said}", flush=True)
 
 
 if __name__ == "__main__":

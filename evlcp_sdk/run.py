@@ -1,4 +1,10 @@
-"""The use cases: what a program does with a recording, and what the commands parse and print."""
+"""The use cases: what a program does with a recording, and what the commands parse and print.
+
+What computes positions and what is live take a tenth of a start; they are imported by the functions that use
+them.
+"""
+
+from __future__ import annotations
 
 import math
 import time
@@ -19,29 +25,12 @@ from evlcp_sdk.io.patience import open_until, pieces_until
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.several import load_links, named_links, placing_links
-from evlcp_sdk.live.budget import Budget
-from evlcp_sdk.live.loop import LiveLoop
-from evlcp_sdk.live.outlet import Outlet
-from evlcp_sdk.live.pictures import PictureSlot
-from evlcp_sdk.live.warm import warm_up
 from evlcp_sdk.pace import Stopwatch, times_real_time
-from evlcp_sdk.place.calibration import Calibrated, CalibrationView
-from evlcp_sdk.place.calibration import calibrate as fit_camera
-from evlcp_sdk.place.navigator import Navigator, PositionPlan
-from evlcp_sdk.place.observations import BarView
-from evlcp_sdk.place.own_poses import OwnPoses
-from evlcp_sdk.place.points import SeenPoints, points_at
-from evlcp_sdk.place.poses import KnownPose
-from evlcp_sdk.place.survey import SurveyedBar
-from evlcp_sdk.place.survey import survey as survey_bars
-from evlcp_sdk.place.whereabouts import Whereabouts
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.summary import Status
 from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
-from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.signals import Stopped, stop_on_request
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Frame, Packet
@@ -50,6 +39,18 @@ if TYPE_CHECKING:
     import pandas
     import pyarrow
 
+    from evlcp_sdk.live.budget import Budget
+    from evlcp_sdk.live.outlet import Outlet
+    from evlcp_sdk.live.pictures import PictureSlot
+    from evlcp_sdk.place.calibration import Calibrated, CalibrationView
+    from evlcp_sdk.place.navigator import PositionPlan
+    from evlcp_sdk.place.observations import BarView
+    from evlcp_sdk.place.points import SeenPoints
+    from evlcp_sdk.place.poses import KnownPose
+    from evlcp_sdk.place.survey import SurveyedBar
+    from evlcp_sdk.place.whereabouts import Whereabouts
+    from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
+    from evlcp_sdk.scene.sites import BarSite, LocalAxes
     from evlcp_sdk.study.diagnosis.diagnose import Diagnosis
 
 __all__ = [
@@ -87,7 +88,7 @@ def receive(
     registry: Registry | None = None,
     attitude: Attitude | AttitudeLog | None = None,
     clock_zero: ClockZero = None,
-) -> "Reception":
+) -> Reception:
     """Receive a recording or a camera: an iterator over its packets, in constant memory.
 
     The packets that the stream's end completes come, too, and the source is closed behind the last one.
@@ -195,7 +196,7 @@ class Reception(Iterator[Packet]):
         for packet in self:
             yield from packet.frames
 
-    def to_pandas(self) -> "pandas.DataFrame":
+    def to_pandas(self) -> pandas.DataFrame:
         """The frames of the packets that follow as a table of pandas, with the columns of `frames.csv`.
 
         Raises:
@@ -204,7 +205,7 @@ class Reception(Iterator[Packet]):
         frame: pandas.DataFrame = frames_table(self, "pandas")
         return frame
 
-    def to_arrow(self) -> "pyarrow.Table":
+    def to_arrow(self) -> pyarrow.Table:
         """The same as a table of Arrow.
 
         Raises:
@@ -362,6 +363,10 @@ def live(
         ConfigError: The sensor is not the link's, or a sink cannot be used.
         PluginError: A plugin's code fails.
     """
+    from evlcp_sdk.live.loop import LiveLoop
+    from evlcp_sdk.live.outlet import Outlet
+    from evlcp_sdk.live.warm import warm_up
+
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     outlet = Outlet() if outlet is None else outlet
@@ -573,7 +578,7 @@ def diagnose(
     *,
     registry: Registry | None = None,
     advance: Advance = lambda _done, _of: None,
-) -> "Diagnosis":
+) -> Diagnosis:
     """Say why a recording is read, or is not: what blinks in it, and which stage of the receiver stops it.
 
     Args:
@@ -768,6 +773,9 @@ def calibrate(
         ConfigError: A pose belongs to none of the recordings, a site contradicts its beacon, or too little
             was seen.
     """
+    from evlcp_sdk.place.calibration import calibrate as fit_camera
+    from evlcp_sdk.scene.sites import LocalAxes
+
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
     if not link.bar.in_even_line or link.bar.clusters < 2:
@@ -805,6 +813,9 @@ def _views(
     source: str,
 ) -> list[CalibrationView]:
     """What a recording shows at the times of known poses."""
+    from evlcp_sdk.place.observations import BarView
+    from evlcp_sdk.place.whereabouts import Whereabouts
+
     who = Whereabouts(sites, link.position)
     seen, _ = _seen_at(url, poses, {"": link}, registry, who, source)
     for how in who.contradicted.values():
@@ -822,6 +833,9 @@ def _views(
 
 
 def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> CalibrationView:
+    from evlcp_sdk.place.calibration import CalibrationView
+    from evlcp_sdk.scene.sites import LocalAxes
+
     place = (pose.latitude_deg, pose.longitude_deg, pose.height_m)
     rotation = None
     if pose.attitude is not None:
@@ -844,6 +858,8 @@ def _seen_at(
         InputError: The recording cannot be read.
         ConfigError: No pose is of a time at which bars are in view.
     """
+    from evlcp_sdk.place.points import points_at
+
     placing = placing_links(links)
     periods = {name: one.packet.packet_chips * one.packet.chip_us for name, one in placing.items()}
     frames: dict[int, list[Frame]] = {}
@@ -908,6 +924,11 @@ def survey(
         InputError: A recording cannot be read.
         ConfigError: A pose belongs to none of the recordings, or has no attitude, or too little was seen.
     """
+    from evlcp_sdk.place.observations import BarView
+    from evlcp_sdk.place.survey import survey as survey_bars
+    from evlcp_sdk.place.whereabouts import Whereabouts
+    from evlcp_sdk.scene.sites import LocalAxes
+
     registry = Registry.load() if registry is None else registry
     links = named_links(load_links(link, registry=registry))
     placing = placing_links(links)
@@ -1004,6 +1025,10 @@ def _own_poses(
     """The poses of a recording's own track while new bars are in view, the bars that it goes by, and what it
     saw.
     """
+    from evlcp_sdk.place.navigator import Navigator
+    from evlcp_sdk.place.own_poses import OwnPoses
+    from evlcp_sdk.scene.attitude import attitude_source
+
     navigator = Navigator(placing_links(named_links(links)), plan, attitude)
     own = OwnPoses(navigator, attitude_source(attitude), Path(url).name)
     taken: dict[int, BarSite] = {}

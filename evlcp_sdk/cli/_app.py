@@ -12,7 +12,7 @@ import typer
 from typer.core import TyperGroup
 from typer.models import CommandInfo, TyperInfo
 
-from evlcp_sdk.cli._common import echo, hush, log_on_stderr
+from evlcp_sdk.cli._common import echo, hush, loaded, log_on_stderr
 from evlcp_sdk.cli._front import print_front
 from evlcp_sdk.printable import printable
 
@@ -58,7 +58,8 @@ _OWN = (
 """Modules of our own commands, each of which adds the one that it is named after."""
 
 _SOON = frozenset({"receive", "live"})
-"""Commands that need neither others nor a plugin's, and would wait for these a tenth of their start."""
+"""Commands that need neither others nor a plugin's, and would wait for these a tenth of their start; they say
+themselves when they are loaded."""
 
 
 class _Commands(TyperGroup):
@@ -97,6 +98,8 @@ class _Commands(TyperGroup):
             return super().make_context(*args, **more)
 
     def invoke(self, ctx: Any) -> Any:
+        if self.late.keys() - _SOON:
+            loaded()
         with _printable_faults():
             return super().invoke(ctx)
 
@@ -153,7 +156,19 @@ def _built(name: str, info: CommandInfo | TyperInfo) -> Any:
         alone.registered_commands.append(info)
     else:
         alone.registered_groups.append(info)
-    return typer.main.get_group(alone).commands[name]
+    command = typer.main.get_group(alone).commands[name]
+    for parameter in command.params:
+        _leave_unset(parameter)
+    return command
+
+
+def _leave_unset(parameter: Any) -> None:
+    """Spare a parameter that is not given what Typer makes to check it, an adapter of pydantic."""
+    if parameter.required or parameter.callback is not None:
+        return
+    process = parameter.process_value
+    unset = () if parameter.multiple or parameter.nargs == -1 else None
+    parameter.process_value = lambda ctx, value: unset if value is None else process(ctx, value)
 
 
 def _childless(info: TyperInfo) -> TyperInfo:

@@ -1,5 +1,6 @@
 """What the commands share: their options, where jobs run, what goes to stderr."""
 
+import gc
 import logging
 import os
 import sys
@@ -32,6 +33,7 @@ __all__ = [
     "console",
     "echo",
     "hush",
+    "loaded",
     "log_on_stderr",
     "make_executor",
     "shows_bars",
@@ -104,6 +106,16 @@ def log_on_stderr() -> "Iterator[None]":
         log.setLevel(before)
 
 
+_GARBAGE = 50_000
+"""New objects before the collector of garbage looks for cycles, of which a run makes few."""
+
+
+def loaded() -> None:
+    """Wake the collector of garbage, which rests while a command is loaded: what that is made of stays."""
+    gc.freeze()
+    gc.set_threshold(_GARBAGE, *gc.get_threshold()[1:])
+
+
 def hush() -> None:
     """Keep Matplotlib from saying on stderr where it keeps its caches when there is no home."""
     logging.getLogger("matplotlib").setLevel(logging.ERROR)
@@ -135,9 +147,6 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     Raises:
         ConfigError: The cluster is not there.
     """
-    from evlcp_sdk.jobs.inline import Inline
-    from evlcp_sdk.jobs.processes import Processes
-
     if dask is not None:
         if workers is not None:
             raise typer.BadParameter("give one of --workers and --dask", param_hint="--dask")
@@ -145,7 +154,11 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
 
         return DaskCluster(dask)
     if workers == 0:
+        from evlcp_sdk.jobs.inline import Inline
+
         return Inline()
+    from evlcp_sdk.jobs.processes import Processes
+
     return Processes(workers or os.cpu_count() or 1)
 
 

@@ -27,9 +27,9 @@ def print_front(group: Any, ctx: Any) -> None:
     usage.highlight_words(["Usage: "], "yellow")
     out.print(Padding(usage, 1), soft_wrap=False)
     first, *others = cleandoc(group.help or "").split("\n\n")
-    parts = [Text.from_markup(first.replace("\n", " "))]
+    parts = [_text(first.replace("\n", " "))]
     if others:
-        parts += [Text(), Text.from_markup("\n\n".join(others), style="dim")]
+        parts += [Text(), _text("\n\n".join(others), style="dim")]
     out.print(Padding(Group(*parts), (0, 1, 1, 1)), soft_wrap=False)
     options = [
         (Text(",".join(o.opts), "bold cyan"), Text(o.display_type_rich(ctx=ctx) or "", "bold yellow"), o.help)
@@ -41,11 +41,17 @@ def print_front(group: Any, ctx: Any) -> None:
     _print_panel(out, "Commands", [(Text(name, "bold cyan"), said) for name, said in shown])
 
 
+def _text(markup: str, style: str = "") -> Any:
+    """Text with markup; names of emojis, of which there are thousands, are none."""
+    from rich.text import Text
+
+    return Text.from_markup(markup, style=style, emoji=False)
+
+
 def _print_panel(out: Any, title: str, rows: list[tuple[Any, ...]]) -> None:
     """Rows of texts, the last column with markup and taking all the room, in a frame."""
     from rich.panel import Panel
     from rich.table import Table
-    from rich.text import Text
 
     table = Table(show_header=False, expand=True, box=None, pad_edge=False, padding=(0, 1))
     for _ in rows[0][:-1]:
@@ -53,5 +59,5 @@ def _print_panel(out: Any, title: str, rows: list[tuple[Any, ...]]) -> None:
     table.add_column(ratio=10)
     for *cells, said in rows:
         paragraph = cleandoc(said or "").split("\n\n")[0].replace("\n", " ")
-        table.add_row(*cells, Text.from_markup(paragraph))
+        table.add_row(*cells, _text(paragraph))
     out.print(Panel(table, border_style="dim", title=title, title_align="left"), soft_wrap=False)

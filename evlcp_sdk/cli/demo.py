@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evlcp_sdk.cli._common import Json, Workers, complain, console, echo
-from evlcp_sdk.files import shipped
 from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
@@ -31,6 +30,7 @@ def register(app: typer.Typer) -> None:
 
 def demo_files() -> tuple[Path, Path]:
     """The demo's recording and its truth: in the wheel, or in a checkout's `examples/recordings`."""
+    from evlcp_sdk.files import shipped
     from evlcp_sdk.sim.truth import truth_path
 
     raw = shipped("recordings", f"{DEMO_NAME}.raw")
@@ -39,6 +39,8 @@ def demo_files() -> tuple[Path, Path]:
 
 def demo_campaign() -> Path:
     """The demo's campaign: in the wheel, or in a checkout's `examples/campaigns`."""
+    from evlcp_sdk.files import shipped
+
     return shipped("campaigns", f"{CAMPAIGN_NAME}.toml")
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import threading
 from contextlib import contextmanager
 from functools import partial
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFiles, Overrides, complain, console, echo
+from evlcp_sdk.cli._common import LinkFiles, Overrides, complain, console, echo, loaded
 from evlcp_sdk.cli._receiving import (
     AttitudeFile,
     ClockZero,
@@ -187,6 +186,8 @@ def live(
     Where the receiver cannot keep up, it leaves out, in this order, and counts: rows outside of regions, the
     distances of most frames, all outside of regions, the oldest events. Ctrl-C ends it, with its summary.
     """
+    import json
+
     from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.reconnect import ReconnectingSource
@@ -202,6 +203,7 @@ def live(
     registry = Registry.load()
     links = load_links(link_files, overrides or [], registry)
     say_alike(links)
+    loaded()
     sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
     attitude = attitude_of(attitude_file, (heading_deg, pitch_deg, roll_deg), sigmas)
     zero = clock_zero_of(clock_zero)

@@ -16,8 +16,8 @@ __all__ = ["main"]
 _FAILED = 1
 _INTERRUPTED = 130
 
-_GARBAGE = 50_000
-"""New objects before the collector looks for cycles: what modules are made of are more, and stay."""
+_GARBAGE = 1_000_000
+"""New objects before the collector of garbage looks for cycles: it rests until a command is `loaded`."""
 
 
 def main() -> None:
@@ -25,6 +25,8 @@ def main() -> None:
     code: object = 0
     # Our matrices are of a dozen rows: a thread a core only spins on them. NumPy reads it when it is loaded.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # To look for plugins of pydantic is to read what every package says of itself.
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.set_threshold(_GARBAGE, *gc.get_threshold()[1:])
     try:
         from signal import SIGHUP, SIGTERM

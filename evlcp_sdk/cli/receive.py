@@ -21,6 +21,7 @@ from evlcp_sdk.cli._common import (
     console,
     echo,
     hush,
+    loaded,
     make_executor,
     shows_bars,
 )
@@ -178,7 +179,6 @@ def receive(
     """
     import json
 
-    from evlcp_sdk.jobs.processes import stop_workers
     from evlcp_sdk.link.several import load_links
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import stop_on_request
@@ -188,6 +188,7 @@ def receive(
     registry = Registry.load()
     links = load_links(link_files, overrides or [], registry)
     say_alike(links)
+    loaded()
     if link_mode is LinkMode.AUTO:
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
@@ -204,7 +205,13 @@ def receive(
     executor = make_executor(0 if here else workers or None, dask)
     worst, degraded, warned = 0, False, False
     interrupted: list[Path | None] = []
-    pass_on = (lambda: None) if here else stop_workers
+
+    def pass_on() -> None:
+        if not here:
+            from evlcp_sdk.jobs.processes import stop_workers
+
+            stop_workers()
+
     with (
         stop_on_request(pass_on) as stopped,
         _recordings_bar(0 if here else len(jobs)) as count,

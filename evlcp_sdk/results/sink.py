@@ -1,14 +1,18 @@
 """What every output format is to a run: a sink that takes packets and positions as they come."""
 
+from __future__ import annotations
+
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Fix, Packet
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan, Settled
 
 __all__ = ["Run", "Sink"]
 

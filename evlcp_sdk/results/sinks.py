@@ -1,20 +1,24 @@
 """All sinks of one run as one, and whose fault it is when one of them fails."""
 
+from __future__ import annotations
+
 import json
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.files import output_fault
-from evlcp_sdk.place.navigator import Placed, Settled
 from evlcp_sdk.plugin.records import InstalledSink
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Events, Packet
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place.navigator import Placed, Settled
 
 __all__ = ["Sinks", "load_sinks"]
 

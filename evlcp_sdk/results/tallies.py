@@ -1,18 +1,24 @@
 """The figures of a summary, counted as packets and positions come, in constant memory."""
 
+from __future__ import annotations
+
 import math
 from collections import Counter, OrderedDict
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.place.learnt import Learnt
-from evlcp_sdk.place.navigator import Navigator, Placed
-from evlcp_sdk.place.refusals import REFUSALS
-from evlcp_sdk.place.trajectory import GNSS
+from evlcp_sdk.late import Late
 from evlcp_sdk.results.text import number_or_none, sigmas
 from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place import refusals, trajectory
+    from evlcp_sdk.place.learnt import Learnt
+    from evlcp_sdk.place.navigator import Navigator, Placed
+else:
+    refusals, trajectory = (Late(f"evlcp_sdk.place.{name}") for name in ("refusals", "trajectory"))
 
 __all__ = ["MOST_MESSAGES", "PositionTally", "RunTally", "TransmitterTally"]
 
@@ -300,7 +306,7 @@ class PositionTally:
             self.refused[placed.fix.refusal] += 1
             self.suspects.update(placed.fix.suspects)
             return
-        if placed.fix.source == GNSS:
+        if placed.fix.source == trajectory.GNSS:
             return
         self.given += 1
         self.last = placed.fix
@@ -315,7 +321,7 @@ class PositionTally:
             "fixes": self.given,
             "fixes_verified": self.verified,
             "last": None if self.last is None else _last(self.last),
-            "refused": {kind: self.refused[kind] for kind in REFUSALS if self.refused[kind]},
+            "refused": {kind: self.refused[kind] for kind in refusals.REFUSALS if self.refused[kind]},
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
             "suspects": dict(sorted(self.suspects.items())),

@@ -1,16 +1,17 @@
 """One run's result: packets in; tallies, positions and files out."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links, placing_links
-from evlcp_sdk.place.navigator import Navigator, Placed, PositionPlan
 from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.doubts import LinkPart, Seen, other_codewords
@@ -24,6 +25,9 @@ from evlcp_sdk.results.tallies import PositionTally, RunTally
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Packet
+
+if TYPE_CHECKING:
+    from evlcp_sdk.place.navigator import Navigator, Placed, PositionPlan
 
 __all__ = ["ResultWriter"]
 
@@ -70,13 +74,17 @@ class ResultWriter:
         self._links = named_links(link)
         first = next(iter(self._links.values()))
         placing = placing_links(self._links) if plan is not None else {}
+        self._navigator: Navigator | None = None
         if plan is not None:
+            # What computes positions takes a tenth of a start.
+            from evlcp_sdk.place.navigator import Navigator
+
             plan.check_links(list(self._links))
+            self._navigator = Navigator(placing, plan, attitude)
         self._placing = next(iter(placing), "")
         self._tally = RunTally({name: one.packet for name, one in self._links.items()})
         self._positions = PositionTally()
         self._readout = ReadoutTally()
-        self._navigator = Navigator(placing, plan, attitude) if plan is not None else None
         several = self._links if len(self._links) > 1 else {}
         self._pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
         run = Run(name, first, plan, self._navigator, clock_zero, several)

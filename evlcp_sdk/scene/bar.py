@@ -234,7 +234,7 @@ class BarLayout:
             near = nearest(name, list(SHAPES)) if isinstance(name, str) else ""
             said = f" = {shown(name)}: expected one of {', '.join(SHAPES)}{near}"
             raise SpecError([(("shape",), said)])
-        return cls(build(SHAPES[name], keys))
+        return cls(build(SHAPES[name], keys)) if table else cls()
 
     @cached_property
     def _leds(self) -> Leds:

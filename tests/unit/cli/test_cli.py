@@ -15,7 +15,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
+from evlcp_sdk.cli._app import _built, make_app
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, open_source, write_events
 from evlcp_sdk.place.nmea import checksum
@@ -86,6 +88,38 @@ def test_what_receives_is_imported_without_what_only_some_of_it_needs() -> None:
         "sys.exit(f'imported {heavy}' if heavy else 0)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True)
+
+
+def test_a_plain_receive_loads_what_it_needs_and_lets_the_collector_rest_until_then(tmp_path: Path) -> None:
+    write_events(tmp_path / "one.raw", Events.of([0], [640], [360], [1]), 1280, 720)
+    code = (
+        "import gc, sys\n"
+        "from evlcp_sdk.cli.main import main\n"
+        "looked = []\n"
+        "gc.callbacks.append(lambda phase, _: phase == 'start' and looked.append(gc.get_threshold()[0]))\n"
+        f"sys.argv = ['evlcp', 'receive', {str(tmp_path / 'one.raw')!r}, '-o', {str(tmp_path / 'out')!r}]\n"
+        "try:\n    main()\nexcept SystemExit:\n    pass\n"
+        "groups = ('place', 'live', 'sim', 'study', 'jobs.processes')\n"
+        "idle = [m for m in sys.modules if m.startswith(tuple(f'evlcp_sdk.{name}' for name in groups))]\n"
+        "print(idle, gc.get_threshold()[0], gc.get_freeze_count() > 50_000, all(n < 1000 for n in looked))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "[] 50000 True True"
+
+
+def test_options_that_are_not_given_are_what_typer_makes_of_them() -> None:
+    app = make_app("receive")
+    (info,) = app.registered_commands
+    command = _built("receive", info)
+    plain = typer.main.get_group(app).commands["receive"]
+    for given in (
+        ["a.raw"],
+        ["a.raw", "b.raw", "-o", "out", "--set", "a.b=1", "--pitch-deg", "2", "--strict"],
+    ):
+        found, expected = (one.make_context("receive", list(given)).params for one in (command, plain))
+        assert found == expected
+    with pytest.raises(Exception, match="recordings"):
+        command.make_context("receive", [])
 
 
 def test_version(evlcp: Evlcp) -> None:

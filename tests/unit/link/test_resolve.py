@@ -15,7 +15,7 @@ from pydantic import Field
 from evlcp_sdk.air.codebook import BARKER13, Codebook, chips_of_values, hadamard
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, PluginError, UnknownAlgorithmError
-from evlcp_sdk.link.resolve import Link, load_link, resolve
+from evlcp_sdk.link.resolve import _SPECS, Link, load_link, resolve
 from evlcp_sdk.link.text import to_toml
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
@@ -39,8 +39,9 @@ from evlcp_sdk.plugin.roles import (
     Tracker,
     Tracking,
 )
-from evlcp_sdk.scene.bar import BarLayout
+from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.specs import build
 
 
 @dataclass(frozen=True)
@@ -147,6 +148,21 @@ def faults_of(registry: Registry, text: str, tmp_path: Path, *overrides: str) ->
         load_link(path, overrides, registry)
     assert caught.value.exit_code == 2
     return str(caught.value).replace(f"{tmp_path}/", "").splitlines()
+
+
+def _ours() -> Iterator[type[Any]]:
+    """What a link is built of, sections and algorithms."""
+    registry = Registry.load()
+    yield from (*_SPECS.values(), LedGrid)
+    for role in ROLES:
+        for entry in registry.installed(role):
+            if entry.distribution == "evlcp-sdk":
+                yield registry.load_class(role, entry.algorithm.id)
+
+
+@pytest.mark.parametrize("cls", list(_ours()), ids=lambda cls: cls.__name__)
+def test_our_defaults_are_what_a_model_makes_of_nothing(cls: type[Any]) -> None:
+    assert repr(build(cls, {})) == repr(cls())
 
 
 def test_defaults_are_all_written_out(registry: Registry) -> None:

@@ -14,14 +14,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk import run
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.cli.live import going_text
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import RawSource, ReplaySource, open_source, write_events
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription
+from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription, warm
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import live, receive
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
@@ -368,7 +367,7 @@ def test_what_positions_need_is_loaded_before_the_first_event() -> None:
 
 
 def test_a_wrong_name_is_said_before_kernels_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "warm_up", lambda *_, **__: pytest.fail("kernels are loaded for nothing"))
+    monkeypatch.setattr(warm, "warm_up", lambda *_, **__: pytest.fail("kernels are loaded for nothing"))
     for name in ("nothing.raw", "replay:nothing.raw", "bag:nothing", "hdf5:nothing.hdf5"):
         with pytest.raises(InputError, match="No such file"):
             live(name)
