@@ -17,6 +17,9 @@ CAMERA_PARAMETERS = ("focal_mm", "centre_x_px", "centre_y_px", "k1", "k2", "p1",
 _NEWTON_STEPS = 12
 """Each doubles the digits; four suffice for what lenses do."""
 
+_ARRIVED = 1e-15
+"""A step of a direction that is rounding: a few units in the last place of directions near 1."""
+
 
 @dataclass(frozen=True)
 class CameraModel:
@@ -125,7 +128,11 @@ class CameraModel:
             size = np.where((a > 0) & (a * d > b * b), a * d - b * b, np.nan)
             step_u = (d * miss[..., 0] - b * miss[..., 1]) / size
             step_v = (a * miss[..., 1] - b * miss[..., 0]) / size
-            found = found + np.stack([step_u, step_v], -1)
+            # Each point by itself, whatever others are with it: it stays once a step is rounding.
+            far = ~(np.maximum(np.abs(step_u), np.abs(step_v)) <= _ARRIVED)
+            if not far.any():
+                break
+            found = np.where(far[..., None], found + np.stack([step_u, step_v], -1), found)
         away = np.abs(self.distort(found) - points_px).max(-1, keepdims=True)
         return np.where(away < 1e-6, found, np.nan)
 

@@ -124,3 +124,11 @@ def test_sigmas_and_correlations_make_the_covariance() -> None:
 def test_correlations_that_are_none_are_refused(rows: tuple[tuple[float, ...], ...], says: str) -> None:
     with pytest.raises(ConfigError, match=f"camera_sigma.correlation: .*{says}"):
         CameraSigma(focal_mm=1.0, correlation=rows)
+
+
+def test_undistort_of_many_points_is_that_of_each_to_the_last_bit() -> None:
+    points = np.stack(np.meshgrid(np.linspace(-4000, 5000, 40), np.linspace(-3000, 3700, 40)), -1)
+    together = BENT.undistort(points)
+    assert 0 < np.isnan(together).sum() < together.size
+    alone = [BENT.undistort(point) for point in points.reshape(-1, 2)]
+    np.testing.assert_array_equal(together.reshape(-1, 2), alone)
