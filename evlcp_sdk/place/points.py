@@ -149,11 +149,14 @@ def points_at(
     pixel_px = math.hypot(spec.pixel_sigma_px * _left(line[0], places), early_px)
     clusters = len(layout_m)
     found, drawn = np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
+    lines: dict[bytes, Floats] = {}
     for k in range(clusters):
         seen = np.isfinite(shapes[:, k, 0])
         if seen.sum() < 3:
             continue
-        inverse = _line(dt[seen])
+        # Most clusters are seen in the same frames, and often in all.
+        if (inverse := lines.get(seen.tobytes())) is None:
+            inverse = lines[seen.tobytes()] = _line(dt[seen])
         found[k] = place + (inverse @ shapes[seen, k])[0]
         drawn[k] = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
     sigma = np.hypot(wider * drawn, pixel_px)
