@@ -17,7 +17,7 @@ from evlcp_sdk.air.codebook import Codebook
 from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine, UsbLine
 from firmware_host.errors import NoBoardError, RefusedError, VerifyError
 from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.client import Timing
@@ -88,6 +88,21 @@ def test_what_the_watchdog_will_do_is_said(evlcp: Evlcp, action: str, what: str)
     assert "watchdog" not in evlcp("board", "program", *options, "--watchdog", "keep").out
     said = evlcp("board", "watchdog", action, "--after-ms", 1500, "--port", "native:").out
     assert f"the board {what}" in said
+
+
+@pytest.mark.parametrize(("latency_s", "frame_s", "at_most"), [(0.0, 0.0, 1.15), (0.002, 0.001, 1.3)])
+def test_programming_is_near_the_wire_time(
+    book: Codebook, latency_s: float, frame_s: float, at_most: float
+) -> None:
+    """By the board's own clock, over a line alone and behind a USB bridge: few waits for answers."""
+    baud = 1_000_000
+    device = SimulatedBoard()
+    board = board_on(UsbLine(device, latency_s, baud, frame_s))
+    bank = Bank.of_symbols(random_symbols(64, 10, book, np.random.default_rng(0)), book)
+    began_us = device.now_us
+    assert provision(board, bank, Settings()).written == len(bank.content)
+    wire_us = 10e6 * len(bank.content) / baud
+    assert wire_us < device.now_us - began_us <= at_most * wire_us
 
 
 def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(book: Codebook) -> None:
