@@ -185,7 +185,7 @@ def test_one_that_stalls_costs_the_others_nothing(stage: Stage) -> None:
                 assert head["dropped"] == 0
         while seen < 6000:
             seen += len(next_of(quick)[0]["news"])
-        assert time.monotonic() - began < 10
+        assert time.monotonic() - began < 60
         head, _ = next_of(stalled)
         # The newest, and how many there were before them.
         assert (len(head["news"]), head["dropped"]) == (4000, 2000)
@@ -489,7 +489,7 @@ def test_a_browser_shows_a_view_apart_and_may_be_killed(tmp_path: Path) -> None:
         for n in range(30):
             stage.frame(n)
             stage.picture(round(time.monotonic() * 1e6))
-        assert time.perf_counter() - began < 1
+        assert time.perf_counter() - began < 10
         with stage.connect() as link:
             assert "about" in json.loads(link.recv(5))
             link.send('{"next": true}')

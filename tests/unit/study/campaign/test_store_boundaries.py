@@ -72,7 +72,7 @@ def test_a_file_of_other_tables_is_refused_at_once(results: Path, statements: tu
     for create in (False, True):
         with pytest.raises(InputError, match=r"a\.sqlite: not a results file of this SDK: other tables"):
             Store(results, create=create)
-    assert time.monotonic() - began < 2
+    assert time.monotonic() - began < 30
 
 
 def test_a_page_that_is_its_own_child_is_damage(results: Path) -> None:
