@@ -28,6 +28,7 @@ def main() -> None:
     # To look for plugins of pydantic is to read what every package says of itself.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
     gc.set_threshold(_GARBAGE, *gc.get_threshold()[1:])
+    before, sys.unraisablehook = sys.unraisablehook, _unraisable
     try:
         from signal import SIGHUP, SIGTERM
 
@@ -53,9 +54,27 @@ def main() -> None:
         complain("interrupted")
     except BaseException as fault:
         code = _told(fault)
+    sys.unraisablehook = before
     if not _stdout_took_all() and not code:
         code = _FAILED
     sys.exit(code)  # type: ignore[arg-type]
+
+
+def _unraisable(fault: sys.UnraisableHookArgs) -> None:
+    """Let Ctrl-C that falls into a callback, such as those of imports, come again with the next call.
+
+    Python would only report it, and go on.
+    """
+    if fault.exc_type is KeyboardInterrupt:
+        sys.setprofile(_interrupt)
+    else:
+        sys.__unraisablehook__(fault)
+
+
+def _interrupt(_frame: object, event: str, _of: object) -> None:
+    if event == "call":
+        sys.setprofile(None)
+        raise KeyboardInterrupt
 
 
 def _told(fault: BaseException) -> int:

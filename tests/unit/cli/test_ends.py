@@ -82,6 +82,28 @@ def test_a_module_interrupted_while_it_is_imported(
     assert (done.code, done.err) == (130, "evlcp: interrupted\n")
 
 
+def test_ctrl_c_in_a_callback_is_not_lost(tmp_path: Path) -> None:
+    """Python only reports what is raised there, as in those that imports end with."""
+    (tmp_path / "falls.py").write_text(
+        "import signal, sys, weakref\n"
+        "class Finder:\n"
+        "    def find_spec(self, name, *_):\n"
+        "        if name == 'evlcp_sdk.cli._app':\n"
+        "            last = set()\n"
+        "            gone = weakref.ref(last, lambda _: signal.raise_signal(signal.SIGINT))\n"
+        "            del last\n"
+        "sys.meta_path.insert(0, Finder())\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", f"import falls; {MAIN}", "info", tmp_path / "none.raw"],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (130, "evlcp: interrupted\n")
+
+
 def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
     """What it imports before it can catch an interrupt is next to nothing."""
     code = "import sys; import evlcp_sdk.cli.main; print(*sys.modules)"
