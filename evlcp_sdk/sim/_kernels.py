@@ -221,12 +221,11 @@ _EVEN = 4
 # A batch's room: rows of LANES numbers, each of which begins here. Rows with constant places in one array are
 # what the compiler knows to be apart. Of every pixel, and with _M_ of those that may fire in a piece of time:
 _X, _Y, _NOW, _U, _REFERENCE, _READY, _LAST_OUT, _ON, _OFF, _FOLLOWER, _ARMED = range(0, 11 * LANES, LANES)
-_REST, _END, _KEPT, _AGE, _NEW, _AROUND, _TOTAL = range(11 * LANES, 18 * LANES, LANES)
-_ALONG, _ACROSS, _ROW_PART, _NODE_PART = range(18 * LANES, 22 * LANES, LANES)
-_M_U, _M_REST, _M_END, _M_REFERENCE, _M_READY, _M_LAST_OUT = range(22 * LANES, 28 * LANES, LANES)
-_M_ON, _M_OFF, _M_AGE, _M_KEPT, _M_SHIFT, _M_FATE = range(28 * LANES, 34 * LANES, LANES)
-_M_RATIO, _M_SPARE, _M_TAU, _M_LATER, _M_CROSS = range(34 * LANES, 39 * LANES, LANES)
-_M_LEVEL, _M_REQUEST, _ROOM = range(39 * LANES, 42 * LANES, LANES)
+_REST, _END, _NEW, _AROUND, _TOTAL = range(11 * LANES, 16 * LANES, LANES)
+_ALONG, _ACROSS, _ROW_PART, _NODE_PART = range(16 * LANES, 20 * LANES, LANES)
+_M_U, _M_REST, _M_END, _M_REFERENCE, _M_READY, _M_LAST_OUT = range(20 * LANES, 26 * LANES, LANES)
+_M_ON, _M_OFF, _M_AGE, _M_SHIFT, _M_FATE, _M_SPARE = range(26 * LANES, 32 * LANES, LANES)
+_M_LATER, _M_CROSS, _M_LEVEL, _M_REQUEST, _ROOM = range(32 * LANES, 37 * LANES, LANES)
 
 
 @njit(cache=True, nogil=True, error_model="numpy", inline="always")
