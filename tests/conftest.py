@@ -1,5 +1,6 @@
 """What tests share: the shipped recording and how the command line is run."""
 
+import gc
 import os
 import signal
 import sys
@@ -77,6 +78,9 @@ def evlcp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
             main()
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        finally:
+            # A command keeps all that is there when it is loaded, as its process ends with it; this one goes on.
+            gc.unfreeze()
         said = capsys.readouterr()
         return Run(code, said.out, said.err)
 
