@@ -79,7 +79,7 @@ def evlcp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else int(end.code is not None)
         finally:
-            # A command keeps all that is there when it is loaded, as its process ends with it; this one goes on.
+            # A command keeps all that is there when it is loaded, as its process ends with it.
             gc.unfreeze()
         said = capsys.readouterr()
         return Run(code, said.out, said.err)
