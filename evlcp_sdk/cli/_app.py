@@ -98,6 +98,7 @@ class _Commands(TyperGroup):
             return super().make_context(*args, **more)
 
     def invoke(self, ctx: Any) -> Any:
+        # An app of one of these alone is loaded when it says so.
         if self.late.keys() - _SOON:
             loaded()
         with _printable_faults():

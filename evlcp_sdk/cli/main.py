@@ -16,7 +16,7 @@ __all__ = ["main"]
 _FAILED = 1
 _INTERRUPTED = 130
 
-_GARBAGE = 1_000_000
+_RESTING = 1_000_000
 """New objects before the collector of garbage looks for cycles: it rests until a command is `loaded`."""
 
 
@@ -27,8 +27,18 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # To look for plugins of pydantic is to read what every package says of itself.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    gc.set_threshold(_GARBAGE, *gc.get_threshold()[1:])
-    before, sys.unraisablehook = sys.unraisablehook, _unraisable
+    gc.set_threshold(_RESTING, *gc.get_threshold()[1:])
+    before = sys.unraisablehook
+
+    def unraisable(fault: sys.UnraisableHookArgs) -> None:
+        # Ctrl-C that falls into a callback, such as those of imports, Python would only report, and go on. It
+        # comes again with the next call.
+        if fault.exc_type is KeyboardInterrupt:
+            sys.setprofile(_interrupt)
+        else:
+            before(fault)
+
+    sys.unraisablehook = unraisable
     try:
         from signal import SIGHUP, SIGTERM
 
@@ -60,18 +70,8 @@ def main() -> None:
     sys.exit(code)  # type: ignore[arg-type]
 
 
-def _unraisable(fault: sys.UnraisableHookArgs) -> None:
-    """Let Ctrl-C that falls into a callback, such as those of imports, come again with the next call.
-
-    Python would only report it, and go on.
-    """
-    if fault.exc_type is KeyboardInterrupt:
-        sys.setprofile(_interrupt)
-    else:
-        sys.__unraisablehook__(fault)
-
-
 def _interrupt(_frame: object, event: str, _of: object) -> None:
+    """Raise, as a profiler that is told of the next call."""
     if event == "call":
         sys.setprofile(None)
         raise KeyboardInterrupt

@@ -216,6 +216,9 @@ def frame_bound(
     """
     if not bar.column_pitch_m > 0 or bar.clusters < 3:
         return plane_frame_bound(camera, bar, codebook, full_events=full_events)
+    # It takes half a second to load, and campaigns know no frames.
+    from scipy.stats import theilslopes
+
     spacing_m = _spacing_m(bar)
 
     def bound(view: FrameView) -> Range:
@@ -231,7 +234,7 @@ def frame_bound(
             sums, light, offset = sums.transpose(0, 2, 1), light.T, offset[::-1]
         k = np.flatnonzero(seen)
         tilt, left = _line(light)
-        spacing, first = _straight(k, at_row[k])
+        spacing, first = theilslopes(at_row[k], k)[:2]
         values, columns = _row_values(sums, light, tilt, left, full_events)
         codes = codes_of(codebook, view.soft.symbols)
         rows, down = _rows(sums.shape[1]), offset[1]
@@ -411,13 +414,6 @@ def _place(presence: PresenceMap) -> tuple[bool, Array, NDArray[np.bool_]] | Non
         middle[:, k] = np.median(np.nonzero(selected[k]), axis=1) * grid + (grid - 1) / 2
     upright = bool(np.ptp(middle[0][seen]) >= np.ptp(middle[1][seen]))
     return upright, middle[0 if upright else 1], seen
-
-
-def _straight(x: NDArray[np.int64], y: NDArray[np.float64]) -> tuple[float, float]:
-    """Slope and start of the line through points, x ascending, by the median slope of pairs (Theil, Sen)."""
-    one, other = np.triu_indices(len(x), 1)
-    slope = float(np.median((y[other] - y[one]) / (x[other] - x[one])))
-    return slope, float(np.median(y) - slope * np.median(x))
 
 
 def _line(light: NDArray[np.float32]) -> tuple[float, float]:

@@ -2,13 +2,13 @@
 
 import numpy as np
 import pytest
-from scipy.stats import norm, theilslopes
+from scipy.stats import norm
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.study.bound import _straight, cramer_rao_sigma_m, frame_bound, lean_sigma_deg
+from evlcp_sdk.study.bound import cramer_rao_sigma_m, frame_bound, lean_sigma_deg
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 LINK = load_link()
@@ -206,11 +206,3 @@ def test_panels_have_that_of_the_plane_and_one_cluster_none() -> None:
         cramer_rao_sigma_m(CameraModel(), panel, LINK.codebook, 50.0, range(16), blur_px=0.4, noise=0.1)
     with pytest.raises(ConfigError, match="needs two clusters"):
         frame_bound(CameraModel(), BarLayout(LedGrid(rows=6)), LINK.codebook)
-
-
-def test_the_line_through_clusters_is_that_of_theil_and_sen() -> None:
-    rng = np.random.default_rng(1)
-    for many in (2, 3, 16, 95):
-        x = np.sort(rng.choice(200, many, replace=False))
-        y = 4.2 * x + rng.standard_cauchy(many)
-        assert _straight(x, y) == pytest.approx(theilslopes(y, x)[:2])
