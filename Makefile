@@ -9,7 +9,7 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test ready lint kernels docs notebooks fuzz sbom wheel release format pictures clean
+.PHONY: help demo test ready lint kernels docs notebooks fuzz sbom release format pictures clean
 
 help:  ## Show this list
 	@grep -E '^[a-z]+:.*## ' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 12
@@ -43,10 +43,6 @@ notebooks: $(VENV)/.dev  ## Run the notebooks of the docs and keep what they sho
 MINUTES ?= 5
 fuzz: $(VENV)/.dev  ## Damage files of every kind and read them, for MINUTES
 	$(BIN)/python -m tests.fuzz --minutes $(MINUTES)
-
-wheel: $(VENV)/.dev  ## Build dist/*.whl with kernels compiled for x86-64-v3
-	$(BIN)/python .ci/kernels.py
-	EVLCP_KERNELS=build/kernels $(BIN)/python -m hatchling build -t wheel
 
 sbom: $(VENV)/.dev  ## Write sbom.json, what the tests run with, from the lock
 	$(BIN)/python .ci/sbom.py > sbom.json

@@ -1,9 +1,7 @@
 """Is this ready for release? `make release`: builds sdist and wheel, tries the wheel on each Python found.
 
-It holds kernels compiled for this Python and processors of level x86-64-v3. The wheel built from the sdist
-holds what the wheel of the checkout does, byte by byte. It is installed
-into a clean environment of each Python from 3.11 to 3.13 that is found (or of those named, e.g. 3.12), its
-dependencies by pip; there
+The wheel built from the sdist holds what the wheel of the checkout does, byte by byte. It is installed
+into a clean environment of each Python from 3.11 to 3.13 that is found (or of those named, e.g. 3.12); there
 `evlcp --version`, `evlcp plugins` and `evlcp demo --recording` must work. What was built stays in dist/.
 """
 
@@ -30,38 +28,27 @@ def contents(wheel: Path) -> dict[str, str]:
         }
 
 
-def run(*command: str | Path, cwd: Path, **more: str) -> str:
-    """What a command prints, with more variables in its environment; it must succeed."""
+def run(*command: str | Path, cwd: Path) -> str:
+    """What a command prints; it must succeed."""
     clean = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "VIRTUAL_ENV")}
     done = subprocess.run(
-        command, cwd=cwd, env=clean | {"NO_COLOR": "1"} | more, capture_output=True, text=True, check=False
+        command, cwd=cwd, env=clean | {"NO_COLOR": "1"}, capture_output=True, text=True, check=False
     )
     if done.returncode:
         sys.exit(f"{' '.join(map(str, command))}: exit code {done.returncode}\n{done.stdout}{done.stderr}")
     return done.stdout
 
 
-def built(out: Path, kernels: Path | None = None) -> tuple[Path, Path]:
-    """The sdist and the wheel of the checkout, kernels and all; the wheel from the sdist is the same."""
-    more = {"EVLCP_KERNELS": str(kernels)} if kernels else {}
+def built(out: Path) -> tuple[Path, Path]:
+    """The sdist and the wheel of the checkout; the wheel from the sdist is the same."""
+    build = (sys.executable, "-m", "hatchling", "build", "-t")
     for target in ("sdist", "wheel"):
-        run(sys.executable, "-m", "hatchling", "build", "-t", target, "-d", out, cwd=ROOT, **more)
+        run(*build, target, "-d", out, cwd=ROOT)
     (sdist,), (wheel,) = out.glob("*.tar.gz"), out.glob("*.whl")
     with tempfile.TemporaryDirectory() as folder:
         shutil.unpack_archive(sdist, folder, filter="data")
         (unpacked,) = Path(folder).iterdir()
-        run(
-            sys.executable,
-            "-m",
-            "hatchling",
-            "build",
-            "-t",
-            "wheel",
-            "-d",
-            Path(folder) / "again",
-            cwd=unpacked,
-            **more,
-        )
+        run(*build, "wheel", "-d", Path(folder) / "again", cwd=unpacked)
         (again,) = (Path(folder) / "again").glob("*.whl")
         ours, theirs = contents(wheel), contents(again)
     if differ := sorted(name for name in ours.keys() | theirs.keys() if ours.get(name) != theirs.get(name)):
@@ -98,8 +85,7 @@ def main() -> None:
     out = ROOT / "dist"
     shutil.rmtree(out, ignore_errors=True)
     out.mkdir()
-    sys.stdout.write(run(sys.executable, ROOT / ".ci" / "kernels.py", cwd=ROOT))
-    for path in built(out, ROOT / "build" / "kernels"):
+    for path in built(out):
         sys.stdout.write(f"{path.name}: {path.stat().st_size / 1e6:.1f} MB\n")
     (wheel,) = out.glob("*.whl")
     for minor in [int(name.removeprefix("3.")) for name in sys.argv[1:]] or MINORS:

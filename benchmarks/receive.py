@@ -18,8 +18,8 @@ from evt3_decode import tile
 
 from evlcp_sdk.io import open_source, read_events
 from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.pace import Stopwatch
 from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.stopwatch import Stopwatch
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 FIRST = "night-50m-30kmh.raw"

@@ -40,13 +40,13 @@ from evt3_decode import tile
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.pace import times_real_time
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.look import Looker
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.steps import Steps
 from evlcp_sdk.sim import Truth, read_truth, truth_path
+from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.compare.variants import load_variants
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import Score

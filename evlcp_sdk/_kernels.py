@@ -10,7 +10,7 @@ from evlcp_sdk.kernels import njit
 Array = NDArray[Any]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def take_in(heard: Array, prior: Array, out: Array) -> None:
     """Probability of each cluster in each cell by Bayes' rule, from its evidence and from the place alone.
 
@@ -42,13 +42,13 @@ def take_in(heard: Array, prior: Array, out: Array) -> None:
                 out_of[k, j] = prior_of[k, j] * (heard_of[k, j] * odds + unheard) / total
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _add_to(total: Array, part: Array) -> None:
     for j in range(total.size):
         total[j] += part[j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def all_ordered(t_us: Array, x: Array, y: Array, width: int, height: int, origin: int, since: Array) -> bool:
     """Whether no event is off the sensor or before its predecessor; times since an origin.
 
@@ -69,7 +69,7 @@ def all_ordered(t_us: Array, x: Array, y: Array, width: int, height: int, origin
     return not (backward or (t_us.size > 0 and (right >= width or low >= height)))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def sort_out(
     t_us: Array,
     x: Array,
@@ -138,7 +138,7 @@ def sort_out(
     return done, lost
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _median(values: Array, n: int) -> float:
     """Median of the first n values, which it reorders (Hoare's selection)."""
     middle = n // 2
@@ -166,7 +166,7 @@ def _median(values: Array, n: int) -> float:
     return float((below + values[middle]) / 2)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def rooted(matrix: Array, damping: float, least: float, scale: Array, low: Array) -> bool:
     """Cholesky's root of a symmetric matrix, scaled to a diagonal of 1 + `damping`; False if there is none.
 
@@ -194,7 +194,7 @@ def rooted(matrix: Array, damping: float, least: float, scale: Array, low: Array
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit
 def substituted(low: Array, scale: Array, side: Array, out: Array) -> None:
     """Solve the equations whose root is `low`, as `rooted` gives it, for a right-hand side: `out` (n,)."""
     n = len(side)
@@ -212,7 +212,7 @@ def substituted(low: Array, scale: Array, side: Array, out: Array) -> None:
         out[i] *= scale[i]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def inverted(matrix: Array, least: float, out: Array) -> bool:
     """The inverse of a positive matrix; False where it is singular, see `rooted`."""
     n = len(matrix)

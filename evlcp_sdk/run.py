@@ -25,13 +25,13 @@ from evlcp_sdk.io.patience import open_until, pieces_until
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.several import load_links, named_links, placing_links
-from evlcp_sdk.pace import Stopwatch, times_real_time
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.summary import Status
 from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.signals import Stopped, stop_on_request
+from evlcp_sdk.stopwatch import Stopwatch, times_real_time
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Frame, Packet
 
@@ -492,9 +492,10 @@ def _run(
     pieces = iter(pieces)
     first_us = last_us = None
     watch = Stopwatch()
-    with watch.running():
-        try:
-            while True:
+    ended = False
+    try:
+        while not ended:
+            with watch.running():
                 try:
                     events, packets = next(pieces)
                 except StopIteration:
@@ -511,16 +512,18 @@ def _run(
                     last_us = int(events.t_us[-1])
                     writer.events(events)
                 writer.write(packets)
+                watch.events += len(events)
                 given += len(packets)
                 advance(source.position_bytes, source.size_bytes)
-                if stopped():
-                    status = "interrupted"
-                    break
-        except InputError as fault:
-            status, error = "failed", str(fault)
-        if broken is None:
-            if (live is not None or source.size_bytes is None) and stopped():
-                status = "interrupted"
+                ended = stopped()
+    except InputError as fault:
+        status, error = "failed", str(fault)
+    if ended:
+        status = "interrupted"
+    if broken is None:
+        if (live is not None or source.size_bytes is None) and stopped():
+            status = "interrupted"
+        with watch.running():
             writer.write(close())
     if status == "complete" and (told := _much_dropped(source, receiver)):
         status, error = "degraded", f"{url}: {told}"

@@ -6,9 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from numba.core.event import Event, Listener, install_listener
-
 from evlcp_sdk.io.open import open_source, write_events
+from evlcp_sdk.kernels import count_compiled, find_cache_folder
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.plugin.registry import Registry
@@ -54,7 +53,7 @@ class Warmth:
     """What a warm-up took.
 
     Attributes:
-        compiled: Kernels and signatures that were not there and are now.
+        compiled: Kernels that were not there and are now.
         elapsed_s: Time on the clock, s.
         kept_in: A folder that they are kept in; None where none can be written, so that the next process
             compiles them again.
@@ -65,37 +64,18 @@ class Warmth:
     kept_in: Path | None
 
 
-class _Counter(Listener):
-    """Counts kernels that are compiled, those within others, too."""
-
-    def __init__(self) -> None:
-        self.compiled = 0
-
-    def on_start(self, event: Event) -> None:
-        self.compiled += 1
-
-    def on_end(self, event: Event) -> None:
-        pass
-
-
 def warm_up(advance: Callable[[str], None] = lambda _step: None) -> Warmth:
     """Simulate and receive a fifth of a second with the default link, with positions, and each file format.
 
-    What that compiles is kept for later processes; those that run at the same time wait for one another's
-    kernels instead of compiling them twice.
+    What that compiles is kept for later processes.
 
     Args:
         advance: Called with the name of a step of `STEPS` when it begins.
     """
-    from evlcp_sdk import _kernels
-
     registry = Registry.load()
     link = load_link(None, registry=registry)
-    counter, began_s = _Counter(), time.perf_counter()
-    with (
-        tempfile.TemporaryDirectory(prefix="evlcp-warm-up-") as name,
-        install_listener("numba:compile", counter),
-    ):
+    compiled, began_s = count_compiled(), time.perf_counter()
+    with tempfile.TemporaryDirectory(prefix="evlcp-warm-up-") as name:
         folder = Path(name)
         scene, recording = folder / "scene.toml", folder / "scene.raw"
         advance("simulate")
@@ -113,8 +93,7 @@ def warm_up(advance: Callable[[str], None] = lambda _step: None) -> Warmth:
         assert events is not None
         for table in ("events.csv", "events.raw"):
             _written_and_read(events[0], folder / table, source.width, source.height, registry)
-    kept = _kernels.take_in._cache.cache_path  # type: ignore[attr-defined]
-    return Warmth(counter.compiled, time.perf_counter() - began_s, None if kept is None else Path(kept))
+    return Warmth(count_compiled() - compiled, time.perf_counter() - began_s, find_cache_folder())
 
 
 def _written_and_read(

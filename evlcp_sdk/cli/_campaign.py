@@ -27,15 +27,34 @@ def show_faults(progress: "Progress") -> None:
 @contextmanager
 def progress_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
     """A bar by tasks, with the errors so far, on a terminal only."""
-    from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        ProgressColumn,
+        Task,
+        TextColumn,
+        TimeRemainingColumn,
+    )
     from rich.progress import Progress as Bar
+    from rich.text import Text
+
+    from evlcp_sdk.kernels import count_compiled, count_imported
+
+    class Work(ProgressColumn):
+        """What is done now, and what was found so far."""
+
+        def render(self, task: Task) -> Text:
+            compiled = count_compiled()
+            if compiled and not task.completed:
+                return Text(f"compiling for the first run, {compiled} of {count_imported()}")
+            return Text(task.fields["errors"])
 
     err = console(stderr=True)
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.fields[errors]}"),
+        Work(),
         TimeRemainingColumn(),
     )
     with Bar(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
@@ -43,7 +62,11 @@ def progress_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
 
         def show(progress: "Progress") -> None:
             failed = f", {len(progress.faults)} failed" if progress.faults else ""
-            errors = f"{progress.bit_errors:,} errors in {progress.bits:,} bits{failed}"
+            errors = (
+                f"{progress.bit_errors:,} errors in {progress.bits:,} bits{failed}"
+                if progress.bits
+                else failed
+            )
             bar.update(task, completed=progress.done, total=progress.tasks, errors=errors)
 
         yield show

@@ -183,19 +183,12 @@ def bytes_bar(name: str) -> "Iterator[Advance]":
         TextColumn("{task.fields[read]}", markup=False),
         TimeRemainingColumn(),
     )
-    # A thread that draws by itself would keep kernels from being compiled by a child, which spares memory.
-    plain = not err.is_terminal
-    with Progress(*columns, console=err, transient=True, auto_refresh=False, disable=plain) as bar:
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(name, total=None, read="")
-        drawn_s = -_DRAWN_EVERY_S
 
         def advance(done: int, total: int | None) -> None:
-            nonlocal drawn_s
             elapsed_s = bar.tasks[0].elapsed or 0.0
             bar.update(task, completed=done, total=total, read=read_so_far(done, total, elapsed_s))
-            if elapsed_s >= drawn_s + _DRAWN_EVERY_S:
-                drawn_s = elapsed_s
-                bar.refresh()
 
         yield advance
 

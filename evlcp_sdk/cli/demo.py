@@ -56,7 +56,7 @@ def demo(
 ) -> None:
     """Drive towards a bar of LEDs, simulated; receive it, and compare with the paper.
 
-    Four stretches of 0.3 s at 30 km/h:   [bold]evlcp demo[/] or [bold]evlcp demo -o somewhere[/]
+    Four stretches at 30 km/h:            [bold]evlcp demo[/] or [bold]evlcp demo -o somewhere[/]
 
     A shipped recording, frame by frame:  [bold]evlcp demo --recording[/]
     """
@@ -118,7 +118,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
 
 
 def show_drive(summary: Summary) -> None:
-    """Print BER and RMSE of each segment of distance beside the paper's."""
+    """Print wrong bits, BER with 95 % confidence, and RMSE of each segment of distance beside the paper's."""
     from rich.table import Table
 
     from evlcp_sdk.study.campaign.summary import beside_paper
@@ -127,12 +127,13 @@ def show_drive(summary: Summary) -> None:
 
     (series,) = summary.series
     paper = {
-        (c.reference.measure, begin): f"{'at most ' if c.reference.bound else ''}{c.reference.value:g}"
+        (c.reference.measure, begin): f"{'≤ ' if c.reference.bound else ''}{c.reference.value:g}"
         for c in beside_paper([series])
         for begin in range(c.reference.from_m, c.reference.to_m, SEGMENT_M)
     }
     table = Table(box=None, pad_edge=False, header_style="dim")
-    for number, name in enumerate(("distance", "frames", "BER", "paper", "RMSE, m", "paper")):
+    heads = ("distance", "frames", "wrong bits", "BER, 95 %", "paper", "RMSE, m", "paper")
+    for number, name in enumerate(heads):
         table.add_column(name, justify="right" if number else "left", no_wrap=True)
     for begin, recordings in reversed(series.segments):
         tally = Tally.together(recordings)
@@ -140,7 +141,8 @@ def show_drive(summary: Summary) -> None:
         table.add_row(
             f"{begin} to {begin + SEGMENT_M} m",
             f"{tally.frames_found} of {tally.frames_sent}",
-            f"below {ber.high:.1g}" if ber.none else f"{ber.value:.2g}" if ber.count else "-",
+            f"{tally.bit_errors} of {tally.bits}",
+            f"≤ {ber.high:.2g}" if ber.count else "-",
             paper.get(("ber", begin), "-"),
             f"{rmse.value:.3f}" if rmse.count else "-",
             paper.get(("rmse_m", begin), "-"),

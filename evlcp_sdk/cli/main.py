@@ -84,6 +84,7 @@ def _told(fault: BaseException) -> int:
     # Our own files are written where their names are known, so what has none is stdout.
     if isinstance(fault, OSError) and fault.filename is None:
         complain(f"standard output: {fault.strerror or fault}")
+        _drop_stdout()
         return _FAILED
     message, code = explained(fault)
     complain(message)
@@ -93,7 +94,6 @@ def _told(fault: BaseException) -> int:
 def _stdout_took_all() -> bool:
     """Whether all that was printed has been written; says so if not, but for a reader who has left."""
     import errno
-    from contextlib import suppress
 
     try:
         if sys.stdout is not None:
@@ -101,11 +101,17 @@ def _stdout_took_all() -> bool:
     except OSError as fault:
         if fault.errno != errno.EPIPE:
             complain(f"standard output: {fault.strerror}")
-        # Or else the interpreter tries once more as it ends, and complains in its own words.
-        with suppress(OSError, ValueError):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        _drop_stdout()
         return False
     except ValueError:
         # It is closed.
         return True
     return True
+
+
+def _drop_stdout() -> None:
+    """Let what is not written yet go nowhere: or else it is tried again, and complained of twice."""
+    from contextlib import suppress
+
+    with suppress(OSError, ValueError, AttributeError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

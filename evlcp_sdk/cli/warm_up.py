@@ -18,7 +18,7 @@ def warm_up(as_json: Json = False) -> None:
     """Compile the kernels now, so that no later command waits for them.
 
     They are kept beside the package, or in your home where that cannot be written. It takes a minute or two,
-    or a few seconds where all have been compiled or came with the package.
+    or a few seconds where all have been compiled.
 
     In an image, before workers start:  [bold]evlcp warm-up[/]
     """
@@ -33,14 +33,11 @@ def warm_up(as_json: Json = False) -> None:
 
     err = console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    # A thread that draws by itself would keep kernels from being compiled by a child, which spares memory.
-    with Progress(
-        *columns, console=err, transient=True, auto_refresh=False, disable=not err.is_terminal
-    ) as bar:
+    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task("", total=len(STEPS))
 
         def advance(step: str) -> None:
-            bar.update(task, description=step, completed=STEPS.index(step), refresh=True)
+            bar.update(task, description=step, completed=STEPS.index(step))
 
         warmth = warm(advance)
     if as_json:

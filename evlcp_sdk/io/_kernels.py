@@ -101,14 +101,14 @@ BITS = np.argsort(1 - (np.arange(256)[:, None] >> np.arange(8) & 1), axis=1, kin
 BIT_COUNT = (np.arange(256)[:, None] >> np.arange(8) & 1).sum(axis=1).astype(np.uint8)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _note(tally: Column, row: Integer, at: Integer) -> None:
     if tally[row, 0] == 0:
         tally[row, 1] = at
     tally[row, 0] += 1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _judge_time(
     words: Column, i: Integer, size: Integer, before: Integer, low_bits: Integer, final: Any
 ) -> Integer:
@@ -153,7 +153,7 @@ def _judge_time(
     return int64(agree >= against)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _shifted(words: Column, i: Integer, size: Integer, shift: Integer) -> Integer:
     """The word that starts `shift` bytes behind the start of words[i]."""
     word = int64(words[i]) >> (8 * shift)
@@ -162,7 +162,7 @@ def _shifted(words: Column, i: Integer, size: Integer, shift: Integer) -> Intege
     return word
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _unlevel(
     words: Column,
     i: Integer,
@@ -224,7 +224,7 @@ def _unlevel(
     return int64(0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _realign(shift: Integer, here: Integer, state: Column, tally: Column) -> None:
     """Pass over bytes; what follows has no time before the next TIME_HIGH."""
     _note(tally, int64(REALIGNED), here)
@@ -233,7 +233,7 @@ def _realign(shift: Integer, here: Integer, state: Column, tally: Column) -> Non
     state[LEVEL] = here + shift
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _are_common(words: Column, start: Integer) -> Any:
     """Whether a run of words is of the three common types alone."""
     odd = uint16(0)
@@ -244,7 +244,7 @@ def _are_common(words: Column, start: Integer) -> Any:
     return odd == 0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _pack_evt3(
     words: Column,
     start: Integer,
@@ -336,7 +336,7 @@ def _pack_evt3(
     return int64(i), int64(n)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _unpack_evt3(
     base: Integer,
     t: Column,
@@ -377,7 +377,7 @@ def _unpack_evt3(
     return (right < width and bottom < height and back >= 0) or start == end
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _sift(
     words: Column,
     word: Integer,
@@ -416,7 +416,7 @@ def _sift(
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
     """Return the index of the word that brings an event, counted from words[word] on."""
     while True:
@@ -437,7 +437,7 @@ def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
         word += 1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _note_other(kind: Integer, at: Integer, tally: Column) -> None:
     """Take note of an EVT3 word that brings neither event nor time."""
     if kind in (EVT3_OTHERS, EVT3_CONTINUED_4, EVT3_CONTINUED_12):
@@ -446,7 +446,7 @@ def _note_other(kind: Integer, at: Integer, tally: Column) -> None:
         _note(tally, int64(RESERVED), at)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def decode_evt3(
     words: Column,
     at: Integer,
@@ -581,7 +581,7 @@ def decode_evt3(
     return i, n, m, max(askew, int64(0))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def decode_evt2(
     words: Column,
     at: Integer,
@@ -671,7 +671,7 @@ def decode_evt2(
     return i, n, m, max(askew, int64(0))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def encode_evt3(
     words: Column,
     width: Integer,
@@ -761,7 +761,7 @@ def encode_evt3(
     return n, i, j
 
 
-@njit(cache=True, nogil=True)
+@njit
 def encode_evt2(
     words: Column,
     _width: Integer,
@@ -803,7 +803,7 @@ def encode_evt2(
     return n, i, j
 
 
-@njit(cache=True, nogil=True)
+@njit
 def parse_csv(
     text: Column, t: Column, x: Column, y: Column, p: Column
 ) -> tuple[Integer, Integer, Integer, bool]:
@@ -856,7 +856,7 @@ def parse_csv(
     return used, lines, n, True
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _put_number(text: Column, i: Integer, number: Integer, end: Integer) -> Integer:
     """Write a number and the byte `end` to text[i] on; return where they stop."""
     if number < 0:
@@ -875,7 +875,7 @@ def _put_number(text: Column, i: Integer, number: Integer, end: Integer) -> Inte
     return i + size + 1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def format_csv(text: Column, t: Column, x: Column, y: Column, p: Column) -> Integer:
     """Write events as lines `t_us,x,y,p` to `text`, uint8, 40 bytes an event; return the bytes used."""
     i = 0

@@ -29,7 +29,7 @@ _HALVINGS = 12
 """Steps of a golden section: from 10 degrees to a 30th of one."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def normal(
     points: Array, bar: Array, bar_sigma: Array, lens: Array, lens_root: Array, fault: float,
     felt: Array, heading: float, known: int, white: Array, huber: float,
@@ -199,7 +199,7 @@ def normal(
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _unknowns(lens_root: Array) -> int:
     """How many unknowns points depend on: the first ones, as far as errors of the camera have a sigma."""
     number = POSE
@@ -211,7 +211,7 @@ def _unknowns(lens_root: Array) -> int:
 
 
 # In any order, so that several are added at once: six times as fast.
-@njit(cache=True, nogil=True, fastmath={"reassoc", "nsz"})
+@njit(fastmath={"reassoc", "nsz"})
 def _products(left: Array, right: Array, wide: int, n: int, out: Array) -> None:
     """Products of the first `n` columns, summed: the upper half of `out` (wide, wide)."""
     for i in range(wide):
@@ -224,7 +224,7 @@ def _products(left: Array, right: Array, wide: int, n: int, out: Array) -> None:
             out[i, j] = value
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _followed(sums: Array, gain: Array, tall: int, wide: int, out: Array) -> None:
     """Products of the rows once the first `tall` unknowns follow the others: `out` (14, 14)."""
     for i in range(tall + wide):
@@ -246,7 +246,7 @@ def _followed(sums: Array, gain: Array, tall: int, wide: int, out: Array) -> Non
                 out[i, j] -= share * sums[k, tall + j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _attitude(
     felt: Array, heading: float, known: int, white: Array, rotation: Array, rows: Array, miss: Array
 ) -> float:
@@ -281,7 +281,7 @@ def _attitude(
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit
 def summed(
     info: Array, right: Array, rows: Array, miss: Array, error: Array, free: Array, whole: Array, side: Array
 ) -> None:
@@ -313,7 +313,7 @@ def summed(
             whole[i, i] = 1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def solved(whole: Array, side: Array, damping: float, move: Array) -> bool:
     """Solve the damped equations; False where they are singular."""
     n = len(side)
@@ -324,7 +324,7 @@ def solved(whole: Array, side: Array, damping: float, move: Array) -> bool:
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit
 def eigen(matrix: Array, values: Array, axes: Array) -> None:
     """Eigenvalues of a symmetric matrix, in no order, and its axes as columns, by Jacobi's turns.
 
@@ -374,7 +374,7 @@ def eigen(matrix: Array, values: Array, axes: Array) -> None:
             axes[i, j], axes[j, i] = axes[j, i], axes[i, j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def stepped(
     move: Array, gain: Array, step: Array, centre: Array,
     position: Array, rotation: Array, local: Array, error: Array,
@@ -424,7 +424,7 @@ def stepped(
     return there, turned, own, off
 
 
-@njit(cache=True, nogil=True)
+@njit
 def fitted(
     points: Array, bar: Array, bar_sigma: Array, lens: Array, lens_root: Array, fault: float,
     felt: Array, heading: float, known: int, white: Array, huber: float, free: Array, steps: int,
@@ -507,7 +507,7 @@ def fitted(
     return False, best, position, rotation, local, error
 
 
-@njit(cache=True, nogil=True)
+@njit
 def tested(
     information: Array, column: Array, side: Array, spread: Array, bound: Array, least: float
 ) -> tuple[float, int, Array, Array]:
@@ -616,7 +616,7 @@ def tested(
     return value, freedom, added, unseen
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _above(matrix: Array, least: float) -> bool:
     """Whether all eigenvalues are above `least`: what is left without it has a root."""
     n = len(matrix)
@@ -626,7 +626,7 @@ def _above(matrix: Array, least: float) -> bool:
     return bool(rooted(left, 0.0, 0.0, np.empty(n), np.zeros((n, n))))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _redundant(
     left: Array, basis: Array, follow: Array, side: Array, bound: Array
 ) -> tuple[float, int, Array, Array]:
@@ -671,7 +671,7 @@ def _redundant(
     return value, rank, added, unseen
 
 
-@njit(cache=True, nogil=True)
+@njit
 def weighed(
     points: Array, bar: Array, bar_sigma: Array, lens: Array, lens_root: Array, fault: float,
     felt: Array, heading: float, known: int, white: Array, huber: float, free: Array, said: Array,
@@ -752,7 +752,7 @@ def weighed(
     )  # fmt: skip
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _bent(
     given: tuple[Any, ...], point: tuple[Any, ...], free: Array, said: Array, gain: Array, step: Array,
     cost: float, spread: Array, size: Array, axes: Array, by_camera: Array, by_attitude: Array, by_bar: Array,
@@ -806,7 +806,7 @@ def _bent(
     return bent
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _hold(free: Array, spread: Array) -> None:
     """Nothing moves the unknowns that are not free."""
     for i in range(len(spread)):
@@ -815,7 +815,7 @@ def _hold(free: Array, spread: Array) -> None:
             spread[:, i] = 0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _parts(
     info: Array, right: Array, rows: Array, miss: Array, white: Array, known: int, free: Array, turns: bool,
     spread: Array, attitude_fault: float, focal_bound: float, bounds: Array, limits: Array, least: float,
@@ -868,7 +868,7 @@ def _parts(
     return hpl, vpl
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _widened(
     hpl: float, vpl: float, added: Array, unseen: Array, spread: Array, limit: float,
     flat: float, high: float, hidden: Array,
@@ -883,7 +883,7 @@ def _widened(
     return max(hpl, level), max(vpl, height)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _moves(
     spread: Array, rows: Array, known: int, said: Array, gain: Array, share: float,
     by_camera: Array, by_attitude: Array, by_bar: Array,
@@ -907,7 +907,7 @@ def _moves(
                 by_bar[b, i, k] += share * value
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _rest(
     spread: Array, pixel: Array, by_camera: Array, by_attitude: Array, by_bar: Array,
     noise: Array, slow: Array,
@@ -944,7 +944,7 @@ def _rest(
                 noise[i, j] += axes[i, k] * max(size[k], 1e-12) * axes[j, k]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def doubted(spread: Array, rows: Array, miss: Array, rarely: float, larger: float, out: Array) -> None:
     """What the doubt adds to a covariance whether the attitude's errors are larger than their sigmas say.
 
@@ -1001,14 +1001,14 @@ def doubted(spread: Array, rows: Array, miss: Array, rarely: float, larger: floa
             out[i, j] = max(weight - rarely, 0.0) * wider + weight * moved[i] * moved[j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _widest(covariance: Array) -> float:
     """Sigma of the horizontal direction that is the least certain."""
     a, b, c = covariance[0, 0], covariance[0, 1], covariance[1, 1]
     return math.sqrt(max((a + c) / 2 + math.hypot((a - c) / 2, b), 0.0))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _bar_bounds(points: Array, bar: Array, position: Array, place: float, turn: float, out: Array) -> None:
     """Inverse covariance of each bar's fault, as a move and a turn of the camera that it alone sees.
 
@@ -1039,7 +1039,7 @@ def _bar_bounds(points: Array, bar: Array, position: Array, place: float, turn: 
                     out[b, j, k] += half[m, j] * half[m, k]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _attitude_bound(white: Array, known: int, fault: float) -> Array:
     """Inverse covariance of the attitude's fault, as whitened, (known, known); 0 where it is of any size."""
     covariance, out = np.zeros((known, known)), np.zeros((known, known))
@@ -1053,7 +1053,7 @@ def _attitude_bound(white: Array, known: int, fault: float) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit
 def whole(points_px: Array, sigma_px: Array, width: int, height: int, out: Array) -> int:
     """Which clusters of a bar count, `out` (K,), and how many: seen, with a sigma, and not cut off.
 
@@ -1078,7 +1078,7 @@ def whole(points_px: Array, sigma_px: Array, width: int, height: int, out: Array
     return number
 
 
-@njit(cache=True, nogil=True)
+@njit
 def flatness(points: Array, bar: Array, bars: int) -> float:
     """How far the bars' centres spread across the line that fits them best, against along it."""
     centres, count, mean = np.zeros((bars, 3)), np.zeros(bars), np.zeros(3)
@@ -1100,7 +1100,7 @@ def flatness(points: Array, bar: Array, bars: int) -> float:
     return math.sqrt(max(values[1], 0.0) / values[2]) if values[2] > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def gathered(
     enu_m: Array, points_px: Array, sigma_px: Array, pixel: float, width: int, height: int, usual: Array,
     least: int, number: int, at: int, points: Array, bar: Array, sigma: Array,
@@ -1132,7 +1132,7 @@ def gathered(
     return many
 
 
-@njit(cache=True, nogil=True)
+@njit
 def shared(enu_m: Array, points_px: Array, seen: Array, usual: Array, sigma: Array) -> None:
     """What a bar's points share, and how they err across it, by those `seen` (K,), into `sigma` (9,).
 
@@ -1171,7 +1171,7 @@ def shared(enu_m: Array, points_px: Array, seen: Array, usual: Array, sigma: Arr
     sigma[8] = sideways + (longways - sideways) * ay * ay
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _apart(places: Array, i: int, j: int) -> float:
     total = 0.0
     for k in range(3):
@@ -1179,7 +1179,7 @@ def _apart(places: Array, i: int, j: int) -> float:
     return math.sqrt(total)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _ends(places: Array, counts: Array) -> tuple[int, int]:
     """Two of the places (n, 3) that count, as far apart as any: the farthest from the farthest from one."""
     one = 0
@@ -1194,7 +1194,7 @@ def _ends(places: Array, counts: Array) -> tuple[int, int]:
     return one, other
 
 
-@njit(cache=True, nogil=True)
+@njit
 def whitening(causes: Array, least: float, out: Array) -> None:
     """What makes errors independent and of sigma 1: the inverse of the lower root, `out` (3, 3).
 
@@ -1217,7 +1217,7 @@ def whitening(causes: Array, least: float, out: Array) -> None:
             out[i, j] = value / low[i, i]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def sights(flat: Array, out: Array) -> int:
     """Unit vectors towards directions (n, 2): `out` (n, 3); NaN of NaN; how many are none."""
     found = 0
@@ -1228,7 +1228,7 @@ def sights(flat: Array, out: Array) -> int:
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit
 def halved(points: Array, bar: Array, out: Array, out_bar: Array) -> int:
     """Means of the halves of each bar's points, as precise as they are together: `out` (2 bars, 10)."""
     at = found = 0
@@ -1255,7 +1255,7 @@ def halved(points: Array, bar: Array, out: Array, out_bar: Array) -> int:
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit
 def halves(points: Array, bar: Array, sights: Array, enu: Array, mean: Array) -> int:
     """Mean places and sights of the halves of each bar, `enu` and `mean` (2 bars, 3), and how many.
 
@@ -1285,7 +1285,7 @@ def halves(points: Array, bar: Array, sights: Array, enu: Array, mean: Array) ->
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit
 def nearest_to_sights(enu: Array, sights: Array, rotations: Array, positions: Array, costs: Array) -> None:
     """The point nearest to all lines through `enu` (n, 3) along `sights` (n, 3), for each of `rotations`.
 
@@ -1333,7 +1333,7 @@ def nearest_to_sights(enu: Array, sights: Array, rotations: Array, positions: Ar
         costs[r] = cost
 
 
-@njit(cache=True, nogil=True)
+@njit
 def level_starts(
     enu: Array, sights: Array, level: Array, headings: int, positions: Array, rotations: Array
 ) -> int:
@@ -1373,7 +1373,7 @@ def level_starts(
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _turned(level: Array, angle: float, out: Array) -> None:
     """Axes (3, 3) turned about up."""
     c, s = math.cos(angle), math.sin(angle)
@@ -1383,7 +1383,7 @@ def _turned(level: Array, angle: float, out: Array) -> None:
         out[2, j] = level[2, j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def widest_three(points: Array, bar: Array, sights: Array, bars: int, enu: Array, mean: Array) -> None:
     """Centres of the three bars that span the largest triangle, `enu` (3, 3), and sights of them, `mean`."""
     centres, seen, count = np.zeros((bars, 3)), np.zeros((bars, 3)), np.zeros(bars)
@@ -1408,7 +1408,7 @@ def widest_three(points: Array, bar: Array, sights: Array, bars: int, enu: Array
                         enu[row], mean[row] = centres[b], seen[b]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def three_points(p: Array, sights: Array, positions: Array, rotations: Array) -> int:
     """Grunert's solutions: `positions` (4, 3) and `rotations` (4, 3, 3), and how many there are.
 
@@ -1464,7 +1464,7 @@ def three_points(p: Array, sights: Array, positions: Array, rotations: Array) ->
     return found
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _triad(points: Array, out: Array) -> None:
     """Axes of a triangle (3, 3), as rows: along its first side, across that in its plane, and upright."""
     one, two = points[1] - points[0], points[2] - points[0]
@@ -1474,7 +1474,7 @@ def _triad(points: Array, out: Array) -> None:
     out[1] = np.cross(out[2], out[0])
 
 
-@njit(cache=True, nogil=True)
+@njit
 def missed(points: Array, sights: Array, positions: Array, rotations: Array, costs: Array) -> None:
     """The sum of squares of the angles between the points and where they are seen, for each place."""
     for r in range(len(costs)):

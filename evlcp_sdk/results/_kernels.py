@@ -15,7 +15,7 @@ _LONGEST = 258
 """What deflate repeats at the most at a time, bytes."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def paint(rows: NDArray[Any], width: int, x: NDArray[Any], y: NDArray[Any], p: NDArray[Any]) -> None:
     """Mark which polarities each pixel has: bit 0 OFF, bit 1 ON.
 
@@ -34,7 +34,7 @@ def paint(rows: NDArray[Any], width: int, x: NDArray[Any], y: NDArray[Any], p: N
             rows[row, 1 + (column >> 2)] |= np.uint8(1 << p[i] << (6 - 2 * (column & 3)))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def deflated(data: NDArray[Any], end: int, codes: NDArray[Any], bits: NDArray[Any], out: NDArray[Any]) -> int:
     """Write data that is mostly zeros as a stream of zlib, in which runs of zeros alone are packed.
 

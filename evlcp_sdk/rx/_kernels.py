@@ -49,7 +49,7 @@ FEW_BOXES = 16
 _ROUND = np.uint32(CLOCK_ROUND - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def score_rises(
     t_us: Array,
     x: Array,
@@ -112,7 +112,7 @@ def score_rises(
     return candidates
 
 
-@njit(cache=True, nogil=True)
+@njit
 def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: int) -> None:
     """In so many rows from the first on, round and round, set rises of `least` ticks ago or more to `age`."""
     then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK)
@@ -126,27 +126,27 @@ def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: in
             line[u] = np.uint32(then | np.uint32(state & _LOW)) if ago >= oldest else state
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _listened(state: int, least: int, same: int) -> bool:
     again = (np.uint32(state) >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
     return bool((np.uint32(state) & np.uint32(SCORES)) >= np.uint32(least)) & bool(again < np.uint32(same))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def in_rhythm(x: Array, y: Array, pixels: Array, least: int, same: int, keep: Array) -> None:
     """Mark events of pixels with a score of `least` or more whose rises are not `same` time after time."""
     for i in range(x.size):
         keep[i] = _listened(pixels[y[i], x[i]], least, same)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _blinks(state: int, now: int, span: int, least: int) -> bool:
     """Whether a pixel rose in the last `span` ticks and has a score of `least` or more."""
     age = (np.uint32(now) - (np.uint32(state) >> _CLOCK)) & _ROUND
     return bool(age <= np.uint32(span)) and bool((np.uint32(state) & np.uint32(SCORES)) >= np.uint32(least))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _mark_blinking(line: Array, now: int, span: int, least: int, blinks: Array, counts: Array) -> None:
     """Which pixels of a line `_blinks`, 1 or 0, added to `counts`."""
     for u in range(line.size):
@@ -155,7 +155,7 @@ def _mark_blinking(line: Array, now: int, span: int, least: int, blinks: Array, 
         counts[u] += np.int32(blinks[u])
 
 
-@njit(cache=True, nogil=True)
+@njit
 def measure_box(
     pixels: Array,
     box: tuple[int, int, int, int],
@@ -221,7 +221,7 @@ def measure_box(
     return total, column, first_column, last_column, upper, lower
 
 
-@njit(cache=True, nogil=True)
+@njit
 def measure_strips(
     pixels: Array,
     box: tuple[int, int, int, int],
@@ -279,7 +279,7 @@ def measure_strips(
     return many, column, first_column, last_column, upper, lower
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _edges_of(rows: Array, top: int, bottom: int, full: float) -> tuple[float, float]:
     """Upper and lower edge of what rows (n,) hold: an edge row counts by its share of a full one."""
     v = top
@@ -292,7 +292,7 @@ def _edges_of(rows: Array, top: int, bottom: int, full: float) -> tuple[float, f
     return upper, v + min(rows[v - top] / full, 1.0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def select_box(
     t_us: Array,
     x: Array,
@@ -342,7 +342,7 @@ def select_box(
     return int(np.int64(n))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def label_boxes(boxes: Array, cell_shift: int, labels: Array, alone: Array) -> None:
     """Label the cells of 2^cell_shift px that boxes (n, 4) touch, k + 1, but of those that touch others'.
 
@@ -363,7 +363,7 @@ def label_boxes(boxes: Array, cell_shift: int, labels: Array, alone: Array) -> N
                     labels[v, u] = k + 1
 
 
-@njit(nogil=True)
+@njit
 def _name_few(x: Array, y: Array, boxes: Array, of: Array, alone: Array) -> None:
     """Say which box (n, 4) each event is in, k + 1, or 0; not of those that share events with one before.
 
@@ -385,7 +385,7 @@ def _name_few(x: Array, y: Array, boxes: Array, of: Array, alone: Array) -> None
             of[i] *= np.uint16(of[i] != name)
 
 
-@njit(nogil=True)
+@njit
 def _name_by_label(x: Array, y: Array, boxes: Array, cell_shift: int, labels: Array, of: Array) -> None:
     """Say which labelled box (n, 4) each event is in, k + 1, or 0: as quick however many there are."""
     shift = np.uint64(cell_shift)
@@ -397,7 +397,7 @@ def _name_by_label(x: Array, y: Array, boxes: Array, cell_shift: int, labels: Ar
         of[i] = name * inside
 
 
-@njit(cache=True, nogil=True)
+@njit
 def select_boxes(
     t_us: Array,
     x: Array,
@@ -454,7 +454,7 @@ def select_boxes(
     return out_t, out_x, out_y, out_p
 
 
-@njit(cache=True, nogil=True)
+@njit
 def add_polarity(
     t_us: Array,
     x: Array,
@@ -523,7 +523,7 @@ _NOWHERE = np.uint32((1 << 32) - 1)
 """Number of no pixel."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _chips_of(
     t_us: Array,
     y: Array,
@@ -541,7 +541,7 @@ def _chips_of(
         out[i] = np.int32(-1) if late < 0 else chip
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _outermost(which: Array, chips: np.uint32) -> tuple[np.uint32, np.uint32]:
     """The first and the last chip of those from 0 to `chips` - 1; the first is beyond where there is none."""
     low, high = _NOWHERE, np.uint32(0)
@@ -552,7 +552,7 @@ def _outermost(which: Array, chips: np.uint32) -> tuple[np.uint32, np.uint32]:
     return low, high
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _pixels_of(
     x: Array,
     y: Array,
@@ -572,7 +572,7 @@ def _pixels_of(
         out[i] = (c * rows + v) * columns + u if inside else _NOWHERE
 
 
-@njit(cache=True, nogil=True)
+@njit
 def count_rows(
     t_us: Array, y: Array, p: Array, start_us: Array, step_us: float, top: float, block: float, counts: Array
 ) -> None:
@@ -587,7 +587,7 @@ def count_rows(
             counts[p[i], b, s] += 1
 
 
-@njit(cache=True, nogil=True)
+@njit
 def fit_rows(counts: Array, chips: Array, chip_steps: int, fit: Array) -> None:
     """How well each block's counts (polarity, blocks, steps) fit chips (-1, +1) at each lag: `fit`.
 
@@ -608,7 +608,7 @@ def fit_rows(counts: Array, chips: Array, chip_steps: int, fit: Array) -> None:
                 fit[polarity, b, lag] = total if polarity else -total
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _connected(selected: Array, done: Array, cells: Array, row: int, column: int) -> int:
     """Cells that are selected and connected (8 neighbours) with one, which is the first; how many."""
     rows, columns = selected.shape
@@ -627,7 +627,7 @@ def _connected(selected: Array, done: Array, cells: Array, row: int, column: int
     return many
 
 
-@njit(cache=True, nogil=True)
+@njit
 def areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
     """Rectangles (left, top, right, bottom) around connected cells (8 neighbours), and their hits.
 
@@ -652,7 +652,7 @@ def areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -> int:
     """Connected cells (8 neighbours) of each cluster, most first: mean column + row * 1j, cluster, number.
 
@@ -694,7 +694,7 @@ def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _score(
     at: Array, cluster: Array, cells: Array, layout: Array, s: complex, shift: complex, reach: float
 ) -> float:
@@ -708,7 +708,7 @@ def _score(
     return score
 
 
-@njit(cache=True, nogil=True)
+@njit
 def best_similarity(
     at: Array,
     cluster: Array,
@@ -745,7 +745,7 @@ def best_similarity(
     return best, best_s, best_shift
 
 
-@njit(cache=True, nogil=True)
+@njit
 def refined_similarity(
     at: Array,
     cluster: Array,
@@ -799,7 +799,7 @@ def refined_similarity(
     return s, shift
 
 
-@njit(cache=True, nogil=True)
+@njit
 def voted_similarity(
     at: Array,
     cluster: Array,
@@ -820,26 +820,26 @@ def voted_similarity(
     return score, s, shift
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _share(off: float, half: float, grid: float) -> float:
     """Part of a cell, `off` from a footprint's middle, that the footprint covers."""
     return max(min(off + grid / 2, half) - max(off - grid / 2, -half), 0.0) / grid
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _add_to(total: Array, part: Array) -> None:
     for j in range(total.size):
         total[j] += part[j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _strip(unit: complex, along: float, across: float) -> tuple[float, float]:
     """How far to the right and down a strip reaches, so long along a direction, so wide across it."""
     right, down = abs(unit.real), abs(unit.imag)
     return along * right + across * down + 1e-6, along * down + across * right + 1e-6
 
 
-@njit(cache=True, nogil=True)
+@njit
 def across_profile(
     probability: Array,
     seen: Array,
@@ -885,7 +885,7 @@ def across_profile(
                     hits[i] += share * probability[k, r, c] - share * share * far
 
 
-@njit(cache=True, nogil=True)
+@njit
 def core_profile(hits: Array, cells: Array, edge: float, out: Array) -> int:
     """Hits per cell by distance from an axis, 0 to 1; how many.
 
@@ -912,7 +912,7 @@ def core_profile(hits: Array, cells: Array, edge: float, out: Array) -> int:
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def line_prior(places: Array, unit: complex, spacing: float, grid: int, profile: Array, out: Array) -> None:
     """Probability of each cluster of a line in each cell, by its share of the cell and its distance off."""
     _, rows, columns = out.shape
@@ -927,7 +927,7 @@ def line_prior(places: Array, unit: complex, spacing: float, grid: int, profile:
                     out[k, r, c] = _share(off.real, spacing / 2, grid) * profile[int(abs(off.imag))]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def block_prior(places: Array, unit: complex, spacing: float, grid: int, out: Array) -> None:
     """Probability of each cluster of a panel in each cell, by its share of the cell."""
     _, rows, columns = out.shape
@@ -941,7 +941,7 @@ def block_prior(places: Array, unit: complex, spacing: float, grid: int, out: Ar
                 out[k, r, c] = _share(off.real, spacing / 2, grid) * _share(off.imag, spacing / 2, grid)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, out: Array) -> None:
     """How far the pixels in each cluster's place follow its pilot, -1 to 1, `out` (K,); 0 without a place.
 
@@ -984,7 +984,7 @@ def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, 
         out[k] = total / (edges * place) if place > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def lit_clusters(
     sums: Array,
     codes: Array,
@@ -1005,7 +1005,7 @@ def lit_clusters(
     return bool(np.all(seen))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _values(first: Array, second: Array, pairs: bool, out: Array) -> None:
     """Sign of the second of two sums, `out` int8 (n,); of `pairs`, if that is 0, the first's opposite."""
     both = np.int8(pairs)
@@ -1015,13 +1015,13 @@ def _values(first: Array, second: Array, pairs: bool, out: Array) -> None:
         out[j] = up + down * np.int8(b == 0) * both
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _add_values(total: Array, values: Array, sign: np.int8) -> None:
     for j in range(total.size):
         total[j] = np.int16(total[j] + np.int8(values[j] * sign))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def rows_of(image: Array) -> tuple[int, int]:
     """First row that is not 0 throughout, and the one after the last; (0, 0) without any."""
     top, bottom = 0, 0
@@ -1035,7 +1035,7 @@ def rows_of(image: Array) -> tuple[int, int]:
     return top, bottom
 
 
-@njit(cache=True, nogil=True)
+@njit
 def spread_between(
     sums: Array,
     codes: Array,
@@ -1086,7 +1086,7 @@ def spread_between(
                     out[dark, 1, zone] += end - begin
 
 
-@njit(cache=True, nogil=True)
+@njit
 def spread_across(
     sums: Array,
     codes: Array,
@@ -1131,7 +1131,7 @@ def spread_across(
                 out[1, column] += edges
 
 
-@njit(cache=True, nogil=True)
+@njit
 def spread_about(
     sums: Array,
     codes: Array,
@@ -1152,7 +1152,7 @@ def spread_about(
         spread_across(sums, codes, every, places, seen, way, along, across)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def copy_near(pixels: Array, places: Array, unit: complex, along: float, across: float, out: Array) -> None:
     """Copy what lies within reach of each cluster's place, along a direction and across it."""
     _, height, width = pixels.shape
@@ -1180,7 +1180,7 @@ _INNER = 0.3
 """Half of the middle part of a cluster, in spacings, in which all light is its own."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def light_along(
     heard: Array,
     code: Array,
@@ -1233,7 +1233,7 @@ def light_along(
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit
 def boundary_between(mine: Array, its: Array, start: float, end: float) -> float:
     """Where two clusters meet, a share of the way between them; NaN: unseen.
 
@@ -1268,7 +1268,7 @@ _TOP = 0.7
 """Share of the most events that counts as all of them: the brightest pixels, kept busy, give fewer."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def middle_across(
     heard: Array,
     edges: Array,
@@ -1335,7 +1335,7 @@ def middle_across(
     return off
 
 
-@njit(cache=True, nogil=True)
+@njit
 def flank_px(profile: Array) -> float:
     """Over how many pixels a line's image fades out to each side, by the events of columns; NaN: unseen.
 
@@ -1355,7 +1355,7 @@ def flank_px(profile: Array) -> float:
     return max(3 * total, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def place_clusters(
     pixels: Array,
     shown: Array,
@@ -1499,13 +1499,13 @@ def place_clusters(
     return squares, flank_px(profile)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _count_some(values: Array, out: Array) -> None:
     for j in range(out.size):
         out[j] = np.int16(out[j] + np.int16(values[j] != 0))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least: float, out: Array) -> None:
     """Share of info chips with events, less `least` of pilot chips': weighted sum of pixels, `out` (K,).
 
@@ -1535,7 +1535,7 @@ def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least
         out[k] = total
 
 
-@njit(cache=True, nogil=True)
+@njit
 def believe(
     read: Array,
     llr: Array,
@@ -1596,7 +1596,7 @@ def believe(
     return right ** (1 / together) if given else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def newest_on_parabola(
     past: Array, speed_weight: float, bend_weight: float, worth: float, outlier: float
 ) -> tuple[float, float, float]:
@@ -1645,7 +1645,7 @@ def newest_on_parabola(
     return path[1], inverse[1, 1], newest * past[n - 1, 2]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _about_parabola(
     place: Array, weight: Array, off: Array, least: float, right: Array, inverse: Array
 ) -> int:
@@ -1669,7 +1669,7 @@ def _about_parabola(
     return n if n > 3 and inverted(normal, _ROUNDING, inverse) else 0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def bend_of(
     place: Array, sums: Array, least: float, wave: float, wave_variance: float
 ) -> tuple[float, float]:
@@ -1699,7 +1699,7 @@ def bend_of(
     return path[0], inverse[0, 0] * left / (n - 3 - 2) + wave_variance * by_wave * by_wave
 
 
-@njit(cache=True, nogil=True)
+@njit
 def wave_of(place: Array, sums: Array, least: float, out: Array) -> None:
     """What a frame's boundaries say of a wave in them that no parabola makes: added to `out` (4,).
 
@@ -1726,7 +1726,7 @@ def wave_of(place: Array, sums: Array, least: float, out: Array) -> None:
     out[3] += n - 3
 
 
-@njit(cache=True, nogil=True)
+@njit
 def mean_length(
     sine: Array, likely: Array, seen: float, sigma: float, along: float, across: float
 ) -> tuple[float, float]:
@@ -1760,7 +1760,7 @@ def mean_length(
     return mean, max(square / total - mean * mean, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> float:
     """Farthest that the middle of a cell of any cluster lies off the line through `on` along `turn`, px."""
     clusters, _, columns = selected.shape
@@ -1775,7 +1775,7 @@ def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> floa
     return most
 
 
-@njit(cache=True, nogil=True)
+@njit
 def bounds_of(places: Array) -> tuple[float, float, float, float]:
     """Least and greatest column and row of places (K,), columns + rows * 1j."""
     left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
@@ -1785,7 +1785,7 @@ def bounds_of(places: Array) -> tuple[float, float, float, float]:
     return left, right, top, bottom
 
 
-@njit(cache=True, nogil=True)
+@njit
 def keep_inside(prior: Array, probability: Array, selected: Array, out: Array, chosen: Array) -> None:
     """Probabilities, and the choice, of cells whose prior is not 0; 0 and False elsewhere."""
     likely, before = prior.reshape(-1), np.ascontiguousarray(probability).reshape(-1)
@@ -1796,7 +1796,7 @@ def keep_inside(prior: Array, probability: Array, selected: Array, out: Array, c
         now[j] = was[j] & inside
 
 
-@njit(cache=True, nogil=True)
+@njit
 def mask(
     probability: Array,
     selected: Array,
@@ -1831,7 +1831,7 @@ def mask(
     keep_inside(prior, probability, selected, out, chosen)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def cells_by_place(
     at: Array,
     cluster: Array,
@@ -1874,7 +1874,7 @@ def cells_by_place(
     return shown, many, total, left
 
 
-@njit(cache=True, nogil=True)
+@njit
 def mean_off(points: Array, places: Array) -> complex | None:
     """How far points (K, 2) are off their places on average, without those that are NaN; None without any."""
     total, n = complex(0.0, 0.0), 0
@@ -1885,7 +1885,7 @@ def mean_off(points: Array, places: Array) -> complex | None:
     return total / n if n else None
 
 
-@njit(cache=True, nogil=True)
+@njit
 def places_at(t_us: Array, places: Array, ahead: float, centre: Array) -> None:
     """Centre (2, m) at times (m,), on straight lines between `places` (5, n): times, columns, rows, ...
 
@@ -1920,7 +1920,7 @@ def places_at(t_us: Array, places: Array, ahead: float, centre: Array) -> None:
             )
 
 
-@njit(cache=True, nogil=True)
+@njit
 def hold_still(centre: Array, width: int, height: int, shift: Array, rest: Array) -> float:
     """Sensor pixel of an image's (0, 0) that holds a centre in its middle, and what is left of it.
 
@@ -1935,7 +1935,7 @@ def hold_still(centre: Array, width: int, height: int, shift: Array, rest: Array
     return total / chips
 
 
-@njit(cache=True, nogil=True)
+@njit
 def clear_cells(hits: Array, box: tuple[int, int, int, int], cell_shift: int) -> int:
     """Set the cells that a box (left, top, right, bottom) of pixels touches to 0; what they had."""
     left, top, right, bottom = box
@@ -1947,7 +1947,7 @@ def clear_cells(hits: Array, box: tuple[int, int, int, int], cell_shift: int) ->
     return had
 
 
-@njit(cache=True, nogil=True)
+@njit
 def slope_of_rows(
     rows: Array, fit: Array, seen: Array, fewest: int, chance: float, least: float
 ) -> tuple[float, float]:

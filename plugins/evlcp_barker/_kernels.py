@@ -14,7 +14,7 @@ _STRIDE = 16
 """Events that are passed over at once in search of a bin's end: a bar has dozens in a bin of 10 us."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Array, counts: Array) -> None:
     """Add events to `known` counts: by polarity (row) and time (column, `bin_us` each from `first_bin`)."""
     bins = counts.shape[1]
@@ -46,7 +46,7 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Arra
         counts[1, b] += on
 
 
-@njit(cache=True, nogil=True)
+@njit
 def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: int, rho: Array) -> float:
     """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1).
 
@@ -83,7 +83,7 @@ def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: i
     return top
 
 
-@njit(cache=True, nogil=True)
+@njit
 def mean_squares(rho: Array, power: float, known: int, memory: int, out: Array) -> tuple[float, int]:
     """Mean square of the positive correlations up to each, of which `known` came before; the last two.
 
@@ -97,7 +97,7 @@ def mean_squares(rho: Array, power: float, known: int, memory: int, out: Array) 
     return power, known
 
 
-@njit(cache=True, nogil=True)
+@njit
 def raise_to_chance(counts: Array, span: int, first: int, squares: Array) -> None:
     """Raise mean squares of correlations, from a lag on, to that of as many events of random sign, 1 / n.
 
@@ -111,7 +111,7 @@ def raise_to_chance(counts: Array, span: int, first: int, squares: Array) -> Non
                 seen += counts[kind, first + i + span] - counts[kind, first + i]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def listen(
     t_us: Array,
     p: Array,
@@ -142,7 +142,7 @@ def listen(
     return top, power, many
 
 
-@njit(cache=True, nogil=True)
+@njit
 def peaks(
     rho: Array, first: int, guard: int, enough: Array, outstands: float, least: float, found: Array
 ) -> int:
@@ -167,7 +167,7 @@ def peaks(
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def refine(
     counts: Array, lag: int, chips: Array, steps: int, pair: int, rising: Array
 ) -> tuple[float, float, float, float, float, float]:
@@ -184,7 +184,7 @@ def refine(
     return on, on_noise, off, off_noise, onset, onset_noise
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _centre(
     count: Array, sign: float, first: int, last: int, chips: Array, steps: int, pair: int
 ) -> tuple[float, float]:
@@ -210,7 +210,7 @@ def _centre(
     return first + _middle(whole), _jackknife(found)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _middle(fit: Array) -> float:
     """Where a correlation is best; NaN where it is positive nowhere.
 
@@ -229,7 +229,7 @@ def _middle(fit: Array) -> float:
     return at / total
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _onset(count: Array, lag: int, steps: int, rising: Array) -> tuple[float, float]:
     """Where counts first reach half of their most, averaged over chips that rise, and its variance."""
     edges, many = rising.size, 2 * steps
@@ -247,7 +247,7 @@ def _onset(count: Array, lag: int, steps: int, rising: Array) -> tuple[float, fl
     return lag - steps + _reached(whole), _jackknife(found)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _reached(response: Array) -> float:
     """Where counts first reach half of their most, over what comes all the time: their lower quartile."""
     ordered = response.copy()
@@ -265,7 +265,7 @@ def _reached(response: Array) -> float:
     return k - 0.5 + ((half - below) / (response[k] - below) if response[k] > below else 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _jackknife(without: Array) -> float:
     """Variance of what was found of all, by what is found without each; those that say nothing left out."""
     n, mean, squares = 0, 0.0, 0.0

@@ -12,7 +12,7 @@ from evlcp_sdk.kernels import njit
 Array = NDArray[Any]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def cell_medians(selected: Array, out: Array) -> None:
     """Median row and column of each cluster's cells, `out` (K, 2); NaN without any.
 
@@ -37,7 +37,7 @@ def cell_medians(selected: Array, out: Array) -> None:
         out[k, 1] = _middle(by_column)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _middle(counts: Array) -> float:
     """Median of the numbers 0, 1, ... that occur `counts` times; NaN of none."""
     many = 0
@@ -55,7 +55,7 @@ def _middle(counts: Array) -> float:
     return float(counts.size - 1)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def cells_in_place(
     selected: Array,
     line: tuple[float, float, float, float],
@@ -90,7 +90,7 @@ def cells_in_place(
         out[k, 1] = sum_c / n if n else np.nan
 
 
-@njit(cache=True, nogil=True)
+@njit
 def straight(x: Array, y: Array) -> tuple[float, float]:
     """Slope and intercept of the line through the medians (Theil-Sen), robust against outliers."""
     n = x.size
@@ -108,7 +108,7 @@ def straight(x: Array, y: Array) -> tuple[float, float]:
     return slope, _median(values, n)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def core_of(counts: Array) -> tuple[float, float]:
     """Middle and half the extent of the cells about the fullest that have three tenths of it.
 
@@ -127,7 +127,7 @@ def core_of(counts: Array) -> tuple[float, float]:
     return (low + high) / 2 - counts.size // 2, (high - low) / 2
 
 
-@njit(cache=True, nogil=True)
+@njit
 def lies_across(middles: Array) -> bool:
     """Whether middles (row, column) spread over more columns than rows; NaN are passed over."""
     extent_of_rows = 0.0
@@ -142,7 +142,7 @@ def lies_across(middles: Array) -> bool:
     return bool(high - low > extent_of_rows)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def line_of_cells(selected: Array, middles: Array, line: Array, seen: Array) -> bool:
     """Line of a bar's cells; False with fewer than three clusters in it.
 
@@ -177,7 +177,7 @@ def line_of_cells(selected: Array, middles: Array, line: Array, seen: Array) -> 
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit
 def lie_of_cells(selected: Array, line: Array, seen: Array) -> int:
     """Whether a bar's cells lie along the image's rows, 1, across them, 2, or nowhere, 0: `line_of_cells`."""
     middles = np.empty((len(selected), 2))
@@ -194,7 +194,7 @@ def lie_of_cells(selected: Array, line: Array, seen: Array) -> int:
     return 2 if line_of_cells(turned, middles, line, seen) else 0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _known(middles: Array, places: Array, by_row: Array, by_column: Array) -> int:
     """How many clusters have a middle; which, and its row and column, come first in the others."""
     n = 0
@@ -205,7 +205,7 @@ def _known(middles: Array, places: Array, by_row: Array, by_column: Array) -> in
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def codes_said(pilots: Array, words: Array, symbols: Array, seen: Array, codes: Array, known: Array) -> None:
     """What each cluster says in a frame, `codes` (K, values), and between which it is known, (K + 1, values).
 
@@ -227,7 +227,7 @@ def codes_said(pilots: Array, words: Array, symbols: Array, seen: Array, codes: 
                 known[k, i] = i < first or said
 
 
-@njit(cache=True, nogil=True)
+@njit
 def column_light(sums: Array, line: Array, top: int, bottom: int, full: float, out: Array) -> None:
     """Mean size of the clipped sums beside a bar's line, from rows `top` to `bottom`, by pixels from it.
 
@@ -253,7 +253,7 @@ def column_light(sums: Array, line: Array, top: int, bottom: int, full: float, o
         out[u] /= max((bottom - top + 1) * (chips // 2), 1)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def row_values(sums: Array, line: Array, weight: Array, full: float, out: Array) -> None:
     """Weighted mean of each row's clipped sums in every value's second chip, `out` (values, rows).
 
@@ -282,7 +282,7 @@ def row_values(sums: Array, line: Array, weight: Array, full: float, out: Array)
             out[i, v] = total * one
 
 
-@njit(cache=True, nogil=True)
+@njit
 def bar_values(
     sums: Array,
     line: Array,
@@ -309,7 +309,7 @@ def bar_values(
     row_values(sums, line, light, full, out)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def dimmer(sums: Array, pilots: Array, seen: Array, place: Array) -> float:
     """How often pixels in clusters' middles answer steps down, as a share of how often they answer steps up.
 
@@ -338,7 +338,7 @@ def dimmer(sums: Array, pilots: Array, seen: Array, place: Array) -> float:
     return float(answers[0] / asked[0] / (answers[1] / asked[1]))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def read_bar(
     sums: Array,
     pilots: Array,
@@ -387,7 +387,7 @@ _REACH = 12.0
 """Widths of a boundary's core beyond which it is not felt: 6 of 100000 of tails thrice as wide are left."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def rows_felt(
     known: Array, offset: Array, when: Array, reach: float, fit: Array, rows: int, first: Array, last: Array
 ) -> None:
@@ -411,7 +411,7 @@ def rows_felt(
                 last[b, i] = min(max(int(np.ceil(place + half)), 0), rows)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def shifts_of(codes: Array, b: int, i: int) -> tuple[float, float]:
     """What shifts boundary b in value i: whether its step is up, and which side repeats its last value.
 
@@ -441,7 +441,7 @@ _SS, _SL, _SZ, _LL, _LZ, _ZZ, _S, _BY_LEVEL, _BY_Z = [_MANY * n for n in range(6
 _COLUMNS = 15
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _steps_of(codes: Array, first: Array, last: Array, offset: Array, when: Array, seen_values: Array) -> Any:
     """All steps across boundaries, where codes differ, that have rows: (blocks, columns), and their values.
 
@@ -477,7 +477,7 @@ def _steps_of(codes: Array, first: Array, last: Array, offset: Array, when: Arra
     return steps, seen
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _begin(column: Array, fit: Array, work: Array) -> None:
     """How far the first row of each step lies beyond its boundary; all sums 0."""
     spacing, centre, drift, side, again = fit[0], fit[1], fit[2], fit[5], fit[6]
@@ -489,7 +489,7 @@ def _begin(column: Array, fit: Array, work: Array) -> None:
         work[j] = 0.0
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _levels(
     column: Array, row: float, scale: float, steepest: float, dim: float, profile: Array, work: Array
 ) -> None:
@@ -518,7 +518,7 @@ def _levels(
         work[_STEEP + j] = -steepest * step * work[_STEEP + j] * less
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(error_model="numpy")
 def _add_row(column: Array, row: float, seen: Array, gain: float, huber: float, work: Array) -> None:
     """Add what a row of each step has to its sums."""
     for j in range(_MANY):
@@ -541,7 +541,7 @@ def _add_row(column: Array, row: float, seen: Array, gain: float, huber: float, 
         work[_BY_Z + j] += pull * z * residual
 
 
-@njit(cache=True, nogil=True)
+@njit
 def equations(
     codes: Array,
     first: Array,
@@ -570,7 +570,7 @@ def equations(
     return _equations(steps, seen, profile, blur, dim, huber, prior, fit, normal, right, work)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _equations(
     steps: Array,
     seen: Array,
@@ -633,7 +633,7 @@ def _equations(
     return float(cost)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def leftovers(
     codes: Array,
     first: Array,
@@ -718,7 +718,7 @@ def leftovers(
     return noise / max(count, 1), spent, all_squares
 
 
-@njit(cache=True, nogil=True)
+@njit
 def solve(
     codes: Array,
     known: Array,
@@ -783,7 +783,7 @@ def solve(
     return not outside
 
 
-@njit(cache=True, nogil=True)
+@njit
 def own_motion(shift: Array, information: Array, when: Array, out: Array) -> None:
     """What each value's shift says of motion that is not a steady drift, as far as it is more than noise.
 
@@ -813,7 +813,7 @@ def own_motion(shift: Array, information: Array, when: Array, out: Array) -> Non
         out[i] = beyond * variance / (variance + noise) if variance > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def fit_bar(
     codes: Array,
     known: Array,
@@ -947,7 +947,7 @@ def fit_bar(
     return (by_row * rows / max(rows - _FITTED, 1) + left_over / max(n - 2, 1) / spread) / 2
 
 
-@njit(cache=True, nogil=True)
+@njit
 def measure_column(
     selected: Array,
     grid: int,
@@ -1016,7 +1016,7 @@ def measure_column(
     return fit[0], sqrt(max(variance, 0.0)) if variance == variance else np.nan, line[3]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _measured(
     sums: Array,
     offset: Array,

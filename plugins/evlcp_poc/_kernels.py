@@ -10,7 +10,7 @@ from evlcp_sdk.kernels import njit
 Array = NDArray[Any]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def dirichlet(start: float, size: int, band: int, values: Array, slopes: Array) -> None:
     """The Dirichlet kernel of `band` (odd) harmonics out of `size`, and its slope, at start, start + 1, ...
 
@@ -32,7 +32,7 @@ def dirichlet(start: float, size: int, band: int, values: Array, slopes: Array) 
         sb, cb = sb * dcb + cb * dsb, cb * dcb - sb * dsb
 
 
-@njit(cache=True, nogil=True)
+@njit
 def fit_peak(samples: Array, size: int, band: int) -> float:
     """Shift of the Dirichlet kernel that fits samples around the middle one best (least squares), px.
 
@@ -78,7 +78,7 @@ def fit_peak(samples: Array, size: int, band: int) -> float:
     return shift
 
 
-@njit(cache=True, nogil=True)
+@njit
 def pair_shifts(
     correlation: Array, most_y: int, most_x: int, reach: int, samples: int, shifts: Array
 ) -> None:
@@ -112,7 +112,7 @@ def pair_shifts(
         shifts[q, 1] = peak_u + fit_peak(row, width, band_x)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def middles(maps: Array, used: Array, min_pixels: int, out: Array) -> None:
     """Weighted median (row, column) of the maps used, -1 where a map has too few lit pixels.
 
@@ -156,7 +156,7 @@ def middles(maps: Array, used: Array, min_pixels: int, out: Array) -> None:
                 break
 
 
-@njit(cache=True, nogil=True)
+@njit
 def cut_maps(maps: Array, used: Array, middle: Array, out: Array) -> None:
     """Windows of the maps around their middles, zero outside a map, `out` (used, height, width)."""
     _, height, width = maps.shape
@@ -173,7 +173,7 @@ def cut_maps(maps: Array, used: Array, middle: Array, out: Array) -> None:
                 into[u] = line[u]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _turns(size: int, most: int) -> Array:
     """Cosine and sine of the turn of each place by each harmonic, float32 (2, size, most + 1)."""
     out = np.empty((2, size, most + 1), np.float32)
@@ -188,7 +188,7 @@ def _turns(size: int, most: int) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _add_turned(part: Array, cosine: float, sine: float, turned: Array) -> None:
     """Add numbers (n,) by a cosine and a sine, `turned` (2, n)."""
     by_cosine, by_sine = turned[0], turned[1]
@@ -197,7 +197,7 @@ def _add_turned(part: Array, cosine: float, sine: float, turned: Array) -> None:
         by_sine[j] += sine * part[j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _both_ways(turned: Array, back: Array, forth: Array) -> None:
     """Complex numbers turned back, and forth, by what `_add_turned` made; real parts come first."""
     by_cosine, by_sine = turned[0], turned[1]
@@ -208,7 +208,7 @@ def _both_ways(turned: Array, back: Array, forth: Array) -> None:
         back[j], forth[j] = by_cosine[j] - by_sine[j - n], by_cosine[j] + by_sine[j - n]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def unit_spectra(images: Array, most_y: int, most_x: int, out: Array) -> None:
     """Spectra of images (n, height, width) over their size, up to a harmonic down and one across.
 
@@ -269,7 +269,7 @@ _TINY = np.float32(1e-37)
 """Takes the place of a power of 0, whose root is divided by before it is known to have no phase."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def correlations(spectra: Array, first: Array, second: Array, far_y: int, far_x: int, out: Array) -> None:
     """Transform conj(first) * second of pairs of `unit_spectra` back, `out` float32 (pairs, height, width).
 
@@ -317,7 +317,7 @@ def correlations(spectra: Array, first: Array, second: Array, far_y: int, far_x:
                     out[q, at, (width - u) % width] = even[u, q] + odd[u, q]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def blob_size(cuts: Array, size: Array) -> None:
     """Height and width, `size` (2,), of the box with the mean distance from its middle that cuts have, px.
 
@@ -338,7 +338,7 @@ def blob_size(cuts: Array, size: Array) -> None:
         size[axis] = 4 * size[axis] / total if total > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _quantile(ordered: Array, share: float) -> float:
     at = share * (ordered.size - 1)
     low = int(at)
@@ -346,7 +346,7 @@ def _quantile(ordered: Array, share: float) -> float:
     return float(ordered[low] + (at - low) * (ordered[high] - ordered[low]))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def median_scale(middle: Array, first: Array, second: Array, apart_m: Array) -> float:
     """Median over pairs of what lies between their middles, px a metre; 0 without a pair that has both."""
     scale = np.empty(first.size)
@@ -359,7 +359,7 @@ def median_scale(middle: Array, first: Array, second: Array, apart_m: Array) -> 
     return _quantile(np.sort(scale[:n]), 0.5) if n else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def pairs_in_place(
     middle: Array,
     first: Array,
@@ -383,7 +383,7 @@ def pairs_in_place(
     return n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def far_pairs(counts: Array, first: Array, second: Array, apart_m: Array, share: float) -> Array:
     """Which pairs, both of whose clusters count, lie a share of the longest such spacing apart, or more."""
     longest = 0.0
@@ -397,7 +397,7 @@ def far_pairs(counts: Array, first: Array, second: Array, apart_m: Array, share:
     return far
 
 
-@njit(cache=True, nogil=True)
+@njit
 def chosen_pairs(
     maps: Array,
     min_pixels: int,
@@ -448,7 +448,7 @@ def chosen_pairs(
     return px_per_m, n
 
 
-@njit(cache=True, nogil=True)
+@njit
 def robust_mean(
     values: Array, weights: Array, first: Array, second: Array, clusters: int, drop: int, iqr: float
 ) -> tuple[float, float, int]:
@@ -498,7 +498,7 @@ def robust_mean(
     return total / mass, sigma, kept
 
 
-@njit(cache=True, nogil=True)
+@njit
 def paired_distance(
     cuts: Array,
     band: tuple[int, int],

@@ -11,7 +11,7 @@ from evlcp_sdk.kernels import njit
 Array = NDArray[Any]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def transform(bits: Array) -> None:
     """Multiply by the Kronecker power of [[1, 0], [1, 1]], in place; its own inverse."""
     half = 1
@@ -22,7 +22,7 @@ def transform(bits: Array) -> None:
         half *= 2
 
 
-@njit(cache=True, nogil=True)
+@njit
 def crc_holds(bits: Array, polynomial: int) -> bool:
     """Whether a message followed by its 24 check bits leaves nothing over."""
     register = 0xFFFFFF
@@ -34,7 +34,7 @@ def crc_holds(bits: Array, polynomial: int) -> bool:
     return register == 0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def discrepancy_limit(weight: Array, log_share: float) -> float:
     """Largest total of flipped weights that is not an accident; negative if any total may be one.
 
@@ -80,7 +80,7 @@ FROZEN, REPEATED, FREE = 0, 1, 2
 """Kinds of nodes: inputs that are all 0; all 0 but the last; all information."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def schedule(information: Array, nodes: Array) -> int:
     """Split the inputs into the largest nodes that are decided at once; their number.
 
@@ -112,7 +112,7 @@ def schedule(information: Array, nodes: Array) -> int:
     return at
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _either(first: Array, second: Array, out: Array) -> None:
     """LLR of the sum of two bits, min-sum."""
     for i in range(len(out)):
@@ -121,7 +121,7 @@ def _either(first: Array, second: Array, out: Array) -> None:
         out[i] = -least if (a < 0) != (b < 0) else least
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _both(first: Array, second: Array, known: Array, out: Array) -> None:
     """LLR of a bit seen twice, once added to a known one."""
     for i in range(len(out)):
@@ -129,7 +129,7 @@ def _both(first: Array, second: Array, known: Array, out: Array) -> None:
         out[i] = b - a if known[i] else b + a
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _find_weakest(values: Array, found: Array) -> None:
     """Fill `found` with the places of the values next to 0, the nearest first."""
     count = 0
@@ -144,7 +144,7 @@ def _find_weakest(values: Array, found: Array) -> None:
         count = min(count + 1, len(found))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _fork(
     metric: Array,
     zero: Array,
@@ -203,7 +203,7 @@ def _fork(
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit
 def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Array, metric: Array) -> int:
     """Successive-cancellation list decoding; the paths kept, none if all exceed the limit.
 

@@ -19,7 +19,7 @@ _AT_ONCE = 64
 """Ticks of which words are followed side by side, as a processor adds several numbers at once."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def bit_evidence(
     counts: Column, logs: Column, gains: Column, means: Column, share: float, doubt: float, out: Column
 ) -> None:
@@ -74,7 +74,7 @@ def bit_evidence(
             out[s, c] -= last
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _sums_over_gains(worths: Column, means: Column, out: Column) -> None:
     """Logarithm of the sum over gains, of each context."""
     for c in range(len(out)):
@@ -87,7 +87,7 @@ def _sums_over_gains(worths: Column, means: Column, out: Column) -> None:
         out[c] = top + math.log(total)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def character_scores(
     evidence: Column, places: Column, bits: int, parity: int, likeliest: bool, out: Column
 ) -> None:
@@ -136,7 +136,7 @@ def character_scores(
             some[k] += fair - max(still, 0.0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _words(
     said: Column,
     places: Column,
@@ -193,7 +193,7 @@ def _words(
                 out[k] = max(out[k], value) if likeliest else out[k] + value
 
 
-@njit(cache=True, nogil=True)
+@njit
 def best_path(
     scores: Column,
     tails: Column,

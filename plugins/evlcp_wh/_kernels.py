@@ -10,14 +10,14 @@ from evlcp_sdk.kernels import njit
 Array = NDArray[Any]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _add(into: Array, part: Array) -> None:
     """Long loops over flat arrays run on many pixels at once; those over a bar's few columns do not."""
     for j in range(into.size):
         into[j] = np.int16(into[j] + part[j])
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _values(first: Array, second: Array, out: Array) -> None:
     """Values of pairs of polarity sums, `out` int8 (n,): the second's sign, else less the first's."""
     for j in range(out.size):
@@ -27,7 +27,7 @@ def _values(first: Array, second: Array, out: Array) -> None:
         out[j] = up + down * np.int8(b == 0)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _fit(code: Array, values: Array, out: Array) -> None:
     """How far values (n, many) agree with a code (n,), `out` int16 (many,): those alike less those unlike."""
     out[:] = 0
@@ -41,7 +41,7 @@ def _fit(code: Array, values: Array, out: Array) -> None:
                 out[j] = np.int16(out[j] - value[j])
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _cell_values(sums: Array, grid: int, rows: int, columns: int, out: Array) -> None:
     """Values of the cells' polarity sums, `out` int8 (values, rows * columns)."""
     chips, height, width = sums.shape
@@ -64,25 +64,25 @@ def _cell_values(sums: Array, grid: int, rows: int, columns: int, out: Array) ->
                 value[r * columns + c] = line[c * grid]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _raise_to(most: Array, fit: Array) -> None:
     for j in range(most.size):
         most[j] = max(most[j], fit[j])
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _add_odds(most: Array, fit: Array, beside: Array, out: Array) -> None:
     for j in range(out.size):
         out[j] += beside[np.uint32(most[j] - fit[j])]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _share(most: Array, fit: Array, beside: Array, norm: Array, out: Array) -> None:
     for j in range(out.size):
         out[j] = beside[np.uint32(most[j] - fit[j])] / norm[j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def presence(
     sums: Array, codes: Array, grid: int, agree: float, disagree: float, min_seen: int, out: Array
 ) -> None:
@@ -131,7 +131,7 @@ def presence(
             by_cell[k, which[j]] = share[j]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def pixel_maps(sums: Array, codes: Array, grid: int, selected: Array, out: Array) -> None:
     """Pilot correlation of the pixels in each cluster's selected cells and their neighbours, 0 to 1."""
     clusters, length = codes.shape
@@ -168,7 +168,7 @@ def pixel_maps(sums: Array, codes: Array, grid: int, selected: Array, out: Array
                             out[k, v, u] = max(line[u], 0) / length
 
 
-@njit(cache=True, nogil=True)
+@njit
 def separated(
     sums: Array,
     codes: Array,
@@ -187,7 +187,7 @@ def separated(
     pixel_maps(sums, codes, grid, selected, pixels)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def weighted_values(sums: Array, probability: Array, grid: int, least: float, out: Array) -> None:
     """Presence-weighted sum of the values of the info chips, `out` (K, values)."""
     clusters, rows, columns = probability.shape
@@ -221,7 +221,7 @@ def weighted_values(sums: Array, probability: Array, grid: int, least: float, ou
                         out[k, i] += weight * values[i]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _fit_words(values: Array, by_value: Array, fit: Array) -> None:
     """Correlation of values (n,) with every word, `by_value` (n, words), `fit` (words,)."""
     fit[:] = 0.0
@@ -231,7 +231,7 @@ def _fit_words(values: Array, by_value: Array, fit: Array) -> None:
             fit[s] += value * column[s]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _max_log(fit: Array, scale: float, llr: Array) -> None:
     """Best correlation of the words with each bit 0, less that with 1, times `scale`; `fit` is used up.
 
@@ -249,7 +249,7 @@ def _max_log(fit: Array, scale: float, llr: Array) -> None:
         llr[b] = (zero - one) * scale
 
 
-@njit(cache=True, nogil=True)
+@njit
 def transformed(
     sums: Array, probability: Array, grid: int, least: float, by_value: Array, symbols: Array, llr: Array
 ) -> float:
@@ -283,7 +283,7 @@ def transformed(
     return explained / energy if energy > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: int, counts: Array) -> None:
     """Histograms of a value's two polarity sums where the value is known, `counts` (value, first, second).
 
@@ -309,7 +309,7 @@ def count_pairs(sums: Array, codes: Array, probability: Array, grid: int, most: 
                             by_pair[(codes[k, i] + 1) // 2, pairs[i, v * width + u]] += weight
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _pairs_of(sums: Array, most: int, values: int) -> Array:
     """Which pair of sums, clipped to -most to most, each value has in each pixel, uint16 (values, pixels)."""
     chips, height, width = sums.shape
@@ -321,7 +321,7 @@ def _pairs_of(sums: Array, most: int, values: int) -> Array:
     return out
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _pair_up(
     first: Array, second: Array, least: np.int16, most: np.int16, side: np.int16, out: Array
 ) -> None:
@@ -331,7 +331,7 @@ def _pair_up(
         out[j] = np.uint16(np.int16(a * side) + b)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _some_above(values: Array, least: float) -> bool:
     some = False
     for j in range(values.size):
@@ -339,7 +339,7 @@ def _some_above(values: Array, least: float) -> bool:
     return some
 
 
-@njit(cache=True, nogil=True)
+@njit
 def log_ratio(counts: Array, prior: float, out: Array) -> None:
     """Log ratio of the second histogram's shares over the first's, `counts` (2, n, m), `prior` in each more.
 
@@ -357,7 +357,7 @@ def log_ratio(counts: Array, prior: float, out: Array) -> None:
             out[a, b] = np.log((counts[1, a, b] + more) / second * first / (counts[0, a, b] + less))
 
 
-@njit(cache=True, nogil=True)
+@njit
 def read_words(values: Array, words: Array, scale: float, symbols: Array, llr: Array) -> float:
     """Likeliest codeword of each cluster's values (K, n), `symbols` (K,), and max-log LLRs, `llr` (K, bits).
 
@@ -381,7 +381,7 @@ def read_words(values: Array, words: Array, scale: float, symbols: Array, llr: A
     return agree / size if size > 0 else 0.0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def sum_worth(
     sums: Array,
     codes: Array,
@@ -444,7 +444,7 @@ def sum_worth(
                             out[k, i] += shows * values[i]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def learn_worth(
     sums: Array, codes: Array, probability: Array, grid: int, most: int, prior: float, out: Array
 ) -> None:
@@ -464,7 +464,7 @@ def learn_worth(
     log_ratio(counts, prior, out)
 
 
-@njit(cache=True, nogil=True)
+@njit
 def read_frame(
     sums: Array,
     codes: Array,
@@ -485,7 +485,7 @@ def read_frame(
     return quality, np.abs(llr).min()
 
 
-@njit(cache=True, nogil=True)
+@njit
 def worth_images(sums: Array, worth: Array, most: int, seam: int, out: Array) -> None:
     """What each pixel's pair of sums says of each value, in a dark seam.
 
@@ -505,7 +505,7 @@ def worth_images(sums: Array, worth: Array, most: int, seam: int, out: Array) ->
                     out[v + seam, u + seam, i] = worth[first, second] - silent
 
 
-@njit(cache=True, nogil=True)
+@njit
 def cluster_matches(maps: Array, prior: Array, grid: int, images: Array, out: Array) -> None:
     """What the pixels of each cluster say of each value if the bar is off its place, `out` (K, n, n, values).
 
@@ -535,7 +535,7 @@ def cluster_matches(maps: Array, prior: Array, grid: int, images: Array, out: Ar
                                     total[i] += weight * line[i]
 
 
-@njit(cache=True, nogil=True)
+@njit
 def path_scores(matches: Array, known: Array, out: Array) -> None:
     """Twice what all clusters say of a shift in each value, `out` (n, n, values).
 
@@ -553,7 +553,7 @@ def path_scores(matches: Array, known: Array, out: Array) -> None:
                     out[a, b, i] += abs(matches[k, a, b, i])
 
 
-@njit(cache=True, nogil=True)
+@njit
 def smooth_path(scores: Array, step_cost: float, place_cost: float, path: Array) -> None:
     """Shifts (down, right) of all values that score best together (Viterbi), `path` (values, 2), px.
 
@@ -599,7 +599,7 @@ def smooth_path(scores: Array, step_cost: float, place_cost: float, path: Array)
         a, b = come_a[i, a, d], d
 
 
-@njit(cache=True, nogil=True)
+@njit
 def take_back(sums: Array, path: Array, out: Array) -> None:
     """Polarity sums with each value's shift (down, right) taken back; 0 where there was no pixel."""
     chips, height, width = sums.shape
@@ -621,7 +621,7 @@ def take_back(sums: Array, path: Array, out: Array) -> None:
                 here[v * width + u] = 0
 
 
-@njit(cache=True, nogil=True)
+@njit
 def _copy(values: Array, out: Array) -> None:
     for j in range(out.size):
         out[j] = values[j]

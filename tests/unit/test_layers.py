@@ -9,7 +9,7 @@ import pytest
 SDK = Path(__file__).parents[2] / "evlcp_sdk"
 
 LAYERS = (
-    {"compiling", "errors", "files", "kernels", "late", "pace", "printable", "signals", "specs", "spelling"},
+    {"errors", "files", "kernels", "late", "printable", "signals", "specs", "spelling", "stopwatch"},
     {"air"},
     {"values", "scene", "clock", "utc", "_kernels"},
     {"plugin"},

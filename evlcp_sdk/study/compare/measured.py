@@ -8,7 +8,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.pace import times_real_time
+from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.tally import Statistics, Tally
 

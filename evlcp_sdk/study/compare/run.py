@@ -12,11 +12,11 @@ import numpy as np
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import EventSource
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.pace import Stopwatch
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim.truth import Truth
+from evlcp_sdk.stopwatch import Stopwatch
 from evlcp_sdk.study.bound import frame_bound
 from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, Times
 from evlcp_sdk.study.compare.table import Row, Table
@@ -98,6 +98,7 @@ class _Lane:
         """Take events; None ends the stream."""
         with self.spent.running():
             packets = self.receiver.close() if events is None else self.receiver.feed(events)
+            self.spent.events += 0 if events is None else len(events)
         self.packets += len(packets)
         self.frames += frames_of(packets)
 
@@ -164,6 +165,7 @@ def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events]:
     while True:
         with watch.running():
             piece = next(pieces, None)
+            watch.events += 0 if piece is None else len(piece)
         if piece is None:
             return
         yield piece

@@ -24,7 +24,7 @@ SOONEST_US = 60
 """Time after a rise in which no other counts: two chips at 30 kHz. Events of strong light ring so long."""
 
 
-@njit(cache=True, nogil=True)
+@njit
 def add_events(
     t_us: Array,
     x: Array,

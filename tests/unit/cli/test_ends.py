@@ -20,30 +20,50 @@ Evlcp = Callable[..., Any]
 MAIN = "from evlcp_sdk.cli.main import main; main()"
 
 
+@pytest.fixture(params=["buffered", "unbuffered"])
+def environment(request: pytest.FixtureRequest) -> dict[str, str]:
+    """Of a command whose output is kept until it ends, as a login has it, or is written at once."""
+    own = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    return own | ({"PYTHONUNBUFFERED": "1"} if request.param == "unbuffered" else {})
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("args", [("info",), ("info", "--json"), ("plugins",), ("--version",)])
-def test_a_full_stdout_is_one_line(demo_raw: Path, args: tuple[str, ...]) -> None:
+def test_a_full_stdout_is_one_line(
+    demo_raw: Path, args: tuple[str, ...], environment: dict[str, str]
+) -> None:
     given = [*args, str(demo_raw)] if args[0] == "info" else list(args)
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-c", MAIN, *given], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+            [sys.executable, "-c", MAIN, *given],
+            env=environment,
+            stdout=full,
+            stderr=subprocess.PIPE,
+            text=True,
+            check=False,
         )
     assert done.stderr == "evlcp: standard output: No space left on device\n"
     assert done.returncode == 1
 
 
-def test_a_reader_who_leaves_is_no_fault() -> None:
+def test_a_reader_who_leaves_is_no_fault(environment: dict[str, str]) -> None:
     command = f"{sys.executable} -c '{MAIN}' plugins --json | true; exit ${{PIPESTATUS[0]}}"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=False)
+    done = subprocess.run(
+        ["bash", "-c", command], env=environment, capture_output=True, text=True, check=False
+    )
     assert done.stderr == ""
     assert done.returncode in (0, 1)
 
 
-def test_a_reader_of_lines_who_leaves_ends_the_run(demo_raw: Path) -> None:
+def test_a_reader_of_lines_who_leaves_ends_the_run(demo_raw: Path, environment: dict[str, str]) -> None:
     """What comes in by a pipe goes out by another, whose reader takes one line."""
     command = f"cat {demo_raw} | {sys.executable} -c '{MAIN}' receive - --json-lines - | head -n 1"
     done = subprocess.run(
-        ["bash", "-c", f"{command}; exit ${{PIPESTATUS[1]}}"], capture_output=True, text=True, check=False
+        ["bash", "-c", f"{command}; exit ${{PIPESTATUS[1]}}"],
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["line"] == "frame"
