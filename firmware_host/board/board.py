@@ -173,7 +173,7 @@ class Board:
         self.session.call(StartRequest(at_pulse, pulse_hz if at_pulse else 0, at_clock), StartReply)
 
     def stop(self) -> None:
-        """Finish the packet, then dark."""
+        """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
         self.session.call(StopRequest(), StopReply)
 
     def blank(self) -> None:

@@ -337,7 +337,7 @@ def start(
 
 @app.command(cls=LineCommand)
 def stop(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
-    """Finish the packet, then dark."""
+    """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
 
     def work(board: Board) -> None:
         board.stop()

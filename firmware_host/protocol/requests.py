@@ -699,7 +699,7 @@ class StartReply(WireMessage):
 
 @dataclass(frozen=True, slots=True)
 class StopRequest(WireMessage):
-    """Finish the packet, then dark."""
+    """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
 
     TYPE: ClassVar[int] = 0x09
     LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()

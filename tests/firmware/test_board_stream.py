@@ -376,6 +376,33 @@ def test_what_changes_is_right_at_its_first_chip(latency_s: float) -> None:
         assert 6 <= shown.count(chips) <= 10, "round and round for 0.25 s"
 
 
+@pytest.mark.parametrize("how", ["stop", "blank"])
+def test_a_stream_that_is_stopped_is_empty(how: str) -> None:
+    """What waits is not played by another START, nor by one that comes before the board is dark."""
+    for at_once in (False, True):
+        device = SimulatedBoard()
+        board = board_on(SimulatedLine(device))
+        sent = symbols(LINK, 6)
+        stream = board.stream(LINK, ahead=6)
+        for packet in sent:
+            stream.send(packet)
+        stream.wait(0.05)
+        assert 1 <= stream.begun < 6
+        getattr(board, how)()
+        begun = stream.begun
+        if not at_once:
+            board.wait_dark()
+        with pytest.raises(RefusedError, match=r"NOTHING_COMMITTED.*a stream that has ended, say, is gone"):
+            board.start()
+        device.run(300_000)
+        assert board.status().state == State.DARK
+        found, _ = played(device, LINK)
+        assert found[:begun] == expected(sent, LINK)[:begun]
+        assert len(found) <= begun + 1
+        provision(board, bank_of(symbols(LINK, 1), LINK), Settings())
+        assert board.status().state == State.PLAYING
+
+
 def test_after_a_stream_nothing_can_be_started_or_compared() -> None:
     device = SimulatedBoard()
     board = board_on(SimulatedLine(device))

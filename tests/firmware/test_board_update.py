@@ -27,6 +27,7 @@ from firmware_host.errors import (
 )
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import (
+    BoardFault,
     State,
     Status,
     UpdateBeginReply,
@@ -292,6 +293,30 @@ def test_a_file_of_an_update(tmp_path: Path) -> None:
 
 
 # -- the real images, on the model of the part
+
+
+@pytest.mark.parametrize("lsi_hz", [17_000, 47_000])
+def test_an_update_without_a_crystal_answers_and_stays_dark(
+    book: Codebook, needs: Callable[..., None], monkeypatch: pytest.MonkeyPatch, lsi_hz: int
+) -> None:
+    """At 16 MHz from power-up on, the watchdog's oscillator at either end of what RM0090 allows."""
+    needs("make", "arm-none-eabi-gcc")
+    pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
+    from firmware_host.emulators import stm32
+
+    chip = stm32.Stm32(build.arm_image("stm32f405"))
+    chip.run(15_000)
+    update(Board(Session(stm32.ModelLine(chip), Timing(latency_s=0.02))), Package.built("stm32f405-8mhz"))
+    monkeypatch.setattr(stm32, "LSI_HZ", lsi_hz)
+    chip.hse_works = False
+    chip.reset(stm32.RESET_BY_PIN)
+    chip.run(800_000)
+    assert chip.resets[-1] == stm32.RESET_BY_PIN
+    board = Board(Session(stm32.ModelLine(chip), Timing(latency_s=0.02)))
+    assert update_status(board).running == 1
+    status = board.status()
+    assert (status.state, status.faults) == (State.FAULT, BoardFault.CLOCK)
+    assert chip.drivers.dark
 
 
 def test_the_real_firmware_updates_itself(book: Codebook, needs: Callable[..., None]) -> None:

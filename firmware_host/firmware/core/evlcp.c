@@ -689,6 +689,14 @@ static enum evlcp_status on_update(struct evlcp *e, uint8_t type, struct exchang
     }
 }
 
+/* No packet is taken from now on, and none of a stream is left for another START. */
+static void play_no_more(struct evlcp *e)
+{
+    atomic_store(&e->player.want_play, false);
+    for (uint8_t bank = 0; bank < EVLCP_BANKS; bank++)
+        evlcp_stream_end(&e->banks.stream[bank]);
+}
+
 static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchange *x)
 {
     switch (type) {
@@ -715,11 +723,11 @@ static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchan
     case EVLCP_TYPE_START:
         return on_start(e, x);
     case EVLCP_TYPE_STOP:
-        atomic_store(&e->player.want_play, false);
+        play_no_more(e);
         test_end(e);
         return EVLCP_STATUS_OK;
     case EVLCP_TYPE_BLANK:
-        atomic_store(&e->player.want_play, false);
+        play_no_more(e);
         evlcp_player_blank(&e->player);
         test_end(e);
         return EVLCP_STATUS_OK;

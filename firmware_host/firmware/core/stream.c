@@ -31,6 +31,12 @@ void evlcp_stream_push(struct evlcp_stream *stream, uint8_t *content, uint32_t n
     }
 }
 
+void evlcp_stream_end(struct evlcp_stream *stream)
+{
+    atomic_store(&stream->ended, true);
+    atomic_store(&stream->pushed, atomic_load(&stream->begun));
+}
+
 bool evlcp_stream_over(const struct evlcp_stream *stream)
 {
     return stream->on && atomic_load(&stream->ended) && atomic_load(&stream->begun) == atomic_load(&stream->pushed);

@@ -39,6 +39,9 @@ void evlcp_stream_begin(struct evlcp_stream *stream, uint32_t packet_bytes, uint
 void evlcp_stream_push(struct evlcp_stream *stream, uint8_t *content, uint32_t number, uint32_t offset,
                        const uint8_t *bytes, uint32_t count);
 
+/* End it, and drop what waits; while no packet is taken. */
+void evlcp_stream_end(struct evlcp_stream *stream);
+
 /* Whether it has ended, and all that was put in has begun to play. */
 bool evlcp_stream_over(const struct evlcp_stream *stream);
 

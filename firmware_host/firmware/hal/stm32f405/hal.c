@@ -701,6 +701,7 @@ bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32
 bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
 {
     evlcp_copy(bytes, (const uint8_t *)(SLOT_ADDRESS(slot) + offset), count);
+    IWDG_KR = IWDG_FEED; /* at 16 MHz two images are checked for longer than it waits */
     return true;
 }
 
@@ -820,6 +821,7 @@ static bool ready(const volatile uint32_t *where, uint32_t mask, uint32_t value)
     for (uint32_t n = 0; n < WAIT_LOOPS; n++) {
         if ((*where & mask) == value)
             return true;
+        IWDG_KR = IWDG_FEED; /* an update starts with it running, and a dead crystal is waited for longer */
     }
     return false;
 #endif
