@@ -125,7 +125,10 @@ class RangeKeeper:
             measured: As the ranging gave it; without a distance, or a sigma, it is given back.
             sight: Where the bar is seen, and what the attitude says of its lean.
         """
-        distance_m, sigma_m = measured.distance_m, measured.sigma_m
+        distance_m, sigma_m = (
+            measured.distance_m * sight.magnification,
+            measured.sigma_m * sight.magnification,
+        )
         if not (0 < distance_m < math.inf and 0 <= sigma_m < math.inf):
             return state, measured
         t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
@@ -133,7 +136,7 @@ class RangeKeeper:
         height, unsure_m = (0.0, _WAVE_PX**2), 0.0
         if measured.bend is not None:
             faded = math.exp(-max(t_s - bend_s, 0.0) / _TILT_MEMORY_S) if bend.size else 0.0
-            new = _weighed(measured.bend, sight.sine)
+            new = _weighed(measured.bend, (sight.sine or 0.0) + sight.bow)
             wave = wave * faded
             _kernels.wave_of(measured.bend.place, new, _LEAST_WEIGHT, wave)
             height = _height(wave)
@@ -195,9 +198,9 @@ def _smooth(past: Floats) -> tuple[float, float, float]:
     )
 
 
-def _weighed(bend: Bend, sine: float | None) -> Floats:
+def _weighed(bend: Bend, sine: float) -> Floats:
     """Weights of a frame's boundaries, and what lies off and the wave by these, without the known lean."""
-    off = bend.off if sine is None else bend.off - sine * bend.place**2
+    off = bend.off - sine * bend.place**2 if sine else bend.off
     sums = np.empty((3, len(off)))
     sums[0], sums[1] = bend.weight, bend.weight * off
     sums[2] = 0.0 if bend.wave is None else bend.weight * bend.wave

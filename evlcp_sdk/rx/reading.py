@@ -16,7 +16,7 @@ from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.spread import Spread, neighbours
 from evlcp_sdk.rx.steps import Steps
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.lean import BarSight, sight_of
+from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
 from evlcp_sdk.values import FrameView, Range, SoftSymbols
 
 __all__ = ["FrameReader", "ReadableFrame", "Reading"]
@@ -127,5 +127,7 @@ class FrameReader:
         sight = BarSight()
         if self._is_column:
             sight = sight_of(self._camera, points_px, sigma_px, shown.attitude)
+        elif not self._camera.is_pinhole:
+            sight = BarSight(magnification=magnification_of(self._camera, points_px))
         spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, look.placement)
         return Reading(soft.symbols, given, distance, points_px, sigma_px, flank_px, centre_px, sight, spread)

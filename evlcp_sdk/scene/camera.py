@@ -117,7 +117,7 @@ class CameraModel:
             points_px: float64 (..., 2).
         """
         straight = (points_px - self.centre_px) / self.focal_px
-        if self.k1 == self.k2 == self.p1 == self.p2 == self.k3 == 0:
+        if self.is_pinhole:
             return straight
         found = straight.copy()
         for _ in range(_NEWTON_STEPS):
@@ -136,9 +136,14 @@ class CameraModel:
         away = np.abs(self.distort(found) - points_px).max(-1, keepdims=True)
         return np.where(away < 1e-6, found, np.nan)
 
+    @property
+    def is_pinhole(self) -> bool:
+        """Whether there is no distortion."""
+        return self.k1 == self.k2 == self.p1 == self.p2 == self.k3 == 0
+
     def direction(self, x_px: float, y_px: float) -> tuple[float, float]:
         """The same as `undistort` of one point (column, row), px."""
-        if self.k1 == self.k2 == self.p1 == self.p2 == self.k3 == 0:
+        if self.is_pinhole:
             (centre_x_px, centre_y_px), focal_px = self.centre_px, self.focal_px
             return (x_px - centre_x_px) / focal_px, (y_px - centre_y_px) / focal_px
         u, v = self.undistort(np.array([x_px, y_px])).tolist()

@@ -1,7 +1,7 @@
 """A bar that leans against the sensor: how much shorter it looks, and how a plumb one must lean."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel
 
-__all__ = ["BarSight", "foreshortening", "sight_of"]
+__all__ = ["BarSight", "foreshortening", "magnification_of", "sight_of"]
 
 Floats = NDArray[np.float64]
 
@@ -32,6 +32,10 @@ class BarSight:
             without an attitude.
         sigma: Standard deviation of that sine.
         askew: The attitude is known, but the image shows that the bar does not stand plumb.
+        magnification: How long the lens's distortion makes the bar look, in what it would be without.
+        bow: What the distortion's change along the bar looks like: the sine of a lean.
+        magnification: How long the lens's distortion makes the bar look, in what it would be without.
+        bow: What the distortion's change along the bar looks like: the sine of a lean.
 
     A default one is in the middle of the image, and nothing is known of its lean.
     """
@@ -41,6 +45,8 @@ class BarSight:
     sine: float | None = None
     sigma: float = 0.0
     askew: bool = False
+    magnification: float = 1.0
+    bow: float = 0.0
 
 
 def foreshortening(sine: Floats, sight: BarSight) -> Floats:
@@ -90,8 +96,10 @@ def sight_of(
         return BarSight()
     u, v, x, y = (u0 + u1) / 2, (v0 + v1) / 2, (u1 - u0) / length, (v1 - v0) / length
     along, across = x * u + y * v, x * v - y * u
+    lens = (1.0, 0.0) if camera.is_pinhole else _lens_of(camera, np.array([[u0, v0], [u1, v1]]))
+    sight = BarSight(along, across, magnification=lens[0], bow=lens[1])
     if attitude is None:
-        return BarSight(along, across)
+        return sight
     up = attitude.rotation()[2]
     # What a small step downward does to the sight, by the rule of the quotient.
     down_x, down_y = up[2] * u - up[0], up[2] * v - up[1]
@@ -102,6 +110,33 @@ def sight_of(
     lean_rad = math.radians(math.hypot(attitude.gravity_sigma_deg, _PLUMB_DEG))
     image_rad = math.hypot(sigma_px[first], sigma_px[last]) / (length * camera.focal_px)
     if off_rad > _ASKEW * math.hypot(lean_rad, image_rad):
-        return BarSight(along, across, askew=True)
+        return replace(sight, askew=True)
     sine = float(-up[2] if upside_down else up[2])
-    return BarSight(along, across, sine, lean_rad * math.sqrt(max(1 - sine**2, 0.0)))
+    return replace(sight, sine=sine, sigma=lean_rad * math.sqrt(max(1 - sine**2, 0.0)))
+
+
+def magnification_of(camera: CameraModel, points_px: Floats) -> float:
+    """How large the lens's distortion makes a layout of clusters look, in what it would be without.
+
+    Args:
+        camera: The camera.
+        points_px: Where the clusters' centres are seen, px, float64 (K, 2); NaN where unseen.
+    """
+    seen = points_px[np.isfinite(points_px).all(1)]
+    if camera.is_pinhole or len(seen) < 2:
+        return 1.0
+    return float(np.sqrt(seen.var(0).sum() / camera.undistort(seen).var(0).sum())) / camera.focal_px
+
+
+def _lens_of(camera: CameraModel, ends: Floats) -> tuple[float, float]:
+    """Magnification and bow of a bar between two directions, float64 (2, 2).
+
+    A distance by the length of a bar that looks m times as long is 1 / m of the true one. Where m grows along
+    the bar, clusters lie off an even scale by half of its growth and the square of their place, as those of
+    a bar do whose last cluster is nearer.
+    """
+    step = ends[1] - ends[0]
+    length = float(np.hypot(*step))
+    first, last = np.linalg.norm(camera.distort_slope(ends) @ (step / length), axis=-1) / camera.focal_px
+    seen = float(np.hypot(*np.subtract(*camera.distort(ends)))) / camera.focal_px / length
+    return seen, float(last - first) / (2 * length * seen)

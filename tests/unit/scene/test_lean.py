@@ -7,7 +7,7 @@ import pytest
 
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.scene.lean import BarSight, foreshortening, sight_of
+from evlcp_sdk.scene.lean import BarSight, foreshortening, magnification_of, sight_of
 
 CAMERA = CameraModel()
 SIGMA_PX = np.full(16, 0.1)
@@ -76,6 +76,40 @@ def test_a_lens_does_not_change_the_sight() -> None:
     plain = sight_of(CAMERA, seen(attitude, 3.0, 3.0, PLUMB)[0], SIGMA_PX, attitude)
     lens = sight_of(bent, seen(attitude, 3.0, 3.0, PLUMB, bent)[0], SIGMA_PX, attitude)
     assert (lens.along, lens.across, lens.sine) == pytest.approx((plain.along, plain.across, plain.sine))
+
+
+CORNERS = [(-600.0, -320.0), (600.0, -320.0), (-600.0, 320.0), (600.0, 320.0)]
+
+
+@pytest.mark.parametrize("corner", CORNERS)
+@pytest.mark.parametrize("lens", [{"k1": -0.25}, {"k1": 0.3, "k2": -5.0}, {"p1": 0.01, "p2": -0.02}])
+@pytest.mark.parametrize("depth_m", [20.0, 45.0])
+def test_distances_and_bends_of_a_distorted_bar_are_those_of_a_pinhole(
+    corner: tuple[float, float], lens: dict[str, float], depth_m: float
+) -> None:
+    """An even scale fitted to where boundaries are seen, as rangings do, by NumPy."""
+    camera = CameraModel(**lens)
+    middle = np.array([*(np.array(corner) / CAMERA.focal_px * depth_m), depth_m])
+    place = np.arange(1.0, 16.0) - 8
+    down = np.array([0.05, 0.998, 0.0]) / np.hypot(0.05, 0.998)
+    boundaries = camera.project(middle + 0.06 * place[:, None] * down)
+    clusters = camera.project(middle + 0.06 * (np.arange(16.0) - 7.5)[:, None] * down)
+    axis = clusters[-1] - clusters[0]
+    shown = (boundaries - clusters.mean(0)) @ axis / np.hypot(*axis)
+    spacing_px, _ = np.polyfit(place, shown, 1)
+    off_px = shown - np.polyval(np.polyfit(place, shown, 1), place)
+    sight = sight_of(camera, clusters, SIGMA_PX)
+    naive_m = camera.distance_m(0.06, spacing_px)
+    assert abs(naive_m / depth_m - 1) > 4e-4
+    assert naive_m * sight.magnification == pytest.approx(depth_m, rel=6e-5)
+    bent, _, _ = np.polyfit(place, off_px / (spacing_px * 0.06 / depth_m), 2)
+    assert sight.bow == pytest.approx(bent, abs=3e-4 + 0.03 * abs(bent))
+    assert magnification_of(camera, clusters) == pytest.approx(sight.magnification, rel=1e-4)
+
+
+def test_without_distortion_nothing_is_magnified() -> None:
+    points = seen(Attitude(), 3.0, 3.0, PLUMB)[0]
+    assert (sight_of(CAMERA, points, SIGMA_PX).magnification, magnification_of(CAMERA, points)) == (1.0, 1.0)
 
 
 def test_a_part_of_a_bar_has_a_sight_and_a_point_has_none() -> None:
