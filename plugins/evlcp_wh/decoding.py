@@ -1,11 +1,10 @@
 """What the info segment of each cluster says."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.late import Late
@@ -17,7 +16,29 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_wh._kernels")
 
-__all__ = ["WhTransform"]
+__all__ = ["WhTransform", "match_words"]
+
+_MIN_WEIGHT = 0.01
+"""Presence probability below which a cell is passed over: it adds nothing that is seen, but takes time."""
+
+
+def match_words(
+    values: NDArray[np.float64], by_value: NDArray[np.float64], bits: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Nearest words of values (K, n), their correlations, and by how much bits 0 correlate better than 1.
+
+    Args:
+        values: Of each cluster, float64 (K, n).
+        by_value: The words, float64 (n, 2**bits or more); those beyond 2**bits carry no bits.
+        bits: Of a symbol.
+
+    Returns:
+        int64 (K,), float64 (K,), float64 (K, bits): max-log, without its scale.
+    """
+    symbols, best = np.empty(len(values), np.int64), np.empty(len(values))
+    margins = np.empty((len(values), bits))
+    _kernels.match_words(values, by_value, symbols, best, margins)
+    return symbols, best, margins
 
 
 @dataclass(frozen=True)
@@ -25,31 +46,27 @@ class WhTransform(Decoding):
     """Presence-weighted sum of the info values, correlated with every codeword (arXiv 2510.17203).
 
     For the WH profiles that correlation is a Walsh-Hadamard transform. Log-likelihood ratios are those of
-    the best codewords (max-log) on a Gaussian channel whose amplitude and noise are taken from the frame.
+    the best codewords (max-log) on a Gaussian channel whose amplitude and noise are taken from the frame:
+    all clusters have one amplitude, the mean, and one noise, as eight values are too few for one each. A dim
+    cluster, whose correlations are small beside them, is unsure.
     """
-
-    min_weight: Annotated[
-        float, Field(gt=0, lt=1, description="Presence probability below which a cell is passed over.")
-    ] = 0.01
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's codewords."""
         codebook.require_pairs("decoding", "wh-transform", "edges")
         by_value = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
-        pilot_chips, m = codebook.pilots.shape[1], codebook.bits_per_symbol
+        pilot_chips, length = codebook.pilots.shape[1], len(by_value)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-            symbols = np.empty(len(presence.probability), np.int64)
-            llr = np.empty((len(symbols), m), np.float32)
-            explained = _kernels.transformed(
-                plain(sums[pilot_chips:]),
-                plain(presence.probability),
-                presence.grid_px,
-                self.min_weight,
-                by_value,
-                symbols,
-                llr,
-            )
-            return SoftSymbols(symbols, llr, explained)
+            probability = plain(presence.probability)
+            values = np.zeros((len(probability), length))
+            info = plain(sums[pilot_chips:])
+            _kernels.weighted_values(info, probability, presence.grid_px, _MIN_WEIGHT, values)
+            symbols, best, margins = match_words(values, by_value, codebook.bits_per_symbol)
+            energy, explained = float((values**2).sum()), float((best**2).sum()) / length
+            rest = max(energy - explained, 1e-3 * energy, 1e-9)
+            scale = max(float(best.mean()) / length, 0.0) * values.size / rest
+            quality = explained / energy if energy > 0 else 0.0
+            return SoftSymbols(symbols, (margins * scale).astype(np.float32), quality)
 
         return decode

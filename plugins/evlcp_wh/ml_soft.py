@@ -1,58 +1,38 @@
 """What the info segment of each cluster says, by likelihoods learned from the pilots."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
+from evlcp_wh.decoding import match_words
 
 if TYPE_CHECKING:
     from evlcp_wh import _kernels
 else:
     _kernels = Late("evlcp_wh._kernels")
 
-__all__ = [
-    "IndependentPixels",
-    "MaxEvents",
-    "MinWeight",
-    "MlSoft",
-    "PixelShare",
-    "PriorCount",
-    "learned_worth",
-    "soft_symbols",
-]
+__all__ = ["INDEPENDENT_PIXELS", "MAX_EVENTS", "LearnedDecoder", "MlSoft"]
 
+MAX_EVENTS = 3
+"""Polarity sums beyond this many events count as this many: more are too rare to learn."""
 
-MaxEvents = Annotated[
-    int, Field(ge=1, le=16, description="Polarity sums beyond this many events count as this many.")
-]
-MinWeight = Annotated[
-    float, Field(gt=0, lt=1, description="Presence probability below which a cell is passed over.")
-]
-PriorCount = Annotated[float, Field(gt=0, description="Observations added to every cell of the histograms.")]
-IndependentPixels = Annotated[
-    float,
-    Field(
-        gt=0,
-        le=1,
-        description="Share of the pixels that err by themselves; neighbours share light and motion.",
-    ),
-]
+_MIN_WEIGHT = 0.05
+"""Presence probability below which a cell is passed over: it adds nothing that is seen, but takes time."""
 
-PixelShare = Annotated[
-    float,
-    Field(
-        gt=0,
-        lt=1,
-        description="Share of the pixels in a cluster's place that show it, before their pilots speak.",
-    ),
-]
+_PRIOR_COUNT = 1.0
+"""Observations added to every pair of sums: what was seen once or twice by chance is worth little."""
+
+INDEPENDENT_PIXELS = 0.25
+"""Share of the pixels that err by themselves; neighbours share light and motion."""
+
+_PIXEL_SHARE = 0.05
+"""Share of the pixels in a cluster's place that show it, before their pilots speak: a bar is narrow."""
 
 
 @dataclass(frozen=True)
@@ -68,89 +48,55 @@ class MlSoft(Decoding):
     dark shows nothing: each counts by the probability that it shows the cluster, by Bayes' rule.
     """
 
-    max_events: MaxEvents = 3
-    min_weight: MinWeight = 0.05
-    prior_count: PriorCount = 1.0
-    independent_pixels: IndependentPixels = 0.25
-    pixel_share: PixelShare = 0.05
-
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
         codebook.require_pairs("decoding", "ml-soft", "edges")
-        words = codebook.codeword_edges.astype(np.float64)
-        pilots = codebook.pilot_edges.astype(np.int64)
+        decoder = LearnedDecoder(codebook)
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-            presence = presence.informed()
-            worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
-            weights = self.min_weight, self.pixel_share, self.independent_pixels
-            return soft_symbols(presence, sums, pilots, words, worth, *weights)[0]
+            return decoder.decode(presence.informed(), sums)[0]
 
         return decode
 
 
-def learned_worth(
-    presence: PresenceMap,
-    sums: NDArray[np.int16],
-    pilots: NDArray[np.int64],
-    max_events: int,
-    prior_count: float,
-) -> NDArray[np.float64]:
-    """Log-likelihood ratio of a value of +1 against -1, by its chips' polarity sums of -n to n events.
+class LearnedDecoder:
+    """`MlSoft` for the pilots and codewords of a codebook of pair codes."""
 
-    Args:
-        presence: Of the frame.
-        sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
-        pilots: The codes, int64 (K, values).
-        max_events: n; sums beyond count as this many.
-        prior_count: Observations added to every cell of the two histograms, on average of the two: to each as
-            its value is frequent, so that what comes with both alike is worth nothing.
+    def __init__(self, codebook: Codebook) -> None:
+        self._words = codebook.codeword_edges.astype(np.float64)
+        self._by_value = np.ascontiguousarray(self._words.T)
+        # Unsigned, as indices below 0 would count from the end.
+        self._signs = (codebook.pilot_edges > 0).astype(np.uint64)
+        self._bits = codebook.bits_per_symbol
 
-    Returns:
-        float64 (2 n + 1, 2 n + 1), by the first chip's sum and the second's.
-    """
-    worth = np.empty((2 * max_events + 1, 2 * max_events + 1))
-    grid = presence.grid_px
-    seen = plain(presence.probability)
-    _kernels.learn_worth(plain(sums), pilots, seen, grid, max_events, prior_count, worth)
-    return worth
+    def decode(
+        self, presence: PresenceMap, sums: NDArray[np.int16]
+    ) -> tuple[SoftSymbols, float, NDArray[np.float64]]:
+        """The likeliest codewords by what all pixels that show a cluster say.
 
+        Args:
+            presence: Of the frame.
+            sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
 
-def soft_symbols(
-    presence: PresenceMap,
-    sums: NDArray[np.int16],
-    pilots: NDArray[np.int64],
-    words: NDArray[np.float64],
-    worth: NDArray[np.float64],
-    min_weight: float,
-    pixel_share: float,
-    independent_pixels: float,
-) -> tuple[SoftSymbols, float]:
-    """The likeliest codewords by what all pixels that show a cluster say; the least size of an LLR.
-
-    Args:
-        presence: Of the frame.
-        sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
-        pilots: The codes, int64 (K, values).
-        words: The codewords, float64 (2**m or more, values).
-        worth: As from `learned_worth`.
-        min_weight: Presence probability below which a cell is passed over.
-        pixel_share: Share of the pixels in a cluster's place that show it.
-        independent_pixels: Share of the pixels that err by themselves.
-    """
-    clusters, bits = len(pilots), len(words).bit_length() - 1
-    symbols, llr = np.empty(clusters, np.int64), np.empty((clusters, bits), np.float32)
-    quality, least = _kernels.read_frame(
-        plain(sums),
-        pilots,
-        plain(presence.probability),
-        presence.grid_px,
-        min_weight,
-        worth,
-        (1 - pixel_share) / pixel_share,
-        words,
-        independent_pixels / 2,
-        symbols,
-        llr,
-    )
-    return SoftSymbols(symbols, llr, quality), least
+        Returns:
+            The symbols; the least size of an LLR; and the log-likelihood ratio of a value of +1 against -1 by
+            its chips' polarity sums of -n to n events, float64 (2 n + 1, 2 n + 1), the first chip's first.
+        """
+        pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
+        _kernels.pair_up(plain(sums), MAX_EVENTS, pairs)
+        seen, width, grid = plain(presence.probability), sums.shape[2], presence.grid_px
+        worth = np.empty((2 * MAX_EVENTS + 1) ** 2)
+        _kernels.learn_worth(pairs, width, self._signs, seen, grid, _PRIOR_COUNT, worth)
+        values = np.zeros((len(seen), len(pairs) - self._signs.shape[1]))
+        odds = (1 - _PIXEL_SHARE) / _PIXEL_SHARE
+        _kernels.sum_worth(pairs, width, self._signs, seen, grid, _MIN_WEIGHT, worth, odds, values)
+        symbols, _, margins = match_words(values, self._by_value, self._bits)
+        llr = (margins * (INDEPENDENT_PIXELS / 2)).astype(np.float32)
+        size = np.abs(values)
+        agrees = float(size[values * self._words[symbols] > 0].sum())
+        quality = agrees / float(size.sum()) if agrees else 0.0
+        return (
+            SoftSymbols(symbols, llr, quality),
+            float(np.abs(llr).min()),
+            worth.reshape(2 * MAX_EVENTS + 1, -1),
+        )

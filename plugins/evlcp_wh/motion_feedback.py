@@ -1,7 +1,7 @@
 """What the info segment of each cluster says, after the bar's motion within the frame is taken out."""
 
 from dataclasses import dataclass, replace
-from math import inf, log
+from math import inf
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -11,24 +11,32 @@ from pydantic import Field
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
-from evlcp_sdk.values import PresenceMap, SoftSymbols
-from evlcp_wh.ml_soft import (
-    IndependentPixels,
-    MaxEvents,
-    MinWeight,
-    PixelShare,
-    PriorCount,
-    learned_worth,
-    soft_symbols,
-)
-from evlcp_wh.separation import ErrorShare, MinValues
+from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
+from evlcp_wh.ml_soft import INDEPENDENT_PIXELS, MAX_EVENTS, LearnedDecoder
+from evlcp_wh.separation import CellPosterior
 
 if TYPE_CHECKING:
     from evlcp_wh import _kernels
 else:
     _kernels = Late("evlcp_wh._kernels")
 
-__all__ = ["MotionFeedback"]
+__all__ = ["MotionFeedback", "find_path", "match_shifts", "take_back"]
+
+_UNSURE_LLR = 2.0
+"""Log-likelihood ratio of a bit below which a bar that moved is sought farther: one such bit in eight is
+wrong."""
+
+_SURE_LLR = 20.0
+"""Log-likelihood ratio of every bit from which on a frame is read once only."""
+
+_STEP_PX = 0.3
+"""Likely change of place (sigma) from value to value: 1.5 px/ms for 0.2 ms."""
+
+_PLACE_PX = 1.0
+"""Likely distance (sigma) of the bar from its place."""
+
+_ROUNDS = 2
+"""How often motion and symbols are found: what is read in the first round tells the motion in the second."""
 
 
 @dataclass(frozen=True)
@@ -54,138 +62,100 @@ class MotionFeedback(Decoding):
     far_px: Annotated[
         int, Field(ge=1, le=16, description="Farthest where that does not do; without effect if it is less.")
     ] = 8
-    unsure_llr: Annotated[
-        float,
-        Field(
-            ge=0,
-            description="Log-likelihood ratio of a bit below which a bar that moved is sought to `far_px`: "
-            "at 2, one such bit in eight is wrong.",
-        ),
-    ] = 2.0
-    step_px: Annotated[
-        float,
-        Field(gt=0, description="Likely change of place (sigma) from value to value: 1.5 px/ms for 0.2 ms."),
-    ] = 0.3
-    place_px: Annotated[
-        float, Field(gt=0, description="Likely distance (sigma) of the bar from its place.")
-    ] = 1.0
-    rounds: Annotated[int, Field(ge=1, le=4, description="How often motion and symbols are found anew.")] = 2
-    max_events: MaxEvents = 3
-    min_weight: MinWeight = 0.05
-    prior_count: PriorCount = 1.0
-    independent_pixels: IndependentPixels = 0.25
-    pixel_share: PixelShare = 0.05
-    value_error: ErrorShare = 0.1
-    min_values: MinValues = 4
-    sure_llr: Annotated[
-        float,
-        Field(ge=0, description="Log-likelihood ratio of every bit from which on a frame is read once only."),
-    ] = 20.0
 
     def compile(self, codebook: Codebook) -> Decode:
         """Precompute for a codebook's pilots and codewords."""
         codebook.require_pairs("decoding", "motion-feedback", "edges")
-        words = codebook.codeword_edges.astype(np.float64)
-        pilots = codebook.pilot_edges.astype(np.int64)
+        decoder, posterior = LearnedDecoder(codebook), CellPosterior(codebook.pilot_edges.astype(np.int64))
+        pilots, words = codebook.pilot_edges, codebook.codeword_edges
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
-            presence = presence.informed()
-            worth = learned_worth(presence, sums, pilots, self.max_events, self.prior_count)
-            soft, least = self._decided(presence, sums, pilots, words, worth)
-            if least >= self.sure_llr:
+            presence, sums = presence.informed(), plain(sums)
+            soft, least, worth = decoder.decode(presence, sums)
+            if least >= _SURE_LLR:
                 return soft
-            read, beyond = self._fed_back(presence, sums, worth, soft, pilots, words, self.reach_px)
+            read, beyond = feed_back(presence, sums, soft, worth, self.reach_px)
             if beyond and self.far_px > self.reach_px:
-                read, _ = self._fed_back(presence, sums, worth, soft, pilots, words, self.far_px)
+                read, _ = feed_back(presence, sums, soft, worth, self.far_px)
             return read
+
+        def feed_back(
+            presence: PresenceMap,
+            sums: NDArray[np.int16],
+            soft: SoftSymbols,
+            worth: NDArray[np.float64],
+            reach_px: int,
+        ) -> tuple[SoftSymbols, bool]:
+            """What is read with the path taken back, and whether the path may lie beyond `reach_px`.
+
+            The best path may go on beyond the border. Where it does not come there, it may have gone over to
+            the same clusters a spacing back: what it passed on the way contradicts what it reads, and leaves
+            a bit unsure. What was read until then does not count.
+            """
+            matches = match_shifts(presence, sums, worth, reach_px)
+            known, least = pilots, inf
+            done = np.zeros((len(sums) // 2, 2), np.int64)
+            for _ in range(_ROUNDS):
+                path = find_path(matches, known)
+                if reach_px < self.far_px and np.abs(path).max() >= reach_px - 1:
+                    return soft, True
+                if (path == done).all():
+                    break
+                still, done = take_back(sums, path), path
+                probability = posterior.probability(still, presence.grid_px)
+                presence = replace(presence, probability=probability).informed()
+                soft, least, _ = decoder.decode(presence, still)
+                known = np.concatenate([pilots, words[soft.symbols]], axis=1)
+            return soft, least < _UNSURE_LLR
 
         return decode
 
-    def _fed_back(
-        self,
-        presence: PresenceMap,
-        sums: NDArray[np.int16],
-        worth: NDArray[np.float64],
-        soft: SoftSymbols,
-        pilots: NDArray[np.int64],
-        words: NDArray[np.float64],
-        reach_px: int,
-    ) -> tuple[SoftSymbols, bool]:
-        """What is read with the path taken back, and whether the path may lie beyond `reach_px`.
 
-        The best path may go on beyond the border. Where it does not come there, it may have gone over to the
-        same clusters a spacing back: what it passed on the way contradicts what it reads, and leaves a bit
-        unsure. What was read until then does not count.
-        """
-        matches = self._matches(presence, sums, worth, reach_px)
-        known, least = pilots, inf
-        done = np.zeros((len(sums) // 2, 2), np.int64)
-        for _ in range(self.rounds):
-            path = self._path(matches, known)
-            if reach_px < self.far_px and np.abs(path).max() >= reach_px - 1:
-                return soft, True
-            if (path == done).all():
-                break
-            aligned, done = _taken_back(sums, path), path
-            presence = self._separated(aligned, presence, pilots)
-            worth = learned_worth(presence, aligned, pilots, self.max_events, self.prior_count)
-            soft, least = self._decided(presence, aligned, pilots, words, worth)
-            known = np.concatenate([pilots, words[soft.symbols].astype(np.int64)], axis=1)
-        return soft, least < self.unsure_llr
+def match_shifts(
+    presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64], reach_px: int
+) -> NDArray[np.float32]:
+    """Log-likelihood ratio of each value of each cluster, by the shift of the bar from its place.
 
-    def _decided(
-        self,
-        presence: PresenceMap,
-        sums: NDArray[np.int16],
-        pilots: NDArray[np.int64],
-        words: NDArray[np.float64],
-        worth: NDArray[np.float64],
-    ) -> tuple[SoftSymbols, float]:
-        weights = self.min_weight, self.pixel_share, self.independent_pixels
-        return soft_symbols(presence, sums, pilots, words, worth, *weights)
+    A pixel without events counts 0: what it is worth adds the same wherever the bar is.
 
-    def _matches(
-        self, presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64], reach_px: int
-    ) -> NDArray[np.float32]:
-        """Log-likelihood ratio of each value of each cluster, by the shift of the bar from its place.
-
+    Returns:
         float32 (K, n, n, values), from `reach_px` up and left to as much down and right.
-        """
-        _, height, width = sums.shape
-        values, seam, side = len(sums) // 2, reach_px, 2 * reach_px + 1
-        images = np.empty((height + 2 * seam, width + 2 * seam, values), np.float32)
-        _kernels.worth_images(sums, worth.astype(np.float32), len(worth) // 2, seam, images)
-        prior = presence.probability if presence.prior is None else presence.prior
-        out = np.empty((len(prior), side, side, values), np.float32)
-        _kernels.cluster_matches(presence.pixels, prior, presence.grid_px, images, out)
-        out *= self.independent_pixels
-        return out
-
-    def _path(self, matches: NDArray[np.float32], known: NDArray[np.int64]) -> NDArray[np.int64]:
-        """Shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
-
-        `known` are the codes of the first n values, int64 (K, n); of the others, each cluster's is what fits.
-        """
-        values = matches.shape[3]
-        scores = np.empty(matches.shape[1:], np.float64)
-        _kernels.path_scores(matches, known, scores)
-        # What is scored is twice a log-likelihood, and so are the costs.
-        path = np.empty((values, 2), np.int64)
-        _kernels.smooth_path(scores, 1 / self.step_px**2, 1 / self.place_px**2 / values, path)
-        return path
-
-    def _separated(
-        self, sums: NDArray[np.int16], before: PresenceMap, pilots: NDArray[np.int64]
-    ) -> PresenceMap:
-        """Presence by Bayes' rule of sums in which the bar stands still."""
-        agree, disagree = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5)
-        probability = np.zeros_like(before.probability)
-        pilot = sums[: 2 * pilots.shape[1]]
-        _kernels.presence(pilot, pilots, before.grid_px, agree, disagree, self.min_values, probability)
-        return replace(before, probability=probability).informed()
+    """
+    pairs = np.clip(sums, -MAX_EVENTS, MAX_EVENTS) + MAX_EVENTS
+    single = worth.astype(np.float32)
+    beside = single - single[MAX_EVENTS, MAX_EVENTS]
+    images = np.moveaxis(beside[pairs[::2], pairs[1::2]], 0, -1)
+    images = np.pad(images, ((reach_px, reach_px), (reach_px, reach_px), (0, 0)))
+    prior = presence.probability if presence.prior is None else presence.prior
+    side = 2 * reach_px + 1
+    out = np.zeros((len(prior), side, side, images.shape[2]), np.float32)
+    _kernels.cluster_matches(presence.pixels, prior, presence.grid_px, images, out)
+    out *= INDEPENDENT_PIXELS
+    return out
 
 
-def _taken_back(sums: NDArray[np.int16], path: NDArray[np.int64]) -> NDArray[np.int16]:
-    out = np.empty_like(sums)
-    _kernels.take_back(sums, path, out)
+def find_path(matches: NDArray[np.float32], known: NDArray[np.signedinteger]) -> NDArray[np.int64]:
+    """Shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
+
+    `known` are the codes of the first n values, (K, n); of the others, each cluster's is what fits better.
+    """
+    values, first = matches.shape[3], known.shape[1]
+    # Twice a log-likelihood, as the costs are.
+    scores = np.abs(matches).sum(0, np.float64)
+    scores[..., :first] = (known[:, None, None] * matches[..., :first]).sum(0, np.float64)
+    path = np.empty((values, 2), np.int64)
+    _kernels.smooth_path(scores, 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values, path)
+    return path
+
+
+def take_back(sums: NDArray[np.int16], path: NDArray[np.int64]) -> NDArray[np.int16]:
+    """Polarity sums with each value's shift (down, right) taken back; 0 where there was no pixel."""
+    _, height, width = sums.shape
+    out = np.zeros_like(sums)
+    for i, (down, right) in enumerate(path.tolist()):
+        top, bottom = max(-down, 0), max(min(height - down, height), 0)
+        left, end = max(-right, 0), max(min(width - right, width), 0)
+        if bottom > top and end > left:
+            there = sums[2 * i : 2 * i + 2, top + down : bottom + down, left + right : end + right]
+            out[2 * i : 2 * i + 2, top:bottom, left:end] = there
     return out

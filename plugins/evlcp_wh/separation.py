@@ -18,14 +18,39 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_wh._kernels")
 
-__all__ = ["ErrorShare", "MinValues", "WhCorrelation"]
+__all__ = ["CellPosterior", "WhCorrelation"]
 
-ErrorShare = Annotated[
-    float, Field(gt=0, lt=0.5, description="Probability that a cell's value is seen wrong.")
-]
-MinValues = Annotated[
-    int, Field(ge=1, description="Values that must be seen in a cell for it to show a cluster.")
-]
+_VALUE_ERROR = 0.1
+"""Probability that a cell's value is seen wrong: of a cell half beside the bar, which is one of four."""
+
+_MIN_VALUES = 4
+"""Values that must be seen in a cell for it to show a cluster: half of a pilot tells it from most others."""
+
+_MIN_PROBABILITY = np.float32(0.5)
+"""Presence probability that selects a cell: rather one cluster than any other, or none."""
+
+
+class CellPosterior:
+    """Bayes' rule with equal priors for the pilots of a codebook, int64 (K, values)."""
+
+    def __init__(self, pilots: NDArray[np.int64]) -> None:
+        self._pilots = pilots
+        clusters, n = pilots.shape
+        agree, disagree = log((1 - _VALUE_ERROR) / 0.5), log(_VALUE_ERROR / 0.5)
+        self._beside = np.exp(np.arange(2 * n + 1) * (disagree - agree) / 2)
+        seen, best = np.arange(n + 1)[:, None], np.arange(-n, n + 1)
+        self._none = clusters * np.exp(-(agree * (seen + best) + disagree * (seen - best)) / 2)
+
+    def probability(self, sums: NDArray[np.int16], grid_px: int) -> NDArray[np.float32]:
+        """Of each cluster in each cell, float32 (K, rows, columns), by polarity sums, pilot first."""
+        clusters, n = self._pilots.shape
+        _, height, width = sums.shape
+        rows, columns = height // grid_px, width // grid_px
+        values = np.empty((n, rows * columns), np.int8)
+        _kernels.cell_values(sums, grid_px, columns, values)
+        out = np.zeros((clusters, rows * columns), np.float32)
+        _kernels.presence(values, self._pilots, self._beside, self._none, _MIN_VALUES, out)
+        return out.reshape(clusters, rows, columns)
 
 
 @dataclass(frozen=True)
@@ -37,26 +62,19 @@ class WhCorrelation(Separation):
     """
 
     grid_px: Annotated[int, Field(ge=2, le=16, description="Side of a grid cell.")] = 2
-    value_error: ErrorShare = 0.1
-    min_values: MinValues = 4
-    min_probability: Annotated[
-        float, Field(gt=0, lt=1, description="Presence probability that selects a cell.")
-    ] = 0.5
 
     def compile(self, codebook: Codebook) -> Separate:
         """Precompute for a codebook's pilots."""
         codebook.require_pairs("separation", "wh-correlation", "edges")
         codes = codebook.pilot_edges.astype(np.int64)
-        odds = log((1 - self.value_error) / 0.5), log(self.value_error / 0.5), self.min_values
-        least = self.min_probability
+        posterior = CellPosterior(codes)
 
         def separate(sums: NDArray[np.int16]) -> PresenceMap:
-            _, height, width = sums.shape
-            rows, columns = height // self.grid_px, width // self.grid_px
-            cells = len(codes), rows, columns
-            probability, selected = np.zeros(cells, np.float32), np.empty(cells, np.bool_)
-            pixels = np.zeros((len(codes), height, width), np.float32)
-            _kernels.separated(plain(sums), codes, self.grid_px, odds, least, probability, selected, pixels)
+            sums = plain(sums)
+            probability = posterior.probability(sums, self.grid_px)
+            selected = probability >= _MIN_PROBABILITY
+            pixels = np.zeros((len(codes), *sums.shape[1:]), np.float32)
+            _kernels.pixel_maps(sums, codes, self.grid_px, selected, pixels)
             return PresenceMap(probability, self.grid_px, selected, pixels)
 
         return separate

@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import wh_twins as twins
-from evlcp_wh import _kernels
-from evlcp_wh.decoding import WhTransform
-from evlcp_wh.ml_soft import MlSoft, learned_worth
+from evlcp_wh import _kernels, ml_soft, motion_feedback
+from evlcp_wh.decoding import WhTransform, match_words
+from evlcp_wh.ml_soft import INDEPENDENT_PIXELS, LearnedDecoder, MlSoft
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
-from evlcp_wh.motion_feedback import MotionFeedback
+from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts, take_back
 from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from numpy.testing import assert_allclose, assert_array_equal
@@ -66,9 +66,8 @@ def presence_of(rng, clusters, rows, columns, grid):
 def test_presence_is_bayes_rule(shape, grid, density):
     rng = np.random.default_rng(grid)
     sums = random_sums(rng, (16, *shape), density)
-    rule = WhCorrelation(grid_px=grid, value_error=0.15, min_values=3)
-    found = rule.compile(book_of())(sums)
-    want = twins.posterior(sums, CODES, grid, 0.15, 3)
+    found = WhCorrelation(grid_px=grid).compile(book_of())(sums)
+    want = twins.posterior(sums, CODES, grid, 0.1, 4)
     # Ratios below 1e-9 count as nothing, and the result is float32.
     assert_allclose(found.probability, want, rtol=1e-5, atol=2e-9)
     assert found.probability.shape == (CLUSTERS, shape[0] // grid, shape[1] // grid)
@@ -119,122 +118,91 @@ def test_weighted_values(seed, grid):
     ("clusters", "bits", "length", "more"),
     [(16, 6, 8, 0), (1, 1, 2, 0), (3, 8, 16, 0), (5, 2, 8, 2), (5, 2, 8, 3)],
 )
-def test_words_are_read(clusters, bits, length, more):
+def test_words_are_matched(clusters, bits, length, more):
     """Words beyond the 2^bits first carry no bits."""
     rng = np.random.default_rng(bits)
     words = rng.choice([-1.0, 1.0], (2**bits + more, length))
     for values in (rng.normal(size=(clusters, length)), np.zeros((clusters, length))):
-        symbols, llr = np.empty(clusters, np.int64), np.empty((clusters, bits), np.float32)
-        quality = _kernels.read_words(values, words, 0.25, symbols, llr)
-        want_symbols, want, want_quality = twins.read_words(values, words, 0.25)
+        symbols, best, margins = match_words(values, np.ascontiguousarray(words.T), bits)
+        want_symbols, want_best, want = twins.match_words(values, words)
         assert_array_equal(symbols, want_symbols)
-        assert_allclose(llr, want, rtol=1e-5, atol=1e-6)
-        assert quality == pytest.approx(want_quality)
+        assert_allclose(best, want_best, rtol=1e-9, atol=1e-12)
+        assert_allclose(margins, want, rtol=1e-9, atol=1e-12)
 
 
-@pytest.mark.parametrize("prior", [0.5, 1.0])
-def test_worth_of_histograms(prior):
-    rng = np.random.default_rng(3)
-    for counts in (
-        rng.random((2, 5, 5)) * [[[100]], [[30]]],
-        np.zeros((2, 3, 3)),
-        np.eye(3) * [[[1]], [[0]]],
-    ):
-        out = np.empty(counts.shape[1:])
-        _kernels.log_ratio(counts, prior, out)
-        assert_allclose(out, twins.log_ratio(counts, prior), rtol=1e-9, atol=1e-12)
+def signs_of(codes):
+    return (codes > 0).astype(np.uint64)
+
+
+def pairs_of(sums, most):
+    pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
+    _kernels.pair_up(sums, most, pairs)
+    return pairs
+
+
+@pytest.mark.parametrize("most", [1, 3])
+def test_pairs_of_sums(most):
+    sums = random_sums(np.random.default_rng(most), (6, 5, 4))
+    first, second = np.clip(sums.astype(int), -most, most).reshape(3, 2, 20).swapaxes(0, 1) + most
+    assert_array_equal(pairs_of(sums, most), first * (2 * most + 1) + second)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("grid", "most"), [(2, 1), (3, 2)])
-def test_histograms_of_pairs_and_their_worth(seed, grid, most):
+@pytest.mark.parametrize("prior", [0.5, 1.0])
+def test_worth_is_learned_and_summed(seed, grid, most, prior):
     rng = np.random.default_rng(seed)
-    sums = random_sums(rng, (16, 13, 10))
+    sums = random_sums(rng, (28, 13, 10))
     # One cluster or none shows in a cell, so that probabilities sum to one at the most.
     probability = rng.dirichlet(np.full(CLUSTERS + 1, 0.1), (13 // grid, 10 // grid)).T[:-1].swapaxes(1, 2)
+    probability = np.ascontiguousarray(probability, np.float32)
     assert ((probability > 0.5).sum((1, 2)) > 0).any()
-    counts = np.full((2, 2 * most + 1, 2 * most + 1), 0.5)
-    _kernels.count_pairs(sums, CODES.astype(np.int64), probability, grid, most, counts)
-    assert_allclose(counts, twins.count_pairs(sums, CODES, probability, grid, most, 0.5), rtol=1e-6)
-    worth = rng.normal(size=counts.shape[1:])
-    sums = np.concatenate([sums, random_sums(rng, (12, 13, 10))])
+    pairs, signs, worth = pairs_of(sums, most), signs_of(CODES), np.empty((2 * most + 1) ** 2)
+    _kernels.learn_worth(pairs, 10, signs, probability, grid, prior, worth)
+    counts = twins.count_pairs(sums[:16], CODES, probability, grid, most, 0.0)
+    worth = worth.reshape(counts.shape[1:])
+    assert_allclose(worth, twins.log_ratio(counts, prior), rtol=1e-6, atol=1e-9)
     out = np.zeros((CLUSTERS, 6))
-    _kernels.sum_worth(sums, CODES.astype(np.int64), probability, grid, 0.2, most, worth, 4.0, out)
-    assert_allclose(
-        out, twins.sum_worth(sums, CODES, probability, grid, 0.2, worth, 0.2), rtol=1e-6, atol=1e-9
-    )
+    _kernels.sum_worth(pairs, 10, signs, probability, grid, 0.2, worth.ravel(), 4.0, out)
+    want = twins.sum_worth(sums, CODES, probability, grid, 0.2, worth, 0.2)
+    assert_allclose(out, want, rtol=1e-6, atol=1e-9)
 
 
-def test_steps_that_are_called_as_one():
-    rng = np.random.default_rng(0)
-    sums, codes = random_sums(rng, (32, 12, 8)), rng.choice([-1, 1], (3, 8))
-    cells, odds = (3, 6, 4), (0.6, -1.6, 4)
-    probability, heard, chosen = (
-        np.zeros(cells, np.float32),
-        np.zeros(cells, np.float32),
-        np.zeros(cells, bool),
-    )
-    pixels, maps = np.zeros((2, 3, 12, 8), np.float32)
-    _kernels.separated(sums, codes, 2, odds, 0.5, heard, chosen, pixels)
-    _kernels.presence(sums, codes, 2, *odds, probability)
-    _kernels.pixel_maps(sums, codes, 2, probability >= 0.5, maps)
-    for one, other in ((heard, probability), (chosen, probability >= 0.5), (pixels, maps)):
-        assert_array_equal(one, other)
-    counts, worth, learned = np.zeros((2, 7, 7)), np.empty((7, 7)), np.empty((7, 7))
-    _kernels.count_pairs(sums[:16], codes, heard, 2, 3, counts)
-    _kernels.log_ratio(counts, 1.0, worth)
-    _kernels.learn_worth(sums, codes, heard, 2, 3, 1.0, learned)
-    assert_array_equal(learned, worth)
-    words, values = rng.choice([-1.0, 1.0], (16, 8)), np.zeros((3, 8))
-    symbols, llr = np.zeros((2, 3), int), np.zeros((2, 3, 4), np.float32)
-    _kernels.sum_worth(sums, codes, heard, 2, 0.05, 3, worth, 19.0, values)
-    quality = _kernels.read_words(values, words, 0.125, symbols[0], llr[0])
-    found = _kernels.read_frame(sums, codes, heard, 2, 0.05, worth, 19.0, words, 0.125, symbols[1], llr[1])
-    assert found == (quality, np.abs(llr[0]).min())
-    assert_array_equal(symbols[1], symbols[0])
-    assert_array_equal(llr[1], llr[0])
+def test_nothing_is_learned_where_nothing_shows():
+    worth = np.empty(49)
+    sums = random_sums(np.random.default_rng(0), (16, 4, 4))
+    dark = np.zeros((CLUSTERS, 2, 2), np.float32)
+    _kernels.learn_worth(pairs_of(sums, 3), 4, signs_of(CODES), dark, 2, 1.0, worth)
+    assert_allclose(worth, 0, atol=1e-12)
 
 
 @pytest.mark.parametrize("value", [-1, 1])
 def test_a_pilot_of_one_value_says_of_the_other_the_same_with_signs_changed(value):
     rng = np.random.default_rng(0)
     sums, cells = random_sums(rng, (16, 12, 8)), np.ones((1, 6, 4), np.float32)
-    codes, counts, worth = np.full((1, 8), value), np.zeros((2, 7, 7)), np.empty((7, 7))
-    _kernels.count_pairs(sums, codes, cells, 2, 3, counts)
+    codes, worth = np.full((1, 8), value), np.empty(49)
+    counts = twins.count_pairs(sums, codes, cells, 2, 3, 0.0)
     known = int(value > 0)
     assert not counts[1 - known].any()
     counts[1 - known] = counts[known, ::-1, ::-1]
-    _kernels.learn_worth(sums, codes, cells, 2, 3, 1.0, worth)
-    assert_allclose(worth, twins.log_ratio(counts, 1.0), rtol=1e-9, atol=1e-12)
+    _kernels.learn_worth(pairs_of(sums, 3), 8, signs_of(codes), cells, 2, 1.0, worth)
+    assert_allclose(worth.reshape(7, 7), twins.log_ratio(counts, 1.0), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize("reach", [1, 3])
 def test_what_clusters_say_off_their_places(seed, reach):
     rng = np.random.default_rng(seed)
-    sums, worth = random_sums(rng, (12, 11, 7)), rng.normal(size=(5, 5))
+    sums, worth = random_sums(rng, (12, 11, 7)), rng.normal(size=(7, 7))
     maps = (rng.random((4, 11, 7)) * (rng.random((4, 11, 7)) < 0.4)).astype(np.float32)
-    images = np.empty((11 + 2 * reach, 7 + 2 * reach, 6))
-    _kernels.worth_images(sums, worth, 2, reach, images)
-    pixels = twins.worth_of(sums, worth) - worth[2, 2]
-    want = np.pad(pixels, ((0, 0), (reach, reach), (reach, reach)))
-    assert_allclose(images, np.moveaxis(want, 0, -1))
     prior = (rng.random((4, 5, 3)) * (rng.random((4, 5, 3)) < 0.7)).astype(np.float32)
-    out = np.empty((4, 2 * reach + 1, 2 * reach + 1, 6))
-    _kernels.cluster_matches(maps, prior, 2, images, out)
+    presence = PresenceMap(prior, 2, prior > 0.5, maps, prior)
+    out = match_shifts(presence, sums, worth, reach)
     own = np.zeros(maps.shape, bool)
     own[:, :10, :6] = (prior > 0).repeat(2, 1).repeat(2, 2)
-    assert_allclose(out, twins.cluster_matches(pixels, maps * own, reach), atol=1e-6)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_scores_of_shifts_by_known_codes_and_by_what_fits(seed):
-    rng = np.random.default_rng(seed)
-    matches, known = rng.normal(size=(4, 3, 3, 7)), rng.choice([-1, 1], (4, 5))
-    out = np.empty((3, 3, 7))
-    _kernels.path_scores(matches, known, out)
-    assert_allclose(out[..., :5], np.einsum("kabi,ki->abi", matches[..., :5], known), atol=1e-12)
-    assert_allclose(out[..., 5:], np.abs(matches[..., 5:]).sum(0), atol=1e-12)
+    pixels = twins.worth_of(sums, worth) - worth[3, 3]
+    want = INDEPENDENT_PIXELS * twins.cluster_matches(pixels, maps * own, reach)
+    assert_allclose(out, want, rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -250,9 +218,7 @@ def test_the_smooth_path_is_the_best_of_all(seed, step_cost, place_cost):
 def test_motion_taken_back(seed):
     rng = np.random.default_rng(seed)
     sums, path = random_sums(rng, (8, 9, 5)), rng.integers(-6, 7, (4, 2))
-    out = np.empty_like(sums)
-    _kernels.take_back(sums, path, out)
-    assert_array_equal(out, twins.take_back(sums, path))
+    assert_array_equal(take_back(sums, path), twins.take_back(sums, path))
 
 
 # Separation
@@ -301,7 +267,7 @@ def test_the_second_chip_outvotes_the_first():
 def test_a_cell_shows_no_cluster_until_enough_values_are_seen(seen, shown):
     sums = image_of(CODES, range(CLUSTERS))
     sums[2 * seen :] = 0
-    found = WhCorrelation(min_values=4).compile(book_of())(sums)
+    found = WhCorrelation().compile(book_of())(sums)
     assert found.probability.any() == shown
     # Four values are half a code: the two clusters that begin with it share the probability.
     assert found.selected.any() == (seen == 8)
@@ -440,7 +406,7 @@ def test_learned_likelihoods_decode_every_symbol(profile, positive_only):
 
 
 @pytest.mark.parametrize("decoding", [MlSoft(), MotionFeedback()])
-def test_what_flickers_before_a_part_of_a_cluster_is_not_listened_to(decoding):
+def test_what_flickers_before_a_part_of_a_cluster_is_not_listened_to(decoding, monkeypatch):
     """Half of the columns of each cluster say what a panel does, not the bar."""
     book, rng = book_of(), np.random.default_rng(0)
     symbols = rng.integers(64, size=CLUSTERS)
@@ -453,7 +419,8 @@ def test_what_flickers_before_a_part_of_a_cluster_is_not_listened_to(decoding):
     presence = ideal_presence(CLUSTERS, **shape)
     soft = decoding.compile(book)(presence, sums)
     assert_array_equal(soft.symbols, symbols)
-    believing = type(decoding)(pixel_share=1 - 1e-9).compile(book)(presence, sums)
+    monkeypatch.setattr(ml_soft, "_PIXEL_SHARE", 1 - 1e-9)
+    believing = decoding.compile(book)(presence, sums)
     assert (believing.symbols != symbols).any()
 
 
@@ -462,7 +429,10 @@ def test_what_comes_with_both_values_alike_is_worth_nothing():
     pilots = np.array([[1, -1, -1, -1, -1], [1, 1, -1, -1, -1]], np.int64)
     presence = ideal_presence(2)
     silent = np.zeros((10, *(presence.grid_px * n for n in presence.probability.shape[1:])), np.int16)
-    assert_allclose(learned_worth(presence, silent, pilots, 3, 1.0), 0, atol=1e-12)
+    worth = np.empty(49)
+    seen = presence.probability
+    _kernels.learn_worth(pairs_of(silent, 3), silent.shape[2], signs_of(pilots), seen, 2, 1.0, worth)
+    assert_allclose(worth, 0, atol=1e-12)
 
 
 def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
@@ -482,18 +452,17 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
     shape = {"cluster_px": 4, "width_px": 4}
     sums, path = drifting(book, symbols, right_down, seed=seed, **shape)
     presence = ideal_presence(CLUSTERS, **shape)
-    algorithm = MotionFeedback()
-    soft = algorithm.compile(book)(presence, sums)
+    soft = MotionFeedback().compile(book)(presence, sums)
     assert_array_equal(soft.symbols, symbols)
     assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
     if right_down[1]:
         assert (MlSoft().compile(book)(presence, sums).symbols != symbols).any()
-    pilots = book.pilot_edges.astype(np.int64)
-    matches = algorithm._matches(presence, sums, learned_worth(presence, sums, pilots, 3, 1.0), 4)
-    known = np.concatenate([pilots, book.codeword_edges[symbols].astype(np.int64)], axis=1)
-    assert_array_equal(algorithm._path(matches, known), path)
+    _, _, worth = LearnedDecoder(book).decode(presence, sums)
+    matches = match_shifts(presence, sums, worth, 4)
+    known = np.concatenate([book.pilot_edges, book.codeword_edges[symbols]], axis=1)
+    assert_array_equal(find_path(matches, known), path)
     # Blind to what the clusters say, it is found as well.
-    assert_array_equal(algorithm._path(matches, pilots), path)
+    assert_array_equal(find_path(matches, book.pilot_edges), path)
 
 
 @pytest.mark.parametrize("right_down", [(0, 6), (0, -6), (6, 0), (-6, 0), (5, -6), (0, 7)])
@@ -515,7 +484,7 @@ def test_a_bar_that_goes_farther_than_is_searched_is_searched_farther(right_down
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_bar_that_leaves_a_bit_unsure_is_searched_farther(seed):
+def test_a_bar_that_leaves_a_bit_unsure_is_searched_farther(seed, monkeypatch):
     """The path may go over to the same clusters a spacing back, and never come to the border."""
     book = book_of()
     symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
@@ -525,7 +494,8 @@ def test_a_bar_that_leaves_a_bit_unsure_is_searched_farther(seed):
     soft = MotionFeedback().compile(book)(presence, sums)
     assert_array_equal(soft.symbols, symbols)
     assert_array_equal(soft.llr, MotionFeedback(reach_px=8).compile(book)(presence, sums).llr)
-    by_border = MotionFeedback(unsure_llr=0.0).compile(book)(presence, sums)
+    monkeypatch.setattr(motion_feedback, "_UNSURE_LLR", 0.0)
+    by_border = MotionFeedback().compile(book)(presence, sums)
     assert (by_border.symbols != symbols).any()
 
 

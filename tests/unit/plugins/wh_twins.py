@@ -167,9 +167,7 @@ def log_ratio(counts, prior):
     return np.log(share[1] / share[0])
 
 
-def read_words(values, words, scale):
-    fit = values @ words.T * scale
-    symbols = fit.argmax(1)
+def match_words(values, words):
+    fit = values @ words.T
     zero, one = max_log(fit, len(words).bit_length() - 1)
-    agrees = np.sign(values) * words[symbols] > 0
-    return symbols, zero - one, np.abs(values)[agrees].sum() / max(np.abs(values).sum(), 1e-9)
+    return fit.argmax(1), fit.max(1), zero - one

@@ -287,11 +287,11 @@ def test_variants_that_cannot_be(text: str, told: str) -> None:
 
 def test_variants_share_what_is_set_for_all() -> None:
     base, other = load_variants(
-        ["base:", "other: decoding.min_weight=0.3,ranging.clusters=[1, 3, 14] , ranging.skip_outer=0"],
-        overrides=["decoding.min_weight=0.2", "ranging.id=poc", "ranging.min_pixels=7"],
+        ["base:", "other: decoding.reach_px=3,ranging.clusters=[1, 3, 14] , ranging.skip_outer=0"],
+        overrides=["decoding.reach_px=2", "ranging.id=poc", "ranging.min_pixels=7"],
     )
-    assert base.links[""].table["decoding"]["min_weight"] == 0.2
-    assert other.links[""].table["decoding"]["min_weight"] == 0.3
+    assert base.links[""].table["decoding"]["reach_px"] == 2
+    assert other.links[""].table["decoding"]["reach_px"] == 3
     assert other.links[""].table["ranging"]["clusters"] == [1, 3, 14]
     assert other.links[""].table["ranging"]["min_pixels"] == 7
     assert base.to_dict()["digest"] != other.to_dict()["digest"]
