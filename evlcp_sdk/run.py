@@ -543,6 +543,7 @@ def _run(
             "events_per_s": round(read / duration_s) if duration_s else None,
             "counts": dict(source.counts),
             "guessed": source.guessed,
+            "step_us": source.step_us,
         },
         processing={
             "processor_s": round(watch.processor_s, 6),

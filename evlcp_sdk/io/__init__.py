@@ -5,13 +5,12 @@ from evlcp_sdk.io.open import open_source, open_writer, read_events, write_event
 from evlcp_sdk.io.raw import RawHeader, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import StreamSource
-from evlcp_sdk.io.tables import CsvSource, CsvWriter, NpzSource, NpzWriter
+from evlcp_sdk.io.tables import CsvWriter, NpzSource, NpzWriter
 from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.source import DEFAULT_MAX_EVENTS, EventSource, Loss
 
 __all__ = [
     "DEFAULT_MAX_EVENTS",
-    "CsvSource",
     "CsvWriter",
     "EventSource",
     "EventWriter",

@@ -69,7 +69,7 @@ from evlcp_sdk.io._words import (
 )
 from evlcp_sdk.kernels import njit
 
-__all__ = ["decode_evt2", "decode_evt3", "encode_evt2", "encode_evt3", "format_csv", "parse_csv"]
+__all__ = ["decode_evt2", "decode_evt3", "encode_evt2", "encode_evt3"]
 
 Column = NDArray[Any]
 Integer = Any  # int to Python, int64 to numba
@@ -801,87 +801,3 @@ def encode_evt2(
         n += 1
     state[0] = step
     return n, i, j
-
-
-@njit
-def parse_csv(
-    text: Column, t: Column, x: Column, y: Column, p: Column
-) -> tuple[Integer, Integer, Integer, bool]:
-    """Parse whole lines `t_us,x,y,p` until they or the columns' room run out; empty lines are skipped.
-
-    Args:
-        text: uint8 (k,).
-        t: Column of events to fill, int64; so x, y (uint16), p (uint8).
-        x: See t.
-        y: See t.
-        p: See t.
-
-    Returns:
-        Bytes used, lines used, events, and whether the line behind these is good.
-    """
-    limits = (int64(10**18 - 1), int64(0xFFFF), int64(0xFFFF), int64(1))
-    values = np.zeros(4, int64)
-    used = lines = n = 0
-    while n < len(t):
-        i = used
-        column = digits = number = 0
-        sign = 1
-        good: Any = True
-        while i < len(text) and text[i] != 10:
-            c = int64(text[i])
-            if 48 <= c <= 57:
-                number = number * 10 + (c - 48)
-                digits += 1
-                good &= digits <= 18
-            elif c == 44:
-                good &= digits > 0 and column < 3 and number <= limits[min(column, 3)]
-                values[min(column, 3)] = sign * number
-                column += 1
-                digits = number = 0
-                sign = 1
-            elif c == 45 and column == 0 and digits == 0 and sign == 1:
-                sign = -1
-            elif c != 13 or i + 1 == len(text) or text[i + 1] != 10:
-                good = False
-            i += 1
-        if i == len(text):
-            break
-        if column or digits or not good or sign < 0:
-            if not good or column != 3 or digits == 0 or number > 1:
-                return used, lines, n, False
-            t[n], x[n], y[n], p[n] = values[0], values[1], values[2], number
-            n += 1
-        used = i + 1
-        lines += 1
-    return used, lines, n, True
-
-
-@njit
-def _put_number(text: Column, i: Integer, number: Integer, end: Integer) -> Integer:
-    """Write a number and the byte `end` to text[i] on; return where they stop."""
-    if number < 0:
-        text[i] = 45
-        i += 1
-        number = -number
-    size = 1
-    power = 10
-    while size < 19 and number >= power:
-        size += 1
-        power *= 10
-    for k in range(i + size - 1, i - 1, -1):
-        text[k] = 48 + number % 10
-        number //= 10
-    text[i + size] = end
-    return i + size + 1
-
-
-@njit
-def format_csv(text: Column, t: Column, x: Column, y: Column, p: Column) -> Integer:
-    """Write events as lines `t_us,x,y,p` to `text`, uint8, 40 bytes an event; return the bytes used."""
-    i = 0
-    for k in range(len(t)):
-        i = _put_number(text, i, t[k], 44)
-        i = _put_number(text, i, int64(x[k]), 44)
-        i = _put_number(text, i, int64(y[k]), 44)
-        i = _put_number(text, i, int64(p[k]), 10)
-    return i

@@ -12,11 +12,11 @@ from evlcp_sdk.io.writers import LAST_TIME_US
 
 __all__ = [
     "Fields",
+    "Polarities",
     "RowError",
     "TimeUnit",
     "fields_of",
     "fields_of_values",
-    "polarities",
     "time_unit",
     "unit_of",
 ]
@@ -60,6 +60,24 @@ _OFF: Final = frozenset(off for _, off in _PAIRS)
 LEAST_RATE_HZ: Final = 20.0
 MOST_RATE_HZ: Final = 5e7
 """Events a second of pixels that see a blinking light: with fewer, or more, the unit is another."""
+
+MOST_PLACED_HZ: Final = 5e8
+"""The same of a whole sensor: half of what the fastest can read out."""
+
+_BLINKS_HZ: Final = (100.0, 6e4)
+"""Chips or bits a second that lights blink at, edges of each bit included."""
+
+_LINE: Final = 30.0
+"""Of a spectrum's line over the median around it, by which a light surely blinks: one of 10^5 places of noise
+reaches 17."""
+
+_CLEARLY: Final = 2.0
+"""How much stronger it is than by the next unit."""
+
+_MOST_BINS: Final = 1 << 18
+
+_LEVELS: Final = ((0, 1), (-1, 1), (1, 2), (255, 1), (0, 255))
+"""OFF and ON."""
 
 _LEAST_SPAN_S: Final = 0.1
 _LEAST_COUNTED_S: Final = 0.01
@@ -106,6 +124,11 @@ class TimeUnit:
         others = [unit for unit in self.others if unit != self.name]
         return f"times in {self.name}, {self.why}" + (f"; {' or '.join(others)} would do" if others else "")
 
+    @property
+    def factor(self) -> float:
+        """Its length, us."""
+        return UNITS_US[self.name]
+
     def us(self, times: NDArray[Any]) -> NDArray[np.int64]:
         """Times in us, int64 (n,), rounded down.
 
@@ -117,8 +140,8 @@ class TimeUnit:
             scaled = np.round(times.astype(np.float64) * UNITS_US[self.name], 3)
             # No number is not within, either.
             self._refuse(~(np.abs(scaled) <= LAST_TIME_US), times)
-            if times.dtype.itemsize < 8:
-                # Fewer digits than a microsecond needs: the nearest one.
+            if len(times) and np.spacing(np.abs(times).max()) * UNITS_US[self.name] > 1e-3:
+                # Fewer digits than thousandths of a microsecond need: the nearest one.
                 return np.rint(scaled).astype(np.int64)
             return np.floor(scaled).astype(np.int64)
         if self.name == "ns":
@@ -282,22 +305,26 @@ def _are_signs(values: NDArray[Any]) -> bool:
         return True
     if values.dtype.kind in "US":
         return all(str(word).strip().lower() in _ON | _OFF for word in np.unique(values).tolist())
-    return bool(np.isin(values, (-1, 0, 1)).all())
+    return any(np.isin(values, pair).all() for pair in _LEVELS)
 
 
-def time_unit(times: NDArray[Any], named: str | None, share: float = 1.0) -> TimeUnit:
-    """The unit of times: the one that their column's name says, or else what cameras do.
+def time_unit(
+    times: NDArray[Any], named: str | None, share: float = 1.0, *, placed: bool = False
+) -> TimeUnit:
+    """The unit of times: the one that is named, or else that in which something blinks, or what cameras do.
 
-    A camera counts microseconds, whole ones: nanoseconds of one are multiples of 1000, milliseconds have
-    three decimals, seconds six. A unit by which less than 20 or more than 50 million events come a second is
-    another one. Times since 1970 say their unit by themselves. Where a list would be over in an instant, or
-    its events come by the million, and would not in a unit a thousand times as long, its times were rounded
-    to milliseconds.
+    Lights blink at 100 to 60 000 chips a second, which is less than a thousandfold: of units a thousandfold
+    apart one alone shows it. Where nothing blinks, times since 1970 say their unit by themselves; and a
+    camera counts microseconds, whole ones: nanoseconds of one are multiples of 1000, milliseconds have three
+    decimals, seconds six. A unit by which fewer than 20 or more than 50 million events come a second, or 500
+    million of a whole sensor, is another one. Where a list of one light would be over in an instant, or its
+    events come by the million, and would not in a unit a thousand times as long, its times were rounded.
 
     Args:
         times: The first ones, in any order, int64 or float64 (n,).
         named: The unit of the name; None for none.
         share: Of all times, those that these are.
+        placed: They are events of many pixels.
 
     >>> time_unit(np.array([0.000125, 0.000893, 0.00131]), None).name
     's'
@@ -311,75 +338,160 @@ def time_unit(times: NDArray[Any], named: str | None, share: float = 1.0) -> Tim
     if named is not None:
         return TimeUnit(named, "as its column says")
     inside = np.sort(times[np.isfinite(times)] if times.dtype.kind == "f" else times)
-    span = float(inside[-1] - inside[0]) if len(inside) > 1 else 0.0
-
-    def rate_hz(unit: str) -> float:
-        return (len(inside) - 1) / (span * UNITS_US[unit] * 1e-6) if span > 0 else LEAST_RATE_HZ
-
-    def likely(unit: str) -> bool:
-        return LEAST_RATE_HZ <= rate_hz(unit) <= MOST_RATE_HZ
-
-    def rounded(unit: str, longer: str, least_s: float) -> bool:
-        """Whether the longer of two units is likelier, though by it times are of whole milliseconds."""
-        least_hz, most_hz = _SURE_RATE_HZ
-        short = span * UNITS_US[unit] * 1e-6 < least_s * share
-        return span > 0 and (short or rate_hz(unit) > most_hz) and least_hz <= rate_hz(longer) <= most_hz
-
+    rates = _Rates(inside, MOST_PLACED_HZ if placed else MOST_RATE_HZ)
+    if (blinks := _blinking_unit(inside)) is not None:
+        unit, rate_hz = blinks
+        return TimeUnit(unit, f"guessed: a light blinks, a line at {rate_hz:.4g} Hz", rates.likely_units)
     for unit in UNITS_US:
         # Whole microseconds of twenty minutes on are no seconds of today: those lie near one another.
-        if (
-            len(inside)
-            and (unit != "s" or span < 1e6)
-            and all(
-                _EPOCH_S[0] < float(t) * UNITS_US[unit] * 1e-6 < _EPOCH_S[1] for t in (inside[0], inside[-1])
-            )
-        ):
+        ends_s = [float(t) * UNITS_US[unit] * 1e-6 for t in (*inside[:1], *inside[-1:])]
+        near = unit != "s" or rates.span < 1e6
+        if near and ends_s and all(_EPOCH_S[0] < t < _EPOCH_S[1] for t in ends_s):
             return TimeUnit(unit, "guessed: times since 1970")
-    others = tuple(unit for unit in UNITS_US if span > 0 and likely(unit))
     if times.dtype.kind != "f" or (inside == np.round(inside)).all():
-        whole = inside - inside[:1]
-        if span > 0 and (whole % 1000 == 0).all() and rate_hz("ns") <= MOST_RATE_HZ:
-            if rounded("ns", "us", _LEAST_SPAN_S):
-                return TimeUnit("us", "guessed: whole numbers, multiples of 1000, too close for ns", others)
-            return TimeUnit("ns", "guessed: whole numbers, all multiples of 1000", others)
-        if rounded("us", "ms", _LEAST_COUNTED_S):
-            return TimeUnit("ms", "guessed: whole numbers, too close for us", others)
-        if not likely("us") and likely("ns"):
-            return TimeUnit("ns", "guessed: whole numbers, too far apart for us", others)
-        return TimeUnit("us", "guessed: whole numbers", others)
+        return _unit_of_whole(inside, rates, share, placed)
+    return _unit_of_decimals(inside, rates, share, placed)
+
+
+class _Rates:
+    """Events a second of some times, by unit."""
+
+    def __init__(self, inside: NDArray[Any], most_hz: float) -> None:
+        self.span = float(inside[-1] - inside[0]) if len(inside) > 1 else 0.0
+        self._intervals, self.most_hz = len(inside) - 1, most_hz
+
+    def of(self, unit: str) -> float:
+        """With a unit, Hz."""
+        return self._intervals / (self.span * UNITS_US[unit] * 1e-6) if self.span > 0 else LEAST_RATE_HZ
+
+    def are_likely(self, unit: str) -> bool:
+        """Whether a camera may give so many."""
+        return LEAST_RATE_HZ <= self.of(unit) <= self.most_hz
+
+    @property
+    def likely_units(self) -> tuple[str, ...]:
+        """All units by which they are."""
+        return tuple(unit for unit in UNITS_US if self.span > 0 and self.are_likely(unit))
+
+    def are_rounded(self, unit: str, longer: str, least_s: float) -> bool:
+        """Whether the longer of two units is likelier, though by it times are of whole milliseconds."""
+        least_hz, most_hz = _SURE_RATE_HZ
+        short = self.span * UNITS_US[unit] * 1e-6 < least_s
+        return self.span > 0 and (short or self.of(unit) > most_hz) and least_hz <= self.of(longer) <= most_hz
+
+
+def _unit_of_whole(inside: NDArray[Any], rates: _Rates, share: float, placed: bool) -> TimeUnit:
+    others = rates.likely_units
+    whole = inside - inside[:1]
+    if rates.span > 0 and (whole % 1000 == 0).all() and rates.of("ns") <= rates.most_hz:
+        if not placed and rates.are_rounded("ns", "us", _LEAST_SPAN_S * share):
+            return TimeUnit("us", "guessed: whole numbers, multiples of 1000, too close for ns", others)
+        return TimeUnit("ns", "guessed: whole numbers, all multiples of 1000", others)
+    if not placed and rates.are_rounded("us", "ms", _LEAST_COUNTED_S * share):
+        return TimeUnit("ms", "guessed: whole numbers, too close for us", others)
+    if not rates.are_likely("us") and rates.are_likely("ns"):
+        return TimeUnit("ns", "guessed: whole numbers, too far apart for us", others)
+    return TimeUnit("us", "guessed: whole numbers", others)
+
+
+def _unit_of_decimals(inside: NDArray[Any], rates: _Rates, share: float, placed: bool) -> TimeUnit:
+    others = rates.likely_units
     decimals = 3 if np.abs(inside * 1e3 - np.round(inside * 1e3)).max() < 1e-4 else 6
-    if decimals == 3 and rounded("ms", "s", _LEAST_SPAN_S):
+    if decimals == 3 and (
+        rates.of("ms") > MOST_PLACED_HZ if placed else rates.are_rounded("ms", "s", _LEAST_SPAN_S * share)
+    ):
         return TimeUnit("s", "guessed: 3 decimals, too close for ms", others)
-    tried = ("ms", "us") if decimals == 3 else ("s", "ms", "us")
-    for unit in tried:
-        if rate_hz(unit) >= LEAST_RATE_HZ:
-            why = f"guessed: {decimals} decimals or more, {rate_hz(unit):.3g} events/s"
+    for unit in ("ms", "us") if decimals == 3 else ("s", "ms", "us"):
+        if rates.of(unit) >= LEAST_RATE_HZ:
+            why = f"guessed: {decimals} decimals or more, {rates.of(unit):.3g} events/s"
             return TimeUnit(unit, why, others)
     return TimeUnit("us", "guessed: too far apart for ms", others)
 
 
-def polarities(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Polarities of 0 and 1, -1 and 1, false and true, or words such as ON and OFF, uint8 (n,).
+def _blinking_unit(inside: NDArray[Any]) -> tuple[str, float] | None:
+    """The unit in which a light blinks, and the line of its spectrum, Hz; None where none does, or two do."""
+    lines = (_line_of(inside * factor, unit) for unit, factor in UNITS_US.items())
+    found = sorted((line for line in lines if line is not None), reverse=True)
+    if not found or found[0][0] < _LINE or (len(found) > 1 and found[0][0] < _CLEARLY * found[1][0]):
+        return None
+    return found[0][1], found[0][2]
 
-    Raises:
-        RowError: One is none of them.
 
-    >>> polarities(np.array(["ON", "off"])).tolist()
-    [1, 0]
+def _line_of(t_us: NDArray[Any], unit: str) -> tuple[float, str, float] | None:
+    """The strongest line in how many events come: over what is around it, the unit, its frequency, Hz.
+
+    Periods below sixteen steps of the times, or above an eighth of their span, say nothing.
     """
-    if values.dtype.kind in "US":
-        words = {}
-        for word in np.unique(values).tolist():
-            text = (word.decode("utf-8", "replace") if isinstance(word, bytes) else word).strip().strip("\"'")
-            plain = text.lower().removesuffix(".0")
-            if plain not in _ON and plain not in _OFF:
-                row = int((values == word).argmax())
-                raise RowError(row, f"polarity {text!r}, expected 0 or 1, or -1 or 1, or ON or OFF")
-            words[word] = plain in _ON
-        kinds, which = np.unique(values, return_inverse=True)
-        return np.array([words[kind] for kind in kinds.tolist()], np.uint8)[which.ravel()]
-    wrong = ~np.isin(values, (-1, 0, 1))
-    if wrong.any():
-        row = int(wrong.argmax())
-        raise RowError(row, f"polarity {values[row]}, expected 0 or 1, or -1 or 1")
-    return (values > 0).astype(np.uint8)
+    steps = np.diff(np.unique(t_us))
+    if not len(steps):
+        return None
+    since_us = t_us - t_us[0]
+    high_hz = min(_BLINKS_HZ[1], 1e6 / (16 * float(steps.min())))
+    low_hz = max(_BLINKS_HZ[0], 8e6 / float(since_us[-1]))
+    if high_hz < 1.5 * low_hz:
+        return None
+    # Whole steps: others would beat with them.
+    bin_us = float(steps.min()) * max(int(1e6 / (4 * high_hz) / float(steps.min())), 1)
+    bins = min(int(since_us[-1] / bin_us), _MOST_BINS) + 1
+    counted = np.bincount(np.minimum(since_us / bin_us, bins).astype(np.int64), minlength=bins + 1)[:bins]
+    power = np.abs(np.fft.rfft((counted - counted.mean()) * np.hanning(bins))) ** 2
+    frequency_hz = np.fft.rfftfreq(bins, bin_us * 1e-6)
+    around = np.maximum(_medians(power), 1e-9 * power.max() + 1e-30)
+    over = np.where((frequency_hz >= low_hz) & (frequency_hz <= high_hz), power / around, 0.0)
+    best = int(over.argmax())
+    return float(over[best]), unit, float(frequency_hz[best])
+
+
+def _medians(power: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The median of the hundred values on either side, at each hundredth; between these a straight line."""
+    middles = np.arange(0, len(power), 100)
+    medians = [np.median(power[max(k - 100, 0) : k + 101]) for k in middles]
+    return np.interp(np.arange(len(power)), middles, medians)
+
+
+class Polarities:
+    """What numbers or words mean: ON or OFF, by all that a column has shown so far.
+
+    Numbers are 0 and 1, -1 and 1, 1 and 2, 0 and 255, or 1 and 255, which is -1 in eight bits.
+    """
+
+    def __init__(self) -> None:
+        self._levels: frozenset[float] = frozenset()
+
+    def of(self, values: NDArray[Any]) -> NDArray[np.uint8]:
+        """Polarities, uint8 (n,).
+
+        Raises:
+            RowError: One is none of them, or does not go with those before.
+
+        >>> Polarities().of(np.array(["ON", "off"])).tolist()
+        [1, 0]
+        >>> Polarities().of(np.array([2, 1, 1])).tolist()
+        [1, 0, 0]
+        """
+        if values.dtype.kind in "US":
+            return _of_words(values)
+        found, first = np.unique(values, return_index=True)
+        pair = _LEVELS[0]
+        for level, row in sorted(zip(found.tolist(), first.tolist(), strict=True), key=lambda one: one[1]):
+            known = self._levels | {level}
+            fits = next((pair for pair in _LEVELS if known <= set(pair)), None)
+            if fits is None:
+                beside = " and ".join(f"{other:g}" for other in sorted(self._levels))
+                beside = f" beside {beside}" if beside else ""
+                raise RowError(row, f"polarity {level:g}{beside}, expected 0 and 1, or -1 and 1")
+            self._levels, pair = known, fits
+        return np.asarray(values == pair[1], np.uint8)
+
+
+def _of_words(values: NDArray[Any]) -> NDArray[np.uint8]:
+    words = {}
+    for word in np.unique(values).tolist():
+        text = (word.decode("utf-8", "replace") if isinstance(word, bytes) else word).strip().strip("\"'")
+        plain = text.lower().removesuffix(".0")
+        if plain not in _ON and plain not in _OFF:
+            row = int((values == word).argmax())
+            raise RowError(row, f"polarity {text!r}, expected 0 or 1, or -1 or 1, or ON or OFF")
+        words[word] = plain in _ON
+    kinds, which = np.unique(values, return_inverse=True)
+    return np.array([words[kind] for kind in kinds.tolist()], np.uint8)[which.ravel()]

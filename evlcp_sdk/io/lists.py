@@ -8,6 +8,7 @@ import codecs
 import csv
 import gzip
 import itertools
+import math
 import re
 import zipfile
 import zlib
@@ -22,34 +23,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io._sieve import Sieve
+from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, ColumnSource, Piece
 from evlcp_sdk.io.fields import (
     UNITS_US,
     Fields,
-    RowError,
-    TimeUnit,
+    Polarities,
     fields_of,
     fields_of_values,
-    polarities,
-    time_unit,
     unit_of,
 )
 from evlcp_sdk.io.tables import COLUMNS, CSV_HEADER, DAMAGE, NpzColumn, said, show
 from evlcp_sdk.io.urls import flag, split_options
-from evlcp_sdk.plugin.source import EventSource, Loss
-from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["SUFFIXES", "ListSource", "is_list", "open_list"]
 
 PIECE_BYTES: Final = 1 << 20
-PIECE_ROWS: Final = 1 << 16
 LOOKED_AT: Final = 1 << 14
-"""Rows at the start from which units are recognized."""
+"""Rows at the start from which columns are recognized."""
 
-MOST_WAITING: Final = 1 << 20
-"""Rows that wait for earlier ones: a list of fewer may be in any order."""
-
-_PLACES: Final = 1 << 16
 _COMMENTS: Final = (b"#", b"%", b"//")
 _SEPARATORS: Final = (b";", b"\t", b"|", b",")
 _DECIMAL_COMMA: Final = re.compile(rb"(?<=\d),(?=\d)")
@@ -59,11 +50,10 @@ _TITLES: Final = 10
 _TEXT: Final = re.compile(rb"[\t\r\n -~\x80-\xff]+")
 _NPY: Final = b"\x93NUMPY"
 _MAT: Final = b"MATLAB "
+_MAT_VALUE_BYTES: Final = 8
+_MOST_MAT_BYTES: Final = 300_000_000
 SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".txt", ".txt.gz", ".dat", ".npy", ".mat")
 """Of names, where the content alone does not say that it is a list."""
-
-Piece = tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, Callable[[int], int]]
-"""Times, polarities, places (n, 2) or None, and in which line or row of the file the k-th of them stands."""
 
 
 def open_list(url: str) -> "ListSource":
@@ -74,9 +64,19 @@ def open_list(url: str) -> "ListSource":
     """
     name, options = split_options(url, {"columns": _order, "unit": _unit, "inverted": flag})
     path = name.partition(":")[2]
+    if _kind_at(path).startswith(b"MATLAB 7.3"):
+        raise InputError(f"{path}: a file of MATLAB 7.3, expected to be named hdf5:{path}")
     return ListSource(
         path, fields=options.get("columns"), unit=options.get("unit"), inverted=options.get("inverted", False)
     )
+
+
+def _kind_at(path: str) -> bytes:
+    try:
+        with Path(path).open("rb") as file:
+            return file.read(16)
+    except OSError:
+        return b""
 
 
 def _order(text: str) -> Fields:
@@ -96,7 +96,7 @@ def _unit(text: str) -> str:
     return text
 
 
-class ListSource(EventSource):
+class ListSource(ColumnSource):
     """A table of times and polarities of events, and of places where it has them.
 
     CSV (`,` `;` `|` tab or blanks, UTF-8 or UTF-16, plain or gzipped, `#` `%` `//` before comments, up to
@@ -124,45 +124,30 @@ class ListSource(EventSource):
         unit: str | None = None,
         inverted: bool = False,
     ) -> None:
-        target = Path(path)
-        self.path, self._position, self._inverted = target, 0, inverted
-        self._counts = {"rows_out_of_order": 0, "rows_cut": 0}
-        self._fields = fields
+        target = self.path = Path(path)
+        self._fields, self._is_ours = fields, False
         try:
-            size = target.stat().st_size
             kind = _kind(target)
         except OSError as error:
             raise InputError(f"{path}: {error.strerror}") from error
         readers = {"NPZ": self._npz, "NPY": self._npy, "MAT": self._mat, "CSV": self._csv}
         with ExitStack() as stack:
-            self._where = "line" if kind == "CSV" else "row"
             try:
                 pieces = readers[kind](target, stack)
-                first = next(pieces, None)
             except (*DAMAGE, zlib.error) as error:
-                raise InputError(f"{path}: {said(error)}") from error
-            self._pieces = iter(()) if first is None else itertools.chain((first,), pieces)
-            times = np.empty(0, np.int64) if first is None else first[0][:LOOKED_AT]
-            named = unit if unit is not None else (self._fields.unit if self._fields else None)
-            # Of the first piece, those that are looked at; of the file, the first piece.
-            seen = len(times) / len(first[0]) if first is not None and len(first[0]) else 1.0
-            self._unit = time_unit(times, named, seen * min(self._position / max(size, 1), 1.0))
-            if unit is not None:
-                self._unit = TimeUnit(unit, "as told")
-            self._sieve = Sieve(self._where, None, None)
-            self._waiting: list[Events] = []
-            self._row = first[3](0) if first is not None and len(first[0]) else 1
-            self._low: tuple[int, int] | None = None
-            self._latest_us: int | None = None
-            self._open = True
-            header = {
-                "pixels": "as its columns x and y say"
-                if first is not None and first[2] is not None
-                else "none given: x = y = 0",
-                "time": f"in {self._unit.name}, {self._unit.why}",
-            }
-            super().__init__(target, kind, header=header, size_bytes=size)
-            self.guessed = self._unit.guess
+                raise InputError(f"{path}: damaged or closed file: {said(error)}") from error
+            super().__init__(
+                target,
+                kind,
+                pieces,
+                stack,
+                where="line" if kind == "CSV" else "row",
+                named=lambda: self._fields.unit if self._fields else None,
+                unit=unit,
+                inverted=inverted,
+                # A table of ours has times as a camera gave them; others may be in any order.
+                window_us=WINDOW_US if self._is_ours else math.inf,
+            )
             self._stack = stack.pop_all()
 
     # -- readers, each an iterator of pieces
@@ -183,6 +168,7 @@ class ListSource(EventSource):
                 " (or say which they are, as by list:PATH?columns=t,p)"
             )
         self._fields = table.fields
+        self._is_ours = table.heading.strip() == CSV_HEADER
         return self._csv_pieces(raw, file, text, table)
 
     def _csv_pieces(self, raw: Any, file: Any, text: bytes, table: "_Text") -> Iterator[Piece]:
@@ -195,7 +181,14 @@ class ListSource(EventSource):
             text = text[len(whole) :]
             lines = whole.splitlines()
             last_is_cut = not more and not whole.endswith((b"\n", b"\r"))
-            rows, cut = table.rows(lines, line, last_is_cut, self._fault)
+            try:
+                rows, cut = table.rows(lines, line, last_is_cut)
+            except _LineError as error:
+                if error.line > line:
+                    rows, _ = table.rows(lines[: error.line - line], line, last_is_cut=False)
+                    if len(rows[0]):
+                        yield (*rows, partial(table.number, lines, line))
+                raise InputError(f"{self.path}: line {error.line}: {error}") from error
             self._counts["rows_cut"] += cut
             if len(rows[0]):
                 yield (*rows, partial(table.number, lines, line))
@@ -264,7 +257,6 @@ class ListSource(EventSource):
 
     def _mat(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
         arrays = _mat_arrays(target)
-        self._position = target.stat().st_size
         names = list(arrays)
         if (fields := self._fields or fields_of(names)) is not None and max(fields.which) < len(names):
             columns = [_flat(arrays[names[k]]) for k in fields.which]
@@ -290,106 +282,13 @@ class ListSource(EventSource):
         if len({len(column) for column in columns}) > 1:
             lengths = [len(column) for column in columns]
             raise InputError(f"{target}: found columns of the lengths {lengths}, expected one length")
-        return (
-            _piece([column[k : k + PIECE_ROWS] for column in columns], k + 1)
-            for k in range(0, len(columns[0]), PIECE_ROWS)
-        )
+        return self._mat_pieces(columns)
 
-    def _fault(self, line: int, what: str) -> InputError:
-        return InputError(f"{self.path}: line {line}: {what}")
-
-    # -- what is given out
-
-    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """As `EventSource.take`.
-
-        Raises:
-            InputError: The file cannot be read on, or a row is none of a time and a polarity.
-        """
-        if not self._open:
-            return None
-        while sum(map(len, self._waiting)) < MOST_WAITING:
-            events = self._next()
-            if events is None:
-                self._open = False
-                break
-            self._waiting.append(events)
-        events = Events.concat(self._waiting)
-        if (np.diff(events.t_us) < 0).any():
-            order = np.argsort(events.t_us, kind="stable")
-            events = Events(events.t_us[order], events.x[order], events.y[order], events.p[order])
-        # What may still be earlier waits, unless all is read.
-        due = len(events) if not self._open else len(events) // 2
-        self._waiting = [events[due:]] if self._open else []
-        given = self._sieve.sift(events[:due], self._row)
-        self._row += due
-        if not self._open:
-            given = Events.concat([given, self._sieve.close()])
-            if not len(given):
-                return None
-        return given, Triggers.empty()
-
-    def _next(self) -> Events | None:
-        """The events of the next piece, in its order; None at the end."""
-        try:
-            piece = next(self._pieces, None)
-        except (*DAMAGE, zlib.error) as error:
-            raise InputError(f"{self.path}: damaged or closed file: {said(error)}") from error
-        if piece is None:
-            return None
-        times, values, places, number = piece
-        try:
-            t_us, p = self._unit.us(times), polarities(values)
-            x, y = _places(places, len(t_us))
-            self._check_low(values, number)
-        except RowError as error:
-            raise InputError(f"{self.path}: {self._where} {number(error.row)}: {error}") from error
-        if len(t_us):
-            before = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
-            latest = np.maximum.accumulate(np.concatenate([[before], t_us]))
-            self._counts["rows_out_of_order"] += int((t_us < latest[:-1]).sum())
-            self._latest_us = int(latest[-1])
-        return Events(t_us, x, y, 1 - p if self._inverted else p)
-
-    def _check_low(self, values: NDArray[Any], number: Callable[[int], int]) -> None:
-        """Refuse 0 beside -1: of three values nobody knows which are OFF.
-
-        Raises:
-            RowError: There are both, in this piece or together with one before.
-        """
-        if values.dtype.kind not in "if":
-            return
-        for low in (-1, 0):
-            at = values == low
-            if at.any():
-                row = int(at.argmax())
-                if self._low is not None and self._low[0] != low:
-                    raise RowError(
-                        row,
-                        f"polarity {values[row]}, but {self._low[0]} in {self._where} {self._low[1]},"
-                        " expected 0 and 1, or -1 and 1",
-                    )
-                self._low = self._low or (low, number(row))
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """As `EventSource.counts`, with `rows_out_of_order` and `rows_cut` where there were any."""
-        counted = {name: count for name, count in self._counts.items() if count}
-        return self._given | self._sieve.counts | counted
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As `EventSource.losses`."""
-        return self._sieve.losses
-
-    @property
-    def position_bytes(self) -> int:
-        """How much of the file is read."""
-        return min(self._position, self.size_bytes or 0)
-
-    def close(self) -> None:
-        """Close the file."""
-        self._stack.close()
+    def _mat_pieces(self, columns: list[NDArray[Any]]) -> Iterator[Piece]:
+        for first in range(0, len(columns[0]), PIECE_ROWS):
+            last = first + PIECE_ROWS
+            self._position = round(self.path.stat().st_size * min(last / len(columns[0]), 1.0))
+            yield _piece([column[first:last] for column in columns], first + 1)
 
 
 def is_list(path: Path) -> bool:
@@ -419,8 +318,6 @@ def is_list(path: Path) -> bool:
         return False
     if start.startswith(_UTF_16):
         start = start[: len(start) // 2 * 2].decode("utf-16", "replace").encode()
-    if start.removeprefix(b"\xef\xbb\xbf").split(b"\n")[0].strip() == CSV_HEADER:
-        return False
     return _TEXT.fullmatch(start) is not None and _Text(start, None).fields is not None
 
 
@@ -466,18 +363,6 @@ def _piece(columns: list[NDArray[Any]], row: int) -> Piece:
     return times, columns[1], np.stack(columns[2:], 1) if len(columns) > 2 else None, row.__add__
 
 
-def _places(places: NDArray[Any] | None, n: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    if places is None:
-        return np.zeros(n, np.uint16), np.zeros(n, np.uint16)
-    whole = np.rint(places.astype(np.float64))
-    wrong = ~((whole >= 0) & (whole < _PLACES) & (whole == places))
-    if wrong.any():
-        row = int(wrong.any(1).argmax())
-        raise RowError(row, f"place {places[wrong][0]}, expected whole numbers from 0 to {_PLACES - 1}")
-    found = whole.astype(np.uint16)
-    return np.ascontiguousarray(found[:, 0]), np.ascontiguousarray(found[:, 1])
-
-
 def _flat(array: NDArray[Any]) -> NDArray[Any]:
     return array.ravel()
 
@@ -490,21 +375,20 @@ def _columns_of(array: NDArray[Any]) -> list[NDArray[Any]]:
 
 def _mat_arrays(path: Path) -> dict[str, NDArray[Any]]:
     """Arrays of a MATLAB file by their names, those inside of structures too."""
-    with path.open("rb") as file:
-        start = file.read(128)
-    if start.startswith(b"MATLAB 7.3"):
-        try:
-            import h5py
-        except ImportError as fault:
-            raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[hdf5]'") from fault
-        with h5py.File(path, "r") as stored:
-            # A matrix lies on its side there.
-            return {name: np.asarray(node).T for name, node in stored.items() if hasattr(node, "shape")}
-    from scipy.io import loadmat
+    from scipy.io import loadmat, whosmat
 
     try:
+        declared = sum(math.prod(map(int, shape)) for _, shape, _ in whosmat(path)) * _MAT_VALUE_BYTES
+        if declared > _MOST_MAT_BYTES:
+            raise InputError(
+                f"{path}: holds {declared / 1e6:.0f} MB, expected at most {_MOST_MAT_BYTES / 1e6:.0f},"
+                " as they are read at once: save them as HDF5 (-v7.3)"
+            )
         found = loadmat(path, simplify_cells=True)
-    except (ValueError, TypeError, NotImplementedError, OSError, IndexError, KeyError, zlib.error) as error:
+    except InputError:
+        raise
+    except Exception as error:
+        # A damaged file makes SciPy fail in any way.
         raise InputError(f"{path}: found no MAT file, expected one ({said(error)})") from error
 
     arrays: dict[str, NDArray[Any]] = {}
@@ -597,6 +481,19 @@ class _Array:
         if self._dtype.names:
             return [values[name] for name in self._dtype.names]
         return list(values.reshape(-1, width).T)
+
+
+class _LineError(ValueError):
+    """A line that is no row of its table.
+
+    Args:
+        line: Its number.
+        what: What it is, and what was expected.
+    """
+
+    def __init__(self, line: int, what: str) -> None:
+        super().__init__(what)
+        self.line = line
 
 
 class _Text:
@@ -707,7 +604,7 @@ class _Text:
         return [_plain(cell) for cell in text.split(mark)]
 
     def rows(
-        self, lines: list[bytes], first: int, last_is_cut: bool, fault: Callable[[int, str], InputError]
+        self, lines: list[bytes], first: int, last_is_cut: bool
     ) -> tuple[tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None], int]:
         """Times, polarities and places of some lines, and how many cut ones at the end are left out.
 
@@ -715,10 +612,9 @@ class _Text:
             lines: The lines.
             first: Number of the first.
             last_is_cut: The last one has no end, so it may be cut.
-            fault: Makes the error of a line.
 
         Raises:
-            InputError: A line is no row of the table.
+            _LineError: A line is no row of the table.
         """
         assert self.fields is not None
         which = self.fields.which
@@ -743,13 +639,10 @@ class _Text:
                 if cut and number == first + len(lines) - 1:
                     continue
                 more = ", x and y" if self.fields.places else ""
-                raise fault(number, f"found {show(line)}, expected a time and a polarity{more}")
+                raise _LineError(number, f"found {show(line)}, expected a time and a polarity{more}")
             cells = self.cells(line)
-            table.append([cells[k] for k in which])
-        whole = all(re.fullmatch(r"[+-]?\d{1,18}", row[0]) for row in table)
-        times = np.array([int(row[0]) for row in table] if whole else [float(row[0]) for row in table])
-        places = np.array([[float(cell) for cell in row[2:]] for row in table]) if len(which) > 2 else None
-        return (times, np.array([row[1] for row in table]), places), cut
+            table.append([cells[k] or "nan" for k in which])
+        return _split(np.array(table)), cut
 
     def number(self, lines: list[bytes], first: int, row: int) -> int:
         """In which line the row stands, of these from `first` on, the row from 0."""
@@ -767,7 +660,10 @@ class _Text:
             except (ValueError, OverflowError):
                 continue
             return found[:, 0], found[:, 1], found[:, 2:] if len(which) > 2 else None
-        return None
+        try:
+            return _split(np.loadtxt(lines, "U32", None, mark, usecols=which, ndmin=2, quotechar='"'))
+        except ValueError:
+            return None
 
     def _is_row(self, line: bytes) -> bool:
         assert self.fields is not None
@@ -775,13 +671,27 @@ class _Text:
         which = self.fields.which
         if len(cells) <= max(which):
             return False
-        if not all(_is_number(cells[k]) for k in which if k != self.fields.polarity):
+        if not all(_is_number(cells[k] or "nan") for k in which if k != self.fields.polarity):
             return False
         try:
-            polarities(np.array([cells[self.fields.polarity]]))
+            Polarities().of(np.array([cells[self.fields.polarity] or "nan"]))
         except ValueError:
             return _is_number(cells[self.fields.polarity])
         return True
+
+
+def _split(cells: NDArray[np.str_]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None]:
+    """Times, polarities and places of cells (n, 2 or 4).
+
+    Raises:
+        ValueError: A time or a place is no number.
+    """
+    cells = np.char.strip(cells, " \t\"'")
+    try:
+        times: NDArray[Any] = cells[:, 0].astype(np.int64)
+    except (ValueError, OverflowError):
+        times = cells[:, 0].astype(np.float64)
+    return times, cells[:, 1], cells[:, 2:].astype(np.float64) if cells.shape[1] > 2 else None
 
 
 def _plain(cell: str) -> str:
@@ -801,7 +711,7 @@ def _separator(lines: list[bytes]) -> bytes:
     """What stands between the cells of most lines."""
 
     def in_most(found: Callable[[bytes], Any]) -> bool:
-        return 2 * sum(bool(found(line)) for line in lines) > len(lines)
+        return 2 * sum(bool(found(line)) for line in lines) >= len(lines) > 0
 
     mark = next((mark for mark in _SEPARATORS if in_most(lambda line, mark=mark: mark in line)), b" ")  # type: ignore[misc]
     if mark == b"," and in_most(lambda line: re.fullmatch(rb"\s*\d+,\d+(\s+[^\s,]+)+\s*", line)):

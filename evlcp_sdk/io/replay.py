@@ -38,7 +38,7 @@ class LoopSource(EventSource):
         self._opened = opened
         self._source = source = opened()
         super().__init__(source.path, source.format, source.width, source.height, source.header)
-        self.live, self.guessed = source.live, source.guessed
+        self.live, self.guessed, self.step_us = source.live, source.guessed, source.step_us
         self.passes = 1
         self._seam_us = seam_us
         self._for_us = for_us
@@ -125,7 +125,7 @@ class ReplaySource(EventSource):
         super().__init__(
             source.path, source.format, source.width, source.height, source.header, source.size_bytes
         )
-        self.guessed = source.guessed
+        self.guessed, self.step_us = source.guessed, source.step_us
         self.lag_s = 0.0
         self._source = source
         self._s_per_us = 1e-6 / speed

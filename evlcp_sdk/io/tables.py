@@ -7,7 +7,6 @@ import tempfile
 import zipfile
 import zlib
 from contextlib import ExitStack
-from io import BufferedIOBase
 from pathlib import Path
 from typing import IO, Any, Final
 
@@ -21,7 +20,7 @@ from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["CsvSource", "CsvWriter", "NpzColumn", "NpzSource", "NpzWriter", "said", "show"]
+__all__ = ["CsvWriter", "NpzColumn", "NpzSource", "NpzWriter", "said", "show"]
 
 COLUMNS: Final = ("t_us", "x", "y", "p")
 TRIGGER_COLUMNS: Final = ("trigger_t_us", "trigger_channel", "trigger_value")
@@ -45,8 +44,7 @@ LAST_VALUES: Final = {
 }
 
 CSV_HEADER = b"t_us,x,y,p"
-CSV_ROW = "four integers t_us,x,y,p with x and y from 0 to 65535 and p 0 or 1"
-CSV_ROW_BYTES = 40
+CSV_ROWS = 1 << 15
 BUFFER_BYTES = 1 << 20
 LEAST_ROWS = 1 << 12
 
@@ -315,92 +313,6 @@ class NpzWriter(EventWriter):
         super().discard()
 
 
-class CsvSource(EventSource):
-    """A CSV file with the header `t_us,x,y,p`, plain or gzipped.
-
-    Args:
-        path: The file.
-
-    Raises:
-        InputError: The file cannot be read, or its first line is not this header.
-    """
-
-    def __init__(self, path: Path | str) -> None:
-        target = Path(path)
-        try:
-            self._raw = target.open("rb")
-        except OSError as error:
-            raise InputError(f"{path}: {error.strerror}") from error
-        is_gzip = self._raw.read(2) == b"\x1f\x8b"
-        self._raw.seek(0)
-        self._file: BufferedIOBase = gzip.GzipFile(fileobj=self._raw) if is_gzip else self._raw
-        self._sieve = Sieve("line", None, None)
-        super().__init__(target, "CSV", size_bytes=target.stat().st_size, ledger=self._sieve)
-        self._text = b""
-        self._line = 1
-        self._exhausted = False
-        try:
-            header = self._more(4096).partition(b"\n")
-        except InputError:
-            self.close()
-            raise
-        if header[0].removeprefix(b"\xef\xbb\xbf").rstrip(b"\r") != CSV_HEADER:
-            self.close()
-            raise InputError(
-                f"{path}: line 1: found {show(header[0])}, expected '{CSV_HEADER.decode()}', or names of"
-                " times and polarities, such as t and p (list:PATH?columns=t,p says which they are)"
-            )
-        self._text = header[2]
-        self._line = 2
-
-    def _more(self, size: int) -> bytes:
-        """Return what follows, at most `size` bytes."""
-        try:
-            text = self._file.read(size)
-        except (OSError, EOFError, ValueError, zlib.error) as error:
-            raise InputError(f"{self.path}: line {self._line}: damaged or closed file: {error}") from error
-        self._exhausted = not text
-        return text
-
-    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """As `EventSource.take`.
-
-        Raises:
-            InputError: The file cannot be read on, or a line is not a row of the table.
-        """
-        from evlcp_sdk.io._kernels import parse_csv
-
-        while len(self._text) < BUFFER_BYTES // 2 and not self._exhausted:
-            more = self._more(BUFFER_BYTES)
-            if not more and self._text and not self._text.endswith(b"\n"):
-                more = b"\n"
-            self._text += more
-        if not self._text:
-            events = self._sieve.close()
-            return (events, Triggers.empty()) if len(events) else None
-        rows = max(max_events, LEAST_ROWS)
-        t_us, x, y = np.empty(rows, np.int64), np.empty(rows, np.uint16), np.empty(rows, np.uint16)
-        p = np.empty(rows, np.uint8)
-        used, lines, rows, good = parse_csv(np.frombuffer(self._text, np.uint8), t_us, x, y, p)
-        first = self._line
-        self._text = self._text[used:]
-        self._line += lines
-        if not good or (used == 0 and rows == 0):
-            line = self._text.partition(b"\n")[0].rstrip(b"\r")
-            raise InputError(f"{self.path}: line {self._line}: found {show(line)}, expected {CSV_ROW}")
-        return self._sieve.sift(Events(t_us[:rows], x[:rows], y[:rows], p[:rows]), first), Triggers.empty()
-
-    @property
-    def position_bytes(self) -> int:
-        """How much of the file is read."""
-        return self._raw.tell() if not self._raw.closed else self.size_bytes or 0
-
-    def close(self) -> None:
-        """Close the file."""
-        self._file.close()
-        self._raw.close()
-
-
 def show(line: bytes) -> str:
     """Return the start of a line for a message."""
     text = line[:60].decode("utf-8", "replace")
@@ -434,17 +346,13 @@ class CsvWriter(EventWriter):
         self._out.write(CSV_HEADER + b"\n")
 
     def _write(self, events: Events, triggers: Triggers) -> None:
-        from evlcp_sdk.io._kernels import format_csv
-
         if len(triggers):
             raise StreamError(f"{self.path}: {len(triggers)} triggers, which a CSV file has no place for")
-        rows = BUFFER_BYTES // CSV_ROW_BYTES
-        text = np.empty(min(rows, len(events)) * CSV_ROW_BYTES, np.uint8)
-        for k in range(0, len(events), rows):
-            piece = events[k : k + rows]
-            columns = (np.ascontiguousarray(c) for c in (piece.t_us, piece.x, piece.y, piece.p))
-            size = format_csv(text, *columns)
-            self._out.write(text[:size].tobytes())
+        for first in range(0, len(events), CSV_ROWS):
+            piece = events[first : first + CSV_ROWS]
+            columns = (column.tolist() for column in (piece.t_us, piece.x, piece.y, piece.p))
+            lines = (f"{t},{x},{y},{p}\n" for t, x, y, p in zip(*columns, strict=True))
+            self._out.write("".join(lines).encode())
 
     def _finish(self) -> None:
         if self._out is not self._file:

@@ -45,6 +45,10 @@ class Loss:
             out[kind] = replace(out[kind], count=out[kind].count + loss.count) if kind in out else loss
         return out
 
+    def more(self, count: int, first: int) -> "Loss":
+        """So many more, the first of which was there."""
+        return replace(self, count=self.count + count, first=self.first if self.count else first)
+
     def __str__(self) -> str:
         return f"{self.count} {self.meaning} (first at {self.unit} {self.first})"
 
@@ -85,6 +89,9 @@ class EventSource(ABC):
 
     guessed = ""
     """What the recording does not say and was guessed, in words; empty for nothing."""
+
+    step_us = 0
+    """What all times are seen to be multiples of, us; 0 where nobody looked."""
 
     _gives_bits = False
     """Whether a polarity is a single bit of what it reads, so that none can be wrong."""

@@ -186,6 +186,7 @@ class Seen:
         losses: Events and words that the source could not use.
         others: Codewords of other modulations by id, uint8 (symbols, chips); asked where it matters.
         guessed: What the recording does not say and was guessed; empty for nothing.
+        step_us: What all its times are multiples of, us; 0 where nobody looked.
         skipped: Silences beside damage that a replay did not wait for, and their time, us.
     """
 
@@ -196,6 +197,7 @@ class Seen:
     losses: int = 0
     others: Callable[[], Mapping[str, NDArray[np.uint8]]] = dict
     guessed: str = ""
+    step_us: int = 0
     skipped: tuple[int, int] = (0, 0)
 
     @property
@@ -230,7 +232,8 @@ def warnings_of(
         positions: Figures of the positions, where they were computed.
     """
     seen = Seen() if seen is None else seen
-    found = [*saturation(seen), *_dropped(counts, seen), *_frames(counts), *_room(counts)]
+    found = [*saturation(seen), *_coarse_times(seen, [link]), *_dropped(counts, seen)]
+    found += [*_frames(counts), *_room(counts)]
     return found + _of_link(tally.transmitters, counts, link, seen, positions, reads_messages=reads_messages)
 
 
@@ -253,7 +256,8 @@ def warnings_of_links(
         positions: Figures of the positions, where they were computed.
         placing: Name of the link that says what is wrong with them.
     """
-    found = [*saturation(seen), *_dropped(counts, seen), *_room(counts)]
+    found = [*saturation(seen), *_coarse_times(seen, [part.link for part in links.values()])]
+    found += [*_dropped(counts, seen), *_room(counts)]
     found += alike_doubts({name: part.link for name, part in links.items()})
     if not tally.transmitters:
         return found + list(_frames(counts))
@@ -269,6 +273,17 @@ def warnings_of_links(
         )
         found += [replace(doubt, link=name) for doubt in told]
     return found
+
+
+def _coarse_times(seen: Seen, links: Sequence[Link]) -> Iterator[Doubt]:
+    """Times in steps of more than a quarter of a chip: of when a light changed, little is left."""
+    chip_us = min(link.packet.chip_us for link in links)
+    if seen.step_us > chip_us / 4:
+        yield Doubt(
+            "coarse-times",
+            f"times are rounded to {seen.step_us / 1000:g} ms; a chip is {chip_us / 1000:g} ms",
+            "export them in whole microseconds, or with six decimals of a second",
+        )
 
 
 def alike_doubts(links: Mapping[str, Link]) -> Iterator[Doubt]:

@@ -177,6 +177,7 @@ class ResultWriter:
             self._readout,
             sum(loss["count"] for loss in losses.values()),
             guessed=str(recording.get("guessed", "")),
+            step_us=recording.get("step_us", 0),
             skipped=(read.get("silences_skipped", 0), read.get("silences_skipped_us", 0)),
         )
         parts = {

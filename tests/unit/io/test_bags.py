@@ -245,8 +245,13 @@ def test_hdf5_tables_without_names(order: str, on_its_side: bool, tmp_path: Path
         got, _ = source.read()
     assert (got.x == EVENTS.y).all()
     assert (got.y == EVENTS.x).all()
+    if order.index("x") < order.index("y"):
+        # By its values, as those of a list.
+        assert (read_events(tmp_path / "a.h5").x == EVENTS.x).all()
+    with h5py.File(tmp_path / "b.h5", "w") as file:
+        file["events"] = np.arange(40.0).reshape(10, 4)
     for name, told in (
-        (str(tmp_path / "a.h5"), "without names: expected to be told what its columns are"),
+        (str(tmp_path / "b.h5"), "without names: expected to be told what its columns are"),
         (f"hdf5:{tmp_path / 'a.h5'}?columns=txy", "columns = 'txy': expected the letters t, x, y and p"),
     ):
         with pytest.raises(InputError, match=re.escape(told)):
@@ -256,7 +261,7 @@ def test_hdf5_tables_without_names(order: str, on_its_side: bool, tmp_path: Path
 def test_what_is_wrong_with_hdf5_is_said(tmp_path: Path) -> None:
     h5py = pytest.importorskip("h5py")
     with h5py.File(tmp_path / "other.h5", "w") as file:
-        file["images"] = np.zeros(3)
+        file["images"] = file["other"] = np.zeros(3)
     with h5py.File(tmp_path / "short.h5", "w") as file:
         file["events/x"] = np.zeros(3)
     with h5py.File(tmp_path / "ecf.h5", "w") as file:
@@ -268,7 +273,7 @@ def test_what_is_wrong_with_hdf5_is_said(tmp_path: Path) -> None:
         group = file.create_group("CD")
         h5py.h5d.create(group.id, b"events", kind, h5py.h5s.create_simple((4,), (4,)), dcpl=plist)
     for name, told in (
-        ("other.h5", "found images, expected /events or /raw_events or /CD/events"),
+        ("other.h5", "found images, other, expected /events or /raw_events or /CD/events"),
         ("short.h5", "/events has x, expected x, y, p and t"),
         ("ecf.h5", "compressed by ECF, Prophesee's own codec"),
     ):

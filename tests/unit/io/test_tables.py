@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import InputError, StreamError
-from evlcp_sdk.io import CsvSource, NpzSource, open_source, open_writer, read_events, write_events
+from evlcp_sdk.io import NpzSource, open_source, open_writer, read_events, write_events
 from evlcp_sdk.values import Events, Triggers
 
 tables = st.lists(
@@ -190,23 +190,17 @@ def test_bad_npz_is_an_error(data, message, tmp_path):
 
 HEAD = b"t_us,x,y,p\n"
 BAD_CSV = {
-    "empty": (b"", r"line 1: found '', expected 't_us,x,y,p'"),
-    "another header": (b"t,x,y,on air\n1,2,3,1\n", r"line 1: found 't,x,y,on air', expected 't_us,x,y,p'"),
-    "no header": (b"1,2,3,1\n", "line 1: found '1,2,3,1'"),
-    "a column missing": (HEAD + b"1,2,3\n", "line 2: found '1,2,3', expected four integers"),
-    "a column more": (HEAD + b"1,2,3,1\n1,2,3,1,5\n", "line 3: found '1,2,3,1,5', expected"),
+    "empty": (b"", r"line 1: found '', expected the columns t and p"),
+    "another header": (b"t,x,y,on air\n1,2,3,1\n", r"line 1: found 't,x,y,on air', expected the columns"),
+    "a column missing": (HEAD + b"1,2,3\n", "line 2: found '1,2,3', expected a time and a polarity, x and y"),
     "a word": (HEAD + b"1,2,3,1\n\n1,two,3,1\n", "line 4: found '1,two,3,1', expected"),
-    "a fraction": (HEAD + b"1.5,2,3,1\n", "line 2: found '1.5,2,3,1', expected"),
-    "a blank": (HEAD + b"1, 2,3,1\n", "line 2: found '1, 2,3,1', expected"),
-    "nothing between commas": (HEAD + b"1,,3,1\n", "line 2: found '1,,3,1', expected"),
-    "nothing at the end": (HEAD + b"1,2,3,\n", "line 2: found '1,2,3,', expected"),
     "only a sign": (HEAD + b"-\n", "line 2: found '-', expected"),
-    "a negative x": (HEAD + b"1,-2,3,1\n", "line 2: found '1,-2,3,1', expected"),
-    "x too large": (HEAD + b"1,65536,3,1\n", "line 2: found '1,65536,3,1', expected.* 0 to 65535"),
-    "polarity": (HEAD + b"1,2,3,2", "line 2: found '1,2,3,2', expected.*p 0 or 1"),
-    "a number without end": (HEAD + b"9" * 30 + b",2,3,1\n", "line 2: found '9{30},2,3,1', expected"),
-    "a line without end": (HEAD + b"1" * 3_000_000, r"line 2: found '1{60}\.\.\.', expected"),
-    "bytes": (HEAD + b"\xff\xfe\n", "line 2: found '\ufffd\ufffd', expected"),
+    "a negative x": (HEAD + b"1,-2,3,1\n", "line 2: place -2, expected whole numbers from 0 to 65535"),
+    "x too large": (HEAD + b"1,65536,3,1\n", "line 2: place 65536, expected whole numbers from 0 to 65535"),
+    "polarity": (HEAD + b"1,2,3,7\n", "line 2: polarity 7, expected 0 and 1, or -1 and 1"),
+    "a number without end": (HEAD + b"9" * 30 + b",2,3,1\n", r"line 2: time 1e\+30 us, expected a number"),
+    "a line without end": (HEAD + b"1" * 3_000_000 + b"\n", "line 2: found '1{60}\\.\\.\\.', expected"),
+    "bytes": (HEAD + b"\xff\xfe\n", "line 2: found '.*', expected"),
 }
 
 
@@ -224,10 +218,10 @@ def test_damaged_gzip_is_an_error(tmp_path):
     data = gzip.compress(HEAD + b"".join(b"%d,1,1,1\n" % t for t in range(100_000)))
     for bad in (data[: len(data) // 2], data[:50_000] + bytes(100) + data[50_100:]):
         (tmp_path / "a.csv.gz").write_bytes(bad)
-        with pytest.raises(InputError, match=r"a\.csv\.gz: line \d+: "):
+        with pytest.raises(InputError, match=r"a\.csv\.gz: damaged or closed file"):
             read_events(tmp_path / "a.csv.gz")
     (tmp_path / "a.csv.gz").write_bytes(b"\x1f\x8bnothing")
-    with pytest.raises(InputError, match="line 1: damaged or closed file"):
+    with pytest.raises(InputError, match="damaged or closed file"):
         read_events(tmp_path / "a.csv.gz")
 
 
@@ -262,11 +256,12 @@ def test_events_that_no_receiver_may_see_are_dropped_and_counted(tmp_path):
             "outside_sensor": (1, 2, "row"),
             "time_backward": (1, 3, "row"),
         }
-    (tmp_path / "a.csv").write_bytes(HEAD + b"5,1,1,1\n4,2,1,1\n3,2,1,1\n6,3,1,1\n")
-    with CsvSource(tmp_path / "a.csv") as source:
-        assert source.read()[0].t_us.tolist() == [5, 6]
-    assert (source.losses["time_backward"].count, source.losses["time_backward"].first) == (2, 3)
-    assert str(source.losses["time_backward"]).endswith("(first at line 3)")
+    late = HEAD + b"50000,1,1,1\n40000,2,1,1\n30000,2,1,1\n60000,3,1,1\n60001,3,1,1\n"
+    (tmp_path / "a.csv").write_bytes(late)
+    with open_source(tmp_path / "a.csv") as source:
+        assert source.read()[0].t_us.tolist() == [40000, 50000, 60000, 60001]
+    assert source.counts["rows_out_of_order"] == 2
+    assert sum(loss.count for loss in source.losses.values()) == 1
 
 
 def test_content_tells_the_format_whatever_the_name(tmp_path):

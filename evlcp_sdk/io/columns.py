@@ -1,0 +1,291 @@
+"""Columns of times, polarities and places, as any table has them, to events: units, wraps, order."""
+
+import itertools
+import math
+import zlib
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io._sieve import Sieve
+from evlcp_sdk.io.fields import Polarities, RowError, TimeUnit, time_unit
+from evlcp_sdk.io.tables import DAMAGE, said
+from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.values import Events, Triggers
+
+__all__ = ["PIECE_ROWS", "WINDOW_US", "ColumnSource", "Piece"]
+
+PIECE_ROWS: Final = 1 << 16
+
+MOST_WAITING: Final = 1 << 20
+"""Rows that wait for earlier ones: a table of fewer may be in any order."""
+
+WINDOW_US: Final = 10_000
+"""How late an event of a camera may come to be sorted in, us."""
+
+_PLACES: Final = 1 << 16
+
+_COARSE_US: Final = 20
+"""Steps of times that are said, us: a fifth of a chip of 100 us; slower lights allow for more."""
+
+_WRAPS: Final = ((0, 1 << 32), (-(1 << 31), 1 << 31))
+"""First and last (not included) of counters of 32 bits, which some cameras' software stores times in."""
+
+_NEAR: Final = 1 << 26
+"""How near to its ends a counter was if it went round: 67 s of microseconds."""
+
+Piece = tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, Callable[[int], int]]
+"""Times, polarities, places (n, 2) or None, and in which line or row of the file the k-th of them stands."""
+
+
+class ColumnSource(EventSource):
+    """A table of times and polarities, and of places where it has them, read piece by piece.
+
+    The unit of the times is the one that is named, or else guessed, see `time_unit`; `header` says which, and
+    why. Times of 32 bits may go round. Rows may be in any order as far as a million of them go; they are
+    sorted, and counted. Rows whose time, polarity or place is no number are dropped, and counted.
+
+    Args:
+        path: The file.
+        format: Its name.
+        pieces: What it holds.
+        stack: Closes it.
+        where: What rows are called: `line` or `row`.
+        named: The unit that the file says; None where it says none.
+        unit: The unit that the caller says, whatever the file does.
+        inverted: The larger polarity is OFF.
+        size: Columns and rows of the sensor, or None.
+        window_us: How much earlier than those before a row may be to be sorted in, us; beyond that the
+            camera's clock has leapt, or it is dropped.
+
+    Raises:
+        InputError: The first piece cannot be read.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        format: str,
+        pieces: Iterator[Piece],
+        stack: ExitStack,
+        *,
+        where: str = "row",
+        named: Callable[[], str | None] = lambda: None,
+        unit: str | None = None,
+        inverted: bool = False,
+        size: tuple[int | None, int | None] = (None, None),
+        window_us: float = math.inf,
+    ) -> None:
+        self._stack, self._pieces = stack, pieces
+        self._counts = {"rows_out_of_order": 0, "rows_cut": 0, "times_gone_round": 0}
+        self._where, self._inverted, self._window_us = where, inverted, window_us
+        self._dropped = Loss(0, 0, where, "rows whose time, polarity or place is no number; dropped")
+        self._position = 0
+        self.path, self.size_bytes = path, path.stat().st_size
+        first = self._next_piece()
+        times = np.empty(0, np.int64) if first is None else first[0]
+        if first is not None:
+            self._pieces = itertools.chain((first,), pieces)
+        share = min(self._position / max(self.size_bytes, 1), 1.0)
+        placed = first is not None and first[2] is not None
+        self._unit = TimeUnit(unit, "as told") if unit else time_unit(times, named(), share, placed=placed)
+        self._polarities = Polarities()
+        self._sieve = Sieve(where, *size)
+        self._waiting: list[Events] = []
+        self._row = first[3](0) if first is not None and len(times) else 1
+        self._wrong: InputError | None = None
+        self._fault: InputError | None = None
+        self._latest_us: int | None = None
+        self._before: int | None = None
+        self._rounds = 0
+        self._open = True
+        header = {
+            "pixels": "as its columns x and y say" if placed else "none given: x = y = 0",
+            "time": f"in {self._unit.name}, {self._unit.why}",
+        }
+        self.step_us = _step_us(self._unit, times)
+        if self.step_us >= _COARSE_US:
+            header["step"] = f"times are rounded to {_in_words(self.step_us)}"
+        super().__init__(path, format, *size, header, self.size_bytes)
+        self.guessed = "; ".join(filter(None, (self._unit.guess, header.get("step"))))
+
+    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+        """As `EventSource.take`.
+
+        Raises:
+            InputError: The file cannot be read on, or a row is none of a time and a polarity.
+        """
+        if self._fault is not None:
+            raise self._fault
+        if not self._open:
+            return None
+        while sum(map(len, self._waiting)) < MOST_WAITING:
+            try:
+                events = self._next()
+            except InputError as fault:
+                # What came before it is given first.
+                self._fault, events = fault, None
+            if events is None:
+                self._open = False
+                break
+            self._waiting.append(events)
+        events = _in_order(Events.concat(self._waiting), self._window_us)
+        # What may still be earlier waits, unless all is read.
+        due = len(events) if not self._open else len(events) // 2
+        self._waiting = [events[due:]] if self._open else []
+        given = self._sieve.sift(events[:due], self._row)
+        self._row += due
+        if not self._open:
+            given = Events.concat([given, self._sieve.close()])
+            if not len(given) and self._fault is not None:
+                raise self._fault
+            if not len(given):
+                return None
+        return given, Triggers.empty()
+
+    def _next_piece(self) -> Piece | None:
+        try:
+            return next(self._pieces, None)
+        except (*DAMAGE, zlib.error) as error:
+            raise InputError(f"{self.path}: damaged or closed file: {said(error)}") from error
+
+    def _next(self) -> Events | None:
+        """The events of the next piece, in its order; None at the end."""
+        if self._wrong is not None:
+            raise self._wrong
+        piece = self._next_piece()
+        if piece is None:
+            return None
+        times, values, places, number = self._numbers_of(piece)
+        try:
+            t_us, p = self._unit.us(self._unwrapped(times)), self._polarities.of(values)
+            x, y = _places(places, len(t_us))
+        except RowError as error:
+            row = error.row
+            self._wrong = InputError(f"{self.path}: {self._where} {number(row)}: {error}")
+            t_us, p = self._unit.us(times[:row]), self._polarities.of(values[:row])
+            x, y = _places(None if places is None else places[:row], row)
+        if len(t_us):
+            before = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
+            latest = np.maximum.accumulate(np.concatenate([[before], t_us]))
+            self._counts["rows_out_of_order"] += int((t_us < latest[:-1]).sum())
+            self._latest_us = int(latest[-1])
+        return Events(t_us, x, y, 1 - p if self._inverted else p)
+
+    def _numbers_of(self, piece: Piece) -> Piece:
+        """A piece without the rows in which something is no number; they are counted."""
+        times, values, places, number = piece
+        good = np.ones(len(times), bool)
+        for column in (times, values, *(() if places is None else places.T)):
+            if column.dtype.kind == "f":
+                good &= np.isfinite(column)
+            elif column.dtype.kind in "US":
+                good &= ~np.isin(
+                    np.char.lower(column), (b"nan", b"") if column.dtype.kind == "S" else ("nan", "")
+                )
+        if good.all():
+            return piece
+        kept = np.flatnonzero(good)
+        lost, first = len(good) - len(kept), number(int((~good).argmax()))
+        self._dropped = self._dropped.more(lost, first)
+        return (
+            times[kept],
+            values[kept],
+            None if places is None else places[kept],
+            lambda row: number(int(kept[row])),
+        )
+
+    def _unwrapped(self, times: NDArray[Any]) -> NDArray[Any]:
+        """Times of a counter of 32 bits that goes round, as if it did not."""
+        if not len(times):
+            return times
+        first, last = next(((a, b) for a, b in _WRAPS if a <= times.min() and times.max() < b), (0, 0))
+        before = times[0] if self._before is None else self._before
+        follow = np.concatenate([[before], times])
+        self._before = int(times[-1])
+        if not last:
+            return times
+        falls = (follow[:-1] >= last - _NEAR) & (follow[1:] < first + _NEAR)
+        rises = (follow[:-1] < first + _NEAR) & (follow[1:] >= last - _NEAR) & (self._rounds > 0)
+        rounds = self._rounds + np.cumsum(falls.astype(np.int64) - rises)
+        if falls.any():
+            self._counts["times_gone_round"] += int(rounds[-1]) - self._rounds
+        self._rounds = int(rounds[-1])
+        return times.astype(np.float64 if times.dtype.kind == "f" else np.int64) + rounds * (last - first)
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """As `EventSource.counts`, with rows out of order or cut, and times gone round, if there were any."""
+        counted = {name: count for name, count in self._counts.items() if count}
+        return self._given | self._sieve.counts | counted
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As `EventSource.losses`, with `rows_dropped`."""
+        dropped = {"rows_dropped": self._dropped} if self._dropped.count else {}
+        return self._sieve.losses | dropped
+
+    @property
+    def position_bytes(self) -> int:
+        """How much of the file is read."""
+        return min(self._position, self.size_bytes or 0)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._fault = self._fault or InputError(f"{self.path}: closed file")
+        self._stack.close()
+
+
+def _in_order(events: Events, window_us: float) -> Events:
+    """Events sorted by time, as far as each is no more than a window earlier than those before it."""
+    t_us = events.t_us
+    if not (np.diff(t_us) < 0).any():
+        return events
+    begins = [0]
+    while (rest := t_us[begins[-1] :]).size:
+        leaps = rest < np.maximum.accumulate(rest) - window_us
+        if not leaps.any():
+            break
+        begins.append(begins[-1] + int(leaps.argmax()))
+    order = np.concatenate(
+        [a + np.argsort(t_us[a:b], kind="stable") for a, b in itertools.pairwise([*begins, len(t_us)])]
+    )
+    return Events(t_us[order], events.x[order], events.y[order], events.p[order])
+
+
+def _step_us(unit: TimeUnit, times: NDArray[Any]) -> int:
+    """What all times are multiples of, us, but for the first; 0 where there are too few to tell."""
+    finite = times[np.isfinite(times)] if times.dtype.kind == "f" else times
+    steps = np.diff(np.unique(finite)) * unit.factor
+    if len(finite) < 1000:
+        return 0
+    if not len(steps):
+        # A thousand events at one time.
+        return 1_000_000
+    if times.dtype.kind == "f" and times.dtype.itemsize == 8:
+        digits = np.spacing(np.abs(finite).max()) * unit.factor
+        steps = steps[steps > 4 * digits] if digits > 0.01 else steps
+    return math.gcd(*np.rint(steps[steps >= 0.5]).astype(np.int64).tolist()) if len(steps) else 0
+
+
+def _in_words(step_us: int) -> str:
+    if step_us < 1000:
+        return f"{step_us} us"
+    return f"{step_us / 1000:g} ms" if step_us < 1_000_000 else f"{step_us / 1e6:g} s"
+
+
+def _places(places: NDArray[Any] | None, n: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
+    if places is None:
+        return np.zeros(n, np.uint16), np.zeros(n, np.uint16)
+    whole = np.rint(places.astype(np.float64))
+    wrong = ~((whole >= 0) & (whole < _PLACES) & (whole == places))
+    if wrong.any():
+        row = int(wrong.any(1).argmax())
+        raise RowError(row, f"place {places[wrong][0]}, expected whole numbers from 0 to {_PLACES - 1}")
+    found = whole.astype(np.uint16)
+    return np.ascontiguousarray(found[:, 0]), np.ascontiguousarray(found[:, 1])
