@@ -1,9 +1,12 @@
 """ROS bags with `event_camera_msgs/EventPacket`, EVT3 inside: ROS 1, and ROS 2 in SQLite or MCAP."""
 
 import importlib
+import re
 import sqlite3
 import struct
-from collections.abc import Iterator
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +21,14 @@ from evlcp_sdk.plugin.source import Loss
 __all__ = ["BagSource", "EventPacket", "is_bag", "open_bag"]
 
 TYPES: Final = ("event_camera_msgs/msg/EventPacket", "event_camera_msgs/EventPacket")
+
+_MOST_HELD: Final = 256
+"""Packets that wait for earlier ones: some seconds of a camera, 30 MB."""
+
+_STEPS: Final = 1_000_000
+_STEPS_A_BYTE: Final = 4
+_STEPS_AT_ONCE: Final = 10_000
+"""Steps that SQLite may take, and those between two looks; a row of a message takes twenty."""
 
 _MAGICS: Final = {b"#ROSBAG V2.0": "ROS 1", b"SQLite format 3": "SQLite", b"\x89MCAP0\r\n": "MCAP"}
 
@@ -61,7 +72,9 @@ def open_bag(url: Path | str) -> "BagSource":
 class BagSource(RawSource):
     """The events of a bag's topic, its packets decoded one after another as one stream of words.
 
-    Packets that are missing, by their numbers, are the loss `packets_lost`.
+    Packets are taken by their numbers, as far as they are in disorder by no more than a few hundred; those
+    that are there twice are left out, and counted (`packets_twice`), and missing ones are the loss
+    `packets_lost`.
 
     Args:
         path: The bag.
@@ -72,7 +85,8 @@ class BagSource(RawSource):
         target = Path(path)
         self._stack = ExitStack()
         try:
-            self._packets = _BagBytes(target, _messages(target, topic, self._stack))
+            self._order = _Order(_messages(target, topic, self._stack))
+            self._packets = _BagBytes(target, iter(self._order))
             super().__init__(target, file=self._packets)
         except BaseException:
             self._stack.close()
@@ -88,10 +102,60 @@ class BagSource(RawSource):
             return super().losses
         return super().losses | {"packets_lost": Loss(lost, first, "byte", "packets missing in the bag")}
 
+    @property
+    def counts(self) -> dict[str, int]:
+        """As `EventSource.counts`, with packets that were there twice, or not in their order."""
+        found = {"packets_twice": self._order.twice, "packets_out_of_order": self._order.out_of_order}
+        return super().counts | {name: count for name, count in found.items() if count}
+
     def close(self) -> None:
         """Close the bag."""
         super().close()
         self._stack.close()
+
+
+class _Order:
+    """Packets by their numbers, each once; a number far below begins anew, as a driver does.
+
+    Args:
+        packets: As the bag gives them.
+
+    Attributes:
+        twice: How many were left out.
+        out_of_order: How many came after a later one.
+    """
+
+    def __init__(self, packets: Iterable[EventPacket]) -> None:
+        self._packets = packets
+        self._held: dict[int, EventPacket] = {}
+        self._given: OrderedDict[int, int] = OrderedDict()
+        self.twice = self.out_of_order = 0
+
+    def __iter__(self) -> Iterator[EventPacket]:
+        latest = -1
+        for packet in self._packets:
+            digest, same = zlib.crc32(packet.data), self._held.get(packet.seq)
+            if self._given.get(packet.seq) == digest or (same is not None and same.data == packet.data):
+                self.twice += 1
+                continue
+            self.out_of_order += packet.seq < latest <= packet.seq + _MOST_HELD
+            latest = packet.seq
+            while packet.seq in self._held or len(self._held) >= _MOST_HELD:
+                yield self._pop()
+            self._held[packet.seq] = packet
+        while self._held:
+            yield self._pop()
+
+    def _pop(self) -> EventPacket:
+        """The one that goes on where the last one ended, or else the first."""
+        expected = next(reversed(self._given), -1) + 1
+        near = [seq for seq in self._held if expected <= seq <= expected + _MOST_HELD] if self._given else []
+        packet = self._held.pop(min(near or self._held))
+        self._given[packet.seq] = zlib.crc32(packet.data)
+        self._given.move_to_end(packet.seq)
+        if len(self._given) > _MOST_HELD:
+            self._given.popitem(last=False)
+        return packet
 
 
 class _BagBytes:
@@ -144,10 +208,25 @@ class _BagBytes:
 
 
 def _files_of(path: Path) -> list[Path]:
-    """The files of a bag: itself, or those of its folder, in order of their names."""
+    """The files of a bag: itself, or those of its folder as metadata.yaml or their numbers order them."""
     if not path.is_dir():
         return [path]
-    return sorted(one for one in path.iterdir() if one.suffix in (".db3", ".mcap"))
+    try:
+        text = (path / "metadata.yaml").read_text("utf-8", "replace")
+    except OSError:
+        text = ""
+    listed = re.search(r"relative_file_paths:[ ]*\n((?:[ ]*-.*\n?)+)", text)
+    if listed is not None:
+        names = [line.strip()[1:].strip(" \"'") for line in listed[1].splitlines()]
+        missing = next((name for name in names if not (path / name).is_file()), None)
+        if missing is not None:
+            raise InputError(f"{path}: metadata.yaml names {missing}, which is not there")
+        return [path / name for name in names]
+    found = (one for one in path.iterdir() if one.suffix in (".db3", ".mcap"))
+    return sorted(
+        found,
+        key=lambda one: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", one.name)],
+    )
 
 
 def _messages(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
@@ -188,25 +267,50 @@ def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
 def _sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
     try:
         # A live run reads in a thread of its own, what it opens in another.
-        base = sqlite3.connect(f"file:{path.resolve()}?mode=ro", uri=True, check_same_thread=False)
+        base = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
         stack.enter_context(closing(base))
+        _limit(base, path)
         rows = base.execute("SELECT name, id, type FROM topics").fetchall()
         number = {name: number for name, number, _ in rows}
         chosen = _chosen(path, {name: kind for name, _, kind in rows}, topic)
-        found = base.execute(
-            "SELECT data FROM messages WHERE topic_id = ? ORDER BY timestamp, id", (number[chosen],)
-        )
+        found = base.execute("SELECT data FROM messages WHERE topic_id = ? ORDER BY rowid", (number[chosen],))
     except sqlite3.Error as fault:
         raise InputError(f"{path}: {fault}") from fault
 
     def packets() -> Iterator[EventPacket]:
         try:
             for (data,) in found:
+                if not isinstance(data, bytes):
+                    raise InputError(f"{path}: a message of type {type(data).__name__}, expected bytes")
                 yield _of_cdr(path, data)
         except sqlite3.Error as fault:
             raise InputError(f"{path}: {fault}") from fault
 
     return packets()
+
+
+def _limit(base: sqlite3.Connection, path: Path) -> None:
+    """Let a file take no more room and time than one of its size may, and have tables where a bag has them.
+
+    Raises:
+        InputError: Something else is there under these names.
+    """
+    size = path.stat().st_size
+    base.text_factory = lambda text: text.decode("utf-8", "replace")
+    base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, max(size, 1 << 16))
+    left = [_STEPS + size * _STEPS_A_BYTE]
+
+    def count_down() -> bool:
+        left[0] -= _STEPS_AT_ONCE
+        return left[0] < 0
+
+    base.set_progress_handler(count_down, _STEPS_AT_ONCE)
+    base.execute("PRAGMA trusted_schema = OFF")
+    found = dict(base.execute("SELECT name, type || coalesce(sql, '') FROM sqlite_master"))
+    for name in ("topics", "messages"):
+        made = " ".join(str(found.get(name, "nothing")).upper().split())
+        if not made.startswith("TABLECREATE TABLE"):
+            raise InputError(f"{path}: found no table '{name}', expected a bag of ROS 2")
 
 
 def _mcap(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
@@ -221,7 +325,7 @@ def _mcap(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPack
             channels = summary.channels.values() if summary is not None else ()
             topics = {one.topic: schemas[one.schema_id].name for one in channels if one.schema_id in schemas}
             chosen = _chosen(path, topics, topic)
-            for _, _, message in made.iter_messages([chosen]):
+            for _, _, message in made.iter_messages([chosen], log_time_order=False):
                 yield _of_cdr(path, message.data)
         except InputError:
             raise

@@ -162,14 +162,16 @@ class ColumnSource(EventSource):
         if piece is None:
             return None
         times, values, places, number = self._numbers_of(piece)
-        try:
-            t_us, p = self._unit.us(self._unwrapped(times)), self._polarities.of(values)
-            x, y = _places(places, len(t_us))
-        except RowError as error:
-            row = error.row
-            self._wrong = InputError(f"{self.path}: {self._where} {number(row)}: {error}")
-            t_us, p = self._unit.us(times[:row]), self._polarities.of(values[:row])
-            x, y = _places(None if places is None else places[:row], row)
+        times, rows, good = self._unwrapped(times), len(times), False
+        while not good:
+            try:
+                t_us, p = self._unit.us(times[:rows]), self._polarities.of(values[:rows])
+                x, y = _places(None if places is None else places[:rows], rows)
+                good = True
+            except RowError as error:
+                # What stands before it is given.
+                rows = error.row
+                self._wrong = InputError(f"{self.path}: {self._where} {number(rows)}: {error}")
         if len(t_us):
             before = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
             latest = np.maximum.accumulate(np.concatenate([[before], t_us]))

@@ -32,9 +32,6 @@ _LOOKED_AT: Final = 1 << 14
 _MOST_RATIO: Final = 1100
 """How much a byte of a file can hold: the limit of deflate is 1032."""
 
-_DAMAGE: Final = (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, AttributeError)
-"""What h5py raises of files that are damaged."""
-
 
 def open_hdf5(url: str) -> "Hdf5Source":
     """Open `hdf5:PATH`, with `?columns=txyp`, `unit=ms`, and `swapped=1` where x is the row.
@@ -93,7 +90,10 @@ class Hdf5Source(ColumnSource):
                 found, named = _columns_of(target, file, columns)
                 size = [file.attrs.get(name) for name in ("width", "height")]
                 width, height = (int(side) if side is not None else None for side in size)
-            except _DAMAGE as fault:
+            except InputError:
+                raise
+            except Exception as fault:
+                # A damaged file makes h5py fail in any way.
                 raise InputError(f"{path}: found no HDF5 file, or a damaged one ({_said(fault)})") from fault
             if swapped:
                 found[2:] = found[:1:-1]
@@ -114,7 +114,7 @@ class Hdf5Source(ColumnSource):
         for first in range(0, rows, PIECE_ROWS):
             try:
                 time, polarity, *places = (column[first : first + PIECE_ROWS] for column in columns)
-            except _DAMAGE as fault:
+            except Exception as fault:
                 raise InputError(f"{self.path}: row {first + 1}: damaged: {_said(fault)}") from fault
             self._position = round(self.path.stat().st_size * min((first + PIECE_ROWS) / rows, 1.0))
             times = time if time.dtype.kind == "f" else time.astype(np.int64)

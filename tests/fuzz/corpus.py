@@ -1,16 +1,23 @@
 """A small good file of every kind that is read, and its reader."""
 
 import json
+import sqlite3
 from collections.abc import Callable
+from contextlib import closing
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+import h5py
 import numpy as np
+from mcap.reader import make_reader
+from scipy.io import savemat
 
 from evlcp_sdk.io import open_source
 from evlcp_sdk.io.open import open_writer
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.place.nmea import checksum, read_nmea
 from evlcp_sdk.place.poses import read_poses
 from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.scene.attitude import AttitudeLog
@@ -25,6 +32,7 @@ from evlcp_sdk.values import Events, Triggers
 from firmware_host.board.bank import read_masks
 from firmware_host.board.fleet import read_inventory
 from firmware_host.board.symbols import read_symbols
+from firmware_host.board.update import Package
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 WIDTH, HEIGHT = 64, 48
@@ -81,6 +89,57 @@ def _recording(folder: Path, name: str, format: str | None = None) -> bytes:
     return path.read_bytes()
 
 
+def _columns() -> dict[str, Any]:
+    events = some_events()
+    return {"t": events.t_us, "x": events.x, "y": events.y, "p": events.p}
+
+
+def _npy(folder: Path) -> bytes:
+    np.save(folder / "a.npy", np.stack([column.astype(np.int64) for column in _columns().values()], 1))
+    return (folder / "a.npy").read_bytes()
+
+
+def _hdf5(folder: Path) -> bytes:
+    with h5py.File(folder / "a.h5", "w") as file:
+        for name, column in _columns().items():
+            file.create_dataset(f"events/{name}", data=column, chunks=(500,), compression="gzip")
+    return (folder / "a.h5").read_bytes()
+
+
+def _matlab_7(folder: Path) -> bytes:
+    with h5py.File(folder / "7.mat", "w", userblock_size=512) as file:
+        for name, column in _columns().items():
+            file[name] = column[None, :]
+    data = (folder / "7.mat").read_bytes()
+    head = b"MATLAB 7.3 MAT-file"
+    return head + data[len(head) :]
+
+
+def _matlab_5(folder: Path) -> bytes:
+    savemat(folder / "5.mat", _columns(), do_compression=True)
+    return (folder / "5.mat").read_bytes()
+
+
+def _db3(folder: Path) -> bytes:
+    """The messages of a bag of MCAP in one of SQLite."""
+    path = folder / "messages.mcap"
+    _recording(folder, path.name)
+    with path.open("rb") as file:
+        messages = [message.data for _, _, message in make_reader(file).iter_messages()]
+    with closing(sqlite3.connect(folder / "a.db3")) as base, base:
+        base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
+        base.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)")
+        base.execute("INSERT INTO topics VALUES (1, '/events', 'event_camera_msgs/msg/EventPacket')")
+        rows = [(n, n, data) for n, data in enumerate(messages)]
+        base.executemany("INSERT INTO messages VALUES (?, 1, ?, ?)", rows)
+    return (folder / "a.db3").read_bytes()
+
+
+def _update(folder: Path) -> bytes:
+    package = Package("stm32f405-8mhz", {1: bytes(range(200)), 2: bytes(range(100, 250))})
+    return package.to_json().encode()
+
+
 def _store(path: Path) -> None:
     with Store(path) as store:
         summarize(store)
@@ -94,6 +153,14 @@ def _summary(path: Path) -> None:
     read_summary(path.parent)
 
 
+NMEA = b"".join(
+    f"${line}*{checksum(line)}\r\n".encode()
+    for line in (
+        "GNGGA,120000.00,3506.0000,N,13712.0000,E,4,12,0.6,54.5,M,37.0,M,1.0,0000",
+        "GNGST,120000.00,0.5,0.02,0.01,45.0,0.02,0.02,0.04",
+        "GNGGA,120001.00,3506.0010,N,13712.0010,E,4,12,0.6,54.5,M,37.0,M,1.0,0000",
+    )
+)
 FRAMES = (
     b"transmitter,packet,frame,t_us,symbols,distance_m,distance_sigma_m,x_px,y_px,echo_of\n"
     b"0,0,0,6276,1 2 3 4 5 6 7 8 9 10 11 12 13 14 15 16,39.9,0.02,640.5,360.5,\n"
@@ -144,6 +211,14 @@ def kinds(folder: Path, store: bytes) -> list[Kind]:
         Kind("NPZ", "a.npz", _recording(folder, "a.npz"), read_recording),
         Kind("CSV", "a.csv", _recording(folder, "a.csv"), read_recording),
         Kind("CSV in gzip", "a.csv.gz", _recording(folder, "a.csv.gz"), read_recording),
+        Kind("NPY", "a.npy", _npy(folder), read_recording),
+        Kind("HDF5", "a.h5", _hdf5(folder), read_recording),
+        Kind("MAT 7.3", "a.mat", _matlab_7(folder), read_recording),
+        Kind("MAT", "a.mat", _matlab_5(folder), read_recording),
+        Kind("MCAP", "a.mcap", _recording(folder, "a.mcap"), read_recording),
+        Kind("db3", "a.db3", _db3(folder), read_recording),
+        Kind("NMEA", "a.nmea", NMEA, lambda path: read_nmea(path, datetime(2026, 11, 1, tzinfo=UTC), 3.0)),
+        Kind("update", "a.json", _update(folder), Package.read),
         Kind("truth", "a.truth.json", json.dumps(truth).encode(), read_truth),
         Kind("frames.csv", "frames.csv", FRAMES, _frames),
         Kind(

@@ -28,6 +28,14 @@ NAMES = (
         "NPZ",
         "CSV",
         "CSV in gzip",
+        "NPY",
+        "HDF5",
+        "MAT 7.3",
+        "MAT",
+        "MCAP",
+        "db3",
+        "NMEA",
+        "update",
         "truth",
         "frames.csv",
         "summary.json",
@@ -37,7 +45,16 @@ NAMES = (
     *("sites", "link", "scene", "campaign", "results", "symbols", "masks", "inventory"),
 )
 
-ROUNDS = {"campaign": 40, "results": 100, "EVT3": 600, "EVT2": 600}
+ROUNDS = {
+    "campaign": 40,
+    "HDF5": 150,
+    "MAT 7.3": 150,
+    "MCAP": 150,
+    "db3": 150,
+    "results": 100,
+    "EVT3": 600,
+    "EVT2": 600,
+}
 """Damaged files of a kind; 300 of others. A second or two each."""
 
 
