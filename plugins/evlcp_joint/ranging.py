@@ -27,12 +27,6 @@ __all__ = ["JointScaleRanging"]
 
 _NONE = Range(float("nan"), float("nan"), 0)
 
-_STEPS = 12
-"""Newton steps at the most; from a start within a tenth of a spacing, four suffice."""
-
-_CLOSE, _EXACT = 1e-3, 1e-5
-"""Last step of the spacing, as a share of it, of a fit that others follow, and of the last one."""
-
 _STARTING_GAIN = 0.8
 """Share of a full value that a cluster's rows show, with a fifth of the negative events missing."""
 
@@ -40,33 +34,8 @@ _TAIL = 3.0
 """Width of the tails of a boundary's profile, in cores: the log of the light's ratio, clipped at a full
 value, is steep in the middle, and the lens gives it tails."""
 
-_WIDTH_SIGMA = 0.3
-"""How far the log of a boundary's width may lie from that of `blur_px` before data must speak for it."""
-
-_NOISE = 0.25
-"""Of a row's values, in full values, when that is weighed."""
-
-_SHIFT_SIGMA_PX = 0.1
-"""How far boundaries are likely to be shifted by the sign of their step, and by values that are repeated."""
-
-_PRIOR = np.array([0, 0, 0, 0, _WIDTH_SIGMA**-2, _SHIFT_SIGMA_PX**-2, _SHIFT_SIGMA_PX**-2]) * _NOISE**2
-"""Weights with which width and shifts are 0, beside those of a row's values."""
-
-_VEIL = 0.3
-"""Share of the brightest column's events that do not count: a dirty lens veils a bar with as much."""
-
-_ROUNDS = 2
-"""Fits after the first, each with the motion and without the boundaries that the one before it showed."""
-
-_OUTLIER = 4.0
-"""Standard deviations, by the median, beyond which a boundary is out of line: 1 of 16000 by chance."""
-
-_LEAST_OUTLIER_PX = 0.25
-"""What pixels that miss events do to a boundary now and then; less is never out of line."""
-
-_LEAST_EXPLAINED = 0.3
-"""Share of the values' energy that a fit explains at the least: fits of noise reach a tenth, and dim bars
-in a bright scene three quarters."""
+_CORE_SHARE = 0.4
+"""Share of the core in a boundary's profile; tails have the rest."""
 
 Floats = NDArray[np.float64]
 
@@ -106,16 +75,6 @@ class JointScaleRanging(Ranging):
         float,
         Field(gt=0, le=5, description="Width (sigma) of a boundary's core in the image: lens and pixel."),
     ] = 0.2
-    core_share: Annotated[
-        float,
-        Field(gt=0, le=1, description="Share of the core in a boundary's profile; tails have the rest."),
-    ] = 0.4
-    full_events: Annotated[
-        float, Field(gt=0, description="Events of a pixel in a chip that count as a full value.")
-    ] = 3.0
-    huber: Annotated[
-        float, Field(gt=0, description="Residual, in full values, beyond which a row weighs less.")
-    ] = 0.5
     min_boundaries: Annotated[
         int,
         Field(
@@ -155,32 +114,37 @@ class JointScaleRanging(Ranging):
         pilots = codebook.pilot_values[column].astype(np.float64)
         words = codebook.codeword_values.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
-
         when = (np.arange(n := pilots.shape[1] + words.shape[1]) + 0.5) / n - 0.5
-        pixels = self.blur_px, self.full_events, _VEIL, _STARTING_GAIN, self.huber
-        search = _STEPS, _ROUNDS, _CLOSE, _EXACT
-        limits = least, _OUTLIER, _LEAST_OUTLIER_PX, _LEAST_EXPLAINED
-
-        chips = 2 * len(when)
+        chips = 2 * n
 
         def measure(view: FrameView) -> Range:
-            by_boundary = np.empty((3, clusters + 1))
-            spacing_px, sigma_px, tilt = _kernels.measure_column(
-                plain(view.presence.selected),
-                view.presence.grid_px,
-                plain(view.sums[:chips]),
-                plain(view.offset_px[:, :chips]),
-                plain(view.soft.symbols.astype(np.int64, copy=False)),
-                pilots,
-                words,
-                when,
-                _profile(self.core_share),
-                _PRIOR,
-                pixels,
-                search,
-                limits,
-                by_boundary,
+            found = find_bar(view, chips)
+            if found is None:
+                return _NONE
+            sums, offset_px, line, seen = found
+            height, (first, spacing, _, tilt, _) = sums.shape[1], line.tolist()
+            values = np.empty((n, height))
+            _kernels.read_rows(sums, line, clusters, values)
+            lens = np.array([self.blur_px, _kernels.measure_dim(sums, pilots, seen, line)])
+            motion = np.empty((2, n))
+            motion[0], motion[1] = _second_chips(offset_px), when
+            if spacing < 0:
+                # A bar upside down is mirrored.
+                spacing, first = -spacing, height - 1 - first
+                values = plain(values[:, ::-1])
+                motion[0] *= -1
+            codes, known = known_codes(pilots, words, view.soft.symbols, seen)
+            centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
+            fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
+            fitted, (off, weight, wave), scores, normal = _kernels.fit_bar(
+                codes, known, motion, values, profile(_CORE_SHARE), lens, least, fit
             )
+            spacing_px, centre_px = fit[:2].tolist()
+            # From the start, which cells gave, an end moves by the size of a cell and a pixel of blur.
+            farthest = abs(spacing_px - spacing) * (clusters - 1) / 2 + abs(centre_px - centre)
+            if not fitted or farthest > view.presence.grid_px + 1:
+                return _NONE
+            sigma_px = math.sqrt(_kernels.spacing_variance(off, weight, scores, normal))
             if math.isnan(sigma_px):
                 return _NONE
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
@@ -188,7 +152,7 @@ class JointScaleRanging(Ranging):
             distance = camera.distance_m(spacing_m, spacing_px * stretch)
             late_chips = (chips - 2 * pilots.shape[1]) / 2
             one_px = spacing_m * spacing_px * stretch / distance
-            off, weight, wave = by_boundary[:, 1:-1]
+            off, weight, wave = off[1:-1], weight[1:-1], wave[1:-1]
             # A wave in the boundaries' places, 1 px high, makes the spacing so much larger.
             apart = weight * (boundaries - weight @ boundaries / weight.sum())
             wider = float(apart @ wave) / float(apart @ boundaries) / spacing_px
@@ -203,17 +167,100 @@ class JointScaleRanging(Ranging):
         return measure
 
 
+def find_bar(
+    view: FrameView, chips: int
+) -> tuple[NDArray[np.int16], Floats, Floats, NDArray[np.bool_]] | None:
+    """A bar in the cells of a frame, None with fewer than three clusters in line.
+
+    Returns:
+        Sums of the first `chips` chips and the offset of the bar along itself in each, turned so that it lies
+        along the rows; its line, float64 (5,), as `_kernels.read_rows` takes it; and which clusters are seen.
+    """
+    selected, sums = plain(view.presence.selected), plain(view.sums[:chips])
+    offset_px, middles = view.offset_px[1, :chips], np.empty((len(selected), 2))
+    if _kernels.find_middles(selected, middles):
+        selected, sums = plain(selected.swapaxes(1, 2)), plain(sums.swapaxes(1, 2))
+        offset_px, middles = view.offset_px[0, :chips], plain(middles[:, ::-1])
+    line = np.empty(5)
+    if not _kernels.fit_line(middles, line):
+        return None
+    # A cluster is as long as the spacing; half of it and a cell of blur. Cells as wide as the bar is long are
+    # looked at first: it is narrower.
+    reach = abs(float(line[1])) / 2 + 1
+    across = np.zeros(2 * int(abs(float(line[1])) * len(selected) / 2) + 3, np.int64)
+    _kernels.cells_in_place(selected, line, reach, across, middles)
+    shift, half = core_of(across)
+    line[2] += shift
+    _kernels.cells_in_place(selected, line, reach, np.zeros(2 * int(half + 1) + 1, np.int64), middles)
+    if not _kernels.fit_line(middles, line):
+        return None
+    # In pixels; in whole cells, as wide as the core is.
+    grid = view.presence.grid_px
+    middle = (grid - 1) / 2
+    first, spacing, left, tilt, _ = line.tolist()
+    line = np.array(
+        [
+            first * grid + middle,
+            spacing * grid,
+            left * grid + middle - tilt * middle,
+            tilt,
+            (half + 0.5) * grid,
+        ]
+    )
+    return sums, offset_px, line, ~np.isnan(middles[:, 0])
+
+
+def core_of(counts: NDArray[np.int64]) -> tuple[float, float]:
+    """Middle and half the extent of the cells about the fullest that have three tenths of it.
+
+    The middle is given from that of `counts`. Stray cells beside a bar, and the dimmer ones of its
+    reflection, are fewer or apart.
+    """
+    cells = counts.tolist()
+    least = 0.3 * max(cells)
+    low = high = cells.index(max(cells))
+    while low > 0 and cells[low - 1] >= least:
+        low -= 1
+    while high + 1 < len(cells) and cells[high + 1] >= least:
+        high += 1
+    return (low + high) / 2 - len(cells) // 2, (high - low) / 2
+
+
+def _second_chips(offset_px: Floats) -> Floats:
+    """Offset of each value from those of its chips, (2 n,) -> (n,).
+
+    A value is read from its second chip, whose events follow the edge at its start, half a chip before the
+    middle that an offset is for. Images are held still by whole pixels, so offsets jump by one.
+    """
+    second = offset_px[1::2]
+    step = second - offset_px[::2]
+    return second - (step - np.rint(step)) / 2
+
+
+def known_codes(
+    pilots: Floats, words: Floats, symbols: NDArray[np.int64], seen: NDArray[np.bool_]
+) -> tuple[Floats, NDArray[np.bool_]]:
+    """What each cluster sends in a frame, (K, values), and between which it is known, (K + 1, values).
+
+    A boundary lies between clusters that are seen; in info values, those whose symbol is known, too.
+    """
+    codes = np.concatenate([pilots, words[np.maximum(symbols, 0)]], axis=1)
+    known = np.zeros((len(pilots) + 1, codes.shape[1]), np.bool_)
+    read = seen & (symbols >= 0)
+    known[1:-1, : pilots.shape[1]] = (seen[1:] & seen[:-1])[:, None]
+    known[1:-1, pilots.shape[1] :] = (read[1:] & read[:-1])[:, None]
+    return codes, known
+
+
 @cache
-def _profile(core_share: float) -> Floats:
+def profile(core_share: float) -> Floats:
     """Of a boundary with a core of width 1: -1 to 1 across it, and the slope of that, float64 (2, n).
 
-    From its middle to `_kernels._REACH`; straight pieces between leave a hundred-thousandth.
+    From its middle to `_kernels.REACH`; straight pieces between leave a hundred-thousandth.
     """
-    from evlcp_joint._kernels import _REACH
-
     # As SciPy's to the last bits, without the import.
     erf = np.vectorize(math.erf)
-    z = np.linspace(0, _REACH, 2049)
+    z = np.linspace(0, _kernels.REACH, 2049)
     parts = ((core_share, 1.0), (1 - core_share, _TAIL))
     across = sum(share * erf(z / wide / np.sqrt(2)) for share, wide in parts)
     slope = sum(share * 2 * np.exp(-0.5 * (z / wide) ** 2) / wide for share, wide in parts) / np.sqrt(

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import _PRIOR, JointScaleRanging, _profile, _together
+from evlcp_joint.ranging import JointScaleRanging, _together, core_of, find_bar, known_codes, profile
 from numpy.testing import assert_allclose
 from scipy.stats import norm, theilslopes
 
@@ -250,13 +250,13 @@ BLUR, SHARE = 0.2, 0.4
 
 
 def test_profile_is_a_mixture_of_normal_distributions() -> None:
-    table = _profile(SHARE)
-    z = np.linspace(0, _kernels._REACH, table.shape[1])
+    table = profile(SHARE)
+    z = np.linspace(0, _kernels.REACH, table.shape[1])
     assert_allclose(table[0], 2 * (SHARE * norm.cdf(z) + (1 - SHARE) * norm.cdf(z / 3)) - 1, atol=1e-12)
     assert_allclose(table[1], 2 * (SHARE * norm.pdf(z) + (1 - SHARE) * norm.pdf(z / 3) / 3), atol=1e-12)
 
 
-PRIOR = np.array([0, 0, 0, 0, 2.0, 5.0, 7.0])
+PRIOR = np.array(_kernels.PRIOR)
 DIM = 0.6
 """How large negative values are, as a share of the positive ones."""
 
@@ -272,12 +272,15 @@ class Twin:
         self.offset, self.when = rng.uniform(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 6)
         self.fit = np.array([5.3, 0.2, 0.1, 0.7, 0.2, 0.07, -0.03])
         self.rows = rows
-        self.first, self.last = np.empty((2, K + 1, 6), np.int64)
-        reach = _kernels._REACH * BLUR * np.exp(0.2)
-        _kernels.rows_felt(self.known, self.offset, self.when, reach, self.fit, rows, self.first, self.last)
+        reach = _kernels.REACH * BLUR * np.exp(0.2)
         self.reach = min(reach, 5.3 / 2)
         self.seen = 0.7 * rng.choice([-1.0, 1.0], (6, rows)) + rng.normal(0, 0.5, (6, rows))
-        self.args = (self.codes, self.first, self.last, self.offset, self.when, _profile(SHARE), BLUR, DIM)
+        self.motion, self.lens = np.stack([self.offset, self.when]), np.array([BLUR, DIM])
+        self.profile = profile(SHARE)
+
+    def steps(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        reach = _kernels.REACH * BLUR * np.exp(0.2)
+        return _kernels.list_steps(self.codes, self.known, self.motion, reach, self.fit, seen)
 
     def place(self, fit: np.ndarray, b: int, i: int) -> float:
         middle = (self.rows - 1) / 2 + self.offset[i] + fit[1] + fit[2] * self.when[i]
@@ -318,7 +321,8 @@ def test_normal_equations_are_huber_s(seed: int) -> None:
     j = twin.slopes()
     w = np.minimum(1, 0.5 / np.abs(r))
     normal, right = np.empty((7, 7)), np.empty(7)
-    cost = _kernels.equations(*twin.args, 0.5, PRIOR, twin.seen, twin.fit, normal, right)
+    steps = twin.steps(twin.seen)
+    cost = _kernels.equations(*steps, twin.profile, twin.lens, twin.fit, normal, right)
     prior = np.diag(PRIOR)
     # The profile is of straight pieces.
     assert_allclose(normal, (j * w) @ j.T + prior, rtol=1e-3, atol=0.05)
@@ -335,7 +339,7 @@ def test_leftovers_are_by_boundary_value_and_row(seed: int) -> None:
     j, clipped = twin.slopes(), np.clip(r, -0.5, 0.5)
     by_boundary, by_value, scores = np.empty((3, K + 1)), np.empty((2, 6)), np.empty((90, 7))
     noise, spent, squares = _kernels.leftovers(
-        *twin.args, 0.5, twin.seen, twin.fit, by_boundary, by_value, scores
+        *twin.steps(twin.seen), twin.profile, twin.lens, twin.fit, by_boundary, by_value, scores
     )
     assert noise == pytest.approx((clipped**2).mean(), rel=1e-4)
     assert spent == pytest.approx((r**2).sum(), rel=1e-4)
@@ -358,64 +362,42 @@ def test_leftovers_are_by_boundary_value_and_row(seed: int) -> None:
 def test_rows_belong_to_the_nearest_boundary_only() -> None:
     known, rows = np.ones((K + 1, 2), np.bool_), 60
     known[5, 1] = False
-    first, last = np.empty((2, K + 1, 2), np.int64)
-    fit = np.array([2.6, 0.3, 0.0, 1.0, 0.0])
-    _kernels.rows_felt(known, np.array([0.2, -0.4]), np.array([-0.5, 0.5]), 2.4, fit, rows, first, last)
-    for i in (0, 1):
-        counts = np.zeros(rows, int)
-        for b in range(K + 1):
-            counts[first[b, i] : last[b, i]] += 1
-        assert counts.max() == 1
-        # All but the rows of the boundary that is not known, and those beyond the last.
-        assert counts.sum() in ((44, 45) if i == 0 else (41, 42))
+    codes = np.repeat(np.resize([1.0, -1.0], K)[:, None], 2, 1)
+    motion, fit = np.array([[0.2, -0.4], [-0.5, 0.5]]), np.array([2.6, 0.3, 0.0, 1.0, 0.0])
+    values = np.arange(2 * rows, dtype=float).reshape(2, rows)
+    steps, seen = _kernels.list_steps(codes, known, motion, 2.4, fit, values)
+    columns = steps.reshape(len(steps), 10, -1).swapaxes(0, 1).reshape(10, -1)
+    counts = np.zeros((2, rows), int)
+    for step, (many, i, b, first) in enumerate(columns[6:].T.astype(int)):
+        counts[i, first : first + many] += 1
+        block, column = divmod(step, seen.shape[2])
+        np.testing.assert_array_equal(seen[block, :many, column], values[i, first : first + many])
+        if many:
+            assert known[b, i]
+            middle = (rows - 1) / 2 + motion[0, i] + fit[1] + fit[0] * (b - K / 2)
+            assert abs(first - middle + (many - 1) / 2) <= 0.5
+    assert counts.max() == 1
+    # All but the rows of the boundary that is not known, and those beyond the first and the last.
+    assert counts.sum(1)[0] in (38, 39, 40)
+    assert counts.sum(1)[1] in (35, 36, 37, 38)
 
 
-def test_column_light_is_the_mean_size_beside_the_line() -> None:
+@pytest.mark.parametrize("spacing", [0.9, -0.9])
+def test_rows_are_weighed_by_the_light_between_a_bars_ends(spacing: float) -> None:
     rng = np.random.default_rng(3)
     sums = rng.integers(-6, 7, (8, 20, 15)).astype(np.int16)
-    line = np.array([5.0, 0.2])
-    out = np.empty(9)
-    _kernels.column_light(sums, line, 3, 16, 3.0, out)
-    want = np.zeros(9)
-    for v in range(3, 17):
-        middle = int(np.rint(5 + 0.2 * v))
-        for off in range(-4, 5):
-            if 0 <= middle + off < 15:
-                want[4 + off] += np.minimum(np.abs(sums[1::2, v, middle + off]) / 3.0, 1).sum()
-    assert_allclose(out, want / (14 * 4))
-
-
-def test_row_values_are_clipped_weighted_means() -> None:
-    rng = np.random.default_rng(1)
-    sums = rng.integers(-6, 7, (8, 20, 15)).astype(np.int16)
-    line = np.array([5.0, 0.2])
-    weight = np.array([0.1, 0.5, 1.0, 0.6, 0.0])
+    line = np.array([3.4 if spacing > 0 else 16.9, spacing, 5.0, 0.2, 1.7])
+    ends = np.sort(line[0] + spacing * np.array([-0.5, K - 0.5]))
     out = np.empty((4, 20))
-    _kernels.row_values(sums, line, weight, 3.0, out)
-    for v in range(20):
-        columns = int(np.rint(5 + 0.2 * v)) + np.arange(-2, 3)
-        inside = (columns >= 0) & (columns < 15)
-        clipped = np.clip(sums[1::2, v][:, columns[inside]] / 3.0, -1, 1)
-        assert_allclose(out[:, v], np.average(clipped, axis=1, weights=weight[inside]))
-
-
-def test_rows_are_weighed_by_the_light_between_a_bars_ends() -> None:
-    rng = np.random.default_rng(3)
-    sums = rng.integers(-5, 6, (8, 20, 15)).astype(np.int16)
-    line, out, want = np.array([5.0, 0.2]), np.empty((4, 20)), np.empty((4, 20))
-    for ends in ((3.2, 16.9), (16.9, 3.2)):
-        _kernels.bar_values(sums, line, 1.7, *ends, 3.0, 0.3, out)
-        light = np.empty(5)
-        _kernels.column_light(sums, line, 3, 16, 3.0, light)
-        _kernels.row_values(sums, line, np.maximum(light - 0.3 * light.max(), 0), 3.0, want)
-        assert_allclose(out, want)
-
-
-def test_a_bar_lies_along_what_it_spreads_over() -> None:
-    upright = np.array([[1.0, 5.0], [np.nan, np.nan], [9.0, 6.0]])
-    assert not _kernels.lies_across(upright)
-    assert _kernels.lies_across(upright[:, ::-1].copy())
-    assert not _kernels.lies_across(np.full((4, 2), np.nan))
+    _kernels.read_rows(sums, line, K, out)
+    middle = np.rint(5 + 0.2 * np.arange(20)).astype(int)
+    columns = middle[:, None] + np.arange(-2, 3)
+    inside = columns < 15
+    beside = sums[1::2, np.arange(20)[:, None], np.minimum(columns, 14)] * inside
+    clipped = np.clip(beside / 3.0, -1, 1)
+    light = np.abs(clipped[:, int(ends[0]) : int(ends[1]) + 1]).sum((0, 1))
+    weight = np.maximum(light - 0.3 * light.max(), 0) * inside
+    assert_allclose(out, (clipped * weight).sum(2) / weight.sum(1))
 
 
 def test_solve_leaves_no_score() -> None:
@@ -426,29 +408,10 @@ def test_solve_leaves_no_score() -> None:
     b, i, v = cells[:, :3].astype(int).T
     seen = np.zeros((6, twin.rows))
     seen[i, v] = cells[:, 3] + rng.normal(0, 0.2, len(b))
-    fit, normal = truth * [1.004, 1, 1, 1, 1, 1, 1], np.empty((7, 7))
-    first, last = np.empty((2, K + 1, 6), np.int64)
-    assert _kernels.solve(
-        twin.codes, twin.known, twin.offset, twin.when, _profile(SHARE), BLUR, DIM, 0.5, PRIOR, seen,
-        50, 1e-12, fit, normal, first, last,
-    )  # fmt: skip
+    fit, normal, steps = truth * [1.004, 1, 1, 1, 1, 1, 1], np.empty((7, 7)), twin.steps(seen)
+    assert _kernels.solve(*steps, twin.profile, twin.lens, 1e-9, fit, normal)
     again, score = np.empty((7, 7)), np.empty(7)
-    _kernels.equations(
-        twin.codes,
-        first,
-        last,
-        twin.offset,
-        twin.when,
-        _profile(SHARE),
-        BLUR,
-        DIM,
-        0.5,
-        PRIOR,
-        seen,
-        fit,
-        again,
-        score,
-    )
+    _kernels.equations(*steps, twin.profile, twin.lens, fit, again, score)
     assert_allclose(normal, again)
     # No score is left: a thousandth of a standard deviation of each.
     assert (np.abs(score) < 1e-3 * np.sqrt(np.diag(normal))).all()
@@ -467,14 +430,14 @@ def test_cells_out_of_place_do_not_count() -> None:
     selected[3, 50:53, 10:12] = True
     selected |= rng.random(selected.shape) < 0.001
     medians = np.empty((K, 2))
-    _kernels.cell_medians(selected, medians)
+    assert not _kernels.find_middles(selected, medians)
     for k in range(K):
         rows, columns = np.nonzero(selected[k])
         # Within the half cell that the bins leave.
         assert abs(medians[k, 0] - np.median(rows)) <= 1
         assert abs(medians[k, 1] - np.median(columns)) <= 1
-    line = (5.0, 3.0, 10.5, 0.0)
-    across, found = np.empty(5, np.int64), np.empty((K, 2))
+    line = np.array([5.0, 3.0, 10.5, 0.0])
+    across, found = np.zeros(5, np.int64), np.empty((K, 2))
     _kernels.cells_in_place(selected, line, 2.5, across, found)
     counts = np.zeros(5, np.int64)
     for k in range(K):
@@ -486,22 +449,27 @@ def test_cells_out_of_place_do_not_count() -> None:
     assert np.array_equal(across, counts)
 
 
-def test_straight_is_theil_sen() -> None:
+def test_the_line_is_theil_sen() -> None:
     rng = np.random.default_rng(7)
-    x = np.arange(12.0)
-    y = 2.5 * x + 1 + rng.normal(0, 0.1, 12)
-    y[3] = 90.0
-    slope, left = _kernels.straight(x, y)
-    assert slope == pytest.approx(theilslopes(y, x)[0])
-    assert left == pytest.approx(np.median(y - slope * x))
+    rows = 2.5 * np.arange(12.0) + 1 + rng.normal(0, 0.1, 12)
+    rows[3] = 90.0
+    middles = np.stack([rows, 0.1 * rows + rng.normal(0, 0.1, 12)], 1)
+    middles[5] = np.nan
+    line = np.empty(4)
+    assert _kernels.fit_line(middles, line)
+    seen = np.flatnonzero(np.isfinite(middles[:, 0]))
+    for at, x, y in ((0, seen, middles[seen, 0]), (2, middles[seen, 0], middles[seen, 1])):
+        assert line[at + 1] == pytest.approx(theilslopes(y, x)[0])
+        assert line[at] == pytest.approx(np.median(y - line[at + 1] * x))
+    middles[2:] = np.nan
+    assert not _kernels.fit_line(middles, line)
 
 
 def test_codes_are_known_between_clusters_that_are_seen_and_read() -> None:
     rng = np.random.default_rng(4)
     symbols, seen = rng.integers(-1, 64, K), rng.random(K) < 0.8
     symbols[[3, 9]] = -1
-    codes, known = np.empty((K, 16)), np.empty((K + 1, 16), np.bool_)
-    _kernels.codes_said(PILOTS, WORDS, symbols, seen, codes, known)
+    codes, known = known_codes(PILOTS, WORDS, symbols, seen)
     np.testing.assert_array_equal(codes, np.concatenate([PILOTS, WORDS[np.maximum(symbols, 0)]], axis=1))
     both, read = seen[1:] & seen[:-1], (symbols[1:] >= 0) & (symbols[:-1] >= 0)
     want = np.zeros((K + 1, 16), bool)
@@ -516,7 +484,7 @@ def test_the_core_is_what_hangs_together_about_the_fullest(seed: int) -> None:
     peak = int(counts.argmax())
     low = enough.rfind(" ", 0, peak) + 1
     high = len(enough[:peak] + enough[peak:].partition(" ")[0]) - 1
-    assert _kernels.core_of(counts) == ((low + high) / 2 - 5, (high - low) / 2)
+    assert core_of(counts) == ((low + high) / 2 - 5, (high - low) / 2)
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
@@ -528,20 +496,31 @@ def test_the_line_of_a_bar_leaves_strays_out(tilt: float) -> None:
             left = round(12 + tilt * v)
             selected[k, v, left : left + 3] = True
     selected |= rng.random(selected.shape) < 0.002
-    medians, line, seen = np.empty((K, 2)), np.empty(5), np.empty(K, np.bool_)
-    _kernels.cell_medians(selected, medians)
-    assert _kernels.line_of_cells(selected, medians, line, seen)
-    assert_allclose(line, [5, 3, 13, tilt, 1], atol=0.35)
-    assert seen.all()
-    for way, cells in ((1, selected), (2, np.ascontiguousarray(selected.transpose(0, 2, 1)))):
-        again, also = np.empty(5), np.empty(K, np.bool_)
-        assert _kernels.lie_of_cells(cells, again, also) == way
-        np.testing.assert_array_equal(again, line)
-        np.testing.assert_array_equal(also, seen)
-    selected[2:] = False
-    _kernels.cell_medians(selected, medians)
-    assert not _kernels.line_of_cells(selected, medians, line, seen)
-    assert _kernels.lie_of_cells(selected, line, seen) == 0
+    rows, columns = 2 * selected.shape[1], 2 * selected.shape[2]
+    sums = rng.integers(-3, 4, (2, rows, columns)).astype(np.int16)
+    for across in (False, True):
+        cells, image = (a.swapaxes(1, 2) if across else a for a in (selected, sums))
+        presence = PresenceMap(cells.astype(np.float32), 2, cells, np.zeros((K, 1, 1), np.float32))
+        soft = SoftSymbols(np.zeros(K, np.int64), np.zeros((K, 6), np.float32), 1.0)
+        found = find_bar(FrameView(image, np.array([[1.0, 2.0], [3.0, 4.0]]), presence, soft), 2)
+        assert found is not None
+        upright, offset_px, line, seen = found
+        np.testing.assert_array_equal(upright, sums)
+        np.testing.assert_array_equal(offset_px, [1, 2] if across else [3, 4])
+        assert_allclose(line, [10.5, 6, 26.5 - tilt / 2, tilt, 3], atol=0.7)
+        assert seen.all()
+    few = selected.copy()
+    few[2:] = False
+    assert find_bar(FrameView(sums, np.zeros((2, 2)), replace(presence, selected=few), soft), 2) is None
+
+
+def test_a_bar_lies_along_what_it_spreads_over() -> None:
+    selected, middles = np.zeros((4, 9, 9), np.bool_), np.empty((4, 2))
+    assert not _kernels.find_middles(selected, middles)
+    assert np.isnan(middles).all()
+    selected[0, 1, 5] = selected[2, 8, 6] = True
+    assert not _kernels.find_middles(selected, middles)
+    assert _kernels.find_middles(selected.swapaxes(1, 2).copy(), middles)
 
 
 def own_motion(shift: np.ndarray, information: np.ndarray, when: np.ndarray) -> np.ndarray:
@@ -573,48 +552,26 @@ def test_rounds_of_fits(seed: int) -> None:
     seen[i, v] = twin.cells(twin.fit)[:, 3] + rng.normal(0, 0.1, len(b))
     # One boundary is out of line, and the bar shakes.
     seen[:, v[b == 5]] = rng.normal(0, 0.5, seen[:, v[b == 5]].shape)
-    profile, start = _profile(SHARE), twin.fit * [1.003, 1, 1, 1, 1, 1, 1]
-    fit, by_boundary = start.copy(), np.empty((3, K + 1))
-    variance = _kernels.fit_bar(
-        twin.codes, twin.known, twin.offset, twin.when, profile, BLUR, DIM, 0.5, PRIOR, seen,
-        (12, 2, 1e-3, 1e-5), (6, 4.0, 0.25, 0.3), fit, by_boundary,
-    )  # fmt: skip
-    known, moved, want = twin.known, twin.offset, start.copy()
-    by, by_value, scores, normal = (
-        np.empty((3, K + 1)),
-        np.empty((2, 6)),
-        np.empty((110, 7)),
-        np.empty((7, 7)),
+    start = twin.fit * [1.003, 1, 1, 1, 1, 1, 1]
+    fit, light = start.copy(), (twin.profile, twin.lens)
+    fitted, by_boundary, got, equations = _kernels.fit_bar(
+        twin.codes, twin.known, twin.motion, seen, *light, 6, fit
     )
-    first, last = np.empty((2, K + 1, 6), np.int64)
+    assert fitted
+    variance = _kernels.spacing_variance(by_boundary[0], by_boundary[1], got, equations)
+    known, motion, want = twin.known, twin.motion.copy(), start.copy()
+    by, by_value, scores, normal = (np.empty(n) for n in ((3, K + 1), (2, 6), (110, 7), (7, 7)))
     for left in (2, 1, 0):
-        tolerance = 1e-3 if left else 1e-5
-        assert _kernels.solve(
-            twin.codes, known, moved, twin.when, profile, BLUR, DIM, 0.5, PRIOR, seen, 12, tolerance,
-            want, normal, first, last,
-        )  # fmt: skip
-        noise, _, _ = _kernels.leftovers(
-            twin.codes,
-            first,
-            last,
-            moved,
-            twin.when,
-            profile,
-            BLUR,
-            DIM,
-            0.5,
-            seen,
-            want,
-            by,
-            by_value,
-            scores,
-        )
+        reach = _kernels.REACH * BLUR * np.exp(want[4])
+        steps = _kernels.list_steps(twin.codes, known, motion, reach, want, seen)
+        assert _kernels.solve(*steps, *light, 1e-3 if left else 1e-5, want, normal)
+        noise, _, _ = _kernels.leftovers(*steps, *light, want, by, by_value, scores)
         used = by[1] > 0
         if left:
             most = max(4 * 1.4826 * np.median(np.abs(by[0, used])), 0.25)
             known = known & (np.abs(by[0]) <= most)[:, None]
-            shift = by_value[0] + moved - twin.offset
-            moved = twin.offset + own_motion(shift, by_value[1] / noise, twin.when)
+            shift = by_value[0] + motion[0] - twin.offset
+            motion[0] = twin.offset + own_motion(shift, by_value[1] / noise, twin.when)
     assert_allclose(fit, want, rtol=1e-6)
     assert_allclose(by_boundary, by, rtol=1e-5, atol=1e-9)
     rows = int(np.count_nonzero(scores[:, 3]))
@@ -643,37 +600,18 @@ def test_how_dim_negative_values_are(spacing: float) -> None:
                     answers[up].append((mine > 0 if up else mine < 0).ravel())
     shares = {up: np.concatenate(of).mean() for up, of in answers.items()}
     pilots = PILOTS.astype(np.float64)
-    assert _kernels.dimmer(sums, pilots, seen, place) == pytest.approx(shares[False] / shares[True])
-    assert _kernels.dimmer(-np.abs(sums), pilots, seen, place) == 1.0
-
-
-@pytest.mark.parametrize("spacing", [5.0, -5.0])
-def test_a_bar_is_read_upright(spacing: float) -> None:
-    rng = np.random.default_rng(2)
-    sums, seen = rng.integers(-5, 6, (32, 90, 15)).astype(np.int16), np.ones(K, np.bool_)
-    pilots, words = PILOTS.astype(np.float64), WORDS.astype(np.float64)
-    symbols, first = rng.integers(0, len(words), K), 6.0 if spacing > 0 else 83.0
-    codes, known, want = np.empty((K, 16)), np.empty((K + 1, 16), np.bool_), np.empty((16, 90))
-    moved, values = rng.normal(0, 1, 16), np.empty((16, 90))
-    before, place = moved.copy(), np.array([first, spacing, 7.0, 0.01, 2.0])
-    dim = _kernels.read_bar(sums, pilots, words, symbols, seen, place, 3.0, 0.3, codes, known, moved, values)
-    ends = first - spacing / 2, first + (K - 0.5) * spacing
-    _kernels.bar_values(sums, place[2:4], 2.0, *ends, 3.0, 0.3, want)
-    way = 1 if spacing > 0 else -1
-    np.testing.assert_array_equal(values, want[:, ::way])
-    np.testing.assert_array_equal(moved, way * before)
-    np.testing.assert_array_equal(codes[:, 8:], words[symbols])
-    assert dim == _kernels.dimmer(sums, pilots, seen, place)
+    assert _kernels.measure_dim(sums, pilots, seen, place) == pytest.approx(shares[False] / shares[True])
+    assert _kernels.measure_dim(-np.abs(sums), pilots, seen, place) == 1.0
 
 
 def fit_of(codes, known, dim, values, start):
     """The fit of a frame's values, of boundaries .45 px wide without tails, and where they lie off it."""
-    fit, by_boundary = start.copy(), np.empty((3, K + 1))
-    variance = _kernels.fit_bar(
-        codes, known, np.zeros(16), (np.arange(16) + 0.5) / 16 - 0.5, _profile(1.0), 0.45, dim, 9.0, _PRIOR,
-        values, (12, 2, 1e-3, 1e-5), (6, 4.0, 0.25, 0.3), fit, by_boundary,
-    )  # fmt: skip
-    assert variance > 0
+    motion, fit = np.stack([np.zeros(16), (np.arange(16) + 0.5) / 16 - 0.5]), start.copy()
+    fitted, by_boundary, scores, normal = _kernels.fit_bar(
+        codes, known, motion, values, profile(1.0), np.array([0.45, dim]), 6, fit
+    )
+    assert fitted
+    assert _kernels.spacing_variance(by_boundary[0], by_boundary[1], scores, normal) > 0
     return fit, by_boundary[:, 1:-1]
 
 
