@@ -8,6 +8,7 @@ checks.
 import argparse
 import random
 import re
+import resource
 import sys
 import tempfile
 import time
@@ -21,9 +22,21 @@ from tests.fuzz.mutate import damaged
 from tests.fuzz.test_readers import store_of
 
 
+MOST_S, MOST_MB = 20, 500
+
+
 def _words(message: str) -> str:
     """A message without its places and values."""
     return " ".join(re.findall(r"\b[a-z]{3,}\b", re.sub(r"'[^']*'|\S*[/\d]\S*", "", message)))
+
+
+def _expect_little(spent_s: float) -> None:
+    """Raise where a file took too long, or this process has ever been too large."""
+    peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    if spent_s > MOST_S or peak_mb > MOST_MB:
+        raise RuntimeError(
+            f"{spent_s:.1f} s, {peak_mb:.0f} MB, expected {MOST_S} s, {MOST_MB} MB at the most"
+        )
 
 
 def main() -> None:
@@ -46,8 +59,10 @@ def main() -> None:
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(data)
             read[kind.name] += 1
+            began_s = time.monotonic()
             try:
                 kind.read(path)
+                _expect_little(time.monotonic() - began_s)
             except EvlcpError as fault:
                 refused[kind.name] += 1
                 words.setdefault(kind.name, set()).add(_words(str(fault)))
@@ -59,6 +74,7 @@ def main() -> None:
     for kind in chosen:
         print(f"{kind.name:14} {read[kind.name]:7} files, {refused[kind.name]:7} refused,", end=" ")
         print(f"in {len(words.get(kind.name, ()))} different words")
+    print(f"{resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:.0f} MB at the most")
     sys.exit(f"{faults} faults: see {kept}/" if faults else 0)
 
 
