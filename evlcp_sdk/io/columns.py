@@ -15,6 +15,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.fields import Polarities, RowError, TimeUnit, time_unit
 from evlcp_sdk.io.tables import DAMAGE, said
+from evlcp_sdk.io.writers import LAST_TIME_US
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
@@ -263,7 +264,8 @@ def _in_order(events: Events, window_us: float) -> Events:
 def _step_us(unit: TimeUnit, times: NDArray[Any]) -> int:
     """What all times are multiples of, us, but for the first; 0 where there are too few to tell."""
     finite = times[np.isfinite(times)] if times.dtype.kind == "f" else times
-    steps = np.diff(np.unique(finite)) * unit.factor
+    with np.errstate(over="ignore"):
+        steps = np.diff(np.unique(finite)) * unit.factor
     if len(finite) < 1000:
         return 0
     if not len(steps):
@@ -272,7 +274,8 @@ def _step_us(unit: TimeUnit, times: NDArray[Any]) -> int:
     if times.dtype.kind == "f" and times.dtype.itemsize == 8:
         digits = np.spacing(np.abs(finite).max()) * unit.factor
         steps = steps[steps > 4 * digits] if digits > 0.01 else steps
-    return math.gcd(*np.rint(steps[steps >= 0.5]).astype(np.int64).tolist()) if len(steps) else 0
+    sure = np.rint(steps[(steps >= 0.5) & (steps < LAST_TIME_US)]).astype(np.int64)
+    return math.gcd(*sure.tolist())
 
 
 def _in_words(step_us: int) -> str:

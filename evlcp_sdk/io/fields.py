@@ -357,7 +357,7 @@ class _Rates:
     """Events a second of some times, by unit."""
 
     def __init__(self, inside: NDArray[Any], most_hz: float) -> None:
-        self.span = float(inside[-1] - inside[0]) if len(inside) > 1 else 0.0
+        self.span = float(inside[-1]) - float(inside[0]) if len(inside) > 1 else 0.0
         self._intervals, self.most_hz = len(inside) - 1, most_hz
 
     def of(self, unit: str) -> float:

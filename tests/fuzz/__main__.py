@@ -21,7 +21,6 @@ from tests.fuzz.corpus import kinds
 from tests.fuzz.mutate import damaged
 from tests.fuzz.test_readers import store_of
 
-
 MOST_S, MOST_MB = 20, 500
 
 
