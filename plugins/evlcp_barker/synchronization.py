@@ -1,7 +1,7 @@
 """Packet timing by sliding correlation with the preamble."""
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_barker.bound import due_chips, guard_chips, least_correlation
+from evlcp_barker.preamble import find_peaks, time_preamble
 from evlcp_sdk.air.codebook import Codebook, are_pairs
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
@@ -43,9 +44,14 @@ _CLEARLY = 0.1
 _QUALITY_PACKETS = 8
 """Packets over which a lock's correlation is averaged."""
 
-_OUTSTANDS = 6.0
-"""A correlation so many times the rms of a packet's others is a preamble: random data reach 5 in 20 s. The
-rms is no less than one over the root of the events' number, which is that of random signs."""
+_STEPS = 10
+"""Correlation steps in a chip: a peak's flat top is a chip long, and its middle is found between steps."""
+
+_MIN_EVENTS = 100
+"""Events of a preamble that counts as detected: of fewer, random signs may agree with its 26 chips."""
+
+_ON_GRID_CHIPS = 0.6
+"""How far from its expected time a preamble keeps the lock; latency grows by 0.5 behind a wiper."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +69,6 @@ class BarkerSync(Synchronization):
     From which correlation on it is a preamble follows from the codes: see `evlcp_barker.bound`.
     """
 
-    steps_per_chip: Annotated[int, Field(ge=4, le=100, description="Correlation steps in a chip.")] = 10
     min_correlation: Annotated[
         float,
         Field(
@@ -73,21 +78,9 @@ class BarkerSync(Synchronization):
             " times the rms of a packet's others. 0: by the codebook, 0.5 for the built-in one.",
         ),
     ] = 0.0
-    min_events: Annotated[int, Field(ge=26, description="Events of a preamble that counts as detected.")] = (
-        100
-    )
     clock_tolerance_ppm: Annotated[
         float, Field(gt=0, le=10_000, description="How far apart the two clocks may be: a bound.")
     ] = 100.0
-    on_grid_chips: Annotated[
-        float,
-        Field(
-            gt=0,
-            lt=1,
-            description="How far from its expected time a preamble keeps the lock; latency"
-            " grows by 0.5 behind a wiper.",
-        ),
-    ] = 0.6
 
     def compile(self, codebook: Codebook, packet: PacketFormat) -> "BarkerSynchronizer":
         """Precompute the correlation's weights."""
@@ -171,10 +164,10 @@ class BarkerSynchronizer:
         self._spec = spec
         self._packet = packet
         # Events come behind edges, and late ones agree with the chip that they come in.
-        self._chips = 2.0 * codebook.preamble - 1
+        self._chips = 2 * codebook.preamble.astype(np.float64) - 1
         self._pair = 2 if are_pairs(codebook.preamble) else 1
         self._due = due_chips(codebook.preamble)
-        self._bin_us = packet.chip_us / spec.steps_per_chip
+        self._bin_us = packet.chip_us / _STEPS
         self._rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
         if not len(self._rising):
             raise ConfigError("synchronization 'barker': a preamble without a rise finds no time")
@@ -190,9 +183,7 @@ class BarkerSynchronizer:
         self, state: SyncState, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
     ) -> tuple[SyncState, list[SyncLock]]:
         """Count events, correlate what is complete, give a lock for each preamble (see `Synchronizer`)."""
-        n = self._spec.steps_per_chip
-        span = n * len(self._chips)
-        guard = n * self._guard_chips
+        span, guard = _STEPS * len(self._chips), _STEPS * self._guard_chips
         until_bin = int(until_us // self._bin_us)
         if state.first_bin is None:
             # A preamble starts with a dark chip: the first event may already be the edge at its end.
@@ -211,36 +202,21 @@ class BarkerSynchronizer:
         locks: list[SyncLock] = []
         power, known, clock, stray = state.power, state.known, state.clock, state.stray
         lo = state.next_bin - state.first_bin
+        _kernels.count_bins(plain(t_us), plain(p), state.first_bin, self._bin_us, state.counts, counts)
         if lags - guard > lo:
-            rho, enough = np.empty(lags), np.empty(lags - guard - lo)
+            rho, squares = np.empty(lags), np.empty(lags - guard - lo)
+            top = _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)
             # Half of a packet's correlations are positive.
-            memory = n * self._packet.packet_chips // 2
-            top, power, known = _kernels.listen(
-                plain(t_us),
-                plain(p),
-                (state.first_bin, self._bin_us, lo, lags - guard),
-                state.counts,
-                self._chips,
-                self._due,
-                n,
-                self._spec.min_events,
-                (power, known, memory),
-                counts,
-                rho,
-                enough,
-            )
+            past = power, known, _STEPS * self._packet.packet_chips // 2
+            power, known = _kernels.mean_squares(rho, counts, span, lo, past, squares)
             if 2 * top >= self._least:
-                lags_found = np.empty(len(enough), np.int64)
-                many = _kernels.peaks(rho, lo, guard, enough, _OUTSTANDS, self._least, lags_found)
-                for lag in lags_found[:many].tolist():
+                for lag in find_peaks(rho, lo, guard, squares, self._least):
                     found = self._refine(lag, counts, state.first_bin, float(rho[lag]))
                     before = clock
                     clock, stray = self._accept(clock, stray, found)
                     if clock is not None and clock is not before:
                         locks.append(self._lock(clock, found.quality))
             lo = lags - guard
-        else:
-            _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
         drop = max(lo - guard, 0)
         state = changed(
             state,
@@ -257,15 +233,13 @@ class BarkerSynchronizer:
 
     def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Heard:
         """Times of one preamble, for positive and negative events apart, us."""
-        # Without each chip in turn, a pair of pair codes, it says how sure it is.
-        middle_on, noise_on, middle_off, noise_off, onset, noise_onset = _kernels.refine(
-            counts, lag, self._chips, self._spec.steps_per_chip, self._pair, self._rising
-        )
-        if math.isnan(middle_on):
-            middle_on, noise_on = middle_off, noise_off
-        at = [(first_bin + v) * self._bin_us for v in (middle_on, middle_off, onset)]
-        noises = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in (noise_on, noise_off, noise_onset)]
-        return _Heard(at[0], at[1], at[2], quality, *noises)
+        times = time_preamble(counts, lag, self._chips, _STEPS, self._pair, self._rising)
+        if math.isnan(times.on):
+            times = replace(times, on=times.off, on_noise=times.off_noise)
+        at = [(first_bin + v) * self._bin_us for v in (times.on, times.off, times.onset)]
+        noises = (times.on_noise, times.off_noise, times.onset_noise)
+        sigmas = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in noises]
+        return _Heard(at[0], at[1], at[2], quality, *sigmas)
 
     def _accept(
         self, clock: _Clock | None, stray: _Heard | None, found: _Heard
@@ -327,7 +301,7 @@ class BarkerSynchronizer:
             return None
         expected, variance, _, _ = self._ahead(clock, packets)
         off_grid = abs(found.on_us - expected) - min(2 * math.sqrt(variance), packets * self._most_us())
-        return packets if off_grid < self._spec.on_grid_chips * self._packet.chip_us else None
+        return packets if off_grid < _ON_GRID_CHIPS * self._packet.chip_us else None
 
     def _next(self, clock: _Clock, found: _Heard, packets: int) -> _Clock:
         """The lock with a preamble more."""

@@ -511,7 +511,10 @@ def solve(
         if not outside:
             new_cost = equations(steps, seen, profile, lens, new_fit, new_normal, new_right)
         if new_cost <= cost:
-            fit[:], right[:], normal[:] = new_fit, new_right, new_normal
+            for a in range(FITTED):
+                fit[a], right[a] = new_fit[a], new_right[a]
+                for c in range(FITTED):
+                    normal[a, c] = new_normal[a, c]
             cost = new_cost
             damping /= 10
             if abs(move[0]) < tolerance * fit[0]:
@@ -609,16 +612,19 @@ def fit_bar(
 
 
 @njit(error_model="numpy")
-def spacing_variance(off: Array, weight: Array, scores: Array, normal: Array) -> float:
-    """Variance of the spacing, px2; NaN where the normal equations have no root.
+def assess_fit(by_boundary: Array, scores: Array, normal: Array) -> tuple[float, int, float]:
+    """Variance of the spacing, px2, of `leftovers`; NaN where the normal equations have no root.
 
-    The mean of that by rows as observations (sandwich estimator) and that by the scatter of the boundaries,
-    `off` and `weight` (K + 1,), of `leftovers`.
+    The mean of that by rows as observations (sandwich estimator) and that by the scatter of the boundaries.
+
+    Returns:
+        It; how many boundaries there are; and how much larger a wave in their places on the pixels, 1 px
+        high, makes the spacing, px.
     """
     inverse, scale, unit = np.empty(FITTED), np.empty(FITTED), np.zeros(FITTED)
     factor = np.empty((FITTED, FITTED))
     if not rooted(normal, 0.0, ROUNDING, scale, factor):
-        return np.nan
+        return np.nan, 0, 0.0
     # The spacing's row of the inverse: one column of it, as that is symmetric.
     unit[0] = 1.0
     substituted(factor, scale, unit, inverse)
@@ -629,15 +635,19 @@ def spacing_variance(off: Array, weight: Array, scores: Array, normal: Array) ->
             part += scores[v, a] * inverse[a]
         by_row += part * part
         rows += scores[v, 3] != 0
-    n, total, mean, spread, left_over = 0, 0.0, 0.0, 0.0, 0.0
-    for b in range(weight.size):
-        n += weight[b] > 0
-        total += weight[b]
-        mean += weight[b] * b
-        left_over += weight[b] * off[b] ** 2
+    n, total, mean, spread, left_over, wave = 0, 0.0, 0.0, 0.0, 0.0, 0.0
+    for b in range(by_boundary.shape[1]):
+        weight = by_boundary[1, b]
+        n += weight > 0
+        total += weight
+        mean += weight * b
+        left_over += weight * by_boundary[0, b] ** 2
     mean /= total
-    for b in range(weight.size):
-        spread += weight[b] * (b - mean) ** 2
+    for b in range(by_boundary.shape[1]):
+        pull = by_boundary[1, b] * (b - mean)
+        spread += pull * (b - mean)
+        wave += pull * by_boundary[2, b]
     if spread <= 0:
-        return np.nan
-    return (by_row * rows / max(rows - FITTED, 1) + left_over / max(n - 2, 1) / spread) / 2
+        return np.nan, n, 0.0
+    variance = (by_row * rows / max(rows - FITTED, 1) + left_over / max(n - 2, 1) / spread) / 2
+    return variance, n, wave / spread

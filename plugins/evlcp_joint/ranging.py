@@ -115,7 +115,7 @@ class JointScaleRanging(Ranging):
         words = codebook.codeword_values.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
         when = (np.arange(n := pilots.shape[1] + words.shape[1]) + 0.5) / n - 0.5
-        chips = 2 * n
+        chips, late_chips = 2 * n, float(n - pilots.shape[1])
 
         def measure(view: FrameView) -> Range:
             found = find_bar(view, chips)
@@ -136,7 +136,7 @@ class JointScaleRanging(Ranging):
             codes, known = known_codes(pilots, words, view.soft.symbols, seen)
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
             fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
-            fitted, (off, weight, wave), scores, normal = _kernels.fit_bar(
+            fitted, by_boundary, scores, normal = _kernels.fit_bar(
                 codes, known, motion, values, profile(_CORE_SHARE), lens, least, fit
             )
             spacing_px, centre_px = fit[:2].tolist()
@@ -144,24 +144,26 @@ class JointScaleRanging(Ranging):
             farthest = abs(spacing_px - spacing) * (clusters - 1) / 2 + abs(centre_px - centre)
             if not fitted or farthest > view.presence.grid_px + 1:
                 return _NONE
-            sigma_px = math.sqrt(_kernels.spacing_variance(off, weight, scores, normal))
-            if math.isnan(sigma_px):
+            variance, seen_boundaries, wider_px = _kernels.assess_fit(by_boundary, scores, normal)
+            if math.isnan(variance):
                 return _NONE
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
             stretch = math.hypot(1.0, tilt)
             distance = camera.distance_m(spacing_m, spacing_px * stretch)
-            late_chips = (chips - 2 * pilots.shape[1]) / 2
             one_px = spacing_m * spacing_px * stretch / distance
-            off, weight, wave = off[1:-1], weight[1:-1], wave[1:-1]
-            # A wave in the boundaries' places, 1 px high, makes the spacing so much larger.
-            apart = weight * (boundaries - weight @ boundaries / weight.sum())
-            wider = float(apart @ wave) / float(apart @ boundaries) / spacing_px
+            off, weight, wave = by_boundary[:, 1:-1]
             return Range(
                 distance,
-                distance * sigma_px / spacing_px,
-                int(np.count_nonzero(weight)),
+                distance * math.sqrt(variance) / spacing_px,
+                seen_boundaries,
                 late_chips,
-                Bend(boundaries.copy(), off / one_px, weight * one_px**2, wave / one_px, -distance * wider),
+                Bend(
+                    boundaries.copy(),
+                    off / one_px,
+                    weight * one_px**2,
+                    wave / one_px,
+                    -distance * wider_px / spacing_px,
+                ),
             )
 
         return measure

@@ -1,7 +1,7 @@
 """What the info segment of each cluster says."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,23 +22,37 @@ _MIN_WEIGHT = 0.01
 """Presence probability below which a cell is passed over: it adds nothing that is seen, but takes time."""
 
 
-def match_words(
-    values: NDArray[np.float64], by_value: NDArray[np.float64], bits: int
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Nearest words of values (K, n), their correlations, and by how much bits 0 correlate better than 1.
+class WordMatch(NamedTuple):
+    """Nearest words of a frame's values.
+
+    Attributes:
+        symbols: Of each cluster, int64 (K,).
+        best: Their correlations, float64 (K,).
+        margins: By how much words with a bit 0 correlate better than those with 1, max-log, float64
+            (K, bits).
+        agreement: Share of the values' sizes that agrees with the words.
+        least: The least size of a margin.
+    """
+
+    symbols: NDArray[np.int64]
+    best: NDArray[np.float64]
+    margins: NDArray[np.float64]
+    agreement: float
+    least: float
+
+
+def match_words(values: NDArray[np.float64], by_value: NDArray[np.float64], bits: int) -> WordMatch:
+    """Nearest words of values, float64 (K, n).
 
     Args:
-        values: Of each cluster, float64 (K, n).
+        values: Of each cluster.
         by_value: The words, float64 (n, 2**bits or more); those beyond 2**bits carry no bits.
         bits: Of a symbol.
-
-    Returns:
-        int64 (K,), float64 (K,), float64 (K, bits): max-log, without its scale.
     """
     symbols, best = np.empty(len(values), np.int64), np.empty(len(values))
     margins = np.empty((len(values), bits))
-    _kernels.match_words(values, by_value, symbols, best, margins)
-    return symbols, best, margins
+    agreement, least = _kernels.match_words(values, by_value, symbols, best, margins)
+    return WordMatch(symbols, best, margins, agreement, least)
 
 
 @dataclass(frozen=True)
@@ -62,7 +76,7 @@ class WhTransform(Decoding):
             values = np.zeros((len(probability), length))
             info = plain(sums[pilot_chips:])
             _kernels.weighted_values(info, probability, presence.grid_px, _MIN_WEIGHT, values)
-            symbols, best, margins = match_words(values, by_value, codebook.bits_per_symbol)
+            symbols, best, margins, _, _ = match_words(values, by_value, codebook.bits_per_symbol)
             energy, explained = float((values**2).sum()), float((best**2).sum()) / length
             rest = max(energy - explained, 1e-3 * energy, 1e-9)
             scale = max(float(best.mean()) / length, 0.0) * values.size / rest

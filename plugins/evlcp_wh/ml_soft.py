@@ -63,8 +63,7 @@ class LearnedDecoder:
     """`MlSoft` for the pilots and codewords of a codebook of pair codes."""
 
     def __init__(self, codebook: Codebook) -> None:
-        self._words = codebook.codeword_edges.astype(np.float64)
-        self._by_value = np.ascontiguousarray(self._words.T)
+        self._by_value = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
         # Unsigned, as indices below 0 would count from the end.
         self._signs = (codebook.pilot_edges > 0).astype(np.uint64)
         self._bits = codebook.bits_per_symbol
@@ -90,13 +89,8 @@ class LearnedDecoder:
         values = np.zeros((len(seen), len(pairs) - self._signs.shape[1]))
         odds = (1 - _PIXEL_SHARE) / _PIXEL_SHARE
         _kernels.sum_worth(pairs, width, self._signs, seen, grid, _MIN_WEIGHT, worth, odds, values)
-        symbols, _, margins = match_words(values, self._by_value, self._bits)
-        llr = (margins * (INDEPENDENT_PIXELS / 2)).astype(np.float32)
-        size = np.abs(values)
-        agrees = float(size[values * self._words[symbols] > 0].sum())
-        quality = agrees / float(size.sum()) if agrees else 0.0
-        return (
-            SoftSymbols(symbols, llr, quality),
-            float(np.abs(llr).min()),
-            worth.reshape(2 * MAX_EVENTS + 1, -1),
-        )
+        found = match_words(values, self._by_value, self._bits)
+        scale = INDEPENDENT_PIXELS / 2
+        llr = (found.margins * scale).astype(np.float32)
+        soft = SoftSymbols(found.symbols, llr, found.agreement)
+        return soft, found.least * scale, worth.reshape(2 * MAX_EVENTS + 1, -1)

@@ -1,4 +1,4 @@
-"""The Barker kernels once more in NumPy, and the events of a region whose clusters blink as told."""
+"""Synchronization once more in NumPy or plain loops, and events of clusters that blink as told."""
 
 import numpy as np
 
@@ -45,50 +45,55 @@ def raise_to_chance(counts, span, first, squares):
 
 
 def peaks(rho, first, guard, enough, outstands, least):
-    """Lags that are enough and the first maximum of the lags about them."""
-    wanted = np.clip(outstands * np.sqrt(enough), least / 2, least)
-    high = first + np.flatnonzero(rho[first : first + len(enough)] >= wanted)
-    return [k for k in high if k == (low := max(k - guard, 0)) + np.argmax(rho[low : k + guard + 1])]
-
-
-def refine(counts, lag, chips, steps, pair, rising):
-    """All lags, and all that is left out, laid out as tables."""
-    lags = np.arange(max(lag - steps, 0), min(lag + steps + 1, counts.shape[1] - steps * len(chips) + 1))
-    bounds = lags[:, None] + steps * np.arange(len(chips) + 1)
+    """Lags that are enough, and more than those before and no less than those after, one by one."""
     found = []
-    for count, sign in ((counts[1], 1), (counts[0], -1)):
-        running = np.concatenate([[0.0], np.cumsum(count)])
-        values = sign * chips * np.diff(running[bounds], axis=1)
-        values = values.reshape(len(bounds), -1, pair).sum(2)
-        found += [lags[0] + middles(values.sum(1)[None])[0]]
-        found += [jackknife(middles(values.sum(1) - values.T))]
-    at = lag + steps * rising[:, None] + np.arange(-steps, steps)
-    response = counts[1][np.clip(at, 0, counts.shape[1] - 1)]
-    found += [lag - steps + onsets(response.sum(0)[None])[0], jackknife(onsets(response.sum(0) - response))]
+    for i, square in enumerate(enough):
+        lag = first + i
+        if rho[lag] < least and not rho[lag] >= max(outstands * np.sqrt(square), least / 2):
+            continue
+        before, after = rho[max(lag - guard, 0) : lag], rho[lag + 1 : lag + guard + 1]
+        if all(value < rho[lag] for value in before) and all(value <= rho[lag] for value in after):
+            found.append(lag)
     return found
 
 
-def middles(fits):
-    top = fits.max(1, keepdims=True)
-    weight = np.maximum(fits - 0.9 * top, 0)
-    total = weight.sum(1)
-    found = weight @ np.arange(fits.shape[1])
-    return np.where(top[:, 0] > 0, found / np.where(total > 0, total, 1), np.nan)
+def refine(counts, lag, chips, steps, pair, rising):
+    """Chip by chip and lag by lag, in plain loops."""
+    first, last = max(lag - steps, 0), min(lag + steps + 1, counts.shape[1] - steps * len(chips) + 1)
+    found = []
+    for count, sign in ((counts[1], 1), (counts[0], -1)):
+        values = np.zeros((len(chips) // pair, last - first))
+        for c, chip in enumerate(chips):
+            for i in range(last - first):
+                begin = first + i + steps * c
+                values[c // pair, i] += sign * chip * count[begin : begin + steps].sum()
+        found += [first + middle(values.sum(0)), jackknife([middle(values.sum(0) - one) for one in values])]
+    response = np.empty((len(rising), 2 * steps))
+    for e, i in np.ndindex(response.shape):
+        response[e, i] = counts[1][min(max(lag + steps * rising[e] + i - steps, 0), counts.shape[1] - 1)]
+    whole = response.sum(0)
+    return [*found, lag - steps + onset(whole), jackknife([onset(whole - one) for one in response])]
 
 
-def onsets(responses):
-    always = np.sort(responses, axis=1)[:, responses.shape[1] // 4]
-    half = (always + responses.max(1)) / 2
-    k = (responses >= half[:, None]).argmax(1)
-    rows = np.arange(len(responses))
-    at, below = responses[rows, k], np.where(k > 0, responses[rows, k - 1], 0.0)
-    rises = at > below
-    return k - 0.5 + np.where(rises, (half - below) / np.where(rises, at - below, 1), 0.0)
+def middle(fit):
+    top = max(fit)
+    if not top > 0:
+        return np.nan
+    weight = [max(value - 0.9 * top, 0.0) for value in fit]
+    return sum(w * i for i, w in enumerate(weight)) / sum(weight)
+
+
+def onset(response):
+    half = (sorted(response)[len(response) // 4] + max(response)) / 2
+    k = next(k for k, value in enumerate(response) if value >= half)
+    below = response[k - 1] if k > 0 else 0.0
+    return k - 0.5 + ((half - below) / (response[k] - below) if response[k] > below else 0.0)
 
 
 def jackknife(without):
-    without = without[np.isfinite(without)]
-    return (len(without) - 1) * without.var() if len(without) else 0.0
+    without = [value for value in without if np.isfinite(value)]
+    mean = sum(without) / max(len(without), 1)
+    return (len(without) - 1) * sum((v - mean) ** 2 for v in without) / len(without) if without else 0.0
 
 
 def events_of(

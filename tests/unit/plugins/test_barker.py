@@ -9,6 +9,7 @@ import pytest
 from evlcp_barker import _kernels
 from evlcp_barker.bound import due_chips, guard_chips, least_correlation, preamble_share
 from evlcp_barker.pilots import Barker13Pilots
+from evlcp_barker.preamble import OUTSTANDS, find_peaks, time_preamble
 from evlcp_barker.synchronization import BarkerSync
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.pilots import WhPilots
@@ -117,31 +118,16 @@ def test_correlation(seed, steps, min_events, share):
     assert abs(int(rho.argmax()) - at) <= 1
 
 
-def test_listening_counts_correlates_and_follows_the_mean_square():
-    rng = np.random.default_rng(0)
-    t, p = np.sort(rng.integers(0, 9000, 4000)), rng.integers(0, 2, 4000).astype(np.uint8)
-    chips, due, known = 2.0 * chips_of_values(BARKER13) - 1, np.ones(26, bool), rng.random((2, 40))
-    counts, want = np.empty((2, 801)), np.empty((2, 801))
-    lags = 800 - 26 * 10 + 1
-    rho, expected, enough, squares = np.empty(lags), np.empty(lags), np.empty(500), np.empty(500)
-    bins, past = (0, 11.25, 20, 520), (0.01, 70, 100)
-    found = _kernels.listen(t, p, bins, known, chips, due, 10, 0, past, counts, rho, enough)
-    _kernels.count_bins(t, p, 0, 11.25, known, want)
-    top = _kernels.correlate(want[:, :800], chips, due, 10, 0, expected)
-    assert found == (top, *_kernels.mean_squares(expected[20:520], *past, squares))
-    squares = twins.raise_to_chance(want[:, :800], 260, 20, squares)
-    for one, other in ((counts, want), (rho, expected), (enough, squares)):
-        assert_array_equal(one, other)
-
-
-@pytest.mark.parametrize("first", [0, 30, 41])
-def test_mean_squares_are_no_less_than_chance(first):
-    rng = np.random.default_rng(first)
+@pytest.mark.parametrize("lag", [0, 30, 41])
+def test_mean_squares_are_no_less_than_chance(lag):
+    rng = np.random.default_rng(lag)
     counts = rng.poisson(np.linspace(3, 0, 100) ** 2 / 3, (2, 100)).astype(float)
-    squares = rng.uniform(0, 0.05, 60 - first)
-    want = twins.raise_to_chance(counts, 40, first, squares)
-    assert 0 < np.count_nonzero(want > squares) < len(want)
-    _kernels.raise_to_chance(counts, 40, first, squares)
+    rho, past = rng.uniform(0, 0.36, 60), (0.03, 10, 10)
+    squares, plain = np.empty(60 - lag), np.empty(60 - lag)
+    end = _kernels.mean_squares(rho, counts, 40, lag, past, squares)
+    assert _kernels.mean_squares(rho, np.full((2, 100), 1e9), 40, lag, past, plain) == end == (plain[-1], 10)
+    want = twins.raise_to_chance(counts, 40, lag, plain)
+    assert 0 < np.count_nonzero(want > plain) < len(want)
     assert_allclose(squares, want, rtol=1e-12)
 
 
@@ -168,13 +154,13 @@ def test_noise_that_ends_at_once_is_no_preamble(rate_hz):
 def test_mean_square_of_the_positive(seed):
     rng = np.random.default_rng(seed)
     rho = np.maximum(rng.normal(0, 0.1, 300), 0)
-    out, parts = np.empty(300), np.empty(300)
-    power, known = _kernels.mean_squares(rho, 0.0, 0, 100, out)
+    out, parts, crowd = np.empty(300), np.empty(300), np.full((2, 340), 1e9)
+    power, known = _kernels.mean_squares(rho, crowd, 40, 0, (0.0, 0, 100), out)
     want = twins.mean_squares(rho, 100)
     assert_allclose(out, want, rtol=1e-12)
     assert (power, known) == (out[-1], 100)
-    middle = _kernels.mean_squares(rho[:77], 0.0, 0, 100, parts[:77])
-    assert _kernels.mean_squares(rho[77:], *middle, 100, parts[77:]) == (power, known)
+    middle = _kernels.mean_squares(rho, crowd, 40, 0, (0.0, 0, 100), parts[:77])
+    assert _kernels.mean_squares(rho, crowd, 40, 77, (*middle, 100), parts[77:]) == (power, known)
     assert_array_equal(parts, out)
 
 
@@ -184,10 +170,8 @@ def test_peaks(seed):
     # Few values, so that some are alike.
     rho = rng.integers(0, 40, 400) / 50
     enough = np.concatenate([np.full(50, np.inf), rng.uniform(0, 0.02, 300)])
-    found = np.empty(350, np.int64)
-    n = _kernels.peaks(rho, 20, 10, enough, 6.0, 0.65, found)
-    want = twins.peaks(rho, 20, 10, enough, 6.0, 0.65)
-    assert found[:n].tolist() == want
+    want = twins.peaks(rho, 20, 10, enough, OUTSTANDS, 0.65)
+    assert find_peaks(rho, 20, 10, enough, 0.65) == want
     assert len(want) > 1
 
 
@@ -203,9 +187,13 @@ def test_times_of_a_preamble(lag, pair, off):
     counts[0, lag : lag + 260] += rng.poisson(1.5 * (part < 0))
     counts[0] *= off
     rising = np.flatnonzero(np.diff(chips) > 0) + 1
-    found = _kernels.refine(counts, lag, chips, steps, pair, rising)
-    assert_allclose(found, twins.refine(counts, lag, chips, steps, pair, rising), rtol=1e-9, atol=1e-12)
-    assert np.isnan(found[2]) == (not off)
+    found = time_preamble(counts, lag, chips, steps, pair, rising)
+    on, on_noise, off_at, off_noise, onset, onset_noise = twins.refine(
+        counts, lag, chips, steps, pair, rising
+    )
+    want = on, off_at, onset, on_noise, off_noise, onset_noise
+    assert_allclose(astuple(found), want, rtol=1e-9, atol=1e-12)
+    assert np.isnan(found.off) == (not off)
 
 
 # From which correlation on it is a preamble

@@ -558,7 +558,7 @@ def test_rounds_of_fits(seed: int) -> None:
         twin.codes, twin.known, twin.motion, seen, *light, 6, fit
     )
     assert fitted
-    variance = _kernels.spacing_variance(by_boundary[0], by_boundary[1], got, equations)
+    variance, seen_boundaries, wider_px = _kernels.assess_fit(by_boundary, got, equations)
     known, motion, want = twin.known, twin.motion.copy(), start.copy()
     by, by_value, scores, normal = (np.empty(n) for n in ((3, K + 1), (2, 6), (110, 7), (7, 7)))
     for left in (2, 1, 0):
@@ -581,6 +581,9 @@ def test_rounds_of_fits(seed: int) -> None:
     spread = np.linalg.inv((terms * by[1, used]) @ terms.T)[0, 0]
     by_scatter = spread * (by[1, used] * by[0, used] ** 2).sum() / (len(place) - 2)
     assert variance == pytest.approx((by_row + by_scatter) / 2, rel=1e-5)
+    assert seen_boundaries == len(place)
+    line = np.polyfit(place, by[2, used], 1, w=np.sqrt(by[1, used]))
+    assert wider_px == pytest.approx(line[0], rel=1e-5)
 
 
 @pytest.mark.parametrize("spacing", [5.3, -5.3])
@@ -611,7 +614,7 @@ def fit_of(codes, known, dim, values, start):
         codes, known, motion, values, profile(1.0), np.array([0.45, dim]), 6, fit
     )
     assert fitted
-    assert _kernels.spacing_variance(by_boundary[0], by_boundary[1], scores, normal) > 0
+    assert _kernels.assess_fit(by_boundary, scores, normal)[0] > 0
     return fit, by_boundary[:, 1:-1]
 
 

@@ -123,11 +123,13 @@ def test_words_are_matched(clusters, bits, length, more):
     rng = np.random.default_rng(bits)
     words = rng.choice([-1.0, 1.0], (2**bits + more, length))
     for values in (rng.normal(size=(clusters, length)), np.zeros((clusters, length))):
-        symbols, best, margins = match_words(values, np.ascontiguousarray(words.T), bits)
-        want_symbols, want_best, want = twins.match_words(values, words)
-        assert_array_equal(symbols, want_symbols)
-        assert_allclose(best, want_best, rtol=1e-9, atol=1e-12)
-        assert_allclose(margins, want, rtol=1e-9, atol=1e-12)
+        found = match_words(values, np.ascontiguousarray(words.T), bits)
+        symbols, best, margins, agreement = twins.match_words(values, words)
+        assert_array_equal(found.symbols, symbols)
+        assert_allclose(found.best, best, rtol=1e-9, atol=1e-12)
+        assert_allclose(found.margins, margins, rtol=1e-9, atol=1e-12)
+        assert found.agreement == pytest.approx(agreement)
+        assert found.least == np.abs(found.margins).min()
 
 
 def signs_of(codes):

@@ -170,4 +170,7 @@ def log_ratio(counts, prior):
 def match_words(values, words):
     fit = values @ words.T
     zero, one = max_log(fit, len(words).bit_length() - 1)
-    return fit.argmax(1), fit.max(1), zero - one
+    symbols = fit.argmax(1)
+    agrees = np.sign(values) * words[symbols] > 0
+    agreement = np.abs(values)[agrees].sum() / max(np.abs(values).sum(), 1e-9)
+    return symbols, fit.max(1), zero - one, agreement
