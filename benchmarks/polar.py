@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 from evlcp_polar import _kernels
-from evlcp_polar.correction import Polar
+from evlcp_polar.correction import Polar, list_nodes
 from evlcp_reed_solomon.correction import ReedSolomon
 from numpy.typing import NDArray
 from scipy import stats
@@ -142,9 +142,7 @@ def by_approximation(code: Any, error_rate: float) -> Any:
     mean[np.setdiff1d(np.arange(n), code.sent)] = 0
     information = np.zeros(n, bool)
     information[np.argsort(mean, kind="stable")[-code.information.sum() :]] = True
-    nodes = np.empty((n, 3), np.int64)
-    nodes = nodes[: _kernels.schedule(information, nodes)].copy()
-    return replace(code, information=information, nodes=nodes)
+    return replace(code, information=information, nodes=list_nodes(information))
 
 
 def orders(blocks: int) -> None:

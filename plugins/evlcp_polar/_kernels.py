@@ -10,16 +10,8 @@ from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
 
-
-@njit
-def transform(bits: Array) -> None:
-    """Multiply by the Kronecker power of [[1, 0], [1, 1]], in place; its own inverse."""
-    half = 1
-    while half < len(bits):
-        for start in range(0, len(bits), 2 * half):
-            for i in range(start, start + half):
-                bits[i] ^= bits[i + half]
-        half *= 2
+FROZEN, REPEATED, FREE = 0, 1, 2
+"""Kinds of nodes: inputs that are all 0; all 0 but the last; all information."""
 
 
 @njit
@@ -76,97 +68,36 @@ def discrepancy_limit(weight: Array, log_share: float) -> float:
     return -1.0
 
 
-FROZEN, REPEATED, FREE = 0, 1, 2
-"""Kinds of nodes: inputs that are all 0; all 0 but the last; all information."""
-
-
 @njit
-def schedule(information: Array, nodes: Array) -> int:
-    """Split the inputs into the largest nodes that are decided at once; their number.
-
-    Args:
-        information: Which inputs carry information, bool (N,).
-        nodes: Filled with (first input, stage, kind) of each, int64 (N, 3).
-    """
-    n, at, first = len(information), 0, 0
-    while first < n:
-        stage = 0
-        kind = REPEATED if information[first] else FROZEN
-        while first >> stage & 1 == 0 and first + (2 << stage) <= n:
-            size = 2 << stage
-            inside = 0
-            for i in range(first, first + size):
-                inside += information[i]
-            if inside == 0:
-                kind = FROZEN
-            elif inside == 1 and information[first + size - 1]:
-                kind = REPEATED
-            elif inside == size:
-                kind = FREE
-            else:
-                break
-            stage += 1
-        nodes[at, 0], nodes[at, 1], nodes[at, 2] = first, stage, kind
-        at += 1
-        first += 1 << stage
-    return at
-
-
-@njit
-def _either(first: Array, second: Array, out: Array) -> None:
+def _either(one: Array, other: Array, out: Array) -> None:
     """LLR of the sum of two bits, min-sum."""
     for i in range(len(out)):
-        a, b = first[i], second[i]
+        a, b = one[i], other[i]
         least = min(abs(a), abs(b))
         out[i] = -least if (a < 0) != (b < 0) else least
 
 
 @njit
-def _both(first: Array, second: Array, known: Array, out: Array) -> None:
+def _both(one: Array, other: Array, known: Array, out: Array) -> None:
     """LLR of a bit seen twice, once added to a known one."""
     for i in range(len(out)):
-        a, b = first[i], second[i]
-        out[i] = b - a if known[i] else b + a
+        out[i] = other[i] - one[i] if known[i] else other[i] + one[i]
 
 
 @njit
-def _find_weakest(values: Array, found: Array) -> None:
-    """Fill `found` with the places of the values next to 0, the nearest first."""
-    count = 0
-    for i in range(len(values)):
-        at = min(count, len(found) - 1)
-        if at < count and not abs(values[i]) < abs(values[found[at]]):
-            continue
-        while at > 0 and abs(values[i]) < abs(values[found[at - 1]]):
-            found[at] = found[at - 1]
-            at -= 1
-        found[at] = i
-        count = min(count + 1, len(found))
-
-
-@njit
-def _fork(
-    metric: Array,
-    zero: Array,
-    one: Array,
-    limit: float,
-    alive: Array,
-    bit: Array,
-    origin: Array,
-    cost: Array,
-    which: Array,
-) -> int:
+def _fork(metric: Array, penalty: Array, limit: float, alive: Array, fork: Array) -> int:
     """Continue each path by bit 0 and bit 1, keep the best that have room; their number.
 
-    `zero` and `one` are what the bits add to the metric. Where both continuations of a path stay, that by 1
-    gets a free row; `origin` says of which path each row is the continuation.
+    `penalty` (2, size) is what the bits add to the metric. Where both continuations of a path stay, that by 1
+    gets a free row; `fork` (2, size) says of which path each row is the continuation, and by which bit.
     """
-    size = len(metric)
+    size, origin, bit = len(metric), fork[0], fork[1]
+    cost, which = np.empty(2 * size), np.empty(2 * size, np.int64)
     found = 0
     for path in range(size):
         if alive[path]:
             for value in range(2):
-                c = metric[path] + (one[path] if value else zero[path])
+                c = metric[path] + penalty[value, path]
                 # Insertion: equal ones keep their order, so that the result is determined.
                 i = found
                 while i > 0 and cost[i - 1] > c:
@@ -192,14 +123,103 @@ def _fork(
                 free += 1
             alive[free] = True
             origin[free] = path
-            metric[free] = metric[path] + one[path]
+            metric[free] = metric[path] + penalty[1, path]
             bit[free] = 1
-        if kept[path] & 1:
-            metric[path] += zero[path]
-            bit[path] = 0
-        elif kept[path]:
-            metric[path] += one[path]
-            bit[path] = 1
+        if kept[path]:
+            value = 0 if kept[path] & 1 else 1
+            metric[path] += penalty[value, path]
+            bit[path] = value
+    return count
+
+
+@njit
+def _decide_free(
+    stage: int,
+    alpha: Array,
+    rows: Array,
+    limit: float,
+    metric: Array,
+    alive: Array,
+    penalty: Array,
+    fork: Array,
+    codewords: Array,
+) -> int:
+    """Decide a node whose inputs are all free, in the first code bits of each path; the paths kept.
+
+    Of `size` paths none goes against more than the `size - 1` weakest signs of such a node.
+    """
+    size, length = len(metric), 1 << stage
+    splits = min(size - 1, length)
+    weakest = np.empty((size, splits), np.int64)
+    count = 0
+    for path in range(size):
+        if not alive[path]:
+            continue
+        count += 1
+        values, found, many = alpha[rows[0, path, stage], length:], weakest[path], 0
+        for i in range(length):
+            codewords[path, i] = values[i] < 0
+            # The places of the values next to 0, the nearest first.
+            at = min(many, splits - 1)
+            if splits == 0 or (at < many and not abs(values[i]) < abs(values[found[at]])):
+                continue
+            while at > 0 and abs(values[i]) < abs(values[found[at - 1]]):
+                found[at] = found[at - 1]
+                at -= 1
+            found[at] = i
+            many = min(many + 1, splits)
+    for split in range(splits):
+        for path in range(size):
+            if alive[path]:
+                penalty[0, path] = 0.0
+                penalty[1, path] = abs(alpha[rows[0, path, stage], length + weakest[path, split]])
+        count = _fork(metric, penalty, limit, alive, fork)
+        for path in range(size):
+            other = fork[0, path]
+            if alive[path] and other != path:
+                for s in range(rows.shape[2]):
+                    rows[0, path, s], rows[1, path, s] = rows[0, other, s], rows[1, other, s]
+                for s in range(splits):
+                    weakest[path, s] = weakest[other, s]
+                for i in range(length):
+                    codewords[path, i] = codewords[other, i]
+        for path in range(size):
+            if alive[path] and fork[1, path]:
+                codewords[path, weakest[path, split]] ^= 1
+    return count
+
+
+@njit
+def _decide_same(
+    stage: int,
+    alpha: Array,
+    rows: Array,
+    limit: float,
+    metric: Array,
+    alive: Array,
+    penalty: Array,
+    fork: Array,
+    codewords: Array,
+) -> int:
+    """Decide a node whose inputs are all 0 but the last: its code bits are all the same; the paths kept."""
+    size, length = len(metric), 1 << stage
+    for path in range(size):
+        if alive[path]:
+            penalty[0, path] = penalty[1, path] = 0.0
+            row = alpha[rows[0, path, stage]]
+            for i in range(length, 2 * length):
+                if row[i] < 0:
+                    penalty[0, path] -= row[i]
+                else:
+                    penalty[1, path] += row[i]
+    count = _fork(metric, penalty, limit, alive, fork)
+    for path in range(size):
+        if alive[path]:
+            other = fork[0, path]
+            for s in range(rows.shape[2]):
+                rows[0, path, s], rows[1, path, s] = rows[0, other, s], rows[1, other, s]
+            for i in range(length):
+                codewords[path, i] = fork[1, path]
     return count
 
 
@@ -214,129 +234,74 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
 
     Args:
         llr: LLRs of the N code bits, float32.
-        nodes: What `schedule` gives, int64 (nodes, 3).
+        nodes: (First input, stage, kind) of each, int64 (nodes, 3).
         size: Most paths; 1 is successive cancellation.
         limit: A path whose metric exceeds it is dropped.
         codewords: Filled with each path's code bits, uint8 (size, N).
         metric: Filled with each path's metric, float64 (size,).
     """
-    n = len(llr)
-    stages = 0
+    n, stages = len(llr), 0
     while 1 << stages < n:
         stages += 1
     # Stage s of a path lies at [2**s, 2**(s + 1)) of a row. All paths write a stage at one time, and read
-    # only the stages above (LLRs) or below (partial sums), so that a clone can share rows with its parent.
-    alpha = np.empty((size, 2 * n), np.float32)
-    beta = np.empty((size, n), np.uint8)
-    alpha_row = np.zeros((size, stages + 1), np.int64)
-    beta_row = np.zeros((size, stages + 1), np.int64)
+    # only the stages above (LLRs) or below (partial sums), so that a clone can share rows with its parent:
+    # `rows` of `alpha` and of `beta`.
+    alpha, beta = np.empty((size, 2 * n), np.float32), np.empty((size, n), np.uint8)
+    rows, alive = np.zeros((2, size, stages + 1), np.int64), np.zeros(size, np.bool_)
+    penalty, fork = np.empty((2, size)), np.empty((2, size), np.int64)
     for i in range(n):
         alpha[0, n + i] = llr[i]
-    alive = np.zeros(size, np.bool_)
-    alive[0] = True
-    count = 1
-    zero, one = np.zeros(size), np.zeros(size)
-    bit = np.zeros(size, np.uint8)
-    cost = np.empty(2 * size, np.float64)
-    which = np.empty(2 * size, np.int64)
-    origin = np.empty(size, np.int64)
-    weakest = np.empty((size, size), np.int64)
     for path in range(size):
-        metric[path] = 0.0
+        alive[path], metric[path] = path == 0, 0.0
     for node in range(len(nodes)):
         first, stage, kind = nodes[node, 0], nodes[node, 1], nodes[node, 2]
-        length = 1 << stage
         top = stages - 1
         if first:
             top = 0
             while not first >> top & 1:
                 top += 1
         for path in range(size):
-            if not alive[path]:
-                continue
-            for s in range(top, stage - 1, -1):
+            for s in range(top, stage - 1 if alive[path] else top, -1):
                 half = 1 << s
-                up = alpha[alpha_row[path, s + 1]]
-                a, b = up[2 * half : 3 * half], up[3 * half : 4 * half]
-                out = alpha[path, half : 2 * half]
+                up, out = alpha[rows[0, path, s + 1]], alpha[path, half : 2 * half]
+                one, other = up[2 * half : 3 * half], up[3 * half : 4 * half]
                 if s == top and first:
-                    _both(a, b, beta[beta_row[path, s], half : 2 * half], out)
+                    _both(one, other, beta[rows[1, path, s], half : 2 * half], out)
                 else:
-                    _either(a, b, out)
-                alpha_row[path, s] = path
-            row = alpha_row[path, stage]
-            zero[path], one[path] = 0.0, 0.0
-            if kind != FREE:
-                for i in range(length, 2 * length):
-                    value = alpha[row, i]
-                    if value < 0:
-                        zero[path] -= value
-                    else:
-                        one[path] += value
-        if kind == FROZEN:
-            count = 0
-            for path in range(size):
-                if alive[path]:
-                    bit[path] = 0
-                    metric[path] += zero[path]
-                    alive[path] = metric[path] <= limit
-                    count += alive[path]
-        elif kind == REPEATED:
-            count = _fork(metric, zero, one, limit, alive, bit, origin, cost, which)
-            for path in range(size):
-                if alive[path] and origin[path] != path:
-                    for s in range(stages + 1):
-                        alpha_row[path, s] = alpha_row[origin[path], s]
-                        beta_row[path, s] = beta_row[origin[path], s]
+                    _either(one, other, out)
+                rows[0, path, s] = path
+        count = 0
+        if kind == REPEATED:
+            count = _decide_same(stage, alpha, rows, limit, metric, alive, penalty, fork, codewords)
+        elif kind == FREE:
+            count = _decide_free(stage, alpha, rows, limit, metric, alive, penalty, fork, codewords)
         else:
-            # Of `size` paths none goes against more than the `size - 1` weakest signs of such a node.
-            splits = min(size - 1, length)
             for path in range(size):
                 if alive[path]:
-                    row = alpha_row[path, stage]
-                    for i in range(length):
-                        codewords[path, i] = alpha[row, length + i] < 0
-                    if splits:
-                        _find_weakest(alpha[row, length : 2 * length], weakest[path, :splits])
-            for split in range(splits):
-                for path in range(size):
-                    if alive[path]:
-                        row = alpha_row[path, stage]
-                        zero[path], one[path] = 0.0, abs(alpha[row, length + weakest[path, split]])
-                count = _fork(metric, zero, one, limit, alive, bit, origin, cost, which)
-                for path in range(size):
-                    if alive[path] and origin[path] != path:
-                        other = origin[path]
-                        for s in range(stages + 1):
-                            alpha_row[path, s] = alpha_row[other, s]
-                            beta_row[path, s] = beta_row[other, s]
-                        for s in range(size):
-                            weakest[path, s] = weakest[other, s]
-                        for i in range(length):
-                            codewords[path, i] = codewords[other, i]
-                for path in range(size):
-                    if alive[path] and bit[path]:
-                        codewords[path, weakest[path, split]] ^= 1
+                    row, zero = alpha[rows[0, path, stage]], 0.0
+                    for i in range(1 << stage):
+                        zero -= min(row[(1 << stage) + i], 0.0)
+                        codewords[path, i] = 0
+                    metric[path] += zero
+                    alive[path] = metric[path] <= limit
+                    count += int(alive[path])
         if count == 0:
             return 0
         for path in range(size):
             if not alive[path]:
                 continue
-            if kind != FREE:
-                for i in range(length):
-                    codewords[path, i] = bit[path]
             s = stage
             while first >> s & 1:
                 half = 1 << s
-                row = beta_row[path, s]
+                left = beta[rows[1, path, s]]
                 for i in range(half):
                     codewords[path, half + i] = codewords[path, i]
-                    codewords[path, i] ^= beta[row, half + i]
+                    codewords[path, i] ^= left[half + i]
                 s += 1
             if s < stages:
                 for i in range(1 << s):
                     beta[path, (1 << s) + i] = codewords[path, i]
-                beta_row[path, s] = path
+                rows[1, path, s] = path
     at = 0
     for path in range(size):
         if alive[path]:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, floor, log
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,15 @@ from pydantic import Field
 from evlcp_polar.sequence import RELIABILITY
 from evlcp_sdk.air.crc import CRC24C, CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
 
-__all__ = ["Polar", "information_set", "sent_bits"]
+if TYPE_CHECKING:
+    from evlcp_polar import _kernels
+else:
+    _kernels = Late("evlcp_polar._kernels")
+
+__all__ = ["Polar", "information_set", "list_nodes", "sent_bits", "transform"]
 
 _MOST_BITS = 1024
 """Longest codeword: what the reliability sequence is given for."""
@@ -147,6 +153,46 @@ def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
     return information
 
 
+def transform(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """Bits times the Kronecker power of [[1, 0], [1, 1]], uint8 (N,); its own inverse.
+
+    >>> transform(np.array([0, 0, 0, 1], np.uint8)).tolist()
+    [1, 1, 1, 1]
+    """
+    out, half = bits.copy(), 1
+    while half < len(out):
+        pairs = out.reshape(-1, 2, half)
+        pairs[:, 0] ^= pairs[:, 1]
+        half *= 2
+    return out
+
+
+def list_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """The largest nodes that are decided at once, (first input, stage, kind) of each, int64 (nodes, 3).
+
+    `information` says which inputs carry some, bool (N,).
+    """
+    inside = np.concatenate([[0], np.cumsum(information)]).tolist()
+    nodes, first = [], 0
+    while first < len(information):
+        stage, kind = 0, _kernels.REPEATED if information[first] else _kernels.FROZEN
+        while first >> stage & 1 == 0 and first + (2 << stage) <= len(information):
+            end = first + (2 << stage)
+            many = inside[end] - inside[first]
+            if many == 0:
+                kind = _kernels.FROZEN
+            elif many == 1 and information[end - 1]:
+                kind = _kernels.REPEATED
+            elif many == end - first:
+                kind = _kernels.FREE
+            else:
+                break
+            stage += 1
+        nodes.append((first, stage, kind))
+        first += 1 << stage
+    return np.array(nodes, np.int64)
+
+
 @dataclass(frozen=True, eq=False)
 class _PolarCode:
     """A block of codewords; `log_share` is the share of random words that may be taken for one codeword."""
@@ -163,23 +209,17 @@ class _PolarCode:
 
     @cached_property
     def nodes(self) -> NDArray[np.int64]:
-        """The order of decoding; found with the first block, as that takes a kernel."""
-        from evlcp_polar import _kernels
-
-        nodes = np.empty((len(self.information), 3), np.int64)
-        return nodes[: _kernels.schedule(self.information, nodes)].copy()
+        """The order of decoding; found with the first block."""
+        return list_nodes(self.information)
 
     def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        from evlcp_polar import _kernels
-
         if bits.shape != (self.message_bits,):
             raise ConfigError(f"message of shape {bits.shape}: expected ({self.message_bits},) bits")
         coded = np.zeros(self.coded_bits, np.uint8)
         for word, message in enumerate(bits.reshape(self.words, -1)):
             code = np.zeros(len(self.information), np.uint8)
             code[self.information] = np.concatenate([message, crc24(message)])
-            _kernels.transform(code)
-            coded[word * self.length : (word + 1) * self.length] = code[self.sent]
+            coded[word * self.length : (word + 1) * self.length] = transform(code)[self.sent]
         return coded
 
     def decode(self, llr: NDArray[np.float32]) -> Corrected:
@@ -199,8 +239,6 @@ class _PolarCode:
         )
 
     def _decode_word(self, llr: NDArray[np.float64]) -> Corrected:
-        from evlcp_polar import _kernels
-
         weight = np.abs(llr)
         mean = weight.mean()
         if mean > 0:
@@ -229,11 +267,7 @@ class _PolarCode:
         return self._corrected(llr, guess, self._inputs(guess), ok=False)
 
     def _inputs(self, codeword: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        from evlcp_polar import _kernels
-
-        inputs = codeword.copy()
-        _kernels.transform(inputs)
-        return inputs[self.information]
+        return transform(codeword)[self.information]
 
     def _corrected(
         self, llr: NDArray[np.float64], codeword: NDArray[np.uint8], inputs: NDArray[np.uint8], *, ok: bool

@@ -7,7 +7,7 @@ from itertools import product
 import numpy as np
 import pytest
 from evlcp_polar import _kernels
-from evlcp_polar.correction import Polar, information_set, sent_bits
+from evlcp_polar.correction import Polar, information_set, list_nodes, sent_bits, transform
 from evlcp_polar.sequence import RELIABILITY
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
@@ -37,11 +37,6 @@ def best_inputs(n: int, k: int) -> NDArray[np.bool_]:
     found = np.zeros(n, bool)
     found[order[-k:]] = True
     return found
-
-
-def nodes_of(information: NDArray[np.bool_]) -> NDArray[np.int64]:
-    table = np.empty((len(information), 3), np.int64)
-    return table[: _kernels.schedule(information, table)]
 
 
 def single_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -129,9 +124,7 @@ def test_the_sequence_is_near_the_best_by_gaussian_approximation(n: int, k: int)
 def test_transform_is_the_kronecker_power(n: int) -> None:
     words = np.random.default_rng(n).integers(0, 2, (20, n)).astype(np.uint8)
     for word in words:
-        out = word.copy()
-        _kernels.transform(out)
-        assert_array_equal(out, word @ matrix(n) % 2)
+        assert_array_equal(transform(word), word @ matrix(n) % 2)
 
 
 @pytest.mark.parametrize(
@@ -272,7 +265,7 @@ def test_a_list_of_all_is_maximum_likelihood(n: int, k: int) -> None:
     rng = np.random.default_rng(n + k)
     for _ in range(50):
         llr = rng.normal(0.5, 1.0, n).astype(np.float32)
-        found, metric = decoded(llr, nodes_of(information), 1 << k)
+        found, metric = decoded(llr, list_nodes(information), 1 << k)
         wanted = discrepancy(llr, codewords)
         assert_array_equal(found[0], codewords[wanted.argmin()])
         assert_allclose(metric, np.sort(wanted), rtol=1e-5, atol=1e-5)
@@ -312,7 +305,7 @@ def test_list_decoding_against_its_twin(n: int, k: int, size: int) -> None:
         for _ in range(4):
             llr = rng.normal(mean, 1.0, n).astype(np.float32)
             wanted = twin(llr.astype(float), information, size)
-            for nodes in (nodes_of(information), single_nodes(information)):
+            for nodes in (list_nodes(information), single_nodes(information)):
                 codewords, metric = decoded(llr, nodes, size)
                 assert_allclose(metric, [m for m, _ in wanted], rtol=1e-4, atol=1e-5)
                 assert_array_equal(codewords, [c for _, c in wanted])
@@ -323,7 +316,7 @@ def test_nodes_cover_all_inputs_once() -> None:
     sets = [best_inputs(256, 128), information_set(960, 480), rng.random(128) < 0.5, np.ones(32, bool)]
     for information in sets:
         at = 0
-        for first, stage, kind in nodes_of(information):
+        for first, stage, kind in list_nodes(information):
             inside = information[first : first + (1 << stage)]
             assert first == at
             assert first % (1 << stage) == 0
@@ -341,7 +334,7 @@ def test_nodes_decided_at_once_change_nothing(size: int) -> None:
         information = information_set(length, length // 2)
         for _ in range(5):
             llr = rng.normal(mean, 1.0, len(information)).astype(np.float32)
-            codewords, metric = decoded(llr, nodes_of(information), size)
+            codewords, metric = decoded(llr, list_nodes(information), size)
             others, same = decoded(llr, single_nodes(information), size)
             assert_allclose(metric, same, rtol=1e-4)
             assert_array_equal(codewords, others)
@@ -353,9 +346,9 @@ def test_a_limit_only_drops_what_exceeds_it() -> None:
     dropped = 0
     for _ in range(100):
         llr = rng.normal(0.7, 1.0, 64).astype(np.float32)
-        codewords, metric = decoded(llr, nodes_of(information), 8)
+        codewords, metric = decoded(llr, list_nodes(information), 8)
         limit = float(np.median(metric))
-        kept, within = decoded(llr, nodes_of(information), 8, limit)
+        kept, within = decoded(llr, list_nodes(information), 8, limit)
         assert (within <= limit).all()
         # What is left has more room: it holds all that was within the limit before.
         assert {w.tobytes() for w in codewords[metric <= limit]} <= {w.tobytes() for w in kept}
