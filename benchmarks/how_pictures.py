@@ -12,7 +12,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from evlcp_poc.ranging import phase_only_correlation
+from evlcp_poc.correlation import phase_only_correlation
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 

@@ -23,7 +23,15 @@ from pathlib import Path
 
 import numpy as np
 from evlcp_poc import _kernels
-from evlcp_poc.ranging import PocRanging, _blob_band, _cut_size, _full_band, phase_only_correlation
+from evlcp_poc.correlation import (
+    blob_band,
+    blob_size,
+    cut_maps,
+    full_band,
+    pair_shifts,
+    phase_only_correlation,
+)
+from evlcp_poc.ranging import PocRanging, cut_size
 from numpy.typing import NDArray
 from scipy.special import ndtr
 from skimage.registration import phase_cross_correlation
@@ -83,14 +91,14 @@ def caught(path: Path, link: Link) -> list[tuple[PresenceMap, float]]:
 
 def windows_of(presence: PresenceMap, distance_m: float, link: Link) -> Windows:
     """All pairs of a frame's clusters, but the outermost, cut as `poc` does."""
-    maps, used = presence.pixels, np.arange(1, link.bar.clusters - 1)
+    used = np.arange(1, link.bar.clusters - 1)
+    maps = presence.pixels[used]
     middle = np.empty((len(used), 2), np.int64)
-    _kernels.middles(maps, used, 4, middle)
+    _kernels.find_middles(maps, 4, middle)
     spacing_px = link.camera.focal_px * float(np.diff(link.bar.cluster_centres_m()[:2, 1])[0]) / distance_m
-    height = _cut_size(2 * spacing_px + 8)
-    width = min(height, _cut_size(maps.shape[2]))
-    cuts = np.zeros((len(used), height, width), np.float32)
-    _kernels.cut_maps(maps, used, middle, cuts)
+    height = cut_size(2 * spacing_px + 8)
+    width = min(height, cut_size(maps.shape[2]))
+    cuts = cut_maps(maps, middle, height, width)
     first, second = np.triu_indices(len(used), 1)
     true_px = spacing_px * (second - first) - (middle[second, 0] - middle[first, 0])
     return Windows(cuts, first, second, true_px, max(int(spacing_px / 2), 2))
@@ -113,11 +121,9 @@ def ideal(like: Windows, blob: tuple[float, float], rng: np.random.Generator) ->
 
 def poc(w: Windows, band: str) -> Shifts:
     """Shifts of all pairs, down, px."""
-    most = _full_band(*w.cuts.shape[1:]) if band == "full" else _blob_band(w.cuts)
-    shifts = np.empty((len(w.first), 2))
+    most = full_band(*w.cuts.shape[1:]) if band == "full" else blob_band(w.cuts)
     correlation = phase_only_correlation(w.cuts, w.first, w.second, most)
-    _kernels.pair_shifts(correlation, *most, w.reach, SAMPLES, shifts)
-    return shifts[:, 0]
+    return pair_shifts(correlation, most, w.reach, SAMPLES)[:, 0]
 
 
 def scikit_image(w: Windows, normalization: str | None) -> Shifts:
@@ -209,10 +215,8 @@ def main() -> None:
             print(f"  band {band}, {name:26}{pairs:4} pairs {ms:7.3f} ms")
     real = [windows_of(presence, distance_m, link) for presence, distance_m in frames]
     compared("real windows", real, args.rounds)
-    sizes = np.empty((len(real), 2))
-    for w, size in zip(real, sizes, strict=True):
-        _kernels.blob_size(w.cuts, size)
-    blob = float(np.median(sizes[:, 0])), float(np.median(sizes[:, 1]))
+    down, across = np.median([blob_size(w.cuts) for w in real], axis=0).tolist()
+    blob = down, across
     rng = np.random.default_rng(0)
     compared(
         f"ideal blobs of {blob[0]:.1f} x {blob[1]:.1f} px, noise {IDEAL_NOISE}",

@@ -8,6 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from evlcp_poc.correlation import (
+    blob_band,
+    cut_maps,
+    full_band,
+    pair_shifts,
+    phase_only_correlation,
+)
+from evlcp_poc.pairs import choose_pairs, far_pairs, robust_mean
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.late import Late
@@ -21,44 +29,13 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_poc._kernels")
 
-__all__ = ["PocRanging", "phase_only_correlation"]
+__all__ = ["PocRanging", "cut_size"]
 
 _NONE = Range(float("nan"), float("nan"), 0)
-
-_CYCLES = 0.5
-"""End of the band that blobs fill, cycles a blob size: half the main lobe of a box's spectrum, where its
-amplitude is still 2 / pi of the peak. The noise of a phase is inverse to the amplitude, and all phases weigh
-the same."""
 
 _RIM_PX = 0.2
 """How far off the shift of two clusters of a panel is in all frames alike: the halo around it has fewer rows
 and columns of clusters between it and them than in a long bar. `benchmarks/links.py` has such a panel."""
-
-
-def phase_only_correlation(
-    images: NDArray[np.float32],
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    most: tuple[int, int] | None = None,
-) -> NDArray[np.float32]:
-    """Phase-only correlation of pairs of images, float32 (n, height, width) -> (pairs, height, width).
-
-    The peak of a pair lies where its second image lies relative to its first (down, right), and has the shape
-    of the Dirichlet kernel of the band kept.
-
-    Args:
-        images: The images.
-        first: First image of each pair.
-        second: Second image of each pair.
-        most: Highest harmonics kept, down and across; None for all but Nyquist's, which have no phase.
-    """
-    n, height, width = images.shape
-    most_y, most_x = most or _full_band(height, width)
-    spectra = np.empty((2 * most_y + 1, 2, most_x + 1, n), np.float32)
-    _kernels.unit_spectra(images, most_y, most_x, spectra)
-    out = np.empty((len(first), height, width), np.float32)
-    _kernels.correlations(spectra, first, second, height // 2, width // 2, out)
-    return out
 
 
 @dataclass(frozen=True)
@@ -158,53 +135,37 @@ class PocRanging(Ranging):
 
         rim_px = _RIM_PX if (bar.sides & 3).any() and (bar.sides & 12).any() else 0.0
         all_pairs = i, j, apart
-        clusters = np.arange(bar.clusters)
-        inner = np.isin(clusters, used[skip : len(used) - skip])
-        least = min(self.min_pairs, max(_far(*pairs, inner, self.min_spacing), 1))
-        focal_px = camera.focal_px
+        inner = np.isin(np.arange(bar.clusters), used[skip : len(used) - skip])
+        least = min(self.min_pairs, max(int(far_pairs(pairs, inner, self.min_spacing).sum()), 1))
 
         def measure(view: FrameView) -> Range:
-            maps = plain(view.presence.pixels)
-            middle = np.empty((bar.clusters, 2), np.int64)
-            which, whole_px = np.empty(len(a), np.int64), np.empty((len(a), 2))
-            px_per_m, n = _kernels.chosen_pairs(
-                maps,
-                self.min_pixels,
-                all_pairs,
-                used,
-                skip,
-                pairs,
-                self.min_spacing,
-                neighbour,
-                middle,
-                which,
-                whole_px,
+            maps, middles = plain(view.presence.pixels), np.empty((bar.clusters, 2), np.int64)
+            _kernels.find_middles(maps, self.min_pixels, middles)
+            px_per_m, chosen = choose_pairs(
+                middles, all_pairs, used, skip, pairs, self.min_spacing, neighbour
             )
-            if n < least or px_per_m <= 0:
+            if len(chosen) < least or px_per_m <= 0:
                 return _NONE
+            first, second, apart_m = pairs[0][chosen], pairs[1][chosen], pairs[2][chosen]
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             neighbour_px = px_per_m * neighbour
-            height = _cut_size(2 * neighbour_px + 8)
-            width = min(height, _cut_size(maps.shape[2]))
-            cuts = np.zeros((bar.clusters, height, width), np.float32)
-            _kernels.cut_maps(maps, clusters, middle, cuts)
-            most = _full_band(height, width) if self.band == "full" else _blob_band(cuts)
+            height = cut_size(2 * neighbour_px + 8)
+            width = min(height, cut_size(maps.shape[2]))
+            cuts = cut_maps(maps, middles, height, width)
+            most = full_band(height, width) if self.band == "full" else blob_band(cuts)
+            correlation = phase_only_correlation(cuts, first, second, most)
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
             reach = max(int(neighbour_px / 2), 2)
-            mean, sigma, kept, apart_m = _kernels.paired_distance(
-                cuts,
-                most,
-                reach,
-                self.peak_samples,
-                which[:n],
-                whole_px[:n],
-                pairs,
-                focal_px,
-                self.weight_power,
-                self.drop_extremes,
-                self.outlier_iqr,
+            beyond_px = pair_shifts(correlation, most, reach, self.peak_samples)
+            down, right = (middles[second] - middles[first] + beyond_px).T
+            length_px = np.hypot(down, right)
+            distance_m = camera.focal_px * apart_m / np.maximum(length_px, 1e-9)
+            weights = apart_m**self.weight_power
+            mean, sigma, kept = robust_mean(
+                distance_m, weights, first, second, self.drop_extremes, self.outlier_iqr
             )
-            return Range(mean, math.hypot(sigma, mean * (rim_px / (px_per_m * apart_m))), kept)
+            rim = mean * (rim_px / (px_per_m * float(apart_m.mean())))
+            return Range(mean, math.hypot(sigma, rim), kept)
 
         return measure
 
@@ -233,35 +194,7 @@ class PocRanging(Ranging):
         return np.sort(used)
 
 
-def _far(
-    first: NDArray[np.int64],
-    second: NDArray[np.int64],
-    spacing: NDArray[np.float64],
-    counts: NDArray[np.bool_],
-    share: float,
-) -> int:
-    """How many pairs, both of whose clusters count, have a share of the longest such spacing, or more."""
-    apart = spacing[counts[first] & counts[second]]
-    return int((apart >= share * apart.max(initial=0.0) - 1e-12).sum())
-
-
-def _full_band(height: int, width: int) -> tuple[int, int]:
-    """Highest harmonics, down and across, that have a phase."""
-    return (height - 1) // 2, (width - 1) // 2
-
-
-def _blob_band(cuts: NDArray[np.float32]) -> tuple[int, int]:
-    """Highest harmonics, down and across, that blobs fill; one at the least."""
-    size = np.empty(2)
-    _kernels.blob_size(cuts, size)
-    down, across = (
-        min(max(round(_CYCLES * n / max(blob, 1.0)), 1), most)
-        for n, blob, most in zip(cuts.shape[1:], size, _full_band(*cuts.shape[1:]), strict=True)
-    )
-    return down, across
-
-
-def _cut_size(least: float) -> int:
+def cut_size(least: float) -> int:
     """An even length that transforms fast, as in the paper: its half has no factors but 2, 3 and 5."""
     half = math.ceil(least / 2)
     while True:

@@ -7,7 +7,16 @@ import poc_twins as twins
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
-from evlcp_poc.ranging import PocRanging, _blob_band, _cut_size, phase_only_correlation
+from evlcp_poc.correlation import (
+    blob_band,
+    blob_size,
+    cut_maps,
+    full_band,
+    pair_shifts,
+    phase_only_correlation,
+)
+from evlcp_poc.pairs import choose_pairs, robust_mean
+from evlcp_poc.ranging import PocRanging, cut_size
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
@@ -26,23 +35,13 @@ EXAMPLES = Path(__file__).parents[3] / "examples"
 SHAPES = [(24, 20), (25, 21), (16, 17), (48, 40)]
 
 
-def full_band(shape):
-    return tuple((n - 1) // 2 for n in shape)
-
-
 # Kernels
 
 
-@pytest.mark.parametrize("size", [5, 8, 21, 24, 64])
-@pytest.mark.parametrize("start", [-8.3, -3.0, -0.5, 0.0, 1e-7, 0.999])
-def test_dirichlet_is_the_sum_of_cosines(size, start):
-    values, slopes = np.empty((2, min(size, 17)))
-    for band in {1, 3, size - 1 + size % 2}:
-        _kernels.dirichlet(start, size, band, values, slopes)
-        want, slope = twins.dirichlet(start + np.arange(len(values)), size, band)
-        assert_allclose(values, want, atol=1e-13)
-        # Near zero the slope is a small difference: 1e-16 / 1e-7.
-        assert_allclose(slopes, slope, atol=1e-8)
+def fit_peak(samples, size, band):
+    shifts = np.empty(1)
+    _kernels.fit_peaks(np.array(samples, float)[None], size, band, shifts)
+    return shifts[0]
 
 
 @pytest.mark.parametrize(("size", "samples"), [(8, 1), (21, 2), (24, 2), (40, 8)])
@@ -52,7 +51,7 @@ def test_an_exact_peak_is_fitted_exactly(size, samples, gain):
     for shift in np.linspace(-0.7, 0.7, 29):
         kernel, _ = twins.dirichlet(np.arange(-samples, samples + 1) - shift, size, band)
         # The last step is below 1e-3 px, and what it leaves its square.
-        assert _kernels.fit_peak(gain * kernel, size, band) == pytest.approx(shift, abs=1e-6)
+        assert fit_peak(gain * kernel, size, band) == pytest.approx(shift, abs=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -63,14 +62,12 @@ def test_a_noisy_peak_is_fitted_by_least_squares(seed):
     kernel, _ = twins.dirichlet(np.arange(-samples, samples + 1) - rng.uniform(-0.6, 0.6), size, band)
     noisy = kernel + rng.normal(0, 0.05, len(kernel))
     # Steps end below 1e-3 px, the next would be quadratically smaller.
-    assert _kernels.fit_peak(noisy, size, band) == pytest.approx(
-        twins.peak_shift(noisy, size, band), abs=1e-4
-    )
+    assert fit_peak(noisy, size, band) == pytest.approx(twins.peak_shift(noisy, size, band), abs=1e-4)
 
 
 @pytest.mark.parametrize("samples", [[0, 0, 0], [-1, -2, -1], [0, 1, 0]])
 def test_no_peak_is_no_shift(samples):
-    assert _kernels.fit_peak(np.array(samples, float), 24, 23) == 0
+    assert fit_peak(samples, 24, 23) == 0
 
 
 @pytest.mark.parametrize("most", [None, (1, 1), (3, 2), (0, 4)])
@@ -105,62 +102,32 @@ def test_phase_only_correlation_takes_views():
     assert phase_only_correlation(images, pairs[0][:0], pairs[1][:0]).shape == (0, 12, 20)
 
 
-@pytest.mark.parametrize("most", [(11, 9), (3, 2), (0, 4), (2, 0)])
-def test_unit_spectra(most):
-    rng = np.random.default_rng(0)
-    images = (rng.random((3, 24, 20)) * (rng.random((3, 24, 1)) < 0.5)).astype(np.float32)
-    out = np.empty((2 * most[0] + 1, 2, most[1] + 1, 3), np.float32)
-    _kernels.unit_spectra(images, *most, out)
-    spectra = np.fft.rfft2(images.astype(float))
-    want = (spectra / np.abs(spectra))[:, np.arange(-most[0], most[0] + 1), : most[1] + 1]
-    assert_allclose(out[:, 0] + 1j * out[:, 1], want.transpose(1, 2, 0), atol=1e-5)
-
-
 def test_what_has_no_phase_counts_for_nothing():
     images = np.ones((2, 6, 8), np.float32)
     images[1] = 0
-    out = np.empty((5, 2, 4, 2), np.float32)
-    _kernels.unit_spectra(images, 2, 3, out)
-    assert out[2, 0, 0, 0] == 1
-    assert np.count_nonzero(out) == 1
-
-
-@pytest.mark.parametrize("far", [(0, 0), (1, 3), (6, 5), (12, 10)])
-def test_correlations_as_far_as_asked_for(far):
-    rng = np.random.default_rng(0)
-    images, pairs = rng.random((3, 24, 21)).astype(np.float32), (np.array([0, 2]), np.array([1, 1]))
-    spectra = np.empty((23, 2, 11, 3), np.float32)
-    _kernels.unit_spectra(images, 11, 10, spectra)
-    out = np.full((2, 24, 21), np.nan, np.float32)
-    _kernels.correlations(spectra, *pairs, *far, out)
-    near = [np.abs(np.fft.fftfreq(n, 1 / n)) <= most for n, most in zip((24, 21), far, strict=True)]
-    inside = np.broadcast_to(np.outer(*near), out.shape)
-    assert_array_equal(np.isfinite(out), inside)
-    assert_allclose(out[inside], phase_only_correlation(images, *pairs)[inside], atol=1e-7)
+    found = phase_only_correlation(images, np.array([0, 0]), np.array([0, 1]))
+    # Of an even image, the mean alone.
+    assert_allclose(found[0], 1 / 48, rtol=1e-6)
+    assert not found[1].any()
 
 
 def test_cuts_have_lengths_that_transform_fast():
-    assert [_cut_size(n) for n in (1, 5, 16.2, 25, 61)] == [2, 6, 18, 30, 64]
+    assert [cut_size(n) for n in (1, 5, 16.2, 25, 61)] == [2, 6, 18, 30, 64]
 
 
 @pytest.mark.parametrize("shape", SHAPES)
 def test_size_of_blobs(shape):
     rng = np.random.default_rng(shape[0])
     cuts = (rng.random((5, *shape)) * (rng.random((5, *shape)) < 0.3)).astype(np.float32)
-    size = np.empty(2)
-    _kernels.blob_size(cuts, size)
-    assert_allclose(size, twins.blob_size(cuts), rtol=1e-6)
-    _kernels.blob_size(np.zeros((2, *shape), np.float32), size)
-    assert size.tolist() == [0, 0]
+    assert_allclose(blob_size(cuts), twins.blob_size(cuts), rtol=1e-6)
+    assert blob_size(np.zeros((2, *shape), np.float32)) == (0, 0)
 
 
 @pytest.mark.parametrize("width", [4, 5, 9.5])
 def test_size_of_a_box(width):
     cuts = np.outer(twins.box(20, 9, 40), twins.box(20, width, 40))[None].astype(np.float32)
-    size = np.empty(2)
-    _kernels.blob_size(cuts, size)
     # Pixels are squares: a box between them is up to a pixel off.
-    assert_allclose(size, [9, width], atol=0.3)
+    assert_allclose(blob_size(cuts), [9, width], atol=0.3)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -170,38 +137,16 @@ def test_medians_and_cuts_of_maps(seed):
     maps[1] = 0
     maps[2], maps[2, 0, :4] = 0, 1
     maps[3], maps[3, -1, -3:] = 0, 1
-    used = np.array([0, 1, 2, 3, 5])
-    middle = np.empty((5, 2), np.int64)
-    _kernels.middles(maps, used, 4, middle)
-    want = [twins.middle(maps[k], 4) for k in used]
+    middle = np.empty((6, 2), np.int64)
+    _kernels.find_middles(maps, 4, middle)
+    want = [twins.middle(image, 4) for image in maps]
     assert middle.tolist() == want
     assert want[1] == want[3] == [-1, -1]
     # Larger and smaller than the maps, even and odd.
     for rows, columns in [(4, 3), (14, 12), (5, 8), (30, 30)]:
-        out = np.zeros((5, rows, columns), np.float32)
-        _kernels.cut_maps(maps, used, middle, out)
-        for n, k in enumerate(used):
-            assert_array_equal(out[n], twins.cut(maps[k], middle[n], rows, columns))
-
-
-@pytest.mark.parametrize("unseen", [[], [2], [0, 5], [0, 1, 2, 3, 4]])
-def test_pairs_in_place_and_their_scale(unseen):
-    rng = np.random.default_rng(0)
-    middle = rng.integers(0, 90, (6, 2))
-    middle[unseen] = -1
-    first, second = np.triu_indices(6, 1)
-    apart = rng.uniform(0.1, 1, 15)
-    shifts = middle[second] - middle[first]
-    length = np.linalg.norm(shifts, axis=1)
-    seen = ~np.isin(first, unseen) & ~np.isin(second, unseen)
-    scale = _kernels.median_scale(middle, first, second, apart)
-    assert scale == (pytest.approx(np.median((length / apart)[seen])) if seen.any() else 0)
-    which, got = np.empty(15, np.int64), np.empty((15, 2))
-    n = _kernels.pairs_in_place(middle, first, second, apart, scale, 30.0, which, got)
-    want = np.flatnonzero(seen & (np.abs(length - scale * apart) <= 30))
-    assert_array_equal(which[:n], want)
-    assert_array_equal(got[:n], shifts[want])
-    assert 0 < n < seen.sum() or not seen.any()
+        out = cut_maps(maps, middle, rows, columns)
+        for n, image in enumerate(maps):
+            assert_array_equal(out[n], twins.cut(image, middle[n], rows, columns))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -213,36 +158,14 @@ def test_pairs_chosen_are_the_far_ones_of_inner_clusters(seed, skip, share):
     at = np.arange(6) * 0.25
     used = np.array([0, 1, 2, 4, 5])
     every, pairs = twins.pairs_of(np.arange(6), at), twins.pairs_of(used, at)
-    middle, which, shifts = np.empty((6, 2), np.int64), np.empty(10, np.int64), np.empty((10, 2))
-    px_per_m, n = _kernels.chosen_pairs(maps, 4, every, used, skip, pairs, share, 20.0, middle, which, shifts)
-    want_scale, want = twins.chosen_pairs(maps, 4, every, used, skip, pairs, share, 20.0)
+    middles = np.empty((6, 2), np.int64)
+    _kernels.find_middles(maps, 4, middles)
+    px_per_m, chosen = choose_pairs(middles, every, used, skip, pairs, share, 0.2)
+    want_scale, want = twins.chosen_pairs(maps, 4, every, used, skip, pairs, share, 0.2)
     assert px_per_m == pytest.approx(want_scale)
-    assert which[:n].tolist() == want
-    assert_array_equal(shifts[:n], (middle[pairs[1]] - middle[pairs[0]])[want])
-    assert n or skip > 1
-    assert _kernels.chosen_pairs(
-        0 * maps, 4, every, used, skip, pairs, share, 1.0, middle, which, shifts
-    ) == (
-        0.0,
-        0,
-    )
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_distance_by_pairs(seed):
-    rng = np.random.default_rng(seed)
-    first, second, apart_m = twins.pairs_of(np.arange(5), np.arange(5) * 0.25)
-    cuts = rng.random((5, 12, 10)).astype(np.float32)
-    which = np.sort(rng.permutation(len(first))[:8])
-    whole_px = rng.uniform(10, 40, (8, 2))
-    pairs = first, second, apart_m
-    got = _kernels.paired_distance(cuts, (5, 4), 3, 2, which, whole_px, pairs, 7000.0, 2.0, 1, 1.5)
-    first, second, apart_m = first[which], second[which], apart_m[which]
-    beyond_px = np.empty((8, 2))
-    _kernels.pair_shifts(phase_only_correlation(cuts, first, second, (5, 4)), 5, 4, 3, 2, beyond_px)
-    distance_m = 7000 * apart_m / np.linalg.norm(whole_px + beyond_px, axis=1)
-    want = twins.robust_mean(distance_m, apart_m**2, first, second, 5, 1, 1.5)
-    assert_allclose(got, (*want, apart_m.mean()), rtol=1e-9)
+    assert chosen.tolist() == want
+    dark = choose_pairs(np.full((6, 2), -1), every, used, skip, pairs, share, 1.0)
+    assert (dark[0], len(dark[1])) == (0.0, 0)
 
 
 @pytest.mark.parametrize("clusters", [2, 3, 4, 14])
@@ -257,7 +180,7 @@ def test_robust_mean_and_jackknife(seed, drop, clusters):
     # Heavy tails, so that there are outliers.
     values = 50 + 0.1 * rng.standard_t(1.5, len(first))
     weights = (second - first) ** rng.uniform(0, 4)
-    mean, sigma, n = _kernels.robust_mean(values, weights, first, second, clusters, drop, 1.5)
+    mean, sigma, n = robust_mean(values, weights, first, second, drop, 1.5)
     want = twins.robust_mean(values, weights, first, second, clusters, drop, 1.5)
     assert n == want[2]
     assert_allclose([mean, sigma], want[:2], rtol=1e-9)
@@ -278,9 +201,8 @@ def test_exact_shifts_are_recovered(seed, samples, shape, most):
     first, second = np.triu_indices(len(by), 1)
     near = np.abs(by[second] - by[first]).max(1) < 5
     first, second = first[near], second[near]
-    shifts = np.empty((len(first), 2))
     correlation = phase_only_correlation(images, first, second, most)
-    _kernels.pair_shifts(correlation, *(most or full_band(shape)), 5, samples, shifts)
+    shifts = pair_shifts(correlation, most or full_band(*shape), 5, samples)
     # The images are float32: 3e-7 px were seen with the full band. The less band, the flatter the peak, and
     # the last step, below 1e-3 px, leaves more.
     assert_allclose(shifts, by[second] - by[first], atol=2e-6 if most is None else 2e-5)
@@ -304,10 +226,9 @@ def test_a_shift_in_noise_and_its_bound(spacing_px, noise):
     noisy = (images + rng.normal(0, noise, images.shape)).astype(np.float32)
     first = 2 * np.arange(pairs)
     ratio = {}
-    for name, most in {"full": full_band((rows, columns)), "blob": _blob_band(images)}.items():
+    for name, most in {"full": full_band(rows, columns), "blob": blob_band(images)}.items():
         correlation = phase_only_correlation(noisy, first, first + 1, most)
-        shifts = np.empty((pairs, 2))
-        _kernels.pair_shifts(correlation, *most, 4, 2, shifts)
+        shifts = pair_shifts(correlation, most, 4, 2)
         ratio[name] = np.sqrt(((shifts[:, 0] - by[:, 0]) ** 2).mean()) / bound
     # Seen: 4.9 to 6.7, and 1.3 to 2.5.
     assert ratio["full"] > 4
@@ -319,9 +240,7 @@ def test_a_peak_out_of_reach_is_not_found():
     spectrum = twins.band_limited(rng, 32, 32)
     images = np.stack([twins.shifted(spectrum, (32, 32), *d) for d in [(0, 0), (0, 7.2)]])
     correlation = phase_only_correlation(images, np.array([0]), np.array([1]))
-    far, near = np.empty((2, 1, 2))
-    _kernels.pair_shifts(correlation, *full_band((32, 32)), 8, 2, far)
-    _kernels.pair_shifts(correlation, *full_band((32, 32)), 4, 2, near)
+    far, near = (pair_shifts(correlation, full_band(32, 32), reach, 2) for reach in (8, 4))
     assert_allclose(far, [[0, 7.2]], atol=2e-6)
     assert np.abs(near).max() <= 5
 

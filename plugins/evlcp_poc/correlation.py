@@ -1,0 +1,113 @@
+"""Shifts between images by phase-only correlation."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.late import Late
+
+if TYPE_CHECKING:
+    from evlcp_poc import _kernels
+else:
+    _kernels = Late("evlcp_poc._kernels")
+
+__all__ = ["blob_band", "blob_size", "cut_maps", "full_band", "pair_shifts", "phase_only_correlation"]
+
+_NO_PHASE = 1e-5
+"""Amplitude, in the largest of a spectrum, below which there is no phase: that of rounding."""
+
+_CYCLES = 0.5
+"""End of the band that blobs fill, cycles a blob size: half the main lobe of a box's spectrum, where its
+amplitude is still 2 / pi of the peak. The noise of a phase is inverse to the amplitude, and all phases weigh
+the same."""
+
+Floats = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Images = NDArray[np.float32]
+
+
+def phase_only_correlation(
+    images: Images, first: Indices, second: Indices, most: tuple[int, int] | None = None
+) -> NDArray[np.floating]:
+    """Phase-only correlation of pairs of images, float32 (n, height, width) -> (pairs, height, width).
+
+    The peak of a pair lies where its second image lies relative to its first (down, right), and has the shape
+    of the Dirichlet kernel of the band kept.
+
+    Args:
+        images: The images.
+        first: First image of each pair.
+        second: Second image of each pair.
+        most: Highest harmonics kept, down and across; None for all but Nyquist's, which have no phase.
+    """
+    _, height, width = images.shape
+    down, across = most or full_band(height, width)
+    spectra = np.fft.rfft2(images)
+    spectra[:, down + 1 : height - down] = 0
+    spectra[:, :, across + 1 :] = 0
+    size = np.abs(spectra)
+    has_phase = size > _NO_PHASE * size.max((1, 2), keepdims=True)
+    unit = np.divide(spectra, size, out=np.zeros_like(spectra), where=has_phase)
+    return np.fft.irfft2(unit[first].conj() * unit[second], (height, width))
+
+
+def pair_shifts(correlation: NDArray[np.floating], most: tuple[int, int], reach: int, samples: int) -> Floats:
+    """Peaks of phase-only correlations within `reach` of no shift, (pairs, 2): down, right, px.
+
+    Args:
+        correlation: Of each pair, (pairs, height, width).
+        most: The highest harmonics that it holds, down and across.
+        reach: How far a peak may be.
+        samples: On each side of a peak, to which the Dirichlet kernel is fitted.
+    """
+    pairs, *shape = correlation.shape
+    # No shift comes first: where nothing is seen, all are alike.
+    far = [min(reach, n // 2 - 1) for n in shape]
+    ways = [(np.arange(2 * n + 1) + n) % (2 * n + 1) - n for n in far]
+    near = correlation[:, ways[0][:, None], ways[1]].reshape(pairs, -1)
+    peaks = [way[at] for way, at in zip(ways, np.divmod(near.argmax(1), len(ways[1])), strict=True)]
+    around, every = np.arange(-samples, samples + 1), np.arange(pairs)[:, None]
+    column = correlation[every, (peaks[0][:, None] + around) % shape[0], peaks[1][:, None]]
+    row = correlation[every, peaks[0][:, None], (peaks[1][:, None] + around) % shape[1]]
+    shifts = np.empty((2, pairs))
+    for axis, values in enumerate((column, row)):
+        _kernels.fit_peaks(values.astype(np.float64), shape[axis], 2 * most[axis] + 1, shifts[axis])
+    return np.stack([peak + shift for peak, shift in zip(peaks, shifts, strict=True)], 1)
+
+
+def cut_maps(maps: Images, middles: Indices, height: int, width: int) -> Images:
+    """Windows of maps around their middles, 0 outside a map and where a middle is -1, (n, height, width)."""
+    out = np.zeros((len(maps), height, width), np.float32)
+    for cut, image, (v, u) in zip(out, maps, middles.tolist(), strict=True):
+        top, left = v - height // 2, u - width // 2
+        if v >= 0:
+            part = image[max(top, 0) : top + height, max(left, 0) : left + width]
+            cut[max(-top, 0) :, max(-left, 0) :][: part.shape[0], : part.shape[1]] = part
+    return out
+
+
+def full_band(height: int, width: int) -> tuple[int, int]:
+    """Highest harmonics, down and across, that have a phase."""
+    return (height - 1) // 2, (width - 1) // 2
+
+
+def blob_size(cuts: Images) -> tuple[float, float]:
+    """Height and width of the box with the mean distance from its middle that cuts have, px.
+
+    A box of h pixels has a mean distance of h / 4, which a stray pixel moves less than it moves a variance.
+    """
+    _, height, width = cuts.shape
+    rows, columns = cuts.sum((0, 2), dtype=np.float64), cuts.sum((0, 1), dtype=np.float64)
+    total = max(float(rows.sum()), 1e-9)
+    down, across = np.abs(np.arange(height) - height // 2), np.abs(np.arange(width) - width // 2)
+    return 4 * float(rows @ down) / total, 4 * float(columns @ across) / total
+
+
+def blob_band(cuts: Images) -> tuple[int, int]:
+    """Highest harmonics, down and across, that blobs in the middles of cuts fill; one at the least."""
+    down, across = (
+        min(max(round(_CYCLES * n / max(size, 1.0)), 1), most)
+        for n, size, most in zip(cuts.shape[1:], blob_size(cuts), full_band(*cuts.shape[1:]), strict=True)
+    )
+    return down, across
