@@ -1,8 +1,6 @@
 """Kernels loaded before anything is live."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from itertools import product
 from typing import Final
 
 import numpy as np
@@ -23,16 +21,8 @@ _WARM_US = 30_000
 """Of the recording that comes with the SDK: three packets, of which two are whole."""
 
 
-_PLACES: Final = ((-4.0, 50.0, 4.5), (4.0, 50.0, 5.5), (0.0, 40.0, 3.5))
-"""Of bars, east, north and up of a camera that looks north and up, m: not in line."""
-
-_PITCH_DEG: Final = 5.0
-_NOISE_PX: Final = 0.3
-_OFF_PX: Final = (0.0, 0.9, 6.0)
-"""Of a bar: none; three sigmas, which is doubted; twenty, so that fits without each bar are tried."""
-
-_OFF_SIGMAS: Final = (0.0, *(2.0 + step / 4 for step in range(11)))
-"""Of an attitude: none; so many that it is doubted, up to where it is taken for wrong."""
+_PLACE: Final = (-2.0, 50.0, 0.5)
+"""Of a bar, east, north and up of a camera that looks north, m."""
 
 
 def warm_up(links: Sequence[Link], *, positions: bool = False) -> None:
@@ -43,11 +33,11 @@ def warm_up(links: Sequence[Link], *, positions: bool = False) -> None:
 
     Args:
         links: What will be received.
-        positions: Load what positions need, too, by a fix of each kind of bars that are made up.
+        positions: Load what positions need, too, by a fix.
     """
     if positions:
         for link in links:
-            _find_places(link)
+            _find_place(link)
     for shaking in (False, True):
         receiver, pictures, camera = Receiver(links), PictureSlot(), links[0].camera
         with RawSource(shipped("recordings", "night-50m-30kmh-cut.raw")) as source:
@@ -65,23 +55,13 @@ def warm_up(links: Sequence[Link], *, positions: bool = False) -> None:
         receiver.close()
 
 
-def _find_places(link: Link) -> None:
-    """Solve for a camera that sees one, two, three bars, with as much known of its attitude as that needs."""
-    rng = np.random.default_rng(1)
-    rotation = Attitude(_PITCH_DEG).rotation()
+def _find_place(link: Link) -> None:
+    """Solve for a camera that sees a bar."""
+    attitude = Attitude(heading_deg=0.0)
     along = np.linspace(0.5, -0.5, link.bar.clusters)[:, None] * (0.0, 0.0, link.bar.length_m)
-    knowledge = (Attitude(_PITCH_DEG, heading_deg=0.0), Attitude(_PITCH_DEG), None)
-    for bars, known in enumerate(knowledge, 1):
-        for off_px, off_sigmas in product(_OFF_PX, _OFF_SIGMAS):
-            views = []
-            for number, place in enumerate(_PLACES[:bars]):
-                points, _ = project_bars(along + place, np.zeros(3), rotation, link.camera)
-                points += rng.normal(0, _NOISE_PX, points.shape) + off_px * (number == 0)
-                views.append(BarView(number, along + place, points, np.full(len(points), _NOISE_PX)))
-            said = known
-            if known is not None:
-                said = replace(known, pitch_deg=known.pitch_deg + off_sigmas * known.gravity_sigma_deg)
-            solve_pose(views, link.camera, said, link.position, link.camera_sigma)
+    points, _ = project_bars(along + _PLACE, np.zeros(3), attitude.rotation(), link.camera)
+    view = BarView(0, along + _PLACE, points, np.full(len(points), 0.3))
+    solve_pose([view], link.camera, attitude, link.position, link.camera_sigma)
 
 
 def _shaken(events: Events) -> Events:

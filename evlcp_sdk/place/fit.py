@@ -1,63 +1,34 @@
 """The weighted least-squares fit of a pose, and of every error that is shared, to all observations."""
 
 import math
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.place.model import SHARED, Equations, Fit, linearize, move
 from evlcp_sdk.place.observations import Problem
 
-if TYPE_CHECKING:
-    from evlcp_sdk.place import _kernels
-else:
-    _kernels = Late("evlcp_sdk.place._kernels")
-
-__all__ = ["FOCAL_UNIT", "STEPS", "Fit", "data", "fit_pose"]
+__all__ = ["STEPS", "fit_pose"]
 
 Floats = NDArray[np.float64]
 
 STEPS = 50
 """Levenberg-Marquardt steps; from a closed-form start, five to ten arrive."""
 
-FOCAL_UNIT = 0.005
-"""Share of the focal length in which a fault of it is counted."""
+_MISSING = 20.0
+"""Square sum a point beyond which what misses is refused, wherever exactly it ends."""
 
-
-@dataclass(frozen=True, eq=False)
-class Fit:
-    """One point of the fit.
-
-    Attributes:
-        position: m, float64 (3,).
-        rotation: Camera axes as columns in ENU, float64 (3, 3).
-        local: Each bar's own errors in their sigmas: shift of the image, length, place, turn, float64 (bars,
-            9).
-        lens: The camera's errors, by the root of their covariance, float64 (7,).
-        cost: Twice the cost.
-        settled: Whether a fit ended here.
-    """
-
-    position: Floats
-    rotation: Floats
-    local: Floats
-    lens: Floats
-    cost: float
-    settled: bool = False
-
-    @classmethod
-    def at(cls, problem: Problem, position: Floats, rotation: Floats) -> "Fit":
-        """A place and axes, and no other error; what it costs is not known."""
-        here = (np.ascontiguousarray(position), np.ascontiguousarray(rotation))
-        return cls(*here, np.zeros((len(problem.transmitters), _kernels.LOCAL)), np.zeros(7), math.nan)
+_STALLED = 4
+"""Steps in a row that hardly lower the cost before it is asked whether it can still fall below the limit."""
 
 
 def fit_pose(
     problem: Problem, start: Fit, steps: int = STEPS, *, robust: bool = True, hopeless: float = math.inf
 ) -> Fit:
     """Levenberg-Marquardt, with Huber's weights if robust.
+
+    The damping follows how much of what the equations promise a step wins (Nielsen 1999).
 
     Args:
         problem: What is seen and known.
@@ -69,25 +40,98 @@ def fit_pose(
     Returns:
         Where it ends; its cost is NaN where the start has a point behind the camera.
     """
-    point = (start.position, start.rotation, start.local, start.lens)
-    given = data(problem) if robust else (*data(problem)[:-1], math.inf)
-    found: tuple[Any, ...] = _kernels.fitted(*given, problem.free, steps, hopeless, *point)  # type: ignore[call-arg]
-    settled, cost, place, turned, local, lens = found
-    return Fit(place, turned, local, lens, cost, settled)
+    huber = problem.spec.huber_sigmas if robust else math.inf
+    here, equations = start, linearize(problem, start, huber)
+    if equations is None:
+        return replace(start, cost=math.nan, settled=False)
+    reduced = _reduce(problem, equations)
+    near = 1e-6 if robust else 1e-4
+    surveyed = bool(problem.bar_sigma[:, :2].any())
+    damping, growth, stalled = 1e-4, 4.0, 0
+    for _ in range(steps):
+        cost = equations.cost
+        step = _solve(reduced.matrix, reduced.side, damping)
+        if step is None:
+            break
+        there = move(problem, here, reduced.step(step))
+        found = linearize(problem, there, huber)
+        if found is not None and found.cost > cost and surveyed:
+            # What a long turn leaves of second order, errors of the sites take up where they are large.
+            there = move(problem, there, _reduce(problem, found).step(None))
+            found = linearize(problem, there, huber)
+        promise = float(reduced.side @ step)
+        hoped = promise + damping * float(step @ (np.diag(reduced.matrix) * step))
+        stalled = 0 if found is not None and found.cost < 0.7 * cost else stalled + 1
+        if found is not None and found.cost <= cost:
+            won = cost - found.cost
+            here, equations = there, found
+            reduced = _reduce(problem, equations)
+            ratio = won / hoped if hoped > 0 else 1.0
+            damping = min(max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12), 1e12)
+            growth = 4.0
+            enough = 1e-3 if found.cost > _MISSING * len(problem.points) else near
+            if won <= max(enough, 1e-6) * (1 + found.cost) and abs(promise) < enough * (100 + found.cost):
+                return replace(here, cost=found.cost, settled=True)
+        else:
+            damping *= growth
+            growth *= 2
+            if damping > 1e12 or abs(promise) < 1e-9:
+                # No step is an improvement any more: rounding decides.
+                return replace(here, cost=cost, settled=promise < 1e-3)
+        if stalled == _STALLED and equations.cost > hopeless:
+            stalled = 0
+            last = _solve(reduced.matrix, reduced.side, 1e-9)
+            if equations.cost - (0.0 if last is None else float(reduced.side @ last)) > hopeless:
+                return replace(here, cost=equations.cost, settled=True)
+    return replace(here, cost=equations.cost, settled=False)
 
 
-def data(problem: Problem) -> tuple[Any, ...]:
-    """What all kernels of the fit take first, how robust it is at its end."""
-    return (
-        problem.points,
-        problem.bar,
-        problem.bar_sigma,
-        problem.lens,
-        problem.lens_root,
-        FOCAL_UNIT,
-        problem.felt,
-        problem.heading_rad,
-        problem.angles,
-        problem.white,
-        problem.spec.huber_sigmas,
-    )
+@dataclass(frozen=True, eq=False)
+class _Reduced:
+    """Normal equations of the shared unknowns that are free, the bars' own following.
+
+    Attributes:
+        problem: Whose they are.
+        matrix: float64 (m, m).
+        side: float64 (m,).
+        follow: How the bars' own follow them, and in the last column what they do by themselves, float64
+            (k, m + 1).
+    """
+
+    problem: Problem
+    matrix: Floats
+    side: Floats
+    follow: Floats
+
+    def step(self, shared: Floats | None) -> Floats:
+        """A step of all unknowns; None: only of the bars' own."""
+        unknowns = self.problem.unknowns
+        whole, m = np.zeros(SHARED + self.problem.bar_sigma.size), len(self.side)
+        moved = np.zeros(m) if shared is None else shared
+        whole[unknowns[:m]], whole[unknowns[m:]] = moved, self.follow[:, -1] - self.follow[:, :-1] @ moved
+        return whole
+
+
+def _reduce(problem: Problem, equations: Equations) -> _Reduced:
+    """The equations at a point without the bars' own unknowns."""
+    matrix, side = equations.normal()
+    unknowns = problem.unknowns
+    m = int(np.searchsorted(unknowns, SHARED))
+    matrix, side = matrix[np.ix_(unknowns, unknowns)], side[unknowns]
+    between = matrix[m:, :m]
+    follow = np.linalg.solve(matrix[m:, m:], np.column_stack([between, side[m:]]))
+    shared = matrix[:m, :m] - between.T @ follow[:, :-1]
+    return _Reduced(problem, shared, side[:m] - between.T @ follow[:, -1], np.asarray(follow, np.float64))
+
+
+def _solve(matrix: Floats, side: Floats, damping: float) -> Floats | None:
+    """The damped equations' solution; None where they are singular."""
+    damped = matrix.copy()
+    damped.flat[:: len(matrix) + 1] *= 1 + damping
+    scale = 1 / np.sqrt(np.maximum(np.diag(damped), 1e-300))
+    try:
+        root = np.linalg.cholesky(damped * scale * scale[:, None])
+    except np.linalg.LinAlgError:
+        return None
+    found: Floats = np.linalg.solve(root.T, np.linalg.solve(root, side * scale)) * scale
+    return found

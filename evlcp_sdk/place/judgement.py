@@ -5,26 +5,30 @@ length - a test of whether the rest contradicts it, and how far the position may
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.chances import chi_square
-from evlcp_sdk.place.fit import FOCAL_UNIT, Fit, data
+from evlcp_sdk.place.model import (
+    FAULT,
+    FOCAL_UNIT,
+    LENS,
+    LOCAL,
+    SHARED,
+    Equations,
+    Fit,
+    linearize,
+    move,
+    skewed,
+)
 from evlcp_sdk.place.observations import Problem
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.values import FailedBar
-
-if TYPE_CHECKING:
-    from evlcp_sdk.place import _kernels
-else:
-    _kernels = Late("evlcp_sdk.place._kernels")
 
 __all__ = ["FOCAL", "Judged", "Pose", "covering", "judged", "misfits"]
 
@@ -47,6 +51,15 @@ _LARGER = 4.0
 
 _LITTLE = 0.01
 """Share of a position's variance below which a doubt does not count."""
+
+_ROUNDING = 1e-14
+"""Share of a diagonal that rounding may leave of nothing."""
+
+_FLAT = 1e-9
+"""Share of what a part says in its best direction below which it says nothing in another."""
+
+_FAR_COST = 12.0
+"""Growth of the cost two sigmas away, where 4 is expected, beyond which errors of sites are fitted anew."""
 
 _REDUNDANT = 1e-6
 """Share of what a part says that others must say, too, for it to be tested: a heading that is known to 0.1
@@ -116,81 +129,342 @@ class Judged:
     tests: Mapping[str, float]
 
 
+@dataclass(frozen=True, eq=False)
+class _Solution:
+    """What the equations at a fit determine.
+
+    Attributes:
+        spread: Covariance of the 14 shared unknowns, 0 of those that are not free, float64 (14, 14).
+        info: What each bar says of them, its own errors free, float64 (bars, 14, 14).
+        right: Right-hand sides of that, float64 (bars, 14).
+        gain: By how much each bar's own errors follow, float64 (bars, 9, 14).
+        own: By how much they would move by themselves, float64 (bars, 9).
+        position: Where that is, m, float64 (3,).
+        equations: There.
+    """
+
+    spread: Floats
+    info: Floats
+    right: Floats
+    gain: Floats
+    own: Floats
+    position: Floats
+    equations: Equations
+
+    def step(self, shared: Floats) -> Floats:
+        """A move of the shared unknowns, and what follows."""
+        return np.concatenate([shared, (self.own - self.gain @ shared).ravel()])
+
+
+def _solve(problem: Problem, fit: Fit) -> _Solution | None:
+    """The equations at a fit, solved; None where they are singular or the fit is behind a bar."""
+    equations = linearize(problem, fit, problem.spec.huber_sigmas)
+    if equations is None:
+        return None
+    bars = len(problem.transmitters)
+    rows = equations.rows.reshape(-1, 2, equations.rows.shape[1])
+    miss = equations.miss.reshape(-1, 2)
+    info, right = np.zeros((bars, SHARED, SHARED)), np.zeros((bars, SHARED))
+    gain, own = np.zeros((bars, LOCAL, SHARED)), np.zeros((bars, LOCAL))
+    for bar in range(bars):
+        mine, first = problem.bar == bar, SHARED + LOCAL * bar
+        shared = rows[mine, :, :SHARED].reshape(-1, SHARED)
+        local = rows[mine, :, first : first + LOCAL].reshape(-1, LOCAL)
+        off, between = miss[mine].ravel(), local.T @ shared
+        both = np.column_stack([between, local.T @ off - fit.local[bar]])
+        follow = np.linalg.solve(local.T @ local + np.eye(LOCAL), both)
+        gain[bar], own[bar] = follow[:, :-1], follow[:, -1]
+        info[bar] = shared.T @ shared - between.T @ gain[bar]
+        right[bar] = shared.T @ off - between.T @ own[bar]
+    angles = equations.angles[:, :SHARED]
+    whole = info.sum(0) + angles.T @ angles
+    whole.flat[LENS * (SHARED + 1) :: SHARED + 1] += 1.0
+    free = np.flatnonzero(problem.free)
+    spread = np.zeros((SHARED, SHARED))
+    inverse = _inverted(whole[np.ix_(free, free)])
+    if inverse is None:
+        return None
+    spread[np.ix_(free, free)] = inverse
+    return _Solution(spread, info, right, gain, own, fit.position, equations)
+
+
+def _inverted(matrix: Floats) -> Floats | None:
+    """The inverse of a matrix that is positive definite beyond rounding; None of another."""
+    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    scaled = matrix * scale * scale[:, None]
+    try:
+        if np.square(np.diag(np.linalg.cholesky(scaled))).min(initial=1.0) < _ROUNDING:
+            return None
+    except np.linalg.LinAlgError:
+        return None
+    inverse: Floats = np.linalg.inv(scaled) * scale * scale[:, None]
+    return inverse
+
+
 def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
     """The pose with its covariance and tests, or why it cannot be trusted."""
-    spec = problem.spec
-    turns = bool(problem.free[3:6].any())
-    names = _parts(problem.transmitters, problem.angles if turns else 0)
-    limits = _limits(spec.false_alarm / 2 / len(names))
-    found: tuple[Any, ...] = _kernels.weighed(  # type: ignore[call-arg]
-        *data(problem),
-        problem.free,
-        problem.said,
-        fit.position,
-        fit.rotation,
-        fit.local,
-        fit.lens,
-        fit.cost,
-        math.radians(spec.attitude_fault_deg),
-        (FOCAL_UNIT / spec.focal_fault) ** 2 if spec.focal_fault else 0.0,
-        spec.bar_fault_m,
-        _BAR_TURN_RAD,
-        limits,
-        _REDUNDANT,
-        spec.max_sigma_m,
-        math.sqrt(chi_square(spec.risk, 2)),
-        math.sqrt(chi_square(spec.risk, 1)),
-        _RARELY,
-        _LARGER,
-        _LITTLE,
-    )
-    regular, wide, bent, spread, values, freed, hpl, vpl, doubted, noise, slow, *rest = found
-    moves, along, slopes, hidden = rest[:3], rest[3], rest[4:7], rest[7]
-    if not regular:
+    spec, freedom = problem.spec, problem.freedom
+    solution = _solve(problem, fit)
+    if solution is None:
         return Refusal("not-determined", "the equations are singular")
-    if len(problem.transmitters) == 1:
-        first, last = problem.points[0, :3] - fit.position, problem.points[-1, :3] - fit.position
-        axis, sight = last - first, first + last
-        cosine = float(axis @ sight) / math.sqrt(float(axis @ axis) * float(sight @ sight))
-        sine = math.sqrt(max(1 - cosine**2, 0.0))
-        if sine < math.sin(math.radians(spec.min_view_deg)):
-            return Refusal(
-                "end-on", f"the bar is seen {math.degrees(math.asin(sine)):.0f} degrees from its axis"
-            )
+    if (end_on := _end_on(problem, fit)) is not None:
+        return end_on
+    size, axes = np.linalg.eigh(solution.spread[:3, :3])
+    wide = math.sqrt(max(size[-1], 0.0))
     if wide > spec.max_sigma_m:
         return Refusal("uncertain", f"by {wide:.1f} m, more than {spec.max_sigma_m:g} m")
+    bent, slopes = _bend(problem, fit, solution, size, axes)
     amiss = misfits(problem, fit)
     # A fit of what does not fit need not be at the least cost.
     if bent > _MOST_BEND and not amiss:
         return Refusal("uncertain", f"by {wide:.2f} m along a curve: an ellipse would mislead")
-    freedom = problem.freedom
-    doubt, tests = "", {}
-    worst = 1.0
-    if amiss:
-        doubt = f"the points miss the sites by {math.sqrt(fit.cost / freedom):.1f} sigmas (rms)"
-    for name, value, tested in zip(names, values.tolist(), freed.tolist(), strict=True):
-        if tested:
-            tests[name] = value
-            if value / limits[tested] > worst:
-                worst = value / limits[tested]
-                doubt = f"{name} does not fit the rest: {math.sqrt(value):.1f} sigmas"
+    levels, tests, worst = _test_parts(problem, solution)
+    doubt = f"the points miss the sites by {math.sqrt(fit.cost / freedom):.1f} sigmas (rms)" if amiss else ""
+    moves = _moves_by_errors(problem, solution)
+    noise, slow = _rest(solution, moves)
+    doubted = _doubted(problem, solution)
     pose = Pose(
         fit.position,
         fit.rotation,
-        spread[:6, :6] + doubted,
+        solution.spread[:6, :6] + doubted,
         noise,
         slow,
-        {**_doubt(doubted[:3, :3]), **_standing(problem, *moves)},
+        {**_doubt(doubted[:3, :3]), **_named(problem, *moves)},
         fit.cost / freedom,
         freedom,
         problem.transmitters,
-        _level(hpl, spec),
-        _level(vpl, spec),
-        along=along,
-        standing_slope=_standing(problem, *slopes),
-        hidden_m=hidden,
+        _level(levels.horizontal_m, spec),
+        _level(levels.vertical_m, spec),
+        along=axes[:, -1],
+        standing_slope=_named(problem, *slopes),
+        hidden_m=levels.hidden_m,
     )
-    return Judged(pose, doubt, tests)
+    return Judged(pose, worst or doubt, tests)
+
+
+def _end_on(problem: Problem, fit: Fit) -> Refusal | None:
+    """A lone bar that points along the line of sight."""
+    if len(problem.transmitters) > 1:
+        return None
+    first, last = problem.points[0, :3] - fit.position, problem.points[-1, :3] - fit.position
+    axis, sight = last - first, first + last
+    cosine = float(axis @ sight) / math.sqrt(float(axis @ axis) * float(sight @ sight))
+    sine = math.sqrt(max(1 - cosine**2, 0.0))
+    if sine >= math.sin(math.radians(problem.spec.min_view_deg)):
+        return None
+    return Refusal("end-on", f"the bar is seen {math.degrees(math.asin(sine)):.0f} degrees from its axis")
+
+
+Moves = tuple[Floats, Floats, Floats]
+"""The position's moves by one sigma of what stays: of the camera (3, 7), of the attitude (3, 4), of what is
+each bar's (bars, 3, 7)."""
+
+
+def _moves_by_errors(problem: Problem, solution: _Solution) -> Moves:
+    place = solution.spread[:3]
+    angles = solution.equations.angles[:, :SHARED]
+    by_attitude = place @ angles.T @ problem.said[: len(angles)]
+    by_bars = place @ solution.gain[:, 2:].swapaxes(1, 2)
+    return -place[:, LENS:], by_attitude if len(angles) else np.zeros((3, 4)), by_bars
+
+
+def _bend(problem: Problem, fit: Fit, solution: _Solution, size: Floats, axes: Floats) -> tuple[float, Moves]:
+    """How far the cost is from its parabola two sigmas away, and how the moves by errors change there.
+
+    Returns:
+        Along the least certain direction, the largest of the ratios, or of their inverses, of the true and
+        the expected growth of the cost, and of one and the square of how far the way there, an arc about the
+        bars, is from that axis, in sigmas; and the mean slopes of the moves, a metre.
+    """
+    wide = math.sqrt(max(size[-1], 0.0))
+    bent, slopes = 1.0, tuple(np.zeros_like(part) for part in _moves_by_errors(problem, solution))
+    for way in (-2 / wide, 2 / wide):
+        shared = way * solution.spread[:, :3] @ axes[:, -1]
+        there = move(problem, fit, solution.step(shared))
+        again = _solve(problem, there)
+        if again is not None and again.equations.cost - fit.cost > _FAR_COST:
+            # Errors of sites take up what is left of second order.
+            there = move(problem, there, again.step(np.zeros(SHARED)))
+            again = _solve(problem, there)
+        growth = 1e-9 if again is None else max((again.equations.cost - fit.cost) / 4, 1e-9)
+        off = axes.T @ (there.position - fit.position - shared[:3])
+        square = float((off**2 / np.maximum(size, 1e-15 * size[-1])).sum())
+        bent = max(bent, growth, 1 / growth, 1 + square)
+        if again is not None:
+            share = math.copysign(1 / (4 * wide), way)
+            for slope, moved in zip(slopes, _moves_by_errors(problem, again), strict=True):
+                slope += share * moved
+    return bent, (slopes[0], slopes[1], slopes[2])
+
+
+@dataclass
+class _Levels:
+    """Protection levels, as wide as the parts so far ask for, m, and what one fault may hide, (3,)."""
+
+    spread: Floats
+    horizontal_sigmas: float
+    vertical_sigmas: float
+    horizontal_m: float = 0.0
+    vertical_m: float = 0.0
+    hidden_m: Floats = field(default_factory=lambda: np.zeros(3))
+
+    def widen(self, added: Floats, unseen: Floats, limit: float) -> None:
+        """Hold with one fault more, whose test just passed."""
+        hidden = np.sqrt(limit * np.maximum(np.diag(unseen), 0.0))
+        self.hidden_m = np.maximum(self.hidden_m, hidden)
+        whole = self.spread + added
+        level_m = math.sqrt(limit) * _widest(unseen) + self.horizontal_sigmas * _widest(whole)
+        height_m = hidden[2] + self.vertical_sigmas * math.sqrt(max(whole[2, 2], 0.0))
+        self.horizontal_m, self.vertical_m = max(self.horizontal_m, level_m), max(self.vertical_m, height_m)
+
+
+def _widest(covariance: Floats) -> float:
+    """Sigma of the horizontal direction that is the least certain."""
+    (a, b), (_, c) = covariance[:2, :2].tolist()
+    return math.sqrt(max((a + c) / 2 + math.hypot((a - c) / 2, b), 0.0))
+
+
+def _test_parts(problem: Problem, solution: _Solution) -> tuple[_Levels, dict[str, float], str]:
+    """Protection levels, each part's test value, and the part that fits the rest the least, if any fails."""
+    spec, spread = problem.spec, solution.spread
+    turns = bool(problem.free[3:6].any())
+    names = _parts(problem.transmitters, problem.angles if turns else 0)
+    limits = _limits(spec.false_alarm / 2 / len(names))
+    flat, high = (math.sqrt(chi_square(spec.risk, freedom)) for freedom in (2, 1))
+    levels = _Levels(spread[:3, :3], flat, high)
+    levels.widen(np.zeros((3, 3)), np.zeros((3, 3)), 0.0)
+    tests, worst, doubt = {}, 1.0, ""
+    for name, (value, freedom, added, unseen) in zip(names, _tested_parts(problem, solution), strict=False):
+        if freedom:
+            tests[name] = value
+            if value / limits[freedom] > worst:
+                worst = value / limits[freedom]
+                doubt = f"{name} does not fit the rest: {math.sqrt(value):.1f} sigmas"
+        if name != "heading":
+            # A heading that is off is an attitude that is.
+            levels.widen(added, unseen, limits[freedom])
+    return levels, tests, doubt
+
+
+Tested = tuple[float, int, Floats, Floats]
+
+
+def _tested_parts(problem: Problem, solution: _Solution) -> Iterator[Tested]:
+    """`_test` of each bar, the focal length, the attitude and the heading, as far as there are."""
+    spec, free = problem.spec, problem.free[:, None]
+    for bar in range(len(problem.transmitters)):
+        own, side = solution.info[bar, :6, :6], solution.right[bar, :6]
+        columns = solution.info[bar, :, :6] * free
+        yield _test(own, columns, side, solution.spread, _bar_bound(problem, solution, bar))
+    columns = solution.info.sum(0)[:, FAULT : FAULT + 1] * free
+    information = solution.info[:, FAULT, FAULT].sum().reshape(1, 1)
+    focal = (FOCAL_UNIT / spec.focal_fault) ** 2 if spec.focal_fault else 0.0
+    side = solution.right[:, FAULT].sum().reshape(1)
+    yield _test(information, columns, side, solution.spread, np.full((1, 1), focal))
+    angles, miss = solution.equations.angles[:, :SHARED], solution.equations.angles_miss
+    bound: NDArray[np.floating] = np.zeros((len(angles), len(angles)))
+    if spec.attitude_fault_deg and len(angles):
+        white = math.radians(spec.attitude_fault_deg) * problem.white[: len(angles), : len(angles)]
+        bound = np.linalg.inv(white @ white.T)
+    for first in (0, 2):
+        if len(angles) > first:
+            alone = np.eye(len(angles) - first)
+            columns = angles[first:].T * free
+            yield _test(alone, columns, miss[first:], solution.spread, bound[first:, first:])
+
+
+def _test(
+    information: Floats, column: Floats, side: Floats, spread: Floats, bound: NDArray[np.floating]
+) -> Tested:
+    """What a fault that shifts some observations would do: a mean-shift test, and the position without them.
+
+    Args:
+        information: Of the fault's parameters by these observations, float64 (m, m).
+        column: The same between the unknowns and these parameters, float64 (14, m).
+        side: Right-hand side of these parameters at the solution, float64 (m,).
+        spread: Covariance of the unknowns, float64 (14, 14).
+        bound: Inverse covariance of how large such a fault may be, float64 (m, m); 0: any size.
+
+    Returns:
+        Test value, its degrees of freedom, what the fault adds to the position's covariance once it is free,
+        float64 (3, 3), and the covariance by which the position may have moved unnoticed, in units of the
+        test value, float64 (3, 3).
+    """
+    diagonal = np.diag(information)
+    scale = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
+    values, axes = np.linalg.eigh(information * scale * scale[:, None])
+    kept = values > _FLAT
+    # In this basis the fault's own information is 1; what is left of it where the unknowns may follow.
+    basis = scale[:, None] * axes[:, kept] / np.sqrt(values[kept])
+    shared = column @ basis
+    follow = spread @ shared
+    left = np.eye(kept.sum()) - shared.T @ follow
+    share, turn = np.linalg.eigh((left + left.T) / 2)
+    turned, moved = basis @ turn, follow[:3] @ turn
+    redundant = share > _REDUNDANT
+    value = float(((turned.T @ side)[redundant] ** 2 / share[redundant]).sum())
+    # What is not tested may be of any size, or of as much as the bound allows.
+    share = np.where(redundant, share, 1e-12)
+    if bound.any() and len(share):
+        inverse = _inverted(turned.T @ bound @ turned + np.diag(share))
+        if inverse is None:
+            return 0.0, 0, np.full((3, 3), math.inf), np.full((3, 3), math.inf)
+        moves = moved @ inverse
+    else:
+        moves = moved / share
+    return value, int(redundant.sum()), moves @ moved.T, (moves * share) @ moves.T
+
+
+def _bar_bound(problem: Problem, solution: _Solution, bar: int) -> Floats:
+    """Inverse covariance of a bar's fault, as a move and a turn of the camera that it alone sees, (6, 6)."""
+    place_m = problem.spec.bar_fault_m
+    if not place_m:
+        return np.zeros((6, 6))
+    row = problem.points[int((problem.bar == bar).argmax())]
+    half = np.zeros((6, 6))
+    half[:3, :3], half[3:, 3:] = np.eye(3) / place_m, np.eye(3) / _BAR_TURN_RAD
+    half[:3, 3:] = skewed((row[:3] - row[3:6] - solution.position)[None])[0].T / place_m
+    return half.T @ half
+
+
+def _rest(solution: _Solution, moves: Moves) -> tuple[Floats, Floats]:
+    """What the position's covariance is made of beside the errors that stay: noise and slow, (3, 3) each."""
+    place, equations = solution.spread[:3], solution.equations
+    follow = np.concatenate([np.eye(SHARED), -solution.gain.reshape(-1, SHARED)])
+    rows = equations.rows @ follow @ place.T
+    slow = rows.T @ (rows * equations.stands[:, None])
+    by_camera, by_attitude, by_bars = moves
+    rest = place[:, :3] - slow - by_camera @ by_camera.T - by_attitude @ by_attitude.T
+    rest = rest - (by_bars @ by_bars.swapaxes(1, 2)).sum(0)
+    # What Huber's weights leave of the points' share may be less than nothing.
+    size, axes = np.linalg.eigh(rest)
+    return (axes * np.maximum(size, 1e-12)) @ axes.T, slow
+
+
+def _doubted(problem: Problem, solution: _Solution) -> Floats:
+    """What the doubt adds to a covariance whether the attitude's errors are larger than their sigmas say.
+
+    The mean over both hypotheses, by their odds after the fit: as said, or `_LARGER` times as large, which
+    is so `_RARELY`. What is no likelier after the fit than before is in the sigmas already. Of position and
+    turn, float64 (6, 6); 0 where it is too little to count.
+    """
+    rows, miss = solution.equations.angles[:, :SHARED], solution.equations.angles_miss
+    nothing = np.zeros((6, 6))
+    if not (len(miss) and problem.free[3:6].any()):
+        return nothing
+    more = _LARGER**2 - 1
+    follow = solution.spread[:6] @ rows.T
+    whole = np.eye(len(miss)) + more * (np.eye(len(miss)) - rows @ solution.spread @ rows.T)
+    inverse = _inverted(whole)
+    if inverse is None:
+        return nothing
+    off = more * inverse @ miss
+    evidence = math.log(_RARELY / (1 - _RARELY)) + 0.5 * float(miss @ off - np.linalg.slogdet(whole)[1])
+    weight, moved = 1 / (1 + math.exp(-min(evidence, 700.0))), follow @ off
+    wider = follow @ (more * inverse) @ follow.T
+    added = max(weight - _RARELY, 0.0) * wider + weight * np.outer(moved, moved)
+    little = np.trace(added[:3, :3]) < _LITTLE * np.trace(solution.spread[:3, :3])
+    return nothing if little else np.asarray(added)
 
 
 def covering(pose: Pose, other: Pose, spec: PositionSpec) -> Pose:
@@ -214,7 +488,7 @@ def misfits(problem: Problem, fit: Fit) -> bool:
 
 @lru_cache(maxsize=256)
 def _parts(transmitters: tuple[int, ...], angles: int) -> tuple[str, ...]:
-    """What may be at fault, in the order of `_kernels.weighed`; `angles` that are known, and free."""
+    """What may be at fault, in the order of `_tested_parts`; `angles` that are known, and free."""
     names = *(f"bar {number}" for number in transmitters), FOCAL
     return (*names, *("attitude", "heading")[: angles - 1]) if angles else names
 
@@ -229,13 +503,12 @@ def _doubt(doubted: Floats) -> dict[str, Floats]:
     """The position's moves by the doubt, by its name; none where there is none."""
     if not doubted.any():
         return {}
-    values, axes = np.empty(3), np.empty((3, 3))
-    _kernels.eigen(doubted.copy(), values, axes)
+    values, axes = np.linalg.eigh(doubted)
     # The symmetric root changes little from fix to fix.
     return {"doubt": (axes * np.sqrt(np.maximum(values, 0))) @ axes.T}
 
 
-def _standing(problem: Problem, camera: Floats, attitude: Floats, bars: Floats) -> dict[str, Floats]:
+def _named(problem: Problem, camera: Floats, attitude: Floats, bars: Floats) -> dict[str, Floats]:
     """The position's moves by what stays, by name; or how they change."""
     standing = {}
     if problem.free[7]:

@@ -2,23 +2,18 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.points import SeenPoints
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
-
-if TYPE_CHECKING:
-    from evlcp_sdk.place import _kernels
-else:
-    _kernels = Late("evlcp_sdk.place._kernels")
 
 __all__ = ["EXACT_RAD", "BarView", "Problem", "between_of", "project_bars", "shared_sigmas"]
 
@@ -121,7 +116,7 @@ class Problem:
             it is seen, px, 1 / sigma, and the share of its variance that stands for a while, float64 (n, 10).
         bar: Number of each point's bar, rising, int64 (n,).
         bar_sigma: Of each bar: its survey, a root of the covariance of its image's shift, px, and what makes
-            errors of points even in all directions, float64 (bars, 9): see `_kernels.shared`.
+            errors of points even in all directions, float64 (bars, 9): see `_sigmas_of`.
         transmitters: Number of each bar.
         lens: Focal length, px, principal point, px, k1, k2, p1, p2, k3, float64 (8,).
         lens_root: A lower root of the covariance of the first seven, float64 (7, 7).
@@ -132,7 +127,7 @@ class Problem:
         angles: How many of pitch, roll and heading are known: 0, 2 or 3.
         white: What whitens the errors of these, float64 (3, 3).
         said: What moves these as they are said, whitened, by its sigmas, float64 (3, 4).
-        free: Which unknowns of the fit there are, bool (14,): see `_kernels`.
+        free: Which unknowns of the fit there are, bool (14,): see `model`.
         shaken_rad: Sigma of what shifts the images of all bars alike.
     """
 
@@ -164,29 +159,25 @@ class Problem:
         sigma: CameraSigma,
     ) -> "Problem | Refusal":
         """What the views give, or why that is too little for a position."""
-        count = sum([len(view.sigma_px) for view in views])
-        points, bar, bar_sigma = np.empty((count, 10)), np.empty(count, np.int64), np.empty((len(views), 9))
-        width, height, between = camera.width, camera.height, between_of(views)
+        between = between_of(views)
         kept: list[int] = []
-        at = most = 0
+        parts: list[Floats] = []
+        sigmas: list[Floats] = []
+        most = 0
         for view in views:
-            own = bar_sigma[len(kept)]
-            own[:3] = view.survey
-            pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
-            number = _kernels.gathered(
-                view.enu_m, view.points_px, view.sigma_px, pixel, width, height, _usual(spec, view, between),
-                spec.min_points,
-                len(kept), at, points, bar, own,
-            )  # fmt: skip
+            whole = whole_clusters(view.points_px, view.sigma_px, camera.width, camera.height)
+            number = int(whole.sum())
             most = max(most, number)
             if number >= spec.min_points:
                 kept.append(view.transmitter)
-                at += number
+                parts.append(_rows_of(view, whole, spec))
+                sigmas.append(_sigmas_of(view, whole, spec, between))
         if not kept:
             return Refusal(
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
             )
-        points, bar = points[:at], bar[:at]
+        points = np.concatenate(parts)
+        bar = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
         told = _told(attitude, points, bar, len(kept), shaken_rad)
         if isinstance(told, Refusal):
@@ -200,7 +191,7 @@ class Problem:
             spec=spec,
             points=points,
             bar=bar,
-            bar_sigma=bar_sigma[: len(kept)],
+            bar_sigma=np.array(sigmas),
             transmitters=tuple(kept),
             lens=np.array(
                 [camera.focal_px, *camera.centre_px, camera.k1, camera.k2, camera.p1, camera.p2, camera.k3]
@@ -227,13 +218,14 @@ class Problem:
             return told
         free = self.free.copy()
         free[3:6] = told.pop("turns")
-        return self._but(attitude=attitude, free=free, **told)
+        return replace(self, attitude=attitude, free=free, **told)
 
     def without(self, bar: int) -> "Problem | Refusal":
         """The same without a bar, by its place among `transmitters`, or why the others are too few."""
         kept = self.bar != bar
         others = self.bar[kept]
-        fewer = self._but(
+        fewer = replace(
+            self,
             points=self.points[kept],
             bar=others - (others > bar),
             bar_sigma=np.delete(self.bar_sigma, bar, 0),
@@ -245,20 +237,26 @@ class Problem:
         """The same through a camera that is so surely known."""
         free = self.free.copy()
         free[7:] = sigma.known
-        return self._but(lens_root=sigma.root(self.camera), free=free)
+        return replace(self, lens_root=sigma.root(self.camera), free=free)
 
     def halved(self) -> "Problem":
         """The same by the means of the halves of each bar: a few points that say nearly as much."""
-        bars = len(self.transmitters)
-        points, bar = np.empty((2 * bars, 10)), np.empty(2 * bars, np.int64)
-        count = _kernels.halved(self.points, self.bar, points, bar)
-        return self._but(points=points[:count], bar=bar[:count])
+        points, bar = [], []
+        for number in range(len(self.transmitters)):
+            mine = self.points[self.bar == number]
+            for half in (mine[: len(mine) // 2], mine[len(mine) // 2 :]):
+                if len(half):
+                    weight = half[:, 8] ** 2
+                    points.append([*(weight @ half[:, :8] / weight.sum()), math.sqrt(weight.sum()), 0.0])
+                    bar.append(number)
+        return replace(self, points=np.array(points), bar=np.array(bar))
 
-    def _but(self, **changes: Any) -> "Problem":
-        """The same with other fields, in a fifth of the time of `dataclasses.replace`."""
-        other = object.__new__(Problem)
-        vars(other).update(vars(self), **changes)
-        return other
+    @cached_property
+    def unknowns(self) -> NDArray[np.int64]:
+        """Numbers of the fit's unknowns that are free and that points depend on: see `model`."""
+        places = 9 if self.bar_sigma[:, :2].any() else 3
+        own = 14 + 9 * np.arange(len(self.transmitters))[:, None] + np.arange(places)
+        return np.concatenate([np.flatnonzero(self.free), own.ravel()])
 
 
 def _told(
@@ -272,7 +270,7 @@ def _told(
     if not compass and bars == 1:
         return Refusal("heading-unknown", "one bar gives a position only with the camera's heading known")
     if attitude is None:
-        if bars < 3 or _kernels.flatness(points, bar, bars) < _INLINE:
+        if bars < 3 or _flatness(points, bar, bars) < _INLINE:
             many = "two bars give" if bars == 2 else "bars in line give"
             return Refusal("gravity-unknown", f"{many} a position only with gravity known")
         return {
@@ -313,22 +311,94 @@ def shared_sigmas(
     """Of a bar: its image's shift, px, in any direction at most; its place, m, turn, radians, and length, a
     share. `between` is what it has in common with others, see `between_of`.
     """
-    found = np.array([*view.survey, *[0.0] * 6])
-    _kernels.shared(view.enu_m, view.points_px, seen, _usual(spec, view, between), found)
-    place, turn, length, columns, both, rows = found[:6].tolist()
+    place, turn, length, columns, both, rows = _sigmas_of(view, seen, spec, between)[:6].tolist()
     return float(np.linalg.eigvalsh([[columns, both], [both, rows]])[-1]), place, turn, length
 
 
-def _usual(spec: PositionSpec, view: BarView, between: float) -> Floats:
-    """What kernels take of these, float64 (5,): see `_kernels.shared`.
+def whole_clusters(points_px: Floats, sigma_px: Floats, width: int, height: int) -> NDArray[np.bool_]:
+    """Which clusters of a bar count, bool (K,): seen, with a sigma, and not cut off.
+
+    Of a cluster that touches the image's edge only a part is seen. It is as long as the spacing of
+    neighbours; three quarters of that and a pixel of blur must be free.
+    """
+    seen = np.flatnonzero(np.isfinite(points_px[:, 0]))
+    edge = 0.5
+    if len(seen) > 1:
+        first, last = seen[0], seen[-1]
+        edge += 0.75 * math.dist(points_px[first], points_px[last]) / (last - first)
+    inside = (points_px >= edge) & (points_px <= np.array([width, height]) - 1 - edge)
+    counted: NDArray[np.bool_] = inside.all(1) & (sigma_px > 0) & (sigma_px < math.inf)
+    return counted
+
+
+def _rows_of(view: BarView, whole: NDArray[np.bool_], spec: PositionSpec) -> Floats:
+    """A bar's whole clusters as rows of a `Problem`, float64 (n, 10)."""
+    pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
+    sigma = view.sigma_px[whole, None]
+    # From the whole bar's centre: errors of its attitude turn it about that, whatever is seen of it.
+    arm = view.enu_m - view.enu_m.mean(0)
+    share = np.minimum((pixel / sigma) ** 2, 1.0)
+    return np.concatenate([view.enu_m[whole], arm[whole], view.points_px[whole], 1 / sigma, share], 1)
+
+
+def _sigmas_of(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec, between: float) -> Floats:
+    """What a bar's points share, and how they err across it, by those `seen`, bool (K,), float64 (9,).
+
+    The first three are its survey's, place, m, turn, radians, and length, a share, to which is added by how
+    much it looks too long; the next are of a root of the covariance of its image's shift, px: of columns, of
+    both, of rows. Of a layout that is no line, what is along it holds in all directions. The whole is as long
+    as from one of its clusters to the farthest other, and a cluster's own part; its image is so by what is
+    seen of it. The last, of columns, of both, of rows, make a point's errors even in all directions and of
+    sigma 1.
 
     The image moves as one: of what is not known of it, a bar has for its own what it has more or less than
     others. These count as independent, so that two bars differ by as much as they do.
     """
     moved = math.hypot(math.sqrt(2) * spec.shaken_sigma_px * abs(view.between - between), view.early_px)
-    across = math.hypot(spec.shared_sigma_px, view.shift_px, moved)
-    shift = across, math.hypot(spec.shared_along_px, moved), spec.shared_share
-    return np.array([*shift, spec.stretch_share, view.across], np.float64)
+    count, points = len(seen), view.points_px
+    i, j = _ends(view.enu_m, np.flatnonzero(seen))
+    first, last = _ends(view.enu_m, np.arange(count))
+    share = math.dist(view.enu_m[first], view.enu_m[last]) / math.dist(view.enu_m[i], view.enu_m[j])
+    share *= count / (count - 1)
+    size = math.dist(points[i], points[j])
+    along = math.hypot(spec.shared_along_px, moved, spec.shared_share * size * share)
+    axis = (points[j] - points[i]) / size if size > 0 else np.array([1.0, 0.0])
+    aside = (points[seen] - points[i]) @ np.array([axis[1], -axis[0]])
+    # Half a cluster beside the line from end to end is no error of a point in it.
+    line = size > 0 and bool((np.abs(aside) <= 0.5 * size * share / count).all())
+    across = math.hypot(spec.shared_sigma_px, view.shift_px, moved) if line else along
+    sideways = 1 / view.across if line else 1 / max(view.across, 1.0)
+    place, turn, length = view.survey
+    return np.array(
+        [
+            *(place, turn, math.hypot(length, spec.stretch_share)),
+            *_root_along(axis, along, across),
+            *_root_along(axis, 1.0 if line else sideways, sideways),
+        ]
+    )
+
+
+def _root_along(axis: Floats, along: float, across: float) -> tuple[float, float, float]:
+    """Of a matrix with these values along an axis and across it: of columns, of both, of rows."""
+    x, y = axis.tolist()
+    more = along - across
+    return across + more * x * x, more * x * y, across + more * y * y
+
+
+def _ends(places: Floats, counted: NDArray[np.int64]) -> tuple[int, int]:
+    """Two of the places that count, as far apart as any: the farthest from the farthest from one."""
+    one = other = int(counted[0])
+    for _ in range(2):
+        away = np.linalg.norm(places[counted] - places[other], axis=1)
+        one, other = other, int(counted[away.argmax()])
+    return one, other
+
+
+def _flatness(points: Floats, bar: NDArray[np.int64], bars: int) -> float:
+    """How far the bars' centres spread across the line that fits them best, against along it."""
+    centres = np.array([points[bar == number, :3].mean(0) for number in range(bars)])
+    values = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
+    return float(values[1] / values[0]) if values[0] > 0 else 0.0
 
 
 def _whitening(attitude: Attitude, causes: Floats, angles: int, shaken_rad: float) -> Floats:
@@ -337,12 +407,12 @@ def _whitening(attitude: Attitude, causes: Floats, angles: int, shaken_rad: floa
     All have those that are new with each time, too: the attitude's own and, of what shifts an image down or
     aside, `shaken_rad`.
     """
-    white = np.zeros((3, 3))
     least = math.radians(attitude.white_sigma_deg) ** 2 + EXACT_RAD**2
     pitch = math.radians(attitude.pitch_deg)
     # As a camera turns about its own axes across and upright: the second is not the world's.
     aside = [[1.0, 0.0], [0.0, math.tan(pitch)], [0.0, 1 / math.cos(pitch)]]
-    _kernels.whitening(np.concatenate([causes, shaken_rad * np.array(aside)], 1), least, white)
+    moves = np.concatenate([causes, shaken_rad * np.array(aside)], 1)
+    white = np.linalg.inv(np.linalg.cholesky(moves @ moves.T + least * np.eye(3)))
     if angles < 3:
         white[2] = (0.0, 0.0, 1.0)
     return white

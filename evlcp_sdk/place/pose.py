@@ -16,8 +16,9 @@ import numpy as np
 
 from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.failed import failed_bar
-from evlcp_sdk.place.fit import Fit, fit_pose
+from evlcp_sdk.place.fit import fit_pose
 from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, covering, judged, misfits
+from evlcp_sdk.place.model import Fit
 from evlcp_sdk.place.observations import BarView, Problem
 from evlcp_sdk.place.refusals import Candidate, Refusal
 from evlcp_sdk.place.starts import ODDS, is_hopeless, likely_starts

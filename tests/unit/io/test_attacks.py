@@ -14,9 +14,11 @@ import pytest
 h5py = pytest.importorskip("h5py")
 
 READ = (
-    "import resource, sys; from evlcp_sdk.cli.main import main\n"
+    "from evlcp_sdk.cli.main import main\n"
     "try: main()\n"
-    "except SystemExit as end: print(end.code, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024)"
+    "except SystemExit as end:\n"
+    "    kb = next(line.split()[1] for line in open('/proc/self/status') if line.startswith('VmHWM'))\n"
+    "    print(end.code, int(kb) // 1024)"
 )
 TOPIC = "INSERT INTO topics VALUES (1, '/e', 'event_camera_msgs/msg/EventPacket')"
 TABLES = (

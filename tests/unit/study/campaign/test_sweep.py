@@ -158,7 +158,7 @@ def test_files_of_a_scene_count_by_what_they_hold(campaign: Path, tmp_path: Path
 
 def test_the_shipped_campaigns_are_read() -> None:
     demo, paper = plan_of(demo_campaign()), plan_of(ROOT / "examples" / "campaigns" / "paper.toml")
-    assert len(demo.jobs) == 4
+    assert len(demo.jobs) == 20
     assert {round(s.identity["motion"]["speed_mps"] * 3.6, 1) for s in paper.scenes} == {20.0, 30.0, 40.0}
     assert [dict(k.labels)["variant"] for k in paper.links] == ["16 clusters", "two clusters"]
     # The guesses are set in one way wherever the paper's drive is simulated.

@@ -1,0 +1,253 @@
+"""The image of bars as a camera sees them, and what every unknown does to it, in arrays.
+
+The unknowns, in this order, are 14 that all points share: the position, m; a small turn of the camera about
+east, north and up, radians; a focal length that is other than said, in units of `FOCAL_UNIT`, which is free
+in no fit but whose column says what such a fault would do; and the camera's seven errors in their own sigmas.
+Then each bar has nine: a shift of its image to the right and down, errors of its length, of its place to the
+east, north and up, and of its attitude about these; all in their own sigmas.
+"""
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.place.observations import Problem
+from evlcp_sdk.scene.camera import CameraModel
+
+__all__ = [
+    "FAULT",
+    "FOCAL_UNIT",
+    "LENS",
+    "LOCAL",
+    "SHARED",
+    "Equations",
+    "Fit",
+    "linearize",
+    "move",
+    "skewed",
+]
+
+Floats = NDArray[np.float64]
+
+FAULT, LENS, SHARED, LOCAL = 6, 7, 14, 9
+
+FOCAL_UNIT = 0.005
+"""Share of the focal length in which a fault of it is counted."""
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """One point of the fit.
+
+    Attributes:
+        position: m, float64 (3,).
+        rotation: Camera axes as columns in ENU, float64 (3, 3).
+        local: Each bar's own errors in their sigmas: shift of the image, length, place, turn, float64 (bars,
+            9).
+        lens: The camera's errors, by the root of their covariance, float64 (7,).
+        cost: Twice the cost.
+        settled: Whether a fit ended here.
+    """
+
+    position: Floats
+    rotation: Floats
+    local: Floats
+    lens: Floats
+    cost: float = math.nan
+    settled: bool = False
+
+    @classmethod
+    def at(cls, problem: Problem, position: Floats, rotation: Floats) -> "Fit":
+        """A place and axes, and no other error; what it costs is not known."""
+        return cls(position, rotation, np.zeros((len(problem.transmitters), LOCAL)), np.zeros(7))
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """The problem at a point, linear.
+
+    Attributes:
+        rows: What the unknowns do to the points, whitened, float64 (2 n, 14 + 9 bars).
+        miss: Seen less expected points, whitened, float64 (2 n,).
+        stands: The share of each row's variance that stands for a while, float64 (2 n,).
+        angles: What the unknowns do to the attitude as it is known, whitened, float64 (k, 14 + 9 bars).
+        angles_miss: Said less expected angles, whitened, float64 (k,).
+        errors: The camera's and the bars' errors, which are expected to be 0 to a sigma, float64 (7 + 9
+            bars,).
+        cost: Twice the robust cost.
+    """
+
+    rows: Floats
+    miss: Floats
+    stands: Floats
+    angles: Floats
+    angles_miss: Floats
+    errors: Floats
+    cost: float
+
+    def normal(self) -> tuple[Floats, Floats]:
+        """Normal equations: the matrix, float64 (m, m), and the right-hand side, float64 (m,)."""
+        matrix = self.rows.T @ self.rows + self.angles.T @ self.angles
+        matrix.flat[LENS * (len(matrix) + 1) :: len(matrix) + 1] += 1.0
+        side = self.rows.T @ self.miss + self.angles.T @ self.angles_miss
+        side[LENS:] -= self.errors
+        return matrix, side
+
+
+def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
+    """The problem at a point; None where a point is behind the camera.
+
+    Args:
+        problem: What is seen and known.
+        at: The point.
+        huber: Misses in sigmas beyond which a point weighs less.
+    """
+    points, bar = problem.points, problem.bar
+    own, sigma, arm = at.local[bar], problem.bar_sigma[bar], skewed(points[:, 3:6])
+    place, turn, length = sigma[:, 0:1], sigma[:, 1:2], sigma[:, 2:3]
+    offset = points[:, :3] - at.position + place * own[:, 3:6] + length * own[:, 2:3] * points[:, 3:6]
+    offset += _by(turn * own[:, 6:9], arm)
+    seen = offset @ at.rotation
+    if not (seen[:, 2] > 0).all():
+        return None
+    camera = _erring(problem.camera, problem.lens_root @ at.lens) if at.lens.any() else problem.camera
+    direction = seen[:, :2] / seen[:, 2:]
+    expected = camera.distort(direction)
+    root, even = _symmetric(sigma[:, 3:6]), _symmetric(sigma[:, 6:9])
+    miss = _by((points[:, 6:8] - expected - _by(own[:, :2], root)) * points[:, 8:9], even)
+    size = np.hypot(miss[:, 0], miss[:, 1])
+    weight = huber / np.maximum(size, huber) if huber < math.inf else np.ones(len(size))
+    cost = float((np.where(size > huber, huber * (2 * size - huber), size**2)).sum())
+    white = even * (np.sqrt(weight) * points[:, 8])[:, None, None]
+    by_point = _by_point(white @ camera.distort_slope(direction), direction, seen[:, 2], at.rotation)
+    rows = np.zeros((len(points), 2, SHARED + at.local.size))
+    rows[:, :, :3] = -by_point
+    rows[:, :, 3:6] = by_point @ skewed(offset)
+    by_focal = (expected - camera.centre_px) * (FOCAL_UNIT * problem.camera.focal_px / camera.focal_px)
+    rows[:, :, FAULT] = _by(by_focal, white)
+    if problem.free[LENS:].any():
+        rows[:, :, LENS:SHARED] = white @ (_by_lens(camera, direction, expected) @ problem.lens_root)
+    local = np.concatenate(
+        [
+            white @ root,
+            by_point @ (points[:, 3:6] * length)[:, :, None],
+            by_point * place[:, :, None],
+            by_point @ arm * -turn[:, :, None],
+        ],
+        -1,
+    )
+    for number in range(len(at.local)):
+        first = SHARED + LOCAL * number
+        rows[bar == number, :, first : first + LOCAL] = local[bar == number]
+    angles, angles_miss = _attitude(problem, at.rotation, rows.shape[2])
+    errors = np.concatenate([at.lens, at.local.ravel()])
+    return Equations(
+        rows.reshape(-1, rows.shape[2]),
+        (miss * np.sqrt(weight)[:, None]).ravel(),
+        np.repeat(points[:, 9] * weight, 2),
+        angles,
+        angles_miss,
+        errors,
+        cost + float(errors @ errors + angles_miss @ angles_miss),
+    )
+
+
+def move(problem: Problem, at: Fit, step: Floats) -> Fit:
+    """The point with its unknowns moved, float64 (14 + 9 bars,).
+
+    A turn takes the camera about the points' centre, to first order along the straight line: their image
+    hardly changes on that arc, so that long steps hold.
+    """
+    turn, angle = step[3:6], math.sqrt(step[3:6] @ step[3:6])
+    # Rodrigues.
+    axis = skewed(turn[None] / max(angle, 1e-300))[0]
+    turned = np.eye(3) + math.sin(angle) * axis + (1 - math.cos(angle)) * axis @ axis
+    centre = problem.points[:, :3].mean(0)
+    away = at.position - centre
+    return Fit(
+        centre + step[:3] + turned @ away - skewed(turn[None])[0] @ away,
+        turned @ at.rotation,
+        at.local + step[SHARED:].reshape(at.local.shape),
+        at.lens + step[LENS:SHARED],
+    )
+
+
+_LEVI_CIVITA = np.zeros((3, 9))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _LEVI_CIVITA[_i, 3 * _j + _k], _LEVI_CIVITA[_i, 3 * _k + _j] = -1.0, 1.0
+
+
+def skewed(vectors: Floats) -> Floats:
+    """Matrices of vectors v (n, 3), float64 (n, 3, 3): times w it is v x w, and w times it is w x v."""
+    return (vectors @ _LEVI_CIVITA).reshape(-1, 3, 3)
+
+
+def _by(vectors: Floats, matrices: Floats) -> Floats:
+    """Vectors (n, k) times symmetric, or from the left, matrices (n, k, m)."""
+    product: Floats = (vectors[:, None, :] @ matrices)[:, 0]
+    return product
+
+
+def _symmetric(upper: Floats) -> Floats:
+    """Matrices of their upper halves (n, 3), float64 (n, 2, 2)."""
+    return upper[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
+
+
+def _erring(camera: CameraModel, error: Floats) -> CameraModel:
+    """A camera with errors of focal length, principal point, k1, k2, p1, p2."""
+    focal, x, y, k1, k2, p1, p2 = error.tolist()
+    return replace(
+        camera,
+        focal_mm=(camera.focal_px + focal) * camera.pitch_um / 1e3,
+        centre_x_px=camera.centre_px[0] + x,
+        centre_y_px=camera.centre_px[1] + y,
+        k1=camera.k1 + k1,
+        k2=camera.k2 + k2,
+        p1=camera.p1 + p1,
+        p2=camera.p2 + p2,
+    )
+
+
+def _by_point(slope: Floats, direction: Floats, ahead: Floats, rotation: Floats) -> Floats:
+    """What a move of a point does to its image, by what its direction does, float64 (n, 2, 3), in ENU."""
+    by = slope / ahead[:, None, None]
+    return np.concatenate([by, -by @ direction[:, :, None]], -1) @ rotation.T
+
+
+def _by_lens(camera: CameraModel, direction: Floats, expected: Floats) -> Floats:
+    """What the camera's seven parameters do to points, px, float64 (n, 2, 7)."""
+    u, v, f = direction[:, 0], direction[:, 1], camera.focal_px
+    r2 = u * u + v * v
+    out = np.zeros((len(u), 2, 7))
+    out[:, :, 0] = (expected - camera.centre_px) / f
+    out[:, 0, 1] = out[:, 1, 2] = 1.0
+    out[:, :, 3] = f * direction * r2[:, None]
+    out[:, :, 4] = out[:, :, 3] * r2[:, None]
+    out[:, 0, 5] = out[:, 1, 6] = 2 * f * u * v
+    out[:, 1, 5], out[:, 0, 6] = f * (r2 + 2 * v * v), f * (r2 + 2 * u * u)
+    return out
+
+
+def _attitude(problem: Problem, rotation: Floats, unknowns: int) -> tuple[Floats, Floats]:
+    """What the turns do to pitch, roll and heading as they are known, whitened, and by how much they miss."""
+    known = problem.angles
+    east, north, high = rotation[:, 2].tolist()
+    level = max(east * east + north * north, 1e-12)
+    fe, fn = east / math.sqrt(level), north / math.sqrt(level)
+    # Up as the sensor felt it, turned as the camera is: level if the rotation is right.
+    x, y, z = (rotation @ problem.felt).tolist()
+    off = problem.heading_rad - math.atan2(east, north)
+    raw = np.array([x * fe + y * fn, y * fe - x * fn, math.remainder(off, 2 * math.pi)])
+    by_turn = np.array(
+        [
+            [z * fn, -z * fe, y * fe - x * fn],
+            [z * fe, z * fn, -x * fe - y * fn],
+            [east * high / level, north * high / level, -1.0],
+        ]
+    )
+    white = problem.white[:known, :known]
+    rows = np.zeros((known, unknowns))
+    rows[:, 3:6] = white @ by_turn[:known]
+    return rows, white @ raw[:known]

@@ -1,0 +1,404 @@
+"""The fit of a pose against numerical slopes, dense equations and SciPy's least squares."""
+
+import dataclasses
+import math
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy import stats
+from scipy.optimize import approx_fprime, least_squares
+from scipy.spatial.transform import Rotation
+
+from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.fit import fit_pose
+from evlcp_sdk.place.judgement import Judged, _doubted, _solve, _test, judged
+from evlcp_sdk.place.model import FOCAL_UNIT, Fit, linearize, move
+from evlcp_sdk.place.observations import (
+    BarView,
+    Problem,
+    _flatness,
+    project_bars,
+    shared_sigmas,
+    whole_clusters,
+)
+from evlcp_sdk.place.starts import _level_starts, likely_starts, nearest_to_sights
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing
+from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
+
+Floats = NDArray[np.float64]
+
+BENT = CameraModel(k1=-0.3, k2=0.1, p1=1e-3, p2=-1e-3, centre_x_px=655.0, centre_y_px=350.0)
+CORRELATED = tuple(tuple(0.4 if i != j else 1.0 for j in range(7)) for i in range(7))
+LENS = CameraSigma(0.1, 3.0, 2.0, 0.05, 0.05, 1e-4, 1e-4, correlation=CORRELATED)
+SURVEY = (0.05, 0.01, 0.01)
+SPEC = PositionSpec(huber_sigmas=3.0)
+ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
+
+
+def problem(rng: np.random.Generator, bars: int = 2, noise: float = 3.0) -> tuple[Problem, Floats, Floats]:
+    """Bars seen with errors, and the place and axes near which they are."""
+    attitude = Attitude(4.0, -2.0, 30.0, 0.2, 0.4, 0.1, 2000.0, (10.0, -20.0, 30.0))
+    rotation, position = attitude.rotation(), np.array([5.0, -3.0, 1.0])
+    views = []
+    for number in range(bars):
+        sight = np.array([0.05 * (number - 0.5), 0.02 * number, 1.0]) * (40 + 8 * number)
+        stands = position + rotation @ sight + ALONG[:, None] * np.array([0.1, 0.05, 0.99])
+        points, _ = project_bars(stands, position, rotation, BENT)
+        points = points + noise * rng.normal(0, 0.1, points.shape)
+        sigma_px = rng.uniform(0.08, 0.15, 16)
+        views.append(BarView(number, stands, points, sigma_px, SURVEY, across=0.6 + 0.7 * number))
+    found = Problem.of(views, BENT, attitude, SPEC, LENS)
+    assert isinstance(found, Problem)
+    return found, position, rotation
+
+
+def misses(p: Problem, at: Fit, change: Floats) -> Floats:
+    """All misses in sigmas, of points and of what is known, at a point that is moved: written out anew.
+
+    `change`: 6 of the pose, 1 of the focal length's fault, 7 of the lens, 9 of each bar.
+    """
+    z = at.lens + change[7:14]
+    off = LENS.root(BENT) @ z
+    f = BENT.focal_px + off[0]
+    camera = dataclasses.replace(
+        BENT,
+        focal_mm=BENT.focal_mm * f / BENT.focal_px,
+        **{name: BENT.centre_px[i] + off[1 + i] for i, name in enumerate(CAMERA_PARAMETERS[1:3])},
+        **{name: getattr(BENT, name) + off[3 + i] for i, name in enumerate(CAMERA_PARAMETERS[3:])},
+    )
+    turn = Rotation.from_rotvec(change[3:6]).as_matrix()
+    position, rotation = at.position + change[:3], turn @ at.rotation
+    found = []
+    for b in range(len(p.transmitters)):
+        own = at.local[b] + change[14 + 9 * b : 23 + 9 * b]
+        rows = p.points[p.bar == b]
+        arm = rows[:, 3:6]
+        place, lean, length, columns, both, rows_px, *even = p.bar_sigma[b]
+        stands = rows[:, :3] + place * own[3:6] + np.cross(lean * own[6:9], arm) + length * own[2] * arm
+        points, _ = project_bars(stands, position, rotation, camera)
+        centre = np.array(camera.centre_px)
+        points = centre + (points - centre) * (1 + FOCAL_UNIT * change[6])
+        points = points + np.array([[columns, both], [both, rows_px]]) @ own[:2]
+        white = np.array([even[:2], even[1:]]) * rows[:, 8, None, None]
+        found.append(np.einsum("nij,nj->ni", white, rows[:, 6:8] - points).ravel())
+        found.append(-own)
+    found.append(-z)
+    assert p.attitude is not None
+    seen = Attitude.of_rotation(rotation)
+    off_deg = np.array(
+        [
+            p.attitude.pitch_deg - seen.pitch_deg,
+            p.attitude.roll_deg - seen.roll_deg,
+            (p.attitude.heading_deg or 0) - (seen.heading_deg or 0),
+        ]
+    )
+    causes = p.attitude.standing()
+    spread = causes @ causes.T + np.radians(p.attitude.white_sigma_deg) ** 2 * np.eye(3)
+    found.append(np.linalg.solve(np.linalg.cholesky(spread), np.radians(off_deg)))
+    return np.concatenate(found)
+
+
+def test_equations_are_those_of_numerical_slopes() -> None:
+    rng = np.random.default_rng(1)
+    p, position, rotation = problem(rng, noise=0.8)
+    at = Fit(position, rotation, rng.normal(0, 0.3, (2, 9)), rng.normal(0, 0.3, 7))
+    found = linearize(p, at, 100.0)
+    assert found is not None
+    at_rest = misses(p, at, np.zeros(32))
+    slope = -approx_fprime(np.zeros(32), lambda x: misses(p, at, x), 1e-6)
+    matrix, side = found.normal()
+    scale = np.sqrt(np.diag(slope.T @ slope))
+    # The roll is about the level forward axis, not the pitched one.
+    np.testing.assert_allclose(
+        matrix / np.outer(scale, scale), slope.T @ slope / np.outer(scale, scale), atol=1e-3
+    )
+    np.testing.assert_allclose(side / scale, slope.T @ at_rest / scale, atol=2e-3)
+    assert found.cost == pytest.approx(at_rest @ at_rest, rel=1e-6)
+    behind = dataclasses.replace(at, position=position + rotation @ np.array([0, 0, 100.0]))
+    assert linearize(p, behind, 100.0) is None
+
+
+def sigmas_of(p: Problem, fit: Fit) -> Floats:
+    """Of the position, by the whole matrix."""
+    equations = linearize(p, fit, SPEC.huber_sigmas)
+    assert equations is not None
+    matrix = equations.normal()[0][np.ix_(p.unknowns, p.unknowns)]
+    sigma: Floats = np.sqrt(np.diag(np.linalg.inv(matrix))[:3])
+    return sigma
+
+
+def test_the_fit_is_that_of_scipy() -> None:
+    rng = np.random.default_rng(3)
+    p, position, rotation = problem(rng, noise=1.0)
+    # A point far out, for Huber's loss.
+    far = p.points.copy()
+    far[4, 6] += 4.0
+    p = dataclasses.replace(p, points=far)
+    fit = fit_pose(p, Fit.at(p, position + np.array([0.5, -0.4, 0.2]), rotation))
+    assert fit.settled
+    start = Fit.at(p, position, rotation)
+
+    def cost(x: Floats) -> Floats:
+        all_ = misses(p, start, np.concatenate([x[:6], [0.0], x[6:]]))
+        for b in range(2):
+            rows = slice(41 * b, 41 * b + 32)
+            pairs = all_[rows].reshape(-1, 2)
+            size = np.linalg.norm(pairs, axis=1)
+            most = SPEC.huber_sigmas
+            less = np.where(
+                size > most, np.sqrt(np.abs(most * (2 * size - most))) / np.maximum(size, 1e-9), 1.0
+            )
+            all_[rows] = (pairs * less[:, None]).ravel()
+        return all_
+
+    scipy = least_squares(cost, np.zeros(31), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
+    # The roll is about the level forward axis, not the pitched one.
+    assert fit.cost == pytest.approx(2 * scipy.cost, rel=5e-5)
+    sigma = sigmas_of(p, fit)
+    np.testing.assert_allclose(fit.position / sigma, (position + scipy.x[:3]) / sigma, atol=0.03)
+    np.testing.assert_allclose(fit.lens, scipy.x[6:13], atol=0.03)
+    np.testing.assert_allclose(fit.local.ravel(), scipy.x[13:], atol=0.03)
+
+
+def test_a_step_turns_about_the_bars() -> None:
+    """To first order along the straight line; a turn alone keeps the camera as far from the bars."""
+    p, position, rotation = problem(np.random.default_rng(4))
+    at = Fit.at(p, position, rotation)
+    centre = p.points[:, :3].mean(0)
+    turn = np.array([0.0, 0.0, 0.3])
+    step = np.zeros(32)
+    step[:3], step[3:6] = np.cross(turn, position - centre), turn
+    there = move(p, at, step)
+    assert np.linalg.norm(there.position - centre) == pytest.approx(np.linalg.norm(position - centre))
+    np.testing.assert_allclose(there.rotation, Rotation.from_rotvec(turn).as_matrix() @ rotation, atol=1e-12)
+    small = move(p, at, 1e-6 * step)
+    np.testing.assert_allclose(small.position - position, 1e-6 * step[:3], atol=1e-10)
+
+
+@pytest.mark.parametrize("bound", [0.0, 0.3])
+def test_a_mean_shift_test_is_the_larger_fit(bound: float) -> None:
+    """A linear problem with the fault's parameters as unknowns beside the others, solved whole."""
+    rng = np.random.default_rng(5)
+    rows, wrong = rng.normal(size=(40, 14)), np.zeros((40, 3))
+    wrong[:12] = rng.normal(size=(12, 3))
+    seen = rng.normal(size=40) + wrong @ [1.0, -2.0, 0.5]
+    spread = np.linalg.inv(rows.T @ rows)
+    left = seen - rows @ (spread @ (rows.T @ seen))
+    value, freedom, added, unseen = _test(
+        wrong.T @ wrong, rows.T @ wrong, wrong.T @ left, spread, bound * np.eye(3)
+    )
+    both = np.concatenate([rows, wrong], 1)
+    better = seen - both @ np.linalg.lstsq(both, seen, rcond=None)[0]
+    assert freedom == 3
+    assert value == pytest.approx(left @ left - better @ better)
+    prior = np.zeros((17, 17))
+    prior[14:, 14:] = bound * np.eye(3)
+    free = np.linalg.inv(both.T @ both + prior)
+    np.testing.assert_allclose(spread[:3, :3] + added, free[:3, :3], atol=1e-9)
+    # What the position moves by when the fault is free, as a linear map of the observations' noise.
+    move = free[:3] @ both.T - spread[:3] @ rows.T
+    noise = np.eye(40) - rows @ spread @ rows.T
+    np.testing.assert_allclose(unseen, move @ noise @ move.T, atol=1e-9)
+
+
+def test_a_part_that_says_nothing_has_no_test() -> None:
+    empty = _test(np.zeros((2, 2)), np.zeros((14, 2)), np.zeros(2), np.eye(14), np.zeros((2, 2)))
+    assert empty[:2] == (0.0, 0)
+    assert not empty[2].any()
+    assert not empty[3].any()
+
+
+def test_the_nearest_point_to_sights() -> None:
+    rng = np.random.default_rng(6)
+    enu, here = rng.uniform(-10, 10, (6, 3)) + np.array([0, 50, 0]), np.array([1.0, 2.0, 3.0])
+    sights = (enu - here) / np.linalg.norm(enu - here, axis=1, keepdims=True) + rng.normal(0, 1e-3, (6, 3))
+    sights /= np.linalg.norm(sights, axis=1, keepdims=True)
+    turns = Rotation.from_rotvec([[0, 0, 0], [0, 0, 0.3], [0, 0, math.pi]]).as_matrix()
+    places, costs = nearest_to_sights(enu, sights, turns)
+    for turn, place, cost in zip(turns, places, costs, strict=True):
+        lines = sights @ turn.T
+        flat = np.eye(3) - lines[:, :, None] * lines[:, None]
+        want = np.linalg.lstsq(flat.reshape(-1, 3), (flat @ enu[:, :, None]).ravel(), rcond=None)[0]
+        np.testing.assert_allclose(place, want, atol=1e-6)
+        away = enu - want
+        cosine = (away * lines).sum(1) / np.linalg.norm(away, axis=1)
+        assert cost == pytest.approx((1 - cosine).sum())
+    parallel = np.tile([[0.0, 1.0, 0.0]], (6, 1))
+    assert np.isinf(nearest_to_sights(enu, parallel, turns)[1]).all()
+
+
+def test_clusters_that_count() -> None:
+    """12 px apart: beside an edge, three quarters of that and half a pixel must be free."""
+    sigma = np.full(8, 0.1)
+    points = np.stack([np.full(8, 100.0), 9.0 + 12 * np.arange(8)], 1)
+    points[3], sigma[4], sigma[5] = np.nan, 0.0, np.inf
+    points[6, 0] = 9.4
+    assert np.flatnonzero(whole_clusters(points, sigma, 1280, 720)).tolist() == [1, 2, 7]
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.1, 5.0])
+def test_how_far_bars_are_from_a_line(offset: float) -> None:
+    rng = np.random.default_rng(16)
+    bar = np.repeat([0, 1, 2, 3], [5, 7, 4, 6])
+    line = np.array([[0, 0, offset], [3, 6, 0], [6, 12, 0], [9, 18, 0]])
+    points = rng.normal(0, 0.01, (len(bar), 10))
+    points[:, :3] += line[bar]
+    centres = np.stack([points[bar == b, :3].mean(0) for b in range(4)])
+    extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
+    assert _flatness(points, bar, 4) == pytest.approx(extent[1] / extent[0], rel=1e-6)
+
+
+@pytest.mark.parametrize("bars", [2, 3])
+def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
+    """Covariance, its causes and what errors of sites do, by the inverse of the whole matrix."""
+    p, position, rotation = problem(np.random.default_rng(12), bars, noise=1.0)
+    fit = fit_pose(p, Fit.at(p, position, rotation))
+    assert fit.settled
+    found, equations = judged(p, fit), linearize(p, fit, SPEC.huber_sigmas)
+    assert isinstance(found, Judged)
+    assert equations is not None
+    pose, keep = found.pose, p.unknowns
+    spread = np.zeros((14 + 9 * bars, 14 + 9 * bars))
+    spread[np.ix_(keep, keep)] = np.linalg.inv(equations.normal()[0][np.ix_(keep, keep)])
+    np.testing.assert_allclose(pose.covariance, spread[:6, :6], rtol=1e-6, atol=1e-12)
+    by_points = spread[:3] @ equations.rows.T
+    slow = by_points @ np.diag(equations.stands) @ by_points.T
+    np.testing.assert_allclose(pose.slow, slow, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(pose.standing["camera"], -spread[:3, 7:14], rtol=1e-6, atol=1e-9)
+    assert p.attitude is not None
+    angles = spread[:3] @ equations.angles.T @ p.white @ p.attitude.standing()
+    np.testing.assert_allclose(pose.standing["attitude"], angles, rtol=1e-6, atol=1e-9)
+    for b in range(bars):
+        own = slice(14 + 9 * b + 2, 23 + 9 * b)
+        np.testing.assert_allclose(pose.standing[f"bar {b}"], -spread[:3, own], rtol=1e-6, atol=1e-9)
+    whole = pose.noise + pose.slow + sum(m @ m.T for m in pose.standing.values())
+    np.testing.assert_allclose(whole, spread[:3, :3], rtol=1e-6, atol=1e-9)
+    assert abs(np.linalg.eigh(spread[:3, :3])[1][:, -1] @ pose.along) == pytest.approx(1)
+
+
+def test_protection_levels_hold_with_any_bar_at_fault() -> None:
+    """The widest of what a bar that stands anywhere may hide, each told by its own test."""
+    p, position, rotation = problem(np.random.default_rng(12), 3, noise=1.0)
+    p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=0.0))
+    fit = fit_pose(p, Fit.at(p, position, rotation))
+    found, solution = judged(p, fit), _solve(p, fit)
+    assert isinstance(found, Judged)
+    assert solution is not None
+    risk = stats.chi2.isf(SPEC.risk, 1)
+    for b in range(3):
+        column = solution.info[b, :, :6] * p.free[:, None]
+        own, side = solution.info[b, :6, :6], solution.right[b, :6]
+        value, freedom, added, unseen = _test(own, column, side, solution.spread, np.zeros((6, 6)))
+        assert value == pytest.approx(found.tests[f"bar {b}"])
+        hidden = np.sqrt(stats.chi2.isf(SPEC.false_alarm / 2 / len(found.tests), freedom) * np.diag(unseen))
+        assert (found.pose.hidden_m >= hidden * (1 - 1e-9)).all()
+        height_m = hidden[2] + math.sqrt(risk * (solution.spread[2, 2] + added[2, 2]))
+        assert found.pose.vpl_m >= height_m * (1 - 1e-9)
+
+
+@pytest.mark.parametrize("off", [0.0, 2.0, 6.0])
+def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
+    """A linear problem, whose evidence is that of all observations under a wide prior of the unknowns."""
+    rng, rarely, larger = np.random.default_rng(13), 0.05, 4.0
+    rows, angles = rng.normal(size=(30, 14)), 0.5 * rng.normal(size=(3, 14))
+    seen = rng.normal(size=33)
+    seen[30:] += np.array([off, 0, -off])
+    both = np.concatenate([rows, angles])
+    found = []
+    for size in (1.0, larger):
+        noise = np.diag([1.0] * 30 + [size**2] * 3)
+        spread = np.linalg.inv(both.T @ np.linalg.solve(noise, both))
+        mean = spread @ both.T @ np.linalg.solve(noise, seen)
+        evidence = stats.multivariate_normal(np.zeros(33), 1e6 * both @ both.T + noise).logpdf(seen)
+        found.append((evidence, mean, spread))
+    (one, at, spread), (two, there, wider) = found
+    weight = rarely * math.exp(two - one) / (1 - rarely + rarely * math.exp(two - one))
+    away = (there - at)[:6]
+    want = max(weight - rarely, 0) * (wider - spread)[:6, :6] + weight * np.outer(away, away)
+    equations: Any = SimpleNamespace(angles=angles, angles_miss=seen[30:] - angles @ at)
+    told: Any = SimpleNamespace(free=np.ones(14, bool))
+    solution: Any = SimpleNamespace(equations=equations, spread=spread)
+    out = _doubted(told, solution)
+    little = np.trace(want[:3, :3]) < 0.01 * np.trace(spread[:3, :3])
+    np.testing.assert_allclose(out, 0 * want if little else want, rtol=1e-3, atol=1e-6)
+    assert (np.trace(out) > 0.1 * np.trace(spread[:6, :6])) == (off > 5)
+
+
+def test_halves_are_weighted_means() -> None:
+    p, _, _ = problem(np.random.default_rng(14), bars=3)
+    few = p.halved()
+    assert few.bar.tolist() == [0, 0, 1, 1, 2, 2]
+    for i in range(6):
+        rows = p.points[8 * i : 8 * i + 8]
+        weight = rows[:, 8] ** 2
+        np.testing.assert_allclose(few.points[i, :8], weight @ rows[:, :8] / weight.sum())
+        assert few.points[i, 8] == pytest.approx(math.sqrt(weight.sum()))
+
+
+def test_headings_are_tried_to_a_fraction_of_a_degree() -> None:
+    rng = np.random.default_rng(16)
+    level = Attitude(5.0, -3.0, 0.0).rotation()
+    true = Rotation.from_rotvec([0, 0, 0.777]).as_matrix() @ level
+    enu = true @ (rng.uniform(-1, 1, (3, 4)) * [[4], [2], [5]] + [[0], [0], [40]])
+    sights = (enu / np.linalg.norm(enu, axis=0)).T @ true
+    found = _level_starts(enu.T.copy(), sights, level)
+    assert 1 <= len(found) <= 4
+    place, turned = found[0]
+    assert Rotation.from_matrix(turned.T @ true).magnitude() < math.radians(0.5)
+    assert np.linalg.norm(place) < 0.5
+    for _, axes in found:
+        np.testing.assert_allclose(axes[2], level[2], atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_starts_lead_to_where_all_points_do(seed: int) -> None:
+    """The fit to a few points is within what noise makes of the one to all; nothing far off is hidden."""
+    p, position, _ = problem(np.random.default_rng(20 + seed), bars=3, noise=1.0)
+    for told in (p, p.told(dataclasses.replace(p.attitude, heading_deg=None)), p.told(None)):
+        assert isinstance(told, Problem)
+        starts = likely_starts(told)
+        fit = fit_pose(told, starts[0])
+        sigma = sigmas_of(told, fit)
+        assert fit.settled
+        assert np.abs((starts[0].position - fit.position) / sigma).max() < 1.0
+        assert np.abs((position - fit.position) / sigma).max() < 5
+
+
+def test_a_fit_that_stalls_far_off_ends() -> None:
+    """A site that is metres off: hopeless from the start of the search, and after few steps."""
+    p, position, rotation = problem(np.random.default_rng(30), bars=2, noise=1.0)
+    wrong = p.points.copy()
+    wrong[p.bar == 1, 0] += 30.0
+    p = dataclasses.replace(p, points=wrong)
+    start = Fit.at(p, position, rotation)
+    whole, short = fit_pose(p, start, robust=False), fit_pose(p, start, robust=False, hopeless=1000.0)
+    assert short.settled
+    assert short.cost > 1000
+    assert whole.cost <= short.cost < 3 * whole.cost
+
+
+@pytest.mark.parametrize(
+    ("layout", "length_m"),
+    [
+        (LedGrid(), 0.96),
+        (LedRing(leds=12, radius_m=0.25), 0.5 * 12 / 11),
+        (LedColumns(apart_m=1.2, rows=24), math.hypot(1.2, 0.18) * 8 / 7),
+        (LedGrid(16, 16, 0.02, 4, 4), 0.24 * math.sqrt(2) * 16 / 15),
+    ],
+)
+@pytest.mark.parametrize("dark", [(), (0, 3)])
+def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -> None:
+    """In whatever order clusters stand: the first and the last of a ring are neighbours."""
+    centres_m = BarLayout(layout).cluster_centres_m()
+    enu_m = np.stack([centres_m[:, 0], 0 * centres_m[:, 0], -centres_m[:, 1]], 1)
+    seen = ~np.isin(np.arange(len(enu_m)), dark)
+    points = np.where(seen[:, None], 300 + 250 * centres_m, np.nan)
+    spec = PositionSpec(shared_along_px=0.05, shared_share=0.002, stretch_share=0.003)
+    view = BarView(0, enu_m, points, np.full(len(enu_m), 0.1), (0.1, 0.2, 0.004))
+    shift, *site = shared_sigmas(view, seen, spec, 1.0)
+    assert shift == pytest.approx(math.hypot(0.05, 0.002 * 250 * length_m), rel=1e-9)
+    assert site == pytest.approx([0.1, 0.2, 0.005])
