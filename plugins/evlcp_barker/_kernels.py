@@ -40,9 +40,10 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Arra
             i += _STRIDE
         while i < t_us.size and t_us[i] < end_us:
             i += 1
-        on = 0
-        for j in range(begin, i):
-            on += p[j]
+        # Narrow sums take many events at once.
+        part, on = p[begin:i], np.uint32(0)
+        for j in range(part.size):
+            on = np.uint32(on + part[j])
         counts[0, b] += i - begin - on
         counts[1, b] += on
 

@@ -77,9 +77,9 @@ class WhTransform(Decoding):
             info = plain(sums[pilot_chips:])
             _kernels.weighted_values(info, probability, presence.grid_px, _MIN_WEIGHT, values)
             symbols, best, margins, _, _ = match_words(values, by_value, codebook.bits_per_symbol)
-            energy, explained = float((values**2).sum()), float((best**2).sum()) / length
+            energy, explained = float(np.vdot(values, values)), float(best @ best) / length
             rest = max(energy - explained, 1e-3 * energy, 1e-9)
-            scale = max(float(best.mean()) / length, 0.0) * values.size / rest
+            scale = max(float(best.sum()) / best.size / length, 0.0) * values.size / rest
             quality = explained / energy if energy > 0 else 0.0
             return SoftSymbols(symbols, (margins * scale).astype(np.float32), quality)
 
