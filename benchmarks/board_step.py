@@ -3,6 +3,9 @@
 Prints the largest distance, in chips, over so many chips; pulses come a hundred times a second.
 """
 
+import sys
+from pathlib import Path
+
 import numpy as np
 
 from evlcp_sdk.link.resolve import load_link
@@ -10,8 +13,11 @@ from firmware_host import build
 from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
-from firmware_host.emulators.stm32 import UNIT_HZ, US, ModelLine, Stm32
 from firmware_host.protocol.client import Timing
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.models.stm32 import UNIT_HZ, US, ModelLine, Stm32
 
 PULSE_HZ = 100
 CHIPS = 3_000

@@ -3,7 +3,9 @@
 Prints a table; times are the model's, which counts an instruction of the core as a clock.
 """
 
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
@@ -14,9 +16,12 @@ from firmware_host import build
 from firmware_host.board.bank import Bank, random_symbols, symbol_chips
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
-from firmware_host.emulators.stm32 import US, Dma, ModelLine, Stm32, Usart
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import CommitReply, CommitRequest, State
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.models.stm32 import US, Dma, ModelLine, Stm32, Usart
 
 MOMENTS = 12
 CHIP_US = 100

@@ -5,6 +5,8 @@ update, the board comes back from a power cut at each word and erase of the flas
 """
 
 import contextlib
+import sys
+from pathlib import Path
 
 import numpy as np
 
@@ -12,12 +14,15 @@ from firmware_host import build
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.board.update import Package, confirm, update, update_status
-from firmware_host.emulators.rom import RomEmulator, RomLine
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import BoardError
 from firmware_host.images import FlashImage
 from firmware_host.ports.rom import RomLoader, flash_image
 from firmware_host.protocol.client import Timing
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.models.rom import RomEmulator, RomLine
 
 IMAGE_BYTES = 400
 OPERATIONS = 1 + IMAGE_BYTES // 4 + 5 + 1 + 1  # erase, content, seal, try, confirmed

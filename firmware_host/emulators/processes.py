@@ -152,6 +152,22 @@ def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> l
     )
 
 
+def _model(name: str) -> list[str]:
+    """Command line of a model of the part, which stands with the tests.
+
+    Raises:
+        ToolchainError: This is no checkout.
+    """
+    root = Path(__file__).parents[2]
+    if not (root / "tests" / "models" / f"{name}.py").is_file():
+        raise ToolchainError("the model of the part comes with a checkout of the sources, not with a package")
+    code = (
+        f"import runpy, sys; sys.path.insert(0, {str(root)!r});"
+        f" runpy.run_module('tests.models.{name}', run_name='__main__', alter_sys=True)"
+    )
+    return [sys.executable, "-c", code]
+
+
 def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
     """Command line of the model of an STM32F405 with the image as it is flashed.
 
@@ -160,12 +176,12 @@ def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
         leds: File for the LED records.
 
     Raises:
-        ToolchainError: Unicorn is missing, or the image cannot be built.
+        ToolchainError: Unicorn or the model is missing, or the image cannot be built.
     """
     if importlib.util.find_spec("unicorn") is None:
         raise ToolchainError("unicorn, the model's core, is missing: pip install unicorn")
     image = build.arm_image("stm32f405")
-    command = [sys.executable, "-m", "firmware_host.emulators.stm32_server", str(image), "--listen", listen]
+    command = [*_model("stm32_server"), str(image), "--listen", listen]
     return command if leds is None else [*command, "--leds", str(leds)]
 
 
@@ -179,6 +195,7 @@ def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None
 
     Raises:
         InputError: The flash file cannot be used.
+        ToolchainError: The model is missing.
     """
     if flash is not None:
         _check_flash(flash)
@@ -186,7 +203,7 @@ def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None
             raise InputError(
                 f"{flash}: {flash.stat().st_size} bytes, expected {FLASH_BYTES}, the flash of the part"
             )
-    command = [sys.executable, "-m", "firmware_host.emulators.rom_server", "--listen", listen]
+    command = [*_model("rom_server"), "--listen", listen]
     for name, value in (("--flash", flash), ("--leds", leds)):
         if value is not None:
             command += [name, str(value)]

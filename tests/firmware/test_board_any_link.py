@@ -119,7 +119,7 @@ def test_other_clusters_and_codes_of_24_chips_on_every_led(device: SimulatedBoar
 def test_the_image_on_the_model_of_the_part(needs: Callable[..., None]) -> None:
     needs("cc", "make", "arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from firmware_host.emulators.stm32 import US, Dma, ModelLine, Stm32
+    from tests.models.stm32 import US, Dma, ModelLine, Stm32
 
     chip = Stm32(build.arm_image("stm32f405"))
     chip.run(15_000)

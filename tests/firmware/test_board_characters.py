@@ -97,7 +97,7 @@ def in_qemu(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.
 def on_the_model(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.uint8]:
     """The image as it is flashed; rows as they are latched, from START on."""
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from firmware_host.emulators.stm32 import ModelLine, Stm32
+    from tests.models.stm32 import ModelLine, Stm32
 
     chip = Stm32(build.arm_image("stm32f405"))
     chip.run(15_000)

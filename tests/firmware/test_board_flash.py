@@ -18,11 +18,11 @@ from firmware_host import build
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.board.update import Package
-from firmware_host.emulators.rom import RomEmulator, RomLine
 from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
 from firmware_host.images import FLASH_START, FlashImage
 from firmware_host.ports.rom import SECTORS, RomLoader, flash_image
 from firmware_host.protocol.client import Timing
+from tests.models.rom import RomEmulator, RomLine
 
 
 @pytest.fixture(scope="module")
@@ -237,7 +237,7 @@ def test_what_the_command_flashes_boots_where_it_was_flashed(
 
 def test_the_image_for_another_crystal_boots_by_that_one(image: FlashImage) -> None:
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from firmware_host.emulators.stm32 import ModelLine, Stm32
+    from tests.models.stm32 import ModelLine, Stm32
 
     rom = RomEmulator(some(1 << 20, 5).data)
     flash_image(RomLoader(RomLine(rom)), FlashImage.read(build.arm_image("stm32f405-12mhz")))

@@ -141,7 +141,7 @@ def test_the_stm32_keeps_in_step(book: Codebook, needs: Callable[..., None]) -> 
     """Crystals 600 ppm apart: in 35 ms they drift by 0.21 chips, in step they stay within 0.03."""
     needs("make", "arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from firmware_host.emulators.stm32 import UNIT_HZ, US, Dma, ModelLine, Stm32
+    from tests.models.stm32 import UNIT_HZ, US, Dma, ModelLine, Stm32
 
     pulse_hz, chips = 100, 350
     found = []

@@ -20,7 +20,7 @@ from firmware_host.protocol.client import Timing
 from firmware_host.protocol.requests import BoardFault, State
 
 pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-from firmware_host.emulators.stm32 import (
+from tests.models.stm32 import (
     RESET_BY_IWDG,
     RESET_BY_PIN,
     US,

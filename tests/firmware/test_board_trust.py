@@ -386,7 +386,7 @@ def test_the_image_of_the_part_seals(needs: Callable[..., None]) -> None:
     needs("cc", "make", "arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     from firmware_host import build
-    from firmware_host.emulators.stm32 import ModelLine, Stm32
+    from tests.models.stm32 import ModelLine, Stm32
 
     chip = Stm32(build.arm_image("stm32f405"))
     chip.run(15_000)

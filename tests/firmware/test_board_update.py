@@ -302,7 +302,7 @@ def test_an_update_without_a_crystal_answers_and_stays_dark(
     """At 16 MHz from power-up on, the watchdog's oscillator at either end of what RM0090 allows."""
     needs("make", "arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from firmware_host.emulators import stm32
+    from tests.models import stm32
 
     chip = stm32.Stm32(build.arm_image("stm32f405"))
     chip.run(15_000)
@@ -322,7 +322,7 @@ def test_an_update_without_a_crystal_answers_and_stays_dark(
 def test_the_real_firmware_updates_itself(book: Codebook, needs: Callable[..., None]) -> None:
     needs("make", "arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from firmware_host.emulators.stm32 import RESET_BY_IWDG, RESET_BY_PIN, RESET_BY_SOFTWARE, ModelLine, Stm32
+    from tests.models.stm32 import RESET_BY_IWDG, RESET_BY_PIN, RESET_BY_SOFTWARE, ModelLine, Stm32
 
     new = Package.built("stm32f405-8mhz")
     chip = Stm32(build.arm_image("stm32f405"))

@@ -14,8 +14,8 @@ from pathlib import Path
 from typing import BinaryIO
 
 from firmware_host.emulators.listening import listener
-from firmware_host.emulators.stm32 import UNIT_HZ, Shown, Stm32
 from firmware_host.protocol.requests import CHIP_DARK, LEDS
+from tests.models.stm32 import UNIT_HZ, Shown, Stm32
 
 __all__ = ["main", "records", "serve"]
 
@@ -87,7 +87,7 @@ def serve(
 
 def main(arguments: list[str] | None = None) -> None:
     """Run the model of an image until it is ended."""
-    parser = argparse.ArgumentParser(prog="python -m firmware_host.emulators.stm32_server")
+    parser = argparse.ArgumentParser(prog="python -m tests.models.stm32_server")
     parser.add_argument("image", type=Path)
     parser.add_argument("--listen", required=True)
     parser.add_argument("--leds", type=Path)

@@ -11,8 +11,8 @@ import sys
 from pathlib import Path
 
 from firmware_host.emulators.listening import listener
-from firmware_host.emulators.rom import RomEmulator
 from firmware_host.images import FLASH_START, FlashImage
+from tests.models.rom import RomEmulator
 
 __all__ = ["main", "serve_rom"]
 
@@ -47,8 +47,8 @@ def _received(line: socket.socket) -> bytes:
 
 def _runs(flash: bytes, server: socket.socket, line: socket.socket, leds: Path | None) -> None:
     """Run what was flashed, by a crystal of 8 MHz or else of 12."""
-    from firmware_host.emulators.stm32 import Stm32
-    from firmware_host.emulators.stm32_server import serve
+    from tests.models.stm32 import Stm32
+    from tests.models.stm32_server import serve
 
     image = FlashImage(FLASH_START, flash)
     for hse_hz in (8_000_000, 12_000_000):
@@ -66,7 +66,7 @@ def _runs(flash: bytes, server: socket.socket, line: socket.socket, leds: Path |
 
 def main(arguments: list[str] | None = None) -> None:
     """Be a part to flash until it is ended."""
-    parser = argparse.ArgumentParser(prog="python -m firmware_host.emulators.rom_server")
+    parser = argparse.ArgumentParser(prog="python -m tests.models.rom_server")
     parser.add_argument("--listen", required=True)
     parser.add_argument("--flash", type=Path)
     parser.add_argument("--leds", type=Path)
