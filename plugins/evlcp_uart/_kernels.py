@@ -51,9 +51,15 @@ def bit_evidence(
         if s and not events and not many[s - 1]:
             out[s] = out[s - 1]
             continue
-        if not is_known[events]:
-            _sums_over_gains(share * events * gains, means, of_gains[events])
-            is_known[events] = True
+        for c in range(0 if is_known[events] else contexts):
+            # Logarithm of the sum over gains.
+            most, total = -np.inf, 0.0
+            for j in range(len(gains)):
+                most = max(most, share * events * gains[j] - means[c, j])
+            for j in range(len(gains)):
+                total += math.exp(share * events * gains[j] - means[c, j] - most)
+            of_gains[events, c] = most + math.log(total)
+        is_known[events] = True
         for c in range(contexts):
             said[c] = of_gains[events, c]
         for polarity in range(2):
@@ -72,19 +78,6 @@ def bit_evidence(
         last = out[s, contexts - 1]
         for c in range(contexts):
             out[s, c] -= last
-
-
-@njit
-def _sums_over_gains(worths: Column, means: Column, out: Column) -> None:
-    """Logarithm of the sum over gains, of each context."""
-    for c in range(len(out)):
-        top = -np.inf
-        for j in range(len(worths)):
-            top = max(top, worths[j] - means[c, j])
-        total = 0.0
-        for j in range(len(worths)):
-            total += math.exp(worths[j] - means[c, j] - top)
-        out[c] = top + math.log(total)
 
 
 @njit

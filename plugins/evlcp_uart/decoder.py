@@ -313,85 +313,96 @@ class CharacterDecoder:
     ) -> tuple[CharacterState, list[Character]]:
         """Decode the first `due` ticks, with the help of some behind; nothing comes behind the last ones."""
         assert state.first is not None
-        first, light = state.first, state.light
-        # No more than that, however much there is: any split of the stream gives the same.
-        counts = state.counts[:, : due + self._ahead]
-        spread = state.spread
-        if light is None:
-            spread = _bunches(counts[:, :due])
-            # What is known only later, is not known yet in whatever pieces events come.
-            if state.grain_at is not None and state.grain_at < first + due:
-                spread = max(spread, round(state.grain_us * TICKS / self.bit_us))
-        counts = _spread(counts, min(spread, TICKS))
-        end = counts.shape[1] - (0 if last else _TAIL)
-        # A character may go on behind what is known.
-        counts = np.pad(counts, ((0, 0), (0, self._length + 2 * _TAIL)))
-        events = int(counts[:, :due].sum())
-        given = dict(state.given)
-        found: list[Character] = []
-        start, dark = max(state.start - first, 0), state.dark
-        stretch = Stretch(counts, start, max(state.seen - first, 0), end)
-        tried = state.tried
-        if light is None and events >= _LEAST_EVENTS:
+        stretch, spread = self._prepare(state, due, last)
+        enough = int(stretch.counts[:, :due].sum()) >= _LEAST_EVENTS
+        after = replace(
+            state,
+            first=state.first + due,
+            # A copy, so that what is done is not held.
+            counts=state.counts[:, due:].copy(),
+            start=state.first + stretch.start,
+            spread=spread,
+        )
+        if state.light is None and enough:
             # Looking takes long: the less often, the longer there was none.
-            other = False
+            light, other, tried = None, False, state.tried
             if tried & (tried - 1) == 0 or tried % _SELDOM == 0:
                 light, other = self._acquire(stretch)
             if light is None and not other and state.blocks == 1 and not last:
                 return replace(state, blocks=_MORE), []
             tried = 0 if light is not None else max(tried, _SELDOM // 2 if other else 0) + 1
-        blocks = state.blocks
-        if light is None:
-            given["stretches_without_light"] += events >= _LEAST_EVENTS
-        else:
-            # Where a stretch tells much of the light, it is read by that.
-            starts, evidence, _ = self._path(stretch, light, False)
-            light = self._learned(stretch, light, starts, evidence, _MEMORY ** (due / self._block))
-            starts, evidence, _ = self._path(stretch, light, False)
-            kept = (starts < due) & (starts + EARLY >= stretch.seen)
-            ahead = starts[starts < due]
-            found = list(self._given(first, starts[kept], evidence, light))
-            if last and found:
-                # Its last edge may be that before the first stop bit.
-                needs = int(starts[kept][-1]) + (self.characters.bits - self.characters.stop_bits) * TICKS
-                if needs >= end and (found[-1].quality < _TELLING or found[-1].wrong_parity):
-                    found.pop()
-            by_chance, ambiguous = 0, 0
-            if state.light is None:
-                ambiguous = self._ambiguous(stretch, light, starts[kept])
-                found = found[ambiguous:]
-                by_chance, found = len(found), _without_chance(found)
-                by_chance -= len(found)
-            sure = float(np.mean([one.quality for one in found])) if found else 1.0
-            if state.light is None and sure < _SURE and state.blocks == 1 and not last:
-                return replace(state, blocks=_MORE), []
-            blocks = 1 if sure >= _SURE else _MORE
-            given["characters"] += len(found)
-            given["characters_by_chance"] += by_chance
-            given["characters_ambiguous"] += ambiguous
-            given["characters_wrong_parity"] += sum(c.wrong_parity for c in found)
-            given["frames_inverted"] += len(found) * light.inverted
-            if len(ahead):
-                start = int(ahead[-1]) + round(self._length * light.rate) - _NEAR
-                dark = 0
-            elif events >= _LEAST_EVENTS:
-                dark += 1
-                if dark >= _LOST:
-                    light, dark = None, 0
-        # A copy, so that what is done is not held.
-        rest = state.counts[:, due:].copy()
-        return replace(
-            state,
-            first=first + due,
-            counts=rest,
-            start=first + start,
-            light=light,
-            dark=dark,
-            spread=spread,
-            tried=tried,
-            blocks=blocks,
-            given=given,
-        ), found
+            after = replace(after, light=light, tried=tried)
+        if after.light is None:
+            return replace(after, given=_added(state.given, stretches_without_light=int(enough))), []
+        after, found, sure = self._read(after, stretch, due, last, is_new=state.light is None)
+        if state.light is None and sure < _SURE and state.blocks == 1 and not last:
+            return replace(state, blocks=_MORE), []
+        if after.start == state.first + stretch.start and enough:
+            # No character began.
+            lost = state.dark + 1 >= _LOST
+            light, dark = (None, 0) if lost else (after.light, state.dark + 1)
+            after = replace(after, light=light, dark=dark)
+        return replace(after, blocks=1 if sure >= _SURE else _MORE), found
+
+    def _prepare(self, state: CharacterState, due: int, last: bool) -> tuple[Stretch, int]:
+        """The stretch that tells of the first `due` ticks, and over how many ticks its events are spread."""
+        assert state.first is not None
+        # No more than that, however much there is: any split of the stream gives the same.
+        counts, spread = state.counts[:, : due + self._ahead], state.spread
+        if state.light is None:
+            spread = _bunches(counts[:, :due])
+            # What is known only later, is not known yet in whatever pieces events come.
+            if state.grain_at is not None and state.grain_at < state.first + due:
+                spread = max(spread, round(state.grain_us * TICKS / self.bit_us))
+        counts = _spread(counts, min(spread, TICKS))
+        end = counts.shape[1] - (0 if last else _TAIL)
+        # A character may go on behind what is known.
+        counts = np.pad(counts, ((0, 0), (0, self._length + 2 * _TAIL)))
+        start, seen = max(state.start - state.first, 0), max(state.seen - state.first, 0)
+        return Stretch(counts, start, seen, end), spread
+
+    def _read(
+        self, after: CharacterState, stretch: Stretch, due: int, last: bool, is_new: bool
+    ) -> tuple[CharacterState, list[Character], float]:
+        """The characters of the first `due` ticks of a stretch, of whose light `after` knows.
+
+        Returns:
+            The state behind them, the characters, and how sure they are on the average, 1 without any.
+        """
+        assert after.first is not None
+        assert after.light is not None
+        # Where a stretch tells much of the light, it is read by that.
+        starts, evidence, _ = self._path(stretch, after.light, False)
+        light = self._learned(stretch, after.light, starts, evidence, _MEMORY ** (due / self._block))
+        starts, evidence, _ = self._path(stretch, light, False)
+        starts = starts[starts < due]
+        kept = starts[starts + EARLY >= stretch.seen]
+        first = after.first - due
+        found = list(self._given(first, kept, evidence, light))
+        if last and found:
+            # Its last edge may be that before the first stop bit.
+            needs = int(kept[-1]) + (self.characters.bits - self.characters.stop_bits) * TICKS
+            if needs >= stretch.end and (found[-1].quality < _TELLING or found[-1].wrong_parity):
+                found.pop()
+        by_chance, ambiguous = 0, 0
+        if is_new:
+            ambiguous = self._ambiguous(stretch, light, kept)
+            clear = found[ambiguous:]
+            found = _without_chance(clear)
+            by_chance = len(clear) - len(found)
+        given = _added(
+            after.given,
+            characters=len(found),
+            characters_by_chance=by_chance,
+            characters_ambiguous=ambiguous,
+            characters_wrong_parity=sum(one.wrong_parity for one in found),
+            frames_inverted=len(found) * light.inverted,
+        )
+        after = replace(after, light=light, given=given)
+        if len(starts):
+            start = first + int(starts[-1]) + round(self._length * light.rate) - _NEAR
+            after = replace(after, start=start, dark=0)
+        return after, found, float(np.mean([one.quality for one in found])) if found else 1.0
 
     def _places(self, light: Light) -> NDArray[np.int64]:
         """Ticks from a character's start to each of its bits."""
@@ -760,6 +771,10 @@ class CharacterDecoder:
         words = beside[: len(places)].reshape(len(starts), bits, CONTEXTS)
         told = log_sums(self.characters.likelihoods(words)) - self.characters.data_bits * np.log(2)
         return float(told.sum() + beside[len(places) :, -1].sum())
+
+
+def _added(given: dict[str, int], **more: int) -> dict[str, int]:
+    return given | {name: given[name] + count for name, count in more.items()}
 
 
 def _bunches(counts: NDArray[np.int32]) -> int:
