@@ -3,19 +3,66 @@
 import logging
 import shutil
 import sys
+import time
 from collections.abc import Callable, Iterator
-from functools import cache
+from contextlib import suppress
+from functools import wraps
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
 import numba
 
-__all__ = ["count_compiled", "count_imported", "count_loaded", "find_cache_folder", "njit"]
+__all__ = ["COMPILING", "Compiling", "count_compiled", "count_imported", "find_cache_folder", "njit"]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 _ROOM_BYTES = 50_000_000
 """All kernels take less; Numba fails in the middle of a run where a kernel cannot be written."""
+
+_LONG_S = 2.0
+"""Time spent on compiling after which that is said."""
+
+
+class Compiling:
+    """What compiling kernels, and loading those that are kept, has taken in this process.
+
+    It is said once, to the log, when it has taken long.
+
+    Attributes:
+        processor_s: Processor time, s.
+        elapsed_s: Time on the clock, s.
+    """
+
+    def __init__(self) -> None:
+        self.processor_s = self.elapsed_s = 0.0
+        self._depth = 0
+        self._is_said = False
+
+    def watched(self, compile_: Callable[[Any], Any]) -> Callable[[Any], Any]:
+        """A kernel's `compile`, its time added; a kernel may need others."""
+
+        @wraps(compile_)
+        def watched(sig: Any) -> Any:
+            begin = time.process_time(), time.perf_counter()
+            self._depth += 1
+            try:
+                return compile_(sig)
+            finally:
+                self._depth -= 1
+                if not self._depth:
+                    self.processor_s += time.process_time() - begin[0]
+                    self.elapsed_s += time.perf_counter() - begin[1]
+                    if self.elapsed_s > _LONG_S and not self._is_said:
+                        self._is_said = True
+                        logging.getLogger(__name__).info(
+                            "compiling kernels, once on a machine; up to a minute in all"
+                        )
+
+        return watched
+
+
+COMPILING = Compiling()
+"""Of this process."""
 
 
 @overload
@@ -36,31 +83,15 @@ def njit(function: Any = None, /, **options: Any) -> Any:
 
     def compile_(given: Callable[..., Any]) -> Any:
         kernel = numba.njit(nogil=True, **options)(given)
-        try:
+        # Numba finds no folder: RuntimeError.
+        with suppress(RuntimeError):
             kernel.enable_caching()
-        except RuntimeError:
-            # Numba finds no folder.
-            return kernel
-        folder = Path(kernel.stats.cache_path)
-        if shutil.disk_usage(folder).free < _ROOM_BYTES:
-            return numba.njit(nogil=True, **options)(given)
-        _announce(folder, Path(given.__code__.co_filename))
+            if shutil.disk_usage(kernel.stats.cache_path).free < _ROOM_BYTES:
+                kernel = numba.njit(nogil=True, **options)(given)
+        kernel.compile = COMPILING.watched(kernel.compile)
         return kernel
 
     return compile_ if function is None else compile_(function)
-
-
-@cache
-def _announce(folder: Path, source: Path) -> None:
-    """Say that kernels will be compiled, where the cache has none of this source."""
-    compiled_s = [path.stat().st_mtime for path in folder.glob(f"{source.stem}.*.nbi")]
-    if max(compiled_s, default=0.0) < source.stat().st_mtime:
-        _announce_once()
-
-
-@cache
-def _announce_once() -> None:
-    logging.getLogger(__name__).info("compiling kernels, once on a machine; up to a minute in all")
 
 
 def _all_kernels() -> Iterator[Any]:
@@ -73,11 +104,6 @@ def _all_kernels() -> Iterator[Any]:
 def count_imported() -> int:
     """How many kernels this process has imported; most of them will be called."""
     return sum(1 for _ in _all_kernels())
-
-
-def count_loaded() -> int:
-    """How many kernels this process has compiled or loaded from the cache."""
-    return sum(len(kernel.signatures) for kernel in _all_kernels())
 
 
 def count_compiled() -> int:

@@ -492,10 +492,9 @@ def _run(
     pieces = iter(pieces)
     first_us = last_us = None
     watch = Stopwatch()
-    ended = False
-    try:
-        while not ended:
-            with watch.running():
+    with watch.running():
+        try:
+            while True:
                 try:
                     events, packets = next(pieces)
                 except StopIteration:
@@ -512,18 +511,16 @@ def _run(
                     last_us = int(events.t_us[-1])
                     writer.events(events)
                 writer.write(packets)
-                watch.events += len(events)
                 given += len(packets)
                 advance(source.position_bytes, source.size_bytes)
-                ended = stopped()
-    except InputError as fault:
-        status, error = "failed", str(fault)
-    if ended:
-        status = "interrupted"
-    if broken is None:
-        if (live is not None or source.size_bytes is None) and stopped():
-            status = "interrupted"
-        with watch.running():
+                if stopped():
+                    status = "interrupted"
+                    break
+        except InputError as fault:
+            status, error = "failed", str(fault)
+        if broken is None:
+            if (live is not None or source.size_bytes is None) and stopped():
+                status = "interrupted"
             writer.write(close())
     if status == "complete" and (told := _much_dropped(source, receiver)):
         status, error = "degraded", f"{url}: {told}"

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from evlcp_sdk.kernels import count_loaded
+from evlcp_sdk.kernels import COMPILING
 
 __all__ = ["Stopwatch", "times_real_time"]
 
@@ -26,41 +26,26 @@ def times_real_time(recorded_s: float, processor_s: float) -> float:
 
 
 class Stopwatch:
-    """Adds up the time of laps; those in which a kernel is compiled or loaded stand for themselves.
+    """Adds up the time of what runs while it is running.
 
     Attributes:
-        events: What the laps took in; to be counted by whoever runs them.
-        elapsed_s: Time on the clock, without laps with kernels, s.
-        kernels_s: Time on the clock of laps with kernels, s. It is spent once in a process, whatever the
-            length of a recording, and says nothing of the receiver's speed.
+        processor_s: Processor time of this process, without that for kernels, s.
+        elapsed_s: Time on the clock, without that for kernels, s.
+        kernels_s: Time on the clock in which kernels were compiled or loaded, s. It is spent once in a
+            process, whatever the length of a recording, and says nothing of the receiver's speed.
     """
 
     def __init__(self) -> None:
-        self.events = 0
-        self.elapsed_s = self.kernels_s = 0.0
-        self._processor_s = self._with_kernels_s = 0.0
-        self._counted = 0
+        self.processor_s = self.elapsed_s = self.kernels_s = 0.0
 
     @contextmanager
     def running(self) -> Iterator[None]:
-        """Count while inside: a lap."""
-        loaded, events = count_loaded(), self.events
-        processor_s, elapsed_s = time.process_time(), time.perf_counter()
+        """Count while inside."""
+        processor_s = time.process_time() - COMPILING.processor_s
+        elapsed_s, kernels_s = time.perf_counter() - COMPILING.elapsed_s, COMPILING.elapsed_s
         try:
             yield
         finally:
-            processor_s, elapsed_s = time.process_time() - processor_s, time.perf_counter() - elapsed_s
-            if count_loaded() == loaded:
-                self._processor_s += processor_s
-                self.elapsed_s += elapsed_s
-                self._counted += self.events - events
-            else:
-                self._with_kernels_s += processor_s
-                self.kernels_s += elapsed_s
-
-    @property
-    def processor_s(self) -> float:
-        """Processor time for all events, by that of laps without kernels if there are any, s."""
-        if self._counted:
-            return self._processor_s * self.events / self._counted
-        return self._processor_s + self._with_kernels_s
+            self.processor_s += time.process_time() - COMPILING.processor_s - processor_s
+            self.elapsed_s += time.perf_counter() - COMPILING.elapsed_s - elapsed_s
+            self.kernels_s += COMPILING.elapsed_s - kernels_s

@@ -17,9 +17,8 @@ logging.basicConfig(level="INFO", format="%(message)s")
 sys.path.insert(0, sys.argv[1])
 import own_kernels
 from evlcp_sdk import kernels
-counts = kernels.count_loaded, kernels.count_compiled
-before = tuple(count() for count in counts)
-print(own_kernels.twice(21), before, kernels.count_imported(), *(count() for count in counts))
+kernels._LONG_S = 0.0
+print(own_kernels.twice(21), kernels.count_imported(), kernels.count_compiled())
 print(kernels.find_cache_folder())
 """
 
@@ -40,10 +39,10 @@ def run(folder: Path, env: dict[str, str]) -> tuple[list[str], str]:
 
 def test_a_kernel_is_compiled_once_and_kept(tmp_path: Path) -> None:
     out, err = run(tmp_path, {})
-    assert out == ["42 (0, 0) 2 1 1", str(tmp_path / "__pycache__")]
+    assert out == ["42 2 1", str(tmp_path / "__pycache__")]
     assert err == "compiling kernels, once on a machine; up to a minute in all\n"
-    out, err = run(tmp_path, {})
-    assert (out[0], err) == ("42 (0, 0) 2 1 0", "")
+    out, _ = run(tmp_path, {})
+    assert out[0] == "42 2 0"
 
 
 def test_kernels_work_where_no_cache_can_be(tmp_path: Path) -> None:
@@ -52,7 +51,7 @@ def test_kernels_work_where_no_cache_can_be(tmp_path: Path) -> None:
     out, _ = run(
         tmp_path, {"HOME": "/dev/null", "XDG_CACHE_HOME": "/dev/null", "PYTHONDONTWRITEBYTECODE": "1"}
     )
-    assert out == ["42 (0, 0) 2 1 1", "None"]
+    assert out == ["42 2 1", "None"]
 
 
 def test_a_disk_without_room_takes_no_cache(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,8 +3,10 @@
 import math
 import time
 
+import numpy as np
 import pytest
 
+from evlcp_sdk.kernels import COMPILING, njit
 from evlcp_sdk.stopwatch import Stopwatch, times_real_time
 
 
@@ -26,21 +28,32 @@ def test_waiting_is_no_work() -> None:
     assert watch.kernels_s == 0
 
 
-def test_laps_with_kernels_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    loaded = [0]
-    monkeypatch.setattr("evlcp_sdk.stopwatch.count_loaded", lambda: loaded[0])
+def test_time_for_kernels_is_left_out() -> None:
     watch = Stopwatch()
-    with watch.running():
-        loaded[0] = 1
+
+    def compile_(_sig: object) -> None:
         busy(0.05)
-        watch.events += 100
-    assert watch.processor_s >= 0.05
+
+    inner = COMPILING.watched(compile_)
+    outer = COMPILING.watched(lambda sig: (busy(0.05), inner(sig)))
     with watch.running():
+        outer(None)
         busy(0.02)
-        watch.events += 300
-    assert watch.kernels_s >= 0.05
-    # The other hundred at the same pace.
-    assert 0.02 * 4 / 3 <= watch.processor_s < 0.05
+    assert 0.1 <= watch.kernels_s < 0.15
+    assert 0.02 <= watch.processor_s < 0.05
+
+
+def test_a_kernel_s_time_is_counted_once() -> None:
+    @njit
+    def summed(values: np.ndarray) -> float:  # type: ignore[type-arg]
+        return float((values**2).sum())
+
+    before = COMPILING.elapsed_s
+    assert summed(np.ones(3)) == 3
+    after = COMPILING.elapsed_s
+    assert after > before
+    assert summed(np.ones(3)) == 3
+    assert COMPILING.elapsed_s == after
 
 
 def test_what_ends_by_a_fault_is_counted() -> None:

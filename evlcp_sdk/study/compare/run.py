@@ -98,7 +98,6 @@ class _Lane:
         """Take events; None ends the stream."""
         with self.spent.running():
             packets = self.receiver.close() if events is None else self.receiver.feed(events)
-            self.spent.events += 0 if events is None else len(events)
         self.packets += len(packets)
         self.frames += frames_of(packets)
 
@@ -165,7 +164,6 @@ def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events]:
     while True:
         with watch.running():
             piece = next(pieces, None)
-            watch.events += 0 if piece is None else len(piece)
         if piece is None:
             return
         yield piece
