@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from evlcp_uart.characters import Characters
 from evlcp_uart.framing import Uart, read_characters
-from evlcp_uart.light import CONTEXTS, DOUBT, GAINS, TICKS, Light
+from evlcp_uart.light import CONTEXTS, GAINS, OUTLIER, TICKS, Light
 from numpy.typing import NDArray
 
 TEXT = (
@@ -220,8 +220,8 @@ def told(
             for phase in np.unique(phases[~known]).tolist():
                 taught, here = phases[known] == phase, phases[~known] == phase
                 light = learned(windows[known][taught], contexts[known][taught])
-                found = np.logaddexp.reduce(light.said(windows[~known][here]), 2)
-                said[here] = np.logaddexp(found - found.max(1, keepdims=True), math.log(DOUBT))
+                found = np.logaddexp.reduce(light.log_likelihoods(windows[~known][here]), 2)
+                said[here] = np.logaddexp(found - found.max(1, keepdims=True), math.log(OUTLIER))
             read = characters.likelihoods(said).argmax(1)
             wrong += wrong_bits(read, values[~known])
         best = min(best, wrong / (7 * len(values)))

@@ -88,7 +88,7 @@ class BarkerSync(Synchronization):
 
 
 @dataclass(frozen=True)
-class _Heard:
+class _Preamble:
     """One preamble's times, us, and their variances, us2; `off_us` is NaN without negative events."""
 
     on_us: float
@@ -122,7 +122,7 @@ class _Clock:
 
     Attributes:
         packet: Its number since the first of this lock.
-        heard: Preambles that it comes from.
+        preambles: Of how many it comes.
         on_us: Time of its positive events.
         rate_us: How much longer than nominal a packet is.
         variances: Of the time, of both together, of the rate.
@@ -132,7 +132,7 @@ class _Clock:
     """
 
     packet: int
-    heard: int
+    preambles: int
     on_us: float
     rate_us: float
     variances: tuple[float, float, float]
@@ -154,7 +154,7 @@ class SyncState:
     power: float = 0.0
     known: int = 0
     clock: _Clock | None = None
-    stray: _Heard | None = None
+    stray: _Preamble | None = None
 
 
 class BarkerSynchronizer:
@@ -231,7 +231,7 @@ class BarkerSynchronizer:
         )
         return state, locks
 
-    def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Heard:
+    def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Preamble:
         """Times of one preamble, for positive and negative events apart, us."""
         times = time_preamble(counts, lag, self._chips, _STEPS, self._pair, self._rising)
         if math.isnan(times.on):
@@ -239,11 +239,11 @@ class BarkerSynchronizer:
         at = [(first_bin + v) * self._bin_us for v in (times.on, times.off, times.onset)]
         noises = (times.on_noise, times.off_noise, times.onset_noise)
         sigmas = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in noises]
-        return _Heard(at[0], at[1], at[2], quality, *sigmas)
+        return _Preamble(at[0], at[1], at[2], quality, *sigmas)
 
     def _accept(
-        self, clock: _Clock | None, stray: _Heard | None, found: _Heard
-    ) -> tuple[_Clock | None, _Heard | None]:
+        self, clock: _Clock | None, stray: _Preamble | None, found: _Preamble
+    ) -> tuple[_Clock | None, _Preamble | None]:
         """Add a preamble to the lock it fits; a better one, or a second one as good, off it starts anew.
 
         One symbol on all clusters at once blinks in phase, too, but can agree with 16 chips of 26 only.
@@ -268,12 +268,12 @@ class BarkerSynchronizer:
         """How much longer or shorter than nominal a packet may be."""
         return self._spec.clock_tolerance_ppm * 1e-6 * self._packet.packet_chips * self._packet.chip_us
 
-    def _first(self, found: _Heard) -> _Clock:
+    def _first(self, found: _Preamble) -> _Clock:
         noise = found.on_noise
         apart = found.off_us - found.on_us
         return _Clock(
             packet=0,
-            heard=1,
+            preambles=1,
             on_us=found.on_us,
             rate_us=0.0,
             # The bound is two sigmas of what clocks have.
@@ -293,7 +293,7 @@ class BarkerSynchronizer:
         time += 2 * packets * both + packets**2 * rate + packets * _LATENCY_SIGMA_US**2
         return clock.on_us + packets * (nominal_us + clock.rate_us), time, both + packets * rate, rate
 
-    def _packets_between(self, clock: _Clock, found: _Heard) -> int | None:
+    def _packets_between(self, clock: _Clock, found: _Preamble) -> int | None:
         """Whole packets from a lock's newest preamble to another, None if it is off the grid."""
         apart = found.on_us - clock.on_us
         packets = round(apart / (self._packet.packet_chips * self._packet.chip_us + clock.rate_us))
@@ -303,7 +303,7 @@ class BarkerSynchronizer:
         off_grid = abs(found.on_us - expected) - min(2 * math.sqrt(variance), packets * self._most_us())
         return packets if off_grid < _ON_GRID_CHIPS * self._packet.chip_us else None
 
-    def _next(self, clock: _Clock, found: _Heard, packets: int) -> _Clock:
+    def _next(self, clock: _Clock, found: _Preamble, packets: int) -> _Clock:
         """The lock with a preamble more."""
         noise = found.on_noise
         expected, time, both, rate = self._ahead(clock, packets)
@@ -316,10 +316,10 @@ class BarkerSynchronizer:
         rate_us = min(max(clock.rate_us + both / spread * late, -most_us), most_us)
         walk = packets * _LATENCY_SIGMA_US**2
         apart = found.off_us - found.on_us
-        heard = min(clock.heard + 1, _QUALITY_PACKETS)
+        preambles = min(clock.preambles + 1, _QUALITY_PACKETS)
         return _Clock(
             packet=clock.packet + packets,
-            heard=heard,
+            preambles=preambles,
             on_us=expected + time / spread * late,
             rate_us=rate_us,
             variances=(time * noise / spread, both * noise / spread, rate - both**2 / spread),
@@ -327,7 +327,7 @@ class BarkerSynchronizer:
             if math.isnan(apart)
             else clock.apart.measured(apart, walk, noise + found.off_noise),
             onset=clock.onset.measured(found.onset_us - found.on_us, walk, noise + found.onset_noise),
-            quality=clock.quality + (found.quality - clock.quality) / heard,
+            quality=clock.quality + (found.quality - clock.quality) / preambles,
         )
 
     def _lock(self, clock: _Clock, quality: float) -> SyncLock:

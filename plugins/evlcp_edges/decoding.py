@@ -85,9 +85,9 @@ class EdgeDecoding(Decoding):
             fit = self._fit(seen, kinds, taught.sum(0, keepdims=True))
             if len(fit) > 1:
                 second, first = np.partition(fit, -2, axis=1)[:, -2:].T
-                said = np.take_along_axis(kinds, fit.argmax(1)[:, None, None], 1)[:, 0]
-                said[first - second < _SURE] = 0
-                own = _counted(said, shown[:, pilot_chips:])
+                decided = np.take_along_axis(kinds, fit.argmax(1)[:, None, None], 1)[:, 0]
+                decided[first - second < _SURE] = 0
+                own = _counted(decided, shown[:, pilot_chips:])
                 # None is taught by itself: what it was taken for would seem likelier.
                 fit = self._fit(seen, kinds, (taught + own).sum(0) - own)
             symbols = fit.argmax(1)
@@ -112,8 +112,8 @@ class EdgeDecoding(Decoding):
             counts: Histograms by kind for each cluster, or one for all, float64 (K or 1, 13, sums).
         """
         # What each cluster's pixels say of each kind in each chip: (K, chips, kinds).
-        said = seen @ self._log_shares(counts).transpose(0, 2, 1)
-        each = np.take_along_axis(said[:, None], kinds[..., None], 3)
+        logs = seen @ self._log_shares(counts).transpose(0, 2, 1)
+        each = np.take_along_axis(logs[:, None], kinds[..., None], 3)
         fit: NDArray[np.float64] = each.sum((2, 3)) * self.independent_pixels
         return fit
 

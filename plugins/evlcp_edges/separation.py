@@ -73,8 +73,8 @@ class EdgeSeparation(Separation):
             probability[:, seen < self.min_answers] = 0
             selected = probability >= self.min_probability
             # Sums of ones are exact in float32, and floats are multiplied by BLAS.
-            told = edges32 @ np.sign(sums[1:]).astype(np.float32).reshape(n, -1)
-            pixels = told.reshape(-1, height, width).astype(np.float64) / norm[:, None, None]
+            fit = edges32 @ np.sign(sums[1:]).astype(np.float32).reshape(n, -1)
+            pixels = fit.reshape(-1, height, width).astype(np.float64) / norm[:, None, None]
             near = ndimage.binary_dilation(selected, np.ones((1, 3, 3), np.bool_))
             pixels = np.where(to_pixels(near, self.grid_px, height, width), np.maximum(pixels, 0), 0)
             return PresenceMap(probability, self.grid_px, selected, pixels.astype(np.float32))

@@ -290,8 +290,8 @@ def _together(parts: Sequence[Range]) -> Range:
     if not parts:
         return _NONE
     distance, sigma, pairs = np.array([(part.distance_m, part.sigma_m, part.pairs) for part in parts]).T
-    told = pairs**3
-    weight = told / np.mean(sigma**2 * told)
+    share = pairs**3
+    weight = share / np.mean(sigma**2 * share)
     mean = float(weight @ distance / weight.sum())
     spread = float(weight @ (distance - mean) ** 2) / max(len(parts) - 1, 1)
     sigma_m = math.sqrt(max(spread, 1.0) / float(weight.sum()))

@@ -13,7 +13,7 @@ __all__ = ["best_path", "bit_evidence", "character_scores"]
 Column = NDArray[Any]
 
 _NOTHING = 30.0
-"""Nats by which what is less likely is left out: 1e-13 of it, against a doubt of a thousandth."""
+"""Nats by which what is less likely is left out: 1e-13 of it, against an outlier of a thousandth."""
 
 _AT_ONCE = 64
 """Ticks of which words are followed side by side, as a processor adds several numbers at once."""
@@ -21,7 +21,7 @@ _AT_ONCE = 64
 
 @njit
 def bit_evidence(
-    counts: Column, logs: Column, gains: Column, means: Column, share: float, doubt: float, out: Column
+    counts: Column, logs: Column, gains: Column, means: Column, share: float, outlier: float, out: Column
 ) -> None:
     """Log-likelihood of the window behind every tick for each context of a bit, less that of the last one.
 
@@ -33,7 +33,7 @@ def bit_evidence(
         means: What a window costs by context and gain: its mean events, each counted as `share`, less the
             logarithm of the gain's share, float64 (C, J).
         share: What an event counts.
-        doubt: Probability that a window is of no context.
+        outlier: Probability that a window is of no context.
         out: Of each tick that has W of them before the end, float64 (n - W + 1, C).
     """
     _, width, contexts = logs.shape
@@ -44,8 +44,8 @@ def bit_evidence(
             many[s] += counts[0, s + m] + counts[1, s + m]
     of_gains = np.empty((many.max() + 1 if len(out) else 0, contexts))
     is_known = np.zeros(len(of_gains), np.bool_)
-    said = np.empty(contexts)
-    least = math.log(doubt)
+    worth = np.empty(contexts)
+    least = math.log(outlier)
     for s in range(len(out)):
         events = many[s]
         if s and not events and not many[s - 1]:
@@ -61,20 +61,20 @@ def bit_evidence(
             of_gains[events, c] = most + math.log(total)
         is_known[events] = True
         for c in range(contexts):
-            said[c] = of_gains[events, c]
+            worth[c] = of_gains[events, c]
         for polarity in range(2):
             for m in range(width):
                 k = counts[polarity, s + m]
                 if k:
                     for c in range(contexts):
-                        said[c] += k * logs[polarity, m, c]
-        top = said[0]
+                        worth[c] += k * logs[polarity, m, c]
+        top = worth[0]
         for c in range(contexts):
-            top = max(top, said[c])
+            top = max(top, worth[c])
         for c in range(contexts):
-            # What is less is nothing beside the doubt.
-            near = said[c] > top - _NOTHING
-            out[s, c] = math.log((1 - doubt) * math.exp(said[c] - top) + doubt) if near else least
+            # What is less is nothing beside an outlier.
+            near = worth[c] > top - _NOTHING
+            out[s, c] = math.log((1 - outlier) * math.exp(worth[c] - top) + outlier) if near else least
         last = out[s, contexts - 1]
         for c in range(contexts):
             out[s, c] -= last
@@ -100,8 +100,8 @@ def character_scores(
     """
     fair = -bits * math.log(2.0)
     n, contexts = evidence.shape
-    said = np.ascontiguousarray(evidence.T)
-    # Sums are of likelihoods, of which the greatest of a tick is 1: of no word they are too small to be told.
+    by_context = np.ascontiguousarray(evidence.T)
+    # Sums are of likelihoods, of which the greatest of a tick is 1: of no word they are too small.
     tops = np.empty(0 if likeliest else n)
     likely = np.empty((contexts, len(tops)))
     for s in range(len(tops)):
@@ -113,7 +113,7 @@ def character_scores(
     sums = np.empty(_AT_ONCE)
     for first in range(0, len(out), _AT_ONCE):
         some = out[first : first + _AT_ONCE]
-        _words(said, places, bits, parity, True, first, states, some)
+        _words(by_context, places, bits, parity, True, first, states, some)
         # The mean over all words matters only where a character may be.
         if not likeliest and some.max() > 0:
             _words(likely, places, bits, parity, False, first, states, sums[: len(some)])
@@ -125,13 +125,13 @@ def character_scores(
         for k in range(len(some)):
             still = 0.0
             for place in places:
-                still += said[0, first + k + place]
+                still += by_context[0, first + k + place]
             some[k] += fair - max(still, 0.0)
 
 
 @njit
 def _words(
-    said: Column,
+    by_context: Column,
     places: Column,
     bits: int,
     parity: int,
@@ -143,7 +143,7 @@ def _words(
     """The likeliest word at some ticks by log-likelihoods, or the sum of all words' likelihoods.
 
     Args:
-        said: Of every context and tick, float64 (C, n).
+        by_context: Of every context and tick, float64 (C, n).
         places: Ticks from the start of a character to each of its bits, int64 (bits on air,).
         bits: Data bits.
         parity: 0 none, 1 odd, 2 even.
@@ -157,7 +157,7 @@ def _words(
     none = -np.inf if likeliest else 0.0
     states[0] = none
     # Before the start bit there was mark.
-    states[0, 0, known - 2, :n] = said[2 * known - 2, first : first + n]
+    states[0, 0, known - 2, :n] = by_context[2 * known - 2, first : first + n]
     now = 0
     for b in range(1, len(places)):
         at = first + places[b]
@@ -170,7 +170,7 @@ def _words(
                     continue
                 was = odd ^ bit if b <= bits else odd
                 one, other = states[now, was, to >> 1, :n], states[now, was, (to + known) >> 1, :n]
-                of_one, of_other = said[to, at : at + n], said[to + known, at : at + n]
+                of_one, of_other = by_context[to, at : at + n], by_context[to + known, at : at + n]
                 if likeliest:
                     for k in range(n):
                         new[k] = max(one[k] + of_one[k], other[k] + of_other[k])

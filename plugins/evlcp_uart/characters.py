@@ -81,16 +81,16 @@ class Characters:
         states = np.full((many, contexts // 2), -np.inf)
         states[:, -1] = 0.0
         for bit in range(bits):
-            said = np.repeat(states, 2, 1) + evidence[:, bit]
+            grown = np.repeat(states, 2, 1) + evidence[:, bit]
             # The oldest bit is forgotten.
-            states = np.logaddexp(said[:, : contexts // 2], said[:, contexts // 2 :])
+            states = np.logaddexp(grown[:, : contexts // 2], grown[:, contexts // 2 :])
         any_bits = np.logaddexp.reduce(states, 1) - bits * np.log(2)
         words = np.logaddexp.reduce(self.likelihoods(evidence), 1) - self.data_bits * np.log(2)
         found: NDArray[np.float64] = words - any_bits
         return found
 
-    def said(self, evidence: NDArray[np.float64]) -> float:
-        """How much of what the data bits of characters could say is said of them, 0 to 1."""
+    def clearness(self, evidence: NDArray[np.float64]) -> float:
+        """How clear the data bits of characters are, 0 to 1."""
         likelihoods = self.likelihoods(evidence)
         logs = likelihoods - np.logaddexp.reduce(likelihoods, 1)[:, None]
         unknown = -(np.exp(logs) * logs).sum() / np.log(2)
@@ -99,7 +99,7 @@ class Characters:
     def soft(
         self, likelihoods: NDArray[np.float64]
     ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
-        """What is said, with how sure, from log-likelihoods of every character, (n, 2**data_bits).
+        """The likeliest of each, with how sure, from log-likelihoods of every character, (n, 2**data_bits).
 
         Returns:
             The likeliest characters, int64 (n,); LLRs ln P(0) / P(1) of their data bits, most significant

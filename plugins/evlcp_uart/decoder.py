@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_uart.characters import Characters
-from evlcp_uart.light import CONTEXTS, DOUBT, EARLY, LOG_GAINS, TICKS, Light, guesses, log_sums
+from evlcp_uart.light import CONTEXTS, EARLY, LOG_GAINS, OUTLIER, TICKS, Light, guesses, log_sums
 
 __all__ = ["CLOCK_SHARE", "Character", "CharacterDecoder", "CharacterState"]
 
@@ -33,7 +33,7 @@ learn."""
 _BEFORE_FIRST = TICKS
 """Ticks before a stream's first event of which that event tells: it may be an edge's, which is late."""
 
-_TELLING = 0.95
+_LAST_SURE = 0.95
 """How sure the last character must be that goes on behind the last event: its rest may not have been seen."""
 
 _AHEAD = 4
@@ -69,7 +69,7 @@ _OTHERWISE = 3.0
 twenty: what was on air before the first event is unknown, and any bit that is 0 may be a start bit."""
 
 _INVERTED_BITS = 10.0
-"""How much more must speak for a light the other way round than said: one link of a thousand errs."""
+"""How much more must speak for a light the other way round: one link of a thousand errs."""
 
 _INVERTED_KINDS = 3
 """Characters of so many kinds at least show which way round the light is: where one or two come again and
@@ -77,7 +77,7 @@ again, pulses are of a length or two, and falls that come a bit late explain the
 
 _CLEAR = 0.8
 """Share of what data bits could say from which on characters are clear: a light that is hardly seen says
-little by its start, parity and stop bits, too, and cannot be told from another."""
+little by its start, parity and stop bits, too, and cannot be distinguished from another."""
 
 _FRAMED = 0.6
 """Share of what their start, parity and stop bits would say, were they as clear as the data bits, that these
@@ -94,7 +94,7 @@ code has what chance gives."""
 _UNFRAMED_BITS = 10.0
 """How much may speak against the start, parity and stop bits of characters: one of a thousand by chance."""
 
-_TOLD_EVENTS, _TOLD_CHARACTERS = 2400, 16
+_LEARN_EVENTS, _LEARN_CHARACTERS = 2400, 16
 """Events and characters that tell what a light is like: more of a bright one take longer, and say no more.
 The events are 30 an edge, `_ENOUGH` of a window, of five edges a character."""
 
@@ -104,7 +104,7 @@ _TRIED, _ROUNDS = 4, 5
 _CLOCKS = (-0.015, 0.015)
 """Clocks by which those are tried, too: within a character, no bit is off by a quarter of itself then."""
 
-_SHIFTS, _TOLD = range(-14, 15, 2), 0.01
+_SHIFTS, _AS_GOOD = range(-14, 15, 2), 0.01
 """Ticks by which bits are tried to begin elsewhere, as a burst should be within its bit's window: the latest
 that tells as much, but for a share."""
 
@@ -225,8 +225,8 @@ class CharacterDecoder:
         characters: Their format.
         bit_us: Nominal length of a bit, us.
         mark_on: The light is on for a mark, which is 1 and idle.
-        pause_bits: Pause that is sent before a packet, by which characters are told where a recording begins
-            within one; 0 where nothing is known of it.
+        pause_bits: Pause that is sent before a packet, by which characters are numbered where a recording
+            begins within one; 0 where nothing is known of it.
     """
 
     characters: Characters
@@ -382,7 +382,7 @@ class CharacterDecoder:
         if last and found:
             # Its last edge may be that before the first stop bit.
             needs = int(kept[-1]) + (self.characters.bits - self.characters.stop_bits) * TICKS
-            if needs >= stretch.end and (found[-1].quality < _TELLING or found[-1].wrong_parity):
+            if needs >= stretch.end and (found[-1].quality < _LAST_SURE or found[-1].wrong_parity):
                 found.pop()
         by_chance, ambiguous = 0, 0
         if is_new:
@@ -418,7 +418,7 @@ class CharacterDecoder:
         counts = stretch.counts
         found = np.empty((counts.shape[1] - TICKS + 1, CONTEXTS))
         logs = np.ascontiguousarray(light.share * light.logs.transpose(1, 2, 0))
-        _kernels.bit_evidence(counts, logs, LOG_GAINS, light.means, light.share, DOUBT, found)
+        _kernels.bit_evidence(counts, logs, LOG_GAINS, light.means, light.share, OUTLIER, found)
         # What there was before the first event, or behind the last, nothing tells.
         found[: max(stretch.seen - EARLY, 0)] = 0
         found[max(stretch.end, 0) :] = 0
@@ -502,8 +502,8 @@ class CharacterDecoder:
             mean = _around(begun[:, None])[:, 0] / _around(np.ones((len(run), 1)))[:, 0]
             at = np.rint(mean + length * np.arange(len(run))).astype(np.int64)[:, None] + shifts
             windows = seen[np.clip(at[:, :, None] + places, 0, most)].reshape(len(run), len(shifts), -1)
-            told = (windows @ logs[run].reshape(len(run), -1, 1))[..., 0]
-            best = at[np.arange(len(run)), _around(told).argmax(1)]
+            fit = (windows @ logs[run].reshape(len(run), -1, 1))[..., 0]
+            best = at[np.arange(len(run)), _around(fit).argmax(1)]
             found[run] = np.clip(best, 0, len(evidence) - 1 - int(places[-1]))
         return found
 
@@ -559,7 +559,7 @@ class CharacterDecoder:
         contexts: NDArray[np.float64],
         shift: int = 0,
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """The bits of characters that were read, of contexts as told, `shift` ticks later than they were.
+        """The bits of characters that were read, of known contexts, `shift` ticks later than they were.
 
         Returns:
             Their events, float64 (n, 2, TICKS), and how likely each is of each context, float64 (n, C).
@@ -580,10 +580,10 @@ class CharacterDecoder:
         for shift in _SHIFTS:
             windows, contexts = self._bits(stretch, light, starts, known, shift)
             learned = light.learn(windows, contexts, 0.0, light.rate)
-            found.append((learned.told(windows, contexts), learned))
-        most = max(told for told, _ in found)
-        most -= _TOLD * abs(most)
-        return [learned for told, learned in found if told >= most][-1]
+            found.append((learned.explained(windows, contexts), learned))
+        most = max(worth for worth, _ in found)
+        most -= _AS_GOOD * abs(most)
+        return [learned for worth, learned in found if worth >= most][-1]
 
     def _rate(
         self, light: Light, starts: NDArray[np.int64], evidence: NDArray[np.float64], memory: float
@@ -627,34 +627,34 @@ class CharacterDecoder:
     def _acquire(self, stretch: "Stretch") -> tuple[Light | None, bool]:
         """Learn the light from a stretch of which nothing is known.
 
-        The light is the other way round than said where its characters have their start, parity and stop bits
-        clearly more often so: only text of few kinds without a pause has them both ways.
+        The light is the other way round where its characters have their start, parity and stop bits clearly
+        more often so: only text of few kinds without a pause has them both ways.
 
         Returns:
             The light, None where the stretch shows no characters; and whether it clearly shows another code.
         """
-        light, other = self._found(told := self._telling(stretch))
-        if told is stretch:
+        light, other = self._found(part := self._informative(stretch))
+        if part is stretch:
             return light, other
         if light is None:
             # Of some light more must be seen.
             return (None, True) if other else self._found(stretch)
         # The rest, of which it has learned nothing, must be of these characters, too.
-        rest = Stretch(stretch.counts, told.end, stretch.seen, stretch.end)
+        rest = Stretch(stretch.counts, part.end, stretch.seen, stretch.end)
         starts, _, _ = self._path(rest, light, False)
         if len(starts) >= _LEAST_CHARACTERS:
             found, other = self._best(rest, [(light, starts)], _REST_FRAMED)
             if found is None:
                 return None, other
         # A few characters may fit by chance: those that do not fit well must go on to.
-        starts, _, _ = self._path(told, light, False)
-        found, _ = self._best(told, [(light, starts)], _NEXT_FRAMED)
+        starts, _, _ = self._path(part, light, False)
+        found, _ = self._best(part, [(light, starts)], _NEXT_FRAMED)
         return self._found(stretch) if found is None else (light, False)
 
-    def _telling(self, stretch: "Stretch") -> "Stretch":
+    def _informative(self, stretch: "Stretch") -> "Stretch":
         """As much of it as tells what its light is like."""
-        known = int(np.searchsorted(np.cumsum(stretch.counts.sum(0)), _TOLD_EVENTS))
-        end = max(known, max(stretch.start, stretch.seen) + _TOLD_CHARACTERS * self._length)
+        known = int(np.searchsorted(np.cumsum(stretch.counts.sum(0)), _LEARN_EVENTS))
+        end = max(known, max(stretch.start, stretch.seen) + _LEARN_CHARACTERS * self._length)
         if end >= stretch.end:
             return stretch
         counts = np.ascontiguousarray(stretch.counts[:, : end + self._length + 2 * _TAIL])
@@ -662,11 +662,11 @@ class CharacterDecoder:
 
     def _found(self, stretch: "Stretch") -> tuple[Light | None, bool]:
         """The light of a stretch as `_acquire` gives it, whatever it costs."""
-        told, of_another = self._best(stretch, self._learnt(stretch, inverted=False))
-        other, _ = self._best(stretch, self._learnt(stretch, inverted=True))
-        if other is None or (told is not None and told[1] + _INVERTED_BITS >= other[1]):
-            return (None, of_another) if told is None else (told[0], False)
-        return (other[0], False) if told is not None or other[1] >= _INVERTED_BITS else (None, of_another)
+        upright, of_another = self._best(stretch, self._candidates(stretch, inverted=False))
+        other, _ = self._best(stretch, self._candidates(stretch, inverted=True))
+        if other is None or (upright is not None and upright[1] + _INVERTED_BITS >= other[1]):
+            return (None, of_another) if upright is None else (upright[0], False)
+        return (other[0], False) if upright is not None or other[1] >= _INVERTED_BITS else (None, of_another)
 
     def _best(
         self,
@@ -697,11 +697,14 @@ class CharacterDecoder:
                 if len(kinds) < _INVERTED_KINDS:
                     continue
             framed = float(self.characters.framed(evidence).sum() / np.log(2))
-            said, fixed = self.characters.said(evidence), self.characters.bits - self.characters.data_bits
+            clearness, fixed = (
+                self.characters.clearness(evidence),
+                self.characters.bits - self.characters.data_bits,
+            )
             # Of rises alone, or falls, none tells: what the others would say is missing.
-            clear = both and said > _CLEAR
+            clear = both and clearness > _CLEAR
             wanted = _NEXT_FRAMED if rank else least_framed
-            unframed = clear and framed < wanted * said * fixed * len(evidence)
+            unframed = clear and framed < wanted * clearness * fixed * len(evidence)
             # However dim it is, characters are never that much less likely than bits without a frame.
             unframed |= both and framed < -_UNFRAMED_BITS
             if not unframed and clear:
@@ -712,8 +715,8 @@ class CharacterDecoder:
         # One that tells little is taken where none is clear.
         return dim, of_another
 
-    def _learnt(self, stretch: "Stretch", inverted: bool) -> list[tuple[Light, NDArray[np.int64]]]:
-        """What the light may be like, on for a mark as said or the other way round, and its characters."""
+    def _candidates(self, stretch: "Stretch", inverted: bool) -> list[tuple[Light, NDArray[np.int64]]]:
+        """What the light may be like, as the link has it or the other way round, and its characters."""
         tried: list[tuple[float, Light]] = []
 
         def explain(light: Light) -> None:
@@ -735,11 +738,11 @@ class CharacterDecoder:
                     starts, evidence, _ = self._path(stretch, light, True)
                 light = self._learned(stretch, light, starts, evidence, 0.0)
             starts, _, worth = self._path(stretch, light, False)
-            if worth > 0 and self._told(stretch, light) > 0:
+            if worth > 0 and self._cross_explained(stretch, light) > 0:
                 learned.append((light, starts))
         return learned
 
-    def _told(self, stretch: "Stretch", light: Light) -> float:
+    def _cross_explained(self, stretch: "Stretch", light: Light) -> float:
         """How much of each half of a stretch the light explains that the other one teaches."""
         starts, evidence, _ = self._path(stretch, light, False)
         half = len(starts) // 2
@@ -767,10 +770,10 @@ class CharacterDecoder:
         places = (starts[:, None] + self._places(light)).ravel()
         at = np.concatenate([places, marks])
         windows = stretch.windows[at].astype(np.float64)
-        beside = np.logaddexp(light.beside_mean(windows), np.log(DOUBT))
+        beside = np.logaddexp(light.beside_mean(windows), np.log(OUTLIER))
         words = beside[: len(places)].reshape(len(starts), bits, CONTEXTS)
-        told = log_sums(self.characters.likelihoods(words)) - self.characters.data_bits * np.log(2)
-        return float(told.sum() + beside[len(places) :, -1].sum())
+        worth = log_sums(self.characters.likelihoods(words)) - self.characters.data_bits * np.log(2)
+        return float(worth.sum() + beside[len(places) :, -1].sum())
 
 
 def _added(given: dict[str, int], **more: int) -> dict[str, int]:

@@ -7,7 +7,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BEFORE", "CONTEXTS", "DOUBT", "EARLY", "GAINS", "TICKS", "Light", "guesses", "log_sums"]
+__all__ = ["BEFORE", "CONTEXTS", "EARLY", "GAINS", "OUTLIER", "TICKS", "Light", "guesses", "log_sums"]
 
 TICKS = 16
 """Ticks of a bit."""
@@ -26,7 +26,7 @@ LOG_GAINS = np.log(GAINS)
 _SHARES = np.array([0.02, 0.12, 0.2, 0.4, 0.2, 0.06])
 """Windows of a context are unlike in strength: by its mean, and how likely each is before any are seen."""
 
-DOUBT = 2e-3
+OUTLIER = 2e-3
 """Probability that the events of a bit are of something else."""
 
 _PRIOR_WINDOWS, _PRIOR_GAINS = 3.0, 12.0
@@ -44,7 +44,7 @@ _FLOOR = 0.004
 
 _BLUR = np.array([1.0, 2.0, 3.0, 4.0, 3.0, 2.0, 1.0]) / 16
 """What is learned of a tick tells of those beside it: cameras read events out in bursts, and a character's
-start is known to a tick or two. Without it bits would be told apart by when their events were read out."""
+start is known to a tick or two. Without it bits would be distinguished by when their events were read out."""
 
 _QUARTER, _STEADY_SHARE = TICKS // 4, 0.4
 """Ticks of a quarter of a bit, and the share of these that are surely without a burst: what comes in them is
@@ -65,7 +65,7 @@ class Light:
         rate: Length of a bit against the nominal one.
         paused: Characters behind a pause, their ticks of pause in all, and characters.
         most: What an event counts at most.
-        inverted: It is on when it is said to be off, and off when on.
+        inverted: It is on when the link has it off, and off when on.
     """
 
     events: NDArray[np.float64]
@@ -105,8 +105,8 @@ class Light:
     def share(self) -> float:
         """What an event counts."""
         # What comes in every context is of something else than the light.
-        telling = self.rates - self.rates.min(0)
-        return min(self.most, _ENOUGH / max(float(telling.sum((1, 2)).max()), 1e-9))
+        informative = self.rates - self.rates.min(0)
+        return min(self.most, _ENOUGH / max(float(informative.sum((1, 2)).max()), 1e-9))
 
     @cached_property
     def logs(self) -> NDArray[np.float64]:
@@ -134,7 +134,7 @@ class Light:
         after_idle = float(np.clip(np.log(length / share), 10.0, 12.0))
         return after_idle, float(np.clip(-np.log(1 - share), 0.1, 3.0)) if many else 1.0
 
-    def said(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def log_likelihoods(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log-likelihood of windows, float64 (..., 2, TICKS), by context and gain, float64 (..., C, J)."""
         flat = windows.reshape(*windows.shape[:-2], -1)
         alike = np.einsum("...k,ck->...c", flat, self.share * self.logs.reshape(CONTEXTS, -1))
@@ -159,10 +159,10 @@ class Light:
         """
         flat = windows.reshape(len(windows), -1)
         events, which = np.unique(flat.sum(1), return_inverse=True)
-        said = events[:, None, None] * (self.share * LOG_GAINS) - self.means
-        over = log_sums(said)
+        worth = events[:, None, None] * (self.share * LOG_GAINS) - self.means
+        over = log_sums(worth)
         alike = np.einsum("nk,ck->nc", flat, self.share * self.logs.reshape(CONTEXTS, -1))
-        return alike + over[which], np.exp(said - over[..., None]), which
+        return alike + over[which], np.exp(worth - over[..., None]), which
 
     def beside_mean(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
         """Log-likelihood of windows, float64 (n, 2, TICKS), of each context beside steady events, (n, C)."""
@@ -172,10 +172,10 @@ class Light:
         costs = mean.sum() * GAINS * self.share - np.log(gains / gains.sum())
         flat = windows.reshape(len(windows), -1)
         alike = np.einsum("nk,k->n", flat, np.log(mean).ravel())
-        said = self.share * (alike[:, None] + flat.sum(1)[:, None] * LOG_GAINS) - costs
-        return self.of_context(windows)[0] - log_sums(said)[:, None]
+        worth = self.share * (alike[:, None] + flat.sum(1)[:, None] * LOG_GAINS) - costs
+        return self.of_context(windows)[0] - log_sums(worth)[:, None]
 
-    def told(self, windows: NDArray[np.float64], contexts: NDArray[np.float64]) -> float:
+    def explained(self, windows: NDArray[np.float64], contexts: NDArray[np.float64]) -> float:
         """How much the events of bits tell of their contexts, in all: their mutual information.
 
         Args:
@@ -184,8 +184,8 @@ class Light:
         """
         likely = _likely(self.of_context(windows)[0])
         any_of = likely @ contexts.mean(0)
-        told: float = (contexts * np.log(likely + 1e-300)).sum() - np.log(any_of + 1e-300).sum()
-        return told
+        found: float = (contexts * np.log(likely + 1e-300)).sum() - np.log(any_of + 1e-300).sum()
+        return found
 
     def learn(
         self, windows: NDArray[np.float64], contexts: NDArray[np.float64], memory: float, rate: float
@@ -198,11 +198,11 @@ class Light:
             memory: What all before counts.
             rate: Length of a bit against the nominal one.
         """
-        said, gains, which = self.of_context(windows)
-        likely = _likely(said)
+        logs, gains, which = self.of_context(windows)
+        likely = _likely(logs)
         # What is rather something else than a bit of that context teaches nothing of it.
-        fits = (1 - DOUBT) * likely / likely.max(1, keepdims=True)
-        contexts = contexts * fits / (fits + DOUBT)
+        fits = (1 - OUTLIER) * likely / likely.max(1, keepdims=True)
+        contexts = contexts * fits / (fits + OUTLIER)
         at = (which[:, None] * CONTEXTS + np.arange(CONTEXTS)).ravel()
         by_events = np.bincount(at, contexts.ravel(), len(gains) * CONTEXTS).reshape(-1, CONTEXTS)
         of_gains = np.einsum("mc,mcj->cj", by_events, gains)
@@ -269,9 +269,9 @@ def log_sums(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     return found
 
 
-def _likely(said: NDArray[np.float64]) -> NDArray[np.float64]:
+def _likely(logs: NDArray[np.float64]) -> NDArray[np.float64]:
     """Likelihoods from their logarithms, float64 (n, C), the greatest of each window 1."""
-    likely: NDArray[np.float64] = np.exp(said - said.max(1, initial=-np.inf, keepdims=True))
+    likely: NDArray[np.float64] = np.exp(logs - logs.max(1, initial=-np.inf, keepdims=True))
     return likely
 
 

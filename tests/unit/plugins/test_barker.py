@@ -430,7 +430,7 @@ def test_the_state_passed_in_is_not_changed():
 def test_memory_does_not_grow():
     rng = np.random.default_rng(0)
     _, state = locks_of(*twins.events_of(packets_of(rng, 12), rng, START_US))
-    assert (state.clock.packet, state.clock.heard) == (11, 8)
+    assert (state.clock.packet, state.clock.preambles) == (11, 8)
     # A preamble, a guard on both sides, and a time step.
     assert state.counts.shape[1] < 10 * (26 + 2 * 3 + 10) + 10
 

@@ -14,7 +14,7 @@ from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
 from evlcp_uart.decoder import Character, _bunches, _spread
 from evlcp_uart.framing import Uart, read_characters
-from evlcp_uart.light import BEFORE, CONTEXTS, DOUBT, GAINS, TICKS, Light
+from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, OUTLIER, TICKS, Light
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
@@ -387,14 +387,14 @@ def test_light_is_learned_as_it_is() -> None:
     mean = np.apply_along_axis(np.convolve, 2, wide, np.convolve(bar, bar), "valid")
     gains = light.gains / light.gains.sum(1, keepdims=True) @ GAINS
     np.testing.assert_allclose(light.rates * gains[:, None, None], mean, atol=0.05, rtol=0.12)
-    said = light.said(windows[:5])
+    said = light.log_likelihoods(windows[:5])
     shares = light.gains + 12 * np.array([0.02, 0.12, 0.2, 0.4, 0.2, 0.06])
     for k, context, j in itertools.product(range(5), range(CONTEXTS), range(len(GAINS))):
         rate = GAINS[j] * light.rates[context]
         poisson = float((windows[k] * np.log(rate) - rate).sum())
         gain = math.log(shares[context, j] / shares[context].sum())
         assert said[k, context, j] == pytest.approx(light.share * poisson + gain)
-    assert light.told(windows, known) > light.told(windows, np.roll(known, 1, 1))
+    assert light.explained(windows, known) > light.explained(windows, np.roll(known, 1, 1))
 
 
 def test_what_gains_make_of_windows_is_that_of_each_window_by_itself() -> None:
@@ -402,19 +402,19 @@ def test_what_gains_make_of_windows_is_that_of_each_window_by_itself() -> None:
     rates = rng.gamma(0.5, 0.5, (CONTEXTS, 2, TICKS)) + 0.1
     light = Light(5 * rates, np.full(CONTEXTS, 5.0), rng.gamma(1.0, 1.0, (CONTEXTS, len(GAINS))))
     windows = rng.poisson(0.2 * rng.gamma(1.0, 1.0, 200)[:, None, None], (200, 2, TICKS)).astype(np.float64)
-    likely = np.exp(light.said(windows))
+    likely = np.exp(light.log_likelihoods(windows))
     said, gains, which = light.of_context(windows)
     np.testing.assert_allclose(said, np.log(likely.sum(2)))
     np.testing.assert_allclose(gains[which], likely / likely.sum(2, keepdims=True))
     known = rng.dirichlet(np.ones(CONTEXTS), 200)
-    fits = (1 - DOUBT) * likely.sum(2) / likely.sum(2).max(1, keepdims=True)
-    taught = known * fits / (fits + DOUBT)
+    fits = (1 - OUTLIER) * likely.sum(2) / likely.sum(2).max(1, keepdims=True)
+    taught = known * fits / (fits + OUTLIER)
     learned = light.learn(windows, known, 0.5, 1.0)
     of_gains = np.einsum("nc,ncj->cj", taught / likely.sum(2), likely)
     np.testing.assert_allclose(learned.gains, 0.5 * light.gains + of_gains)
     np.testing.assert_allclose(learned.events, 2.5 * rates + np.einsum("nc,npt->cpt", taught, windows))
     told = (known * np.log(likely.sum(2))).sum() - np.log(likely.sum(2) @ known.mean(0)).sum()
-    assert light.told(windows, known) == pytest.approx(told)
+    assert light.explained(windows, known) == pytest.approx(told)
 
 
 @pytest.mark.parametrize(
