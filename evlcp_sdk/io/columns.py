@@ -89,7 +89,7 @@ class ColumnSource(EventSource):
         self._position = 0
         self.path, self.size_bytes = path, path.stat().st_size
         first = self._next_piece()
-        times = np.empty(0, np.int64) if first is None else first[0]
+        times = np.empty(0, np.int64) if first is None else _unwrap(first[0], None, 0)[0]
         if first is not None:
             self._pieces = itertools.chain((first,), pieces)
         share = min(self._position / max(self.size_bytes, 1), 1.0)
@@ -163,7 +163,12 @@ class ColumnSource(EventSource):
         if piece is None:
             return None
         times, values, places, number = self._numbers_of(piece)
-        times, rows, good = self._unwrapped(times), len(times), False
+        before = self._before
+        self._before = int(times[-1]) if len(times) and math.isfinite(times[-1]) else before
+        rows, good = len(times), False
+        times, rounds = _unwrap(times, before, self._rounds)
+        self._counts["times_gone_round"] += max(rounds - self._rounds, 0)
+        self._rounds = rounds
         while not good:
             try:
                 t_us, p = self._unit.us(times[:rows]), self._polarities.of(values[:rows])
@@ -174,8 +179,8 @@ class ColumnSource(EventSource):
                 rows = error.row
                 self._wrong = InputError(f"{self.path}: {self._where} {number(rows)}: {error}")
         if len(t_us):
-            before = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
-            latest = np.maximum.accumulate(np.concatenate([[before], t_us]))
+            start_us = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
+            latest = np.maximum.accumulate(np.concatenate([[start_us], t_us]))
             self._counts["rows_out_of_order"] += int((t_us < latest[:-1]).sum())
             self._latest_us = int(latest[-1])
         return Events(t_us, x, y, 1 - p if self._inverted else p)
@@ -203,24 +208,6 @@ class ColumnSource(EventSource):
             lambda row: number(int(kept[row])),
         )
 
-    def _unwrapped(self, times: NDArray[Any]) -> NDArray[Any]:
-        """Times of a counter of 32 bits that goes round, as if it did not."""
-        if not len(times):
-            return times
-        first, last = next(((a, b) for a, b in _WRAPS if a <= times.min() and times.max() < b), (0, 0))
-        before = times[0] if self._before is None else self._before
-        follow = np.concatenate([[before], times])
-        self._before = int(times[-1])
-        if not last:
-            return times
-        falls = (follow[:-1] >= last - _NEAR) & (follow[1:] < first + _NEAR)
-        rises = (follow[:-1] < first + _NEAR) & (follow[1:] >= last - _NEAR) & (self._rounds > 0)
-        rounds = self._rounds + np.cumsum(falls.astype(np.int64) - rises)
-        if falls.any():
-            self._counts["times_gone_round"] += int(rounds[-1]) - self._rounds
-        self._rounds = int(rounds[-1])
-        return times.astype(np.float64 if times.dtype.kind == "f" else np.int64) + rounds * (last - first)
-
     @property
     def counts(self) -> dict[str, int]:
         """As `EventSource.counts`, with rows out of order or cut, and times gone round, if there were any."""
@@ -242,6 +229,29 @@ class ColumnSource(EventSource):
         """Close the file."""
         self._fault = self._fault or InputError(f"{self.path}: closed file")
         self._stack.close()
+
+
+def _unwrap(times: NDArray[Any], before: int | None, rounds: int) -> tuple[NDArray[Any], int]:
+    """Times of a counter of 32 bits that goes round, as if it did not, and how often it has.
+
+    Args:
+        times: The next ones; of other counters they stay.
+        before: The one before them; None for none.
+        rounds: How often it had gone round until then.
+    """
+    finite = times[np.isfinite(times)] if times.dtype.kind == "f" else times
+    if not len(finite):
+        return times, rounds
+    low, high = finite.min(), finite.max()
+    first, last = next(((a, b) for a, b in _WRAPS if a <= low and high < b), (0, 0))
+    if not last:
+        return times, rounds
+    follow = np.concatenate([[times[0] if before is None else before], times])
+    falls = (follow[:-1] >= last - _NEAR) & (follow[1:] < first + _NEAR)
+    rises = (follow[:-1] < first + _NEAR) & (follow[1:] >= last - _NEAR)
+    turns = rounds + np.cumsum(falls.astype(np.int64) - (rises & (np.cumsum(falls) + rounds > 0)))
+    whole = times.astype(np.float64 if times.dtype.kind == "f" else np.int64)
+    return whole + turns * (last - first), int(turns[-1])
 
 
 def _in_order(events: Events, window_us: float) -> Events:

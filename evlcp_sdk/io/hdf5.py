@@ -127,6 +127,12 @@ class _Column:
     def __init__(self, dataset: Any, part: str | int | None = None, *, on_its_side: bool = False) -> None:
         self.dataset, self._part, self._on_its_side = dataset, part, on_its_side
 
+    @property
+    def kind(self) -> str:
+        """Of its type, as NumPy's."""
+        kinds = self.dataset.dtype
+        return str((kinds[self._part] if isinstance(self._part, str) else kinds).kind)
+
     def __len__(self) -> int:
         shape = self.dataset.shape
         return int(max(shape) if self._part is None else shape[1 if self._on_its_side else 0])
@@ -180,8 +186,10 @@ def _columns_of(path: Path, file: Any, order: str | None) -> tuple[list[_Column]
         if fields is None:
             raise InputError(f"{path}: {at} has {', '.join(names) or 'no fields'}, expected x, y, p and t")
         columns = [_Column(node[names[k]]) if is_group else _Column(node, names[k]) for k in fields.which]
-    for column in columns:
+    for number, column in enumerate(columns):
         _check(path, column.dataset)
+        if column.kind not in ("biufS" if number == 1 else "biuf"):
+            raise InputError(f"{path}: found {column.dataset.name}, expected a column of numbers")
     lengths = [len(column) for column in columns]
     if len(set(lengths)) > 1:
         raise InputError(f"{path}: {at} has columns of the lengths {lengths}, expected one length")
@@ -228,7 +236,10 @@ def _check(path: Path, dataset: Any) -> None:
     """
     import h5py
 
-    if not isinstance(dataset, h5py.Dataset) or dataset.shape is None or len(dataset.shape) > 2:
+    is_column = (
+        isinstance(dataset, h5py.Dataset) and dataset.shape is not None and 1 <= len(dataset.shape) <= 2
+    )
+    if not is_column:
         raise InputError(f"{path}: found {dataset.name}, expected a column of numbers")
     if dataset.is_virtual or dataset.external:
         raise InputError(f"{path}: {dataset.name} is stored in another file, expected it in this one")

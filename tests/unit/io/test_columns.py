@@ -134,13 +134,15 @@ def test_float32_of_microseconds(events: Events, tmp_path: Path) -> None:
     same(tmp_path / "a.npy", events, -60_000)
 
 
-@pytest.mark.parametrize("first", [(1 << 32) - 7000, (1 << 31) - 7000], ids=["uint32", "int32"])
-def test_times_of_32_bits_go_round(first: int, events: Events, tmp_path: Path) -> None:
+@pytest.mark.parametrize("before_us", [200, 7000])
+@pytest.mark.parametrize("end", [1 << 32, 1 << 31], ids=["uint32", "int32"])
+def test_times_of_32_bits_go_round(end: int, before_us: int, events: Events, tmp_path: Path) -> None:
+    """Within the rows by which the unit is known, and beyond."""
     h5py = pytest.importorskip("h5py")
     c = columns_of(events)
-    shift = first - int(c["t"][0])
+    shift = end - before_us - int(c["t"][0])
     t = (c["t"] + shift).astype(np.uint32)
-    c["t"] = t if first > 1 << 31 else t.view(np.int32)
+    c["t"] = t if end > 1 << 31 else t.view(np.int32)
     np.savez(tmp_path / "a.npz", **c)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name, column in c.items():
