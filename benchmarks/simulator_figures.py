@@ -8,6 +8,7 @@ recording needs ../shared/recordings and is left out without it.
 
 import argparse
 import math
+import sys
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -33,7 +34,15 @@ from evlcp_sdk.sim import (
     truth_of,
 )
 from evlcp_sdk.sim.optics import blur_of
-from evlcp_sdk.sim.validation import (
+from evlcp_sdk.study.frames import frames_of
+from evlcp_sdk.study.intervals import rms_interval
+from evlcp_sdk.study.measure import statistics_of
+from evlcp_sdk.study.tally import Tally
+from evlcp_sdk.values import Events
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.models.pixels import (
     MEASURED_AREA,
     MEASURED_LATENCY,
     events_per_edge,
@@ -42,11 +51,6 @@ from evlcp_sdk.sim.validation import (
     pixel_events,
     step_response,
 )
-from evlcp_sdk.study.frames import frames_of
-from evlcp_sdk.study.intervals import rms_interval
-from evlcp_sdk.study.measure import statistics_of
-from evlcp_sdk.study.tally import Tally
-from evlcp_sdk.values import Events
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 SENSOR = SensorSpec()

@@ -11,7 +11,8 @@ from scipy.stats import binomtest, chisquare, kstest, norm
 
 from evlcp_sdk.sim import BarSpec, MotionSpec, Scene, SensorSpec, Simulation, _kernels
 from evlcp_sdk.sim.simulation import quantile_table, seed_key
-from evlcp_sdk.sim.validation import (
+from evlcp_sdk.values import Events
+from tests.models.pixels import (
     MEASURED_AREA,
     MEASURED_LATENCY,
     crossing_by_steps,
@@ -21,7 +22,6 @@ from evlcp_sdk.sim.validation import (
     pixel_events,
     step_response,
 )
-from evlcp_sdk.values import Events
 
 SENSOR = SensorSpec()
 IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)

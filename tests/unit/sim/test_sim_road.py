@@ -40,10 +40,10 @@ from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.scene import LensSpec
-from evlcp_sdk.sim.validation import pixel_events
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import Score
 from evlcp_sdk.values import Events
+from tests.models.pixels import pixel_events
 
 SHARED = Path(__file__).parents[4] / "shared"
 TOOL = SHARED / "tools" / "score_road.py"
