@@ -402,6 +402,8 @@ def equations(
                 normal[3, a] += slope[a] * work[_SL + j]
                 normal[4, a] += slope[a] * work[_SZ + j]
                 for c in _SHIFTING:
+                    if c > a:
+                        break
                     normal[a, c] += slope[a] * slope[c] * work[_SS + j]
             right[3] += work[_BY_LEVEL + j]
             right[4] += work[_BY_Z + j]
@@ -412,6 +414,8 @@ def equations(
     normal[3, 4] = normal[4, 3]
     for a in _SHIFTING:
         normal[a, 3], normal[a, 4] = normal[3, a], normal[4, a]
+        for c in _SHIFTING:
+            normal[min(a, c), max(a, c)] = normal[max(a, c), min(a, c)]
     return cost
 
 

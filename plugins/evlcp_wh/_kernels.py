@@ -85,11 +85,12 @@ def presence(values: Array, codes: Array, beside: Array, none: Array, min_seen: 
     for i in range(length):
         for j in range(m):
             some[i, j] = values[i, which[j]]
-    best = np.empty(m, np.int16)
+    # A literal 0 would compile the fit once more.
+    best, begin = np.empty(m, np.int16), n - n
     for j in range(m):
         best[j] = -length
     for k in range(clusters):
-        _fit(codes[k], some, 0, fits[k])
+        _fit(codes[k], some, begin, fits[k])
         for j in range(m):
             best[j] = max(best[j], fits[k, j])
     norm = np.empty(m)
