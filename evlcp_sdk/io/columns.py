@@ -34,11 +34,11 @@ _PLACES: Final = 1 << 16
 _COARSE_US: Final = 20
 """Steps of times that are said, us: a fifth of a chip of 100 us; slower lights allow for more."""
 
-_WRAPS: Final = ((0, 1 << 32), (-(1 << 31), 1 << 31))
-"""First and last (not included) of counters of 32 bits, which some cameras' software stores times in."""
+_COUNTERS: Final = ((0, 1 << 32, 1 << 26), (-(1 << 31), 1 << 31, 1 << 26), (0, 1 << 24, 1 << 17))
+"""Counters that times are kept in: first value, end, and how near to both one was if it went round.
 
-_NEAR: Final = 1 << 26
-"""How near to its ends a counter was if it went round: 67 s of microseconds."""
+For 32 bits of microseconds that is 67 s; for 24, which are full after 17 s, 131 ms.
+"""
 
 Piece = tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, Callable[[int], int]]
 """Times, polarities, places (n, 2) or None, and in which line or row of the file the k-th of them stands."""
@@ -48,8 +48,8 @@ class ColumnSource(EventSource):
     """A table of times and polarities, and of places where it has them, read piece by piece.
 
     The unit of the times is the one that is named, or else guessed, see `time_unit`; `header` says which, and
-    why. Times of 32 bits may go round. Rows may be in any order as far as a million of them go; they are
-    sorted, and counted. Rows whose time, polarity or place is no number are dropped, and counted.
+    why. Times of 32 or 24 bits may go round. Rows may be in any order as far as a million of them go; they
+    are sorted, and counted. Rows whose time, polarity or place is no number are dropped, and counted.
 
     Args:
         path: The file.
@@ -103,7 +103,7 @@ class ColumnSource(EventSource):
         self._fault: InputError | None = None
         self._latest_us: int | None = None
         self._before: int | None = None
-        self._rounds = 0
+        self._gone_round = 0
         self._open = True
         header = {
             "pixels": "as its columns x and y say" if placed else "none given: x = y = 0",
@@ -166,9 +166,10 @@ class ColumnSource(EventSource):
         before = self._before
         self._before = int(times[-1]) if len(times) and math.isfinite(times[-1]) else before
         rows, good = len(times), False
-        times, rounds = _unwrap(times, before, self._rounds)
-        self._counts["times_gone_round"] += max(rounds - self._rounds, 0)
-        self._rounds = rounds
+        times, turns, self._gone_round = _unwrap(times, before, self._gone_round)
+        if turns > 0 and not self._counts["times_gone_round"]:
+            self.guessed = "; ".join(filter(None, (self.guessed, "the counter of times went round")))
+        self._counts["times_gone_round"] += max(turns, 0)
         while not good:
             try:
                 t_us, p = self._unit.us(times[:rows]), self._polarities.of(values[:rows])
@@ -231,27 +232,32 @@ class ColumnSource(EventSource):
         self._stack.close()
 
 
-def _unwrap(times: NDArray[Any], before: int | None, rounds: int) -> tuple[NDArray[Any], int]:
-    """Times of a counter of 32 bits that goes round, as if it did not, and how often it has.
+def _unwrap(times: NDArray[Any], before: int | None, gone_round: int) -> tuple[NDArray[Any], int, int]:
+    """Times of a counter that goes round, as if it did not; how often it has, and by how much in all.
 
     Args:
         times: The next ones; of other counters they stay.
         before: The one before them; None for none.
-        rounds: How often it had gone round until then.
+        gone_round: By how much it had gone round until then.
     """
-    finite = times[np.isfinite(times)] if times.dtype.kind == "f" else times
-    if not len(finite):
-        return times, rounds
-    low, high = finite.min(), finite.max()
-    first, last = next(((a, b) for a, b in _WRAPS if a <= low and high < b), (0, 0))
-    if not last:
-        return times, rounds
-    follow = np.concatenate([[times[0] if before is None else before], times])
-    falls = (follow[:-1] >= last - _NEAR) & (follow[1:] < first + _NEAR)
-    rises = (follow[:-1] < first + _NEAR) & (follow[1:] >= last - _NEAR)
-    turns = rounds + np.cumsum(falls.astype(np.int64) - (rises & (np.cumsum(falls) + rounds > 0)))
+    follow = np.concatenate([times[:1] if before is None else [before], times])
+    finite = follow[np.isfinite(follow)] if follow.dtype.kind == "f" else follow
+    turns = np.zeros(len(times), np.int64)
+    size = 0
+    for first, end, near in _COUNTERS:
+        if not len(finite) or finite.min() < first or finite.max() >= end:
+            continue
+        falls = (follow[:-1] >= end - near) & (follow[1:] < first + near)
+        rises = (follow[:-1] < first + near) & (follow[1:] >= end - near)
+        rises &= np.cumsum(falls) + gone_round > 0
+        if falls.any() or rises.any():
+            turns, size = np.cumsum(falls.astype(np.int64) - rises), end - first
+            break
+    if not gone_round and not size:
+        return times, 0, 0
     whole = times.astype(np.float64 if times.dtype.kind == "f" else np.int64)
-    return whole + turns * (last - first), int(turns[-1])
+    last = int(turns[-1]) if len(turns) else 0
+    return whole + (turns * size + gone_round), last, last * size + gone_round
 
 
 def _in_order(events: Events, window_us: float) -> Events:

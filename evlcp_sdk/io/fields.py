@@ -387,7 +387,11 @@ def _unit_of_whole(inside: NDArray[Any], rates: _Rates, share: float, placed: bo
         if not placed and rates.are_rounded("ns", "us", _LEAST_SPAN_S * share):
             return TimeUnit("us", "guessed: whole numbers, multiples of 1000, too close for ns", others)
         return TimeUnit("ns", "guessed: whole numbers, all multiples of 1000", others)
-    if not placed and rates.are_rounded("us", "ms", _LEAST_COUNTED_S * share):
+    if (
+        rates.of("us") > rates.most_hz and rates.are_likely("ms")
+        if placed
+        else rates.are_rounded("us", "ms", _LEAST_COUNTED_S * share)
+    ):
         return TimeUnit("ms", "guessed: whole numbers, too close for us", others)
     if not rates.are_likely("us") and rates.are_likely("ns"):
         return TimeUnit("ns", "guessed: whole numbers, too far apart for us", others)

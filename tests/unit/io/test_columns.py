@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.io import open_source, read_events
+from evlcp_sdk.io.columns import PIECE_ROWS
 from evlcp_sdk.values import Events
 
 N = 150_000
@@ -135,14 +136,14 @@ def test_float32_of_microseconds(events: Events, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("before_us", [200, 7000])
-@pytest.mark.parametrize("end", [1 << 32, 1 << 31], ids=["uint32", "int32"])
-def test_times_of_32_bits_go_round(end: int, before_us: int, events: Events, tmp_path: Path) -> None:
+@pytest.mark.parametrize("end", [1 << 32, 1 << 31, 1 << 24], ids=["uint32", "int32", "24 bits"])
+def test_counters_go_round(end: int, before_us: int, events: Events, tmp_path: Path) -> None:
     """Within the rows by which the unit is known, and beyond."""
     h5py = pytest.importorskip("h5py")
     c = columns_of(events)
     shift = end - before_us - int(c["t"][0])
     t = (c["t"] + shift).astype(np.uint32)
-    c["t"] = t if end > 1 << 31 else t.view(np.int32)
+    c["t"] = {1 << 32: t, 1 << 31: t.view(np.int32), 1 << 24: t % (1 << 24)}[end]
     np.savez(tmp_path / "a.npz", **c)
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name, column in c.items():
@@ -150,6 +151,18 @@ def test_times_of_32_bits_go_round(end: int, before_us: int, events: Events, tmp
     for name in ("a.npz", "a.h5"):
         source = same(tmp_path / name, events, shift)
         assert source.counts["times_gone_round"] == 1
+        assert source.guessed.endswith("the counter of times went round")
+
+
+def test_a_clock_that_restarts_at_a_piece_has_not_gone_round(tmp_path: Path) -> None:
+    """However much was counted before: a counter of 24 bits never had that."""
+    n = PIECE_ROWS
+    t = np.concatenate([3_000_000_000 + 100 * np.arange(n), 100 * np.arange(n)])
+    np.savez(tmp_path / "a.npz", t_us=t, x=t % 640, y=t % 480, p=np.arange(2 * n) & 1)
+    with open_source(tmp_path / "a.npz") as source:
+        got, _ = source.read()
+    np.testing.assert_array_equal(got.t_us, t)
+    assert "times_gone_round" not in source.counts
 
 
 @pytest.mark.parametrize("name", [n for n in ARRAYS if "txyp" not in n and "xytp" not in n])
@@ -224,6 +237,20 @@ def test_rounded_times_are_said(digits: int, words: str, events: Events, tmp_pat
         assert source.header["step"] == words
         assert words in source.guessed
         assert source.step_us == 10 ** (6 - digits)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_whole_milliseconds_are_said(suffix: str, events: Events, tmp_path: Path) -> None:
+    c = columns_of(events)
+    c["t"] = c["t"] // 1000
+    path = tmp_path / f"a.{suffix}"
+    if suffix == "csv":
+        np.savetxt(path, table_of(c, "txyp", np.int64), "%d", ",", header="t,x,y,p", comments="")
+    else:
+        np.savez(path, **c)  # type: ignore[arg-type]
+    with open_source(path) as source:
+        assert source.header["step"] == "times are rounded to 1 ms"
+        assert "in ms, guessed" in source.header["time"]
 
 
 def test_times_since_1970_of_six_digits_are_said(events: Events, tmp_path: Path) -> None:
