@@ -12,12 +12,10 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
-from evlcp_sdk.jobs.executor import Executor
-from evlcp_sdk.jobs.inline import Inline
-from evlcp_sdk.jobs.processes import Processes
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.plan import Case, Job, make_plan
 from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.jobs import Executor, Inline, Processes
 from evlcp_sdk.study.tally import Statistics, Tally
 
 NOTHING = Statistics.of([(10 * n, Tally.distance(0.01 * n)) for n in range(3, 10)], tasks=1)

@@ -18,8 +18,8 @@ if TYPE_CHECKING:
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
 
-    from evlcp_sdk.jobs.executor import Executor
     from evlcp_sdk.run import Advance
+    from evlcp_sdk.study.jobs import Executor
 
 __all__ = [
     "Dask",
@@ -150,14 +150,14 @@ def make_executor(workers: int | None, dask: str | None) -> "Executor":
     if dask is not None:
         if workers is not None:
             raise typer.BadParameter("give one of --workers and --dask", param_hint="--dask")
-        from evlcp_sdk.jobs.dask import DaskCluster
+        from evlcp_sdk.study.jobs import DaskCluster
 
         return DaskCluster(dask)
     if workers == 0:
-        from evlcp_sdk.jobs.inline import Inline
+        from evlcp_sdk.study.jobs import Inline
 
         return Inline()
-    from evlcp_sdk.jobs.processes import Processes
+    from evlcp_sdk.study.jobs import Processes
 
     return Processes(workers or os.cpu_count() or 1)
 

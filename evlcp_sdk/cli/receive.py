@@ -208,7 +208,7 @@ def receive(
 
     def pass_on() -> None:
         if not here:
-            from evlcp_sdk.jobs.processes import stop_workers
+            from evlcp_sdk.study.jobs import stop_workers
 
             stop_workers()
 

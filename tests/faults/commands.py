@@ -26,10 +26,10 @@ from evlcp_sdk.cli.main import main
 from evlcp_sdk.errors import EvlcpError, InputError
 from evlcp_sdk.files import STAGE_PREFIX, read_json
 from evlcp_sdk.io.open import write_events
-from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.results.folder import check_result_file, read_summary
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.values import Events, Packet
 from tests.unit.study.campaign.fake import fake_plan, run_fake
 

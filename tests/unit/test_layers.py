@@ -15,7 +15,7 @@ LAYERS = (
     {"plugin"},
     {"link"},
     {"io", "rx", "place", "sim"},
-    {"results", "jobs", "study", "live"},
+    {"results", "study", "live"},
     {"run", "simulated", "warming"},
     {"testing"},
     {"cli"},

@@ -3,9 +3,9 @@
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from evlcp_sdk.jobs.executor import Executor, Fault
 from evlcp_sdk.study.campaign.plan import Job, Plan, StopRule
 from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.jobs import Executor, Fault
 from evlcp_sdk.study.tally import Statistics
 
 __all__ = ["Counted", "Progress", "RunJob", "collect", "progress_of"]

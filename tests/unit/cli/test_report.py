@@ -11,7 +11,6 @@ import pytest
 from evlcp_sdk.cli.report import as_markdown
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs
-from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.study.campaign.charts import charts_of, save_charts
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.paper import PAPER
@@ -21,6 +20,7 @@ from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.compare.campaigns import of_campaign
 from evlcp_sdk.study.intervals import measure
+from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.campaign.fake import run_fake

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.jobs.processes import Processes
 from evlcp_sdk.study.campaign.plan import Case, Job, Plan, StopRule, make_plan
+from evlcp_sdk.study.jobs import Processes
 from evlcp_sdk.study.tally import Statistics, Tally
 
 

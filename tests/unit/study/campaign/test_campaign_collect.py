@@ -14,12 +14,10 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
-from evlcp_sdk.jobs.executor import Executor
-from evlcp_sdk.jobs.inline import Inline
-from evlcp_sdk.jobs.processes import Processes
 from evlcp_sdk.study.campaign.collect import Counted, Progress, collect
 from evlcp_sdk.study.campaign.plan import Plan, StopRule
 from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.jobs import Executor, Inline, Processes
 from evlcp_sdk.study.tally import Statistics
 from tests.conftest import ROOT
 from tests.unit.study.campaign.fake import fake_plan, run_fake
@@ -107,7 +105,7 @@ def test_a_job_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     progress, _ = collected(fake_plan(scenes=3, seeds=1, dies=1), tmp_path / "a.sqlite", Processes(2))
     ((job, fault),) = progress.faults
     assert job.scene["n"] == 1
-    assert fault.message == "its process died 3 times (exit code -9)"
+    assert fault.message == "its process died 3 times"
     assert progress.done == 4
 
 

@@ -79,11 +79,11 @@ def test_ctrl_c_and_its_like_end_all_of_them(
 
 @pytest.mark.parametrize("how", ["", "raise SystemExit(0)"])
 def test_a_program_that_leaves_its_processes_ends(how: str) -> None:
-    """Its workers hear the SIGTERM by which Python ends them."""
+    """When the jobs under way are done; nobody closes the outcomes."""
     code = f"""import time
-from evlcp_sdk.jobs.processes import Processes
+from evlcp_sdk.study.jobs import Processes
 if __name__ == "__main__":
-    outcomes = Processes(2).run(time.sleep, [0.01, 100, 100])
+    outcomes = Processes(2).run(time.sleep, [0.01, 2, 2])
     next(outcomes)
     {how}
 """

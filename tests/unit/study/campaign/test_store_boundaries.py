@@ -14,7 +14,6 @@ from typing import Any
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.study.campaign.charts import charts_of
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.plan import Case, make_plan
@@ -23,6 +22,7 @@ from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import Summary, summarize
 from evlcp_sdk.study.compare.campaigns import of_campaign
 from evlcp_sdk.study.compare.table import Comparison
+from evlcp_sdk.study.jobs import Inline
 from tests.unit.mutants import mutants, refusal
 from tests.unit.study.campaign.fake import fake_plan, run_fake
 from tests.unit.study.test_markup import HOSTILE, Elements

@@ -15,7 +15,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.jobs.inline import Inline
 from evlcp_sdk.sim.truth import truth_path
 from evlcp_sdk.study.campaign.collect import collect
 from evlcp_sdk.study.campaign.store import Store
@@ -25,6 +24,7 @@ from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, Times
 from evlcp_sdk.study.compare.run import _Watch
 from evlcp_sdk.study.compare.table import BOUND_NAME, COLUMNS, Comparison, Row, Table, total_of
 from evlcp_sdk.study.compare.variants import load_variants
+from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.study.campaign.fake import fake_plan, run_fake
 
