@@ -5,7 +5,7 @@ from evlcp_sdk.io.open import open_source, open_writer, read_events, write_event
 from evlcp_sdk.io.raw import RawHeader, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import StreamSource
-from evlcp_sdk.io.tables import CsvWriter, NpzSource, NpzWriter
+from evlcp_sdk.io.tables import CsvWriter, NpzWriter
 from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.source import DEFAULT_MAX_EVENTS, EventSource, Loss
 
@@ -17,7 +17,6 @@ __all__ = [
     "FaerySource",
     "LoopSource",
     "Loss",
-    "NpzSource",
     "NpzWriter",
     "RawHeader",
     "RawSource",

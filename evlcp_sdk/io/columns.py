@@ -19,7 +19,7 @@ from evlcp_sdk.io.writers import LAST_TIME_US
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["PIECE_ROWS", "WINDOW_US", "ColumnSource", "Piece"]
+__all__ = ["PIECE_ROWS", "WINDOW_US", "ColumnSource", "Piece", "piece_of"]
 
 PIECE_ROWS: Final = 1 << 16
 
@@ -60,6 +60,7 @@ class ColumnSource(EventSource):
         named: The unit that the file says; None where it says none.
         unit: The unit that the caller says, whatever the file does.
         inverted: The larger polarity is OFF.
+        triggers: External ones, by time, of a table that has some.
         size: Columns and rows of the sensor, or None.
         window_us: How much earlier than those before a row may be to be sorted in, us; beyond that the
             camera's clock has leapt, or it is dropped.
@@ -79,6 +80,7 @@ class ColumnSource(EventSource):
         named: Callable[[], str | None] = lambda: None,
         unit: str | None = None,
         inverted: bool = False,
+        triggers: Iterator[Triggers] | None = None,
         size: tuple[int | None, int | None] = (None, None),
         window_us: float = math.inf,
     ) -> None:
@@ -101,10 +103,12 @@ class ColumnSource(EventSource):
         self._row = first[3](0) if first is not None and len(times) else 1
         self._wrong: InputError | None = None
         self._fault: InputError | None = None
+        self._closed: InputError | None = None
         self._latest_us: int | None = None
         self._before: int | None = None
         self._gone_round = 0
         self._open = True
+        self._merged = _with_triggers(iter(self._take_events, None), triggers or iter(()))
         header = {
             "pixels": "as its columns x and y say" if placed else "none given: x = y = 0",
             "time": f"in {self._unit.name}, {self._unit.why}",
@@ -121,6 +125,16 @@ class ColumnSource(EventSource):
         Raises:
             InputError: The file cannot be read on, or a row is none of a time and a polarity.
         """
+        if self._closed is not None:
+            raise self._closed
+        try:
+            return next(self._merged, None)
+        except InputError as fault:
+            self._closed = fault
+            raise
+
+    def _take_events(self) -> Events | None:
+        """The next ones by time; None at the end."""
         if self._fault is not None:
             raise self._fault
         if not self._open:
@@ -147,7 +161,7 @@ class ColumnSource(EventSource):
                 raise self._fault
             if not len(given):
                 return None
-        return given, Triggers.empty()
+        return given
 
     def _next_piece(self) -> Piece | None:
         try:
@@ -228,8 +242,40 @@ class ColumnSource(EventSource):
 
     def close(self) -> None:
         """Close the file."""
-        self._fault = self._fault or InputError(f"{self.path}: closed file")
+        self._closed = self._closed or InputError(f"{self.path}: closed file")
         self._stack.close()
+
+
+def _with_triggers(
+    pieces: Iterator[Events], triggers: Iterator[Triggers]
+) -> Iterator[tuple[Events, Triggers]]:
+    """Events with the triggers up to the last of each piece; those of a long file are never all at hand."""
+    ahead = next(triggers, None)
+    for events in pieces:
+        rest = events
+        while ahead is not None and len(rest):
+            due = int(np.searchsorted(ahead.t_us, rest.t_us[-1], "right"))
+            if due < len(ahead):
+                break
+            n = int(np.searchsorted(rest.t_us, ahead.t_us[-1], "right"))
+            yield rest[:n], ahead
+            rest, ahead = rest[n:], next(triggers, None)
+        due = 0 if ahead is None or not len(rest) else due
+        yield rest, Triggers.empty() if ahead is None else ahead[:due]
+        ahead = None if ahead is None else ahead[due:]
+    while ahead is not None:
+        yield Events.empty(), ahead
+        ahead = next(triggers, None)
+
+
+def piece_of(columns: list[NDArray[Any]], row: int) -> Piece:
+    """A piece of times, polarities and perhaps places, each (n,), of rows from `row` on."""
+    times = columns[0]
+    if times.dtype.kind == "u" and times.size and times.max() > np.iinfo(np.int64).max:
+        times = times.astype(np.float64)
+    elif times.dtype.kind != "f":
+        times = times.astype(np.int64)
+    return times, columns[1], np.stack(columns[2:], 1) if len(columns) > 2 else None, row.__add__
 
 
 def _unwrap(times: NDArray[Any], before: int | None, gone_round: int) -> tuple[NDArray[Any], int, int]:
@@ -241,6 +287,8 @@ def _unwrap(times: NDArray[Any], before: int | None, gone_round: int) -> tuple[N
         gone_round: By how much it had gone round until then.
     """
     follow = np.concatenate([times[:1] if before is None else [before], times])
+    if not gone_round and not (follow[1:] < follow[:-1]).any():
+        return times, 0, 0
     finite = follow[np.isfinite(follow)] if follow.dtype.kind == "f" else follow
     turns = np.zeros(len(times), np.int64)
     size = 0

@@ -18,6 +18,7 @@ __all__ = [
     "fields_of",
     "fields_of_values",
     "time_unit",
+    "unit_named",
     "unit_of",
 ]
 
@@ -240,6 +241,17 @@ def _as_time(name: str) -> str | None:
             return unit if unit or form is not _BRACKETS else ""
     # A unit alone; `s` may be a sign.
     return unit_of(name) if len(name) > 1 else None
+
+
+def unit_named(text: str) -> str:
+    """A unit of times that somebody names: `s`, `ms`, `us` or `ns`.
+
+    Raises:
+        ValueError: It is none of them.
+    """
+    if text not in UNITS_US:
+        raise ValueError(f"{', '.join(UNITS_US)}")
+    return text
 
 
 def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
@@ -483,7 +495,9 @@ class Polarities:
             if fits is None:
                 beside = " and ".join(f"{other:g}" for other in sorted(self._levels))
                 beside = f" beside {beside}" if beside else ""
-                raise RowError(row, f"polarity {level:g}{beside}, expected 0 and 1, or -1 and 1")
+                raise RowError(
+                    row, f"polarity {level:g}{beside}, expected 0 and 1, or -1 and 1, 1 and 2, 0 and 255"
+                )
             self._levels, pair = known, fits
         return np.asarray(values == pair[1], np.uint8)
 

@@ -8,8 +8,9 @@ from typing import Any, Final
 import numpy as np
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, ColumnSource, Piece
-from evlcp_sdk.io.fields import UNITS_US, Fields, fields_of, fields_of_values
+from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, ColumnSource, Piece, piece_of
+from evlcp_sdk.io.fields import Fields, fields_of, fields_of_values, unit_named
+from evlcp_sdk.io.tables import said
 from evlcp_sdk.io.urls import flag, split_options
 
 __all__ = ["Hdf5Source", "open_hdf5"]
@@ -39,7 +40,7 @@ def open_hdf5(url: str) -> "Hdf5Source":
     Raises:
         InputError: As for `Hdf5Source`, or an option is wrong.
     """
-    name, options = split_options(url, {"columns": _order, "unit": _unit, "swapped": flag})
+    name, options = split_options(url, {"columns": _order, "unit": unit_named, "swapped": flag})
     return Hdf5Source(
         name.partition(":")[2],
         columns=options.get("columns"),
@@ -51,12 +52,6 @@ def open_hdf5(url: str) -> "Hdf5Source":
 def _order(text: str) -> str:
     if sorted(text) != sorted("txyp"):
         raise ValueError("the letters t, x, y and p in the order of the table's columns, such as txyp")
-    return text
-
-
-def _unit(text: str) -> str:
-    if text not in UNITS_US:
-        raise ValueError(f"{', '.join(UNITS_US)}")
     return text
 
 
@@ -94,7 +89,7 @@ class Hdf5Source(ColumnSource):
                 raise
             except Exception as fault:
                 # A damaged file makes h5py fail in any way.
-                raise InputError(f"{path}: found no HDF5 file, or a damaged one ({_said(fault)})") from fault
+                raise InputError(f"{path}: found no HDF5 file, or a damaged one ({said(fault)})") from fault
             if swapped:
                 found[2:] = found[:1:-1]
             super().__init__(
@@ -115,10 +110,9 @@ class Hdf5Source(ColumnSource):
             try:
                 time, polarity, *places = (column[first : first + PIECE_ROWS] for column in columns)
             except Exception as fault:
-                raise InputError(f"{self.path}: row {first + 1}: damaged: {_said(fault)}") from fault
+                raise InputError(f"{self.path}: row {first + 1}: damaged: {said(fault)}") from fault
             self._position = round(self.path.stat().st_size * min((first + PIECE_ROWS) / rows, 1.0))
-            times = time if time.dtype.kind == "f" else time.astype(np.int64)
-            yield times, polarity, np.stack(places, 1) if places else None, (first + 1).__add__
+            yield piece_of([time, polarity, *places], first + 1)
 
 
 class _Column:
@@ -147,10 +141,6 @@ class _Column:
         return np.asarray(
             self.dataset[self._part, rows] if self._on_its_side else self.dataset[rows, self._part]
         )
-
-
-def _said(fault: Exception) -> str:
-    return " ".join(str(fault).split())[:200] or type(fault).__name__
 
 
 def _columns_of(path: Path, file: Any, order: str | None) -> tuple[list[_Column], str | None]:

@@ -23,21 +23,32 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, ColumnSource, Piece
+from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, ColumnSource, Piece, piece_of
 from evlcp_sdk.io.fields import (
-    UNITS_US,
     Fields,
     Polarities,
     fields_of,
     fields_of_values,
+    unit_named,
     unit_of,
 )
-from evlcp_sdk.io.tables import COLUMNS, CSV_HEADER, DAMAGE, NpzColumn, said, show
+from evlcp_sdk.io.tables import (
+    COLUMNS,
+    CSV_HEADER,
+    DAMAGE,
+    TRIGGER_COLUMNS,
+    NpzColumn,
+    npy_header,
+    said,
+    show,
+)
 from evlcp_sdk.io.urls import flag, split_options
+from evlcp_sdk.values import Triggers
 
 __all__ = ["SUFFIXES", "ListSource", "is_list", "open_list"]
 
 PIECE_BYTES: Final = 1 << 20
+TRIGGER_ROWS: Final = 1 << 12
 LOOKED_AT: Final = 1 << 14
 """Rows at the start from which columns are recognized."""
 
@@ -62,7 +73,7 @@ def open_list(url: str) -> "ListSource":
     Raises:
         InputError: As for `ListSource`, or an option is wrong.
     """
-    name, options = split_options(url, {"columns": _order, "unit": _unit, "inverted": flag})
+    name, options = split_options(url, {"columns": _order, "unit": unit_named, "inverted": flag})
     path = name.partition(":")[2]
     if _kind_at(path).startswith(b"MATLAB 7.3"):
         raise InputError(f"{path}: a file of MATLAB 7.3, expected to be named hdf5:{path}")
@@ -90,14 +101,11 @@ def _order(text: str) -> Fields:
     return Fields(names.index("t"), names.index("p"), places)
 
 
-def _unit(text: str) -> str:
-    if text not in UNITS_US:
-        raise ValueError(f"{', '.join(UNITS_US)}")
-    return text
-
-
 class ListSource(ColumnSource):
     """A table of times and polarities of events, and of places where it has them.
+
+    An NPZ file of `t_us`, `x`, `y`, `p` may have the numbers `width` and `height`, and external triggers
+    in `trigger_t_us`, `trigger_channel`, `trigger_value`, by rising time.
 
     CSV (`,` `;` `|` tab or blanks, UTF-8 or UTF-16, plain or gzipped, `#` `%` `//` before comments, up to
     ten lines of titles above), NPZ and MAT of arrays, of one structured or (n, 2) or (n, 4) array, and NPY of
@@ -126,6 +134,8 @@ class ListSource(ColumnSource):
     ) -> None:
         target = self.path = Path(path)
         self._fields, self._is_ours = fields, False
+        self._triggers: list[NpzColumn] = []
+        self._size: tuple[int | None, int | None] = (None, None)
         try:
             kind = _kind(target)
         except OSError as error:
@@ -147,6 +157,8 @@ class ListSource(ColumnSource):
                 inverted=inverted,
                 # A table of ours has times as a camera gave them; others may be in any order.
                 window_us=WINDOW_US if self._is_ours else math.inf,
+                size=self._size,
+                triggers=self._trigger_pieces(),
             )
             self._stack = stack.pop_all()
 
@@ -197,8 +209,12 @@ class ListSource(ColumnSource):
                 return
 
     def _npz(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
-        archive = stack.enter_context(zipfile.ZipFile(target))
+        try:
+            archive = stack.enter_context(zipfile.ZipFile(target))
+        except (zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError) as error:
+            raise InputError(f"{target}: found no NPZ file, expected one ({error})") from error
         names = [member.removesuffix(".npy") for member in archive.namelist()]
+        self._is_ours = self._fields is None and set(COLUMNS) <= set(names)
         fields = self._fields or fields_of(names) or _fields_of_two(target, archive)
         if self._fields is None and (len(names) == 1 or fields is None):
             for name in sorted(names, key=len):
@@ -208,23 +224,29 @@ class ListSource(ColumnSource):
                 raise InputError(f"{target}: found the arrays {', '.join(sorted(names))}, expected t and p")
             return self._table(_Array(target, stack.enter_context(archive.open(f"{name}.npy"))))
         assert fields is not None
-        if fields.places and any(_is_scalar(archive, f"{names[k]}.npy") for k in fields.places):
-            # Where the pixels are, not a place of each event.
-            fields = replace(fields, places=None)
-        self._fields = fields
         if max(fields.which) >= len(names):
             raise InputError(f"{target}: found {len(names)} arrays, expected {max(fields.which) + 1}")
         columns = [
-            NpzColumn(target, archive, names[k], stack, kinds=kinds, bounded=False)
+            NpzColumn(target, archive, names[k], stack, kinds=kinds)
             for k, kinds in zip(fields.which, ("iuf", "iubfUS", "iuf", "iuf"), strict=False)
         ]
-        lengths = [column.rows for column in columns]
-        if len(set(lengths)) > 1:
-            raise InputError(
-                f"{target}: found {lengths[0]} times and {lengths[1]} polarities, expected one length"
-                if lengths[0] != lengths[1]
-                else f"{target}: found {lengths[0]} times and {lengths[2:]} places, expected one length"
+        if any(column.is_scalar for column in columns[2:]) and not self._is_ours:
+            # Where the pixels are, not a place of each event.
+            fields, columns = replace(fields, places=None), columns[:2]
+        self._fields = fields
+        if self._is_ours:
+            self._triggers = [
+                NpzColumn(target, archive, name, stack) for name in TRIGGER_COLUMNS if "trigger_t_us" in names
+            ]
+            width, height = (
+                NpzColumn(target, archive, name, stack).one() if name in names else None
+                for name in ("width", "height")
             )
+            self._size = width, height
+        for group in (columns, self._triggers):
+            lengths = {column.name: column.rows for column in group}
+            if any(column.is_scalar for column in group) or len(set(lengths.values())) > 1:
+                raise InputError(f"{target}: found arrays of the lengths {lengths}, expected one length")
         return self._npz_pieces(columns, target.stat().st_size)
 
     def _npz_pieces(self, columns: list[NpzColumn], size: int) -> Iterator[Piece]:
@@ -233,7 +255,15 @@ class ListSource(ColumnSource):
             row = time.row + 1
             taken = [column.take(PIECE_ROWS) for column in columns]
             self._position = round(size * time.row / time.rows)
-            yield _piece(taken, row)
+            yield piece_of(taken, row)
+        self._position = size
+
+    def _trigger_pieces(self) -> Iterator[Triggers]:
+        try:
+            while self._triggers and self._triggers[0].row < self._triggers[0].rows:
+                yield Triggers(*(column.take_bounded(TRIGGER_ROWS) for column in self._triggers))
+        except DAMAGE as error:
+            raise InputError(f"{self.path}: damaged triggers: {said(error)}") from error
 
     def _npy(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
         return self._table(_Array(target, stack.enter_context(target.open("rb"))))
@@ -252,14 +282,14 @@ class ListSource(ColumnSource):
         row = 1
         while len((taken := array.take(PIECE_ROWS))[0]):
             self._position = round(array.path.stat().st_size * array.done)
-            yield _piece([taken[k] for k in fields.which], row)
+            yield piece_of([taken[k] for k in fields.which], row)
             row += len(taken[0])
 
     def _mat(self, target: Path, stack: ExitStack) -> Iterator[Piece]:
         arrays = _mat_arrays(target)
         names = list(arrays)
         if (fields := self._fields or fields_of(names)) is not None and max(fields.which) < len(names):
-            columns = [_flat(arrays[names[k]]) for k in fields.which]
+            columns = [arrays[names[k]].ravel() for k in fields.which]
         else:
             tables = {
                 name: array
@@ -288,25 +318,19 @@ class ListSource(ColumnSource):
         for first in range(0, len(columns[0]), PIECE_ROWS):
             last = first + PIECE_ROWS
             self._position = round(self.path.stat().st_size * min(last / len(columns[0]), 1.0))
-            yield _piece([column[first:last] for column in columns], first + 1)
+            yield piece_of([column[first:last] for column in columns], first + 1)
 
 
 def is_list(path: Path) -> bool:
-    """Whether a file is a list of times and polarities, and no table in the SDK's own layout.
+    """Whether a file is a list of times and polarities.
 
     Raises:
         OSError: It cannot be read.
     """
     try:
         kind = _kind(path)
-        if kind in ("NPY", "MAT"):
+        if kind in ("NPZ", "NPY", "MAT"):
             return True
-        if kind == "NPZ":
-            with zipfile.ZipFile(path) as archive:
-                names = [member.removesuffix(".npy") for member in archive.namelist()]
-                if fields_of(names) is None and _fields_of_two(path, archive) is None:
-                    return any(_is_table(archive, name) for name in archive.namelist())
-            return not set(COLUMNS) <= set(names)
         with path.open("rb") as file:
             start = file.read(1 << 13)
         if start.startswith(b"\x1f\x8b"):
@@ -328,43 +352,29 @@ def _fields_of_two(path: Path, archive: zipfile.ZipFile) -> Fields | None:
         return None
     try:
         with ExitStack() as stack:
-            columns = [NpzColumn(path, archive, name, stack, kinds="iufbUS", bounded=False) for name in names]
+            columns = [NpzColumn(path, archive, name, stack, kinds="iufbUS") for name in names]
             return fields_of_values([column.take(LOOKED_AT) for column in columns])
     except InputError:
         return None
 
 
-def _is_scalar(archive: zipfile.ZipFile, name: str) -> bool:
-    with archive.open(name) as member:
-        return _npy_header(member)[0] == ()
-
-
 def _is_table(archive: zipfile.ZipFile, name: str) -> bool:
     try:
         with archive.open(name) as member:
-            shape, _, dtype = _npy_header(member)
+            shape, _, dtype = npy_header(member)
     except (ValueError, *DAMAGE):
         return False
     return bool(dtype.names) or (len(shape) == 2 and 1 < min(shape) <= 8)
 
 
 def _kind(path: Path) -> str:
-    if zipfile.is_zipfile(path):
-        return "NPZ"
     with path.open("rb") as file:
         start = file.read(16)
+    if start.startswith(b"PK\x03\x04") or path.suffix.lower() == ".npz":
+        return "NPZ"
     if start.startswith(_NPY):
         return "NPY"
     return "MAT" if start.startswith(_MAT) or path.suffix.lower() == ".mat" else "CSV"
-
-
-def _piece(columns: list[NDArray[Any]], row: int) -> Piece:
-    times = columns[0] if columns[0].dtype.kind == "f" else columns[0].astype(np.int64)
-    return times, columns[1], np.stack(columns[2:], 1) if len(columns) > 2 else None, row.__add__
-
-
-def _flat(array: NDArray[Any]) -> NDArray[Any]:
-    return array.ravel()
 
 
 def _columns_of(array: NDArray[Any]) -> list[NDArray[Any]]:
@@ -404,30 +414,13 @@ def _mat_arrays(path: Path) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-    """Shape, whether columns lie on end, and type.
-
-    Raises:
-        ValueError: It is no array of numbers.
-    """
-    try:
-        version = np.lib.format.read_magic(file)
-        read = np.lib.format.read_array_header_1_0
-        found = (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(file)
-    except Exception as error:
-        # NumPy evaluates the header as a piece of Python, which may fail in any way.
-        raise ValueError(said(error)) from error
-    shape, on_end, dtype = found
-    return shape, on_end, dtype
-
-
 class _Array:
     """A table in one array, structured, (n, k) or (k, n), read from front to back."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self.path = path
         try:
-            self._shape, on_end, self._dtype = _npy_header(file)
+            self._shape, on_end, self._dtype = npy_header(file)
         except ValueError as error:
             raise InputError(f"{path}: {error}") from error
         self.what = f"{self._dtype} {self._shape}"

@@ -12,7 +12,7 @@ from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import SCHEMES, open_stream
-from evlcp_sdk.io.tables import CsvWriter, NpzSource, NpzWriter
+from evlcp_sdk.io.tables import CsvWriter, NpzWriter
 from evlcp_sdk.io.urls import flag, positive, split_options
 from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.late import Late
@@ -172,7 +172,7 @@ def _open_file(path: Path | str) -> EventSource:
     if start.startswith(b"% ") and suffix not in lists.SUFFIXES:
         return RawSource(path)
     if start.startswith(b"PK\x03\x04") or suffix == ".npz":
-        return lists.ListSource(path) if start and lists.is_list(target) else NpzSource(path)
+        return lists.ListSource(path)
     is_table = start.startswith(b"\x1f\x8b") or suffix in (".csv", ".csv.gz")
     if is_table or (start and not special and lists.is_list(target)):
         return lists.ListSource(path)

@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError, OutputError, StreamError
 from evlcp_sdk.files import Outputs
-from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
-from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["CsvWriter", "NpzColumn", "NpzSource", "NpzWriter", "said", "show"]
+__all__ = ["CsvWriter", "NpzColumn", "NpzWriter", "npy_header", "said", "show"]
 
 COLUMNS: Final = ("t_us", "x", "y", "p")
 TRIGGER_COLUMNS: Final = ("trigger_t_us", "trigger_channel", "trigger_value")
@@ -34,10 +32,6 @@ WIRE_TYPES: Final[dict[str, np.dtype[Any]]] = {
     "trigger_value": np.dtype("u1"),
 }
 LAST_VALUES: Final = {
-    "t_us": LAST_TIME_US,
-    "x": 0xFFFF,
-    "y": 0xFFFF,
-    "p": 1,
     "trigger_t_us": LAST_TIME_US,
     "trigger_channel": 0xFF,
     "trigger_value": 1,
@@ -46,7 +40,6 @@ LAST_VALUES: Final = {
 CSV_HEADER = b"t_us,x,y,p"
 CSV_ROWS = 1 << 15
 BUFFER_BYTES = 1 << 20
-LEAST_ROWS = 1 << 12
 
 
 DAMAGE: Final = (
@@ -64,7 +57,6 @@ class NpzColumn:
         name: Of the array.
         stack: Closes it.
         kinds: Kinds of types that it may have, as NumPy's.
-        bounded: Values are checked against those that its column of a table of events may have.
 
     Raises:
         InputError: There is no such array, or it is not one of numbers of these kinds in one dimension.
@@ -77,12 +69,8 @@ class NpzColumn:
         name: str,
         stack: ExitStack,
         kinds: str = "iub",
-        bounded: bool = True,
     ) -> None:
-        self.name = name
-        self._bounded = bounded
-        self.row = 0
-        self._path = path
+        self.name, self.row, self._path = name, 0, path
         try:
             self._file = stack.enter_context(archive.open(f"{name}.npy"))
         except KeyError:
@@ -91,15 +79,10 @@ class NpzColumn:
         except DAMAGE as error:
             raise InputError(f"{path}: array {name}: {said(error)}") from error
         try:
-            version = np.lib.format.read_magic(self._file)
-            read = np.lib.format.read_array_header_1_0
-            if version != (1, 0):
-                read = np.lib.format.read_array_header_2_0
-            shape, _, dtype = read(self._file)
-        except Exception as error:
-            # NumPy evaluates the header as a piece of Python, which may fail in any way.
-            raise InputError(f"{path}: array {name}: {said(error)}") from error
-        if not bounded and len(shape) == 2 and 1 in shape:
+            shape, _, dtype = npy_header(self._file)
+        except ValueError as error:
+            raise InputError(f"{path}: array {name}: {error}") from error
+        if len(shape) == 2 and 1 in shape:
             # One column or one row of a table is a column, too.
             shape = (shape[0] * shape[1],)
         if dtype.kind not in kinds or len(shape) > 1 or min(shape, default=0) < 0:
@@ -110,29 +93,34 @@ class NpzColumn:
         self.rows = shape[0] if shape else 1
 
     def take(self, rows: int) -> NDArray[Any]:
-        """Return the next values, as many as there are up to `rows`, in the column's type.
+        """Return the next values, as many as there are up to `rows`.
 
         Raises:
-            InputError: A value has no place in the column, or the array ends too early.
+            InputError: The array ends too early.
         """
         rows = min(rows, self.rows - self.row)
         data = self._file.read(rows * self.dtype.itemsize)
         if len(data) < rows * self.dtype.itemsize:
             found = self.row + len(data) // self.dtype.itemsize
             raise InputError(f"{self._path}: array {self.name}: found {found} values, expected {self.rows}")
-        values = np.frombuffer(data, self.dtype)
-        if not self._bounded:
-            self.row += rows
-            return values
+        self.row += rows
+        return np.frombuffer(data, self.dtype)
+
+    def take_bounded(self, rows: int) -> NDArray[Any]:
+        """The same of a column of ours, in its type.
+
+        Raises:
+            InputError: A value has no place in the column, or the array ends too early.
+        """
+        row, values = self.row, self.take(rows)
         last = LAST_VALUES.get(self.name, 0xFFFF)
-        first = -last if self.name in ("t_us", "trigger_t_us") else 0
-        if rows and not (first <= values.min() and values.max() <= last):
+        first = -last if self.name == "trigger_t_us" else 0
+        if len(values) and not (first <= values.min() and values.max() <= last):
             k = int(((values < first) | (values > last)).argmax())
             raise InputError(
-                f"{self._path}: array {self.name}: row {self.row + k + 1}: found {values[k]},"
+                f"{self._path}: array {self.name}: row {row + k + 1}: found {values[k]},"
                 f" expected {first} to {last}"
             )
-        self.row += rows
         return values.astype(WIRE_TYPES.get(self.name, np.dtype(np.int64)))
 
     def one(self) -> int:
@@ -143,7 +131,24 @@ class NpzColumn:
         """
         if self.rows != 1:
             raise InputError(f"{self._path}: array {self.name}: found {self.rows} values, expected one")
-        return int(self.take(1)[0])
+        return int(self.take_bounded(1)[0])
+
+
+def npy_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    """Shape of an array in NumPy's format, whether columns lie on end, and type.
+
+    Raises:
+        ValueError: It is none.
+    """
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0
+        found = (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(file)
+    except Exception as error:
+        # NumPy evaluates the header as a piece of Python, which may fail in any way.
+        raise ValueError(said(error)) from error
+    shape, on_end, dtype = found
+    return shape, on_end, dtype
 
 
 def said(error: Exception) -> str:
@@ -152,104 +157,8 @@ def said(error: Exception) -> str:
     return text if len(text) <= 200 else f"{text[:200]}..."
 
 
-class NpzSource(EventSource):
-    """An NPZ file: arrays `t_us`, `x`, `y`, `p`, and where known the numbers `width` and `height`.
-
-    External triggers are in `trigger_t_us`, `trigger_channel`, `trigger_value`, if there are any, by rising
-    time. Both are read in pieces, compressed or not.
-
-    Args:
-        path: The file.
-
-    Raises:
-        InputError: The file cannot be read, or its arrays are not these.
-    """
-
-    def __init__(self, path: Path | str) -> None:
-        target = Path(path)
-        with ExitStack() as stack:
-            try:
-                self._file = stack.enter_context(target.open("rb"))
-                archive = stack.enter_context(zipfile.ZipFile(self._file))
-            except OSError as error:
-                raise InputError(f"{path}: {error.strerror}") from error
-            except (zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError) as error:
-                raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
-            try:
-                self._columns = [NpzColumn(target, archive, name, stack) for name in COLUMNS]
-                sizes = {column.name: column.rows for column in self._columns if not column.is_scalar}
-                if len(sizes) < len(COLUMNS) or len(set(sizes.values())) > 1:
-                    raise InputError(f"{path}: found arrays of the lengths {sizes}, expected one length")
-                names = archive.namelist()
-                width, height = (
-                    NpzColumn(target, archive, name, stack).one() if f"{name}.npy" in names else None
-                    for name in ("width", "height")
-                )
-                self._trigger_columns: list[NpzColumn] = []
-                if "trigger_t_us.npy" in names:
-                    columns = [NpzColumn(target, archive, name, stack) for name in TRIGGER_COLUMNS]
-                    lengths = {column.name: column.rows for column in columns}
-                    if len(set(lengths.values())) > 1:
-                        raise InputError(
-                            f"{path}: found arrays of the lengths {lengths}, expected one length"
-                        )
-                    self._trigger_columns = columns
-            except DAMAGE as error:
-                raise InputError(f"{path}: damaged NPZ file: {said(error)}") from error
-            self._sieve = Sieve("row", width, height)
-            super().__init__(target, "NPZ", width, height, None, target.stat().st_size, self._sieve)
-            self._events, self._triggers = Events.empty(), Triggers.empty()
-            self._stack = stack.pop_all()
-
-    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """As `EventSource.take`.
-
-        Raises:
-            InputError: The file cannot be read on, or a value has no place in its column.
-        """
-        row = self._columns[0].row
-        try:
-            if not len(self._events):
-                taken = Events(*(column.take(max_events) for column in self._columns))
-                self._events = self._sieve.sift(taken, row + 1)
-            self._more_triggers(max(max_events, LEAST_ROWS))
-        except DAMAGE as error:
-            raise InputError(f"{self.path}: damaged NPZ file at row {row + 1}: {said(error)}") from error
-        events, triggers = self._events, self._triggers
-        left = self._columns[0].rows - self._columns[0].row
-        if not len(events) and not len(triggers) and not left:
-            events = self._sieve.close()
-            return (events, triggers) if len(events) else None
-        n, due = len(events), 0 if left else len(triggers)
-        if n:
-            due = int(np.searchsorted(triggers.t_us, events.t_us[-1], "right"))
-        if due == len(triggers) and self._triggers_left():
-            # More of them may be due before the last of these events.
-            n = int(np.searchsorted(events.t_us, triggers.t_us[-1], "right"))
-        self._events, self._triggers = events[n:], triggers[due:]
-        return events[:n], triggers[:due]
-
-    def _more_triggers(self, rows: int) -> None:
-        """Have some triggers at hand, if any are left; never all of a long file's at once."""
-        if not len(self._triggers) and self._triggers_left():
-            self._triggers = Triggers(*(column.take(rows) for column in self._trigger_columns))
-
-    def _triggers_left(self) -> bool:
-        return any(column.row < column.rows for column in self._trigger_columns)
-
-    @property
-    def position_bytes(self) -> int:
-        """How much of the file is read."""
-        column = self._columns[0]
-        return round((self.size_bytes or 0) * (column.row / column.rows if column.rows else 1))
-
-    def close(self) -> None:
-        """Close the file."""
-        self._stack.close()
-
-
 class NpzWriter(EventWriter):
-    """An NPZ file being written, with the arrays that `NpzSource` reads; not compressed.
+    """An NPZ file being written, with the arrays `COLUMNS` and `TRIGGER_COLUMNS`; not compressed.
 
     The columns grow in temporary files and are put together at the end.
 

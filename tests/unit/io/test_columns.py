@@ -90,6 +90,10 @@ def table_of(c: Columns, order: str, dtype: Any) -> np.ndarray:
     return np.stack([c[name] for name in order], 1).astype(dtype)
 
 
+def renamed(c: Columns) -> Columns:
+    return {"t_us" if name == "t" else name: column for name, column in c.items()}
+
+
 ARRAYS: dict[str, Callable[[Columns], Columns]] = {
     "arrays": lambda c: c,
     "as floats": lambda c: {"timestamp": c["t"] * 1.0, "polarity": c["p"] * 1.0, "x": c["x"], "y": c["y"]},
@@ -104,6 +108,9 @@ ARRAYS: dict[str, Callable[[Columns], Columns]] = {
     "polarity 255 for -1": lambda c: {**c, "p": (2 * c["p"] - 1).astype(np.uint8)},
     "polarity 0 and 255": lambda c: {**c, "p": (255 * c["p"]).astype(np.uint8)},
     "booleans": lambda c: {**c, "p": c["p"] > 0},
+    "our names": lambda c: renamed({**c, "t": c["t"] * 1.0}),
+    "our names, polarity 1 and 2": lambda c: renamed({**c, "p": c["p"] + 1.0}),
+    "our names, polarity -1": lambda c: renamed({**c, "p": 2 * c["p"] - 1}),
 }
 
 
@@ -145,10 +152,11 @@ def test_counters_go_round(end: int, before_us: int, events: Events, tmp_path: P
     t = (c["t"] + shift).astype(np.uint32)
     c["t"] = {1 << 32: t, 1 << 31: t.view(np.int32), 1 << 24: t % (1 << 24)}[end]
     np.savez(tmp_path / "a.npz", **c)
+    np.savez(tmp_path / "ours.npz", **renamed(c))
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name, column in c.items():
             file[f"events/{name}"] = column
-    for name in ("a.npz", "a.h5"):
+    for name in ("a.npz", "ours.npz", "a.h5"):
         source = same(tmp_path / name, events, shift)
         assert source.counts["times_gone_round"] == 1
         assert source.guessed.endswith("the counter of times went round")
@@ -207,11 +215,13 @@ def test_late_rows_are_sorted_in(events: Events, tmp_path: Path) -> None:
     with h5py.File(tmp_path / "a.h5", "w") as file:
         for name, column in c.items():
             file[f"events/{name}"] = column[order]
-    with open_source(tmp_path / "a.h5") as source:
-        got, _ = source.read()
-    np.testing.assert_array_equal(got.t_us, events.t_us)
-    assert source.counts["rows_out_of_order"] > 1000
-    assert not source.losses
+    np.savez(tmp_path / "a.npz", **renamed({name: column[order] for name, column in c.items()}))
+    for name in ("a.h5", "a.npz"):
+        with open_source(tmp_path / name) as source:
+            got, _ = source.read()
+        np.testing.assert_array_equal(got.t_us, events.t_us)
+        assert source.counts["rows_out_of_order"] > 1000
+        assert not source.losses
 
 
 @pytest.mark.parametrize("times", ["whole", "fractions"])

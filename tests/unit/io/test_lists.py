@@ -80,7 +80,10 @@ def test_pieces_of_a_long_list_are_the_whole(tmp_path: Path) -> None:
     ("text", "message"),
     [
         ("t,p\n1,1\n2,5\n", "line 3: polarity 5 beside 1, expected 0 and 1"),
-        ("t,p\n1,1\n2,-1\n3,0\n4,0\n", "line 4: polarity 0 beside -1 and 1, expected 0 and 1, or -1 and 1"),
+        (
+            "t,p\n1,1\n2,-1\n3,0\n4,0\n",
+            "line 4: polarity 0 beside -1 and 1, expected 0 and 1, or -1",
+        ),
         ("t,x,y,p\n1,1,1,1\n2,1,70000,1\n", "line 3: place 70000, expected whole numbers from 0"),
         ("t,p\n1,1\nx,1\n", "line 3: found 'x,1', expected a time and a polarity"),
         ("t,p\n1,1\n\n3\n", "line 4: found '3', expected a time and a polarity"),
