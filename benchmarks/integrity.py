@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.spatial.transform import Rotation
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.judgement import Pose
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.pose import solve_pose
@@ -48,7 +48,7 @@ from evlcp_sdk.values import Fix
 Floats = NDArray[np.float64]
 
 CAMERA = CameraModel()
-SPEC = PositionSpec()
+SPEC = ErrorModel()
 NOISE_PX = 0.05
 PIXEL_PX = 0.05
 POINT_PX = math.hypot(NOISE_PX, PIXEL_PX)
@@ -93,7 +93,7 @@ class Scene:
     rotation: Floats
 
 
-def own_shift(points_px: Floats, spec: PositionSpec) -> Floats:
+def own_shift(points_px: Floats, spec: ErrorModel) -> Floats:
     """A root of the covariance of the shift that a bar's points share, px^2, float64 (2, 2)."""
     whole = points_px[-1] - points_px[0]
     length_px = float(np.linalg.norm(whole))
@@ -292,7 +292,7 @@ def floors(fixes: int) -> None:
             print(f"| {name}; {what} | " + " | ".join(texts) + " |", flush=True)
 
 
-def row(world: World, fault: Fault | None, fixes: int, seed: int, spec: PositionSpec) -> dict[str, float]:
+def row(world: World, fault: Fault | None, fixes: int, seed: int, spec: ErrorModel) -> dict[str, float]:
     """The figures of a row of the table."""
     rng = np.random.default_rng(seed)
     squares, hpl, vpl = [], [], []
@@ -353,7 +353,7 @@ STEPS, STEP_S, SPEED_M_S = 20, 0.036, 11.0
 """Fixes of a drive, their distance in time, and the speed at first: 8 m."""
 
 
-def drive(world: World, rng: np.random.Generator, spec: PositionSpec) -> tuple[list[Fix], Floats]:
+def drive(world: World, rng: np.random.Generator, spec: ErrorModel) -> tuple[list[Fix], Floats]:
     """Fixes past bars with errors of the sigmas and of the persistence that are stated, and the true places.
 
     Bars are 50 to 90 m ahead at first; the motion is what the track takes it for, white acceleration.

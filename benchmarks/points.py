@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from scipy.optimize import minimize
 
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.points import SeenPoints, points_at
 from evlcp_sdk.place.positioner import BarKind
 from evlcp_sdk.rx.receiver import Receiver
@@ -91,7 +91,7 @@ def rows_of(what: str, distance_m: float, seed: int, duration_s: float, drive: i
                 f for f in packet.frames if math.isfinite(f.points_t_us)
             )
     rows = []
-    spec = PositionSpec(pixel_sigma_px=1.0, early_sigma_us=1.0)
+    spec = ErrorModel(pixel_sigma_px=1.0, early_sigma_us=1.0)
     period_us, layout_m = BarKind.of(LINK).packet_us, LINK.bar.cluster_positions_m()
     for seen in frames.values():
         seen.sort(key=lambda frame: frame.points_t_us)
@@ -100,7 +100,7 @@ def rows_of(what: str, distance_m: float, seed: int, duration_s: float, drive: i
             t_us = number * period_us
             points = points_at(seen, t_us, period_us, layout_m, spec)
             if points is not None:
-                stated = points_at(seen, t_us, period_us, layout_m, LINK.position)
+                stated = points_at(seen, t_us, period_us, layout_m, ErrorModel.of(LINK.position))
                 assert stated is not None
                 true_px = true_points(simulation, t_us, points.points_px)
                 rows.append(row_of(points, stated, true_px, (what, seed, drive, t_us)))

@@ -775,6 +775,7 @@ def calibrate(
             was seen.
     """
     from evlcp_sdk.place.calibration import calibrate as fit_camera
+    from evlcp_sdk.place.error_model import ErrorModel
     from evlcp_sdk.scene.sites import LocalAxes
 
     registry = Registry.load() if registry is None else registry
@@ -789,7 +790,7 @@ def calibrate(
     for url in recordings:
         mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
         views += _views(url, mine, link, sites, axes, registry, name)
-    return fit_camera(views, link.camera, link.position, limit_px=limit_px)
+    return fit_camera(views, link.camera, ErrorModel.of(link.position), limit_px=limit_px)
 
 
 def _check_names(recordings: Sequence[str], poses: Sequence[KnownPose], source: str) -> None:
@@ -859,6 +860,7 @@ def _seen_at(
         InputError: The recording cannot be read.
         ConfigError: No pose is of a time at which bars are in view.
     """
+    from evlcp_sdk.place.error_model import ErrorModel
     from evlcp_sdk.place.points import points_at
 
     placing = placing_links(links)
@@ -889,7 +891,8 @@ def _seen_at(
         for number, seen in frames.items():
             name = link_of[number]
             link = placing[name]
-            points = points_at(seen, pose.t_us, periods[name], link.bar.cluster_positions_m(), link.position)
+            errors = ErrorModel.of(link.position)
+            points = points_at(seen, pose.t_us, periods[name], link.bar.cluster_positions_m(), errors)
             if points is not None:
                 found[-1][number] = points
     times = [pose.t_us for pose in poses]
@@ -925,6 +928,7 @@ def survey(
         InputError: A recording cannot be read.
         ConfigError: A pose belongs to none of the recordings, or has no attitude, or too little was seen.
     """
+    from evlcp_sdk.place.error_model import ErrorModel
     from evlcp_sdk.place.observations import BarView
     from evlcp_sdk.place.survey import survey as survey_bars
     from evlcp_sdk.place.whereabouts import Whereabouts
@@ -965,7 +969,7 @@ def survey(
                 bars.append(BarView.of(number, np.empty((0, 3)), found))
             views.append(_view(pose, bars, axes))
     long_m = {number: placing[by].bar.length_m for number, by in sends.items()}
-    surveyed = survey_bars(views, axes, long_m, like.camera, like.camera_sigma, like.position)
+    surveyed = survey_bars(views, axes, long_m, like.camera, like.camera_sigma, ErrorModel.of(like.position))
     named = [
         replace(bar, site=replace(bar.site, link=sends[bar.site.transmitter_id] or None)) for bar in surveyed
     ]

@@ -97,62 +97,6 @@ class RegionSpec:
 class PositionSpec:
     """How positions are computed from the image points of bars at known places."""
 
-    min_points: Annotated[
-        int, Field(ge=2, description="Clusters of a bar that must be seen for it to count.")
-    ] = 6
-    huber_sigmas: Annotated[
-        float, Field(gt=0, description="Miss of a point, in its sigmas, beyond which it weighs less.")
-    ] = 3.0
-    shaken_sigma_px: Annotated[
-        float,
-        Field(
-            ge=0,
-            description="How far the image moves unseen midway between two frames, for all bars alike.",
-        ),
-    ] = 0.04
-    shared_sigma_px: Annotated[
-        float,
-        Field(
-            ge=0,
-            description="Error that a bar's points share across it, besides what its image does not show.",
-        ),
-    ] = 0.02
-    shared_along_px: Annotated[
-        float, Field(ge=0, description="The same along it, where its ends are half a cluster's light.")
-    ] = 0.04
-    shared_share: Annotated[
-        float,
-        Field(ge=0, le=0.1, description="What of that grows with the bar: a share of its length."),
-    ] = 0.00015
-    early_sigma_us: Annotated[
-        float,
-        Field(
-            ge=0,
-            description="How early, or late, a moving bar is seen where it is: all of it, and each point.",
-        ),
-    ] = 13.0
-    stretch_share: Annotated[
-        float, Field(ge=0, le=0.1, description="By how much a bar looks too long, or short, all the time.")
-    ] = 0.0001
-    bend_sigma_px: Annotated[
-        float,
-        Field(
-            ge=0,
-            description="How a bar looks bent along itself, all the time: root of the sum of squares of its "
-            "points. A survey cannot tell it from a lean towards the camera.",
-        ),
-    ] = 0.05
-    pixel_sigma_px: Annotated[
-        float,
-        Field(
-            ge=0,
-            description="Error of a point that no averaging over frames removes: where in a pixel it is.",
-        ),
-    ] = 0.04
-    min_view_deg: Annotated[
-        float,
-        Field(ge=0, lt=90, description="Angle between a bar and the line of sight that a lone bar needs."),
-    ] = 10.0
     max_sigma_m: Annotated[
         float, Field(gt=0, description="Largest sigma of a position, in any direction, that is given.")
     ] = 3.0
@@ -203,27 +147,7 @@ class PositionSpec:
         float,
         Field(ge=0, description="How precisely a beacon says its place (sigma, to the east, north and up)."),
     ] = 0.1
-    acceleration_m2_s3: Annotated[
-        float,
-        Field(gt=0, description="Power density of the change of speed: 1 m/s2 that lasts for a second."),
-    ] = 1.0
-    slow_s: Annotated[
-        float, Field(gt=0, description="Time in which errors within pixels change, as the image moves.")
-    ] = 0.3
     rate_sigma_deg_s: Annotated[float, Field(gt=0, description="Bias of an IMU's rates (sigma).")] = 0.1
-    rate_white_deg_rts: Annotated[
-        float, Field(ge=0, description="How an IMU's angle drifts in a second by noise, degrees.")
-    ] = 0.02
-    push_sigma_m_s2: Annotated[
-        float,
-        Field(gt=0, description="Bias of an IMU's accelerations, by its attitude's error, too (sigma)."),
-    ] = 0.05
-    push_white_m2_s3: Annotated[
-        float, Field(gt=0, description="Power density of the noise of an IMU's accelerations.")
-    ] = 1e-3
-    gnss_s: Annotated[float, Field(gt=0, description="Time in which most of a GNSS fix's error changes.")] = (
-        30.0
-    )
     gnss_sigma_m: Annotated[
         float,
         Field(
@@ -232,14 +156,7 @@ class PositionSpec:
             description="Sigma of east and north of a fix in NMEA without GST, of up twice that; 0: none.",
         ),
     ] = 0.0
-    gnss_white_share: Annotated[
-        float, Field(gt=0, le=1, description="Share of its variance that is new with every fix.")
-    ] = 0.1
     antenna_m: Annotated[
         tuple[float, float, float],
         Field(description="The GNSS antenna's place from the camera: right, down, forward, m."),
     ] = (0.0, 0.0, 0.0)
-    gate_sigmas: Annotated[
-        float,
-        Field(gt=1, description="Sigmas from the prediction beyond which a trajectory leaves a fix out."),
-    ] = 5.0

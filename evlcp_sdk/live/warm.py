@@ -9,6 +9,7 @@ from evlcp_sdk.files import shipped
 from evlcp_sdk.io.raw import RawSource
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.pictures import PictureSlot
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.pose import solve_pose
 from evlcp_sdk.rx.receiver import Receiver
@@ -61,7 +62,7 @@ def _find_place(link: Link) -> None:
     along = np.linspace(0.5, -0.5, link.bar.clusters)[:, None] * (0.0, 0.0, link.bar.length_m)
     points, _ = project_bars(along + _PLACE, np.zeros(3), attitude.rotation(), link.camera)
     view = BarView(0, along + _PLACE, points, np.full(len(points), 0.3))
-    solve_pose([view], link.camera, attitude, link.position, link.camera_sigma)
+    solve_pose([view], link.camera, attitude, ErrorModel.of(link.position), link.camera_sigma)
 
 
 def _shaken(events: Events) -> Events:

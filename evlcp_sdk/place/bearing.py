@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.points import unseen_px
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.values import Frame
@@ -40,7 +40,7 @@ def bar_point(
     length_m: float,
     camera: CameraModel,
     sigma: CameraSigma | None = None,
-    spec: PositionSpec | None = None,
+    spec: ErrorModel | None = None,
 ) -> BarPoint | None:
     """Where the centre of a frame's bar is; None where the frame has no distance.
 
@@ -54,7 +54,7 @@ def bar_point(
         sigma: How precisely it is known; None: exactly.
         spec: Errors that a bar's points share; None for the defaults.
     """
-    spec = PositionSpec() if spec is None else spec
+    spec = ErrorModel() if spec is None else spec
     depth = frame.range.distance_m
     sight = camera.undistort(np.array([frame.x_px, frame.y_px]))
     if not (math.isfinite(depth) and math.isfinite(frame.range.sigma_m) and np.isfinite(sight).all()):

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, between_of, project_bars, shared_sigmas
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
@@ -113,7 +113,7 @@ class Calibrated:
 def calibrate(
     views: Sequence[CalibrationView],
     camera: CameraModel,
-    spec: PositionSpec | None = None,
+    spec: ErrorModel | None = None,
     *,
     limit_px: float = 2.0,
 ) -> Calibrated:
@@ -133,7 +133,7 @@ def calibrate(
     Raises:
         ConfigError: Not even the focal length is determined, or the views do not fit their places.
     """
-    spec = PositionSpec() if spec is None else spec
+    spec = ErrorModel() if spec is None else spec
     for view in views:
         _check_near(view, camera, spec)
     seen = [SeenView.of(view, camera, spec) for view in views]
@@ -180,7 +180,7 @@ def calibrate(
     )
 
 
-def _check_near(view: CalibrationView, camera: CameraModel, spec: PositionSpec) -> None:
+def _check_near(view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> None:
     """Raise where a bar looks far nearer than its site and the pose are to each other."""
     for bar in view.bars:
         seen = np.flatnonzero(np.isfinite(bar.points_px).all(1))
@@ -233,7 +233,7 @@ class SeenView:
     turn_sigma_rad: float
 
     @classmethod
-    def of(cls, view: CalibrationView, camera: CameraModel, spec: PositionSpec) -> "SeenView":
+    def of(cls, view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> "SeenView":
         """The points of the bars of which enough is seen."""
         enu, points, whiten, number, arm, bend = [], [], [], [], [], []
         survey: dict[int, tuple[float, float, float]] = {}

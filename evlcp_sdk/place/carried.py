@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.swing import Swing
 
 __all__ = ["Carried", "carried", "imu_sigmas"]
@@ -37,7 +37,7 @@ class Carried:
     turn_rad: float
 
 
-def imu_sigmas(swing: Swing, spec: PositionSpec) -> Floats:
+def imu_sigmas(swing: Swing, spec: ErrorModel) -> Floats:
     """Sigmas of an IMU's biases: the gyroscope's, radians/s, the accelerometer's, m/s2: none, 1 or 4."""
     sigmas = [np.radians(spec.rate_sigma_deg_s)] if swing.gyro else []
     if swing.push_m_s2 is not None:
@@ -51,7 +51,7 @@ def carried(
     heading_rad: float,
     heading_sigma_rad: float,
     imu: Floats,
-    spec: PositionSpec,
+    spec: ErrorModel,
 ) -> Carried:
     """Carry position and velocity over a time.
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import check_columns, csv_number, read_csv
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.nmea import read_nmea
 from evlcp_sdk.place.poses import PLACE
 from evlcp_sdk.place.trajectory import GNSS
@@ -148,7 +148,7 @@ def gnss_fix(
     row: int,
     axes: LocalAxes,
     attitude: Attitude | None,
-    spec: PositionSpec,
+    spec: ErrorModel,
 ) -> Fix | None:
     """A fix of satellites as one of the camera; None where no heading tells where the antenna is from it.
 

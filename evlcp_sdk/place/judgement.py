@@ -12,8 +12,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.chances import chi_square
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.model import (
     FAULT,
     FOCAL_UNIT,
@@ -467,7 +467,7 @@ def _doubted(problem: Problem, solution: _Solution) -> Floats:
     return nothing if little else np.asarray(added)
 
 
-def covering(pose: Pose, other: Pose, spec: PositionSpec) -> Pose:
+def covering(pose: Pose, other: Pose, spec: ErrorModel) -> Pose:
     """A pose with levels that reach to where the camera is by another solution, with that one's error."""
     east, north, up = np.abs(other.enu_m - pose.enu_m).tolist()
     wide = np.linalg.eigvalsh(other.covariance[:2, :2])[-1]
@@ -476,7 +476,7 @@ def covering(pose: Pose, other: Pose, spec: PositionSpec) -> Pose:
     return replace(pose, hpl_m=_level(max(pose.hpl_m, hpl), spec), vpl_m=_level(max(pose.vpl_m, vpl), spec))
 
 
-def _level(level_m: float, spec: PositionSpec) -> float:
+def _level(level_m: float, spec: ErrorModel) -> float:
     """A level as it is given: none above the highest."""
     return level_m if level_m <= spec.max_protection_m else math.inf
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import IMU
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
@@ -51,7 +51,7 @@ def learnt(
     camera_sigma: CameraSigma,
     attitude: Attitude | None,
     sites: Mapping[int, BarSite],
-    spec: PositionSpec,
+    spec: ErrorModel,
 ) -> list[Learnt]:
     """Standing states in their units; an error that was stated as none is left out.
 

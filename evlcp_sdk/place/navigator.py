@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
 from evlcp_sdk.place.learnt import Learnt, focal_share, learnt
 from evlcp_sdk.place.positioner import BarKind, Positioner
@@ -150,13 +151,13 @@ class Navigator:
     ) -> None:
         links = {"": links} if isinstance(links, Link) else links
         link = next(iter(links.values()))
-        self._spec = link.position
+        self._spec = ErrorModel.of(link.position)
         self.positioner = Positioner(
             link.camera,
             {name: BarKind.of(one) for name, one in links.items()},
             plan.sites,
             attitude_source(attitude),
-            link.position,
+            self._spec,
             link.camera_sigma,
         )
         self._log = attitude if isinstance(attitude, AttitudeLog) else None
@@ -250,7 +251,7 @@ class Navigator:
     def learnt(self) -> list[Learnt]:
         """What the drive says so far of standing errors: of the camera, the attitude, the IMU, the sites."""
         link, sites = self._link, self.positioner.stands_at
-        return learnt(self._standing, link.camera, link.camera_sigma, self._attitude, sites, link.position)
+        return learnt(self._standing, link.camera, link.camera_sigma, self._attitude, sites, self._spec)
 
     def bars_enu_m(self) -> dict[int, Floats]:
         """Centres of the bars whose places are known, in the local axes, m, float64 (3,) each."""

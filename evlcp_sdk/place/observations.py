@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.points import SeenPoints
 from evlcp_sdk.place.refusals import Refusal
 from evlcp_sdk.scene.attitude import Attitude
@@ -40,7 +40,7 @@ class BarView:
             a share; 0: exact.
         pixel_px: The part of `sigma_px` that stands until the image has moved; None: `position.
             pixel_sigma_px`.
-        shift_px: What all points share across the bar besides `position.shared_sigma_px`, px.
+        shift_px: What all points share across the bar besides `ErrorModel.shared_sigma_px`, px.
         between: How far the image may have moved otherwise than its frames show, in `position.
             shaken_sigma_px`.
         early_px: What all points share in any direction besides, as a moving image is seen early or late, px.
@@ -133,7 +133,7 @@ class Problem:
 
     camera: CameraModel
     attitude: Attitude | None
-    spec: PositionSpec
+    spec: ErrorModel
     points: Floats
     bar: NDArray[np.int64]
     bar_sigma: Floats
@@ -155,7 +155,7 @@ class Problem:
         views: Sequence[BarView],
         camera: CameraModel,
         attitude: Attitude | None,
-        spec: PositionSpec,
+        spec: ErrorModel,
         sigma: CameraSigma,
     ) -> "Problem | Refusal":
         """What the views give, or why that is too little for a position."""
@@ -306,7 +306,7 @@ def between_of(views: Sequence[BarView]) -> float:
 
 
 def shared_sigmas(
-    view: BarView, seen: NDArray[np.bool_], spec: PositionSpec, between: float
+    view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, between: float
 ) -> tuple[float, ...]:
     """Of a bar: its image's shift, px, in any direction at most; its place, m, turn, radians, and length, a
     share. `between` is what it has in common with others, see `between_of`.
@@ -331,7 +331,7 @@ def whole_clusters(points_px: Floats, sigma_px: Floats, width: int, height: int)
     return counted
 
 
-def _rows_of(view: BarView, whole: NDArray[np.bool_], spec: PositionSpec) -> Floats:
+def _rows_of(view: BarView, whole: NDArray[np.bool_], spec: ErrorModel) -> Floats:
     """A bar's whole clusters as rows of a `Problem`, float64 (n, 10)."""
     pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
     sigma = view.sigma_px[whole, None]
@@ -341,7 +341,7 @@ def _rows_of(view: BarView, whole: NDArray[np.bool_], spec: PositionSpec) -> Flo
     return np.concatenate([view.enu_m[whole], arm[whole], view.points_px[whole], 1 / sigma, share], 1)
 
 
-def _sigmas_of(view: BarView, seen: NDArray[np.bool_], spec: PositionSpec, between: float) -> Floats:
+def _sigmas_of(view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, between: float) -> Floats:
     """What a bar's points share, and how they err across it, by those `seen`, bool (K,), float64 (9,).
 
     The first three are its survey's, place, m, turn, radians, and length, a share, to which is added by how

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.values import Frame
 
 __all__ = ["SeenPoints", "points_at", "unseen_px"]
@@ -95,7 +95,7 @@ def _interpolation(t: Floats) -> Floats:
 
 
 def points_at(
-    frames: Sequence[Frame], t_us: float, period_us: float, layout_m: Floats, spec: PositionSpec
+    frames: Sequence[Frame], t_us: float, period_us: float, layout_m: Floats, spec: ErrorModel
 ) -> SeenPoints | None:
     """A bar's image points at a time between its frames.
 

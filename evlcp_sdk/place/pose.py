@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.failed import failed_bar
 from evlcp_sdk.place.fit import fit_pose
 from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, covering, judged, misfits
@@ -55,7 +55,7 @@ def solve_pose(
     views: Sequence[BarView],
     camera: CameraModel,
     attitude: Attitude | None = None,
-    spec: PositionSpec | None = None,
+    spec: ErrorModel | None = None,
     sigma: CameraSigma | None = None,
 ) -> Pose | Refusal:
     """Fit position and attitude to all image points.
@@ -75,7 +75,7 @@ def solve_pose(
     Returns:
         The pose, or why the geometry does not determine one, or the parts contradict one another.
     """
-    spec = PositionSpec() if spec is None else spec
+    spec = ErrorModel() if spec is None else spec
     sigma = CameraSigma() if sigma is None else sigma
     problem = Problem.of(views, camera, attitude, spec, sigma)
     if isinstance(problem, Refusal):
@@ -144,7 +144,7 @@ def fitting_focal_mm(
     views: Sequence[BarView],
     camera: CameraModel,
     attitude: Attitude | None = None,
-    spec: PositionSpec | None = None,
+    spec: ErrorModel | None = None,
     sigma: CameraSigma | None = None,
 ) -> float:
     """The focal length with which views that contradict one another fit best, mm; NaN where with none.
@@ -152,7 +152,7 @@ def fitting_focal_mm(
     For what `solve_pose` refuses: it believes a focal length that is some percent off at the most, and one
     that was mistyped is another lens altogether.
     """
-    spec = PositionSpec() if spec is None else spec
+    spec = ErrorModel() if spec is None else spec
     sigma = CameraSigma() if sigma is None else sigma
 
     def tried(focal_mm: float, free: float) -> Problem | Refusal:
@@ -184,7 +184,7 @@ def _mixed_up(
     views: Sequence[BarView],
     camera: CameraModel,
     attitude: Attitude | None,
-    spec: PositionSpec,
+    spec: ErrorModel,
     sigma: CameraSigma,
 ) -> list[tuple[str, Pose]]:
     """Which two sites would explain all, too, if they stood at each other's place, and the pose by that.

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at
 from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
@@ -73,7 +73,7 @@ class Positioner:
         kinds: Mapping[str, BarKind],
         sites: Sequence[BarSite],
         attitude_at: Callable[[float], Attitude | None],
-        spec: PositionSpec | None = None,
+        spec: ErrorModel | None = None,
         camera_sigma: CameraSigma | None = None,
     ) -> None:
         self.axes: LocalAxes | None = LocalAxes.of(sites) if sites else None
@@ -82,7 +82,7 @@ class Positioner:
         self._kinds = dict(kinds)
         self._packet_us = max(kind.packet_us for kind in self._kinds.values())
         self._attitude_at = attitude_at
-        self._spec = PositionSpec() if spec is None else spec
+        self._spec = ErrorModel() if spec is None else spec
         self._links: dict[int, str] = {}
         only = next(iter(self._kinds.values())).link if len(self._kinds) == 1 else ""
         self._bars = Whereabouts(sites, self._spec, only)

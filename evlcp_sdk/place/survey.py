@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.calibration import CalibrationView, SeenView, solve_views
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 
@@ -59,7 +59,7 @@ def survey(
     length_m: float | Mapping[int, float],
     camera: CameraModel,
     sigma: CameraSigma | None = None,
-    spec: PositionSpec | None = None,
+    spec: ErrorModel | None = None,
 ) -> list[SurveyedBar]:
     """Estimate where bars stand.
 
@@ -75,7 +75,7 @@ def survey(
     Raises:
         ConfigError: A view's attitude is not known, no bar is seen, or the views do not fit one another.
     """
-    spec = PositionSpec() if spec is None else spec
+    spec = ErrorModel() if spec is None else spec
     if any(view.rotation is None for view in views):
         raise ConfigError("a survey needs poses with heading_deg, pitch_deg and roll_deg")
     numbers = _numbers(views)

@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.carried import Carried, carried, imu_sigmas
 from evlcp_sdk.place.chances import chi_square
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.swing import Swing
 from evlcp_sdk.values import Fix
 
@@ -38,7 +38,7 @@ SwingSource = Callable[[float, float], Swing | None]
 """How the camera turned from one time to a later one, us; None where that is not known."""
 
 GNSS, IMU = "gnss", "imu"
-"""Causes of standing errors: a receiver of satellites, whose errors have a memory of `position.gnss_s`, and
+"""Causes of standing errors: a receiver of satellites, whose errors have a memory of `ErrorModel.gnss_s`, and
 the IMU's rates and accelerations."""
 
 _SPEED_M_S = 30.0
@@ -171,7 +171,7 @@ def _columns(causes: Iterable[Cause]) -> list[tuple[Cause, slice]]:
 
 
 def trajectory_step(
-    state: TrajectoryPoint | None, fix: Fix, spec: PositionSpec, imu: SwingSource | None = None
+    state: TrajectoryPoint | None, fix: Fix, spec: ErrorModel, imu: SwingSource | None = None
 ) -> TrajectoryPoint:
     """Take a fix: velocity that turns as the camera does, driven by white acceleration (Bar-Shalom, chapter
     6), or that changes as an accelerometer says.
@@ -199,7 +199,7 @@ def trajectory_step(
     return _caught_up(state, _taken(ahead, fix, seen), spec)
 
 
-def _caught_up(state: TrajectoryPoint, point: TrajectoryPoint, spec: PositionSpec) -> TrajectoryPoint:
+def _caught_up(state: TrajectoryPoint, point: TrajectoryPoint, spec: ErrorModel) -> TrajectoryPoint:
     """A point after a state; when a course is young, and known better, its fixes are taken again."""
     course = point.course
     if course is None or course.count > _AGAIN[-1] or point.fix is None:
@@ -228,7 +228,7 @@ def _taken(ahead: TrajectoryPoint, fix: Fix, seen: Floats) -> TrajectoryPoint:
 
 
 def filter_fixes(
-    fixes: Iterable[Fix], spec: PositionSpec, imu: SwingSource | None = None
+    fixes: Iterable[Fix], spec: ErrorModel, imu: SwingSource | None = None
 ) -> list[TrajectoryPoint]:
     """Filter the fixes that are given, one point each; refused ones have none."""
     points: list[TrajectoryPoint] = []
@@ -238,7 +238,7 @@ def filter_fixes(
     return points
 
 
-def smooth_trajectory(points: Sequence[TrajectoryPoint], spec: PositionSpec) -> list[TrajectoryPoint]:
+def smooth_trajectory(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[TrajectoryPoint]:
     """Smooth filtered points with those after them (Rauch, Tung, Striebel 1965), each trajectory alone.
 
     Where noise of the fixes changes how errors that stay move them, they are filtered and smoothed once more,
@@ -251,7 +251,7 @@ def smooth_trajectory(points: Sequence[TrajectoryPoint], spec: PositionSpec) -> 
 
 
 def _again(
-    points: Sequence[TrajectoryPoint], smoothed: Sequence[TrajectoryPoint], spec: PositionSpec
+    points: Sequence[TrajectoryPoint], smoothed: Sequence[TrajectoryPoint], spec: ErrorModel
 ) -> list[TrajectoryPoint]:
     """Filter points again, each fix as it is where the smoothed track has it; the first one, where no
     trajectory starts, stays.
@@ -275,7 +275,7 @@ def _again(
     return again
 
 
-def _smoothed(points: Sequence[TrajectoryPoint], spec: PositionSpec) -> list[TrajectoryPoint]:
+def _smoothed(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[TrajectoryPoint]:
     """One pass of the smoother."""
     smoothed = list(points)
     for i in range(len(points) - 2, -1, -1):
@@ -413,7 +413,7 @@ def _joined(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
     return replace(point, mean=mean, covariance=covariance, causes=(*causes, *new))
 
 
-def _ahead(point: TrajectoryPoint, t_us: float, swing: Swing, spec: PositionSpec) -> TrajectoryPoint:
+def _ahead(point: TrajectoryPoint, t_us: float, swing: Swing, spec: ErrorModel) -> TrajectoryPoint:
     mean, move, noise, causes, turn_rad = _motion(point, t_us, swing, spec)
     covariance = move @ point.covariance @ move.T + noise
     ahead = replace(
@@ -441,7 +441,7 @@ def _faced(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
 
 
 def _motion(
-    point: TrajectoryPoint, t_us: float, swing: Swing, spec: PositionSpec
+    point: TrajectoryPoint, t_us: float, swing: Swing, spec: ErrorModel
 ) -> tuple[Floats, Floats, Floats, tuple[Cause, ...], float]:
     """A point at a later time, (m,), how it depends on it, (m, n), what is new, (m, m), causes, the turn."""
     dt = (t_us - point.t_us) * 1e-6
@@ -479,7 +479,7 @@ def _motion(
     return np.append(mean, np.zeros(biases)), move, wide + new @ new.T, tuple(causes), way.turn_rad
 
 
-def _way(point: TrajectoryPoint, swing: Swing, own: slice | None, spec: PositionSpec) -> tuple[Carried, int]:
+def _way(point: TrajectoryPoint, swing: Swing, own: slice | None, spec: ErrorModel) -> tuple[Carried, int]:
     """Position and velocity as a swing carries them, and how many biases it has."""
     biases = len(imu_sigmas(swing, spec))
     imu = np.zeros(biases) if own is None else point.mean[own][:biases]

@@ -3,6 +3,7 @@
 import csv
 
 from evlcp_sdk.place.bearing import bar_point
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Packet
@@ -29,10 +30,11 @@ class PointsCsv(Sink):
     def packet(self, packet: Packet) -> None:
         """Write a row per frame that has a distance; reflections are no bars at a place."""
         link = self.run.link_of(packet.link)
+        errors = ErrorModel.of(link.position)
         for frame in packet.frames:
             found = None
             if frame.echo_of is None:
-                found = bar_point(frame, link.bar.length_m, link.camera, link.camera_sigma, link.position)
+                found = bar_point(frame, link.bar.length_m, link.camera, link.camera_sigma, errors)
             if found is not None:
                 self._rows.writerow(
                     [

@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.bearing import bar_point
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.values import Frame, Range, SoftSymbols
 
 BENT = CameraModel(focal_mm=8.0, k1=-0.2, k2=0.05, p1=1e-3, p2=-1e-3, centre_x_px=650.0, centre_y_px=350.0)
 LENS = CameraSigma(0.04, 2.0, 2.0, 0.01, 0.01, 1e-4, 1e-4)
-SPEC = PositionSpec(shaken_sigma_px=0.1, shared_sigma_px=0.17320508, shared_share=0.002, stretch_share=0.004)
+SPEC = ErrorModel(shaken_sigma_px=0.1, shared_sigma_px=0.17320508, shared_share=0.002, stretch_share=0.004)
 SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 
 
@@ -35,10 +35,10 @@ def test_the_point_is_the_one_that_is_seen() -> None:
         0.96,
         BENT,
         None,
-        PositionSpec(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0),
+        ErrorModel(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0),
     )
     assert exact is not None
-    stretched = 0.1**2 + (40 * PositionSpec().stretch_share) ** 2
+    stretched = 0.1**2 + (40 * ErrorModel().stretch_share) ** 2
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
 
 

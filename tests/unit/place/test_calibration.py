@@ -11,7 +11,6 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.calibration import (
     PARAMETERS,
     CalibrationView,
@@ -19,6 +18,7 @@ from evlcp_sdk.place.calibration import (
     _turn_slope,
     calibrate,
 )
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.poses import read_poses
 from evlcp_sdk.scene.attitude import Attitude
@@ -26,7 +26,7 @@ from evlcp_sdk.scene.camera import CameraModel
 
 TRUE = CameraModel(focal_mm=8.2, centre_x_px=652.0, centre_y_px=351.0, k1=-0.12, k2=0.05, p1=8e-4, p2=-5e-4)
 NOMINAL = CameraModel(focal_mm=8.0)
-SPEC = PositionSpec(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0)
+SPEC = ErrorModel(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0)
 ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
 
 

@@ -7,8 +7,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.carried import carried, imu_sigmas
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import IMU, filter_fixes, smooth_trajectory
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.swing import Swing
@@ -16,7 +16,7 @@ from evlcp_sdk.values import Fix
 
 Floats = NDArray[np.float64]
 
-SPEC = PositionSpec(acceleration_m2_s3=0.7, rate_white_deg_rts=2.0, push_white_m2_s3=0.3)
+SPEC = ErrorModel(acceleration_m2_s3=0.7, rate_white_deg_rts=2.0, push_white_m2_s3=0.3)
 VELOCITY = np.array([8.0, 5.0, -1.0])
 
 
@@ -114,7 +114,7 @@ def test_noise_is_that_of_kicks(push: bool) -> None:
 
 
 def drive(
-    rng: np.random.Generator, spec: PositionSpec, *, push: bool, rate_deg_s: float
+    rng: np.random.Generator, spec: ErrorModel, *, push: bool, rate_deg_s: float
 ) -> tuple[list[Fix], AttitudeLog, Floats, Floats]:
     """A car that turns by turns, fixes with a gap of 3 s, an IMU of 50 Hz with biases; truth and biases."""
     steps, dt = 400, 0.02
@@ -162,7 +162,7 @@ def drive(
 def test_a_turning_car_is_followed_through_a_gap(push: bool) -> None:
     """At 45 degrees/s, forward and smoothed: errors as large as their covariances say, biases found."""
     rng = np.random.default_rng(5)
-    spec = PositionSpec(acceleration_m2_s3=0.01, rate_sigma_deg_s=0.5, rate_white_deg_rts=0.1)
+    spec = ErrorModel(acceleration_m2_s3=0.01, rate_sigma_deg_s=0.5, rate_white_deg_rts=0.1)
     squares: dict[tuple[str, int], list[float]] = {}
     estimates, sigmas = [], []
     trials = 9
@@ -194,7 +194,7 @@ def test_a_turning_car_is_followed_through_a_gap(push: bool) -> None:
 
 def test_without_an_imu_a_gap_is_lost() -> None:
     """What the IMU is for: the same drive goes astray by metres, and says so."""
-    spec = PositionSpec(acceleration_m2_s3=0.01, rate_sigma_deg_s=0.5, rate_white_deg_rts=0.1)
+    spec = ErrorModel(acceleration_m2_s3=0.01, rate_sigma_deg_s=0.5, rate_white_deg_rts=0.1)
     fixes, log, truth, _ = drive(np.random.default_rng(6), spec, push=False, rate_deg_s=45.0)
     wide = dataclasses.replace(spec, gate_sigmas=1e6)
     assert filter_fixes(fixes, spec)[38].misses

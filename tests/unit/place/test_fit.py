@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.fit import fit_pose
 from evlcp_sdk.place.judgement import Judged, _doubted, _solve, _test, judged
 from evlcp_sdk.place.model import FOCAL_UNIT, Fit, linearize, move
@@ -35,7 +35,7 @@ BENT = CameraModel(k1=-0.3, k2=0.1, p1=1e-3, p2=-1e-3, centre_x_px=655.0, centre
 CORRELATED = tuple(tuple(0.4 if i != j else 1.0 for j in range(7)) for i in range(7))
 LENS = CameraSigma(0.1, 3.0, 2.0, 0.05, 0.05, 1e-4, 1e-4, correlation=CORRELATED)
 SURVEY = (0.05, 0.01, 0.01)
-SPEC = PositionSpec(huber_sigmas=3.0)
+SPEC = ErrorModel(huber_sigmas=3.0)
 ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
 
 
@@ -397,7 +397,7 @@ def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -
     enu_m = np.stack([centres_m[:, 0], 0 * centres_m[:, 0], -centres_m[:, 1]], 1)
     seen = ~np.isin(np.arange(len(enu_m)), dark)
     points = np.where(seen[:, None], 300 + 250 * centres_m, np.nan)
-    spec = PositionSpec(shared_along_px=0.05, shared_share=0.002, stretch_share=0.003)
+    spec = ErrorModel(shared_along_px=0.05, shared_share=0.002, stretch_share=0.003)
     view = BarView(0, enu_m, points, np.full(len(enu_m), 0.1), (0.1, 0.2, 0.004))
     shift, *site = shared_sigmas(view, seen, spec, 1.0)
     assert shift == pytest.approx(math.hypot(0.05, 0.002 * 250 * length_m), rel=1e-9)

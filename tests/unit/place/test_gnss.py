@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
 from evlcp_sdk.place.trajectory import GNSS, filter_fixes, smooth_trajectory, trajectory_step
 from evlcp_sdk.scene.attitude import Attitude
@@ -19,7 +19,7 @@ from evlcp_sdk.values import Fix
 
 Floats = NDArray[np.float64]
 
-SPEC = PositionSpec(acceleration_m2_s3=0.5, gnss_s=4.0, gate_sigmas=50.0)
+SPEC = ErrorModel(acceleration_m2_s3=0.5, gnss_s=4.0, gate_sigmas=50.0)
 SIGMA_M = {"bars": np.array([0.03, 0.05, 0.02]), GNSS: np.array([0.8, 0.6, 1.5])}
 
 
@@ -100,7 +100,7 @@ def test_between_bars_errors_are_as_said() -> None:
     widths = []
     for _ in range(trials):
         fixes, truth = drive(rng)
-        points = filter_fixes(fixes, PositionSpec(acceleration_m2_s3=0.5, gnss_s=4.0))
+        points = filter_fixes(fixes, ErrorModel(acceleration_m2_s3=0.5, gnss_s=4.0))
         for name, found in (("forward", points), ("smoothed", smooth_trajectory(points, SPEC))):
             for at in (10, 45, 58, 80):
                 off = found[at].mean[:3] - truth[at]
@@ -126,7 +126,7 @@ def test_the_antenna_is_not_the_camera() -> None:
     axes = LocalAxes(35.0, 137.0, 50.0)
     place = np.stack(axes.to_geodetic(np.array([[200.0, 300.0, 4.0]])), 1)
     log = GnssLog(np.array([5.0]), place, np.diag([0.04, 0.09, 0.25])[None])
-    spec = PositionSpec(antenna_m=(0.5, -1.0, -2.0))
+    spec = ErrorModel(antenna_m=(0.5, -1.0, -2.0))
     # Heading east: right is south, forward is east.
     east = Attitude(0.0, 0.0, 90.0, 0.0, math.degrees(0.1))
     found = gnss_fix(log, 0, axes, east, spec)
@@ -139,7 +139,7 @@ def test_the_antenna_is_not_the_camera() -> None:
     np.testing.assert_allclose(whole, found.covariance_m2)
     assert found.alarms == ("unavailable",)
     assert gnss_fix(log, 0, axes, Attitude(0.0, 0.0), spec) is None
-    assert gnss_fix(log, 0, axes, None, PositionSpec()) is not None
+    assert gnss_fix(log, 0, axes, None, ErrorModel()) is not None
 
 
 def test_headings_for_the_antenna() -> None:

@@ -8,7 +8,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.learnt import Learnt, focal_share, learnt
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.pose import solve_pose
@@ -19,7 +19,7 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.values import Fix
 
-SPEC = PositionSpec(stretch_share=0.0, shared_sigma_px=0.05, shared_along_px=0.05, shared_share=0.0)
+SPEC = ErrorModel(stretch_share=0.0, shared_sigma_px=0.05, shared_along_px=0.05, shared_share=0.0)
 CAMERA, LENS = CameraModel(), CameraSigma(focal_mm=0.005 * CameraModel().focal_mm)
 SITE_M, BIAS_DEG, TIME_US = 0.1, 0.1, 8000.0
 

@@ -9,6 +9,7 @@ from scipy import stats
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.calibration import CalibrationView
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import BarView, project_bars
@@ -89,7 +90,7 @@ def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:
             seen = (BarView(2, np.empty((0, 3)), points, np.full(16, 0.0707)),)
             sigmas = (pose.position_sigma_m, pose.attitude.rotation(), pose.attitude_sigma_deg)
             views.append(CalibrationView(seen, here, *sigmas))
-        (bar,) = survey(views, AXES, 0.96, LINK.camera, None, LINK.position)
+        (bar,) = survey(views, AXES, 0.96, LINK.camera, None, ErrorModel())
         place = AXES.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
         squares.append((place - SPOTS[2]) @ np.linalg.solve(bar.covariance_m2, place - SPOTS[2]))
         assert np.linalg.norm(place - SPOTS[2]) < 0.4

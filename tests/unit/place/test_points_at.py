@@ -8,11 +8,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.points import SeenPoints, points_at, unseen_px
 from evlcp_sdk.values import Frame, Range, SoftSymbols
 
-SPEC = PositionSpec(pixel_sigma_px=0.08)
+SPEC = ErrorModel(pixel_sigma_px=0.08)
 EXACT = replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
 SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 T_US = (np.arange(9) - 4.3) * 3600.0

@@ -12,7 +12,7 @@ from scipy import stats
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.failed import failed_bar
 from evlcp_sdk.place.judgement import Pose
 from evlcp_sdk.place.observations import BarView, Problem, project_bars
@@ -24,7 +24,7 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 CAMERA = CameraModel()
 BENT = CameraModel(k1=-0.3, k2=0.1, p1=1e-3, p2=-1e-3, centre_x_px=655.0, centre_y_px=350.0)
-POINT_ONLY = PositionSpec(
+POINT_ONLY = ErrorModel(
     shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0
 )
 LEVEL = Attitude(gravity_sigma_deg=0)
@@ -180,7 +180,7 @@ def test_errors_at_50_m_and_their_sigmas(
 
 
 def own_shift(
-    points_px: NDArray[np.float64], spec: PositionSpec, rng: np.random.Generator
+    points_px: NDArray[np.float64], spec: ErrorModel, rng: np.random.Generator
 ) -> NDArray[np.float64]:
     """By what a bar's points are off alike, drawn across the bar and along it."""
     whole = points_px[-1] - points_px[0]
@@ -265,7 +265,7 @@ def drawn(
 ) -> tuple[list[BarView], Attitude | None, CameraSigma]:  # fmt: skip
     """A camera at the origin that looks up, with every error drawn from its stated sigma."""
     true = dataclasses.replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + focal * rng.normal()))
-    spec, seen = PositionSpec(), []
+    spec, seen = ErrorModel(), []
     for view in views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng, 0.1, true, across):
         arm = view.enu_m - view.enu_m.mean(0)
         said = view.enu_m + rng.normal(0, survey[0], 3) + np.cross(rng.normal(0, survey[1], 3), arm)
@@ -365,7 +365,7 @@ def test_a_bar_that_is_left_out_stands_where_its_image_says() -> None:
 @pytest.mark.parametrize("across", [0.3, 1.0, 2.0])
 def test_where_a_left_out_bar_stands_is_the_weighted_fit_of_its_points(across: float) -> None:
     """Generalized least squares with the points' whole covariance, along the bar and across."""
-    rng, spec = np.random.default_rng(34), PositionSpec()
+    rng, spec = np.random.default_rng(34), ErrorModel()
     known = Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
     seen, told, sigma = drawn(rng, THREE, known, (0.0, 0.0, 0.0), 0.0, across)
     moved = dataclasses.replace(seen[1], enu_m=seen[1].enu_m - np.array([0.3, -0.4, 0.2]))
@@ -494,7 +494,7 @@ def test_a_lone_bar_has_no_protection() -> None:
 
 
 def test_a_lone_bar_is_protected_from_being_off_by_so_much() -> None:
-    rng, spec = np.random.default_rng(18), PositionSpec(bar_fault_m=0.5)
+    rng, spec = np.random.default_rng(18), ErrorModel(bar_fault_m=0.5)
     level = Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
     for _ in range(60):
         (seen,), told, _ = drawn(rng, POLES[:1], level, (0.0, 0.0, 0.0), 0.0)
@@ -506,7 +506,7 @@ def test_a_lone_bar_is_protected_from_being_off_by_so_much() -> None:
 
 def test_two_bars_that_may_be_mixed_up_are_protected_as_far_as_behind_them() -> None:
     """On gravity alone, two that stand alike fit from behind, too, each at the other's site: 100 m away."""
-    rng, spec = np.random.default_rng(19), PositionSpec(bar_fault_m=0.5)
+    rng, spec = np.random.default_rng(19), ErrorModel(bar_fault_m=0.5)
     for other, alike in ((POLES[1], True), ((4.0, 46.0, 5.5), False)):
         seen = views([bar(POLES[0]), bar(other)], np.zeros(3), UP.rotation(), rng, 0.1)
         level = Attitude(5.0, 0.0, None, 0.1)
@@ -525,7 +525,7 @@ def test_two_bars_that_may_be_mixed_up_are_protected_as_far_as_behind_them() -> 
 def test_levels_hold_for_faults_of_the_size_that_is_stated(what: str) -> None:
     """A lone bar, which shows neither: five times as large a fault is covered where it is stated only."""
     rng, level = np.random.default_rng(20), Attitude(5.0, 0.0, 0.0, 0.1, 0.1)
-    usual = PositionSpec(bar_fault_m=0.01, attitude_fault_deg=0.1)
+    usual = ErrorModel(bar_fault_m=0.01, attitude_fault_deg=0.1)
     if what == "attitude":
         stated = dataclasses.replace(usual, attitude_fault_deg=5.0)
         spared = dataclasses.replace(usual, attitude_fault_deg=0.0)
@@ -551,7 +551,7 @@ def test_levels_hold_for_faults_of_the_size_that_is_stated(what: str) -> None:
 
 def test_false_alarms_are_as_rare_as_said() -> None:
     """At a chance that can be counted: one of fifty."""
-    rng, spec = np.random.default_rng(18), PositionSpec(false_alarm=0.02)
+    rng, spec = np.random.default_rng(18), ErrorModel(false_alarm=0.02)
     alarms = 0
     for _ in range(500):
         seen, told, sigma = drawn(rng, THREE, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), SURVEY, 0.002)
@@ -628,7 +628,7 @@ def test_what_is_not_determined_is_refused() -> None:
     # At the camera's own height, two bars leave a circle through them; ranges alone say where on it.
     level = views([bar((-3.0, 50.0, 0.0)), bar((3.0, 50.0, 0.0))], here, Attitude().rotation(), rng, 0.3)
     assert refused(solve_pose(level, CAMERA, LEVEL)) in ("uncertain", "not-determined", "two-solutions")
-    assert refused(solve_pose(seen(POLES[0]), CAMERA, known, PositionSpec(max_sigma_m=0.01))) == "uncertain"
+    assert refused(solve_pose(seen(POLES[0]), CAMERA, known, ErrorModel(max_sigma_m=0.01))) == "uncertain"
     # A bar that points at the camera.
     sight = np.array(POLES[0]) / np.linalg.norm(POLES[0])
     end_on = bar(POLES[0], tuple(sight + np.array([0.1, 0, 0])))

@@ -13,7 +13,7 @@ from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.kinds import BeaconKind
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.positioner import BarKind, Positioner, _alternatives
 from evlcp_sdk.place.refusals import Candidate, Refusal
@@ -71,7 +71,7 @@ def merged(*streams: list[Packet]) -> list[Packet]:
 
 def positioner(sites: list[BarSite], attitude: Attitude | None = EXACT, **spec: object) -> Positioner:
     return Positioner(
-        CAMERA, {"": BarKind(BarLayout(), PACKET_US)}, sites, lambda _t: attitude, PositionSpec(**spec)
+        CAMERA, {"": BarKind(BarLayout(), PACKET_US)}, sites, lambda _t: attitude, ErrorModel(**spec)
     )  # type: ignore[arg-type]
 
 
@@ -85,14 +85,14 @@ def test_a_ring_gives_a_fix_where_its_site_says_how_it_faces() -> None:
     assert enu[4] - enu[12] == pytest.approx([0.9, 0, 0], abs=1e-6)
     assert enu[0] - enu[8] == pytest.approx([0, 0, 0.9], abs=1e-6)
     packets = packets_of(ring, 0, 8, enu=enu)
-    whole = Positioner(CAMERA, {"": BarKind(RING, PACKET_US)}, [ring], lambda _t: EXACT, PositionSpec())
+    whole = Positioner(CAMERA, {"": BarKind(RING, PACKET_US)}, [ring], lambda _t: EXACT, ErrorModel())
     assert_right(whole.feed(packets) + whole.close(), 5e-3)
     unknown = Positioner(
         CAMERA,
         {"": BarKind(RING, PACKET_US)},
         [dataclasses.replace(ring, facing_deg=None)],
         lambda _t: EXACT,
-        PositionSpec(),
+        ErrorModel(),
     )
     fixes = unknown.feed(packets) + unknown.close()
     assert {f.refusal for f in fixes} == {"no-facing"}

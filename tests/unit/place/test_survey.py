@@ -10,8 +10,8 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.sections import PositionSpec
 from evlcp_sdk.place.calibration import CalibrationView
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.survey import survey
 from evlcp_sdk.scene.attitude import Attitude
@@ -20,7 +20,7 @@ from evlcp_sdk.scene.sites import BarSite, LocalAxes
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
 CAMERA = CameraModel(focal_mm=16.0)
-SPEC = PositionSpec(
+SPEC = ErrorModel(
     shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0, bend_sigma_px=0
 )
 ROTATION = Attitude(3.0, 1.0, 2.0).rotation()
@@ -96,7 +96,7 @@ def test_a_bar_that_looks_bent_leans_within_its_sigma() -> None:
     rng = np.random.default_rng(12)
     bars = [site(7, [0.1, 45.0, 0.2], 6.0, 10.0)]
     bent = dataclasses.replace(SPEC, bend_sigma_px=0.2)
-    sigmas: dict[PositionSpec, list[float]] = {bent: [], SPEC: []}
+    sigmas: dict[ErrorModel, list[float]] = {bent: [], SPEC: []}
     for _ in range(12):
         seen = views(rng, 0.002, 0.002, bend_px=0.2, bars=bars)
         for spec, misses in sigmas.items():

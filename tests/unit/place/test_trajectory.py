@@ -7,11 +7,11 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory, trajectory_step
 from evlcp_sdk.values import Fix
 
-SPEC = PositionSpec(acceleration_m2_s3=2.0)
+SPEC = ErrorModel(acceleration_m2_s3=2.0)
 SIGMA_M = np.array([0.3, 0.1, 0.05])
 
 
@@ -280,10 +280,10 @@ def test_a_car_that_turns_stays_on_its_track(rate_deg_s: float) -> None:
                     heading_deg=np.degrees(heading) + rng.normal(0, 0.02),
                 )
             )  # fmt: skip
-        points = filter_fixes(fixes, PositionSpec(acceleration_m2_s3=0.01))
+        points = filter_fixes(fixes, ErrorModel(acceleration_m2_s3=0.01))
         assert not any(p.misses for p in points)
         at = 20 + trial % 30
-        for found in (points, smooth_trajectory(points, PositionSpec(acceleration_m2_s3=0.01))):
+        for found in (points, smooth_trajectory(points, ErrorModel(acceleration_m2_s3=0.01))):
             error = found[at].mean[:3] - truth[at]
             squares.append(error @ np.linalg.solve(found[at].covariance_m2, error))
     assert np.mean(squares) < stats.chi2.isf(1e-4, 120) / 40

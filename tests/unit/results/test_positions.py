@@ -22,6 +22,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import STAGE_PREFIX
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place import navigator
+from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.geoid import geoid_m
 from evlcp_sdk.place.gnss import GnssLog
 from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
@@ -176,7 +177,7 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
     assert fix.alarms == ("excluded", "unavailable")
     assert wrong.alarms == ("misfit",)
     assert Fix.refused(3e6, (0,), "heading-unknown", "").alarms == ()
-    point = trajectory_step(None, fix, LINK.position)
+    point = trajectory_step(None, fix, ErrorModel())
     place = Place(2e6, 35.0, 137.0, 5.0, point.mean[:3], point.covariance_m2, 0.0, 0.0, False, True)
     with ResultFolder(tmp_path, ["fixes.csv", "fixes.nmea", "fixes.geojson"]) as folder:
         run = Run("", LINK, PositionPlan((SITE,)), Navigator(LINK, PositionPlan((SITE,))), None)
@@ -343,9 +344,7 @@ def test_points_of_frames(tmp_path: Path) -> None:
     point = np.array([float(row[f"{axis}_m"]) for axis in "xyz"])
     np.testing.assert_allclose(LINK.camera.project(point), [700, 300], atol=0.02)
     assert point[2] == 50
-    assert float(row["cov_zz_m2"]) == pytest.approx(
-        0.2**2 + (50 * LINK.position.stretch_share) ** 2, rel=1e-4
-    )
+    assert float(row["cov_zz_m2"]) == pytest.approx(0.2**2 + (50 * ErrorModel.stretch_share) ** 2, rel=1e-4)
     assert float(row["cov_xz_m2"]) > 0 > float(row["cov_yz_m2"])
 
 
