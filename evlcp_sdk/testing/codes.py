@@ -7,7 +7,7 @@ from evlcp_sdk.air.codebook import are_pairs, edges_of_chips
 from evlcp_sdk.air.frames import bits_of_symbols, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.testing.exercises import link_of
-from evlcp_sdk.testing.law import Law, Subject, expect
+from evlcp_sdk.testing.law import Subject, expect, law
 from evlcp_sdk.testing.views import ideal_frame, ideal_presence, ideal_sums
 
 __all__ = ["MODULATION", "PILOTS"]
@@ -47,15 +47,15 @@ def _edges(code: NDArray[np.uint8]) -> NDArray[np.int64]:
     return edges_of_chips(code)[..., :: 2 if are_pairs(code) else 1].astype(np.int64)
 
 
-def pilots_shapes(subject: Subject) -> None:
-    """Hold the law."""
+@law("shapes", "uint8 chips, one code per cluster")
+def _pilots_shapes(subject: Subject) -> None:
     _chips(subject.algorithm.preamble(), 1, "preamble()")
     for codes in _families(subject):
         _chips(codes, 2, f"codes({len(codes)})")
 
 
-def pilots_apart(subject: Subject) -> None:
-    """Hold the law."""
+@law("pilots-apart", "of the edges of any two pilots, no more agree than of 8 values that differ in 3")
+def _pilots_apart(subject: Subject) -> None:
     for codes in _families(subject):
         edges = _edges(codes)
         many = np.maximum(np.sqrt((edges**2).sum(1)), 1e-9)
@@ -70,8 +70,8 @@ def pilots_apart(subject: Subject) -> None:
         )
 
 
-def sharp_preamble(subject: Subject) -> None:
-    """Hold the law."""
+@law("sharp-preamble", "the preamble's sidelobes are a quarter of its peak at the most")
+def _sharp_preamble(subject: Subject) -> None:
     preamble = subject.algorithm.preamble()
     code = _edges(preamble)
     most, near = (_MOST_SIDELOBE, 1) if are_pairs(preamble) else (_MOST_EDGES_ALIKE, _NEAR_CHIPS)
@@ -79,22 +79,22 @@ def sharp_preamble(subject: Subject) -> None:
     expect(side <= most, f"sidelobes of the preamble of {most} at most, got {side:.2f}")
 
 
-def codewords_shapes(subject: Subject) -> None:
-    """Hold the law."""
+@law("shapes", "uint8 chips, one codeword per symbol")
+def _codewords_shapes(subject: Subject) -> None:
     words = subject.algorithm.codewords()
     _chips(words, 2, "codewords()")
     expect(len(words) >= 2, f"two codewords or more, got {len(words)}")
 
 
-def codewords_distinct(subject: Subject) -> None:
-    """Hold the law."""
+@law("codewords-distinct", "the codewords of any two symbols differ in an edge")
+def _codewords_distinct(subject: Subject) -> None:
     words = subject.algorithm.codewords()
     distinct = len(np.unique(edges_of_chips(words), axis=0))
     expect(distinct == len(words), f"{len(words)} codewords of different edges, got {distinct}")
 
 
-def codewords_come_back(subject: Subject) -> None:
-    """Hold the law."""
+@law("comes-back", "every symbol comes back from an ideal image of its codeword")
+def _codewords_come_back(subject: Subject) -> None:
     link = link_of(subject)
     book = link.codebook
     decode = link.algorithm("decoding").compile(book)
@@ -111,8 +111,8 @@ def codewords_come_back(subject: Subject) -> None:
             expect(False, f"symbol {symbols[k]} from an ideal image of its codeword, got {soft.symbols[k]}")
 
 
-def default_clusters(subject: Subject) -> None:
-    """Hold the law."""
+@law("tells-apart", "the link's separation tells the clusters of an ideal image apart")
+def _default_clusters(subject: Subject) -> None:
     link = link_of(subject)
     book = link.codebook
     presence = link.algorithm("separation").compile(book)(
@@ -132,21 +132,8 @@ def default_clusters(subject: Subject) -> None:
     expect(placed >= 0.9, f"nine tenths of the found cells in their place, got {placed:.0%}")
 
 
-PILOTS = (
-    Law("shapes", "uint8 chips, one code per cluster", pilots_shapes),
-    Law(
-        "pilots-apart",
-        "of the edges of any two pilots, no more agree than of 8 values that differ in 3",
-        pilots_apart,
-    ),
-    Law("sharp-preamble", "the preamble's sidelobes are a quarter of its peak at the most", sharp_preamble),
-    Law("tells-apart", "the link's separation tells the clusters of an ideal image apart", default_clusters),
-)
+PILOTS = (_pilots_shapes, _pilots_apart, _sharp_preamble, _default_clusters)
 """Laws of pilots."""
 
-MODULATION = (
-    Law("shapes", "uint8 chips, one codeword per symbol", codewords_shapes),
-    Law("codewords-distinct", "the codewords of any two symbols differ in an edge", codewords_distinct),
-    Law("comes-back", "every symbol comes back from an ideal image of its codeword", codewords_come_back),
-)
+MODULATION = (_codewords_shapes, _codewords_distinct, _codewords_come_back)
 """Laws of modulation."""

@@ -10,7 +10,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Corrected
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.exercises import compiled_subject, expect_column, link_of
-from evlcp_sdk.testing.law import InapplicableLawError, Law, Subject, expect
+from evlcp_sdk.testing.law import InapplicableLawError, Subject, expect, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 
 __all__ = ["ERROR_CORRECTION"]
@@ -60,8 +60,8 @@ def _refuses(call: Any, given: NDArray[Any], what: str) -> None:
     expect(False, f"ConfigError from {what}")
 
 
-def shapes(subject: Subject) -> None:
-    """Hold the law."""
+@law("shapes", "uint8 bits of the lengths stated, at any length that is not refused")
+def _shapes(subject: Subject) -> None:
     for code in _codes(subject):
         expect(0 < code.message_bits <= code.coded_bits, f"1 to {code.coded_bits} message bits")
         coded = code.encode(_message(code))
@@ -79,8 +79,8 @@ def shapes(subject: Subject) -> None:
             _refuses(code.decode, np.zeros(wrong, np.float32), f"decode() of {wrong} LLRs, not {n}")
 
 
-def round_trip(subject: Subject) -> None:
-    """Hold the law."""
+@law("comes-back", "a message comes back from the LLRs of its coded bits, none flipped")
+def _round_trip(subject: Subject) -> None:
     for code in _codes(subject):
         for seed in range(3):
             sent = _message(code, seed)
@@ -92,8 +92,8 @@ def round_trip(subject: Subject) -> None:
             expect(found.flipped == 0, f"no bit flipped {what}, got {found.flipped}")
 
 
-def every_bit(subject: Subject) -> None:
-    """Hold the law."""
+@law("every-bit", "each message bit changes the coded bits")
+def _every_bit(subject: Subject) -> None:
     for code in _codes(subject):
         sent = _message(code)
         coded = code.encode(sent)
@@ -104,16 +104,16 @@ def every_bit(subject: Subject) -> None:
             expect(changed, f"message bit {i} of {code.message_bits} to change the coded bits")
 
 
-def knows_nothing(subject: Subject) -> None:
-    """Hold the law."""
+@law("knows-nothing", "nothing received gives no message")
+def _knows_nothing(subject: Subject) -> None:
     for code in _codes(subject):
         found = code.decode(np.zeros(code.coded_bits, np.float32))
         expect(not found.ok, f"not ok where none of {code.coded_bits} bits was received")
         expect(found.flipped == 0, f"no bit flipped of none received, got {found.flipped}")
 
 
-def no_message_in_noise(subject: Subject) -> None:
-    """Hold the law."""
+@law("no-message-in-noise", "LLRs of random signs give no message")
+def _no_message_in_noise(subject: Subject) -> None:
     rng = np.random.default_rng(0)
     for code in _codes(subject):
         for spread in (0.0, 1.0):
@@ -124,8 +124,8 @@ def no_message_in_noise(subject: Subject) -> None:
             expect(not ok, f"no message in random LLRs of {code.coded_bits} bits, got {ok} of {_BLOCKS}")
 
 
-def errors_found(subject: Subject) -> None:
-    """Hold the law."""
+@law("errors-found", "what passes the check is what was sent, however many bits are wrong")
+def _errors_found(subject: Subject) -> None:
     rng = np.random.default_rng(0)
     for code in _codes(subject):
         for seed in range(_BLOCKS):
@@ -137,8 +137,8 @@ def errors_found(subject: Subject) -> None:
             expect(not passed, f"not ok with a message of {code.message_bits} bits that was not sent")
 
 
-def corrects(subject: Subject) -> None:
-    """Hold the law."""
+@law("corrects", "one bit in 100 wrong, or one in 50 not received, is put right and counted")
+def _corrects(subject: Subject) -> None:
     code = compiled_subject(subject)
     if code.message_bits > _MOST_RATE * code.coded_bits:
         raise InapplicableLawError(
@@ -163,8 +163,8 @@ def corrects(subject: Subject) -> None:
         expect(found.flipped == 0, f"no bit flipped {what}, got {found.flipped}")
 
 
-def clean_link(subject: Subject) -> None:
-    """Hold the law."""
+@law("clean-link", "messages pass through a clean recording, sent by packets of the link")
+def _clean_link(subject: Subject) -> None:
     link = link_of(subject)
     expect_column(link)
     code = compiled_subject(subject)
@@ -184,17 +184,13 @@ def clean_link(subject: Subject) -> None:
 
 
 ERROR_CORRECTION = (
-    Law("shapes", "uint8 bits of the lengths stated, at any length that is not refused", shapes),
-    Law("comes-back", "a message comes back from the LLRs of its coded bits, none flipped", round_trip),
-    Law("every-bit", "each message bit changes the coded bits", every_bit),
-    Law("knows-nothing", "nothing received gives no message", knows_nothing),
-    Law("no-message-in-noise", "LLRs of random signs give no message", no_message_in_noise),
-    Law("errors-found", "what passes the check is what was sent, however many bits are wrong", errors_found),
-    Law("corrects", "one bit in 100 wrong, or one in 50 not received, is put right and counted", corrects),
-    Law(
-        "clean-link",
-        "messages pass through a clean recording, sent by packets of the link",
-        clean_link,
-    ),
+    _shapes,
+    _round_trip,
+    _every_bit,
+    _knows_nothing,
+    _no_message_in_noise,
+    _errors_found,
+    _corrects,
+    _clean_link,
 )
 """Laws of error correction."""

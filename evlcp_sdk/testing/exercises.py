@@ -1,8 +1,8 @@
-"""One plain task a role: what the laws of form give an algorithm to do."""
+"""What the laws hold an algorithm against: its link, what it compiles to, and one plain task a role."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -16,40 +16,29 @@ from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_frame, ideal_sums, ideal_view
-from evlcp_sdk.values import Events, Heard
+from evlcp_sdk.values import Events
 
 __all__ = [
     "ONE_CLUSTER",
     "Exercise",
     "arguments_of",
-    "base_link_of",
     "compiled_subject",
     "exercise_of",
     "expect_column",
+    "feed",
     "filters_of",
-    "heard_of",
     "link_of",
     "link_of_one_cluster",
+    "recording_of",
     "subject_of",
     "symbols_of",
 ]
 
-
 ONE_CLUSTER = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
 """A bar for what sends with one cluster only."""
 
-
-@dataclass(frozen=True)
-class Exercise:
-    """A task.
-
-    Attributes:
-        inputs: Values that hold arrays; empty where a role takes none.
-        prepare: Compiles anew and gives a function from the inputs to the results.
-    """
-
-    inputs: tuple[Any, ...]
-    prepare: Callable[[], Callable[[tuple[Any, ...]], Any]]
+FRAME_US = 3200.0
+"""Time from measurement to measurement of what tracks."""
 
 
 def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
@@ -62,12 +51,9 @@ def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
     """
     if link is not None and link.algorithms[role] == algorithm:
         return Subject(role, algorithm, link, link.table[role]["id"])
-    cls = type(algorithm)
-    target = f"{cls.__module__}:{cls.__qualname__}"
-    for entry in Registry.load().installed(role):
-        if entry.algorithm.target == target:
-            return Subject(role, algorithm, link, entry.algorithm.id)
-    return Subject(role, algorithm, link)
+    target = f"{type(algorithm).__module__}:{type(algorithm).__qualname__}"
+    ids = (e.algorithm.id for e in Registry.load().installed(role) if e.algorithm.target == target)
+    return Subject(role, algorithm, link, next(ids, None))
 
 
 @cache
@@ -81,18 +67,13 @@ def _default_link() -> Link:
     return load_link()
 
 
-def base_link_of(subject: Subject) -> Link:
-    """The link that the subject is tested on, without it."""
-    return _default_link() if subject.link is None else subject.link
-
-
 def link_of(subject: Subject, **air: Any) -> Link:
     """The link with the subject in its role; `air` overrides values of its table `[air]`.
 
     Raises:
         InapplicableLawError: The subject has no code for the link's bar.
     """
-    link = base_link_of(subject)
+    link = _default_link() if subject.link is None else subject.link
     if subject.role == "framing" and subject.link is None:
         try:
             subject.algorithm.codebook(link.bar.clusters)
@@ -144,11 +125,13 @@ def arguments_of(subject: Subject) -> tuple[Any, ...]:
 
 
 def compiled_subject(subject: Subject) -> Any:
-    """What the subject compiles to on its link.
+    """What the subject compiles to on its link; a role that compiles to nothing, itself.
 
     Raises:
         InapplicableLawError: It refuses the link.
     """
+    if subject.role not in _ARGUMENTS:
+        return subject.algorithm
     arguments = arguments_of(subject)
     return compiled(lambda: subject.algorithm.compile(*arguments))
 
@@ -158,13 +141,19 @@ def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np
     return np.random.default_rng(seed).integers(0, 2**codebook.bits_per_symbol, codebook.clusters)
 
 
+def recording_of(link: Link, packets: int, **how: Any) -> tuple[IdealBar, Events]:
+    """A bar that sends random symbols, and its events; `how` is of `ideal_events`."""
+    bar = IdealBar(random_symbols(link, packets))
+    return bar, ideal_events(link, bar, **how)
+
+
 def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
     """The filters of a tracking algorithm: (name, filter, values of a measurement).
 
     Raises:
         InapplicableLawError: It leaves everything as measured.
     """
-    tracker = compiled(subject.algorithm.compile)
+    tracker = compiled_subject(subject)
     pairs = [("position", tracker.position, 2), ("distance", tracker.distance, 1)]
     found = [entry for entry in pairs if entry[1] is not None]
     if not found:
@@ -172,138 +161,115 @@ def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
     return found
 
 
-def exercise_of(subject: Subject) -> Exercise:
-    """The task of the subject's role, on its link."""
-    return _EXERCISES[subject.role](subject)
-
-
-def _detection(subject: Subject) -> Exercise:
-    link = link_of(subject)
-    events = ideal_events(link, IdealBar(random_symbols(link, 1)))
-
-    def detect() -> Callable[[tuple[Any, ...]], Any]:
-        detector = compiled_subject(subject)
-        if detector is None:
-            return lambda _: ()
-        return lambda given: detector.step(detector.init(), 0, given[0])[1]
-
-    return Exercise((events,), detect)
-
-
-def _framing(subject: Subject) -> Exercise:
-    link = link_of(subject)
-    events = ideal_events(link, IdealBar(random_symbols(link, 2)))
-    until_us = int(events.t_us[-1]) + 1
-
-    def frame() -> Callable[[tuple[Any, ...]], Any]:
-        deframer = compiled_subject(subject)
-        if deframer is None:
-            return lambda _: ()
-        return lambda given: heard_of(deframer, given[0], [until_us])
-
-    return Exercise((events,), frame)
-
-
-def heard_of(deframer: Any, events: Events, until_us: Sequence[int]) -> list[Heard]:
-    """Frames of a recording that is cut at times, those at its end, too."""
-    state = deframer.init()
-    heard: list[Heard] = []
-    begin = 0
+def feed(machine: Any, events: Events, until_us: Sequence[int]) -> list[Any]:
+    """What a framing's machine gives of a recording that is cut at times, and at its end."""
+    state, found, begin = machine.init(), [], 0
     for until in until_us:
         end = int(np.searchsorted(events.t_us, until))
-        state, found = deframer.step(state, events[begin:end], until)
-        heard += found
+        state, new = machine.step(state, events[begin:end], until)
+        found += new
         begin = end
-    heard += deframer.close(state)[1]
-    return heard
+    return [*found, *machine.close(state)[1]]
 
 
-def _pilots(subject: Subject) -> Exercise:
-    algorithm = subject.algorithm
-    return Exercise((), lambda: lambda _: (algorithm.preamble(), algorithm.codes(4)))
+def track(follow: Any, values: Any, peek: Callable[[Any, float], Any] | None = None) -> list[Any]:
+    """What a filter gives of measurements: (filtered, sigma); `peek` may change its state before each."""
+    state, out = follow.init(), []
+    for i, value in enumerate(values):
+        if peek is not None:
+            state = peek(state, i * FRAME_US)
+        state, filtered, sigma = follow.step(state, i * FRAME_US, value, 0.1)
+        out.append((filtered, sigma))
+    return out
 
 
-def _modulation(subject: Subject) -> Exercise:
-    return Exercise((), lambda: lambda _: subject.algorithm.codewords())
+@dataclass(frozen=True)
+class Exercise:
+    """A task.
+
+    Attributes:
+        inputs: Values that hold arrays; empty where a role takes none.
+        prepare: Compiles anew and gives a function from the inputs to the results.
+    """
+
+    inputs: tuple[Any, ...]
+    prepare: Callable[[], Callable[..., Any]]
 
 
-def _synchronization(subject: Subject) -> Exercise:
+def exercise_of(subject: Subject) -> Exercise:
+    """The task of the subject's role, on its link."""
+    inputs, run = _EXERCISES[subject.role]
+    return Exercise(inputs(subject), lambda: partial(run, compiled_subject(subject)))
+
+
+def _events(packets: int) -> Callable[[Subject], tuple[Any, ...]]:
+    return lambda subject: (recording_of(link_of(subject), packets)[1],)
+
+
+def _detect(detector: Any, events: Events) -> Any:
+    return () if detector is None else detector.step(detector.init(), 0, events)[1]
+
+
+def _frame(deframer: Any, events: Events) -> Any:
+    return () if deframer is None else feed(deframer, events, [int(events.t_us[-1]) + 1])
+
+
+def _synchronize(synchronizer: Any, t_us: Any, p: Any) -> Any:
+    return synchronizer.step(synchronizer.init(), t_us, p, int(t_us[-1]) + 1)[1]
+
+
+def _pilot_sums(subject: Subject) -> tuple[Any, ...]:
     link = link_of(subject)
-    events = ideal_events(link, IdealBar(random_symbols(link, 2)))
-    until_us = int(events.t_us[-1]) + 1
-
-    def synchronize() -> Callable[[tuple[Any, ...]], Any]:
-        synchronizer = compiled_subject(subject)
-        return lambda given: synchronizer.step(synchronizer.init(), *given, until_us)[1]
-
-    return Exercise((events.t_us, events.p), synchronize)
+    return (ideal_sums(link.codebook, symbols_of(link.codebook), missing=0.1)[: link.packet.pilot_chips],)
 
 
-def _separation(subject: Subject) -> Exercise:
-    link = link_of(subject)
-    sums = ideal_sums(link.codebook, symbols_of(link.codebook), missing=0.1)
-    return Exercise((sums[: link.packet.pilot_chips],), lambda: _spread(compiled_subject(subject)))
-
-
-def _decoding(subject: Subject) -> Exercise:
+def _frame_image(subject: Subject) -> tuple[Any, ...]:
     book = link_of(subject).codebook
     # Clusters of which it is not known what follows, that it is dark, that it is lit.
-    after = np.arange(book.clusters) % 3 - 1
-    inputs = ideal_frame(book, symbols_of(book), after=after, missing=0.1)
-    return Exercise(inputs, lambda: _spread(compiled_subject(subject)))
+    return ideal_frame(book, symbols_of(book), after=np.arange(book.clusters) % 3 - 1, missing=0.1)
 
 
-def _ranging(subject: Subject) -> Exercise:
+def _view(subject: Subject) -> tuple[Any, ...]:
     book = link_of(subject).codebook
-    view = ideal_view(book, symbols_of(book), missing=0.1)
-    return Exercise((view,), lambda: _spread(compiled_subject(subject)))
+    return (ideal_view(book, symbols_of(book), missing=0.1),)
 
 
-def _tracking(subject: Subject) -> Exercise:
+def _measurements(subject: Subject) -> tuple[Any, ...]:
     rng = np.random.default_rng(0)
-    values = tuple(rng.normal(50.0, 0.1, (20, n)) for _, _, n in filters_of(subject))
-
-    def track() -> Callable[[tuple[Any, ...]], Any]:
-        filters = [f for _, f, _ in filters_of(subject)]
-        return lambda given: [_filtered(f, v) for f, v in zip(filters, given, strict=True)]
-
-    return Exercise(values, track)
+    return tuple(rng.normal(50.0, 0.1, (20, n)) for _, _, n in filters_of(subject))
 
 
-def _error_correction(subject: Subject) -> Exercise:
+def _filter(tracker: Any, *values: Any) -> Any:
+    filters = [follow for follow in (tracker.position, tracker.distance) if follow is not None]
+    return [track(follow, v) for follow, v in zip(filters, values, strict=True)]
+
+
+def _bits_and_llr(subject: Subject) -> tuple[Any, ...]:
     code = compiled_subject(subject)
     bits = np.random.default_rng(0).integers(0, 2, code.message_bits).astype(np.uint8)
     llr = (4 * (1 - 2 * code.encode(bits).astype(np.float32))).astype(np.float32)
     llr[::50] = 0
-
-    def correct() -> Callable[[tuple[Any, ...]], Any]:
-        again = compiled_subject(subject)
-        return lambda given: (again.encode(given[0]), again.decode(given[1]))
-
-    return Exercise((bits, llr), correct)
+    return bits, llr
 
 
-_EXERCISES: dict[str, Callable[[Subject], Exercise]] = {
-    "detection": _detection,
-    "framing": _framing,
-    "pilots": _pilots,
-    "modulation": _modulation,
-    "synchronization": _synchronization,
-    "separation": _separation,
-    "decoding": _decoding,
-    "ranging": _ranging,
-    "tracking": _tracking,
-    "error-correction": _error_correction,
+def _nothing(_: Subject) -> tuple[Any, ...]:
+    return ()
+
+
+def _call(function: Any, *inputs: Any) -> Any:
+    return function(*inputs)
+
+
+_EXERCISES: dict[str, tuple[Callable[[Subject], tuple[Any, ...]], Callable[..., Any]]] = {
+    "detection": (_events(1), _detect),
+    "framing": (_events(2), _frame),
+    "pilots": (_nothing, lambda pilots: (pilots.preamble(), pilots.codes(4))),
+    "modulation": (_nothing, lambda modulation: modulation.codewords()),
+    "synchronization": (lambda s: (_events(2)(s)[0].t_us, _events(2)(s)[0].p), _synchronize),
+    "separation": (_pilot_sums, _call),
+    "decoding": (_frame_image, _call),
+    "ranging": (_view, _call),
+    "tracking": (_measurements, _filter),
+    "error-correction": (_bits_and_llr, lambda code, bits, llr: (code.encode(bits), code.decode(llr))),
 }
-
-
-def _spread(function: Callable[..., Any]) -> Callable[[tuple[Any, ...]], Any]:
-    return lambda given: function(*given)
-
-
-def _filtered(follow: Any, values: Any) -> list[Any]:
-    state, out = follow.init(), []
-    for i, value in enumerate(values):
-        state, filtered, sigma = follow.step(state, 3200.0 * i, value, 0.1)
-        out.append((filtered, sigma))
-    return out
+"""Role to its inputs, and what is done with them and what the algorithm compiles to."""

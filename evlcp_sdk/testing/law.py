@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.testing.trees import difference
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
@@ -18,7 +19,9 @@ __all__ = [
     "Verdict",
     "compiled",
     "expect",
+    "expect_same",
     "judge",
+    "law",
 ]
 
 Status = Literal["ok", "failed", "skipped", "excused"]
@@ -48,9 +51,6 @@ class Subject:
     algorithm: Any
     link: "Link | None" = None
     id: str | None = None
-
-    def __str__(self) -> str:
-        return f"{self.role} {type(self.algorithm).__name__}"
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,11 @@ class Law:
             raise LawError(f"expected no exception, got {type(fault).__name__}: {fault}") from fault
 
 
+def law(name: str, says: str) -> Callable[[Callable[[Subject], None]], Law]:
+    """Make a test of a subject a law."""
+    return lambda test: Law(name, says, test)
+
+
 @dataclass(frozen=True)
 class Verdict:
     """How a law was kept.
@@ -102,6 +107,12 @@ def expect(holds: object, what: str) -> None:
     """Raise `LawError` with `what` was expected unless `holds`."""
     if not holds:
         raise LawError(f"expected {what}")
+
+
+def expect_same(got: Any, wanted: Any, what: str, tolerance: float = 0.0, name: str = "result") -> None:
+    """Raise `LawError` with `what` was expected, and the first difference, unless two values are equal."""
+    differs = difference(got, wanted, tolerance, name)
+    expect(differs is None, f"{what}; {differs}")
 
 
 def compiled(make: Callable[[], Any]) -> Any:

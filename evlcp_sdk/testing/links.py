@@ -1,15 +1,12 @@
-"""The law of the link: the whole receiver, with one algorithm exchanged, on a clean recording."""
-
-from collections.abc import Sequence
+"""The laws of the link: the whole receiver, with one algorithm exchanged, on a clean recording."""
 
 import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.exercises import expect_column, link_of
-from evlcp_sdk.testing.law import Law, Subject, compiled, expect
+from evlcp_sdk.testing.law import Subject, compiled, expect, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
-from evlcp_sdk.values import Frame
 
 __all__ = ["LINK"]
 
@@ -18,18 +15,17 @@ _CLUSTER_PX = 8.0
 _NEAR = 0.05
 """Half a pixel of the image's edges in 8 px."""
 
-
 _SPARSE = 4
 """Frames from pilot to pilot, as in the fast profile."""
 
 
-def clean_link(subject: Subject) -> None:
-    """Hold the law."""
+@law("clean-link", "no error in a clean recording with this algorithm in the link")
+def _clean(subject: Subject) -> None:
     _expect_clean(link_of(subject))
 
 
-def sparse_pilots(subject: Subject) -> None:
-    """Hold the law."""
+@law("sparse-pilots", f"no error in a clean recording with the pilot in every {_SPARSE}th frame only")
+def _sparse(subject: Subject) -> None:
     _expect_clean(link_of(subject, pilot_every=_SPARSE))
 
 
@@ -39,37 +35,22 @@ def _expect_clean(link: Link) -> None:
     receiver = compiled(lambda: Receiver(link))
     packets = receiver.feed(ideal_events(link, bar, missing=0.0)) + receiver.close()
     frames = [frame for packet in packets for frame in packet.frames]
-    expect(
-        len(frames) == bar.symbols[..., 0].size,
-        f"all {bar.symbols[..., 0].size} frames of a clean recording, got {len(frames)}",
-    )
     sent = bar.symbols.reshape(-1, link.codebook.clusters)
-    heard = np.array([frame.soft.symbols for frame in frames])
-    wrong = int((heard != sent).sum())
+    expect(len(frames) == len(sent), f"all {len(sent)} frames of a clean recording, got {len(frames)}")
+    wrong = int((np.array([frame.soft.symbols for frame in frames]) != sent).sum())
     expect(wrong == 0, f"no wrong symbol in a clean recording, got {wrong} of {sent.size}")
+    if not link.algorithm("ranging").measures:
+        return
     centres = link.bar.cluster_centres_m()
     true_m = link.camera.distance_m(float(np.hypot(*(centres[1] - centres[0]))), _CLUSTER_PX)
-    ranged = [frame for frame in frames if link.packet.has_pilot(frame.frame)]
-    if link.algorithm("ranging").measures:
-        _expect_near(ranged, true_m)
-
-
-def _expect_near(frames: Sequence[Frame], true_m: float) -> None:
     for frame in frames:
-        ranges = [("distance", frame.range)] + ([("filtered", frame.filtered)] if frame.filtered else [])
-        for name, found in ranges:
-            expect(
-                abs(found.distance_m / true_m - 1) <= _NEAR,
-                f"{name} {true_m:.2f} m within {_NEAR:.0%}, got {found.distance_m:.2f} m",
-            )
+        if not link.packet.has_pilot(frame.frame):
+            continue
+        for name, found in (("distance", frame.range), ("filtered", frame.filtered)):
+            if found is not None:
+                what = f"{name} {true_m:.2f} m within {_NEAR:.0%}, got {found.distance_m:.2f} m"
+                expect(abs(found.distance_m / true_m - 1) <= _NEAR, what)
 
 
-LINK = (
-    Law("clean-link", "no error in a clean recording with this algorithm in the link", clean_link),
-    Law(
-        "sparse-pilots",
-        f"no error in a clean recording with the pilot in every {_SPARSE}th frame only",
-        sparse_pilots,
-    ),
-)
-"""The law of the link, for every role."""
+LINK = (_clean, _sparse)
+"""The laws of the link, for every role."""

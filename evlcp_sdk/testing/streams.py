@@ -1,47 +1,71 @@
-"""Laws of what keeps state: synchronization and tracking."""
+"""Laws of what keeps state: detection, framing, synchronization, tracking."""
 
 import pickle
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.testing.exercises import compiled_subject, filters_of, link_of
-from evlcp_sdk.testing.law import Law, Subject, expect
+from evlcp_sdk.testing.exercises import (
+    FRAME_US,
+    compiled_subject,
+    feed,
+    filters_of,
+    link_of,
+    link_of_one_cluster,
+    recording_of,
+    track,
+)
+from evlcp_sdk.testing.law import Subject, expect, expect_same, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
-from evlcp_sdk.testing.trees import difference
-from evlcp_sdk.values import Events, SyncLock
+from evlcp_sdk.values import Events, Region, SyncLock
 
-__all__ = ["SYNCHRONIZATION", "TRACKING"]
+__all__ = ["DETECTION", "FRAMING", "SYNCHRONIZATION", "TRACKING"]
 
 _PACKETS = 4
 _STEP_US = 1500
+_FLUSH_US = 100_000
 _RATE_CHIPS = 0.02
 """Error of the clock rate over a packet, in chips: a fiftieth moves no edge; 58 ppm of the default packet's
 346 chips. Of few pixels and short packets the events' own scatter leaves up to half of it."""
-_SAME_US = 1e-9
+_SAME = 1e-9
 """Relative: 0.1 ns in the times of these recordings."""
-_FRAME_US = 3200.0
-_FLUSH_US = 100_000
+_NEAR_CHIPS = 0.75
+_MOST_BYTES = 1 << 22
+"""What a state may take, pickled, however long the stream is."""
+_GIVEN = {"framing": "frames", "synchronization": "locks"}
+"""What a role gives."""
 
 
-def _recording(link: Link, ppm: float = 0.0, start_us: float = 5000.0) -> Events:
-    bar = IdealBar(random_symbols(link, _PACKETS), ppm=ppm, start_us=start_us)
-    return ideal_events(link, bar)
+@dataclass(frozen=True)
+class _Synchronizer:
+    """A synchronizer in the shape of what a framing compiles to."""
+
+    inner: Any
+
+    def init(self) -> Any:
+        return self.inner.init()
+
+    def step(self, state: Any, events: Events, until_us: int) -> Any:
+        return self.inner.step(state, events.t_us, events.p, until_us)
+
+    def close(self, state: Any) -> Any:
+        return state, []
+
+    def counts(self, state: Any) -> dict[str, int]:
+        return {}
 
 
-def _locks(synchronizer: Any, events: Events, until_us: Sequence[int]) -> list[SyncLock]:
-    """Locks of a recording that is cut at times."""
-    state = synchronizer.init()
-    locks: list[SyncLock] = []
-    begin = 0
-    for until in until_us:
-        end = int(np.searchsorted(events.t_us, until))
-        state, found = synchronizer.step(state, events.t_us[begin:end], events.p[begin:end], until)
-        locks += found
-        begin = end
-    return locks
+def _machine(subject: Subject) -> tuple[Link, Any]:
+    """The link, and what turns its events into frames or locks; None where the receiver does."""
+    link, made = link_of(subject), compiled_subject(subject)
+    return link, _Synchronizer(made) if subject.role == "synchronization" else made
+
+
+def _recording(subject: Subject, link: Link) -> Events:
+    return recording_of(link, _PACKETS, missing=0.0 if subject.role == "framing" else 0.1)[1]
 
 
 def _steps(events: Events) -> list[int]:
@@ -49,15 +73,158 @@ def _steps(events: Events) -> list[int]:
     return [*range(_STEP_US, last + _STEP_US, _STEP_US), last + _FLUSH_US]
 
 
-def _synchronizer(subject: Subject) -> tuple[Link, Any]:
-    return link_of(subject), compiled_subject(subject)
+def _any_split(subject: Subject) -> None:
+    link, machine = _machine(subject)
+    if machine is None:
+        return
+    given, events = _GIVEN[subject.role], _recording(subject, link)
+    wanted = feed(machine, events, _steps(events))
+    last = int(events.t_us[-1]) + 1
+    rng = np.random.default_rng(0)
+    cuts = {
+        "all at once": [],
+        "at random": np.sort(rng.integers(1, last, 200)).tolist(),
+        "every 137 us": range(137, last, 137),
+    }
+    for how, until_us in cuts.items():
+        got = feed(machine, events, [*until_us, last + _FLUSH_US])
+        expect_same(got, wanted, f"the same {given} from events fed {how} as every 1500 us", _SAME, given)
 
 
-def locks_shapes(subject: Subject) -> None:
-    """Hold the law."""
-    link, synchronizer = _synchronizer(subject)
-    events = _recording(link)
-    for lock in _locks(synchronizer, events, _steps(events)):
+def _state_kept(subject: Subject) -> None:
+    link, machine = _machine(subject)
+    if machine is None:
+        return
+    given, events = _GIVEN[subject.role], _recording(subject, link)
+    half = len(events) // 2
+    middle, end = int(events.t_us[half]), int(events.t_us[-1]) + _FLUSH_US
+    state, _ = machine.step(machine.init(), events[:half], middle)
+
+    def rest() -> list[Any]:
+        then, found = machine.step(state, events[half:], end)
+        counts = machine.counts(then)
+        expect(all(isinstance(n, int) for n in counts.values()), f"counts of whole numbers, got {counts}")
+        return [*found, *machine.close(then)[1]]
+
+    first = rest()
+    what = f"a step not to change the state it is given: the same {given} again"
+    expect_same(rest(), first, what, name=given)
+    state = pickle.loads(pickle.dumps(state))
+    expect_same(rest(), first, f"the same {given} from a pickled state", name=given)
+
+
+@law("clean", "no error in the events of an ideal sensor, every frame in its place")
+def _reads_clean(subject: Subject) -> None:
+    link, deframer = _machine(subject)
+    if deframer is None:
+        return
+    bar, events = recording_of(link, _PACKETS, missing=0.0)
+    found = feed(deframer, events, _steps(events))
+    sent = bar.symbols.reshape(-1, link.codebook.clusters)
+    # The first packet begins with the recording: its first frame may be cut.
+    expect(len(found) >= len(sent) - 1, f"{len(sent)} frames, or all but the first; got {len(found)}")
+    starts = np.array([link.packet.frame_start_chip(frame) for frame in range(link.packet.frames)])
+    for one in found:
+        at = (one.t_us - bar.start_us) / link.packet.chip_us
+        packet, chip = divmod(at + _NEAR_CHIPS, link.packet.packet_chips)
+        chip -= _NEAR_CHIPS
+        frame = int(np.abs(starts - chip).argmin())
+        off = abs(chip - starts[frame])
+        expect(off <= _NEAR_CHIPS, f"frames where they were sent, got one {off:.2f} chips off")
+        expect(frame == one.frame, f"number {frame} of the frame at {one.t_us:.0f} us, got {one.frame}")
+        wanted, got = bar.symbols[int(packet), frame].tolist(), one.soft.symbols.tolist()
+        expect(got == wanted, f"symbols {wanted}, got {got}")
+
+
+@law("bounded", "a state of bounded size, however long the stream is")
+def _bounded(subject: Subject) -> None:
+    link, deframer = _machine(subject)
+    if deframer is None:
+        return
+    rng = np.random.default_rng(0)
+    state, now_us, n = deframer.init(), 0, 500
+    step_us = max(_STEP_US, round(link.packet.packet_chips * link.packet.chip_us / 4))
+    for _ in range(40):
+        t_us = np.sort(rng.integers(now_us, now_us + step_us, n))
+        now_us += step_us
+        noise = Events.of(t_us, np.zeros(n), np.zeros(n), rng.integers(0, 2, n))
+        state, _ = deframer.step(state, noise, now_us)
+    size = len(pickle.dumps(state))
+    what = f"a state of at most {_MOST_BYTES} bytes after ten packets of noise, got {size}"
+    expect(size <= _MOST_BYTES, what)
+
+
+FRAMING = (
+    _reads_clean,
+    law("any-split", "any split of the events gives the same frames")(_any_split),
+    law("state-kept", "a step leaves the state it is given, which can be pickled")(_state_kept),
+    _bounded,
+)
+"""Laws of framing."""
+
+
+def _detected(detector: Any, events: Events, keep: Any = None) -> list[list[Region]]:
+    """The regions of each step of a recording."""
+    state = detector.init()
+    found = []
+    for start_us in range(0, int(events.t_us[-1]), _STEP_US):
+        a, b = np.searchsorted(events.t_us, (start_us, start_us + _STEP_US))
+        if keep is not None:
+            state = keep(state, start_us)
+        state, regions = detector.step(state, start_us, events[a:b])
+        found.append(regions)
+    return found
+
+
+def _seen(subject: Subject) -> tuple[Any, Events]:
+    """A detector, and a recording in which it finds something, if any: of a bar, or else of one light."""
+    detector = compiled_subject(subject)
+    events = recording_of(link_of(subject), 2, missing=0.0)[1]
+    if detector is not None and subject.link is None and not any(_detected(detector, events)):
+        # One that looks for single lights sees none in a bar.
+        return _seen(replace(subject, link=link_of_one_cluster()))
+    return detector, events
+
+
+@law("shapes", "regions of finite places and sizes, each of another id; one where a bar is, or a light")
+def _regions_shapes(subject: Subject) -> None:
+    detector, events = _seen(subject)
+    if detector is None:
+        return
+    found = _detected(detector, events)
+    for regions in found:
+        ids = [region.id for region in regions]
+        expect(len(set(ids)) == len(ids), f"regions of different ids, got {ids}")
+        for region in regions:
+            values = region.x_px, region.y_px, region.width_px, region.height_px
+            expect(np.isfinite(values).all(), f"finite places and sizes, got {region}")
+    expect(any(found), "a region in a recording of a bar, or of one light; got none")
+
+
+@law("state-kept", "a step leaves the state it is given, which can be pickled")
+def _detection_state_kept(subject: Subject) -> None:
+    detector, events = _seen(subject)
+    if detector is None:
+        return
+
+    def branch(state: Any, start_us: int) -> Any:
+        # A branch that is given up, and a state that was away.
+        detector.step(state, start_us, events[:50])
+        return pickle.loads(pickle.dumps(state))
+
+    got, wanted = _detected(detector, events, branch), _detected(detector, events)
+    expect_same(got, wanted, "branches and pickling not to change what follows", name="regions")
+
+
+DETECTION = (_regions_shapes, _detection_state_kept)
+"""Laws of detection."""
+
+
+@law("shapes", "locks of finite numbers, quality in range")
+def _locks_shapes(subject: Subject) -> None:
+    link, synchronizer = _machine(subject)
+    events = _recording(subject, link)
+    for lock in feed(synchronizer, events, _steps(events)):
         expect(isinstance(lock, SyncLock), f"SyncLock, got {type(lock).__name__}")
         for name in ("packet_t_us", "chip_us", "delay_on_us", "delay_off_us", "quality"):
             value = getattr(lock, name)
@@ -65,21 +232,22 @@ def locks_shapes(subject: Subject) -> None:
         expect(0 <= lock.quality <= 1, f"a quality from 0 to 1, got {lock.quality}")
 
 
-def finds_time(subject: Subject) -> None:
-    """Hold the law."""
-    link, synchronizer = _synchronizer(subject)
+@law("finds-time", "packets and clock rate of an ideal recording, one lock a packet")
+def _finds_time(subject: Subject) -> None:
+    link, synchronizer = _machine(subject)
     for ppm, start_us in ((0.0, 5000.0), (60.0, 3333.0), (-60.0, 7777.0)):
-        events = _recording(link, ppm, start_us)
-        locks = _locks(synchronizer, events, _steps(events))
+        bar = IdealBar(random_symbols(link, _PACKETS), ppm=ppm, start_us=start_us)
+        events = ideal_events(link, bar)
+        locks = feed(synchronizer, events, _steps(events))
         # The first packet's beginning is the recording's: it may be found or not.
         expect(
             _PACKETS - 1 <= len(locks) <= _PACKETS,
             f"one lock a packet of {_PACKETS}, or all but the first; got {len(locks)}",
         )
         chip_us = link.packet.chip_us / (1 + ppm * 1e-6)
+        packet_us = chip_us * link.packet.packet_chips
         for lock in locks:
-            packets = (lock.packet_t_us - start_us) / (chip_us * link.packet.packet_chips)
-            off_us = (packets - round(packets)) * chip_us * link.packet.packet_chips
+            off_us = (lock.packet_t_us - start_us + packet_us / 2) % packet_us - packet_us / 2
             expect(
                 abs(off_us) <= chip_us / 2,
                 f"packets at {start_us} us and whole periods later, to half a chip; got {off_us:+.1f} us",
@@ -89,82 +257,48 @@ def finds_time(subject: Subject) -> None:
         expect(abs(rate) <= most, f"chips of {chip_us:.4f} us within {most:.0f} ppm, got {rate:+.0f} ppm")
 
 
-def any_split(subject: Subject) -> None:
-    """Hold the law."""
-    link, synchronizer = _synchronizer(subject)
-    events = _recording(link)
-    wanted = _locks(synchronizer, events, _steps(events))
-    last = int(events.t_us[-1]) + 1
-    rng = np.random.default_rng(0)
-    cuts = {
-        "all at once": [last + _FLUSH_US],
-        "at random": [*np.sort(rng.integers(1, last, 200)).tolist(), last + _FLUSH_US],
-        "every 137 us": [*range(137, last, 137), last + _FLUSH_US],
-    }
-    for how, until_us in cuts.items():
-        differs = difference(_locks(synchronizer, events, until_us), wanted, _SAME_US, "locks")
-        expect(differs is None, f"the same locks from events fed {how} as every {_STEP_US} us; {differs}")
-
-
-def sync_state_kept(subject: Subject) -> None:
-    """Hold the law."""
-    link, synchronizer = _synchronizer(subject)
-    events = _recording(link)
-    half = len(events) // 2
-    middle, end = int(events.t_us[half]), int(events.t_us[-1]) + _FLUSH_US
-    state, _ = synchronizer.step(synchronizer.init(), events.t_us[:half], events.p[:half], middle)
-
-    def rest() -> Any:
-        return synchronizer.step(state, events.t_us[half:], events.p[half:], end)[1]
-
-    first = rest()
-    differs = difference(rest(), first, name="locks")
-    expect(differs is None, f"a step not to change the state it is given: the same locks again; {differs}")
-    state = pickle.loads(pickle.dumps(state))
-    differs = difference(rest(), first, name="locks")
-    expect(differs is None, f"the same locks from a pickled state; {differs}")
-
-
-def no_lock_in_noise(subject: Subject) -> None:
-    """Hold the law."""
-    _, synchronizer = _synchronizer(subject)
+@law("no-lock-in-noise", "no lock in silence and in noise")
+def _no_lock_in_noise(subject: Subject) -> None:
+    _, synchronizer = _machine(subject)
     for rate_hz in (0.0, 1e5, 2e6):
         rng = np.random.default_rng(int(rate_hz))
         n = int(rate_hz * 0.1)
         t_us = np.sort(rng.integers(0, 100_000, n))
         noise = Events.of(t_us, np.zeros(n), np.zeros(n), rng.integers(0, 2, n))
-        locks = _locks(synchronizer, noise, [*range(_STEP_US, 100_000, _STEP_US), 100_000 + _FLUSH_US])
+        locks = feed(synchronizer, noise, [*range(_STEP_US, 100_000, _STEP_US), 100_000 + _FLUSH_US])
         expect(not locks, f"no lock in noise of {rate_hz:g} events/s, got {len(locks)}")
 
 
-def _track(follow: Any, values: Any, peek: Callable[[Any, float], Any] | None = None) -> list[Any]:
-    state = follow.init()
-    out = []
-    for i, value in enumerate(values):
-        t_us = i * _FRAME_US
-        if peek is not None:
-            state = peek(state, t_us)
-        state, filtered, sigma = follow.step(state, t_us, value, 0.1)
-        out.append((filtered, sigma))
-    return out
+SYNCHRONIZATION = (
+    _locks_shapes,
+    _finds_time,
+    law("any-split", "any split of the events gives the same locks")(_any_split),
+    law("state-kept", "a step leaves the state it is given, which can be pickled")(_state_kept),
+    _no_lock_in_noise,
+)
+"""Laws of synchronization."""
+
+
+def _line(frames: int) -> Any:
+    """A straight line, float64 (frames, 1)."""
+    return (50.0 - 8.0 * np.arange(frames) * FRAME_US * 1e-6)[:, None]
 
 
 def _measured(n: int, frames: int = 200) -> Any:
-    """A straight line with noise of 0.1, float64 (frames, n)."""
-    line = 50.0 - 8.0 * np.arange(frames) * _FRAME_US * 1e-6
-    return line[:, None] + np.random.default_rng(0).normal(0, 0.1, (frames, n))
+    """The line with noise of 0.1, float64 (frames, n)."""
+    return _line(frames) + np.random.default_rng(0).normal(0, 0.1, (frames, n))
 
 
-def filter_shapes(subject: Subject) -> None:
-    """Hold the law."""
+@law("shapes", "float64 values and a positive sigma; no prediction at first")
+def _filter_shapes(subject: Subject) -> None:
     for name, follow, n in filters_of(subject):
         state = follow.init()
         expect(follow.predict(state, 0.0) is None, f"{name}: a prediction of None before any measurement")
         for i, value in enumerate(_measured(n, 5)):
             given = value.copy()
-            state, filtered, sigma = follow.step(state, i * _FRAME_US, given, 0.1)
+            state, filtered, sigma = follow.step(state, i * FRAME_US, given, 0.1)
             expect((given == value).all(), f"{name}: the measurement to stay as it was")
-            ahead = follow.predict(state, (i + 1) * _FRAME_US)
+            ahead = follow.predict(state, (i + 1) * FRAME_US)
             expect(ahead is not None, f"{name}: a prediction after a measurement")
             for values, spread, what in ((filtered, sigma, "step"), (*ahead, "predict")):
                 expect(
@@ -177,59 +311,39 @@ def filter_shapes(subject: Subject) -> None:
                 )
 
 
-def looking_changes_nothing(subject: Subject) -> None:
-    """Hold the law."""
-
-    def branches(follow: Any) -> Callable[[Any, float], Any]:
+@law("any-split", "predictions, branches and pickled states change nothing")
+def _looking_changes_nothing(subject: Subject) -> None:
+    def peeking(follow: Any, n: int) -> Callable[[Any, float], Any]:
         def peek(state: Any, t_us: float) -> Any:
             follow.predict(state, t_us)
             follow.predict(state, t_us + 50_000)
             # A branch that is given up.
-            follow.step(state, t_us + 10, np.full(2 if follow is position else 1, 1e3), 1.0)
+            follow.step(state, t_us + 10, np.full(n, 1e3), 1.0)
             return pickle.loads(pickle.dumps(state))
 
         return peek
 
-    found = filters_of(subject)
-    position = next((f for name, f, _ in found if name == "position"), None)
-    for name, follow, n in found:
+    for name, follow, n in filters_of(subject):
         values = _measured(n, 40)
-        differs = difference(_track(follow, values, branches(follow)), _track(follow, values), name=name)
-        expect(
-            differs is None,
-            f"predictions, branches and pickling not to change what follows; {differs}",
-        )
+        got, wanted = track(follow, values, peeking(follow, n)), track(follow, values)
+        expect_same(got, wanted, "predictions, branches and pickling not to change what follows", name=name)
 
 
-def follows_a_line(subject: Subject) -> None:
-    """Hold the law."""
+@law("straight-line", "less error than measured on a straight line, none at rest")
+def _follows_a_line(subject: Subject) -> None:
     for name, follow, n in filters_of(subject):
         values = _measured(n)
-        line = 50.0 - 8.0 * np.arange(len(values)) * _FRAME_US * 1e-6
         late = slice(len(values) // 2, None)
-        filtered = np.array([f for f, _ in _track(follow, values)])
-        raw, left = (float(np.sqrt(((v[late] - line[late, None]) ** 2).mean())) for v in (values, filtered))
+        filtered = np.array([f for f, _ in track(follow, values)])
+        off = [(v - _line(len(values)))[late] for v in (values, filtered)]
+        raw, left = (float(np.sqrt((v**2).mean())) for v in off)
         expect(
             left <= raw * 1.001,
             f"{name}: no more error than measured on a straight line, {raw:.3f}, got {left:.3f}",
         )
-        still = np.full((100, n), 42.0)
-        end = _track(follow, still)[-1][0]
+        end = track(follow, np.full((100, n), 42.0))[-1][0]
         expect(np.allclose(end, 42.0, atol=1e-6), f"{name}: 42 from measurements of 42, got {end}")
 
 
-SYNCHRONIZATION = (
-    Law("shapes", "locks of finite numbers, quality in range", locks_shapes),
-    Law("finds-time", "packets and clock rate of an ideal recording, one lock a packet", finds_time),
-    Law("any-split", "any split of the events gives the same locks", any_split),
-    Law("state-kept", "a step leaves the state it is given, which can be pickled", sync_state_kept),
-    Law("no-lock-in-noise", "no lock in silence and in noise", no_lock_in_noise),
-)
-"""Laws of synchronization."""
-
-TRACKING = (
-    Law("shapes", "float64 values and a positive sigma; no prediction at first", filter_shapes),
-    Law("any-split", "predictions, branches and pickled states change nothing", looking_changes_nothing),
-    Law("straight-line", "less error than measured on a straight line, none at rest", follows_a_line),
-)
+TRACKING = (_filter_shapes, _looking_changes_nothing, _follows_a_line)
 """Laws of tracking."""

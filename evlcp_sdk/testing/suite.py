@@ -1,6 +1,6 @@
-"""All laws of a role; an algorithm held against them."""
+"""All laws of a role; an algorithm held against them, by a call or as tests of pytest."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 from evlcp_sdk.errors import ConfigError
@@ -10,13 +10,12 @@ from evlcp_sdk.testing.codes import MODULATION, PILOTS
 from evlcp_sdk.testing.corrections import ERROR_CORRECTION
 from evlcp_sdk.testing.exercises import subject_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
-from evlcp_sdk.testing.framings import DETECTION, FRAMING
 from evlcp_sdk.testing.images import DECODING, RANGING, SEPARATION
-from evlcp_sdk.testing.law import Law, Verdict, judge
+from evlcp_sdk.testing.law import InapplicableLawError, Law, LawError, Subject, Verdict, judge
 from evlcp_sdk.testing.links import LINK
-from evlcp_sdk.testing.streams import SYNCHRONIZATION, TRACKING
+from evlcp_sdk.testing.streams import DETECTION, FRAMING, SYNCHRONIZATION, TRACKING
 
-__all__ = ["check", "check_link", "checked_excuses", "laws_of"]
+__all__ = ["check", "check_link", "conformance", "laws_of"]
 
 
 _EVERY = DESCRIPTION + FUNCTION + RESULT
@@ -48,19 +47,13 @@ def laws_of(role: str) -> tuple[Law, ...]:
     return _LAWS[role]
 
 
-def checked_excuses(role: str, excuses: Mapping[str, str]) -> dict[str, str]:
-    """The excuses, if each names a law of the role and gives a reason.
-
-    Raises:
-        ConfigError: It does not.
-    """
+def _check_excuses(role: str, excuses: Mapping[str, str]) -> None:
     names = [law.name for law in laws_of(role)]
     for name, reason in excuses.items():
         if name not in names:
             raise ConfigError(f"no {role} law named '{name}' (known: {', '.join(names)})")
         if not reason.strip():
             raise ConfigError(f"excuse from '{name}': expected a reason")
-    return dict(excuses)
 
 
 def check(
@@ -82,9 +75,10 @@ def check(
     >>> {outcome.status for outcome in check("modulation", load_link().algorithm("modulation"))}
     {'ok'}
     """
-    known = checked_excuses(role, excuses or {})
+    excuses = excuses or {}
+    _check_excuses(role, excuses)
     subject = subject_of(role, algorithm, link)
-    return [judge(law, subject, known) for law in laws_of(role)]
+    return [judge(law, subject, excuses) for law in laws_of(role)]
 
 
 def check_link(link: Link) -> Iterator[tuple[str, Verdict]]:
@@ -102,9 +96,58 @@ def check_link(link: Link) -> Iterator[tuple[str, Verdict]]:
         for law in laws_of(role):
             if law not in LINK:
                 yield role, judge(law, subject, {})
-    if "decoding" not in link.algorithms:
-        # The framing has its own; its laws are those of the whole link.
-        return
-    whole = subject_of("decoding", link.algorithm("decoding"), link)
-    for law in LINK:
-        yield "link", judge(law, whole, {})
+    # A framing without the built-in steps has its own laws; they are those of the whole link.
+    if "decoding" in link.algorithms:
+        whole = subject_of("decoding", link.algorithm("decoding"), link)
+        for law in LINK:
+            yield "link", judge(law, whole, {})
+
+
+def conformance(
+    role: str, *algorithms: Any, excuses: Mapping[str, str] | None = None, link: Link | None = None
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Make a test of pytest one test per law (and algorithm); its argument `check` holds the law.
+
+    Args:
+        role: The role that the algorithms fill.
+        algorithms: The algorithms, with the parameters to be tested.
+        excuses: Law to the reason why it is known to be broken: a strict expected failure.
+        link: What the rest of the link is; None for the default.
+
+    Raises:
+        ConfigError: There is no such role or law, or an excuse has no reason.
+
+    ```python
+    @conformance("ranging", LineRanging(), LineRanging(min_clusters=4))
+    def test_conformance(check):
+        check()
+    ```
+    """
+    import pytest
+
+    excuses = excuses or {}
+    _check_excuses(role, excuses)
+    cases = []
+    for number, algorithm in enumerate(algorithms):
+        suffix = f"-{number}" if len(algorithms) > 1 else ""
+        subject = subject_of(role, algorithm, link)
+        for law in laws_of(role):
+            reason = excuses.get(law.name)
+            marks = [pytest.mark.xfail(reason=reason, raises=LawError, strict=True)] if reason else []
+            hold = _case(law, subject, reason)
+            cases.append(pytest.param(hold, id=f"{type(algorithm).__name__}{suffix}-{law.name}", marks=marks))
+    return pytest.mark.parametrize("check", cases)
+
+
+def _case(law: Law, subject: Subject, reason: str | None) -> Callable[[], None]:
+    def check() -> None:
+        import pytest
+
+        try:
+            law.hold(subject)
+        except InapplicableLawError as why:
+            if reason is not None:
+                pytest.fail(f"excused ({reason}), but the law does not apply: {why}")
+            pytest.skip(str(why))
+
+    return check

@@ -1,18 +1,16 @@
-"""Arrays within tuples, lists and frozen dataclasses: copy, compare, replace."""
+"""Arrays within tuples, lists and frozen dataclasses: change, compare."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["arrays_of", "copied", "difference", "mapped", "read_only", "strided"]
-
-Array = NDArray[Any]
+__all__ = ["difference", "mapped"]
 
 
-def mapped(value: Any, change: Callable[[Array], Array]) -> Any:
+def mapped(value: Any, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Any:
     """The same structure with every array changed."""
     if isinstance(value, np.ndarray):
         return change(value)
@@ -21,37 +19,6 @@ def mapped(value: Any, change: Callable[[Array], Array]) -> Any:
     if is_dataclass(value) and not isinstance(value, type):
         return type(value)(**{f.name: mapped(getattr(value, f.name), change) for f in fields(value)})
     return value
-
-
-def arrays_of(value: Any) -> Iterator[Array]:
-    """Every array in it."""
-    if isinstance(value, np.ndarray):
-        yield value
-    elif isinstance(value, tuple | list):
-        for v in value:
-            yield from arrays_of(v)
-    elif is_dataclass(value) and not isinstance(value, type):
-        for f in fields(value):
-            yield from arrays_of(getattr(value, f.name))
-
-
-def copied(array: Array) -> Array:
-    """A copy, writeable and contiguous."""
-    return array.copy()
-
-
-def read_only(array: Array) -> Array:
-    """A copy that cannot be written."""
-    out = array.copy()
-    out.setflags(write=False)
-    return out
-
-
-def strided(array: Array) -> Array:
-    """A copy whose elements lie two apart in memory."""
-    out = np.zeros((*array.shape[:-1], 2 * array.shape[-1]), array.dtype)[..., ::2]
-    out[...] = array
-    return out
 
 
 def difference(got: Any, wanted: Any, tolerance: float = 0.0, name: str = "result") -> str | None:
@@ -77,12 +44,10 @@ def difference(got: Any, wanted: Any, tolerance: float = 0.0, name: str = "resul
     if isinstance(wanted, tuple | list):
         if len(got) != len(wanted):
             return f"{name}: {len(got)} entries, not {len(wanted)}"
-        parts = ((g, w, f"{name}[{i}]") for i, (g, w) in enumerate(zip(got, wanted, strict=True)))
-    elif is_dataclass(wanted) and not isinstance(wanted, type):
-        if type(got) is not type(wanted):
-            return f"{name}: {type(got).__name__}, not {type(wanted).__name__}"
+        parts = [(g, w, f"{name}[{i}]") for i, (g, w) in enumerate(zip(got, wanted, strict=True))]
+    elif is_dataclass(wanted) and type(got) is type(wanted):
         names = [f.name for f in fields(wanted)]
-        parts = ((getattr(got, n), getattr(wanted, n), f"{name}.{n}") for n in names)
+        parts = [(getattr(got, n), getattr(wanted, n), f"{name}.{n}") for n in names]
     elif isinstance(wanted, float):
         same = bool(np.isclose(got, wanted, tolerance, tolerance, equal_nan=True))
         return None if same else f"{name}: {got}, not {wanted}"
