@@ -58,18 +58,18 @@ pictures: $(VENV)/.installed  ## Draw the pictures of the docs again
 	cp demo-out/presence.png demo-out/distance.png docs/images/
 	$(BIN)/evlcp video examples/recordings/night-50m-30kmh-cut.raw -o docs/images/film.webp \
 	  --for-ms 10 --size 420
-	$(BIN)/python benchmarks/how_pictures.py docs/images
-	$(BIN)/python benchmarks/link_picture.py docs/images/link.svg
-	$(BIN)/python benchmarks/packet_picture.py docs/images/packet.svg
+	$(BIN)/python docs/figures/how.py docs/images
+	$(BIN)/python docs/figures/link.py docs/images/link.svg
+	$(BIN)/python docs/figures/packet.py docs/images/packet.svg
 	$(BIN)/evlcp simulate examples/scenes/gate.toml -o demo-out/gate.raw
 	$(BIN)/evlcp receive demo-out/gate.raw -o demo-out/gate --sites demo-out/gate.site.toml \
 	  --attitude demo-out/gate.attitude.csv --figures --report
 	cp demo-out/gate/track.png docs/images/
-	$(BIN)/python benchmarks/live_picture.py docs/images/live.png demo-out/gate.raw \
+	$(BIN)/python docs/figures/live.py docs/images/live.png demo-out/gate.raw \
 	  --sites demo-out/gate.site.toml --attitude demo-out/gate.attitude.csv
 	chromium --headless --hide-scrollbars --force-prefers-reduced-motion --window-size=1280,1640 \
 	  --screenshot=docs/images/report.png demo-out/gate/report.html
-	$(BIN)/python benchmarks/polar.py curves --figure docs/images/error-correction.png
+	$(BIN)/python docs/figures/error_correction.py curves --figure docs/images/error-correction.png
 
 clean:  ## Remove .venv and everything that was generated
 	rm -rf $(VENV) demo-out loop-out quickstart-out .mypy_cache .pytest_cache .ruff_cache .hypothesis site .sphinx

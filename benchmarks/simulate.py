@@ -4,9 +4,7 @@
 
 Whole scenes, kernels warm, one thread, processor time, the best of the rounds: a bar at 30, 50 and 90 m,
 rendered to sorted events; beside it how much longer one thread takes than two, by the clock, the quickest of
-rounds in turn: a round in which anything else runs has one core for both; and how much two processes of one
-thread each render in the time of one, the median of the rounds: no threads could do more on this machine
-(`machine.py`). Then the same pixels' worth of work
+rounds in turn. Then the same pixels' worth of work
 three ways, in events a second: the closed form; a compiled loop that steps one pixel through the same light
 by 1 us and by 10 ns (what it takes to be as exact); and whole frames in NumPy, all pixels of the sensor, 1 us
 a step. `--memory` renders a drive of so many seconds and prints the peak of the resident memory.
@@ -15,12 +13,10 @@ a step. `--memory` renders a drive of so many seconds and prints the peak of the
 import argparse
 import math
 import resource
-import statistics
 import time
 from collections.abc import Callable
 
 import numpy as np
-from machine import two_to_one
 from numba import njit
 
 from evlcp_sdk.sim import SensorSpec, Simulation, _kernels, load_scene
@@ -37,8 +33,8 @@ def best(work: Callable[[], int], rounds: int) -> float:
     return max(rates)
 
 
-def scene_rate(distance_m: float, seconds: float, rounds: int) -> tuple[float, float, float]:
-    """Events a second of processor time in millions; the time of one thread in times of two's; the limit."""
+def scene_rate(distance_m: float, seconds: float, rounds: int) -> tuple[float, float]:
+    """Events a second of processor time in millions; the time of one thread in times of two's."""
     scene = load_scene(
         "drive-30kmh",
         {"motion.distance_m": distance_m, "duration_s": seconds, "background.light_w_m2": 0.05},
@@ -55,7 +51,7 @@ def scene_rate(distance_m: float, seconds: float, rounds: int) -> tuple[float, f
     # Not the median of ratios: on a machine with other work that is 1, whatever threads could do.
     one, two = zip(*[(took(1), took(2)) for _ in range(rounds)], strict=True)
     ratio = min(one) / min(two)
-    return best(render, rounds), ratio, statistics.median(two_to_one(render, rounds))
+    return best(render, rounds), ratio
 
 
 @njit
@@ -107,10 +103,10 @@ def main() -> None:
     for _ in Simulation(load_scene("drive-30kmh", ["duration_s=0.004"])).stream():
         pass
     for distance_m in (30.0, 50.0, 90.0):
-        rate, ratio, limit = scene_rate(distance_m, args.seconds, args.rounds)
+        rate, ratio = scene_rate(distance_m, args.seconds, args.rounds)
         print(
             f"scene at {distance_m:.0f} m, one core       {rate:8.2f} Mev/s, two threads {ratio:.2f} times"
-            f" as quick, two processes {limit:.2f}",
+            " as quick",
             flush=True,
         )
 

@@ -12,8 +12,8 @@ __all__ = ["ErrorModel"]
 class ErrorModel(PositionSpec):
     """What `[position]` says, and errors that are the camera's and the bar's, which nobody sets.
 
-    Those of points were measured on simulated drives (`benchmarks/points.py`), where they make the mean of
-    (error / sigma)^2 one.
+    Those of points were measured on simulated drives, where they make the mean of (error / sigma)^2 one
+    (`examples/campaigns/position.toml`).
 
     Attributes:
         min_points: Clusters of a bar that must be seen for it to count: a line and its bend need four, two

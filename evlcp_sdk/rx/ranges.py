@@ -61,8 +61,8 @@ _WAVE_WORTH = 4.0
 
 _WAVE_SHARE, _WAVE_REST_PX = 0.6, 0.03
 """Share of the wave that distances have, and by how much that is off (sigma): rows far off a fit hardly pull
-it. `benchmarks/wave.py` finds 0.35 in recordings of an independent generator, and 0.85 in rendered ones where
-the wave is higher; off by 0.01 to 0.05 px."""
+it. 0.35 were found in recordings of an independent generator, and 0.85 in rendered ones where the wave is
+higher; off by 0.01 to 0.05 px."""
 
 _LEAST_WEIGHT = 0.1
 """Of the heaviest boundary: below, one is not seen."""

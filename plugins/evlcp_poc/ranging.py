@@ -35,7 +35,7 @@ _NONE = Range(float("nan"), float("nan"), 0)
 
 _RIM_PX = 0.2
 """How far off the shift of two clusters of a panel is in all frames alike: the halo around it has fewer rows
-and columns of clusters between it and them than in a long bar. `benchmarks/links.py` has such a panel."""
+and columns of clusters between it and them than in a long bar."""
 
 
 @dataclass(frozen=True)

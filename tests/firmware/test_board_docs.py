@@ -54,9 +54,9 @@ def test_code_runs(block: str) -> None:
 
 def test_the_delays_of_streams_are_the_benchmarks() -> None:
     """One row of the table measured again; the others are of the same function."""
-    from benchmarks.board_stream import measure
+    from benchmarks.board import measure_stream
 
-    m = measure(0.016, 4, 0.1, packets=5)
+    m = measure_stream(0.016, 4, 0.1, packets=5)
     (row,) = re.findall(r"^\| 16 ms \| alone \| ([0-9.]+) \| ([0-9.]+) \|", PAGE, re.MULTILINE)
     assert float(row[0]) == pytest.approx(np.median(m.delays_ms), abs=0.2)
     assert float(row[1]) == pytest.approx(m.delays_ms.max(), abs=0.2)

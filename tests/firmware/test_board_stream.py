@@ -326,12 +326,12 @@ def test_masks_may_be_streamed_too() -> None:
 
 
 def test_the_benchmark_says_what_it_should() -> None:
-    from benchmarks.board_stream import measure
+    from benchmarks.board import measure_stream
 
-    alone = measure(0.016, 4, 0.1, packets=6)
+    alone = measure_stream(0.016, 4, 0.1, packets=6)
     # a millisecond of USB, 3.4 of wire, at most four chips until the idle pattern is over
     assert 1.0 + 3.4 <= alone.delays_ms.min() <= alone.delays_ms.max() <= 1.0 + 3.6 + 0.4
-    full = measure(0.016, 2, 0.0, packets=12)
+    full = measure_stream(0.016, 2, 0.0, packets=12)
     assert full.underruns == 0
     assert full.delays_ms.max() <= 3 * 34.6
     assert full.round_trips <= 2.0
@@ -340,7 +340,7 @@ def test_the_benchmark_says_what_it_should() -> None:
 @pytest.mark.parametrize("latency_s", [0.0, 0.016])
 def test_what_changes_is_right_at_its_first_chip(latency_s: float) -> None:
     """A countdown made for `delay_s` ahead, against the ticks at which the board showed it."""
-    from benchmarks.board_stream import starts_of
+    from benchmarks.board import starts_of
     from evlcp_sdk.air.blocks import Kind, Message
     from evlcp_sdk.air.kinds import Countdown, CountdownKind
     from evlcp_sdk.link.compose import packets_of

@@ -14,7 +14,7 @@ PAGE = (ROOT / "docs" / "hardware.md").read_text()
 
 @pytest.fixture(scope="module")
 def bar() -> ModuleType:
-    from benchmarks import hardware
+    from docs.figures import hardware
 
     return hardware
 
@@ -24,7 +24,7 @@ def test_what_is_written_is_fresh(bar: ModuleType) -> None:
     assert sorted(made) == sorted(p.name for p in (ROOT / "docs" / "hardware").iterdir())
     for name, text in made.items():
         assert (ROOT / "docs" / "hardware" / name).read_text() == text, (
-            "python benchmarks/hardware.py --write"
+            "python docs/figures/hardware.py --write"
         )
 
 

@@ -302,7 +302,7 @@ def test_what_users_read_first_uses_the_public_face_only(path: str) -> None:
 
 
 def test_the_drawing_of_the_link_is_what_its_program_draws() -> None:
-    from benchmarks.link_picture import TEXT, drawing
+    from docs.figures.link import TEXT, drawing
 
     assert (ROOT / "docs" / "images" / "link.svg").read_text(encoding="utf-8") == drawing()
     assert drawing().count(f">{TEXT}</text>") == 2

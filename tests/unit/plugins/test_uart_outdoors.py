@@ -1,37 +1,19 @@
-"""Lists of events of one LED outdoors, by the pixels of benchmarks/lists.py."""
-
-import importlib.util
-import sys
-from pathlib import Path
-from types import ModuleType
+"""Lists of events of one LED outdoors, by a simulator of their pixels."""
 
 import numpy as np
 import pytest
 
-FILE = Path(__file__).parents[3] / "benchmarks" / "lists.py"
-
-
-@pytest.fixture(scope="module")
-def lists() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("benchmarks_lists", FILE)
-    assert spec is not None
-    assert spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
-    return module
+from tests.models.outdoor_led import Pixels, measure, seen
 
 
 @pytest.mark.parametrize(
     ("scene", "raw"),
     # What others' receivers got wrong outdoors. With so few characters a plain one's share is known to a
-    # factor of some three; `python benchmarks/lists.py` reads more of them.
+    # factor of some three.
     [("504 near", 0.0), ("504 far", 0.0017), ("3125 near", 0.014), ("3125 far", 0.094)],
 )
-def test_half_of_a_plain_receivers_errors_or_one_in_a_thousand(
-    lists: ModuleType, scene: str, raw: float
-) -> None:
-    rates = [lists.measure(scene, seed, 200) for seed in (1, 2)]
+def test_half_of_a_plain_receivers_errors_or_one_in_a_thousand(scene: str, raw: float) -> None:
+    rates = [measure(scene, seed, 200) for seed in (1, 2)]
     assert np.mean([one.plain for one in rates]) >= max(raw / 4, 1e-3)
     wrong = [one.ours - one.lost * 3.5 / (7 * 200) for one in rates]
     assert np.mean(wrong) <= max(raw / 2, 1e-3)
@@ -40,15 +22,13 @@ def test_half_of_a_plain_receivers_errors_or_one_in_a_thousand(
     assert sum(one.of_nobody for one in rates) == 0
 
 
-def test_pixels_see_edges_late_and_more_of_a_stronger_light(lists: ModuleType) -> None:
+def test_pixels_see_edges_late_and_more_of_a_stronger_light() -> None:
     light = [(1000.0 + 2000 * k, bool(k % 2)) for k in range(200)]
     many = []
     for contrast in (1.0, 8.0):
         # Slow pixels that are hardly blind, so that an edge is seen in steps.
-        pixels = lists.Pixels(
-            (contrast,) * 5, lag_us=150.0, refractory_us=3.0, noise_hz=0.0, missing=(0.0, 0.0)
-        )
-        t_us, p = lists.seen(np.random.default_rng(0), light, 402_000.0, pixels)
+        pixels = Pixels((contrast,) * 5, lag_us=150.0, refractory_us=3.0, noise_hz=0.0, missing=(0.0, 0.0))
+        t_us, p = seen(np.random.default_rng(0), light, 402_000.0, pixels)
         assert (np.diff(t_us) >= 0).all()
         after = (t_us - 1000) % 2000
         # Half of them come within twice the lag, and hardly any when the next edge is near.

@@ -1,6 +1,6 @@
 """The drawing of the link, from text to text: docs/images/link.svg.
 
-    python benchmarks/link_picture.py docs/images/link.svg
+    python docs/figures/link.py docs/images/link.svg
 
 Symbols and chips in it are those of the message. Its colours follow the reader's scheme.
 """

@@ -1,6 +1,6 @@
 """The drawing of a packet in time: docs/images/packet.svg.
 
-    python benchmarks/packet_picture.py docs/images/packet.svg
+    python docs/figures/packet.py docs/images/packet.svg
 
 The beginning of a packet of the default link, chip by chip, as the clusters send it and as one pixel sees it;
 below, the same 16 chips of other codes. Its colours follow the reader's scheme.

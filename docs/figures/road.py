@@ -1,7 +1,7 @@
 """What a road adds, and where it breaks the receiver: the figures and the tables of docs/road.md.
 
-    python benchmarks/road_figures.py                 draws road-scenes.png: what each condition looks like
-    python benchmarks/road_figures.py road.sqlite     draws road.png and prints the tables, from what
+    python docs/figures/road.py                 draws road-scenes.png: what each condition looks like
+    python docs/figures/road.py road.sqlite     draws road.png and prints the tables, from what
                                                       evlcp sweep examples/campaigns/road.toml -o road.sqlite
                                                       has found
 
@@ -29,7 +29,7 @@ from evlcp_sdk.study.campaign.task import plan_of
 from evlcp_sdk.study.tally import Statistics, Tally
 from evlcp_sdk.values import Events
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 CAMPAIGN = ROOT / "examples" / "campaigns" / "road.toml"
 ON, OFF, INK, PAPER = "#d55e00", "#0072b2", "#222222", "#ffffff"
 COLOURS = {"holds": "#b6d7f0", "suffers": "#f7dc9c", "lost": "#d98a84"}

@@ -1,6 +1,7 @@
 """Error correction: frame errors, messages taken from noise, time; the figures of docs/error-correction.md.
 
-    python benchmarks/polar.py [SECTION ...] [--blocks 10000] [--noise 100000] [--figure FILE.png]
+    python docs/figures/error_correction.py [SECTION ...] [--blocks 10000] [--noise 100000]
+        [--figure FILE.png]
 
 Prints Markdown. Channels: binary-input AWGN with true LLRs, and a binary symmetric channel, both named by
 the error rate of hard decisions. Intervals are of 95 % (Clopper and Pearson). Random numbers are fixed; only

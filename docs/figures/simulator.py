@@ -1,6 +1,6 @@
 """The figures and the tables of docs/simulator.md: the simulator against measurement and closed forms.
 
-    python benchmarks/simulator_figures.py [-o docs/images]
+    python docs/figures/simulator.py [-o docs/images]
 
 Writes simulator-pixel.png and simulator-scene.png, prints the tables. The comparison with the independent
 recording needs ../shared/recordings and is left out without it.
@@ -40,7 +40,7 @@ from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Events
 
-sys.path.insert(0, str(Path(__file__).parents[1]))
+sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from tests.models.pixels import (
     MEASURED_AREA,
@@ -52,7 +52,7 @@ from tests.models.pixels import (
     step_response,
 )
 
-SHARED = Path(__file__).parents[2] / "shared" / "recordings"
+SHARED = Path(__file__).parents[3] / "shared" / "recordings"
 SENSOR = SensorSpec()
 IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
 ON, OFF, INK = "#d55e00", "#0072b2", "#333333"
@@ -259,7 +259,7 @@ def draw_scene(figure: Figure) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("-o", "--out", type=Path, default=Path(__file__).parents[1] / "docs" / "images")
+    parser.add_argument("-o", "--out", type=Path, default=Path(__file__).parents[1] / "images")
     args = parser.parse_args()
     figure = Figure(figsize=(11, 6.2), layout="constrained")
     axes = figure.subplots(2, 3).ravel()

@@ -1,6 +1,6 @@
 """The pictures of docs/how: real output of the receiver on the recording that comes with the package.
 
-    python benchmarks/how_pictures.py docs/images
+    python docs/figures/how.py docs/images
 
 The last one simulates a still camera at several distances and takes a minute.
 """
@@ -21,7 +21,7 @@ from evlcp_sdk.air.codebook import edges_of_chips
 from evlcp_sdk.results.figures import cluster_colours, plain, titled
 from evlcp_sdk.study.bound import frame_bound
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 RECORDING = ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
 ON, OFF, INK = "#d99a00", "#2f7fd6", "#333333"
 SHOWN = 3

@@ -1,6 +1,6 @@
 """The picture of the live view: docs/images/live.png.
 
-    python benchmarks/live_picture.py docs/images/live.png REC.raw --sites site.toml --attitude FILE.csv
+    python docs/figures/live.py docs/images/live.png REC.raw --sites site.toml --attitude FILE.csv
 
 The recording is replayed 50 times slower before headless Chromium, which is driven as by the tests.
 """
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--attitude", type=Path, required=True)
     parser.add_argument("--at-s", type=float, default=0.3, help="of the recording's time")
     given = parser.parse_args()
-    sys.path.insert(0, str(Path(__file__).parents[1]))
+    sys.path.insert(0, str(Path(__file__).parents[2]))
     from tests.unit.study.campaign.browser import Browser
 
     links, outlet, sites = load_links(None), Outlet(), load_sites(given.sites)

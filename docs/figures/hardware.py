@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.sax.saxutils import escape
 
-FOLDER = Path(__file__).parents[1] / "docs" / "hardware"
+FOLDER = Path(__file__).parents[1] / "hardware"
 
 DRIVERS, OUTPUTS = 6, 16
 LEDS = DRIVERS * OUTPUTS

@@ -1,30 +1,17 @@
-"""Lists of events of one LED outdoors: wrong bits of `uart` beside a plain and a told receiver.
-
-    python benchmarks/lists.py [--seeds 1 2] [--characters 400] [--only NAME ...]
-        [--lamp sine100|sine120|square100 ...] [--strength 0.1 1 ...]
+"""Events of one LED outdoors, by a model of its pixels, and a plain receiver to compare with.
 
 Pixels as in the sensor's model (logarithmic receptor with a lag, thresholds, refractory time, missing events,
 latencies with jitter, noise) look at one LED that sends 7 data bits, highest first, even parity and two stop
 bits; their events are merged by time. The plain receiver sums events with a leak, takes two thresholds (the
-best of four pairs) and samples the middles of bits between falling edges. The told one is given when each
-character starts, and learns from the other half of the characters what events come after which bits; what it
-gets wrong is in the events.
-
-`--lamp` lets a lamp shine on the same pixels, so many times as bright at its brightest as the background: the
-square of a sine, 100 or 120 times a second, or a square wave. The told receiver is then told its phase,
-too, and learns each eighth of its period apart.
+best of four pairs) and samples the middles of bits between falling edges.
 """
 
-import argparse
 import math
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from evlcp_uart.characters import Characters
 from evlcp_uart.framing import Uart, read_characters
-from evlcp_uart.light import CONTEXTS, GAINS, OUTLIER, TICKS, Light
 from numpy.typing import NDArray
 
 TEXT = (
@@ -62,8 +49,6 @@ class Pixels:
 THRESHOLD, THRESHOLD_SPREAD, CHARGE = 0.223, 0.1, 14.6
 DELAYS_US, JITTER = (33.0, 22.0), 0.25
 CLOCK = 1.003
-LAMP_STEP_US, PHASES = 100.0, 8
-LAMPS = {"sine100": 10_000.0, "sine120": 1e6 / 120, "square100": 10_000.0}
 QUIET_BITS = 40
 
 
@@ -99,40 +84,27 @@ def edges(bits: NDArray[np.int64], bit_us: float, start_us: float) -> list[Edge]
     return [(start_us + k * bit_us, bool(padded[k + 1])) for k in at.tolist()]
 
 
-def lit_by(lamp: str, end_us: float) -> list[tuple[float, float]]:
-    """From when on a lamp is how bright, of its brightest."""
-    period_us = LAMPS[lamp]
-    if lamp.startswith("square"):
-        return [(k * period_us / 2, float(k % 2)) for k in range(math.ceil(2 * end_us / period_us))]
-    at = np.arange(0, end_us, LAMP_STEP_US)
-    return list(zip(at.tolist(), (np.sin(np.pi * at / period_us) ** 2).tolist(), strict=True))
-
-
 def seen(
     rng: np.random.Generator,
     light: Sequence[Edge],
     end_us: float,
     pixels: Pixels,
-    lamp: tuple[str, float] | None = None,
 ) -> Pulses:
     """Times and polarities of what pixels make of the edges, ascending."""
     found: list[tuple[float, bool]] = []
-    # Until when the LED is on or off, and how bright the background is.
-    parts, shares, on, share = [], [(end_us, 0.0)], True, 0.0
-    if lamp is not None:
-        shares = [(t_us, 1 + lamp[1] * value) for t_us, value in lit_by(lamp[0], end_us)] + shares
-    changes = sorted([(t_us, True, float(lit)) for t_us, lit in light] + [(t, False, v) for t, v in shares])
-    share = 1.0
-    for t_us, of_led, value in changes:
-        parts.append((t_us, on, pixels.background * share))
-        on, share = (bool(value), share) if of_led else (on, value)
+    # Until when the LED is on or off.
+    parts, on = [], True
+    for t_us, lit in light:
+        parts.append((t_us, on))
+        on = lit
+    parts.append((end_us, on))
     for contrast in pixels.contrasts:
         thresholds = np.maximum(THRESHOLD * (1 + THRESHOLD_SPREAD * rng.standard_normal(2)), 0.05)
         lit = pixels.background * (1 + contrast)
         inverse, now, blind = 1 / lit, 0.0, 0.0
         reference = math.log(lit)
-        for next_us, is_on, background in parts:
-            level = background + pixels.background * contrast * is_on
+        for next_us, is_on in parts:
+            level = pixels.background * (1 + contrast * is_on)
             lag = CHARGE / level + pixels.lag_us
             while True:
                 wake = max(now, blind)
@@ -193,50 +165,6 @@ def plain(events: Pulses, bits: NDArray[np.int64], bit_us: float, start_us: floa
     return best
 
 
-def told(
-    events: Pulses, values: NDArray[np.int64], bit_us: float, start_us: float, lamp_us: float = 0.0
-) -> float:
-    """Share of the data bits that the told receiver gets wrong; where bits begin is the best of four.
-
-    With the period of a lamp it is told its phase, too: it learns each eighth of the period apart.
-    """
-    characters: Characters = UART.characters
-    tick_us, word = bit_us / TICKS, BITS * TICKS
-    ticks = (events[0] / tick_us).astype(np.int64)
-    counts = np.zeros((2, max(int(ticks.max()), round(start_us / tick_us) + word * len(values)) + 2 * word))
-    np.add.at(counts, (events[1].astype(np.int64), ticks), 1)
-    contexts, best = characters.contexts[values], 1.0
-    for shift in (-5, -3, -1, 1):
-        starts = start_us / tick_us + shift + word * np.arange(len(values))
-        at = np.rint(starts[:, None] + TICKS * np.arange(BITS)).astype(np.int64)
-        windows = counts[:, at[..., None] + np.arange(TICKS)].transpose(1, 2, 0, 3)
-        phases = np.zeros(at.shape, np.int64)
-        if lamp_us:
-            phases = np.floor(at * tick_us / lamp_us * PHASES).astype(np.int64) % PHASES
-        wrong = 0
-        for half in (0, 1):
-            known = np.arange(len(values)) % 2 == half
-            said = np.zeros((int((~known).sum()), BITS, CONTEXTS))
-            for phase in np.unique(phases[~known]).tolist():
-                taught, here = phases[known] == phase, phases[~known] == phase
-                light = learned(windows[known][taught], contexts[known][taught])
-                found = np.logaddexp.reduce(light.log_likelihoods(windows[~known][here]), 2)
-                said[here] = np.logaddexp(found - found.max(1, keepdims=True), math.log(OUTLIER))
-            read = characters.likelihoods(said).argmax(1)
-            wrong += wrong_bits(read, values[~known])
-        best = min(best, wrong / (7 * len(values)))
-    return best
-
-
-def learned(windows: NDArray[np.float64], contexts: NDArray[np.int64]) -> Light:
-    """The light as bits of known contexts show it."""
-    blank = np.full((CONTEXTS, 2, TICKS), windows.mean() if len(windows) else 1.0)
-    light = Light(blank, np.ones(CONTEXTS), np.ones((CONTEXTS, len(GAINS))))
-    for _ in range(6 if len(windows) else 0):
-        light = light.learn(windows, np.eye(CONTEXTS)[contexts], 0.0, 1.0)
-    return light
-
-
 def wrong_bits(read: NDArray[np.int64], sent: NDArray[np.int64]) -> int:
     """How many bits differ."""
     return sum((a ^ b).bit_count() for a, b in zip(read.tolist(), sent.tolist(), strict=True))
@@ -247,25 +175,19 @@ class Rates:
     """What the receivers get of one scene.
 
     Attributes:
-        events: Events of an edge.
         plain: Wrong bits of the plain receiver, as a share.
         ours: Wrong bits of `uart`; a lost character counts half its bits.
-        told: Wrong bits of the told one.
-        phase: The same where it is told the lamp's phase, too.
         lost: Characters that `uart` does not give.
         of_nobody: Characters that it gives where none was sent.
     """
 
-    events: float
     plain: float
     ours: float
-    told: float
-    phase: float
     lost: int
     of_nobody: int
 
 
-def measure(name: str, seed: int, many: int, lamp: tuple[str, float] | None = None) -> Rates:
+def measure(name: str, seed: int, many: int) -> Rates:
     """One scene, received by each."""
     bit_hz, pixels = SCENES[name]
     rng = np.random.default_rng(seed)
@@ -274,7 +196,7 @@ def measure(name: str, seed: int, many: int, lamp: tuple[str, float] | None = No
     bit_us = 1e6 / bit_hz * CLOCK
     start_us = 5000 + QUIET_BITS * bit_us
     light = edges(bits, bit_us, start_us)
-    events = seen(rng, light, start_us + (bits.size + QUIET_BITS) * bit_us, pixels, lamp)
+    events = seen(rng, light, start_us + (bits.size + QUIET_BITS) * bit_us, pixels)
     found = read_characters(*events, bit_hz, UART)
     places = [(one.t_us - start_us) / (BITS * bit_us) for one in found]
     inside = {round(at): one for at, one in zip(places, found, strict=True) if abs(at - round(at)) < 0.2}
@@ -282,47 +204,8 @@ def measure(name: str, seed: int, many: int, lamp: tuple[str, float] | None = No
     wrong = wrong_bits(np.array([inside[k].value for k in read], np.int64), values[read])
     lost = many - len(read)
     return Rates(
-        len(events[0]) / len(light),
         plain(events, bits, bit_us, start_us),
         (wrong + 3.5 * lost) / (7 * many),
-        told(events, values, bit_us, start_us),
-        told(events, values, bit_us, start_us, LAMPS[lamp[0]]) if lamp else np.nan,
         lost,
         len(found) - len(read),
     )
-
-
-def main() -> None:
-    """Print the table."""
-    parser = argparse.ArgumentParser(
-        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--characters", type=int, default=400)
-    parser.add_argument("--only", nargs="+", default=list(SCENES), choices=list(SCENES), metavar="NAME")
-    parser.add_argument("--lamp", nargs="+", default=[], choices=list(LAMPS), help="Beside the LED.")
-    parser.add_argument("--strength", type=float, nargs="+", default=[1.0], metavar="TIMES")
-    args = parser.parse_args()
-    lamps = [(lamp, strength) for lamp in args.lamp for strength in args.strength] or [None]
-    phase = " told the lamp's phase |" if args.lamp else ""
-    head = f"| scene | events an edge | plain | `uart` | told |{phase} lost | of nobody | s CPU |"
-    print(head + "\n|" + "---|" * (head.count("|") - 1))
-    for name, lamp in ((name, lamp) for name in args.only for lamp in lamps):
-        begun = time.process_time()
-        rates = [measure(name, seed, args.characters, lamp) for seed in args.seeds]
-        mean = [
-            np.mean([getattr(one, key) for one in rates])
-            for key in ("events", "plain", "ours", "told", "phase")
-        ]
-        counted = f"{sum(one.lost for one in rates)} | {sum(one.of_nobody for one in rates)}"
-        spent = time.process_time() - begun
-        which = f"{name}, {lamp[0]} x {lamp[1]:g}" if lamp else name
-        figures = " | ".join(f"{value:.2g}" for value in mean[1 : 5 if lamp else 4])
-        print(
-            f"| {which} | {mean[0]:.1f} | {figures} | {counted} | {spent:.0f} |",
-            flush=True,
-        )
-
-
-if __name__ == "__main__":
-    main()

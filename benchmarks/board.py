@@ -1,0 +1,268 @@
+"""The board: programming, chips in QEMU and on the model of the STM32F405, streams, flashing.
+
+    python benchmarks/board.py [program] [chips] [stm32] [stream] [flash]
+
+Prints Markdown, all sections without a name. Times of QEMU and of models are virtual and the same in every
+run; the model counts an instruction of the core as a clock.
+"""
+
+import argparse
+import contextlib
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.link.resolve import load_link
+from firmware_host import build
+from firmware_host.board.bank import Bank, bank_of, random_symbols
+from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.session import Session
+from firmware_host.emulators.led_record import LedRecord
+from firmware_host.emulators.processes import start_native, start_qemu
+from firmware_host.emulators.simulated import SimulatedBoard, UsbLine
+from firmware_host.errors import BoardError
+from firmware_host.images import FlashImage
+from firmware_host.ports.rom import RomLoader, flash_image
+from firmware_host.protocol.client import RequestOutcome, Timing
+from firmware_host.protocol.requests import CommitReply, CommitRequest, StatusReply, StatusRequest
+from firmware_host.protocol.wire import WireMessage
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+BAUD = 1_000_000
+CHIP_US = 100
+STREAMED = 200
+
+
+def program() -> None:
+    """64 packets against the time that their bytes take; the native board keeps to the line's rate."""
+    book = load_link().codebook
+    bank = Bank.of_symbols(random_symbols(64, 10, book, np.random.default_rng(0)), book)
+    times_s = []
+    for _ in range(5):
+        with Session(start_native(baud=BAUD), Timing(BAUD)) as session:
+            began = time.perf_counter()
+            provision(Board(session), bank, Settings())
+            times_s.append(time.perf_counter() - began)
+    wire_s = 10 * len(bank.content) / BAUD
+    print(
+        f"64 packets verified and playing: {np.median(times_s) / wire_s:.2f} times the wire's {wire_s:.3f} s"
+    )
+
+
+def chips() -> None:
+    """Intervals of chips in QEMU while the host asks for STATUS without pause."""
+    for name, bar in (("words", []), ("10 clusters", ["bar.rows=90", "bar.cluster_rows=9"])):
+        link = load_link(overrides=bar)
+        bank = bank_of(random_symbols(8, 10, link.codebook, np.random.default_rng(5)), link)
+        with tempfile.TemporaryDirectory() as folder:
+            leds = Path(folder) / "leds.bin"
+            asked, status = ask_while_playing(leds, bank, 20_000)
+            ticks = LedRecord.read(leds).played().ticks[:20_000]
+        intervals_us = np.diff(ticks) / 25.0
+        print(
+            f"{name}: {len(ticks)} chips, {asked} requests answered, intervals {intervals_us.min():.2f}"
+            f" to {intervals_us.max():.2f} us, {status.lateness_max_ticks / 25:.2f} us late at most"
+        )
+
+
+def ask_while_playing(leds: Path, bank: Bank, chips: int) -> tuple[int, StatusReply]:
+    """How many requests the board in QEMU has answered after so many chips, and the last answer."""
+    with Session(start_qemu(leds)) as session:
+        board = Board(session)
+        provision(board, bank, Settings())
+        asked, last = 0, board.status()
+
+        def requests() -> Iterator[StatusRequest]:
+            while last.chips_sent < chips:
+                yield StatusRequest()
+
+        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+            nonlocal asked, last
+            reply = session.checked(request, outcome)
+            if isinstance(reply, StatusReply):
+                asked, last = asked + 1, reply
+
+        session.run(requests(), handle)
+        return asked, last
+
+
+def stm32() -> None:
+    """What interrupts and COMMIT take on the model, by bank, and how soon it is dark on a fault."""
+    from tests.models.stm32 import US, Dma, ModelLine, Stm32
+
+    def model() -> tuple[Stm32, Board]:
+        chip = Stm32(build.arm_image("stm32f405"))
+        chip.run(15_000)
+        return chip, Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
+
+    print("| bank | chip interrupt, us | COMMIT, ms |\n|---|---|---|")
+    for name, bank in full_banks().items():
+        chip, board = model()
+        board.prepare(bank)
+        board.fill(0, bank.content)
+        sizes = (bank.format, bank.packets, len(bank.content), bank.crc)
+        began = chip.now
+        board.session.call(CommitRequest(0, *sizes, bytes.fromhex(bank.digest)), CommitReply)
+        commit_ms = (chip.now - began) / US / 1e3
+        board.start()
+        chip.run(10_000)
+        print(f"| {name} | {chip.longest[16 + Dma.IRQ] / US:.1f} | {commit_ms:.1f} |")
+    breaks: dict[str, Callable[[Stm32], object]] = {
+        "TIM1 stands": lambda chip: chip.tim1.stop_for_good(),
+        "DMA stands": lambda chip: setattr(chip.dma, "dead", True),
+        "DMA transfer error": lambda chip: chip.dma.error(Dma.TRANSFER_ERROR),
+        "SPI1 stands": lambda chip: setattr(chip.spi, "dead", True),
+        "TIM3 stands": lambda chip: chip.tim3.stop_for_good(),
+        "crystal stops": lambda chip: chip.stop_crystal(),
+        "supply falls": lambda chip: chip.pending.add(16 + 1),
+    }
+    book = load_link().codebook
+    print("\n| fault at a random moment | dark after, chips at most |\n|---|---|")
+    for name, fail in breaks.items():
+        late_us = []
+        for moment in range(12):
+            rng = np.random.default_rng(moment)
+            chip, board = model()
+            provision(board, Bank.of_symbols(random_symbols(1, 4, book, rng), book), Settings())
+            chip.run(5_000 + float(rng.uniform(0, 1_000)))
+            at = chip.now
+            fail(chip)
+            chip.run(1_000)
+            dark = max(s.time for s in chip.drivers.log if s.dark) if chip.drivers.dark else np.inf
+            late_us.append((dark - at) / US)
+        print(f"| {name} | {max(late_us) / CHIP_US:.2f} |")
+
+
+def full_banks() -> dict[str, Bank]:
+    """A bank of each kind, as full as it gets; every chip that is lit lights every LED."""
+    book = load_link().codebook
+    found = {"words": Bank.of_symbols(random_symbols(128, 10, book, np.random.default_rng(1)), book)}
+    for clusters in (1, 10, 16, 88, 96):
+        drawn = np.random.default_rng(1).integers(0, 2, (clusters + 2, 48), dtype=np.uint8)
+        own = Codebook("drawn", book.preamble, drawn[:-2], drawn[-2:])
+        row = -(-clusters // 8)
+        most = (40_960 - (12 * clusters if row < 12 else 0)) // row
+        packet = replace(PacketFormat.of(own, 1), preamble_chips=most - 96)
+        light = np.tile(np.array([[1], [0]], np.uint8), (most, clusters))[:most]
+        name = f"{clusters} clusters" if row < 12 else "masks of each LED"
+        found[name] = Bank.of_chips(light, own, packet, np.arange(96) * clusters // 96)
+    return found
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Delays, ms, of some packets, and what they took."""
+
+    delays_ms: np.ndarray
+    round_trips: float
+    underruns: int
+
+
+def stream() -> None:
+    """Delay of a streamed packet from the call to its first chip, on a line of 1 Mbit/s behind USB.
+
+    `alone`: each packet when the board has none; else so many are kept on the board.
+    """
+    print("| USB latency | queue | median, ms | largest | round trips a packet | underruns |")
+    print("|---|---|---|---|---|---|")
+    for latency_s in (0.0, 1e-3, 16e-3):
+        rows = [("alone", measure_stream(latency_s, 4, 0.1))]
+        rows += [(f"{ahead} on the board", measure_stream(latency_s, ahead, 0.0)) for ahead in (2, 4, 8)]
+        for name, m in rows:
+            underruns = "-" if name == "alone" else m.underruns
+            print(
+                f"| {latency_s * 1e3:g} ms | {name} | {np.median(m.delays_ms):.1f} | {m.delays_ms.max():.1f}"
+                f" | {m.round_trips:.2f} | {underruns} |"
+            )
+
+
+def measure_stream(latency_s: float, ahead: int, pause_s: float, packets: int = STREAMED) -> Measured:
+    """Stream packets, each `pause_s` after the one before has gone out; the board has virtual time."""
+    link, device = load_link(), SimulatedBoard()
+    symbols = random_symbols(packets, link.packet.frames, link.codebook, np.random.default_rng(0))
+    session = Session(UsbLine(device, latency_s, frame_s=1e-3), Timing(), first=1, nonce=1)
+    calls = []
+    with Board(session).stream(link, ahead) as streamed:
+        for packet in symbols:
+            calls.append(device.now_us)
+            streamed.send(packet)
+            if pause_s:
+                streamed.wait(pause_s)
+    played = device.records().played()
+    starts = starts_of(played.chips(), played.ticks, symbols.shape[0], link.packet.packet_chips)
+    delays_ms = (np.array(starts) / (device.TICK_HZ / 1e6) - np.array(calls)) / 1e3
+    return Measured(delays_ms, streamed.requests / packets, streamed.underruns)
+
+
+def starts_of(chips: np.ndarray, ticks: np.ndarray, packets: int, packet_chips: int) -> list[int]:
+    """Tick of each packet's first chip; between packets there may be the idle pattern."""
+    preamble = load_link().codebook.preamble
+    found, at = [], 0
+    while len(found) < packets:
+        while not (chips[at : at + len(preamble)] == preamble[:, None]).all():
+            at += 1
+        found.append(int(ticks[at]))
+        at += packet_chips
+    return found
+
+
+def flash() -> None:
+    """What flashing by the part's ROM takes by the line's clock, with bytes lost or turned, too."""
+    from tests.models.rom import RomEmulator, RomLine
+
+    class BadLine(RomLine):
+        """Loses or turns a byte in so many, both ways."""
+
+        def __init__(self, rom: RomEmulator, one_in: int, seed: int) -> None:
+            super().__init__(rom)
+            self._one_in, self._rng = one_in, np.random.default_rng(seed)
+
+        def to_part(self, data: bytes) -> bytes:
+            dice = self._rng.integers(0, 2 * self._one_in, len(data))
+            return bytes(b ^ (0x10 * (d == 1)) for b, d in zip(data, dice, strict=True) if d)
+
+        to_host = to_part
+
+    image = FlashImage.read(build.arm_image("stm32f405"))
+    for one_in in (0, 10_000, 3_000):
+        right, seconds = 0, []
+        for seed in range(10):
+            rom = RomEmulator()
+            line = BadLine(rom, one_in, seed) if one_in else RomLine(rom)
+            with contextlib.suppress(BoardError):
+                flash_image(RomLoader(line), image)
+                right += rom.flash[: len(image.data)] == image.data
+                seconds.append(line.now())
+        kind = f"a byte in {one_in} bad" if one_in else "a good line"
+        print(f"flash {len(image.data)} bytes, {kind}: {right} of 10 right, {np.mean(seconds):.1f} s")
+
+
+SECTIONS: dict[str, Callable[[], None]] = {
+    "program": program, "chips": chips, "stm32": stm32, "stream": stream, "flash": flash,
+}  # fmt: skip
+
+
+def main() -> None:
+    """Print the sections that are named."""
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("sections", nargs="*", metavar="SECTION", help=", ".join(SECTIONS))
+    given = parser.parse_args().sections or list(SECTIONS)
+    for name in given:
+        if name not in SECTIONS:
+            parser.error(f"{name}: expected {', '.join(SECTIONS)}")
+        print(f"\n## {name}\n")
+        SECTIONS[name]()
+
+
+if __name__ == "__main__":
+    main()
