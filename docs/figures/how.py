@@ -257,7 +257,7 @@ def distance(r: Recording) -> Figure:
             off = [f.range.distance_m - away for f in probe.found["frame"] if np.isfinite(f.range.distance_m)]
             rms[name].append(float(np.sqrt(np.mean(np.square(off)))))
             print(f"{name} at {away} m: {len(off)} frames, RMSE {rms[name][-1]:.4f} m", flush=True)
-        bound = frame_bound(link.camera, link.bar, link.codebook)
+        bound = frame_bound(link)
         least = [bound(view).sigma_m for view in probe.found["view"]]
         rms["bound"].append(float(np.sqrt(np.nanmean(np.square(least)))))
         print(f"bound at {away} m: {rms['bound'][-1]:.4f} m", flush=True)

@@ -1,29 +1,43 @@
-"""The least error that a frame's distance and lean can have: Cramer-Rao bounds of the boundaries of clusters.
+"""The least errors that one frame can have: Cramer-Rao bounds.
 
-It belongs to the geometry of the problem and to no algorithm, so it stands here and not beside one: how
-sharply a boundary of the bar shows in the image, how noisy its pixels are, and how far boundaries lie apart
-bound whatever ranging there is. `frame_bound` reads these quantities from the frames of a recording. This is
-of bars, one even column of clusters; `plane_bound` takes any layout.
+They belong to the geometry of the problem and to no algorithm, so they stand here and not beside one: how
+sharply light shows in the image, how noisy its pixels are, and how far clusters lie apart bound whatever
+reads it. Pixels have Gaussian noise of one size (Kay, Estimation Theory, chapter 3). Of a bar, one even
+column of clusters, it is the boundaries between clusters that say where they lie; of any other layout the
+light of each cluster, in two dimensions.
 """
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.optimize import least_squares
 from scipy.special import ndtr
+from scipy.stats import theilslopes
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.study.plane_bound import LEAST_GAIN, MOST_OFF, codes_of, plane_frame_bound
 from evlcp_sdk.values import FrameView, PresenceMap, Range
 
-__all__ = ["cramer_rao_sigma_m", "frame_bound", "lean_sigma_deg"]
+__all__ = ["BarBound", "LayoutBound", "bar_bound", "frame_bound", "layout_bound"]
 
-_NONE = Range(float("nan"), float("nan"), 0)
+Array = NDArray[np.float64]
+
+_NONE = Range(math.nan, math.nan, 0)
+
+_UNKNOWN = 1e-9
+"""Share of a parameter's own information below which what others leave of it is none."""
+
+_LEAST_GAIN = 0.01
+"""Share of a full value below which a fit has found no light: one event in some thirty values."""
+
+_MOST_OFF = 0.2
+"""How far, as a share, a fit's scale may lie from that of the clusters' middles: not a fit beyond."""
 
 _MOVES_PX = 3.0
 """How far a value's boundaries may lie from a steady motion before data must speak."""
@@ -44,13 +58,32 @@ _LEAST_FREE = 0.1
 _LEAST_BOUNDARIES = 3
 """Boundaries without which spacing, position and drift cannot be separated."""
 
-Array = NDArray[np.float64]
+_POSE = ("x_px", "y_px", "scale", "turn")
+_LENS = ("gain", "dark", "blur", "drift_x", "drift_y")
+_LEAN = ("lean", "swing")
+
+_STEP = 1e-4
+"""Of the differences that give slopes, px, radians and shares: their errors are its square."""
+
+_SEAM_SIGMAS = 4.0
+"""How far around its LEDs an image shows a layout, in blurs; and 2 px beside."""
 
 
-def cramer_rao_sigma_m(
-    camera: CameraModel,
-    bar: BarLayout,
-    codebook: Codebook,
+@dataclass(frozen=True)
+class BarBound:
+    """Smallest standard deviations of what one frame says of a bar; infinite where no pixel shows it.
+
+    Attributes:
+        distance_m: Of its distance.
+        lean_deg: Of its lean, of a bar that hardly leans.
+    """
+
+    distance_m: float
+    lean_deg: float
+
+
+def bar_bound(
+    link: Link,
     distance_m: float,
     symbols: ArrayLike,
     *,
@@ -59,68 +92,17 @@ def cramer_rao_sigma_m(
     columns: float = 5.0,
     gain: float = 0.8,
     shift_px: float = 0.0,
-) -> float:
-    """Smallest standard deviation of one frame's distance, m, with spacing, position, drift and gain unknown.
+) -> BarBound:
+    """Bounds of one frame of a bar, with spacing, position, drift and gain unknown.
 
     A row of pixels at a boundary sees light of both clusters, in shares that follow a normal distribution;
-    each pixel's value is that mixture of their codes plus Gaussian noise. The Fisher information is then the
-    sum of the slopes' outer products over the noise's variance (Kay, Estimation Theory, chapter 3). Rows
-    beyond the middles of the outermost clusters, which have no neighbour, do not count.
+    each pixel's value is that mixture of their codes plus noise. Rows beyond the middles of the outermost
+    clusters, which have no neighbour, do not count. A lean of sine s moves the boundary at place b, in
+    spacings from the bar's middle, by b^2 s times spacing_px * spacing_m / distance_m pixels: a parabola,
+    which the other unknowns do not make. So its bound grows with the distance squared.
 
     Args:
-        camera: For the spacing in the image.
-        bar: One column of clusters.
-        codebook: Pilots and codewords.
-        distance_m: Distance of the bar, m.
-        symbols: What the frame says, integers (K,).
-        blur_px: Width (sigma) of a boundary in the image, px.
-        noise: Standard deviation of one pixel's value, in full values.
-        columns: Pixels across the bar.
-        gain: Share of a full value that is seen.
-        shift_px: Where the bar lies on the pixel grid, px.
-
-    Returns:
-        Infinite where no pixel sees a boundary move, as each falls between two of them and is sharp.
-
-    Raises:
-        ConfigError: A quantity that must be positive is not, or the bar is another layout.
-
-    >>> from evlcp_sdk.link.resolve import load_link
-    >>> link = load_link()
-    >>> scene = link.camera, link.bar, link.codebook, 50.0, range(16)
-    >>> round(cramer_rao_sigma_m(*scene, blur_px=0.45, noise=0.3), 4)
-    0.0145
-    """
-    slopes, spacing = _frame_slopes(
-        camera, bar, codebook, distance_m, symbols, blur_px=blur_px, noise=noise, gain=gain, shift_px=shift_px
-    )
-    information = columns / noise**2 * (slopes[:4] @ slopes[:4].T)
-    return distance_m * _least_error(information, 0) / spacing
-
-
-def lean_sigma_deg(
-    camera: CameraModel,
-    bar: BarLayout,
-    codebook: Codebook,
-    distance_m: float,
-    symbols: ArrayLike,
-    *,
-    blur_px: float,
-    noise: float,
-    columns: float = 5.0,
-    gain: float = 0.8,
-    shift_px: float = 0.0,
-) -> float:
-    """Smallest standard deviation of the lean by one frame, degrees, of a bar that hardly leans.
-
-    A lean of sine s moves the boundary at place b, in spacings from the bar's middle, by b^2 s times
-    spacing_px * spacing_m / distance_m pixels: a parabola, which spacing, position, drift and gain, unknown
-    beside it, do not make. So the bound grows with the distance squared.
-
-    Args:
-        camera: For the spacing in the image.
-        bar: One column of clusters.
-        codebook: Pilots and codewords.
+        link: For the camera, the bar and its codes; the bar is one even column of clusters.
         distance_m: Distance of the bar, m.
         symbols: What the frame says, integers (K,).
         blur_px: Width (sigma) of a boundary in the image, px.
@@ -133,138 +115,131 @@ def lean_sigma_deg(
         ConfigError: A quantity that must be positive is not, or the bar is another layout.
 
     >>> from evlcp_sdk.link.resolve import load_link
-    >>> link = load_link()
-    >>> scene = link.camera, link.bar, link.codebook, 50.0, range(16)
-    >>> round(lean_sigma_deg(*scene, blur_px=0.45, noise=0.3), 2)
-    3.52
+    >>> bound = bar_bound(load_link(), 50.0, range(16), blur_px=0.45, noise=0.3)
+    >>> round(bound.distance_m, 4), round(bound.lean_deg, 2)
+    (0.0145, 3.52)
     """
-    slopes, spacing = _frame_slopes(
-        camera, bar, codebook, distance_m, symbols, blur_px=blur_px, noise=noise, gain=gain, shift_px=shift_px
-    )
-    slopes = np.stack([*slopes[:4], slopes[4] * spacing * _spacing_m(bar) / distance_m])
-    information = columns / noise**2 * (slopes @ slopes.T)
-    return float(np.degrees(_least_error(information, 4)))
-
-
-def _least_error(information: Array, which: int) -> float:
-    """Bound of one unknown, all others unknown, too; infinite where no pixel shows it."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
-    alike = information * np.outer(scale, scale)
-    if not np.linalg.cond(alike) < 1 / np.finfo(np.float64).eps:
-        return math.inf
-    return float(scale[which] * np.sqrt(np.linalg.inv(alike)[which, which]))
-
-
-def _frame_slopes(
-    camera: CameraModel,
-    bar: BarLayout,
-    codebook: Codebook,
-    distance_m: float,
-    symbols: ArrayLike,
-    *,
-    blur_px: float,
-    noise: float,
-    gain: float,
-    shift_px: float,
-) -> tuple[Array, float]:
-    """Slopes of a frame's values by spacing, centre, drift, gain and bend, (5, n), and the spacing, px.
-
-    The bend is how far, in px, a boundary moves one spacing from the bar's middle, and b^2 times that at b.
-    """
-    for name, quantity in (("distance_m", distance_m), ("blur_px", blur_px), ("noise", noise)):
-        if not quantity > 0:
-            raise ConfigError(f"{name} = {quantity}: expected a positive number")
-    spacing = camera.focal_px * _spacing_m(bar) / distance_m
-    codes = codes_of(codebook, np.asarray(symbols, np.int64))
+    _check_positive(distance_m=distance_m, blur_px=blur_px, noise=noise)
+    spacing_m = link.bar.column_pitch_m
+    if not spacing_m > 0:
+        raise ConfigError(
+            "this Cramer-Rao bound needs one even column of two clusters or more; layout_bound takes any"
+        )
+    spacing = link.camera.focal_px * spacing_m / distance_m
+    codes = _codes(link.codebook, np.asarray(symbols, np.int64))
     clusters, values = codes.shape
-    rows = _rows(2 * int(spacing * clusters / 2 + 4))
+    rows = _from_middle(2 * int(spacing * clusters / 2 + 4))
     fit = np.array([spacing, shift_px, 0.0, gain, np.log(blur_px), 0.0, 0.0, 0.0])
-    offset, when = np.zeros(values), _when(values)
+    offset, when = np.zeros(values), _times(values)
     nearest = _nearest(fit, clusters, rows, offset, when)
     _, slopes = _model(fit, codes, nearest, rows, offset, when)
-    bend = slopes[1] * (np.clip(nearest, 1, clusters - 1) - clusters / 2) ** 2
-    flat = np.concatenate([slopes[:4], bend[None]])[:, _counts(nearest, np.ones(clusters, np.bool_))]
-    return flat, spacing
+    bend = (
+        slopes[1] * (np.clip(nearest, 1, clusters - 1) - clusters / 2) ** 2 * spacing * spacing_m / distance_m
+    )
+    seen = _counts(nearest, np.ones(clusters, np.bool_))
+    slopes = np.concatenate([slopes[:4], bend[None]])[:, seen]
+    information = columns / noise**2 * (slopes @ slopes.T)
+    sigma_px, lean = _sigmas(information[:4, :4])[0], _sigmas(information)[4]
+    return BarBound(float(distance_m * sigma_px / spacing), float(np.degrees(lean)))
 
 
-def frame_bound(
-    camera: CameraModel, bar: BarLayout, codebook: Codebook, *, full_events: float = 3.0
-) -> Callable[[FrameView], Range]:
+def _check_positive(**quantities: float) -> None:
+    for name, quantity in quantities.items():
+        if not quantity > 0:
+            raise ConfigError(f"{name} = {quantity}: expected a positive number")
+
+
+def _sigmas(information: Array) -> Array:
+    """Standard deviation of each parameter, the others unknown, too; infinite where nothing says it."""
+    own = np.sqrt(np.maximum(np.diag(information), 0.0))
+    known = own > 0
+    found = np.full(len(own), np.inf)
+    scaled = information[np.ix_(known, known)] / np.outer(own[known], own[known])
+    for i, k in enumerate(np.flatnonzero(known)):
+        others = np.delete(np.arange(len(scaled)), i)
+        row = scaled[i, others]
+        left = 1.0 - row @ np.linalg.pinv(scaled[np.ix_(others, others)], rcond=_UNKNOWN) @ row
+        if left > _UNKNOWN:
+            found[k] = 1 / (own[k] * math.sqrt(left))
+    return found
+
+
+def _codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Array:
+    """What each cluster sends in a frame, pilot and info, float64 (K, values)."""
+    sent = codebook.codeword_edges[symbols]
+    return np.concatenate([codebook.pilot_edges, sent], axis=1).astype(np.float64)
+
+
+def frame_bound(link: Link, *, full_events: float = 3.0) -> Callable[[FrameView], Range]:
     """A function that gives, as sigma, the bound of a frame.
 
-    Blur, gain and noise of the bound are those of the frame: its values are fitted by the boundaries' model
-    (least squares over spacing, position, drift, gain, blur, an offset between positive and negative events,
-    shifts by a step's sign and by values that are repeated, and a motion of each value), and what is left
-    over is the noise. It is that of the rows that say where boundaries lie: each weighs with the square of
-    its slope, and with the leverage that the fit has on it. Neither truth nor any algorithm is needed. The
-    noise is taken as Gaussian and independent; an error that several frames share is not seen.
+    Blur, gain and noise of the bound are those of the frame. The values of a bar, one even column of three
+    clusters or more, are fitted by the boundaries' model (least squares over spacing, position, drift, gain,
+    blur, an offset between positive and negative events, shifts by a step's sign and by values that are
+    repeated, and a motion of each value), and what is left over is the noise. It is that of the rows that say
+    where boundaries lie: each weighs with the square of its slope, and with the leverage that the fit has on
+    it. Values of any other layout are fitted by its image (place, scale, turn, gain, background and blur).
+    Neither truth nor any algorithm is needed. The noise is taken as Gaussian and independent; an error that
+    several frames share is not seen.
 
     Args:
-        camera: For the spacing in the image.
-        bar: One even column of three clusters or more; of another layout, the bound is that of
-            `plane_bound.plane_frame_bound`.
-        codebook: Pilots and codewords.
+        link: For the camera, the layout and its codes.
         full_events: Events of a pixel in a chip that count as a full value; more are clipped, as hot pixels
             send them.
 
     Returns:
         From what the receiver's stage `view` shows to the fit's distance and the bound, both NaN where the
-        frame shows no boundaries.
+        frame shows too little.
 
     Raises:
         ConfigError: The layout is one cluster.
     """
-    if not bar.column_pitch_m > 0 or bar.clusters < 3:
-        return plane_frame_bound(camera, bar, codebook, full_events=full_events)
-    # It takes half a second to load, and campaigns know no frames.
-    from scipy.stats import theilslopes
+    if link.bar.clusters < 2:
+        raise ConfigError("the Cramer-Rao bound of a distance needs two clusters or more")
+    even = link.bar.column_pitch_m > 0 and link.bar.clusters > 2
+    return partial(_bound_bar_frame if even else _bound_layout_frame, link, full_events)
 
-    spacing_m = _spacing_m(bar)
 
-    def bound(view: FrameView) -> Range:
-        place = _place(view.presence)
-        if place is None:
-            return _NONE
-        upright, at_row, seen = place
-        behind = codebook.edge_chips
-        sums, offset = view.sums[behind], (view.offset_px[:, behind - 1] + view.offset_px[:, behind]) / 2
-        light = view.presence.pixels.sum(0)
-        if not upright:
-            # A bar that lies across the image: exchange rows and columns.
-            sums, light, offset = sums.transpose(0, 2, 1), light.T, offset[::-1]
-        k = np.flatnonzero(seen)
-        tilt, left = _line(light)
-        spacing, first = theilslopes(at_row[k], k)[:2]
-        values, columns = _row_values(sums, light, tilt, left, full_events)
-        codes = codes_of(codebook, view.soft.symbols)
-        rows, down = _rows(sums.shape[1]), offset[1]
-        centre = first + spacing * (len(codes) - 1) / 2 - (sums.shape[1] - 1) / 2
-        if spacing < 0:
-            # A bar upside down: mirror it.
-            values, down, spacing, centre = values[:, ::-1], -down, -spacing, -centre
-        start = np.array([spacing, centre, 0.0, 0.5, np.log(_USUAL_PX), 0.0, 0.0, 0.0])
-        found = _fit(start, codes, values, seen, rows, down, _when(len(values)))
-        if found is None:
-            return _NONE
-        fit, noise = found
-        distance_m = camera.distance_m(spacing_m, float(fit[0]) * float(np.hypot(1.0, tilt)))
-        sigma_m = cramer_rao_sigma_m(
-            camera,
-            bar,
-            codebook,
-            distance_m,
-            view.soft.symbols,
-            blur_px=float(np.exp(fit[4])),
-            noise=noise * float(np.sqrt(columns)),
-            columns=columns,
-            gain=float(fit[3]),
-            shift_px=float(fit[1]),
-        )
-        if not math.isfinite(sigma_m):
-            return _NONE
-        return Range(distance_m, sigma_m, int((seen[1:] & seen[:-1]).sum()))
-
-    return bound
+def _bound_bar_frame(link: Link, full_events: float, view: FrameView) -> Range:
+    place = _place(view.presence)
+    if place is None:
+        return _NONE
+    upright, at_row, seen = place
+    behind = link.codebook.edge_chips
+    sums, offset = view.sums[behind], (view.offset_px[:, behind - 1] + view.offset_px[:, behind]) / 2
+    light = view.presence.pixels.sum(0)
+    if not upright:
+        # A bar that lies across the image: exchange rows and columns.
+        sums, light, offset = sums.transpose(0, 2, 1), light.T, offset[::-1]
+    k = np.flatnonzero(seen)
+    tilt, left = _line(light)
+    spacing, first = theilslopes(at_row[k], k)[:2]
+    values, columns = _row_values(sums, light, tilt, left, full_events)
+    codes = _codes(link.codebook, view.soft.symbols)
+    rows, down = _from_middle(sums.shape[1]), offset[1]
+    centre = first + spacing * (len(codes) - 1) / 2 - (sums.shape[1] - 1) / 2
+    if spacing < 0:
+        # A bar upside down: mirror it.
+        values, down, spacing, centre = values[:, ::-1], -down, -spacing, -centre
+    start = np.array([spacing, centre, 0.0, 0.5, np.log(_USUAL_PX), 0.0, 0.0, 0.0])
+    found = _fit(start, codes, values, seen, rows, down, _times(len(values)))
+    if found is None:
+        return _NONE
+    fit, noise = found
+    distance_m = link.camera.distance_m(link.bar.column_pitch_m, float(fit[0]) * float(np.hypot(1.0, tilt)))
+    bound = bar_bound(
+        link,
+        distance_m,
+        view.soft.symbols,
+        blur_px=float(np.exp(fit[4])),
+        noise=noise * float(np.sqrt(columns)),
+        columns=columns,
+        gain=float(fit[3]),
+        shift_px=float(fit[1]),
+    )
+    if not math.isfinite(bound.distance_m):
+        return _NONE
+    return Range(distance_m, bound.distance_m, int((seen[1:] & seen[:-1]).sum()))
 
 
 def _row_values(
@@ -286,21 +261,12 @@ def _row_values(
     return values, float(np.median(total**2 / np.maximum((weight**2).sum(1), 1e-12)))
 
 
-def _spacing_m(bar: BarLayout) -> float:
-    """Distance of neighbouring clusters, m."""
-    if not bar.column_pitch_m > 0:
-        raise ConfigError(
-            "this Cramer-Rao bound needs one even column of two clusters or more; layout_bound takes any"
-        )
-    return bar.column_pitch_m
+def _from_middle(pixels: int) -> Array:
+    """Pixels from the image's middle, px."""
+    return np.arange(pixels, dtype=np.float64) - (pixels - 1) / 2
 
 
-def _rows(height: int) -> Array:
-    """Rows from the image's middle, px."""
-    return np.arange(height, dtype=np.float64) - (height - 1) / 2
-
-
-def _when(values: int) -> Array:
+def _times(values: int) -> Array:
     """Times of the values, from the frame's middle, in frames."""
     return np.arange(values, dtype=np.float64) / values - 0.5
 
@@ -384,7 +350,7 @@ def _fit(
     begin = np.concatenate([start, np.zeros(len(when))])
     found = least_squares(residuals, begin, slopes, method="lm", x_scale=scale)
     spacing, blur = found.x[0], np.exp(found.x[4])
-    seen_well = found.x[3] > LEAST_GAIN and blur < spacing and abs(spacing / start[0] - 1) < MOST_OFF
+    seen_well = found.x[3] > _LEAST_GAIN and blur < spacing and abs(spacing / start[0] - 1) < _MOST_OFF
     if not (found.success and seen_well):
         return None
     many = int(counts.sum())
@@ -426,3 +392,201 @@ def _line(light: NDArray[np.float32]) -> tuple[float, float]:
     middle = (weight * row).sum() / total
     slope = (weight * (row - middle) * column).sum() / (weight * (row - middle) ** 2).sum()
     return float(slope), float((weight * column).sum() / total - slope * middle)
+
+
+@dataclass(frozen=True)
+class LayoutBound:
+    """Smallest standard deviations of what one frame says; infinite where it says nothing.
+
+    Attributes:
+        x_px: Of the layout's place in the image, to the right.
+        y_px: The same, downward.
+        distance_m: Of its distance.
+        turn_deg: Of its turn in the image.
+        lean_deg: Of a lean of its top towards the camera or from it, of a layout that hardly leans.
+        swing_deg: The same of its left side.
+    """
+
+    x_px: float
+    y_px: float
+    distance_m: float
+    turn_deg: float
+    lean_deg: float
+    swing_deg: float
+
+
+def layout_bound(
+    link: Link,
+    distance_m: float,
+    symbols: ArrayLike,
+    *,
+    blur_px: float,
+    noise: float,
+    gain: float = 0.8,
+    dark: float = 0.1,
+    shift_px: tuple[float, float] = (0.0, 0.0),
+    turn_deg: float = 0.0,
+) -> LayoutBound:
+    """Bounds of one frame of a layout seen from the front.
+
+    Place, scale, turn, gain, background, blur and the drift within the frame are unknown together; for lean
+    and swing, these too.
+
+    Args:
+        link: For the camera, the layout and its codes.
+        distance_m: Its distance, m.
+        symbols: What the frame says, integers (K,).
+        blur_px: Sigma of a point in the image, px.
+        noise: Standard deviation of one pixel's value, in full values.
+        gain: Share of a full value that is seen.
+        dark: The background's light, as a share of that of a pixel that an LED fills.
+        shift_px: Where the layout's centre lies from a pixel's middle, right and down, px.
+        turn_deg: Its turn in the image, clockwise.
+
+    Raises:
+        ConfigError: A quantity that must be positive is not.
+
+    >>> from evlcp_sdk.link.resolve import load_link
+    >>> link = load_link(overrides=["bar.shape=ring"])
+    >>> bound = layout_bound(link, 50.0, range(12), blur_px=0.45, noise=0.3)
+    >>> round(bound.distance_m, 3), round(bound.lean_deg, 1)
+    (0.031, 13.6)
+    """
+    _check_positive(distance_m=distance_m, blur_px=blur_px, noise=noise, gain=gain, dark=dark)
+    scale = link.camera.focal_px / distance_m
+    codes = _codes(link.codebook, np.asarray(symbols, np.int64))
+    image = _Image.around(link.bar, scale, blur_px, codes, distance_m)
+    fit = {
+        "x_px": shift_px[0],
+        "y_px": shift_px[1],
+        "scale": math.log(scale),
+        "turn": math.radians(turn_deg),
+        "gain": gain,
+        "dark": math.log(dark),
+        "blur": math.log(blur_px),
+    }
+    slopes = np.stack([image.slope(fit, name) for name in (*_POSE, *_LENS, *_LEAN)])
+    information = slopes @ slopes.T / noise**2
+    flat = _sigmas(information[: len(_POSE + _LENS), : len(_POSE + _LENS)])
+    leaning = _sigmas(information)
+    x_px, y_px, share, turn = flat[:4].tolist()
+    lean, swing = np.degrees(leaning[-2:]).tolist()
+    return LayoutBound(x_px, y_px, distance_m * share, math.degrees(turn), lean, swing)
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """What makes the values of a frame of its parameters.
+
+    Attributes:
+        leds_m: The LEDs, m, float64 (n, 3).
+        first: Of the LEDs in the order of their clusters, where each cluster starts, int64 (K + 1,).
+        side_m: Width and height that one lights, m.
+        codes: What each cluster sends, float64 (K, values).
+        columns: Of the pixels, from the middle of the image, px, float64 (width,).
+        rows: The same, float64 (height,).
+        distance_m: For the perspective of what stands out or leans.
+    """
+
+    leds_m: Array
+    first: NDArray[np.int64]
+    side_m: float
+    codes: Array
+    columns: Array
+    rows: Array
+    distance_m: float
+
+    @classmethod
+    def of(cls, bar: BarLayout, codes: Array, columns: Array, rows: Array, distance_m: float) -> "_Image":
+        which = bar.led_clusters()
+        order = np.argsort(which, kind="stable")
+        first = np.searchsorted(which[order], np.arange(bar.clusters + 1))
+        return cls(bar.led_positions_m()[order], first, bar.shape.led_m, codes, columns, rows, distance_m)
+
+    @classmethod
+    def around(
+        cls, bar: BarLayout, scale: float, blur_px: float, codes: Array, distance_m: float
+    ) -> "_Image":
+        seam = _SEAM_SIGMAS * blur_px + 2 + bar.shape.led_m * scale
+        half = math.ceil(scale * float(np.abs(bar.led_positions_m()[:, :2]).max()) + seam)
+        across = np.arange(-half, half + 1, dtype=np.float64)
+        return cls.of(bar, codes, across, across, distance_m)
+
+    def values(self, fit: dict[str, float]) -> Array:
+        """Expected values, float64 (values, pixels)."""
+        x, y, z = self.leds_m.T
+        # To first order, what leans stands out by so much.
+        z = z + y * fit.get("lean", 0.0) + x * fit.get("swing", 0.0)
+        scale = math.exp(fit["scale"])
+        near = scale / (1 - z / self.distance_m)
+        turn, side, blur = fit["turn"], scale * self.side_m, math.exp(fit["blur"])
+        c, s = math.cos(turn), math.sin(turn)
+        u = fit["x_px"] + near * (c * x - s * y)
+        v = fit["y_px"] + near * (s * x + c * y)
+        across, down = (
+            ndtr((grid - at[:, None] + side / 2) / blur) - ndtr((grid - at[:, None] - side / 2) / blur)
+            for grid, at in ((self.columns, u), (self.rows, v))
+        )
+        light = np.stack(
+            [(down[a:b].T @ across[a:b]).ravel() for a, b in zip(self.first, self.first[1:], strict=False)]
+        )
+        seen: Array = fit["gain"] * (self.codes.T @ (light / (light.sum(0) + math.exp(fit["dark"]))))
+        return seen
+
+    def slope(self, fit: dict[str, float], name: str) -> Array:
+        """How the values change with a parameter, float64 (values * pixels,)."""
+        step = _STEP
+        if name.startswith("drift"):
+            axis = name.replace("drift_", "") + "_px"
+            values = len(self.codes[0])
+            when = _times(values)
+            return (self.slope(fit, axis).reshape(values, -1) * when[:, None]).ravel()
+        if name in _LEAN:
+            # A lean shows by its perspective, which is weak.
+            step *= self.distance_m
+        low, high = ({**fit, name: fit.get(name, 0.0) + by} for by in (-step, step))
+        return ((self.values(high) - self.values(low)) / (2 * step)).ravel()
+
+
+def _bound_layout_frame(link: Link, full_events: float, view: FrameView) -> Range:
+    start = _start(view.presence, link.bar.cluster_centres_m() @ np.array([1, 1j]))
+    if start is None:
+        return _NONE
+    scale, shift, seen = start
+    values = np.clip(view.sums[link.codebook.edge_chips].astype(np.float64) / full_events, -1.0, 1.0)
+    height, width = values.shape[1:]
+    codes = _codes(link.codebook, np.where(view.soft.symbols < 0, 0, view.soft.symbols))
+    distance_m = link.camera.focal_px / abs(scale)
+    image = _Image.of(link.bar, codes, _from_middle(width), _from_middle(height), distance_m)
+    middle = shift - complex(width - 1, height - 1) / 2
+    names = (*_POSE, "gain", "dark", "blur")
+    first = [middle.real, middle.imag, math.log(abs(scale)), float(np.angle(scale))]
+    first += [0.6, math.log(0.1), math.log(0.45)]
+
+    def off(fit: Array) -> Array:
+        return image.values(dict(zip(names, fit.tolist(), strict=True))).ravel() - values.ravel()
+
+    found = least_squares(off, first, x_scale=[1, 1, 0.01, 0.01, 0.3, 1, 0.3], max_nfev=30)
+    fit = dict(zip(names, found.x.tolist(), strict=True))
+    noise = math.sqrt(2 * found.cost / max(found.fun.size - len(first), 1))
+    if fit["gain"] < _LEAST_GAIN or abs(fit["scale"] - first[2]) > _MOST_OFF or not noise > 0:
+        return _NONE
+    distance_m = link.camera.focal_px / math.exp(fit["scale"])
+    slopes = np.stack([image.slope(fit, name) for name in (*_POSE, *_LENS)])
+    sigma = float(_sigmas(slopes @ slopes.T / noise**2)[2])
+    return Range(distance_m, distance_m * sigma, seen) if math.isfinite(sigma) else _NONE
+
+
+def _start(presence: PresenceMap, centres_m: NDArray[np.complex128]) -> tuple[complex, complex, int] | None:
+    """Scale, px a metre with the turn, place, px, and how many clusters are seen, by the cells' medians."""
+    selected, grid = presence.selected, presence.grid_px
+    seen = np.flatnonzero(selected.any((1, 2)))
+    at = np.array([complex(*np.median(np.nonzero(selected[k]), axis=1)[::-1]) for k in seen], np.complex128)
+    at = at * grid + (grid - 1) / 2 * (1 + 1j)
+    layout = centres_m[seen]
+    spread = layout - layout.mean() if len(seen) else layout
+    power = float((np.abs(spread) ** 2).sum())
+    if len(seen) < 2 or power <= 0:
+        return None
+    scale = complex(np.conj(spread) @ at) / power
+    return (scale, complex(at.mean() - scale * layout.mean()), len(seen)) if abs(scale) > 0 else None

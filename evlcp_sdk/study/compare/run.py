@@ -191,7 +191,7 @@ def _bound_of(links: Mapping[str, Link]) -> _Bound | None:
         return None
     (link,) = links.values()
     try:
-        return _Bound(frame_bound(link.camera, link.bar, link.codebook))
+        return _Bound(frame_bound(link))
     except ConfigError:
         return None
 

@@ -13,7 +13,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedRing
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.study.bound import cramer_rao_sigma_m
+from evlcp_sdk.study.bound import bar_bound
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
 
 LINK = load_link()
@@ -706,9 +706,7 @@ def test_the_fit_reaches_the_cramer_rao_bound() -> None:
     for seed in range(80):
         distance_m, symbols = noisy_fit(55.0, noise, seed)
         errors.append(distance_m - 55)
-        bounds.append(
-            cramer_rao_sigma_m(LINK.camera, LINK.bar, LINK.codebook, 55.0, symbols, blur_px=0.45, noise=noise)
-        )
+        bounds.append(bar_bound(LINK, 55.0, symbols, blur_px=0.45, noise=noise).distance_m)
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(bounds)))
     # The error of 80 draws is known to 8 %: three of these.
     assert 0.76 < ratio < 1.24

@@ -1,14 +1,16 @@
 """The Cramer-Rao bound: its laws, and its statistics from frames that follow the model."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scipy.stats import norm
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout, LedGrid
-from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.study.bound import cramer_rao_sigma_m, frame_bound, lean_sigma_deg
+from evlcp_sdk.study.bound import bar_bound, frame_bound
+from evlcp_sdk.testing import ideal_view
+from evlcp_sdk.testing.trees import mapped
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 LINK = load_link()
@@ -17,7 +19,7 @@ K, COLUMNS, FULL = 16, 4, 300.0
 
 def bound(**how: float) -> float:
     given = {"distance_m": 50.0, "blur_px": 0.45, "noise": 0.3} | how
-    return cramer_rao_sigma_m(LINK.camera, LINK.bar, LINK.codebook, symbols=np.arange(K), **given)
+    return bar_bound(LINK, symbols=np.arange(K), **given).distance_m
 
 
 def test_the_bound_follows_noise_and_distance() -> None:
@@ -48,7 +50,7 @@ def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
 
 def lean_bound(**how: float) -> float:
     given = {"distance_m": 50.0, "blur_px": 0.45, "noise": 0.3} | how
-    return lean_sigma_deg(LINK.camera, LINK.bar, LINK.codebook, symbols=np.arange(K), **given)
+    return bar_bound(LINK, symbols=np.arange(K), **given).lean_deg
 
 
 def test_the_bound_of_the_lean_follows_noise_and_distance() -> None:
@@ -140,7 +142,7 @@ def view_of(
 @pytest.mark.parametrize("blur_px", [0.45, 0.6])
 def test_statistics_come_from_the_frames(distance_m: float, blur_px: float) -> None:
     noise, rng = 0.1, np.random.default_rng(0)
-    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook, full_events=FULL)
+    measure = frame_bound(LINK, full_events=FULL)
     errors, sigmas, wanted = [], [], []
     for _ in range(60):
         view = view_of(distance_m, noise, rng, blur_px=blur_px)
@@ -148,8 +150,7 @@ def test_statistics_come_from_the_frames(distance_m: float, blur_px: float) -> N
         errors.append(found.distance_m - distance_m)
         sigmas.append(found.sigma_m)
         given = {"blur_px": blur_px, "noise": noise, "columns": COLUMNS, "gain": 0.5}
-        where = (LINK.camera, LINK.bar, LINK.codebook, distance_m, view.soft.symbols)
-        wanted.append(cramer_rao_sigma_m(*where, **given))
+        wanted.append(bar_bound(LINK, distance_m, view.soft.symbols, **given).distance_m)
     assert np.mean(sigmas) == pytest.approx(np.mean(wanted), rel=0.03)
     # 60 errors tell a spread to 9 %: three of these.
     assert np.std(errors) == pytest.approx(np.mean(wanted), rel=0.27)
@@ -160,14 +161,13 @@ def test_statistics_come_from_the_frames(distance_m: float, blur_px: float) -> N
 )
 def test_what_says_nothing_of_the_boundaries_is_no_noise_of_theirs(how: dict[str, float]) -> None:
     noise, rng = 0.1, np.random.default_rng(3)
-    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook, full_events=FULL)
+    measure = frame_bound(LINK, full_events=FULL)
     sigmas, wanted = [], []
     for _ in range(40):
         view = view_of(60.0, noise, rng, **how)
         sigmas.append(measure(view).sigma_m)
         given = {"blur_px": 0.45, "noise": noise, "columns": COLUMNS, "gain": 0.5}
-        where = (LINK.camera, LINK.bar, LINK.codebook, 60.0, view.soft.symbols)
-        wanted.append(cramer_rao_sigma_m(*where, **given))
+        wanted.append(bar_bound(LINK, 60.0, view.soft.symbols, **given).distance_m)
     assert np.mean(sigmas) == pytest.approx(np.mean(wanted), rel=0.05)
 
 
@@ -182,7 +182,7 @@ def test_boundaries_between_pixels_that_are_sharp_say_nothing() -> None:
 
 @pytest.mark.parametrize("how", [{"upside_down": True}, {"across": True}, {"dark": (5,)}], ids=str)
 def test_any_way_that_a_bar_lies(how: dict[str, bool]) -> None:
-    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook, full_events=FULL)
+    measure = frame_bound(LINK, full_events=FULL)
     plain = measure(view_of(50.0, 0.1, np.random.default_rng(1)))
     found = measure(view_of(50.0, 0.1, np.random.default_rng(1), **how))
     assert found.distance_m == pytest.approx(50, abs=4 * plain.sigma_m)
@@ -191,7 +191,7 @@ def test_any_way_that_a_bar_lies(how: dict[str, bool]) -> None:
 
 
 def test_frames_that_show_no_boundary_have_no_bound() -> None:
-    measure = frame_bound(LINK.camera, LINK.bar, LINK.codebook)
+    measure = frame_bound(LINK)
     rng = np.random.default_rng(2)
     assert np.isnan(measure(view_of(50.0, 0.1, rng, dark=tuple(range(0, 16, 2)))).sigma_m)
     view = view_of(50.0, 0.1, rng)
@@ -200,9 +200,13 @@ def test_frames_that_show_no_boundary_have_no_bound() -> None:
 
 
 def test_panels_have_that_of_the_plane_and_one_cluster_none() -> None:
-    panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
-    frame_bound(CameraModel(), panel, LINK.codebook)
+    panel = load_link(
+        overrides=["bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4"]
+    )
     with pytest.raises(ConfigError, match="layout_bound takes any"):
-        cramer_rao_sigma_m(CameraModel(), panel, LINK.codebook, 50.0, range(16), blur_px=0.4, noise=0.1)
+        bar_bound(panel, 50.0, range(16), blur_px=0.4, noise=0.1)
+    nothing = ideal_view(panel.codebook, np.zeros(16, np.int64))
+    none = mapped(nothing.presence, np.zeros_like)
+    assert np.isnan(frame_bound(panel)(replace(nothing, presence=none)).distance_m)
     with pytest.raises(ConfigError, match="needs two clusters"):
-        frame_bound(CameraModel(), BarLayout(LedGrid(rows=6)), LINK.codebook)
+        frame_bound(load_link(overrides=["bar.rows=6"]))

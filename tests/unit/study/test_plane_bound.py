@@ -8,14 +8,12 @@ from scipy.optimize import least_squares
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing, LedTable
-from evlcp_sdk.study.bound import cramer_rao_sigma_m, lean_sigma_deg
-from evlcp_sdk.study.plane_bound import _Image, layout_bound, plane_frame_bound
-from evlcp_sdk.testing import ideal_view
+from evlcp_sdk.scene.bar import BarLayout, LedTable
+from evlcp_sdk.study.bound import _Image, bar_bound, frame_bound, layout_bound
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
-RING = load_link(overrides=["bar.shape=ring", "bar.leds=12", "bar.radius_m=0.25"])
-SMALL = BarLayout(LedRing(leds=12, radius_m=0.25, led_m=0.001))
+RING_BAR = ["bar.shape=ring", "bar.leds=12", "bar.radius_m=0.25"]
+RING, SMALL = load_link(overrides=RING_BAR), load_link(overrides=[*RING_BAR, "bar.led_m=0.001"])
 FOCAL_PX = RING.camera.focal_px
 
 # Light far below the background's, so that values follow it in proportion, and LEDs far smaller than the
@@ -34,9 +32,7 @@ def one_led_information(side_px: float, gain: float = 0.8) -> float:
 def test_a_ring_of_faint_leds_has_the_closed_form(distance_m: float) -> None:
     px_per_m = FOCAL_PX / distance_m
     each = one_led_information(0.001 * px_per_m)
-    found = layout_bound(
-        RING.camera, SMALL, RING.codebook, distance_m, range(12), blur_px=BLUR_PX, noise=NOISE, dark=FAINT
-    )
+    found = layout_bound(SMALL, distance_m, range(12), blur_px=BLUR_PX, noise=NOISE, dark=FAINT)
     radius_px, radius_m = 0.25 * px_per_m, 0.25
     together = math.sqrt(12 * each)
     assert found.x_px == pytest.approx(1 / together, rel=0.02)
@@ -53,14 +49,10 @@ def test_a_ring_of_faint_leds_has_the_closed_form(distance_m: float) -> None:
 def test_a_bar_has_nearly_the_bound_of_its_boundaries() -> None:
     # This one knows the outer edges, too, and that boundaries are LEDs beside each other.
     link = load_link()
-    scene = link.camera, link.bar, link.codebook, 50.0, range(16)
-    found = layout_bound(*scene, blur_px=0.45, noise=0.3)
-    assert found.distance_m == pytest.approx(
-        cramer_rao_sigma_m(*scene, blur_px=0.45, noise=0.3, columns=2), rel=0.1
-    )
-    assert found.lean_deg == pytest.approx(
-        lean_sigma_deg(*scene, blur_px=0.45, noise=0.3, columns=2), rel=0.2
-    )
+    found = layout_bound(link, 50.0, range(16), blur_px=0.45, noise=0.3)
+    wanted = bar_bound(link, 50.0, range(16), blur_px=0.45, noise=0.3, columns=2)
+    assert found.distance_m == pytest.approx(wanted.distance_m, rel=0.1)
+    assert found.lean_deg == pytest.approx(wanted.lean_deg, rel=0.2)
     assert math.isinf(found.swing_deg)
 
 
@@ -88,10 +80,7 @@ def test_a_fit_of_drawn_images_scatters_as_the_bound_says() -> None:
 
 
 def test_what_nothing_says_is_infinite() -> None:
-    one = layout_bound(
-        RING.camera, BarLayout(LedTable()), load_link(overrides=["bar.shape=table"]).codebook, 50.0, [3],
-        blur_px=0.45, noise=0.3,
-    )  # fmt: skip
+    one = layout_bound(load_link(overrides=["bar.shape=table"]), 50.0, [3], blur_px=0.45, noise=0.3)
     assert one.x_px == pytest.approx(one.y_px)
     assert one.x_px < 0.2
     assert one.distance_m > 1000
@@ -104,7 +93,7 @@ def test_quantities_are_positive(name: str) -> None:
     given = {"distance_m": 50.0, "blur_px": 0.4, "noise": 0.1, name: 0.0}
     distance_m = given.pop("distance_m")
     with pytest.raises(ConfigError, match=f"{name} = 0"):
-        layout_bound(RING.camera, RING.bar, RING.codebook, distance_m, range(12), **given)
+        layout_bound(RING, distance_m, range(12), **given)
 
 
 def view_of(layout: BarLayout, distance_m: float, noise: float, seed: int) -> FrameView:
@@ -132,10 +121,10 @@ def view_of(layout: BarLayout, distance_m: float, noise: float, seed: int) -> Fr
 
 
 def test_the_bound_of_a_frame_is_that_of_its_image() -> None:
-    measure = plane_frame_bound(RING.camera, RING.bar, RING.codebook, full_events=300.0)
+    measure = frame_bound(RING, full_events=300.0)
     found = measure(view_of(RING.bar, 90.0, 0.1, seed=1))
     want = layout_bound(
-        RING.camera, RING.bar, RING.codebook, 90.0, range(12),
+        RING, 90.0, range(12),
         blur_px=0.5, noise=0.1, gain=0.7, dark=0.1, shift_px=(0.3, -0.2), turn_deg=math.degrees(0.05),
     )  # fmt: skip
     assert found.pairs == 12
@@ -145,19 +134,6 @@ def test_the_bound_of_a_frame_is_that_of_its_image() -> None:
 
 def test_a_frame_without_light_has_no_bound() -> None:
     view = view_of(RING.bar, 90.0, 0.1, seed=1)
-    measure = plane_frame_bound(RING.camera, RING.bar, RING.codebook)
+    measure = frame_bound(RING)
     dark = FrameView(np.zeros_like(view.sums), view.offset_px, view.presence, view.soft)
     assert math.isnan(measure(dark).sigma_m)
-    book = load_link().codebook
-    nothing = ideal_view(book, np.zeros(16, np.int64))
-    none = PresenceMap(
-        *(np.zeros_like(a) if isinstance(a, np.ndarray) else a
-          for a in (nothing.presence.probability, 2, nothing.presence.selected, nothing.presence.pixels))
-    )  # fmt: skip
-    panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
-    found = plane_frame_bound(RING.camera, panel, book)(
-        FrameView(nothing.sums, nothing.offset_px, none, nothing.soft)
-    )
-    assert math.isnan(found.distance_m)
-    with pytest.raises(ConfigError, match="two clusters"):
-        plane_frame_bound(RING.camera, BarLayout(LedRing(leds=3, cluster_leds=3)), book)
