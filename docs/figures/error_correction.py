@@ -27,7 +27,6 @@ from scipy.special import ndtri
 
 from evlcp_sdk.results.colours import TRANSMITTER_COLOURS
 from evlcp_sdk.results.figures import plain, titled
-from evlcp_sdk.study.intervals import proportion_interval
 
 AIR_S = 346 * 100e-6
 """A packet of the default profile on air."""
@@ -67,7 +66,7 @@ def frame_errors(code: Any, error_rate: float, soft: bool, blocks: int, enough: 
 
 
 def share(lost: int, done: int) -> str:
-    low, high = proportion_interval(lost, done)
+    low, high = stats.binomtest(lost, done).proportion_ci()
     return f"{lost / done:.1e} ({low:.1e} to {high:.1e})" if lost else f"0 (to {high:.1e})"
 
 
@@ -253,7 +252,7 @@ def draw(found: dict[tuple[int, bool], list[tuple[float, int, int]]], path: Path
             points = [p for p in found[n, soft] if p[1]]
             x = [p[0] for p in points]
             y = np.array([lost / done for _, lost, done in points])
-            bars = np.array([proportion_interval(lost, done) for _, lost, done in points]).T
+            bars = np.array([stats.binomtest(lost, done).proportion_ci() for _, lost, done in points]).T
             style = {"ms": 5, "lw": 1.2, "capsize": 2, "color": colour, "label": f"n = {n}"}
             ax.errorbar(x, y, np.abs(bars - y), fmt=f"{marker}-", **style)
         ax.set(yscale="log", xlabel="bit error rate of hard decisions")

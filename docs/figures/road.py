@@ -56,7 +56,7 @@ class Step:
     def of(cls, statistics: Statistics) -> "Step":
         """The figures of a series."""
         total: Tally = statistics.total()
-        far = sum((start + 5) * tally.frames_sent for start, tally in statistics.segments)
+        far = sum((start + 5) * tally.frames_sent for start, tally in statistics.segments.items())
         return cls(
             total.frames_found / max(total.frames_sent, 1),
             total.ber,

@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from scipy.special import j0, j1
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest, chi2, norm
 
 from evlcp_sdk.io import read_events
 from evlcp_sdk.rx.receiver import Receiver
@@ -35,7 +35,6 @@ from evlcp_sdk.sim import (
 )
 from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.study.frames import frames_of
-from evlcp_sdk.study.intervals import rms_interval
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Events
@@ -213,7 +212,8 @@ def compare() -> None:
             ("simulated", Events.concat(list(simulate(made))), truth_of(made)),
         ):
             score = receive([events], truth_)
-            low, high = rms_interval(score.rmse_m, score.ranged)
+            tails = chi2.ppf([0.975, 0.025], score.ranged)
+            low, high = score.rmse_m * np.sqrt(score.ranged / tails)
             print(
                 f"| {name} | {len(events) / made.duration_s / 1e6:.2f} | {events.p.mean():.3f}"
                 f" | {score.frames_found}/{score.frames_sent} | {score.bit_errors}"

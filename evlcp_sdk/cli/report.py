@@ -122,7 +122,7 @@ def _series_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
     def shown(figure: Figure, form: str) -> str:
         return f"{figure.value:{form}} {figure.interval(form)}".rstrip() if figure.count else "-"
 
-    tallies = [t for one in summary.series for _, t in one.statistics.segments]
+    tallies = [t for one in summary.series for t in one.statistics.segments.values()]
     messages = any(t.messages_sent for t in tallies)
     positions = any(t.fixes or t.fixes_refused for t in tallies)
     rows = []

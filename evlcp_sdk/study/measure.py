@@ -96,9 +96,8 @@ def statistics_of(
         for sent, pairs in zip(matched.bars, matched.pairs, strict=True)
         for tally in bar_tallies(sent, pairs)
     ]
-    blind = without_truth(frames, packets)
     return replace(
-        blind,
+        without_truth(frames, packets),
         tasks=1,
         events=events,
         duration_us=round(truth.duration_us),

@@ -113,7 +113,7 @@ def _segments(bar: Statistics) -> dict[str, dict[str, Any]]:
             "rmse_m": _rounded(tally.rmse_m, 4),
             "bias_m": _rounded(tally.bias_m, 4),
         }
-        for start, tally in bar.segments
+        for start, tally in bar.segments.items()
         if tally.ranged and 0 <= start < _FARTHEST_M
     }
 

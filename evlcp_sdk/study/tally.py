@@ -1,10 +1,9 @@
 """Statistics that add: what was counted of decoded frames, exact in any order of summation."""
 
 import math
-import re
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Annotated, Any, Self
 
 from pydantic import Field
@@ -47,7 +46,7 @@ _MOST = 10**40
 
 Count = Annotated[int, Field(ge=0, lt=2**53)]
 Sum = Annotated[int, Field(ge=0, le=_MOST)]
-Bin = tuple[Annotated[int, Field(ge=-_FARTHEST_POSITION_BIN, le=_FARTHEST_POSITION_BIN)], Count]
+Histogram = dict[Annotated[int, Field(ge=-_FARTHEST_POSITION_BIN, le=_FARTHEST_POSITION_BIN)], Count]
 _LARGEST = ("worst_nm",)
 _MOST_SIGMAS = 1e6
 """So many sigmas are wrong beyond all measure; an error in sigmas of 0 has no number."""
@@ -117,7 +116,7 @@ class Tally:
         track_nees_micro: Sum of these errors squared in their own sigmas, millionths.
         smoothed_squares_nm2: The same as smoothed, nm^2.
         smoothed_nees_micro: The same as smoothed, millionths.
-        histogram: (bin, count) in order of the bin; bin b holds errors from `b * BIN_M` up to the next, the
+        histogram: Bin to count, in order of the bin; bin b holds errors from `b * BIN_M` up to the next, the
             outermost ones also everything beyond.
         position_histogram: The same of the positions' errors, in bins of `POSITION_BIN_M` from 0.
     """
@@ -158,8 +157,8 @@ class Tally:
     track_nees_micro: Sum = 0
     smoothed_squares_nm2: Sum = 0
     smoothed_nees_micro: Sum = 0
-    histogram: tuple[Bin, ...] = ()
-    position_histogram: tuple[Bin, ...] = ()
+    histogram: Histogram = field(default_factory=dict)
+    position_histogram: Histogram = field(default_factory=dict)
 
     @classmethod
     def distance(cls, error_m: float, sigma_m: float = math.nan) -> Self:
@@ -170,7 +169,7 @@ class Tally:
             sigma_m: The standard deviation that comes with it, m; NaN for none.
 
         >>> Tally.distance(-0.05).histogram
-        ((-3, 1),)
+        {-3: 1}
         """
         error_nm = in_nm(error_m)
         bin = max(-_FARTHEST_BIN, min(_FARTHEST_BIN, error_nm // in_nm(BIN_M)))
@@ -182,7 +181,7 @@ class Tally:
             worst_nm=abs(error_nm),
             with_sigma=int(not math.isnan(sigma_m)),
             nees_micro=0 if math.isnan(sigma_m) else _nees_micro(_sigmas(error_m, sigma_m) ** 2),
-            histogram=((bin, 1),),
+            histogram={bin: 1},
         )
 
     @classmethod
@@ -205,7 +204,7 @@ class Tally:
             beyond: Its error is beyond one of these.
 
         >>> Tally.fix(0.012, 2.5).position_histogram
-        ((2, 1),)
+        {2: 1}
         """
         error_nm = in_nm(error_m)
         bin = min(_FARTHEST_POSITION_BIN, error_nm // in_nm(POSITION_BIN_M))
@@ -218,7 +217,7 @@ class Tally:
             fixes_uncovered=int(nees > SILENT_NEES and (beyond or not protected)),
             position_squares_nm2=error_nm**2,
             position_nees_micro=_nees_micro(nees),
-            position_histogram=((bin, 1),),
+            position_histogram={bin: 1},
         )
 
     @classmethod
@@ -235,17 +234,15 @@ class Tally:
     @classmethod
     def together(cls, tallies: Iterable["Tally"]) -> "Tally":
         """All of them together."""
-        columns: dict[str, list[Any]] = {f.name: [] for f in fields(cls)}
-        for tally in tallies:
-            for name, column in columns.items():
-                column.append(getattr(tally, name))
+        tallies = list(tallies)
         numbers: dict[str, Any] = {}
-        for name, column in columns.items():
+        for name in (f.name for f in fields(cls)):
+            column = [getattr(tally, name) for tally in tallies]
             if name in _HISTOGRAMS:
                 bins: Counter[int] = Counter()
                 for histogram in column:
-                    bins.update(dict(histogram))
-                numbers[name] = tuple(sorted(bins.items()))
+                    bins.update(histogram)
+                numbers[name] = dict(sorted(bins.items()))
             else:
                 numbers[name] = max(column, default=0) if name in _LARGEST else sum(column)
         return cls(**numbers)
@@ -299,6 +296,16 @@ class Tally:
         return _ratio(self.gross, self.ranged)
 
     @property
+    def messages_lost(self) -> int:
+        """Messages that were sent and not read."""
+        return self.messages_sent - self.messages_found
+
+    @property
+    def messages_read(self) -> int:
+        """Messages that were read, right or wrong."""
+        return self.messages_found + self.messages_wrong
+
+    @property
     def position_rmse_m(self) -> float:
         """Root mean square of the positions' errors in space, m; NaN without any."""
         return _rms_m(self.position_squares_nm2, self.fixes)
@@ -340,7 +347,7 @@ class Tally:
         0.025
         """
         seen = 0
-        for bin, count in self.position_histogram:
+        for bin, count in self.position_histogram.items():
             seen += count
             if seen >= share * self.fixes:
                 return (bin + 1) * POSITION_BIN_M
@@ -377,9 +384,9 @@ class Statistics:
         unmatched: Those of them that match no sent one.
         stated: Distances that come with a standard deviation, of matched frames and others.
         sigma_squares_nm2: Sum of the squares of these standard deviations, nm^2.
-        segments: (start of the segment in m, tally), in order.
+        segments: Start of the segment in m to its tally, in order.
 
-    >>> one = Statistics(rows=3, segments=((30, Tally(bits=96, bit_errors=2)),))
+    >>> one = Statistics(rows=3, segments={30: Tally(bits=96, bit_errors=2)})
     >>> (one + one).total().bit_errors
     4
     """
@@ -393,7 +400,7 @@ class Statistics:
     unmatched: Count = 0
     stated: Count = 0
     sigma_squares_nm2: Sum = 0
-    segments: tuple[tuple[int, Tally], ...] = ()
+    segments: dict[int, Tally] = field(default_factory=dict)
 
     @classmethod
     def of(cls, tallies: Iterable[tuple[int, Tally]], **counts: int) -> Self:
@@ -403,15 +410,19 @@ class Statistics:
             tallies: Each with the start of its segment, m.
             counts: The other fields.
         """
-        return cls(**counts, segments=_by_segment(tallies))
+        found: dict[int, list[Tally]] = {}
+        for start, tally in tallies:
+            found.setdefault(start, []).append(tally)
+        return cls(**counts, segments={start: Tally.together(found[start]) for start in sorted(found)})
 
     def __add__(self, other: "Statistics") -> "Statistics":
-        counts = {name: getattr(self, name) + getattr(other, name) for name in _COUNTS}
-        return Statistics.of([*self.segments, *other.segments], **counts)
+        names = (f.name for f in fields(self) if f.name != "segments")
+        counts = {name: getattr(self, name) + getattr(other, name) for name in names}
+        return Statistics.of([*self.segments.items(), *other.segments.items()], **counts)
 
     def total(self) -> Tally:
         """The tally of all segments."""
-        return Tally.together(tally for _, tally in self.segments)
+        return Tally.together(self.segments.values())
 
     @property
     def sigma_m(self) -> float:
@@ -420,32 +431,21 @@ class Statistics:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as for JSON."""
-        segments = {
-            str(start): {f.name: getattr(tally, f.name) for f in fields(tally) if f.name not in _HISTOGRAMS}
-            | {name: {str(b): n for b, n in getattr(tally, name)} for name in _HISTOGRAMS}
-            for start, tally in self.segments
-        }
-        return {name: getattr(self, name) for name in _COUNTS} | {"segments": segments}
+        return asdict(self)
 
     @classmethod
     def from_dict(cls, table: Mapping[str, Any]) -> Self:
-        """What `to_dict` gave.
+        """What `to_dict` gave, also as JSON gives it back.
 
         Raises:
             ConfigError: It is something else.
         """
-        kept = build(_Kept, table)
-        tallies = []
-        for start, values in kept.segments.items():
-            if values.keys() != _TALLIED:
-                raise ConfigError(f"segments.{start:.20}: expected the keys of a tally")
-            bins = {name: _pairs(values[name]) for name in _HISTOGRAMS}
-            tally = build(Tally, {**values, **bins})
+        found = build(cls, table)
+        for start, tally in found.segments.items():
             for part, whole in _PARTS:
                 if getattr(tally, part) > getattr(tally, whole):
                     raise ConfigError(f"segments.{start}.{part}: more than {whole}")
-            tallies.append((_whole(start), tally))
-        return cls.of(tallies, **{name: getattr(kept, name) for name in _COUNTS})
+        return replace(found, segments=dict(sorted(found.segments.items())))
 
 
 _PARTS = (
@@ -454,43 +454,3 @@ _PARTS = (
     *(("fixes_beyond", "fixes_protected"), ("fixes_silent", "fixes"), ("fixes_uncovered", "fixes_silent")),
 )
 """Counts, and what each is a part of."""
-
-_TALLIED = {f.name for f in fields(Tally)}
-
-
-@dataclass(frozen=True)
-class _Kept:
-    """Statistics as JSON values have them."""
-
-    tasks: Count
-    events: Count
-    duration_us: Count
-    packets: Count
-    rows: Count
-    echoes: Count
-    unmatched: Count
-    stated: Count
-    sigma_squares_nm2: Sum
-    segments: dict[str, dict[str, Any]]
-
-
-def _pairs(bins: Any) -> list[list[Any]]:
-    if not isinstance(bins, dict):
-        raise ConfigError("expected a table of bins")
-    return sorted([_whole(bin), number] for bin, number in bins.items())
-
-
-def _whole(text: str) -> int:
-    if not re.fullmatch(r"-?[0-9]{1,6}", text):
-        raise ConfigError(f"{text[:20]!r}: expected a whole number")
-    return int(text)
-
-
-_COUNTS = tuple(f.name for f in fields(Statistics) if f.name != "segments")
-
-
-def _by_segment(tallies: Iterable[tuple[int, Tally]]) -> tuple[tuple[int, Tally], ...]:
-    found: dict[int, list[Tally]] = {}
-    for start, tally in tallies:
-        found.setdefault(start, []).append(tally)
-    return tuple((start, Tally.together(found[start])) for start in sorted(found))

@@ -247,7 +247,7 @@ def _bins(series: Series) -> tuple[Dot, ...]:
     tally = series.statistics.total()
     if not tally.ranged:
         return ()
-    counts = dict(tally.histogram)
+    counts = tally.histogram
     dots = []
     for bin in range(min(counts) - 1, max(counts) + 2):
         low, share = bin * BIN_M, counts.get(bin, 0) / tally.ranged

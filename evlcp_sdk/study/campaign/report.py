@@ -54,8 +54,8 @@ def page(summary: Summary) -> str:
 
 def title_of(summary: Summary) -> str:
     """What was measured, at which distances, and the campaign's name."""
-    tallies = [tally for one in summary.series for _, tally in one.statistics.segments]
-    begins = [begin for one in summary.series for begin, _ in one.statistics.segments]
+    tallies = [tally for one in summary.series for tally in one.statistics.segments.values()]
+    begins = [begin for one in summary.series for begin in one.statistics.segments]
     if not begins:
         return f"{summary.name}: nothing measured yet"
     what = ["bit errors", "distance errors"]
@@ -374,8 +374,10 @@ def _positions_table(summary: Summary) -> Markup:
 
 
 def _figures_table(summary: Summary) -> Markup:
-    messages = any(t.messages_sent for one in summary.series for _, t in one.statistics.segments)
-    positions = any(t.fixes or t.fixes_refused for one in summary.series for _, t in one.statistics.segments)
+    messages = any(t.messages_sent for one in summary.series for t in one.statistics.segments.values())
+    positions = any(
+        t.fixes or t.fixes_refused for one in summary.series for t in one.statistics.segments.values()
+    )
     rows = []
     for one in summary.series:
         for begin, recordings in one.segments:

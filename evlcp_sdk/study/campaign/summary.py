@@ -47,7 +47,7 @@ class Series:
     @cached_property
     def segments(self) -> tuple[tuple[int, tuple[Tally, ...]], ...]:
         """(Start of the segment in m, the tally of each recording), in order."""
-        return tuple((at, self.between(at, at + SEGMENT_M)) for at, _ in self.statistics.segments)
+        return tuple((at, self.between(at, at + SEGMENT_M)) for at in self.statistics.segments)
 
     @property
     def name(self) -> str:
@@ -86,7 +86,8 @@ class Series:
     def between(self, from_m: int, to_m: int) -> tuple[Tally, ...]:
         """The tally of each recording, of the segments that lie between two distances."""
         return tuple(
-            Tally.together(t for at, t in one.segments if from_m <= at < to_m) for one in self.recordings
+            Tally.together(t for at, t in one.segments.items() if from_m <= at < to_m)
+            for one in self.recordings
         )
 
 

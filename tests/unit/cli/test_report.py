@@ -68,7 +68,7 @@ def test_points_that_differ_in_distance_only_are_one_series(summary: Summary) ->
         f"30 km/h, {TWO}",
     ]
     for series in summary.series:
-        assert [at for at, _ in series.statistics.segments] == [30, 40, 50, 60, 70]
+        assert [*series.statistics.segments] == [30, 40, 50, 60, 70]
         assert series.statistics.tasks == 10
     assert [s.clusters for s in summary.series] == [16, 2, 16, 2]
     assert [s.speed_kmh for s in summary.series] == [20, 20, 30, 30]
@@ -107,7 +107,7 @@ def test_a_seed_is_one_recording_over_all_distances(summary: Summary) -> None:
         assert len(series.recordings) == 2
         assert sum(series.recordings, Statistics()) == series.statistics
         for at, recordings in series.segments:
-            assert Tally.together(recordings) == dict(series.statistics.segments)[at]
+            assert Tally.together(recordings) == series.statistics.segments[at]
             assert measure(recordings, "rmse_m").recordings == 2
 
 

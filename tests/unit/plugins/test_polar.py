@@ -16,7 +16,6 @@ from scipy import integrate, optimize, stats
 from evlcp_sdk.air.crc import CRC24C, crc24
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Code
-from evlcp_sdk.study.intervals import proportion_interval
 
 Bits = NDArray[np.uint8]
 
@@ -445,7 +444,7 @@ def test_random_words_are_taken_no_more_often_than_stated() -> None:
         llr = rng.normal(size=48).astype(np.float32)
         limit = _kernels.discrepancy_limit(np.abs(llr).astype(float), np.log(0.01 / 256))
         near += bool((discrepancy(llr, codewords) <= limit).any())
-    low, high = proportion_interval(near, trials)
+    low, high = stats.binomtest(near, trials).proportion_ci()
     assert high > 0.0005
     assert low < 0.01
     assert near / trials < 0.01
@@ -510,7 +509,7 @@ def test_frame_errors_between_bounds() -> None:
     code = Polar(undetected=0.5, reserve=0).compile(256)
     bit_error_rate = 0.115
     sigma = -1 / stats.norm.ppf(bit_error_rate)
-    low, high = proportion_interval(lost(code, 1500, bit_error_rate, hard=False), 1500)
+    low, high = stats.binomtest(lost(code, 1500, bit_error_rate, hard=False), 1500).proportion_ci()
     assert converse(256, 104, sigma) < high
     assert low < converse(256, 104, sigma * 10 ** (1.5 / 20))
 

@@ -80,7 +80,7 @@ def test_each_frame_is_held_beside_the_sent_one() -> None:
     assert (found.tasks, found.events, found.duration_us, found.unmatched) == (1, 123, 20_000, 2)
     assert (found.rows, found.packets, found.stated) == (5, 4, 4)
     assert found.sigma_m == pytest.approx(0.1)
-    (near, at_30), (far, at_40) = found.segments
+    (near, at_30), (far, at_40) = found.segments.items()
     assert (near, far) == (30, 40)
     # Frames begin at 0, 3.2, 9 and 12.2 ms; the bar is 40 m away at 10 ms.
     assert (at_40.frames_sent, at_40.frames_found, at_40.bits, at_40.bit_errors) == (3, 3, 36, 2)
@@ -121,7 +121,7 @@ def test_figures_are_the_scorers(name: str, tmp_path: Path, evlcp: Any) -> None:
         (total.ranged, "ranged"),
     ):
         assert mine == sum(bar[theirs] for bar in bars)
-    for begin, tally in ours.segments:
+    for begin, tally in ours.segments.items():
         key = f"{begin}-{begin + 10}m"
         segments = [bar["segments"][key] for bar in bars if key in bar["segments"]]
         if len(segments) == 1:
