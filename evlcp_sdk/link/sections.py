@@ -35,18 +35,6 @@ class MessageSpec:
         int,
         Field(ge=0, le=256, description="Undecoded blocks kept to be added to their repetitions; 0: none."),
     ] = 16
-    llr_power: Annotated[
-        float,
-        Field(
-            gt=0,
-            le=1,
-            description="Power that sizes of LLRs are raised to: decoders are surer than they are right.",
-        ),
-    ] = 0.5
-    max_llr: Annotated[
-        float,
-        Field(gt=0, le=100, description="Largest LLR after that; no bit is surer than the sync it hangs on."),
-    ] = 7.0
     trusted_keys: Annotated[
         tuple[TrustedKey, ...],
         Field(description="Public Ed25519 keys whose beacons are verified, and what each may sign."),
@@ -75,22 +63,12 @@ class RegionSpec:
         int,
         Field(ge=2, le=40, description="Score at which a pixel is a candidate: 2 for each run of one chip."),
     ] = 8
-    min_rises: Annotated[
-        int, Field(ge=1, description="Rises of candidate pixels in a step that a new region needs.")
-    ] = 20
-    margin_px: Annotated[
-        int, Field(ge=2, le=64, description="Seam around a region: how far it may move in a step, and blur.")
-    ] = 5
     merge_px: Annotated[
         int, Field(ge=1, le=256, description="Gap below which two blinking areas are one region.")
     ] = 11
     fade_us: Annotated[
         int, Field(ge=1000, description="Time without blinking after which a region is released.")
     ] = 50_000
-    min_clusters_share: Annotated[
-        float,
-        Field(ge=0, le=1, description="Share of the clusters that must be in their place in a frame."),
-    ] = 0.5
 
 
 @dataclass(frozen=True)

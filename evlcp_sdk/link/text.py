@@ -12,6 +12,7 @@ from evlcp_sdk.specs import spec_model, toml_value
 __all__ = ["to_toml"]
 
 _UNITS = {
+    "deg_s": "deg/s",
     "us": "us",
     "ms": "ms",
     "s": "s",
@@ -45,6 +46,10 @@ def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
         schema = spec_model(cls).model_json_schema()["properties"]
         yield f"# {_first_line(cls)}"
         yield f"[{section}]"
+        if section == "camera_sigma" and thing == cls():
+            yield f"# {', '.join(schema)}: by `evlcp calibrate`; default: exact"
+            yield ""
+            continue
         if "shape" in values:
             yield f'shape = "{values["shape"]}"  # or {", ".join(s for s in SHAPES if s != values["shape"])}'
         if section in ROLES:
@@ -59,7 +64,7 @@ def _toml_lines(link: Link, registry: Registry) -> Iterator[str]:
 
 
 def _comment(key: str, schema: Mapping[str, Any]) -> str:
-    unit = _UNITS.get(key.rpartition("_")[2], "") if "_" in key else ""
+    unit = next((unit for end, unit in _UNITS.items() if key.endswith(f"_{end}")), "")
     bounds = [
         f"{sign} {schema[name]}"
         for name, sign in (

@@ -26,6 +26,12 @@ else:
 
 __all__ = ["BACKFILL_STEPS", "SAME_PX", "Followed", "RegionFollower", "same_place"]
 
+MARGIN_PX = 5
+"""Seam around a region: how far it may move in a step, 1.5 px/ms and more, and how far it is blurred."""
+
+_LEAST_RISES = 20
+"""Rises of candidate pixels in a step that a new region needs: a cluster at 100 m has as many, noise few."""
+
 SAME_PX = 5.0
 """How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
 
@@ -341,7 +347,7 @@ class RegionFollower:
         """
         if len(boxes) < 2:
             return boxes
-        seam = self._spec.margin_px
+        seam = MARGIN_PX
         tight = [
             _grown(box, -seam) if one.size_px else None for box, one in zip(boxes, self.alive, strict=True)
         ]
@@ -443,7 +449,7 @@ class RegionFollower:
                 return 0.0
         followed.size_px = size_px
         # Where less of the bar was seen, or more than it, its place is not that of what was seen.
-        most_px = 2 * self._spec.margin_px if known is None else math.inf
+        most_px = 2 * MARGIN_PX if known is None else math.inf
         followed.positions = followed.positions.moved(
             followed.id,
             *off,
@@ -583,11 +589,11 @@ class RegionFollower:
             # What is not known yet may grow to either side.
             told = 0.0 if known is None else _told(n, int(inside.max()), int(total[-1]), len(rows))
             y_px = first_px + _likeliest(inside, told, expected_px - first_px)
-        elif known is not None and excess_px < -2 * self._spec.margin_px:
+        elif known is not None and excess_px < -2 * MARGIN_PX:
             # By its upper end, and by its lower one.
             ends_px = measured.y_px - excess_px / 2, measured.y_px + excess_px / 2
             y_px = min(ends_px, key=lambda end_px: abs(end_px - expected_px))
-            if abs(y_px - expected_px) > self._spec.margin_px:
+            if abs(y_px - expected_px) > MARGIN_PX:
                 y_px = followed.latest.y_px + off_px
         else:
             slack_px = abs(excess_px) / 2
@@ -606,7 +612,7 @@ class RegionFollower:
 
     def _reach(self, x_px: float, y_px: float, width_px: float, height_px: float) -> Box:
         """The box in which a region's events lie within the next step; an empty one off the sensor."""
-        m = self._spec.margin_px
+        m = MARGIN_PX
         half_w, half_h = width_px / 2 + m, height_px / 2 + m
         width, height = self._camera.width, self._camera.height
         left, top = int(x_px - half_w), int(y_px - half_h)
@@ -622,7 +628,7 @@ class RegionFollower:
         strips = None
         if followed.strips_px is not None:
             expected_px, _ = self._expected(followed, end_us - self._age_us)
-            strips = expected_px, float(self._spec.margin_px), followed.strips_px
+            strips = expected_px, float(MARGIN_PX), followed.strips_px
         return self._measure(followed.id, box, end_us, rows, width_px, strips)
 
     def _measure(
@@ -658,21 +664,21 @@ class RegionFollower:
         hits = self._hits
         merge = self._spec.merge_px
         for followed in self.alive:
-            if rises < self._spec.min_rises:
+            if rises < _LEAST_RISES:
                 break
             last = followed.positions.latest
             reach = self._reach(last.x_px, last.y_px, last.width_px, last.height_px)
             rises -= _cleared(hits, reach if followed.size_px else _grown(reach, merge))
             if followed.outgrown is not None and end_us > followed.outgrown[4]:
                 rises -= _cleared(hits, self._reach(*_outgrown(followed)))
-        if rises < self._spec.min_rises:
+        if rises < _LEAST_RISES:
             self._fresh = []
             if rises:
                 hits[:] = 0
             return
         lit = [self._lit(cells, end_us) for cells in self._areas(hits)]
         joined = _joined([box for box in lit if box is not None], merge)
-        boxes = [box for box in joined if _inside(hits, box).sum() >= self._spec.min_rises]
+        boxes = [box for box in joined if _inside(hits, box).sum() >= _LEAST_RISES]
         hits[:] = 0
         fresh, self._fresh = self._fresh, []
         for box in boxes:

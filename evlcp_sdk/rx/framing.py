@@ -12,7 +12,7 @@ from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detected import DetectedRegions
-from evlcp_sdk.rx.detection import SAME_PX, Followed, RegionFollower, same_place
+from evlcp_sdk.rx.detection import MARGIN_PX, SAME_PX, Followed, RegionFollower, same_place
 from evlcp_sdk.rx.echoes import EchoQueue, Sighting
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.limits import LIMITS, Limits
@@ -100,7 +100,6 @@ class PacketFraming:
         self._attitude_at = attitude_at
         self._packet = link.packet
         self._step_us = link.regions.step_us
-        self._seam_px = link.regions.margin_px
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
         self._clock = clock
         self._announcer = announcer
@@ -414,10 +413,10 @@ class PacketFraming:
             if off_px > 0 and not self._join(region, look.middle_us):
                 return None
             # Within half of the seam, motion in the frame is known as well as by its next look.
-            if off_px == 0 or (whole and off_px <= self._seam_px / 2):
+            if off_px == 0 or (whole and off_px <= MARGIN_PX / 2):
                 break
             self._regions.gather(region, due.start_us, due.read_us)
-        if most_px > self._seam_px / 2:
+        if most_px > MARGIN_PX / 2:
             self._regions.gather(region)
         if look is None:
             return None

@@ -22,6 +22,10 @@ from evlcp_sdk.values import Packet, ReceivedMessage, changed
 
 __all__ = ["MessageAssembler"]
 
+_LLR_POWER, _MOST_LLR = 0.5, 7.0
+"""Power that sizes of LLRs are raised to, as decoders are surer within a burst than they are right, and the
+largest after that: no bit is surer than the sync it hangs on, which is wrong once in a thousand."""
+
 _SAME_BLOCK_SIGMA = 6.0
 """Agreement of two packets' soft bits from which on they carry one block: by chance once in 1e9 pairs."""
 
@@ -204,7 +208,7 @@ class MessageAssembler:
         for frame in packet.frames:
             llr[frame.frame] = frame.soft.llr.ravel()
         known = np.nan_to_num(llr.ravel(), nan=0.0)
-        size = np.minimum(np.abs(known) ** self._spec.llr_power, self._spec.max_llr)
+        size = np.minimum(np.abs(known) ** _LLR_POWER, _MOST_LLR)
         return np.copysign(size, known).astype(np.float32)
 
     def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:

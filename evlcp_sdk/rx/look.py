@@ -12,7 +12,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.detection import Followed
+from evlcp_sdk.rx.detection import MARGIN_PX, Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
 from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed, plain
@@ -23,6 +23,9 @@ else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
 __all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
+
+_LEAST_CLUSTERS = 0.5
+"""Share of the clusters that must be in their place in a frame: fewer may be another bar's."""
 
 _EVEN = 0.01
 """Steps from cluster to cluster are a spacing where they are longer by rounding only."""
@@ -152,7 +155,7 @@ class Looker:
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
             presence = self._separate(heard)
             before = pilot.placement if pilot is not None else None
-            found = placements(presence, self._layout, before, self._spec.min_clusters_share)
+            found = placements(presence, self._layout, before, _LEAST_CLUSTERS)
             if not found:
                 return None, pilot
             presence = masked(presence, self._layout, found[0])
@@ -263,7 +266,7 @@ class Looker:
             return None
         places, right_px, _ = self._spots(look, look.placement)
         across = np.sort(places.real)
-        ends = np.flatnonzero(np.diff(across) > 2 * (right_px + self._spec.margin_px))
+        ends = np.flatnonzero(np.diff(across) > 2 * (right_px + MARGIN_PX))
         if not len(ends):
             return None
         first, last = across[[0, *(ends + 1)]], across[[*ends, len(across) - 1]]
@@ -293,7 +296,7 @@ class Looker:
 
     def _size(self, width_px: float, height_px: float) -> tuple[int, int]:
         """Of the image: a region's, its seam on both sides, made even."""
-        seam_px = 2 * self._spec.margin_px
+        seam_px = 2 * MARGIN_PX
         width_px, height_px = min(width_px, self._sensor_px[0]), min(height_px, self._sensor_px[1])
         # Twice an odd number: a bar of one or two columns stands in the middle of a cell of 2 px, not on the
         # edge of two, each of which would see half of it.

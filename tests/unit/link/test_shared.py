@@ -15,7 +15,7 @@ from evlcp_sdk.link.shared import differences
     ("table", "says"),
     [
         ({}, ()),
-        ({"decoding": {"id": "ml-soft"}, "camera": {"focal_mm": 50.0}, "regions": {"min_rises": 3}}, ()),
+        ({"decoding": {"id": "ml-soft"}, "camera": {"focal_mm": 50.0}, "regions": {"fade_us": 30_000}}, ()),
         ({"air": {"chip_rate_hz": 5000.0}}, ("air.chip_rate_hz: sent with 5000.0, received with 10000.0",)),
         (
             {"air": {"frames_per_packet": 20, "pilot_every": 4}},

@@ -243,7 +243,7 @@ def test_what_a_bar_has_left_is_no_region() -> None:
     x, y = (np.broadcast_to(v, t.shape).ravel()[order] for v in left)
     trail = Events.of(t.ravel()[order], x, y, np.ones(t.size))
     # As many candidates in a step as a region needs, time after time.
-    assert np.bincount((trail.t_us - 90_000) // 1400).min() > 5 * SPEC.min_rises
+    assert np.bincount((trail.t_us - 90_000) // 1400).min() > 5 * 20
     by_step = followed(merged(seen, trail), 150_000)
     assert {region.id for found in by_step.values() for region in found} == {0}
     assert not by_step[149_000]
