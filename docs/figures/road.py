@@ -222,7 +222,7 @@ def shown_scenes() -> list[tuple[str, Scene]]:
     """The third step of each condition, cut in the middle of what happens in it."""
     found: dict[str, list[tuple[str, Scene]]] = {}
     for case in plan_of(CAMPAIGN).scenes:
-        name = str(dict(case.labels)["variant"])
+        name = str(case.labels["variant"])
         found.setdefault(name.partition(": ")[0], []).append((name, case.value))
     scenes = []
     for steps in found.values():

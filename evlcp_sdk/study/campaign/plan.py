@@ -10,7 +10,8 @@ import itertools
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,21 +24,15 @@ from evlcp_sdk.study.tally import Statistics
 __all__ = [
     "Case",
     "Job",
-    "KeptCase",
-    "KeptPlan",
-    "KeptPoint",
     "Plan",
     "Point",
     "StopRule",
     "Task",
     "digest_of",
-    "kept_plan",
     "load_plan",
     "make_plan",
+    "plan_from_dict",
 ]
-
-Labels = tuple[tuple[str, Any], ...]
-"""What sets a case apart: (key, value) of everything that the campaign varies."""
 
 
 @dataclass(frozen=True)
@@ -68,14 +63,21 @@ class Case:
     """A scene or a link of the grid.
 
     Attributes:
-        labels: What sets it apart from the others.
-        value: What a worker needs of it; can be pickled.
+        labels: What sets it apart from the others: everything that the campaign varies.
+        value: What a worker needs of it; can be pickled, and is not kept.
         identity: Everything about it that determines a result, as JSON values.
+        group: Of scenes, what is seen of them: those with the same have one rendering; None: no two of them.
+            Of links, what is on air: those with the same receive the same rendering.
     """
 
-    labels: Labels
-    value: Any
-    identity: Any
+    labels: dict[str, Any] = field(default_factory=dict)
+    value: Any = None
+    identity: Any = None
+    group: Any = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """What is kept of it, as for JSON."""
+        return {"labels": self.labels, "identity": self.identity}
 
 
 @dataclass(frozen=True)
@@ -84,13 +86,11 @@ class Task:
 
     Attributes:
         id: SHA-256 of everything that determines its result, 64 hex digits.
-        point: Number of its point.
         scene: The scene's value, as `Case.value` has it.
         link: The link's value, likewise.
     """
 
     id: str
-    point: int
     scene: Any
     link: Any
 
@@ -112,6 +112,9 @@ class Job:
     environment: Mapping[str, Any]
 
 
+_Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
+
+
 @dataclass(frozen=True)
 class Point:
     """One scene with one link.
@@ -123,10 +126,10 @@ class Point:
         tasks: Ids of its tasks, by seed.
     """
 
-    labels: Labels
-    scene: int
-    link: int
-    tasks: tuple[str, ...]
+    labels: dict[str, Any]
+    scene: Annotated[int, Field(ge=0)]
+    link: Annotated[int, Field(ge=0)]
+    tasks: tuple[_Sha256, ...]
 
 
 @dataclass(frozen=True)
@@ -141,71 +144,7 @@ class Plan:
         scenes: The scenes.
         links: The links.
         points: Every scene with every link.
-        jobs: What there is to do: the first seed of every rendering, then the second, and so on.
         environment: Code and versions that the results come from.
-    """
-
-    name: str
-    rule: StopRule
-    merge: tuple[str, ...]
-    seeds: tuple[int, ...]
-    scenes: tuple[Case, ...]
-    links: tuple[Case, ...]
-    points: tuple[Point, ...]
-    jobs: tuple[Job, ...]
-    environment: Mapping[str, Any]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Plain values, as for JSON: everything but the jobs."""
-        return {
-            "name": self.name,
-            "rule": asdict(self.rule),
-            "merge": list(self.merge),
-            "seeds": list(self.seeds),
-            "scenes": [{"labels": dict(s.labels), "identity": s.identity} for s in self.scenes],
-            "links": [{"labels": dict(k.labels), "identity": k.identity} for k in self.links],
-            "points": [
-                {"labels": dict(p.labels), "scene": p.scene, "link": p.link, "tasks": list(p.tasks)}
-                for p in self.points
-            ],
-            "environment": dict(self.environment),
-            "digest": digest_of([p.tasks for p in self.points]),
-        }
-
-
-_SHA256 = r"^[0-9a-f]{64}$"
-_NAME = r"^[\w.-]+( [\w.-]+)*$"
-"""Words of letters, digits, dots and dashes: a campaign names files."""
-
-
-@dataclass(frozen=True)
-class KeptCase:
-    """A scene or a link of a plan that was kept.
-
-    Attributes:
-        labels: What sets it apart from the others.
-        identity: Everything about it that determines a result, as JSON values.
-    """
-
-    labels: dict[str, Any]
-    identity: Any
-
-
-@dataclass(frozen=True)
-class KeptPoint:
-    """A point of a plan that was kept; see `Point`."""
-
-    labels: dict[str, Any]
-    scene: Annotated[int, Field(ge=0)]
-    link: Annotated[int, Field(ge=0)]
-    tasks: tuple[Annotated[str, Field(pattern=_SHA256)], ...]
-
-
-@dataclass(frozen=True)
-class KeptPlan:
-    """A plan that was kept: what `Plan.to_dict` gives, checked; see `Plan`.
-
-    Attributes:
         digest: SHA-256 of all its tasks.
 
     Raises:
@@ -216,19 +155,17 @@ class KeptPlan:
     rule: StopRule
     merge: tuple[str, ...]
     seeds: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1)]
-    scenes: tuple[KeptCase, ...]
-    links: tuple[KeptCase, ...]
-    points: tuple[KeptPoint, ...]
+    scenes: tuple[Case, ...]
+    links: tuple[Case, ...]
+    points: tuple[Point, ...]
     environment: dict[str, Any]
-    digest: Annotated[str, Field(pattern=_SHA256)]
+    digest: _Sha256
 
     def __post_init__(self) -> None:
         for i, point in enumerate(self.points):
-            for key, cases in (("scene", self.scenes), ("link", self.links)):
-                if getattr(point, key) >= len(cases):
-                    raise ConfigError(
-                        f"points.{i}.{key} = {getattr(point, key)}: there are {len(cases)}, counted from 0"
-                    )
+            for key, number, cases in (("scene", point.scene, self.scenes), ("link", point.link, self.links)):
+                if number >= len(cases):
+                    raise ConfigError(f"points.{i}.{key} = {number}: there are {len(cases)}, counted from 0")
             if len(point.tasks) != len(self.seeds):
                 raise ConfigError(
                     f"points.{i}.tasks: {len(point.tasks)} of them, expected one a seed, {len(self.seeds)}"
@@ -236,44 +173,70 @@ class KeptPlan:
         labelled = [part.labels for part in (*self.scenes, *self.links)]
         for labels in (*labelled, *(point.labels for point in self.points)):
             for key, value in labels.items():
-                if not all(isinstance(v, _PLAIN) for v in (value if isinstance(value, list) else [value])):
+                values = value if isinstance(value, list) else [value]
+                if not all(isinstance(v, str | int | float) for v in values):
                     raise ConfigError(f"labels.{key:.40}: expected a text, a number, or a list of these")
         if self.digest != digest_of([point.tasks for point in self.points]):
             raise ConfigError(f"digest = {self.digest}: not that of its tasks")
 
+    @cached_property
+    def jobs(self) -> tuple[Job, ...]:
+        """What there is to do: the first seed of every rendering, then the second, and so on."""
+        alike: dict[Any, list[int]] = {}
+        for s, scene in enumerate(self.scenes):
+            alike.setdefault(s if scene.group is None else scene.group, []).append(s)
+        together: dict[Any, list[int]] = {}
+        for k, link in enumerate(self.links):
+            together.setdefault(link.group, []).append(k)
+        points = {(point.scene, point.link): point for point in self.points}
+        jobs = []
+        for (n, seed), scenes, links in itertools.product(
+            enumerate(self.seeds), alike.values(), together.values()
+        ):
+            tasks = (
+                Task(points[s, k].tasks[n], self.scenes[s].value, self.links[k].value)
+                for s, k in itertools.product(scenes, links)
+            )
+            # Scenes or links that differ in name only are one task.
+            once = {task.id: task for task in tasks}
+            jobs.append(Job(self.scenes[scenes[0]].value, seed, tuple(once.values()), self.environment))
+        return tuple(jobs)
 
-_PLAIN = (str, int, float)
-_DEEPEST = 32
+    def to_dict(self) -> dict[str, Any]:
+        """What is kept of it, as for JSON."""
+        parts = {
+            "rule": asdict(self.rule),
+            "scenes": [case.to_dict() for case in self.scenes],
+            "links": [case.to_dict() for case in self.links],
+            "points": [asdict(point) for point in self.points],
+        }
+        return {f.name: getattr(self, f.name) for f in fields(self)} | parts
 
 
-def kept_plan(table: Any) -> KeptPlan:
-    """Check what `Plan.to_dict` gave.
+def plan_from_dict(table: Any) -> Plan:
+    """What `Plan.to_dict` gave, also as JSON gives it back; it has no values, so no jobs can be run.
 
     Raises:
         ConfigError: It is something else.
     """
     if not isinstance(table, dict):
         raise ConfigError("expected a table")
-    _check_plain(table)
-    return build(KeptPlan, table)
+    _check_plain(table, _DEEPEST)
+    return build(Plan, table)
 
 
-def _check_plain(table: Any) -> None:
+def _check_plain(value: Any, deepest: int) -> None:
     """What is shown and hashed as it is, is of finite numbers and not too deep."""
-    below: list[Any] = [table]
-    for _ in range(_DEEPEST):
-        values, below = below, []
-        for value in values:
-            if isinstance(value, dict):
-                below += value.values()
-            elif isinstance(value, list):
-                below += value
-            elif isinstance(value, int | float) and not abs(value) <= _MOST:
-                raise ConfigError(f"a number that is not finite, or beyond {_MOST:g}")
-    if below:
-        raise ConfigError(f"tables nested more than {_DEEPEST} deep")
+    if isinstance(value, dict | list | tuple):
+        if not deepest:
+            raise ConfigError(f"tables nested more than {_DEEPEST} deep")
+        for inner in value.values() if isinstance(value, dict) else value:
+            _check_plain(inner, deepest - 1)
+    elif isinstance(value, int | float) and not abs(value) <= _MOST:
+        raise ConfigError(f"a number that is not finite, or beyond {_MOST:g}")
 
 
+_DEEPEST = 32
 _MOST = 1e300
 
 
@@ -296,8 +259,6 @@ def make_plan(
     rule: StopRule = StopRule(),
     merge: Sequence[str] = (),
     environment: Mapping[str, Any] | None = None,
-    share: Callable[[Case], Any] = lambda _: None,
-    look: Callable[[Case], Any] | None = None,
 ) -> Plan:
     """Every scene with every link and every seed.
 
@@ -309,8 +270,6 @@ def make_plan(
         rule: When a point has enough.
         merge: Labels over which a report adds points up.
         environment: Code and versions, part of every task's id.
-        share: Links for which it gives the same receive the same rendering of a scene.
-        look: Scenes for which it gives the same have the same rendering; None: no two of them.
     """
     environment = dict(environment or {})
 
@@ -320,40 +279,18 @@ def make_plan(
 
     points = []
     for (s, scene), (k, link) in itertools.product(enumerate(scenes), enumerate(links)):
-        tasks = tuple(id_of(scene, link, seed) for seed in seeds)
-        labels = (*(("scene." + a, b) for a, b in scene.labels), *(("link." + a, b) for a, b in link.labels))
-        points.append(Point(labels, s, k, tasks))
-    together: dict[Any, list[int]] = {}
-    for k, link in enumerate(links):
-        together.setdefault(share(link), []).append(k)
-    alike: dict[Any, list[int]] = {}
-    for s, scene in enumerate(scenes):
-        alike.setdefault(s if look is None else look(scene), []).append(s)
-    jobs = []
-    for (n, seed), these, some in itertools.product(enumerate(seeds), alike.values(), together.values()):
-        # Scenes or links that differ in name only are one task.
-        tasks_of = {
-            points[p].tasks[n]: Task(points[p].tasks[n], p, scenes[s].value, links[k].value)
-            for s, k in itertools.product(these, some)
-            for p in (s * len(links) + k,)
-        }
-        jobs.append(Job(scenes[these[0]].value, seed, tuple(tasks_of.values()), environment))
-    return Plan(
-        name,
-        rule,
-        tuple(merge),
-        tuple(seeds),
-        tuple(scenes),
-        tuple(links),
-        tuple(points),
-        tuple(jobs),
-        environment,
-    )
+        labels = {f"scene.{key}": value for key, value in scene.labels.items()}
+        labels |= {f"link.{key}": value for key, value in link.labels.items()}
+        points.append(Point(labels, s, k, tuple(id_of(scene, link, seed) for seed in seeds)))
+    digest = digest_of([point.tasks for point in points])
+    parts = tuple(merge), tuple(seeds), tuple(scenes), tuple(links), tuple(points)
+    return Plan(name, rule, *parts, environment, digest)
 
 
 @dataclass(frozen=True)
 class _Campaign:
-    name: Annotated[str, Field(pattern=_NAME, max_length=200)]
+    # Words of letters, digits, dots and dashes: a campaign names files.
+    name: Annotated[str, Field(pattern=r"^[\w.-]+( [\w.-]+)*$", max_length=200)]
     seeds: Annotated[int, Field(ge=1, le=1_000_000)] = 1
     first_seed: Annotated[int, Field(ge=0)] = 0
     max_bits: Annotated[int | None, Field(ge=1)] = None
@@ -380,18 +317,16 @@ _MOST_CASES = 10_000
 _MOST_TASKS = 1_000_000
 """A task simulates for a second or more; a campaign of more would end in weeks."""
 
-SceneCases = Callable[[str | None, Sequence[str]], tuple[Any, Any]]
-"""From base and overrides to (value, identity)."""
+MakeCase = Callable[[str | None, Sequence[str]], Case]
+"""From base and overrides to a case, whose labels are left to the plan."""
 
 
 def load_plan(
     path: Path | str,
-    scene_of: SceneCases,
-    link_of: SceneCases,
+    scene_of: MakeCase,
+    link_of: MakeCase,
     environment: Mapping[str, Any],
     overrides: Sequence[str] = (),
-    share: Callable[[Case], Any] = lambda _: None,
-    look: Callable[[Case], Any] | None = None,
 ) -> Plan:
     """Read a campaign file and lay out its points.
 
@@ -401,8 +336,6 @@ def load_plan(
         link_of: Makes a link likewise.
         environment: Code and versions, part of every task's id.
         overrides: What `--set` takes, e.g. `"campaign.seeds=2"`; the value is TOML, or else plain text.
-        share: Links for which it gives the same receive the same rendering of a scene.
-        look: Scenes for which it gives the same have the same rendering; None: no two of them.
 
     Raises:
         ConfigError: All faults of the file, one line each.
@@ -418,8 +351,8 @@ def load_plan(
     faults: list[str] = []
     scenes = _cases("scene", file.scene, folder, scene_of, faults, path)
     links = _cases("link", file.link, folder, link_of, faults, path)
-    varied = {"scene." + key for s in scenes for key, _ in s.labels}
-    varied |= {"link." + key for k in links for key, _ in k.labels}
+    varied = {f"scene.{key}" for scene in scenes for key in scene.labels}
+    varied |= {f"link.{key}" for link in links for key in link.labels}
     merge = file.campaign.merge
     if merge is None:
         merge = tuple(sorted(key for key in varied if key.endswith("distance_m")))
@@ -444,8 +377,6 @@ def load_plan(
         rule=StopRule(head.max_bits, head.max_errors),
         merge=merge,
         environment=environment,
-        share=share,
-        look=look,
     )
 
 
@@ -466,7 +397,7 @@ def _override(table: dict[str, Any], text: str) -> None:
 
 
 def _cases(
-    kind: str, grid: _Grid, folder: Path, make: SceneCases, faults: list[str], path: Path | str
+    kind: str, grid: _Grid, folder: Path, make: MakeCase, faults: list[str], path: Path | str
 ) -> list[Case]:
     fixed = _flat(grid.set)
     axes = _flat(grid.grid)
@@ -493,12 +424,11 @@ def _cases(
                 for key, value in (fixed | chosen | variant).items()
             ]
             try:
-                value, identity = make(_located(its_base, folder), overrides)
+                case = make(_located(its_base, folder), overrides)
             except ConfigError as fault:
                 faults.extend(f"{path}: {kind}: {line}" for line in str(fault).splitlines())
                 continue
-            labels = (*([("variant", name)] if grid.variants else []), *chosen.items())
-            cases.append(Case(tuple(labels), value, identity))
+            cases.append(replace(case, labels=({"variant": name} if grid.variants else {}) | chosen))
     return cases
 
 

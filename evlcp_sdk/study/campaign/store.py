@@ -17,7 +17,7 @@ from urllib.parse import quote
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
 from evlcp_sdk.files import check_output
-from evlcp_sdk.study.campaign.plan import KeptPlan, Plan, kept_plan
+from evlcp_sdk.study.campaign.plan import Plan, plan_from_dict
 from evlcp_sdk.study.tally import Statistics
 
 __all__ = ["Store"]
@@ -179,7 +179,7 @@ class Store:
             body = json.dumps(plan.to_dict())
             self._base.execute("INSERT OR REPLACE INTO plan VALUES (1, ?, ?)", (plan.name, body))
 
-    def plan(self) -> KeptPlan:
+    def plan(self) -> Plan:
         """The plan.
 
         Raises:
@@ -188,7 +188,7 @@ class Store:
         with self._reading():
             row = self._base.execute("SELECT body FROM plan").fetchone()
             if row is not None:
-                return kept_plan(json.loads(row[0]))
+                return plan_from_dict(json.loads(row[0]))
         raise InputError(f"{self.path}: no campaign has started in it")
 
     def put(self, results: list[tuple[str, Statistics]]) -> None:

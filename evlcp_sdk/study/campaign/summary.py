@@ -15,7 +15,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.study.campaign.collect import Counted
 from evlcp_sdk.study.campaign.paper import PAPER, Measure, Reference
-from evlcp_sdk.study.campaign.plan import KeptPlan
+from evlcp_sdk.study.campaign.plan import Plan
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
@@ -123,7 +123,7 @@ class Summary:
     tasks: int
     done: int
     series: tuple[Series, ...]
-    plan: KeptPlan
+    plan: Plan
 
     def to_dict(self) -> dict[str, Any]:
         """Every figure as JSON values; what was not measured is null."""

@@ -46,37 +46,28 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
     """
     registry = Registry.load()
 
-    def scene_of(base: str | None, settings: Sequence[str]) -> tuple[Any, Any]:
+    def scene_of(base: str | None, settings: Sequence[str]) -> Case:
         if base is None:
             raise ConfigError("base: missing; expected a preset or a scene file")
         scene = load_scene(base, settings, registry)
-        return scene, _identity(scene)
+        # What is only said of a scene is not seen.
+        return Case(value=scene, identity=_identity(scene), group=digest_of(_identity(rendered(scene))))
 
-    def link_of(base: str | None, settings: Sequence[str]) -> tuple[Any, Any]:
+    def link_of(base: str | None, settings: Sequence[str]) -> Case:
         link = load_link(base, settings, registry)
         table = {section: dict(keys) for section, keys in link.table.items()}
+        revisions = dict(link.revisions)
         identity = {
             "digest": link.digest,
             "codebook": link.codebook.digest,
-            "revisions": dict(link.revisions),
+            "revisions": revisions,
             "table": table,
         }
-        return (table, link.digest), json.loads(json.dumps(identity))
+        on_air = ({key: part[key] for key in _ON_AIR if key in part} for part in (table, revisions))
+        group = digest_of([*on_air, link.codebook.digest])
+        return Case(value=(table, link.digest), identity=json.loads(json.dumps(identity)), group=group)
 
-    return load_plan(path, scene_of, link_of, environment_of(registry), overrides, _air_of, _look_of)
-
-
-def _air_of(link: Case) -> str:
-    """Digest of what is on air with a link: a scene is rendered once for all links with the same."""
-    said = link.identity
-    sections = {section: said["table"][section] for section in _ON_AIR if section in said["table"]}
-    revisions = {role: said["revisions"][role] for role in _ON_AIR if role in said["revisions"]}
-    return digest_of([sections, revisions, said["codebook"]])
-
-
-def _look_of(scene: Case) -> str:
-    """Digest of what is seen of a scene: what is only said of it is left out."""
-    return digest_of(_identity(rendered(scene.value)))
+    return load_plan(path, scene_of, link_of, environment_of(registry), overrides)
 
 
 def _sending(scene: Scene, table: Mapping[str, Any]) -> Scene:

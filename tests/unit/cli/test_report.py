@@ -39,12 +39,12 @@ def plan_of_two_methods() -> Plan:
     return make_plan(
         "two methods </script>",
         [
-            Case((("speed_kmh", v), ("distance_m", 30.0 + 10 * n)), {"n": n}, {"n": n, "speed_kmh": v})
+            Case({"speed_kmh": v, "distance_m": 30.0 + 10 * n}, {"n": n}, {"n": n, "speed_kmh": v})
             for v in (20, 30)
             for n in range(5)
         ],
         [
-            Case((("variant", name),), i, {"table": {"bar": bar, "ranging": ranging}, "digest": "d" * 64})
+            Case({"variant": name}, i, {"table": {"bar": bar, "ranging": ranging}, "digest": "d" * 64})
             for i, (name, ranging) in enumerate(methods.items())
         ],
         range(2),
@@ -227,7 +227,7 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
 def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_path: Path) -> None:
     assert position_rows(summary) == []
     assert "<h2>Positions</h2>" not in page(summary)
-    plan = make_plan("p", [Case((("variant", v),), v, v) for v in ("right", "off")], [Case((), 0, {})], [0])
+    plan = make_plan("p", [Case({"variant": v}, v, v) for v in ("right", "off")], [Case({}, 0, {})], [0])
     fixes = [Tally.fix(0.1, 2.0, protected=True), Tally.fix(0.3, 20.0, excluded=True)]
     tallies = {
         "right": [*fixes, Tally.tracked(0.2, 3.0, 0.1, 6.0)],
@@ -255,8 +255,8 @@ def test_no_script_but_the_page_s_own_runs_in_a_browser(tmp_path: Path) -> None:
     identity = {"n": 0, HOSTILE: HOSTILE, "digest": HOSTILE, "table": {HOSTILE: HOSTILE}}
     plan = make_plan(
         HOSTILE,
-        [Case(((HOSTILE, HOSTILE),), {"n": n}, identity | {"n": n}) for n in range(2)],
-        [Case((("variant", HOSTILE),), 0, identity)],
+        [Case({HOSTILE: HOSTILE}, {"n": n}, identity | {"n": n}) for n in range(2)],
+        [Case({"variant": HOSTILE}, 0, identity)],
         range(2),
         environment={HOSTILE: HOSTILE},
     )

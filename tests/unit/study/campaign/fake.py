@@ -20,8 +20,8 @@ def fake_plan(
     """Scenes of growing difficulty; `scene` says what else their tasks do."""
     return make_plan(
         "fake",
-        [Case((("distance_m", 30.0 + 10 * n),), {"n": n, **scene}, {"n": n}) for n in range(scenes)],
-        [Case((("variant", f"link {n}"),), n, n) for n in range(links)],
+        [Case({"distance_m": 30.0 + 10 * n}, {"n": n, **scene}, {"n": n}) for n in range(scenes)],
+        [Case({"variant": f"link {n}"}, n, n) for n in range(links)],
         range(seeds),
         rule=rule or StopRule(),
         environment={"code": "fake"},

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +16,9 @@ from evlcp_sdk.study.campaign.plan import (
     Plan,
     StopRule,
     digest_of,
-    kept_plan,
     load_plan,
     make_plan,
+    plan_from_dict,
 )
 
 TEXT = """
@@ -41,10 +42,11 @@ distance_m = [90.0, 60.0, 30.0]
 """
 
 
-def made(base: str | None, overrides: Sequence[str]) -> tuple[Any, Any]:
+def made(base: str | None, overrides: Sequence[str]) -> Case:
     if any(o.startswith("wrong=") for o in overrides):
         raise ConfigError("wrong: unknown key\nand more")
-    return (base, tuple(overrides)), {"base": base and Path(base).name, "set": list(overrides)}
+    identity = {"base": base and Path(base).name, "set": list(overrides)}
+    return Case(value=(base, tuple(overrides)), identity=identity)
 
 
 def plan_of(tmp_path: Path, text: str = TEXT, overrides: Sequence[str] = (), environment: Any = None) -> Plan:
@@ -62,11 +64,8 @@ def test_a_grid_with_variants(tmp_path: Path) -> None:
     assert len(plan.scenes) == 6
     assert len(plan.points) == 12
     assert len(plan.jobs) == 18
-    assert plan.points[3].labels == (
-        ("scene.speed_kmh", 20),
-        ("scene.distance_m", 60.0),
-        ("link.variant", "two clusters"),
-    )
+    labels = {"scene.speed_kmh": 20, "scene.distance_m": 60.0, "link.variant": "two clusters"}
+    assert plan.points[3].labels == labels
     base, overrides = plan.scenes[1].value
     assert base == str(tmp_path / "night.toml")
     assert overrides == ("sensor.noise_ln=0.02", "speed_kmh=20", "distance_m=60.0")
@@ -107,25 +106,24 @@ def test_a_digest_knows_no_order(table: dict[str, Any]) -> None:
 
 
 def test_links_that_differ_in_name_only_are_one_task() -> None:
-    links = [Case((("variant", name),), 0, 0) for name in "ab"]
-    plan = make_plan("x", [Case((), 0, 0)], links, [0])
+    links = [Case({"variant": name}, 0, 0) for name in "ab"]
+    plan = make_plan("x", [Case({}, 0, 0)], links, [0])
     assert [len(job.tasks) for job in plan.jobs] == [1]
     assert plan.points[0].tasks == plan.points[1].tasks
 
 
 def test_scenes_that_look_the_same_are_one_job() -> None:
-    scenes = [Case((("variant", name),), name, name) for name in ("a", "b", "other")]
-    links = [Case((("variant", n),), n, n) for n in (0, 1)]
-    plan = make_plan("x", scenes, links, [0, 1], look=lambda case: case.value == "other")
+    scenes = [Case({"variant": name}, name, name, name == "other") for name in ("a", "b", "other")]
+    links = [Case({"variant": n}, n, n) for n in (0, 1)]
+    plan = make_plan("x", scenes, links, [0, 1])
     found = [(job.scene, job.seed, [(task.scene, task.link) for task in job.tasks]) for job in plan.jobs]
     both = [("a", 0), ("a", 1), ("b", 0), ("b", 1)]
     other = [("other", 0), ("other", 1)]
     assert found == [("a", 0, both), ("other", 0, other), ("a", 1, both), ("other", 1, other)]
     for job in plan.jobs:
         for task in job.tasks:
-            point = plan.points[task.point]
+            (point,) = (point for point in plan.points if task.id in point.tasks)
             assert plan.scenes[point.scene].value == task.scene
-            assert task.id in point.tasks
 
 
 def test_an_override_takes_the_place_of_an_axis(tmp_path: Path) -> None:
@@ -182,19 +180,14 @@ def test_a_grid_of_too_many_points_is_refused_at_once(tmp_path: Path) -> None:
 
 def test_a_kept_plan_is_the_plan(tmp_path: Path) -> None:
     plan = plan_of(tmp_path)
-    kept = kept_plan(json.loads(json.dumps(plan.to_dict())))
-    assert (kept.name, kept.rule, kept.merge, kept.seeds) == (plan.name, plan.rule, plan.merge, plan.seeds)
-    assert [(p.scene, p.link, p.tasks) for p in kept.points] == [
-        (p.scene, p.link, p.tasks) for p in plan.points
-    ]
-    for one, other in zip((*kept.scenes, *kept.links), (*plan.scenes, *plan.links), strict=True):
-        assert one.labels == dict(other.labels)
-        assert [type(v) for v in one.labels.values()] == [type(v) for _, v in other.labels]
-        assert one.identity == other.identity
-    assert kept.digest == digest_of([p.tasks for p in plan.points])
+    kept = plan_from_dict(json.loads(json.dumps(plan.to_dict())))
+    cases = [tuple(Case(c.labels, identity=c.identity) for c in some) for some in (plan.scenes, plan.links)]
+    assert kept == replace(plan, scenes=cases[0], links=cases[1])
+    for one, other in zip(kept.points, plan.points, strict=True):
+        assert [type(v) for v in one.labels.values()] == [type(v) for v in other.labels.values()]
     deep: Any = 1
     for _ in range(40):
         deep = [deep]
     for change in ({"environment": {"a": deep}}, {"environment": {"a": float("inf")}}):
         with pytest.raises(ConfigError, match=r"nested more than 32 deep|not finite"):
-            kept_plan(plan.to_dict() | change)
+            plan_from_dict(plan.to_dict() | change)

@@ -272,8 +272,8 @@ def test_hostile_names_are_shown_as_they_are(
     identity = {"n": 0, HOSTILE: [HOSTILE], "digest": HOSTILE, "table": {HOSTILE: HOSTILE}}
     plan = make_plan(
         HOSTILE,
-        [Case(((HOSTILE, HOSTILE), ("variant", "[/]$\\frac$")), {"n": 0}, identity)],
-        [Case((("variant", HOSTILE),), 0, identity)],
+        [Case({HOSTILE: HOSTILE, "variant": "[/]$\\frac$"}, {"n": 0}, identity)],
+        [Case({"variant": HOSTILE}, 0, identity)],
         range(2),
         environment={HOSTILE: HOSTILE},
     )

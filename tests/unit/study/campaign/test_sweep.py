@@ -160,7 +160,7 @@ def test_the_shipped_campaigns_are_read() -> None:
     demo, paper = plan_of(demo_campaign()), plan_of(ROOT / "examples" / "campaigns" / "paper.toml")
     assert len(demo.jobs) == 20
     assert {round(s.identity["motion"]["speed_mps"] * 3.6, 1) for s in paper.scenes} == {20.0, 30.0, 40.0}
-    assert [dict(k.labels)["variant"] for k in paper.links] == ["16 clusters", "two clusters"]
+    assert [k.labels["variant"] for k in paper.links] == ["16 clusters", "two clusters"]
     # The guesses are set in one way wherever the paper's drive is simulated.
     guesses = {json.dumps([s.identity["sensor"], s.identity["lens"]]) for s in [*demo.scenes, *paper.scenes]}
     assert len(guesses) == 1
@@ -168,9 +168,9 @@ def test_the_shipped_campaigns_are_read() -> None:
 
 def test_a_road_is_swept_in_steps_by_the_default_link_and_the_papers() -> None:
     plan = plan_of(ROOT / "examples" / "campaigns" / "road.toml")
-    assert [dict(link.labels)["variant"] for link in plan.links] == ["default", "paper"]
+    assert [link.labels["variant"] for link in plan.links] == ["default", "paper"]
     assert plan.links[0].identity["digest"] == resolve({}).digest
-    names = [str(dict(scene.labels)["variant"]).split(": ") for scene in plan.scenes]
+    names = [str(scene.labels["variant"]).split(": ") for scene in plan.scenes]
     assert names.pop(0) == ["clean road", "nothing"]
     assert all(len({condition for condition, _ in names[i : i + 4]}) == 1 for i in range(0, len(names), 4))
     digests = {json.dumps(scene.identity) for scene in plan.scenes}
