@@ -1,12 +1,13 @@
 """The collection: which tasks are still needed, and the loop that runs them and keeps their results."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import closing
+from dataclasses import dataclass, field, replace
 
 from evlcp_sdk.study.campaign.plan import Job, Plan, StopRule
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.jobs import Executor, Fault
-from evlcp_sdk.study.tally import Statistics
+from evlcp_sdk.study.tally import Statistics, Tally
 
 __all__ = ["Counted", "Progress", "RunJob", "collect", "progress_of"]
 
@@ -50,15 +51,15 @@ class Counted:
         results: Task id to statistics; `advance` looks what has come.
 
     Attributes:
-        total: The statistics so far.
-        seeds: How many seeds they take.
+        tally: The tally so far, of all segments.
+        seeds: How many seeds it takes.
         complete: No more seeds are needed.
     """
 
     tasks: Sequence[str]
     rule: StopRule
     results: Mapping[str, Statistics]
-    total: Statistics = field(default_factory=Statistics)
+    tally: Tally = field(default_factory=Tally)
     seeds: int = 0
     complete: bool = False
 
@@ -68,10 +69,10 @@ class Counted:
     def advance(self) -> None:
         """Count what has come since."""
         while not self.complete:
-            if self.seeds == len(self.tasks) or self.rule.reached(self.total):
+            if self.seeds == len(self.tasks) or self.rule.reached(self.tally):
                 self.complete = True
             elif (result := self.results.get(self.tasks[self.seeds])) is not None:
-                self.total += result
+                self.tally += result.total()
                 self.seeds += 1
             else:
                 return
@@ -82,60 +83,14 @@ class Counted:
         return tuple(self.results[task] for task in self.tasks[: self.seeds])
 
     @property
+    def needed(self) -> int:
+        """Tasks that count or may still."""
+        return self.seeds if self.complete else len(self.tasks)
+
+    @property
     def done(self) -> int:
-        """Tasks that are finished, of those that count or may still."""
-        return self.seeds if self.complete else sum(task in self.results for task in self.tasks)
-
-
-class _Collection:
-    """What is known and what is under way."""
-
-    def __init__(self, plan: Plan, results: dict[str, Statistics]) -> None:
-        self.faults: list[tuple[Job, Fault]] = []
-        self._plan = plan
-        self._results = results
-        self._begun: set[str] = set()
-        self._counted = [Counted(point.tasks, plan.rule, results) for point in plan.points]
-        self._shares = [_share(counted) for counted in self._counted]
-        self._sums = [sum(column) for column in zip(*self._shares, strict=True)]
-        self._points_of: dict[str, list[int]] = {}
-        for number, point in enumerate(plan.points):
-            for task in point.tasks:
-                self._points_of.setdefault(task, []).append(number)
-
-    def needed(self) -> Iterator[Job]:
-        """Jobs in order of their seed; each task is looked at again before it is given out."""
-        for job in self._plan.jobs:
-            tasks = tuple(task for task in job.tasks if self._is_needed(task.id))
-            if tasks:
-                self._begun.update(task.id for task in tasks)
-                yield Job(job.scene, job.seed, tasks, job.environment)
-
-    def _is_needed(self, task: str) -> bool:
-        if task in self._results or task in self._begun:
-            return False
-        return any(not self._counted[number].complete for number in self._points_of[task])
-
-    def take(self, results: Sequence[tuple[str, Statistics]]) -> None:
-        self._results.update(results)
-        for task, _ in results:
-            for number in self._points_of[task]:
-                self._counted[number].advance()
-                share = _share(self._counted[number])
-                changes = zip(self._sums, self._shares[number], share, strict=True)
-                self._sums = [total - old + new for total, old, new in changes]
-                self._shares[number] = share
-
-    def progress(self) -> Progress:
-        tasks, done, points_done, bits, bit_errors = self._sums
-        return Progress(tasks, done, len(self._counted), points_done, bits, bit_errors, tuple(self.faults))
-
-
-def _share(counted: Counted) -> tuple[int, int, int, int, int]:
-    """A point's tasks, done ones, whether it is complete, its bits and wrong bits."""
-    tally = counted.total.total()
-    tasks = counted.seeds if counted.complete else len(counted.tasks)
-    return tasks, counted.done, int(counted.complete), tally.bits, tally.bit_errors
+        """Those of them that are finished."""
+        return sum(task in self.results for task in self.tasks[: self.needed])
 
 
 def collect(
@@ -161,19 +116,61 @@ def collect(
         EvlcpError: The store cannot be written, or the executor cannot go on; what was finished is kept.
     """
     store.adopt(plan)
-    wanted = {task for point in plan.points for task in point.tasks}
-    collection = _Collection(plan, {id: s for id, s in store.results().items() if id in wanted})
-    watch(collection.progress())
-    for outcome in executor.run(run, collection.needed()):
-        if outcome.fault is not None:
-            collection.faults.append((outcome.job, outcome.fault))
-        else:
-            store.put(list(outcome.value or ()))
-            collection.take(outcome.value or ())
-        watch(collection.progress())
-    return collection.progress()
+    results = store.results()
+    points = _counted(plan, results)
+    points_of: dict[str, list[Counted]] = {}
+    for point in points:
+        for task in point.tasks:
+            points_of.setdefault(task, []).append(point)
+    begun: set[str] = set()
+    faults: list[tuple[Job, Fault]] = []
+
+    def needed() -> Iterator[Job]:
+        """Jobs in order of their seed; each task is looked at again before it is given out."""
+        for job in plan.jobs:
+            tasks = tuple(
+                task
+                for task in job.tasks
+                if task.id not in results
+                and task.id not in begun
+                and not all(point.complete for point in points_of[task.id])
+            )
+            if tasks:
+                begun.update(task.id for task in tasks)
+                yield replace(job, tasks=tasks)
+
+    watch(_progress(points, faults))
+    with closing(executor.run(run, needed())) as outcomes:
+        for outcome in outcomes:
+            if outcome.fault is not None:
+                faults.append((outcome.job, outcome.fault))
+            else:
+                found = list(outcome.value or ())
+                store.put(found)
+                results.update(found)
+                for task, _ in found:
+                    for point in points_of[task]:
+                        point.advance()
+            watch(_progress(points, faults))
+    return _progress(points, faults)
+
+
+def _counted(plan: Plan, results: Mapping[str, Statistics]) -> list[Counted]:
+    return [Counted(point.tasks, plan.rule, results) for point in plan.points]
+
+
+def _progress(points: Sequence[Counted], faults: Sequence[tuple[Job, Fault]] = ()) -> Progress:
+    return Progress(
+        tasks=sum(point.needed for point in points),
+        done=sum(point.done for point in points),
+        points=len(points),
+        points_done=sum(point.complete for point in points),
+        bits=sum(point.tally.bits for point in points),
+        bit_errors=sum(point.tally.bit_errors for point in points),
+        faults=tuple(faults),
+    )
 
 
 def progress_of(plan: Plan, results: Mapping[str, Statistics]) -> Progress:
     """How far a campaign is with these results."""
-    return _Collection(plan, dict(results)).progress()
+    return _progress(_counted(plan, results))

@@ -19,7 +19,7 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.specs import SpecError, build, parse_value, read_toml
-from evlcp_sdk.study.tally import Statistics
+from evlcp_sdk.study.tally import Tally
 
 __all__ = [
     "Case",
@@ -47,13 +47,12 @@ class StopRule:
     max_bits: Annotated[int | None, Field(ge=0, lt=2**63)] = None
     max_errors: Annotated[int | None, Field(ge=0, lt=2**63)] = None
 
-    def reached(self, statistics: Statistics) -> bool:
-        """Whether these statistics are enough.
+    def reached(self, tally: Tally) -> bool:
+        """Whether this is enough.
 
-        >>> StopRule(max_errors=0).reached(Statistics())
+        >>> StopRule(max_errors=0).reached(Tally())
         True
         """
-        tally = statistics.total()
         enough_bits = self.max_bits is not None and tally.bits >= self.max_bits
         return enough_bits or (self.max_errors is not None and tally.bit_errors >= self.max_errors)
 

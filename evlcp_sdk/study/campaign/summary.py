@@ -207,7 +207,7 @@ def summarize(store: Store) -> Summary:
     tasks = done = 0
     for point in plan.points:
         counted = Counted(point.tasks, plan.rule, results)
-        tasks += counted.seeds if counted.complete else len(counted.tasks)
+        tasks += counted.needed
         done += counted.done
         labels = {k: v for k, v in point.labels.items() if k not in merged}
         key = json.dumps(labels)
