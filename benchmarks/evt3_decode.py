@@ -3,8 +3,8 @@
     pip install evt3==0.4.1 faery==0.7.1
     python benchmarks/evt3_decode.py [RECORDING] [--events 20000000] [--rounds 21]
 
-Those that are installed are compared on a recording, by default one of `../shared`, else a synthetic one,
-tiled in time. All run in turn, in rounds of alternating order, by processor time; a ratio is the median of
+Those that are installed are compared on a recording, by default the one that comes with the package, tiled in
+time. All run in turn, in rounds of alternating order, by processor time; a ratio is the median of
 each round's pair, with quartiles. Copying the decoded columns once is the limit: a decoder has to write them.
 """
 
@@ -20,15 +20,7 @@ import numpy as np
 from evlcp_sdk.io import open_source, open_writer, read_events
 from evlcp_sdk.values import Events
 
-SHARED = Path(__file__).parents[2] / "shared" / "recordings" / "night-50m-30kmh.raw"
-
-
-def synthetic(n: int = 2_000_000) -> Events:
-    """Events of a 1280x720 camera at 10 Mev/s, in rows as the sensor reads them out."""
-    rng = np.random.default_rng(0)
-    t, y = np.sort(rng.integers(0, n // 10, n)), rng.integers(200, 400, n)
-    order = np.lexsort((y, t))
-    return Events.of(t, rng.integers(0, 1280, n), y[order], rng.integers(0, 2, n))
+RECORDING = Path(__file__).parents[1] / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
 
 
 def tile(events: Events, path: Path, count: int) -> None:
@@ -66,11 +58,11 @@ def read_by_faery(path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="EVT3 decoding, side by side")
-    parser.add_argument("recording", nargs="?", type=Path, default=SHARED)
+    parser.add_argument("recording", nargs="?", type=Path, default=RECORDING)
     parser.add_argument("--events", type=int, default=20_000_000)
     parser.add_argument("--rounds", type=int, default=21)
     given = parser.parse_args()
-    events = read_events(given.recording) if given.recording.exists() else synthetic()
+    events = read_events(given.recording)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "tiled.raw"
         tile(events, path, given.events)

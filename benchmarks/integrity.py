@@ -109,6 +109,14 @@ def uneven(points_px: Floats) -> Floats:
     return ACROSS * np.eye(2) + (1 - ACROSS) * np.outer(along, along)
 
 
+def told_attitude(world: World, pitch_deg: float, roll_deg: float, heading_deg: float) -> Attitude | None:
+    """What is known of an attitude, of which this is measured."""
+    if world.told == "none":
+        return None
+    heading = heading_deg if world.told == "heading" else None
+    return Attitude(pitch_deg, roll_deg, heading, world.attitude_deg, world.attitude_deg)
+
+
 def scene(world: World, rng: np.random.Generator) -> Scene:
     """A scene with errors of the sigmas that are stated."""
     pitch, roll, heading = rng.uniform(0, 6), rng.normal(0, 1), rng.uniform(0, 360)
@@ -135,12 +143,7 @@ def scene(world: World, rng: np.random.Generator) -> Scene:
         sigma_px = np.full(16, POINT_PX)
         views.append(BarView(number, said, points, sigma_px, world.survey, PIXEL_PX, across=ACROSS))
     off = rng.normal(0, world.attitude_deg, 3)
-    known = world.attitude_deg
-    told = {
-        "none": None,
-        "gravity": Attitude(pitch + off[0], roll + off[1], None, known, known),
-        "heading": Attitude(pitch + off[0], roll + off[1], (heading + off[2]) % 360, known, known),
-    }[world.told]
+    told = told_attitude(world, pitch + off[0], roll + off[1], (heading + off[2]) % 360)
     sigma = CameraSigma(focal_mm=world.focal * CAMERA.focal_mm)
     return Scene(views, told, CAMERA, sigma, rotation)
 
@@ -340,7 +343,6 @@ def square(pose: Pose) -> float:
     return float(pose.enu_m @ np.linalg.solve(pose.covariance[:3, :3], pose.enu_m))
 
 
-SURVEYED = {"survey": (0.05, math.radians(0.3), 0.002), "focal": 0.005}
 WORLDS = {
     "1 bar, heading": World(1, "heading"),
     "2 bars, gravity": World(2, "gravity"),
@@ -349,6 +351,18 @@ WORLDS = {
     "3 bars, gravity": World(3, "gravity"),
     "3 bars, heading": World(3, "heading"),
 }
+
+
+def stated_worlds() -> dict[str, World]:
+    """Every world, and each with sigmas of survey and focal length."""
+    survey = (0.05, math.radians(0.3), 0.002)
+    found = {}
+    for name, world in WORLDS.items():
+        found[name] = world
+        found[f"{name}; survey 5 cm, focal .5 %"] = replace(world, survey=survey, focal=0.005)
+    return found
+
+
 STEPS, STEP_S, SPEED_M_S = 20, 0.036, 11.0
 """Fixes of a drive, their distance in time, and the speed at first: 8 m."""
 
@@ -361,12 +375,8 @@ def drive(world: World, rng: np.random.Generator, spec: ErrorModel) -> tuple[lis
     pitch, roll, heading = rng.uniform(0, 6), rng.normal(0, 1), rng.uniform(0, 360)
     rotation = Attitude(pitch, roll, heading).rotation()
     true = replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + world.focal * rng.normal()))
-    off, known = rng.normal(0, world.attitude_deg, 3), world.attitude_deg
-    told = {
-        "none": None,
-        "gravity": Attitude(pitch + off[0], roll + off[1], None, known, known),
-        "heading": Attitude(pitch + off[0], roll + off[1], (heading + off[2]) % 360, known, known),
-    }[world.told]
+    off = rng.normal(0, world.attitude_deg, 3)
+    told = told_attitude(world, pitch + off[0], roll + off[1], (heading + off[2]) % 360)
     depth, (place, turn, length) = rng.uniform(50, 90), world.survey
     bars = []
     for slot in rng.permutation(3)[: world.bars]:
@@ -419,42 +429,38 @@ def tracks(drives: int) -> None:
     """Print NEES and errors of fixes, and of the track filtered and smoothed, for each world."""
     print("| what | fixes | NEES | 3D RMSE, m | track: NEES | m | smoothed: NEES | m |")
     print("|---" * 8 + "|")
-    for name, world in WORLDS.items():
-        stated = replace(world, survey=SURVEYED["survey"], focal=SURVEYED["focal"])  # type: ignore[arg-type]
-        for what, of in ((name, world), (f"{name}; survey 5 cm, focal .5 %", stated)):
-            rng = np.random.default_rng(1)
-            squares, errors = [], []
-            for _ in range(drives):
-                fixes, places = drive(of, rng, SPEC)
-                points = filter_fixes(fixes, SPEC)
-                smoothed = smooth_trajectory(points, SPEC)
-                for fix, now, later, place in zip(fixes, points, smoothed, places, strict=True):
-                    off = fix.enu_m - place, now.mean[:3] - place, later.mean[:3] - place
-                    spread = fix.covariance_m2, now.covariance_m2, later.covariance_m2
-                    squares.append([e @ np.linalg.solve(p, e) for e, p in zip(off, spread, strict=True)])
-                    errors.append([e @ e for e in off])
-            nees, rmse = np.mean(squares, 0), np.sqrt(np.mean(errors, 0))
-            pairs = " | ".join(f"{n:.2f} | {m:.3f}" for n, m in zip(nees, rmse, strict=True))
-            print(f"| {what} | {len(squares)} | {pairs} |", flush=True)
+    for what, of in stated_worlds().items():
+        rng = np.random.default_rng(1)
+        squares, errors = [], []
+        for _ in range(drives):
+            fixes, places = drive(of, rng, SPEC)
+            points = filter_fixes(fixes, SPEC)
+            smoothed = smooth_trajectory(points, SPEC)
+            for fix, now, later, place in zip(fixes, points, smoothed, places, strict=True):
+                off = fix.enu_m - place, now.mean[:3] - place, later.mean[:3] - place
+                spread = fix.covariance_m2, now.covariance_m2, later.covariance_m2
+                squares.append([e @ np.linalg.solve(p, e) for e, p in zip(off, spread, strict=True)])
+                errors.append([e @ e for e in off])
+        nees, rmse = np.mean(squares, 0), np.sqrt(np.mean(errors, 0))
+        pairs = " | ".join(f"{n:.2f} | {m:.3f}" for n, m in zip(nees, rmse, strict=True))
+        print(f"| {what} | {len(squares)} | {pairs} |", flush=True)
 
 
 def speeds(fixes: int) -> None:
     """Print processor time of a fix without a fault, solved one after the other: the best of six rounds."""
     print("| what | ms |\n|---|---|")
     times_ms = []
-    for name, world in WORLDS.items():
-        stated = replace(world, survey=SURVEYED["survey"], focal=SURVEYED["focal"])  # type: ignore[arg-type]
-        for what, of in ((name, world), (f"{name}; survey 5 cm, focal .5 %", stated)):
-            rng = np.random.default_rng(3)
-            scenes = [scene(of, rng) for _ in range(fixes)]
-            rounds_s = []
-            for _ in range(6):
-                began = time.process_time()
-                for seen in scenes:
-                    solve_pose(seen.views, seen.camera, seen.attitude, SPEC, seen.sigma)
-                rounds_s.append(time.process_time() - began)
-            times_ms.append(min(rounds_s) / fixes * 1e3)
-            print(f"| {what} | {times_ms[-1]:.3f} |", flush=True)
+    for what, of in stated_worlds().items():
+        rng = np.random.default_rng(3)
+        scenes = [scene(of, rng) for _ in range(fixes)]
+        rounds_s = []
+        for _ in range(6):
+            began = time.process_time()
+            for seen in scenes:
+                solve_pose(seen.views, seen.camera, seen.attitude, SPEC, seen.sigma)
+            rounds_s.append(time.process_time() - began)
+        times_ms.append(min(rounds_s) / fixes * 1e3)
+        print(f"| {what} | {times_ms[-1]:.3f} |", flush=True)
     print(f"| mean | {np.mean(times_ms):.3f} |")
 
 
@@ -492,9 +498,7 @@ def main() -> None:
         return
     spec = replace(SPEC, bar_fault_m=given.bar_fault, max_protection_m=given.max_protection)
     rows: list[tuple[str, World, Fault | None]] = []
-    for name, world in WORLDS.items():
-        stated = replace(world, survey=SURVEYED["survey"], focal=SURVEYED["focal"])  # type: ignore[arg-type]
-        rows += [(name, world, None), (f"{name}; survey 5 cm, focal .5 %", stated, None)]
+    rows += [(name, world, None) for name, world in stated_worlds().items()]
     for what, fault in FAULTS.items():
         for name, world in WORLDS.items():
             if (what == "sites swapped" and world.bars < 2) or ("attitude" in what and world.told == "none"):

@@ -2,7 +2,6 @@
 
 python benchmarks/latency.py                            one bar at 50 m and two at 60 and 75 m, of ../shared
 python benchmarks/latency.py --recording REC.raw --slice-us 500
-python benchmarks/latency.py --paper                    the paper's ranging and decoding
 
 A busy machine cannot keep a pace, so nothing is paced. A slice of the recording arrives when its time on
 the recording's clock is over, waits until the slices before it are done, and takes as much time as
@@ -34,7 +33,6 @@ from evlcp_sdk.values import Events, Frame
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 NAMES = "night-50m-30kmh.raw", "two-bars-60m-75m.raw"
 START_US = 100_000
-PAPER = "ranging.id=poc", "decoding.id=wh-transform"
 
 
 @dataclass(frozen=True)
@@ -88,9 +86,8 @@ def main() -> None:
     options.add_argument("--recording", type=Path, action="append")
     options.add_argument("--slice-us", type=int, default=1000)
     options.add_argument("--rounds", type=int, default=3)
-    options.add_argument("--paper", action="store_true")
     given = options.parse_args()
-    link = load_link(overrides=PAPER if given.paper else ())
+    link = load_link()
     for path in given.recording or [SHARED / name for name in NAMES]:
         if not path.exists():
             sys.exit(f"{path} is not there: name a recording")

@@ -1,15 +1,14 @@
 """The whole receiver, from RAW file to frames.csv, ranging included: events a second, and real time.
 
-    python benchmarks/receive.py [RECORDING ...] [--events 20000000] [--bytes 2000000000]
+    python benchmarks/receive.py [RECORDING ...] [--events 20000000]
 
 Without names, all recordings of `../shared`. Each is received in turn by what `evlcp receive` calls, in
 one process, one thread, kernels warm; times are processor times, and the best of the rounds counts. Then the
-first is tiled in time to `--events` and received once, beside the plain decoding of the same file, and a file
-of `--bytes` is received in a fresh process for its peak resident memory (0 leaves either out).
+first is tiled in time to `--events` and received once, beside the plain decoding of the same file (0 leaves
+it out). Memory is measured by `memory.py`.
 """
 
 import argparse
-import subprocess
 import sys
 import tempfile
 from pathlib import Path
@@ -46,23 +45,10 @@ def plain_decoding(path: Path) -> float:
     return watch.processor_s
 
 
-def peak_memory(path: Path, folder: Path) -> float:
-    """Peak resident memory of `evlcp receive`, MB."""
-    code = (
-        "import resource, sys; from evlcp_sdk.cli.main import main\n"
-        "try: main()\n"
-        "except SystemExit: pass\n"
-        "print(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024)"
-    )
-    command = [sys.executable, "-c", code, "receive", str(path), "-o", str(folder)]
-    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split()[-1])
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("recordings", nargs="*", type=Path)
     parser.add_argument("--events", type=int, default=20_000_000)
-    parser.add_argument("--bytes", type=int, default=2_000_000_000)
     parser.add_argument("--rounds", type=int, default=5)
     args = parser.parse_args()
     recordings = args.recordings or sorted(SHARED.glob("*.raw"), key=lambda p: (p.name != FIRST, p.name))
@@ -89,11 +75,6 @@ def main() -> None:
                 f" {result['times_real_time']:.2f} x real time; decoding alone is"
                 f" {file_s / result['processor_s']:.0%} of the time"
             )
-        if args.bytes:
-            events = read_events(recordings[0])
-            tile(events, big, int(args.bytes * len(events) / recordings[0].stat().st_size))
-            size = big.stat().st_size / 1e9
-            print(f"{size:.2f} GB received in {peak_memory(big, out):.0f} MB of memory")
 
 
 if __name__ == "__main__":

@@ -1,8 +1,8 @@
 """What the receiver finds on a road, beside the figures to reach, and what its parts cost: one table each.
 
-    python benchmarks/road.py [RECORDING or FOLDER ...] [--only NAME ...] [--link LINK.toml]
-        [--set TABLE.KEY=VALUE] [--against LINK.toml or NAME:TABLE.KEY=VALUE,...]
-        [--rounds 3] [--tiled 20000000] [--json | --markdown]
+    python benchmarks/road.py [RECORDING or FOLDER ...] [--only NAME ...]
+        [--against LINK.toml or NAME:TABLE.KEY=VALUE,...] [--rounds 3] [--tiled 20000000]
+        [--json | --markdown]
 
 Without names, all recordings of `../shared/recordings/road` and one folder up. Each has its truth beside it,
 and is received by what `evlcp receive` calls, in this process and on one thread, with the modulation that it
@@ -10,7 +10,7 @@ was sent with; its `frames.csv` is counted as the road score of `evlcp score` co
 not this project's is at hand, `tools/score_road.py` above the recordings, the table says whether it agrees.
 Figures to reach are in `benchmarks/road.toml`, by the recording's name.
 
-`--against` puts another link beside the first one, from a file or as settings; it may be repeated.
+`--against` puts another link beside the default one, from a file or as settings; it may be repeated.
 `--markdown` prints the tables of docs/compare.md: what each link finds, side by side.
 
 Speed is processor time, kernels warm, the best of the rounds (0 leaves it out): recorded time and events over
@@ -73,23 +73,11 @@ Plain = dict[str, Any]
 
 
 class Clock:
-    """Processor time of each part, s, without that of other parts inside it.
+    """Processor time of each part, s, without that of other parts inside it."""
 
-    Args:
-        parts: The calls of each part.
-        rest: What everything else is.
-        key: What a part's time goes to, by its name and a call's arguments; None for the part.
-    """
-
-    def __init__(
-        self,
-        parts: Mapping[Any, Sequence[tuple[Any, str]]] = PARTS,
-        rest: Any = "files",
-        key: Callable[[Any, tuple[Any, ...]], Any] | None = None,
-    ) -> None:
-        self.spent_s: Counter[Any] = Counter(dict.fromkeys([*parts, rest] if key is None else (), 0.0))
-        self._parts, self._key = parts, key
-        self._open = [rest]
+    def __init__(self) -> None:
+        self.spent_s: Counter[str] = Counter(dict.fromkeys([*PARTS, "files"], 0.0))
+        self._open = ["files"]
         self._since_s = time.process_time()
 
     def turn(self) -> None:
@@ -98,13 +86,13 @@ class Clock:
         self.spent_s[self._open[-1]] += now_s - self._since_s
         self._since_s = now_s
 
-    def timed(self, part: Any, call: Callable[..., Any]) -> Callable[..., Any]:
+    def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
         """The same call, its time counted."""
 
         @wraps(call)
         def run(*args: Any, **kwargs: Any) -> Any:
             self.turn()
-            self._open.append(part if self._key is None else self._key(part, args))
+            self._open.append(part)
             try:
                 return call(*args, **kwargs)
             finally:
@@ -117,7 +105,7 @@ class Clock:
     def running(self) -> Iterator[None]:
         """Count while inside."""
         with ExitStack() as undo:
-            for part, calls in self._parts.items():
+            for part, calls in PARTS.items():
                 for owner, name in calls:
                     call = getattr(owner, name)
                     undo.callback(setattr, owner, name, call)
@@ -369,27 +357,22 @@ def speed_line(name: str, link: str, found: Plain, real_time: float | None, mev_
     ]
 
 
-def links_of(args: argparse.Namespace) -> dict[str, Make]:
-    """Links by name; all faults are told at once, before anything is received."""
+def links_of(texts: Sequence[str]) -> dict[str, Make]:
+    """Links by name, the default one first; all faults are told at once, before anything is received."""
 
-    def with_file(file: Path | None, sets: Sequence[str], profile: str) -> Link:
-        return load_link(file, [f"modulation.id={profile}", *sets])
+    def of_file(file: Path | None, profile: str) -> Link:
+        return load_link(file, [f"modulation.id={profile}"])
 
-    def with_settings(text: str, profile: str) -> Link:
-        return load_variants([text], args.link, [f"modulation.id={profile}", *args.set])[0].links[""]
+    def of_settings(text: str, profile: str) -> Link:
+        return load_variants([text], None, [f"modulation.id={profile}"])[0].links[""]
 
-    links: dict[str, Make] = {
-        args.link.stem if args.link else "link" if args.set else "default": partial(
-            with_file, args.link, args.set
-        )
-    }
-    for text in args.against:
-        from_file = text.endswith(".toml")
-        name = Path(text).stem if from_file else text.partition(":")[0]
-        make: Make = partial(with_file, Path(text), []) if from_file else partial(with_settings, text)
-        if name in links:
-            sys.exit(f"--against {text}: the name '{name}' is taken by another link")
-        links[name] = make
+    links: dict[str, Make] = {"default": partial(of_file, None)}
+    for text in texts:
+        path = Path(text)
+        if path.suffix == ".toml":
+            links[path.stem] = partial(of_file, path)
+        else:
+            links[text.partition(":")[0]] = partial(of_settings, text)
     for make in links.values():
         make("wh4x2")
     return links
@@ -415,20 +398,11 @@ def recordings_of(args: argparse.Namespace) -> list[Path]:
     return found
 
 
-FIGURES = (
-    *(
-        "frames_sent",
-        "frames_found",
-        "bits",
-        "bit_errors",
-        "visible",
-        "erased",
-        "hidden",
-        "claimed",
-        "ranged",
-    ),
-    *("ber", "erased_share", "claimed_share", "rmse_m", "bias_m", "worst_m", "filtered_rmse_m", "nees"),
-)
+FIGURES = [
+    *("frames_sent", "frames_found", "bits", "bit_errors", "visible", "erased", "hidden", "claimed"),
+    *("ranged", "ber", "erased_share", "claimed_share", "rmse_m", "bias_m", "worst_m", "filtered_rmse_m"),
+    "nees",
+]
 """Of a tally, what JSON gets."""
 
 
@@ -454,8 +428,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("recordings", nargs="*", type=Path)
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
-    parser.add_argument("--link", type=Path)
-    parser.add_argument("--set", action="append", default=[], metavar="TABLE.KEY=VALUE")
     parser.add_argument("--against", action="append", default=[], metavar="LINK")
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--tiled", type=int, default=20_000_000)
@@ -468,7 +440,7 @@ def main() -> None:
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | {"OPENBLAS_NUM_THREADS": "1"})
     recordings = recordings_of(args)
     try:
-        links = links_of(args)
+        links = links_of(args.against)
     except EvlcpError as fault:
         sys.exit(str(fault))
     table = tomllib.loads(TARGETS.read_text())

@@ -1,12 +1,11 @@
 """Processor time before there is something to see: version, help, the first event, `receive`; Linux.
 
-    python benchmarks/start.py [--beside CHECKOUT] [--rounds 3] [--warm]
+    python benchmarks/start.py [--rounds 3] [--warm]
 
 Each command runs in a process of its own, and all its children count, orphans, too. Bytecode is kept, as that
 of an installed package is; an interpreter that does nothing stands beside. Warm: the kernels are kept by an
-earlier run. Cold: none are; tried once a checkout, as it takes long; `--warm` leaves it out. The first event:
-a recording that has no other, and its result. Beside another checkout, both run in turn, each by the
-interpreter of its own `.venv` if it has one. Printed are the least time and the median, and their ratios.
+earlier run. Cold: none are; tried once, as it takes long; `--warm` leaves it out. The first event: a
+recording that has no other, and its result. Printed are the least time and the median.
 """
 
 import argparse
@@ -26,19 +25,18 @@ RECORDING = ROOT / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
 PR_SET_CHILD_SUBREAPER = 36
 
 
-def spent_s(checkout: Path, cache: Path, *arguments: str) -> float:
-    """Processor time of a command of a checkout and of all its children, s."""
+def spent_s(cache: Path, *arguments: str) -> float:
+    """Processor time of a command and of all its children, s."""
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     code = "from evlcp_sdk.cli.main import main; main()" if arguments else "pass"
     environment = os.environ | {
-        "PYTHONPATH": f"{checkout}:{checkout / 'plugins'}",
+        "PYTHONPATH": f"{ROOT}:{ROOT / 'plugins'}",
         "PYTHONDONTWRITEBYTECODE": "",
         "PYTHONPYCACHEPREFIX": str(cache / "bytecode"),
         "NUMBA_CACHE_DIR": str(cache),
     }
     silence = os.open(os.devnull, os.O_RDWR)
-    own = checkout / ".venv" / "bin" / "python"
-    command = [str(own) if own.exists() else sys.executable, "-P", "-c", code, *arguments]
+    command = [sys.executable, "-P", "-c", code, *arguments]
     files = [(os.POSIX_SPAWN_DUP2, silence, 1), (os.POSIX_SPAWN_DUP2, silence, 2)]
     first = os.posix_spawn(command[0], command, environment, file_actions=files)
     os.close(silence)
@@ -48,20 +46,18 @@ def spent_s(checkout: Path, cache: Path, *arguments: str) -> float:
         except ChildProcessError:
             break
         if child == first and status:
-            sys.exit(f"{checkout}: {' '.join(arguments)} ends with {os.waitstatus_to_exitcode(status)}")
+            sys.exit(f"{' '.join(arguments)} ends with {os.waitstatus_to_exitcode(status)}")
     after = resource.getrusage(resource.RUSAGE_CHILDREN)
     return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description="Processor time of a start")
-    parser.add_argument("--beside", type=Path, default=None)
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--warm", action="store_true")
     options = parser.parse_args()
     # Whoever compiles for a command that has ended is waited for, too.
     ctypes.CDLL(None).prctl(PR_SET_CHILD_SUBREAPER, 1, 0, 0, 0)
-    checkouts = [ROOT] + ([options.beside.resolve()] if options.beside else [])
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         write_events(folder / "first.raw", Events.of([0], [640], [360], [1]), 1280, 720)
@@ -80,18 +76,9 @@ def main() -> None:
                 continue
             if not cold:
                 # Leaves its bytecode, and kernels.
-                for k, checkout in enumerate(checkouts):
-                    spent_s(checkout, folder / str(k), *arguments)
-            spent: list[list[float]] = [[] for _ in checkouts]
-            for _ in range(1 if cold else options.rounds):
-                for k, checkout in enumerate(checkouts):
-                    spent[k].append(spent_s(checkout, folder / str(k), *arguments))
-            said = ""
-            for name, found in (("least", list(map(min, spent))), ("median", list(map(median, spent)))):
-                own, *other = found
-                said += f"  {name} {own:.3f} s"
-                said += f", beside {other[0]:.3f} s: {other[0] / own:.2f} times" if other else ""
-            print(f"{way:<14}{said}", flush=True)
+                spent_s(folder, *arguments)
+            spent = [spent_s(folder, *arguments) for _ in range(1 if cold else options.rounds)]
+            print(f"{way:<14}  least {min(spent):.3f} s  median {median(spent):.3f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Bits of one LED by the framing `uart`: how many are wrong, by rate and distance.
 
     python benchmarks/uart.py [--rates 500 3125 10000] [--at 30 100] [--bits 10000] [--preset night]
-        [--scene TABLE.KEY=VALUE ...] [--set TABLE.KEY=VALUE ...] [--seed 1] [--keep FOLDER]
+        [--scene TABLE.KEY=VALUE ...] [--set TABLE.KEY=VALUE ...] [--seed 1]
 
 One LED, 7 data bits, even parity, two stop bits, 100 characters a packet, is simulated in front of a camera
 that shakes as on a car, and received by the link alone. Wrong bits are those of the characters that were
@@ -54,14 +54,13 @@ def main() -> None:
     parser.add_argument("--scene", nargs="+", default=[], metavar="TABLE.KEY=VALUE", help="Of the scene.")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--set", nargs="+", default=[], metavar="TABLE.KEY=VALUE", help="Of the link.")
-    parser.add_argument("--keep", type=Path, help="Where recordings are kept, and found again.")
     args = parser.parse_args()
     print(HEAD)
     print("|" + "---|" * (HEAD.count("|") - 1))
     for rate in args.rates:
         for distance_m in args.at:
             with tempfile.TemporaryDirectory() as folder:
-                print(row(args, rate, distance_m, args.keep or Path(folder)), flush=True)
+                print(row(args, rate, distance_m, Path(folder)), flush=True)
 
 
 def row(args: argparse.Namespace, rate: float, distance_m: float, folder: Path) -> str:
@@ -73,12 +72,8 @@ def row(args: argparse.Namespace, rate: float, distance_m: float, folder: Path) 
         "motion.distance_m": distance_m,
         "motion.speed_mps": 0.0,
     } | {key: parse_value(value) for key, _, value in (text.partition("=") for text in args.scene)}
-    path = folder / "-".join(
-        ["uart", args.preset, *(f"{v}" for v in settings.values()), f"{rate:g}-{args.seed}.raw"]
-    )
-    if not path.exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        evlcp.simulate(load_scene(args.preset, settings, link=link), args.seed).save(path)
+    path = folder / "uart.raw"
+    evlcp.simulate(load_scene(args.preset, settings, link=link), args.seed).save(path)
     begun = time.process_time()
     with receive(path, [link]) as packets:
         heard = [frame for packet in packets for frame in packet.frames]
