@@ -39,6 +39,7 @@ if TYPE_CHECKING:
     import pandas
     import pyarrow
 
+    from evlcp_sdk.diagnosis.diagnose import Diagnosis
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.outlet import Outlet
     from evlcp_sdk.live.pictures import PictureSlot
@@ -51,7 +52,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.whereabouts import Whereabouts
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.scene.sites import BarSite, LocalAxes
-    from evlcp_sdk.study.diagnosis.diagnose import Diagnosis
 
 __all__ = [
     "Advance",
@@ -593,7 +593,7 @@ def diagnose(
         ConfigError: The file does not describe a link, or the recording's sensor is not the link's.
     """
     # What it needs of SciPy takes long to import, and no other use case needs it.
-    from evlcp_sdk.study.diagnosis.diagnose import diagnosis_of
+    from evlcp_sdk.diagnosis.diagnose import diagnosis_of
 
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
@@ -642,7 +642,7 @@ def film(
         OutputError: It cannot be written.
     """
     # Matplotlib and Pillow take longer to import than other use cases to start.
-    from evlcp_sdk.results.film import (
+    from evlcp_sdk.report.film import (
         FILM_KINDS,
         MOST_MEGAPIXELS,
         MOST_PICTURES,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.results.colours import cluster_colours
+from evlcp_sdk.report.colours import cluster_colours
 
 TEXT = "Road works"
 TOP, HIGH = 34, 176

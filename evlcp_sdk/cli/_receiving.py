@@ -178,11 +178,11 @@ def say_alike(links: "Sequence[Link]") -> None:
     """Say on stderr, before anything is read, which links a receiver cannot tell apart."""
     if len(links) < 2:
         return
+    from evlcp_sdk.diagnosis.warnings import alike_warnings
     from evlcp_sdk.link.several import named_links
-    from evlcp_sdk.results.doubts import alike_doubts
 
-    for doubt in alike_doubts(named_links(links)):
-        complain(f"warning: {doubt}")
+    for warning in alike_warnings(named_links(links)):
+        complain(f"warning: {warning}")
 
 
 def plan_of(

@@ -18,7 +18,7 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
     from rich.table import Table
     from rich.text import Text
 
-    from evlcp_sdk.results.doubts import Doubt
+    from evlcp_sdk.diagnosis.warnings import Diagnostic
 
     out = console(stderr=stderr)
     recording, processing = summary["recording"], summary["processing"]
@@ -69,9 +69,9 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
             style="yellow",
         )
     for note in summary["notes"]:
-        out.print(str(Doubt(**note)), style="dim")
+        out.print(str(Diagnostic(**note)), style="dim")
     for warning in summary["warnings"]:
-        out.print(f"warning: {Doubt(**warning)}", style="yellow")
+        out.print(f"warning: {Diagnostic(**warning)}", style="yellow")
     if folder is not None:
         out.print(f"written: {folder}/{', '.join([*summary['files'], 'summary.json'])}", style="dim")
 

@@ -10,7 +10,7 @@ import typer
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, echo
 
 if TYPE_CHECKING:
-    from evlcp_sdk.study.diagnosis.diagnose import Diagnosis
+    from evlcp_sdk.diagnosis.diagnose import Diagnosis
 
 __all__ = ["register"]
 
@@ -55,7 +55,7 @@ def diagnose(
     with bytes_bar(Path(recording).name) as advance:
         found = run(recording, link, registry=registry, advance=advance)
     if out is not None:
-        from evlcp_sdk.study.diagnosis.page import page
+        from evlcp_sdk.report.diagnosis_page import page
 
         with Outputs() as outputs:
             outputs.write_text(page(found), out)

@@ -263,8 +263,8 @@ def receive(
 
 def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
     """A job with the link that fits its recording best; says which."""
+    from evlcp_sdk.diagnosis.diagnose import infer_link
     from evlcp_sdk.io.open import STDIN, open_source
-    from evlcp_sdk.study.diagnosis.diagnose import infer_link
 
     if job.url == STDIN:
         raise typer.BadParameter(

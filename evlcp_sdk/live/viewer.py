@@ -25,8 +25,8 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.desk import cannot_listen, stop_listening
 from evlcp_sdk.live.telling import MOST_WAITING, PICTURES_PER_S, FrameNews, Line, Shot, line_text
-from evlcp_sdk.results.colours import TRANSMITTER_COLOURS, cluster_colours
-from evlcp_sdk.study.markup import Markup, document
+from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_colours
+from evlcp_sdk.report.markup import Markup, document
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection

@@ -101,13 +101,13 @@ def evlcp_sinks() -> Iterator[SinkRecord]:
     )
     yield SinkRecord(
         "figures",
-        f"{here}.figures:Figures",
+        "evlcp_sdk.report.figures:Figures",
         ("regions.png", "presence.png", "distance.png", "track.png"),
         "regions, presence, distance and track as pictures",
     )
     yield SinkRecord(
         "report",
-        f"{here}.report:Report",
+        "evlcp_sdk.report.page:Report",
         ("report.html",),
         "the recording on one page: slow motion, charts, map, messages, warnings",
     )

@@ -3,10 +3,10 @@
 import csv
 from math import isfinite
 
+from evlcp_sdk.formatting import covariances, sigmas, text_or_empty
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import covariances, sigmas, text_or_empty
 from evlcp_sdk.values import Fix
 
 __all__ = ["ALTERNATIVE_COLUMNS", "AlternativesCsv"]

@@ -3,7 +3,7 @@
 import math
 from typing import Any
 
-from evlcp_sdk.results.text import symbol_list
+from evlcp_sdk.formatting import symbol_list
 from evlcp_sdk.values import Frame
 
 __all__ = ["FILTERED_COLUMNS", "FRAME_COLUMNS", "LINK_COLUMN", "frame_columns", "frame_value"]

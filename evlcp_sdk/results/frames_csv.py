@@ -3,10 +3,10 @@
 import csv
 from typing import Any
 
+from evlcp_sdk.formatting import text_or_empty
 from evlcp_sdk.results.columns import frame_columns, frame_value
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import text_or_empty
 from evlcp_sdk.values import Packet
 
 __all__ = ["FramesCsv"]

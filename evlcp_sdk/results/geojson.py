@@ -4,10 +4,10 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from evlcp_sdk.formatting import integrity, number_or_none, sigmas
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import integrity, number_or_none, sigmas
 from evlcp_sdk.results.trail import Trail
 from evlcp_sdk.values import Fix
 

@@ -5,9 +5,9 @@ import math
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
+from evlcp_sdk.formatting import sigmas
 from evlcp_sdk.place.geoid import geoid_m
 from evlcp_sdk.place.navigator import Place
-from evlcp_sdk.results.text import sigmas
 from evlcp_sdk.values import Fix
 
 __all__ = ["DEVICE", "VERSION", "answer", "sky", "tpv"]

@@ -8,11 +8,11 @@ from datetime import UTC, timedelta
 from typing import Any
 from xml.sax.saxutils import escape
 
+from evlcp_sdk.formatting import sigmas
 from evlcp_sdk.place.geoid import geoid_m
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import sigmas
 from evlcp_sdk.results.trail import Trail
 from evlcp_sdk.utc import zero_at
 from evlcp_sdk.values import Fix

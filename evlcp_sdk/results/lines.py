@@ -4,9 +4,9 @@ import json
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from evlcp_sdk.formatting import integrity, number_or_none, sigmas, symbol_list
 from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value
 from evlcp_sdk.results.packets_jsonl import message_line
-from evlcp_sdk.results.text import integrity, number_or_none, sigmas, symbol_list
 from evlcp_sdk.values import Fix, Frame, Packet
 
 __all__ = ["FrameSaid", "JsonLines", "fix_line", "frame_said", "frame_text", "said_text"]

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.formatting import integrity
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.columns import FRAME_COLUMNS
@@ -19,7 +20,6 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.lines import frame_text
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import integrity
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.utc import at_ns

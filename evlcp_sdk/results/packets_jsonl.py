@@ -4,10 +4,10 @@ import json
 from typing import Any
 
 from evlcp_sdk.errors import PluginError
+from evlcp_sdk.formatting import characters, symbol_list
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.text import characters, symbol_list
 from evlcp_sdk.values import Packet, ReceivedMessage
 
 __all__ = ["PacketsJsonl", "message_line", "packet_line"]

@@ -5,14 +5,14 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any, Literal
 
+from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.diagnosis.warnings import Diagnostic, LinkPart, Seen, notes_of, warnings_of, warnings_of_links
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import output_fault
+from evlcp_sdk.formatting import characters
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
-from evlcp_sdk.results.doubts import Doubt, LinkPart, Seen, notes_of, warnings_of, warnings_of_links
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.tallies import RunTally
-from evlcp_sdk.results.text import characters
 
 __all__ = ["Status", "messages_off", "summary_of", "write_summary"]
 
@@ -70,7 +70,7 @@ def summary_of(
     else:
         warnings = warnings_of_links(tally, counts, links, seen=seen, positions=positions, placing=placing)
         silent = [name for name in links if tally.transmitters and not tally.of_link(name)]
-        notes += [Doubt("nothing-found", "no frame of it was read", link=name) for name in silent]
+        notes += [Diagnostic("nothing-found", "no frame of it was read", link=name) for name in silent]
         described = {"links": {name: _described(part.link) | _told(part) for name, part in links.items()}}
     return {
         "status": status,

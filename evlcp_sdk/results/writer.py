@@ -10,18 +10,18 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from evlcp_sdk.diagnosis.readout import ReadoutTally
+from evlcp_sdk.diagnosis.tallies import PositionTally, RunTally
+from evlcp_sdk.diagnosis.warnings import LinkPart, Seen, other_codewords
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links, placing_links
 from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.doubts import LinkPart, Seen, other_codewords
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.lines import JsonLines
-from evlcp_sdk.results.readout import ReadoutTally
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
 from evlcp_sdk.results.summary import Status, messages_off, summary_of, write_summary
-from evlcp_sdk.results.tallies import PositionTally, RunTally
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Packet

@@ -43,9 +43,9 @@ def loop(
     """
     import json
 
+    from evlcp_sdk.diagnosis.warnings import Diagnostic
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.results.doubts import Doubt
     from firmware_host.loop import loop as steps
 
     link = load_link(link_file, overrides or [], Registry.load())
@@ -66,7 +66,7 @@ def loop(
                 continue
             screen.print(f"{step.name:9} {_WORDS[step.name](done)}")
             for warning in done.get("warnings", ()):
-                screen.print(f"          warning: {Doubt(**warning)}", style="yellow")
+                screen.print(f"          warning: {Diagnostic(**warning)}", style="yellow")
     if not as_json:
         screen.print(f"written: {out}/{', '.join(files)}", style="dim")
     if not done["as_sent"]:

@@ -19,7 +19,7 @@ import numpy as np
 import typer
 from matplotlib.figure import Figure
 
-import evlcp_sdk.results.figures
+import evlcp_sdk.report.figures
 import evlcp_sdk.run
 import evlcp_sdk.study.campaign.task as task
 from evlcp_sdk.cli.main import main
@@ -235,7 +235,7 @@ def sinks(work: Path, demo: Path) -> Trial:
     """The same with every format that one may ask for; pictures of one colour, drawn at once."""
     picture = Figure(figsize=(0.1, 0.1))
     for name in ("draw_regions", "draw_presence", "draw_distance", "draw_track"):
-        setattr(evlcp_sdk.results.figures, name, lambda *_: picture)
+        setattr(evlcp_sdk.report.figures, name, lambda *_: picture)
     site = work / "site.toml"
     place = "latitude_deg = 35.0\nlongitude_deg = 137.0\nheight_m = 2.0\nheading_deg = 0.0\n"
     site.write_text(f"[[bar]]\ntransmitter_id = 0\n{place}")

@@ -9,9 +9,9 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from evlcp_sdk.files import defused
+from evlcp_sdk.report.markup import Bar, Markup, bars, details, document, table
 from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, median
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, measure
-from evlcp_sdk.study.markup import Bar, Markup, bars, details, document, table
 
 __all__ = ["BOUND_NAME", "COLUMNS", "MARK", "Column", "Comparison", "Row", "Table", "total_of"]
 

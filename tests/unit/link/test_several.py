@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.cli._receiving import say_alike
+from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.diagnosis.warnings import LinkPart, Seen, warnings_of_links
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import alike_links, load_links, named_links
-from evlcp_sdk.results.doubts import LinkPart, Seen, warnings_of_links
-from evlcp_sdk.results.tallies import RunTally
 
 
 @pytest.fixture

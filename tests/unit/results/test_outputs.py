@@ -21,12 +21,12 @@ from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS
+from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
 from evlcp_sdk.errors import ConfigError, InputError, OutputError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma

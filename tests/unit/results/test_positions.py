@@ -29,9 +29,9 @@ from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.report.figures import TrackProbe, draw_track
 from evlcp_sdk.results.alternatives_csv import AlternativesCsv
 from evlcp_sdk.results.columns import FRAME_COLUMNS
-from evlcp_sdk.results.figures import TrackProbe, draw_track
 from evlcp_sdk.results.fixes_csv import FixesCsv
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import GeoJson

@@ -16,7 +16,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.results.colours import cluster_colours, transmitter_colour
+from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, Region
 

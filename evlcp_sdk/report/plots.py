@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.study.markup import Markup
+from evlcp_sdk.report.markup import Markup
 
 __all__ = ["PLOT_STYLE", "Plot", "ellipse"]
 

@@ -8,16 +8,16 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.diagnosis.checks import Check, Facts, checks_of
+from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
+from evlcp_sdk.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
+from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.diagnosis.warnings import Diagnostic, Seen, other_codewords, warnings_of
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
-from evlcp_sdk.results.doubts import Doubt, Seen, other_codewords, warnings_of
-from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.study.diagnosis.checks import Check, Facts, checks_of
-from evlcp_sdk.study.diagnosis.light import LightSource, LightSurvey
-from evlcp_sdk.study.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
 from evlcp_sdk.values import Events
 
 __all__ = ["Diagnosis", "diagnosis_of", "infer_link"]
@@ -52,7 +52,7 @@ class Diagnosis:
     checks: tuple[Check, ...]
     sources: tuple[LightSource, ...]
     trials: tuple[Trial, ...]
-    warnings: tuple[Doubt, ...]
+    warnings: tuple[Diagnostic, ...]
     counts: dict[str, int]
     cell_px: int
     frequency_hz: NDArray[np.float64]

@@ -7,11 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evlcp_sdk.diagnosis.readout import ReadoutTally
+from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.diagnosis.warnings import Seen, notes_of, other_codewords, warnings_of
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.doubts import Seen, notes_of, other_codewords, warnings_of
-from evlcp_sdk.results.readout import ReadoutTally
-from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
 
 LINK = load_link()

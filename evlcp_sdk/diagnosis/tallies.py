@@ -9,8 +9,8 @@ from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.formatting import number_or_none, sigmas
 from evlcp_sdk.late import Late
-from evlcp_sdk.results.text import number_or_none, sigmas
 from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
 
 if TYPE_CHECKING:

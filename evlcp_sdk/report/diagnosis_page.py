@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.study.diagnosis.diagnose import Diagnosis
-from evlcp_sdk.study.diagnosis.light import LightSource
-from evlcp_sdk.study.markup import Markup, details, document, table
+from evlcp_sdk.diagnosis.diagnose import Diagnosis
+from evlcp_sdk.diagnosis.light import LightSource
+from evlcp_sdk.report.markup import Markup, details, document, table
 
 __all__ = ["page"]
 

@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from evlcp_sdk.results.readout import ReadoutTally
-from evlcp_sdk.study.diagnosis import _kernels
-from evlcp_sdk.study.diagnosis._kernels import BINS, COARSE, COARSE_US, FINE, FINE_US, SHORT
+from evlcp_sdk.diagnosis import _kernels
+from evlcp_sdk.diagnosis._kernels import BINS, COARSE, COARSE_US, FINE, FINE_US, SHORT
+from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.values import Events
 
 __all__ = ["LightSource", "LightSurvey", "comb"]

@@ -9,8 +9,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.results.colours import cluster_colours
-from evlcp_sdk.results.figures import (
+from evlcp_sdk.report.colours import cluster_colours
+from evlcp_sdk.report.figures import (
     FigureProbe,
     Figures,
     Thinned,

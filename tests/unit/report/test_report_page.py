@@ -9,21 +9,21 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.unit.report.test_markup import HOSTILE, Elements
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.navigator import PositionPlan
+from evlcp_sdk.report.motion import Motion, MotionProbe, cluster_map, sent_chips
+from evlcp_sdk.report.page import Report
+from evlcp_sdk.report.plots import Plot, ellipse
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.motion import Motion, MotionProbe, cluster_map, sent_chips
-from evlcp_sdk.results.plots import Plot, ellipse
-from evlcp_sdk.results.report import Report
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
 from tests.unit.results.test_positions import ATTITUDE, SITE, packets
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
-from tests.unit.study.test_markup import HOSTILE, Elements
 
 LINK = load_link()
 SUMMARY: dict[str, Any] = {

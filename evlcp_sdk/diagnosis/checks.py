@@ -7,12 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from evlcp_sdk.diagnosis.light import LightSource
+from evlcp_sdk.diagnosis.probe import SURE, Trial
+from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.diagnosis.warnings import Seen, codewords_never, saturation
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.results.doubts import Seen, codewords_never, saturation
-from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.spelling import counted
-from evlcp_sdk.study.diagnosis.light import LightSource
-from evlcp_sdk.study.diagnosis.probe import SURE, Trial
 
 __all__ = ["Check", "Facts", "checks_of"]
 
@@ -256,9 +256,9 @@ def _events(facts: Facts) -> Check:
 
 
 def _readout(facts: Facts) -> Check:
-    for doubt in saturation(facts.seen):
+    for full in saturation(facts.seen):
         verdict: Verdict = "doubt" if facts.reads else "fail"
-        return Check("readout", verdict, doubt.code, doubt.text, doubt.next_step)
+        return Check("readout", verdict, full.code, full.text, full.next_step)
     return Check("readout", "pass", "readout", f"at most {facts.seen.peak_mev_s:.3g} Mev/s, not at a limit")
 
 

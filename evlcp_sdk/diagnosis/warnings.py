@@ -8,19 +8,19 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.diagnosis.readout import ReadoutTally
+from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.link.several import alike_links
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.readout import ReadoutTally
-from evlcp_sdk.results.tallies import RunTally, TransmitterTally
 from evlcp_sdk.spelling import counted
 
 __all__ = [
-    "Doubt",
+    "Diagnostic",
     "LinkPart",
     "Seen",
-    "alike_doubts",
+    "alike_warnings",
     "codewords_never",
     "notes_of",
     "other_codewords",
@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 _MOST_IDS = 5
-"""Ids that a doubt names; how many there are besides, it counts."""
+"""Ids that a warning names; how many there are besides, it counts."""
 
 _TOLD_SIGMAS = 3.0
 """Sigmas beyond which what a drive tells is hinted at."""
@@ -125,7 +125,7 @@ _SUSPECTS = {
 
 
 @dataclass(frozen=True)
-class Doubt:
+class Diagnostic:
     """Something that looks wrong, or a plain statement of what there was none of.
 
     Attributes:
@@ -135,7 +135,7 @@ class Doubt:
         transmitter: Number of the transmitter that it is about; None for all of the recording.
         link: Where there are several links, name of the one that it is about; empty for none of them.
 
-    >>> print(Doubt("clock", "its clock is 900 ppm off", "try another rate", 0))
+    >>> print(Diagnostic("clock", "its clock is 900 ppm off", "try another rate", 0))
     transmitter 0: its clock is 900 ppm off: try another rate
     """
 
@@ -220,7 +220,7 @@ def warnings_of(
     seen: Seen | None = None,
     reads_messages: bool = True,
     positions: Mapping[str, Any] | None = None,
-) -> list[Doubt]:
+) -> list[Diagnostic]:
     """What looks wrong in a result, the recording first, then each transmitter, messages and positions.
 
     Args:
@@ -245,7 +245,7 @@ def warnings_of_links(
     seen: Seen,
     positions: Mapping[str, Any] | None = None,
     placing: str = "",
-) -> list[Doubt]:
+) -> list[Diagnostic]:
     """What looks wrong in a result of several links: the recording, and then what each link has read.
 
     Args:
@@ -258,11 +258,11 @@ def warnings_of_links(
     """
     found = [*saturation(seen), *_coarse_times(seen, [part.link for part in links.values()])]
     found += [*_dropped(counts, seen), *_room(counts)]
-    found += alike_doubts({name: part.link for name, part in links.items()})
+    found += alike_warnings({name: part.link for name, part in links.items()})
     if not tally.transmitters:
         return found + list(_frames(counts))
     for name, part in links.items():
-        told = [doubt for doubt in _frames(part.counts) if doubt.code not in ("no-preamble", "no-frames")]
+        told = [one for one in _frames(part.counts) if one.code not in ("no-preamble", "no-frames")]
         told += _of_link(
             tally.of_link(name),
             part.counts,
@@ -271,25 +271,25 @@ def warnings_of_links(
             positions if name == placing else None,
             reads_messages=part.reads_messages,
         )
-        found += [replace(doubt, link=name) for doubt in told]
+        found += [replace(one, link=name) for one in told]
     return found
 
 
-def _coarse_times(seen: Seen, links: Sequence[Link]) -> Iterator[Doubt]:
+def _coarse_times(seen: Seen, links: Sequence[Link]) -> Iterator[Diagnostic]:
     """Times in steps of more than a quarter of a chip: of when a light changed, little is left."""
     chip_us = min(link.packet.chip_us for link in links)
     if seen.step_us > chip_us / 4:
-        yield Doubt(
+        yield Diagnostic(
             "coarse-times",
             f"times are rounded to {seen.step_us / 1000:g} ms; a chip is {chip_us / 1000:g} ms",
             "export them in whole microseconds, or with six decimals of a second",
         )
 
 
-def alike_doubts(links: Mapping[str, Link]) -> Iterator[Doubt]:
+def alike_warnings(links: Mapping[str, Link]) -> Iterator[Diagnostic]:
     """Links of which nothing on air tells one from the other, by name: known before anything is read."""
     for one, other in alike_links(links):
-        yield Doubt(
+        yield Diagnostic(
             "alike-links",
             f"what one of the links '{one}' and '{other}' sends, the other may read: the rates are alike,"
             " and codewords of one are codewords of the other",
@@ -305,9 +305,9 @@ def _of_link(
     positions: Mapping[str, Any] | None,
     *,
     reads_messages: bool,
-) -> list[Doubt]:
+) -> list[Diagnostic]:
     """What looks wrong in what a link has read."""
-    found: list[Doubt] = []
+    found: list[Diagnostic] = []
     for number, one in sorted(transmitters.items()):
         if one.frames - one.echoes >= _FEW_FRAMES:
             found += _transmitter(number, one, link, counts, seen)
@@ -330,7 +330,7 @@ def notes_of(
     *,
     seen: Seen | None = None,
     reads_messages: bool = True,
-) -> list[Doubt]:
+) -> list[Diagnostic]:
     """Plain statements: reflections, what was guessed or skipped, what had no frames, and no messages.
 
     Args:
@@ -340,7 +340,7 @@ def notes_of(
         reads_messages: Whether messages were looked for.
     """
     found = [
-        Doubt(
+        Diagnostic(
             "reflection",
             f"a reflection of transmitter {one.echo_of}, {counted(one.echoes, 'frame')}",
             "",
@@ -352,12 +352,12 @@ def notes_of(
     seen = Seen() if seen is None else seen
     if seen.guessed:
         found.append(
-            Doubt("guessed", seen.guessed, "where it is wrong, list:PATH?columns=...&unit=... says it")
+            Diagnostic("guessed", seen.guessed, "where it is wrong, list:PATH?columns=...&unit=... says it")
         )
     silences, silent_us = seen.skipped
     if silences:
         found.append(
-            Doubt(
+            Diagnostic(
                 "pace",
                 f"{counted(silences, 'silence')} of {silent_us * 1e-6:.1f} s in all, where the recording is"
                 " damaged, not waited for",
@@ -365,7 +365,9 @@ def notes_of(
         )
     if not tally.transmitters and counts.get("events", 0):
         found.append(
-            Doubt("nothing-found", "no frame was read", "`evlcp diagnose` says what blinks, and what to try")
+            Diagnostic(
+                "nothing-found", "no frame was read", "`evlcp diagnose` says what blinks, and what to try"
+            )
         )
     if seen.duration_us and tally.transmitters:
         covered_us = tally.covered_us
@@ -373,7 +375,7 @@ def notes_of(
             first_us = min(one.first_us for one in tally.transmitters.values())
             last_us = max(one.last_us for one in tally.transmitters.values())
             found.append(
-                Doubt(
+                Diagnostic(
                     "coverage",
                     f"frames in {_ms(covered_us)} of {_ms(seen.duration_us)}: nothing before"
                     f" {_ms(first_us - seen.first_us)}, nothing after {_ms(last_us - seen.first_us)}",
@@ -382,7 +384,7 @@ def notes_of(
     tried = counts.get("blocks_tried", 0)
     if reads_messages and tried and not _read(counts):
         what = f"none of {tried} packets has" if tried > 1 else "the packet does not have"
-        found.append(Doubt("no-messages", f"no messages: {what} a block that can be read"))
+        found.append(Diagnostic("no-messages", f"no messages: {what} a block that can be read"))
     return found
 
 
@@ -424,7 +426,7 @@ def _read(counts: Mapping[str, int]) -> int:
     return counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0)
 
 
-def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
+def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Diagnostic]:
     satellites = positions["gnss"] + positions["gnss_outside"]
     if not positions["fixes"] + sum(positions["refused"].values()) + satellites:
         return
@@ -433,7 +435,7 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
     if not link.camera_sigma.known:
         unsaid.append("the camera ([camera_sigma], which evlcp calibrate prints)")
     if unsaid:
-        yield Doubt(
+        yield Diagnostic(
             "no-sigma",
             f"positions take as exact what has no sigma: {' and '.join(unsaid)}; their sigmas and protection"
             " levels hold only if it is",
@@ -447,39 +449,39 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
     for name, number in positions["excluded"].items():
         steps = [lens] if lens and name != "focal length" else []
         steps.append(_SUSPECTS.get(name, "its place, angles and length, and their sigmas"))
-        yield Doubt(
+        yield Diagnostic(
             "excluded",
             f"{number} position{_s(number)} without {name}, which the rest contradicts",
             f"compare {'; or '.join(steps)}",
         )
     yield from _learnt(positions["learnt"], link)
     if number := positions["alarms"].get("contradicted", 0):
-        yield Doubt(
+        yield Diagnostic(
             "gnss-contradicted",
             f"{number} time{_s(number)} bars and GNSS contradict one another{_apart(positions)}",
             "compare heights (above the ellipsoid), the sigmas of both, position.antenna_m, and both clocks",
         )
     if (number := positions["attitude_missing"]) and not positions["attitude_outside"]:
         tried = positions["fixes"] + sum(positions["refused"].values())
-        yield Doubt(
+        yield Diagnostic(
             "attitude-missing",
             f"{number} of {tried} positions have no attitude: its file does not reach there, or lacks lines",
             "t_us of its file has to be the camera's clock, us, from before the first bar to after the last",
         )
     if number := positions["attitude_outside"]:
-        yield Doubt(
+        yield Diagnostic(
             "attitude-outside",
             f"none of the attitude's {number} lines is within the recording's time",
             "t_us of its file has to be the camera's clock, us",
         )
     if (number := positions["gnss_outside"]) and not positions["gnss"]:
-        yield Doubt(
+        yield Diagnostic(
             "gnss-outside",
             f"none of {number} GNSS fixes is within the recording's time",
             "t_us of their file has to be the camera's clock",
         )
     if number := positions["gnss_without_heading"]:
-        yield Doubt(
+        yield Diagnostic(
             "gnss-without-heading",
             f"{number} GNSS fix{'es' * (number != 1)} not used, as no heading says where the antenna is"
             " (position.antenna_m)",
@@ -488,7 +490,7 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
     if (number := positions["refused"].get("no-site", 0)) and not positions["fixes"]:
         heard = sorted(set(positions["heard"].values()))
         ids = f"id{_s(len(heard))} {_some(heard)}" if heard else "no id"
-        yield Doubt(
+        yield Diagnostic(
             "no-site",
             f"{number} position{_s(number)} refused, as no bar in view stands at a known place;"
             f" received: {ids}",
@@ -499,7 +501,7 @@ def _positions(positions: Mapping[str, Any], link: Link) -> Iterator[Doubt]:
     unseen = positions["sites_unseen"]
     if positions["fixes"] and strange and unseen:
         # Either alone is no fault: a bar that is not on the list, a bar of the list that is elsewhere.
-        yield Doubt(
+        yield Diagnostic(
             "unknown-id",
             f"positions are without id{_s(len(strange))} {_some(strange)}, received and in no site;"
             f" id{_s(len(unseen))} {_some(unseen)} of the sites {'were' if len(unseen) > 1 else 'was'} not",
@@ -515,7 +517,7 @@ def _some(ids: Sequence[int]) -> str:
     return ", ".join(map(str, ids[:_MOST_IDS])) + more
 
 
-def _misfit(number: int, suspects: Mapping[str, int], lens: str) -> Doubt:
+def _misfit(number: int, suspects: Mapping[str, int], lens: str) -> Diagnostic:
     """Positions refused, with the parts that would each explain most of them."""
     text = f"{number} position{_s(number)} refused, as bars, attitude and camera contradict one another"
     likely = {name: times for name, times in suspects.items() if 2 * times > number}
@@ -525,33 +527,33 @@ def _misfit(number: int, suspects: Mapping[str, int], lens: str) -> Doubt:
         likely["focal length"] = number + 1
         steps["focal length"] = lens
     if not likely:
-        return Doubt(
+        return Diagnostic(
             "misfit",
             text,
             "compare sites, angles and [camera], its focal_mm first, with what is there, and their sigmas",
         )
     names = sorted(likely, key=lambda name: -likely[name])
-    return Doubt(
+    return Diagnostic(
         "misfit",
         f"{text}; another {' or another '.join(names)} would explain it",
         f"compare {'; '.join(steps[name] for name in names)}",
     )
 
 
-def _learnt(rows: Sequence[Mapping[str, Any]], link: Link) -> Iterator[Doubt]:
+def _learnt(rows: Sequence[Mapping[str, Any]], link: Link) -> Iterator[Diagnostic]:
     for row in rows:
         off, sigma, stated = row["correction"], row["sigma"], row["stated_sigma"]
         if not row["determined"]:
             continue
         if abs(off) > _TOLD_SIGMAS * stated:
-            yield Doubt(
+            yield Diagnostic(
                 "learnt",
                 f"the drive shows {row['part']}, {row['what']}, {off:+.3g} off what is stated, {stated:.3g}"
                 f" (sigma): {abs(off) / stated:.1f} sigmas",
                 "compare it with what is there",
             )
         elif row["what"] == "focal_mm" and abs(off) > _TOLD_SIGMAS * sigma:
-            yield Doubt(
+            yield Diagnostic(
                 "focal",
                 f"the drive shows a focal length of {link.camera.focal_mm + off:.5g} +- {sigma:.2g} mm, not"
                 f" {link.camera.focal_mm:g}",
@@ -559,11 +561,11 @@ def _learnt(rows: Sequence[Mapping[str, Any]], link: Link) -> Iterator[Doubt]:
             )
 
 
-def saturation(seen: Seen) -> Iterator[Doubt]:
+def saturation(seen: Seen) -> Iterator[Diagnostic]:
     """A readout that is at its limit."""
     if seen.readout is not None and seen.readout.at_limit:
         share, _ = seen.readout.capped()
-        yield Doubt(
+        yield Diagnostic(
             "saturated",
             f"{share:.0%} of all milliseconds, {seen.readout.capped_ms}, hold {seen.peak_mev_s:.3g} Mev/s, no"
             " more and no less: the sensor's readout is at its limit, and what is beyond is lost",
@@ -571,7 +573,7 @@ def saturation(seen: Seen) -> Iterator[Doubt]:
         )
 
 
-def _dropped(counts: Mapping[str, int], seen: Seen) -> Iterator[Doubt]:
+def _dropped(counts: Mapping[str, int], seen: Seen) -> Iterator[Diagnostic]:
     """Events that were there and did not count, for other reasons than room."""
     names = [name for name, _ in _NO_ROOM]
     dropped = {n: k for n, k in counts.items() if n.startswith("dropped_") and k and n not in names}
@@ -579,27 +581,27 @@ def _dropped(counts: Mapping[str, int], seen: Seen) -> Iterator[Doubt]:
     if number >= _DROPPED_LEAST and number > _DROPPED_SHARE * (counts.get("events", 0) + seen.losses):
         kinds = [f"{k} {n.removeprefix('dropped_').replace('_', ' ')}" for n, k in dropped.items()]
         kinds += [f"{seen.losses} in the file"] * (seen.losses > 0)
-        yield Doubt(
+        yield Diagnostic(
             "dropped",
             f"{number} events or words dropped ({', '.join(kinds)})",
             "losses and counts in summary.json say where and why; `evlcp info` says what is in the recording",
         )
 
 
-def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
+def _frames(counts: Mapping[str, int]) -> Iterator[Diagnostic]:
     blinking = counts.get("events_in_regions", 0)
     if blinking >= _MANY_EVENTS and not counts.get("locks", counts.get("frames", 0)):
         regions = counts.get("regions_opened", 0)
         blinks = f"something blinks, {blinking} events in {regions} region{_s(regions)}"
         if "locks" in counts:
-            yield Doubt(
+            yield Diagnostic(
                 "no-preamble",
                 f"{blinks}, but no preamble is detected",
                 "compare air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves behind a"
                 " bar may mask it; `evlcp diagnose` says what blinks, and how fast",
             )
         else:
-            yield Doubt(
+            yield Diagnostic(
                 "no-frames",
                 f"{blinks}, but no frame is read",
                 "compare air.chip_rate_hz and [framing] with the transmitter's; `evlcp diagnose` says what"
@@ -610,7 +612,7 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
     rejected, frames = counts.get("frames_rejected", 0), counts.get("frames", 0)
     share = _REJECTED_BESIDE_READ_SHARE if _read(counts) > counts.get("blocks_failed", 0) else _REJECTED_SHARE
     if rejected >= _FEW_FRAMES and rejected > share * (frames + rejected):
-        yield Doubt(
+        yield Diagnostic(
             "frames-rejected",
             f"{rejected} of {frames + rejected} frames rejected, as their clusters do not stand where the bar"
             " has them",
@@ -618,14 +620,14 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
         )
     unread = counts.get("frames_unread", 0)
     if unread >= _FEW_FRAMES and unread > _REJECTED_SHARE * (frames + unread):
-        yield Doubt(
+        yield Diagnostic(
             "frames-unread",
             f"{unread} of {frames + unread} frames show their clusters, but not one symbol that is sure",
             "compare modulation.id with the transmitter's; in little light another decoding.id may do",
         )
     askew = counts.get("frames_askew", 0)
     if askew >= _FEW_FRAMES and askew > _ASKEW_SHARE * frames:
-        yield Doubt(
+        yield Diagnostic(
             "attitude",
             f"{min(askew, frames)} of {frames} frames show bars that do not stand plumb by the camera's"
             " attitude, which does not correct their distances",
@@ -633,12 +635,12 @@ def _frames(counts: Mapping[str, int]) -> Iterator[Doubt]:
         )
 
 
-def _signs(counts: Mapping[str, int], events: int, frames: int) -> Iterator[Doubt]:
+def _signs(counts: Mapping[str, int], events: int, frames: int) -> Iterator[Diagnostic]:
     """Frames of a light that is the other way round than said, or of which one kind of edges is not seen."""
     # Of several links those that another one fits better may all be among them.
     inverted = counts.get("frames_inverted", 0) - counts.get("frames_of_others", 0)
     if inverted >= _FEW_FRAMES and inverted > _INVERTED_SHARE * frames:
-        yield Doubt(
+        yield Diagnostic(
             "polarity",
             f"{inverted} of {frames} frames fit only a light that is on where the link says off, and were"
             " read so",
@@ -650,7 +652,7 @@ def _signs(counts: Mapping[str, int], events: int, frames: int) -> Iterator[Doub
         return
     if min(on, events - on) < _ONE_SIGN_SHARE * events:
         sign, other = ("ON", "off") if 2 * on > events else ("OFF", "on")
-        yield Doubt(
+        yield Diagnostic(
             "one-polarity",
             f"{max(on, events - on)} of {events} events are {sign}: when the light goes {other} is not"
             " seen, so that most of what it says may be read in several ways",
@@ -658,11 +660,11 @@ def _signs(counts: Mapping[str, int], events: int, frames: int) -> Iterator[Doub
         )
 
 
-def _room(counts: Mapping[str, int]) -> Iterator[Doubt]:
+def _room(counts: Mapping[str, int]) -> Iterator[Diagnostic]:
     """What the receiver had no room for."""
     found = [text.format(n, _s(n)) for name, text in _NO_ROOM if (n := counts.get(name, 0))]
     if found:
-        yield Doubt(
+        yield Diagnostic(
             "no-room",
             f"more than the receiver holds at a time: {'; '.join(found)}; frames may be missing",
         )
@@ -670,13 +672,13 @@ def _room(counts: Mapping[str, int]) -> Iterator[Doubt]:
 
 def _transmitter(
     number: int, one: TransmitterTally, link: Link, counts: Mapping[str, int], seen: Seen
-) -> Iterator[Doubt]:
+) -> Iterator[Diagnostic]:
     ppm = one.clock_ppm()
     # A packet's time may be half a chip off where the light changes.
     unsure_ppm = link.packet.chip_us / 2 / one.steps_us * 1e6 if one.steps_us else math.inf
     if abs(ppm) > _CRYSTALS_PPM + unsure_ppm:
         fits = link.packet.chip_rate_hz * (1 + ppm * 1e-6)
-        yield Doubt(
+        yield Diagnostic(
             "clock",
             f"its clock is {ppm:+.0f} ppm off the link's, crystals stay within {_CRYSTALS_PPM:.0f}",
             f"air.chip_rate_hz = {fits:.6g} would fit",
@@ -691,7 +693,7 @@ def _transmitter(
         and link.algorithm("ranging").measures
         and one.ranged < _RANGED_SHARE * own
     ):
-        yield Doubt(
+        yield Diagnostic(
             "few-distances",
             f"{one.ranged} of {own:.0f} frames have a distance: too few boundaries between clusters are seen,"
             " or their values do not fit the layout",
@@ -700,7 +702,7 @@ def _transmitter(
         )
     hidden = [k for k in range(link.codebook.clusters) if one.unseen[k] == one.frames]
     if hidden:
-        yield Doubt(
+        yield Diagnostic(
             "clusters-hidden",
             f"clusters never seen: {', '.join(map(str, hidden))}",
             "is something before them? if not, compare the link's [bar] and [pilots] with the bar",
@@ -711,7 +713,7 @@ def _transmitter(
 
 def _codewords(
     number: int, one: TransmitterTally, link: Link, counts: Mapping[str, int], seen: Seen
-) -> Iterator[Doubt]:
+) -> Iterator[Diagnostic]:
     """Codewords that never occur, and the modulation that they are all of."""
     if link.characters_on_air and not one.blocks:
         # Of characters a text has few.
@@ -732,14 +734,14 @@ def _codewords(
             text = f"only {occur} of {codewords} symbols ever occur"
             if occur > len(words):
                 text = f"{share:.0%} of its symbols are {len(heard)} of {codewords}"
-            yield Doubt(
+            yield Diagnostic(
                 "profile",
                 f"{text}{unread}",
                 f"was this sent with {name}? try --set modulation.id={name}",
                 number,
             )
             return
-    yield Doubt(
+    yield Diagnostic(
         "codewords",
         f"{never} of {codewords} codewords never occur in {one.given} symbols{unread}",
         "data that repeats, or another modulation than modulation.id",
@@ -747,7 +749,7 @@ def _codewords(
     )
 
 
-def _turned_bits(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+def _turned_bits(number: int, one: TransmitterTally, link: Link) -> Iterator[Diagnostic]:
     """Characters that are text if their bits come the other way round."""
     each = link.codebook.bits_per_symbol
     text = {*range(0x20, 0x7F), 0x09, 0x0A, 0x0D}
@@ -764,7 +766,7 @@ def _turned_bits(number: int, one: TransmitterTally, link: Link) -> Iterator[Dou
         )
     own, other = shares
     if one.given >= _FEW_FRAMES and other[0] > _SPLIT > own[0] + 0.1 and other[1] > own[1]:
-        yield Doubt(
+        yield Diagnostic(
             "bit-order",
             f"{own[0]:.0%} of its characters are printable, and {other[0]:.0%} if their bits come the other"
             " way round",
@@ -773,12 +775,12 @@ def _turned_bits(number: int, one: TransmitterTally, link: Link) -> Iterator[Dou
         )
 
 
-def _one_character(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+def _one_character(number: int, one: TransmitterTally, link: Link) -> Iterator[Diagnostic]:
     """Characters that are all the same, as those of a lamp are that blinks once in a character's time."""
     value = max(one.values, key=one.values.__getitem__, default=0)
     if one.given >= _MANY_CHARACTERS and one.values[value] > _ALIKE_SHARE * one.given:
         digits = (link.codebook.bits_per_symbol + 3) // 4
-        yield Doubt(
+        yield Diagnostic(
             "one-character",
             f"{one.values[value]} of its {one.given} characters are 0x{value:0{digits}x}: a lamp that blinks"
             " once in a character's time reads like that",
@@ -787,7 +789,7 @@ def _one_character(number: int, one: TransmitterTally, link: Link) -> Iterator[D
         )
 
 
-def _unsure(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Iterator[Doubt]:
+def _unsure(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Iterator[Diagnostic]:
     """Symbols that are not given, of every cluster, or that are said to be wrong.
 
     What covers some of a bar is no fault of the link's.
@@ -806,7 +808,7 @@ def _unsure(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Itera
         name for name, words in seen.others().items() if len(words) > len(own) and _among(own, words).all()
     ]
     asked = f"was this sent with {' or '.join(larger)} (modulation.id)? if not, " if larger else ""
-    yield Doubt(
+    yield Diagnostic(
         "unsure",
         text,
         f"{asked}more light, a sharper image, or another decoding.id; `evlcp diagnose` says what it lacks",
@@ -838,7 +840,7 @@ def codewords_never(one: TransmitterTally, link: Link) -> int:
     return never if chance < math.log(_BY_CHANCE) else 0
 
 
-def _size(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+def _size(number: int, one: TransmitterTally, link: Link) -> Iterator[Diagnostic]:
     """Distances against those that the bar's length in the picture gives."""
     if one.sized < _FEW_FRAMES:
         return
@@ -846,7 +848,7 @@ def _size(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
     reach = math.exp(one.reach_sum / one.sized)
     share = reach / (link.camera.focal_px * math.dist(centres_m[0], centres_m[-1])) - 1
     if abs(share) > _SIZE_OFF:
-        yield Doubt(
+        yield Diagnostic(
             "size",
             f"its distances are {abs(share):.0%} too {'long' if share > 0 else 'short'} for a bar of"
             f" {link.bar.length_m:g} m that looks as long as this one",
@@ -855,12 +857,12 @@ def _size(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
         )
 
 
-def _turned(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+def _turned(number: int, one: TransmitterTally, link: Link) -> Iterator[Diagnostic]:
     """A bar that stands on its head in the picture; where positions are computed, they tell."""
     centres_m = link.bar.cluster_centres_m()
     along, way = np.array(one.along_px), centres_m[-1] - centres_m[0]
     if one.sized >= _FEW_FRAMES and along @ way < -_HEAD_DOWN * math.hypot(*along) * math.hypot(*way):
-        yield Doubt(
+        yield Diagnostic(
             "turned",
             "its clusters stand the other way round in the picture",
             "is the camera upside down, its picture mirrored, or the bar mounted so? positions have to know",
@@ -868,12 +870,12 @@ def _turned(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
         )
 
 
-def _length(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
+def _length(number: int, one: TransmitterTally, link: Link) -> Iterator[Diagnostic]:
     """The bar's length as its own beacon says it."""
     said_m, length_m = one.beacon_m, link.bar.length_m
     if not math.isnan(said_m) and abs(said_m / length_m - 1) > _LENGTH_OFF:
         how = f"{abs(length_m / said_m - 1):.0%} too {'long' if length_m > said_m else 'short'}"
-        yield Doubt(
+        yield Diagnostic(
             "bar-length",
             f"its beacon says that the bar is {said_m:.3f} m long, the link {length_m:.3f}: its distances are"
             f" {how} if the beacon is right",
@@ -882,7 +884,7 @@ def _length(number: int, one: TransmitterTally, link: Link) -> Iterator[Doubt]:
         )
 
 
-def _coverage(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Iterator[Doubt]:
+def _coverage(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Iterator[Diagnostic]:
     """Light that is there before the first frame or after the last one."""
     lit = (seen.lit_us or {}).get(number)
     if lit is None or not seen.duration_us:
@@ -897,7 +899,7 @@ def _coverage(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Ite
     if lit[1] - one.last_us > least_us:
         said.append(f"nothing after {at[2]}, though its light is there until {at[3]}")
     if said:
-        yield Doubt(
+        yield Diagnostic(
             "coverage",
             "; ".join(said),
             "compare air.chip_rate_hz and air.frames_per_packet with the transmitter's, or try --link auto",
@@ -905,17 +907,17 @@ def _coverage(number: int, one: TransmitterTally, link: Link, seen: Seen) -> Ite
         )
 
 
-def _blocks(counts: Mapping[str, int]) -> Iterator[Doubt]:
+def _blocks(counts: Mapping[str, int]) -> Iterator[Diagnostic]:
     tried, read = counts.get("blocks_tried", 0), _read(counts)
     if other := counts.get("blocks_other_codebook", 0):
-        yield Doubt(
+        yield Diagnostic(
             "other-codebook",
             f"{other} packet{_s(other)} sent with another codebook",
             "compare both ends' `evlcp config`",
         )
     alike = counts.get("blocks_alike", 0)
     if not read and alike >= _ALIKE:
-        yield Doubt(
+        yield Diagnostic(
             "blocks-unread",
             f"none of {tried} packets has a block that can be read, though {alike} of them repeat others",
             "another error correction than error-correction.id, or frames taken from another place in the"
@@ -923,11 +925,11 @@ def _blocks(counts: Mapping[str, int]) -> Iterator[Doubt]:
         )
 
 
-def _unread(number: int, one: TransmitterTally) -> Iterator[Doubt]:
+def _unread(number: int, one: TransmitterTally) -> Iterator[Diagnostic]:
     """Packets without a block of a transmitter that sends some; another one may send none at all."""
     failed = one.packets - one.blocks
     if one.blocks and failed >= _FEW_FRAMES and failed > _FAILED_SHARE * one.packets:
-        yield Doubt(
+        yield Diagnostic(
             "blocks-failed",
             f"{failed} of {one.packets} packets cannot be read",
             "more light, a nearer or a better focused bar, or an error correction of a lower rate",

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from evlcp_sdk.study.markup import Markup, details, document, table, tiles
+from evlcp_sdk.report.markup import Markup, details, document, table, tiles
 
 HOSTILE = (
     "</script><script>document.title='caught'</script><img src=x onerror=\"document.title='caught'\">'\"&"

@@ -13,7 +13,7 @@ from PIL import Image
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import write_events
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.results.film import Film, draw_film, pictures_of, plan_film, save_film
+from evlcp_sdk.report.film import Film, draw_film, pictures_of, plan_film, save_film
 from evlcp_sdk.run import film
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, Range, Region, SoftSymbols
@@ -155,7 +155,7 @@ def test_a_film_for_programs_that_play_no_pictures(tmp_path: Path) -> None:
 
 
 def test_a_film_asks_for_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("evlcp_sdk.results.film.find_spec", lambda name: None)
+    monkeypatch.setattr("evlcp_sdk.report.film.find_spec", lambda name: None)
     with pytest.raises(ConfigError, match=r"pip install 'evlcp-sdk\[mp4\]'"):
         film(tmp_path / "never read.raw", tmp_path / "a.mp4", LINK)
 

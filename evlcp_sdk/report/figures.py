@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.results.colours import TRANSMITTER_COLOURS, cluster_colours, transmitter_colour
+from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_colours, transmitter_colour
+from evlcp_sdk.report.plots import ellipse
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.plots import ellipse
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.spelling import counted

@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
+from evlcp_sdk.diagnosis.warnings import Diagnostic
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.results.colours import cluster_colours, transmitter_colour
-from evlcp_sdk.results.doubts import Doubt
-from evlcp_sdk.results.figures import Thinned, TrackProbe
+from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
+from evlcp_sdk.report.figures import Thinned, TrackProbe
+from evlcp_sdk.report.markup import Markup, details, document, table, tiles
+from evlcp_sdk.report.motion import MotionProbe
+from evlcp_sdk.report.plots import PLOT_STYLE, Plot, ellipse
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.motion import MotionProbe
-from evlcp_sdk.results.plots import PLOT_STYLE, Plot, ellipse
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.study.markup import Markup, details, document, table, tiles
 from evlcp_sdk.values import Events, Frame, Packet
 
 __all__ = ["Report"]
@@ -154,7 +154,7 @@ class Report(Sink):
             _configuration(summary),
         ]
         told: dict[str, Any] = {plot.id: plot.told for plot in plots}
-        script = files("evlcp_sdk.results").joinpath("report.js").read_text(encoding="utf-8")
+        script = files("evlcp_sdk.report").joinpath("report.js").read_text(encoding="utf-8")
         data = {"report": {"plots": told, "motions": motions}}
         page = document(f"{self.run.name}: report", body, [script], data, _STYLE)
         self.folder.open("report.html").write(page)
@@ -393,7 +393,7 @@ def _warnings(summary: Mapping[str, Any]) -> Markup:
     held = Markup("<li>{}{}</li>")
     step = Markup('<div class="note">{}</div>')
     items = [
-        held.format(str(Doubt(**{**told, "next_step": ""})), step.format(told["next_step"]))
+        held.format(str(Diagnostic(**{**told, "next_step": ""})), step.format(told["next_step"]))
         for told in summary["warnings"]
     ]
     items += [
@@ -407,7 +407,7 @@ def _warnings(summary: Mapping[str, Any]) -> Markup:
     else:
         shown = Markup('<p class="note">What blinks in it, and which stage stops it: evlcp diagnose.</p>')
     for note in summary["notes"]:
-        shown += Markup('<p class="note">{}</p>').format(str(Doubt(**note)))
+        shown += Markup('<p class="note">{}</p>').format(str(Diagnostic(**note)))
     return shown
 
 

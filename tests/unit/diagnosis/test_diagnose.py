@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from evlcp_sdk.cli._app import make_app
+from evlcp_sdk.diagnosis import _kernels
+from evlcp_sdk.diagnosis.checks import Facts, checks_of
+from evlcp_sdk.diagnosis.diagnose import Diagnosis, diagnosis_of, infer_link
+from evlcp_sdk.diagnosis.light import LightSource, LightSurvey, comb
+from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
+from evlcp_sdk.diagnosis.warnings import Seen
 from evlcp_sdk.io import open_source
 from evlcp_sdk.io.open import write_events
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.results.doubts import Seen
-from evlcp_sdk.results.tallies import RunTally, TransmitterTally
+from evlcp_sdk.report.diagnosis_page import page
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import SimulatedSource, simulate
-from evlcp_sdk.study.diagnosis import _kernels
-from evlcp_sdk.study.diagnosis.checks import Facts, checks_of
-from evlcp_sdk.study.diagnosis.diagnose import Diagnosis, diagnosis_of, infer_link
-from evlcp_sdk.study.diagnosis.light import LightSource, LightSurvey, comb
-from evlcp_sdk.study.diagnosis.page import page
 from evlcp_sdk.values import Events
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 

@@ -4,11 +4,11 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.diagnosis.warnings import codewords_never
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.doubts import codewords_never
-from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events
 

@@ -8,12 +8,12 @@ import pytest
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.diagnosis.warnings import warnings_of
 from evlcp_sdk.io import write_events
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import Measure, Ranging
 from evlcp_sdk.plugin.source import EventSource
-from evlcp_sdk.results.doubts import warnings_of
-from evlcp_sdk.results.tallies import RunTally
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.limits import LIMITS
 from evlcp_sdk.rx.receiver import Receiver
