@@ -22,9 +22,9 @@ from evlcp_sdk.study.compare.campaigns import of_campaign
 from evlcp_sdk.study.intervals import measure
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.tally import Statistics, Tally
+from tests.unit.report.test_markup import HOSTILE, Elements
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 from tests.unit.study.campaign.fake import run_fake
-from tests.unit.report.test_markup import HOSTILE, Elements
 
 TWO = "two clusters <!--<script>"
 """In a script element, such a name would keep its end tag from ending it."""

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.unit.report.test_markup import HOSTILE, Elements
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
@@ -22,6 +21,7 @@ from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
+from tests.unit.report.test_markup import HOSTILE, Elements
 from tests.unit.results.test_positions import ATTITUDE, SITE, packets
 from tests.unit.study.campaign.browser import CHROMIUM, Browser
 

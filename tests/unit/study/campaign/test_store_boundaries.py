@@ -24,8 +24,8 @@ from evlcp_sdk.study.compare.campaigns import of_campaign
 from evlcp_sdk.study.compare.table import Comparison
 from evlcp_sdk.study.jobs import Inline
 from tests.unit.mutants import mutants, refusal
-from tests.unit.study.campaign.fake import fake_plan, run_fake
 from tests.unit.report.test_markup import HOSTILE, Elements
+from tests.unit.study.campaign.fake import fake_plan, run_fake
 
 
 @pytest.fixture
