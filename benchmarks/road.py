@@ -49,7 +49,9 @@ from evlcp_sdk.sim import Truth, read_truth, truth_path
 from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.compare.variants import load_variants
 from evlcp_sdk.study.frames import read_frames
-from evlcp_sdk.study.score import Score
+from evlcp_sdk.study.match import match
+from evlcp_sdk.study.measure import bar_tallies
+from evlcp_sdk.study.score import score_frames
 from evlcp_sdk.study.tally import Statistics, Tally
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
@@ -197,30 +199,32 @@ def measured(path: Path, make: Make, table: Mapping[str, Any], tool: Path, round
             summary = receive_to_folder(path, out, make(profile))
             if summary["status"] != "complete":
                 raise EvlcpError(str(summary["error"]))
-            score = Score.of(read_frames(out), truth, road=True)
+            frames = read_frames(out)
+            found = match(frames, truth)
         except Exception as fault:  # whatever ends one recording must not end the table
             return result | {"fault": f"{type(fault).__name__}: {fault}".splitlines()[0]}
-        other = independent(tool, out, truth_path(path))
+        ours, other = score_frames(frames, truth)["road"], independent(tool, out, truth_path(path))
+        ghosts, bars = found.unmatched, zip(found.bars, found.pairs, strict=True)
         result |= {
-            "rows": score.rows,
-            "ghosts": score.unmatched,
-            "echoes": score.echoes,
+            "rows": len(frames),
+            "ghosts": ghosts,
+            "echoes": found.echoes,
             "warnings": [warning["code"] for warning in summary["warnings"]],
-            "independent": "absent" if other is None else "agrees" if other == score.to_road() else "differs",
+            "independent": "absent" if other is None else "agrees" if other == ours else "differs",
         }
-        for number, bar in enumerate(score.bars):
+        for number, bar in enumerate(Statistics.of(bar_tallies(*one)) for one in bars):
             targets = targets_of(table, name, number)
             result["bars"].append(
                 {
                     "statistics": bar,
                     "targets": targets,
-                    "missed": missed(bar.total(), score.unmatched if number == 0 else 0, targets),
+                    "missed": missed(bar.total(), ghosts if number == 0 else 0, targets),
                 }
             )
-        if not score.bars:
+        if not found.bars:
             targets = targets_of(table, name, 0)
             result["bars"].append(
-                {"statistics": None, "targets": targets, "missed": missed(None, score.unmatched, targets)}
+                {"statistics": None, "targets": targets, "missed": missed(None, ghosts, targets)}
             )
         if rounds:
             result["speed"] = speed(path, out, make(profile), rounds)

@@ -6,7 +6,6 @@ image. Every length follows from the link that the bar sends with.
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +18,7 @@ from evlcp_sdk.rx.echoes import FOLLOWED_CHIPS
 from evlcp_sdk.sim.truth import SentBar, Truth
 from evlcp_sdk.study.frames import GivenFrame
 
-__all__ = ["BarFrames", "BarPackets", "Matched", "check_link", "frame_on_air_us", "match", "nearest_bar"]
+__all__ = ["BarFrames", "Matched", "check_link", "find_start", "match", "nearest_bar", "sent_packets"]
 
 Floats = NDArray[np.float64]
 
@@ -40,46 +39,32 @@ def _tail_us(packet: PacketFormat) -> float:
     return TAIL_CHIPS * packet.chip_us
 
 
-def _near_us(packet: PacketFormat) -> float:
-    """How far from its true start a frame may start: half a pilot.
+def find_start(starts_us: Floats, t_us: float, packet: PacketFormat) -> int | None:
+    """Number of the start that is nearest to a time, if it is so by half a pilot; None if none is.
 
     What is further off has not found the pilot. Frames without one follow each other by an info segment, so
     that it is not more than half of that, either.
     """
     chips = packet.pilot_chips if packet.pilot_every == 1 else min(packet.pilot_chips, packet.info_chips)
-    # Without pilots, frames are info segments.
-    chips = chips or packet.info_chips
-    return chips / 2 * packet.chip_us
-
-
-def frame_on_air_us(packet: PacketFormat) -> float:
-    """Time of a frame with its pilot, until its last events have come, us."""
-    return packet.frame_chips * packet.chip_us + _tail_us(packet)
-
-
-class _Placed(Protocol):
-    """What has a place in the image."""
-
-    @property
-    def x_px(self) -> float: ...
-
-    @property
-    def y_px(self) -> float: ...
-
-
-def apart_px(bar: SentBar, truth: Truth, t_us: float, placed: _Placed) -> float:
-    """How far from a bar's centre something lies at a time after the scene's start, px."""
-    x, y = (float(np.interp(t_us, truth.t_us, bar.centre_px[:, axis])) for axis in (0, 1))
-    return float(np.hypot(placed.x_px - x, placed.y_px - y))
+    if not len(starts_us):
+        return None
+    nearest = int(np.argmin(np.abs(starts_us - t_us)))
+    near_us = (chips or packet.info_chips) / 2 * packet.chip_us
+    return nearest if abs(starts_us[nearest] - t_us) <= near_us else None
 
 
 def nearest_bar(
-    bars: Sequence[SentBar], truth: Truth, t_us: float, placed: _Placed
+    bars: Sequence[SentBar], truth: Truth, t_us: float, x_px: float, y_px: float
 ) -> tuple[int, float] | None:
-    """Number of the bar that is nearest in the image, and how far it is, px; None without bars."""
-    away = [apart_px(bar, truth, t_us, placed) for bar in bars]
-    nearest = min(range(len(bars)), key=away.__getitem__, default=None)
-    return None if nearest is None else (nearest, away[nearest])
+    """Number of the bar that is nearest in the image at a time after the scene's start, and its distance, px.
+
+    None without bars.
+    """
+    away = []
+    for bar in bars:
+        x, y = (float(np.interp(t_us, truth.t_us, bar.centre_px[:, axis])) for axis in (0, 1))
+        away.append(float(np.hypot(x_px - x, y_px - y)))
+    return min(enumerate(away), key=lambda one: one[1], default=None)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +107,9 @@ class BarFrames:
         start_us: Floats = (chip - bar.start_chip) / rate_hz * 1e6
         end_us: Floats = start_us + long / rate_hz * 1e6
         clusters = bar.link.codebook.clusters
-        hidden, cut = _hidden(bar, clusters, start_us, end_us) if covers else _nothing(len(chip), clusters)
+        hidden, cut = (np.zeros((len(chip), clusters), np.bool_) for _ in range(2))
+        if covers:
+            _hide(bar, start_us, end_us, hidden, cut)
         sent = (start_us >= 0) & (end_us + _tail_us(packet) < truth.duration_us) & ~cut.all(1)
         # Most of what ranging uses is the pilot, and its middle the time that the distance is of.
         middle = (
@@ -130,36 +117,14 @@ class BarFrames:
         )
         distance_m: Floats = np.interp(start_us[sent] + middle[sent], truth.t_us, bar.distance_m)
         symbols = np.asarray(bar.symbols, np.int64).reshape(-1, clusters)[: len(chip)]
-        return cls(
-            bar,
-            start_us[sent],
-            symbols[sent],
-            distance_m,
-            hidden[sent],
-            cut[sent],
-        )
-
-    def number(self, t_us: float) -> int | None:
-        """The frame that started at a time after the scene's start; None if there is none."""
-        return _at(self.start_us, t_us, _near_us(self.bar.link.packet))
+        return cls(bar, start_us[sent], symbols[sent], distance_m, hidden[sent], cut[sent])
 
 
-def _at(starts_us: Floats, t_us: float, near_us: float) -> int | None:
-    if not len(starts_us):
-        return None
-    nearest = int(np.argmin(np.abs(starts_us - t_us)))
-    return nearest if abs(starts_us[nearest] - t_us) <= near_us else None
-
-
-def _nothing(frames: int, clusters: int) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    return np.zeros((frames, clusters), np.bool_), np.zeros((frames, clusters), np.bool_)
-
-
-def _hidden(
-    bar: SentBar, clusters: int, start_us: Floats, end_us: Floats
-) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-    """Clusters hidden in the whole of each time, and those hidden in any part of it: bool (n, clusters)."""
-    whole, part = _nothing(len(start_us), clusters)
+def _hide(
+    bar: SentBar, start_us: Floats, end_us: Floats, whole: NDArray[np.bool_], part: NDArray[np.bool_]
+) -> None:
+    """Mark clusters that are hidden in the whole of each time, and in any part of it, (n, clusters)."""
+    clusters = whole.shape[1]
     covered = list(bar.covered)
     whole[:, covered] = part[:, covered] = True
     recovery_us = RECOVERY_CHIPS * bar.link.packet.chip_us
@@ -167,7 +132,6 @@ def _hidden(
         behind = slice(int(first), int(last) + 1)
         part[(start_us < to_s * 1e6 + recovery_us) & (end_us > from_s * 1e6), behind] = True
         whole[(start_us >= from_s * 1e6) & (end_us <= to_s * 1e6), behind] = True
-    return whole, part
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,12 +184,12 @@ def match(
             continue
         t_us = frame.t_us - truth.t0_us
         among = senders.get(frame.link, range(len(bars)))
-        nearest = nearest_bar([bars[i].bar for i in among], truth, t_us, frame)
+        nearest = nearest_bar([bars[i].bar for i in among], truth, t_us, frame.x_px, frame.y_px)
         if nearest is None:
             unmatched += 1
             continue
         i, away_px = among[nearest[0]], nearest[1]
-        number = bars[i].number(t_us)
+        number = find_start(bars[i].start_us, t_us, bars[i].bar.link.packet)
         if away_px <= NEAREST_PX and number is not None and number not in found[i]:
             found[i].add(number)
             pairs[i].append((frame, number))
@@ -237,7 +201,9 @@ def match(
 def _is_cut(sent: BarFrames, truth: Truth, t_us: float, found: set[int], *, road: bool) -> bool:
     """Whether a frame of a bar at a time would be cut, and not one that was found before is nearest."""
     packet = sent.bar.link.packet
-    tail_us, long_us = _tail_us(packet), frame_on_air_us(packet)
+    tail_us = _tail_us(packet)
+    # With its pilot, until its last events have come.
+    long_us = packet.frame_chips * packet.chip_us + tail_us
     at_end = t_us < tail_us or t_us + long_us > truth.duration_us
     dark = road and any(t_us < b * 1e6 + long_us and t_us + long_us > a * 1e6 for a, b in sent.bar.pole_s)
     if not (at_end or dark):
@@ -245,36 +211,20 @@ def _is_cut(sent: BarFrames, truth: Truth, t_us: float, found: set[int], *, road
     return not len(sent.start_us) or int(np.argmin(np.abs(sent.start_us - t_us))) not in found
 
 
-@dataclass(frozen=True, eq=False)
-class BarPackets:
-    """The packets that a bar sent, at least in part, while the recording ran.
+def sent_packets(bar: SentBar, truth: Truth) -> tuple[Floats, NDArray[np.bool_], Floats]:
+    """Packets that a bar sent, at least in part, while the recording ran.
 
-    Attributes:
-        bar: The bar.
-        start_us: Start of each after the scene's, us, float64 (n,).
-        whole: Those that were sent whole, bool (n,).
-        distance_m: Distance in the middle of each, m, float64 (n,).
+    Returns:
+        Start of each after the scene's, us; those that were sent whole; the distance in its middle, m.
     """
-
-    bar: SentBar
-    start_us: Floats
-    whole: NDArray[np.bool_]
-    distance_m: Floats
-
-    @classmethod
-    def of(cls, bar: SentBar, truth: Truth) -> "BarPackets":
-        """Those of a bar."""
-        packet = bar.link.packet
-        period_us = packet.packet_chips / bar.rate_hz * 1e6
-        number = np.arange(len(bar.symbols), dtype=np.float64)
-        start_us: Floats = number * period_us - bar.start_chip / bar.rate_hz * 1e6
-        whole = (start_us >= 0) & (start_us + period_us + _tail_us(packet) < truth.duration_us)
-        distance_m: Floats = np.interp(start_us + period_us / 2, truth.t_us, bar.distance_m)
-        return cls(bar, start_us, whole, distance_m)
-
-    def number(self, t_us: float) -> int | None:
-        """The packet that started at a time after the scene's start; None if there is none."""
-        return _at(self.start_us, t_us, _near_us(self.bar.link.packet))
+    packet = bar.link.packet
+    period_us = packet.packet_chips / bar.rate_hz * 1e6
+    start_us: Floats = (
+        np.arange(len(bar.symbols), dtype=np.float64) * period_us - bar.start_chip / bar.rate_hz * 1e6
+    )
+    whole = (start_us >= 0) & (start_us + period_us + _tail_us(packet) < truth.duration_us)
+    distance_m: Floats = np.interp(start_us + period_us / 2, truth.t_us, bar.distance_m)
+    return start_us, whole, distance_m
 
 
 def check_link(truth: Truth, link: Link | Mapping[str, Link], name: str, *, messages: bool = False) -> None:

@@ -14,7 +14,7 @@ from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.study.frames import GivenFrame
-from evlcp_sdk.study.match import NEAREST_PX, BarFrames, BarPackets, match, nearest_bar
+from evlcp_sdk.study.match import NEAREST_PX, BarFrames, find_start, match, nearest_bar, sent_packets
 from evlcp_sdk.study.tally import Statistics, Tally, in_nm, segment_of
 from evlcp_sdk.values import Frame, Packet
 
@@ -128,28 +128,29 @@ def message_tallies(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) 
         truth: What was sent.
         coder: How packets carry blocks.
     """
-    bars = [BarPackets.of(bar, truth) for bar in truth.bars if bar.sends_frames and bar.payload != "symbols"]
+    bars = [bar for bar in truth.bars if bar.sends_frames and bar.payload != "symbols"]
+    sent = [sent_packets(bar, truth) for bar in bars]
     tallies = [
         (segment_of(at), Tally(messages_sent=1))
-        for sent in bars
-        for at in sent.distance_m[sent.whole].tolist()
+        for _, whole, distance_m in sent
+        for at in distance_m[whole].tolist()
     ]
     for packet in packets:
         if packet.block is None or not packet.frames or packet.echo_of is not None:
             continue
-        t_us = packet.t_us - truth.t0_us
-        nearest = nearest_bar([sent.bar for sent in bars], truth, t_us, packet.frames[0])
-        sent = None if nearest is None else bars[nearest[0]]
-        number = None if sent is None else sent.number(t_us)
-        if sent is None or number is None:
+        t_us, first = packet.t_us - truth.t0_us, packet.frames[0]
+        nearest = nearest_bar(bars, truth, t_us, first.x_px, first.y_px)
+        bar = 0 if nearest is None else nearest[0]
+        number = None if nearest is None else find_start(sent[bar][0], t_us, bars[bar].link.packet)
+        if number is None:
             tallies.append((0, Tally(messages_wrong=1)))
             continue
-        said = coder.symbols(packet.block.pack(coder.block_bytes))
-        segment = segment_of(float(sent.distance_m[number]))
-        if not np.array_equal(said, sent.bar.symbols[number]):
-            tallies.append((segment, Tally(messages_wrong=1)))
-        elif sent.whole[number]:
-            tallies.append((segment, Tally(messages_found=1)))
+        _, whole, distance_m = sent[bar]
+        read = coder.symbols(packet.block.pack(coder.block_bytes))
+        if not np.array_equal(read, bars[bar].symbols[number]):
+            tallies.append((segment_of(float(distance_m[number])), Tally(messages_wrong=1)))
+        elif whole[number]:
+            tallies.append((segment_of(float(distance_m[number])), Tally(messages_found=1)))
     return tallies
 
 
@@ -170,7 +171,7 @@ def sites_seen(
             if frame.echo_of is None:
                 first.setdefault(packet.transmitter, frame)
     for number, frame in first.items():
-        nearest = nearest_bar(truth.bars, truth, frame.t_us - truth.t0_us, frame)
+        nearest = nearest_bar(truth.bars, truth, frame.t_us - truth.t0_us, frame.x_px, frame.y_px)
         if nearest is not None and nearest[1] <= NEAREST_PX and said[nearest[0]].transmitter is None:
             said[nearest[0]] = replace(said[nearest[0]], transmitter=number)
     return said

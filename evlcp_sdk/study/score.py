@@ -7,7 +7,6 @@ that is not given is erased and no error, and one of a hidden cluster is claimed
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -23,62 +22,10 @@ from evlcp_sdk.study.match import match
 from evlcp_sdk.study.measure import bar_tallies
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
-__all__ = ["Score", "links_of_result", "score_frames"]
+__all__ = ["links_of_result", "score_frames"]
 
 _FARTHEST_M = 200
 """Segments from here on are not written."""
-
-
-@dataclass(frozen=True)
-class Score:
-    """Decoded frames held against the truth.
-
-    Attributes:
-        rows: Decoded frames.
-        unmatched: Those of them that match no true frame.
-        echoes: Those that are said to be reflections and were left out; 0 in the plain score.
-        bars: One per bar that shone, its tallies by segment of distance.
-    """
-
-    rows: int
-    unmatched: int
-    echoes: int
-    bars: tuple[Statistics, ...]
-
-    @classmethod
-    def of(
-        cls,
-        frames: Iterable[GivenFrame],
-        truth: Truth,
-        *,
-        road: bool,
-        links: Mapping[str, Link] | None = None,
-    ) -> "Score":
-        """Score decoded frames.
-
-        Args:
-            frames: The decoded frames.
-            truth: What was sent.
-            road: The road score, not the plain one.
-            links: The receiver's links by name, where it has several; None for one.
-        """
-        frames = list(frames)
-        found = match(frames, truth, road=road, links=links)
-        bars = (Statistics.of(bar_tallies(*one)) for one in zip(found.bars, found.pairs, strict=True))
-        return cls(len(frames), found.unmatched, found.echoes, tuple(bars))
-
-    def to_plain(self) -> dict[str, Any]:
-        """The figures of the plain score as JSON values, rounded; null where nothing was measured."""
-        return {"rows": self.rows, "unmatched": self.unmatched, "bars": [_plain(bar) for bar in self.bars]}
-
-    def to_road(self) -> dict[str, Any]:
-        """The figures of the road score as JSON values, rounded; null where nothing was measured."""
-        return {
-            "rows": self.rows,
-            "unmatched": self.unmatched,
-            "echoes": self.echoes,
-            "bars": [_road(bar) for bar in self.bars],
-        }
 
 
 def score_frames(
@@ -92,22 +39,49 @@ def score_frames(
         links: The receiver's links by name, where it has several: each bar's row names its; None for one.
     """
     frames = list(frames)
-    plain, road = (Score.of(frames, truth, road=road, links=links) for road in (False, True))
-    found = plain.to_plain() | {"road": road.to_road()}
-    if links:
-        lit = [bar for bar in truth.bars if bar.lit]
-        for rows in (found["bars"], found["road"]["bars"]):
-            for bar, row in zip(lit, rows, strict=True):
-                row["link"] = next((n for n, one in links.items() if not differences(bar.link, one)), None)
-    return found
+    plain, road = (_score(frames, truth, links, road=road) for road in (False, True))
+    return plain | {"road": road}
 
 
-def _rounded(value: float, digits: int) -> float | None:
-    return None if math.isnan(value) else round(value, digits)
+def _score(
+    frames: list[GivenFrame], truth: Truth, links: Mapping[str, Link] | None, *, road: bool
+) -> dict[str, Any]:
+    found = match(frames, truth, road=road, links=links)
+    bars = []
+    for sent, pairs in zip(found.bars, found.pairs, strict=True):
+        row = _figures(Statistics.of(bar_tallies(sent, pairs)), road=road)
+        if links:
+            link = sent.bar.link
+            row["link"] = next((name for name, one in links.items() if not differences(link, one)), None)
+        bars.append(row)
+    echoes = {"echoes": found.echoes} if road else {}
+    return {"rows": len(frames), "unmatched": found.unmatched} | echoes | {"bars": bars}
 
 
-def _segments(bar: Statistics) -> dict[str, dict[str, Any]]:
-    return {
+def _figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
+    """Figures of one bar, rounded; None where nothing was measured."""
+    tally = bar.total()
+    # A symbol that is not given counts as all bits wrong, or not at all.
+    erased = 0 if road else tally.erased_bits
+    counted = Tally(bits=tally.bits + erased, bit_errors=tally.bit_errors + erased)
+    figures: dict[str, Any] = {
+        "frames_sent": tally.frames_sent,
+        "frames_found": tally.frames_found,
+        "bit_errors": counted.bit_errors,
+        "bits": counted.bits,
+        "ber": _rounded(counted.ber, 6),
+    }
+    if road:
+        figures["erased"] = _rounded(tally.erased_share, 5)
+        figures["claimed"] = _rounded(tally.claimed_share, 5)
+    figures["rmse_m"] = _rounded(tally.rmse_m, 4)
+    if road:
+        figures["bias_m"] = _rounded(tally.bias_m, 4)
+        figures["worst_m"] = _rounded(tally.worst_m, 3)
+        figures["nees"] = _rounded(tally.nees, 2)
+    figures["ranged"] = tally.ranged
+    figures["over_half_metre"] = _rounded(tally.gross_share, 4)
+    figures["segments"] = {
         f"{start}-{start + SEGMENT_M}m": {
             "n": tally.ranged,
             "rmse_m": _rounded(tally.rmse_m, 4),
@@ -116,42 +90,11 @@ def _segments(bar: Statistics) -> dict[str, dict[str, Any]]:
         for start, tally in bar.segments.items()
         if tally.ranged and 0 <= start < _FARTHEST_M
     }
+    return figures
 
 
-def _plain(bar: Statistics) -> dict[str, Any]:
-    tally = bar.total()
-    errors, bits = tally.bit_errors + tally.erased_bits, tally.bits + tally.erased_bits
-    return {
-        "frames_sent": tally.frames_sent,
-        "frames_found": tally.frames_found,
-        "bit_errors": errors,
-        "bits": bits,
-        "ber": _rounded(Tally(bits=bits, bit_errors=errors).ber, 6),
-        "rmse_m": _rounded(tally.rmse_m, 4),
-        "ranged": tally.ranged,
-        "over_half_metre": _rounded(tally.gross_share, 4),
-        "segments": _segments(bar),
-    }
-
-
-def _road(bar: Statistics) -> dict[str, Any]:
-    tally = bar.total()
-    return {
-        "frames_sent": tally.frames_sent,
-        "frames_found": tally.frames_found,
-        "bit_errors": tally.bit_errors,
-        "bits": tally.bits,
-        "ber": _rounded(tally.ber, 6),
-        "erased": _rounded(tally.erased_share, 5),
-        "claimed": _rounded(tally.claimed_share, 5),
-        "rmse_m": _rounded(tally.rmse_m, 4),
-        "bias_m": _rounded(tally.bias_m, 4),
-        "worst_m": _rounded(tally.worst_m, 3),
-        "nees": _rounded(tally.nees, 2),
-        "ranged": tally.ranged,
-        "over_half_metre": _rounded(tally.gross_share, 4),
-        "segments": _segments(bar),
-    }
+def _rounded(value: float, digits: int) -> float | None:
+    return None if math.isnan(value) else round(value, digits)
 
 
 def links_of_result(folder: Path | str, registry: Registry | None = None) -> dict[str, Link]:

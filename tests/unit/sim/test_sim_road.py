@@ -41,7 +41,7 @@ from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.scene import LensSpec
 from evlcp_sdk.study.frames import read_frames
-from evlcp_sdk.study.score import Score
+from evlcp_sdk.study.score import score_frames
 from evlcp_sdk.values import Events
 from tests.models.pixels import pixel_events
 
@@ -506,7 +506,7 @@ def test_scores_agree_on_what_is_hidden(tmp_path: Path) -> None:
                 out.writerow([1, t_us, text, 50.1, 0.1, 424.0, 500.0, 0])
     command = [sys.executable, TOOL, tmp_path, tmp_path / "a.truth.json", "--json"]
     theirs = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    ours = Score.of(read_frames(tmp_path), truth, road=True).to_road()
+    ours = score_frames(read_frames(tmp_path), truth)["road"]
     assert theirs["echoes"] == ours["echoes"] > 40
     (their_bar,), (our_bar,) = theirs["bars"], ours["bars"]
     assert their_bar["claimed"] > 0.9
