@@ -1,17 +1,121 @@
-"""Recordings with their truth beside them, received with every variant: one comparison of all."""
+"""Recordings with their truth beside them, received with every variant: one comparison of all.
 
-from collections.abc import Callable, Mapping, Sequence
+A recording is read once; each piece of its events goes through one `Receiver.feed` after the other, so that
+all see the same and time is measured in one run. What comes out is counted as the road score of `evlcp score`
+counts.
+"""
+
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+
+import numpy as np
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import EventSource, open_source
 from evlcp_sdk.io.sensor import check_sensor
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.sim.truth import read_truth, truth_path
-from evlcp_sdk.study.compare.run import measure_recording
-from evlcp_sdk.study.compare.table import Comparison, Table, total_of
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.sim.truth import Truth, read_truth, truth_path
+from evlcp_sdk.stopwatch import Stopwatch
+from evlcp_sdk.study.bound import frame_bound
+from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, Times
+from evlcp_sdk.study.compare.table import Comparison, Row, Table, total_of
 from evlcp_sdk.study.compare.variants import Variant
+from evlcp_sdk.study.frames import GivenFrame, frames_of
+from evlcp_sdk.study.match import check_link
+from evlcp_sdk.study.measure import statistics_of, without_truth
+from evlcp_sdk.values import Events, FrameView, Range
 
 __all__ = ["compare_recording", "comparison_of"]
+
+_WARM_PACKETS = 2
+"""Packets that a variant decodes beforehand: one may be cut, so that a whole one loads every kernel."""
+
+
+class _Watch:
+    """Notes the processor time of the stages of each frame, us.
+
+    A stage's time is what passed since the stage before finished, on the clock of the thread's processor, or
+    on that of the wall where that is less: between two frames, work of other stages lies before the first.
+    """
+
+    def __init__(self) -> None:
+        self.stage_us: dict[str, list[float]] = {stage: [] for stage in STAGES}
+        self.frame_us: list[float] = []
+        self._frame: dict[str, float] = {}
+        self._finished_s = time.thread_time()
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, elapsed_s: float) -> None:
+        spent_s = min(elapsed_s, time.thread_time() - self._finished_s)
+        if stage in STAGES:
+            self._frame[stage] = spent_s * 1e6
+        elif stage == "frame":
+            for name, us in self._frame.items():
+                self.stage_us[name].append(us)
+            self.frame_us.append(sum(self._frame.values()))
+            self._frame = {}
+        self._finished_s = time.thread_time()
+
+
+class _Bound:
+    """Gives the bound of every frame that a receiver decodes.
+
+    Args:
+        measure: From a frame's view to its bound.
+    """
+
+    def __init__(self, measure: Callable[[FrameView], Range]) -> None:
+        self.sigma_m: list[float] = []
+        self._measure = measure
+        self._views: list[FrameView] = []
+
+    @hookimpl
+    def evlcp_stage_finished(self, stage: str, value: object) -> None:
+        if stage == "view":
+            assert isinstance(value, FrameView)
+            self._views.append(value)
+
+    def settle(self) -> None:
+        """Compute what is due, while no receiver's time runs."""
+        self.sigma_m += [self._measure(view).sigma_m for view in self._views]
+        self._views = []
+
+
+class _Lane:
+    """One variant's receiver, its frames and its time."""
+
+    def __init__(self, links: Mapping[str, Link], bound: _Bound | None = None) -> None:
+        self.watch = _Watch()
+        self.links = links
+        others = [] if bound is None else [bound]
+        self.receiver = Receiver([*links.values()], Registry.load(self.watch, *others).hook)
+        self.frames: list[GivenFrame] = []
+        self.packets = 0
+        self.spent = Stopwatch()
+
+    def feed(self, events: Events | None) -> None:
+        """Take events; None ends the stream."""
+        with self.spent.running():
+            packets = self.receiver.close() if events is None else self.receiver.feed(events)
+        self.packets += len(packets)
+        self.frames += frames_of(packets)
+
+    def measured(self, name: str, truth: Truth | None, recorded_s: float, reading_s: float) -> Measured:
+        """What it gave on a recording of that name, beside the truth if it is known."""
+        times = Times(
+            frame_us=tuple(self.watch.frame_us),
+            stage_us={stage: tuple(us) for stage, us in self.watch.stage_us.items()},
+            recorded_s=recorded_s,
+            cpu_s=reading_s + self.spent.processor_s,
+        )
+        if truth is None:
+            return Measured(without_truth(self.frames, self.packets), times)
+        several = self.links if len(self.links) > 1 else None
+        counted = statistics_of(self.frames, truth, packets=self.packets, links=several)
+        return Measured(counted, times, {name: counted.total()})
 
 
 def compare_recording(
@@ -21,6 +125,9 @@ def compare_recording(
     advance: Callable[[int, int | None], None] = lambda _done, _of: None,
 ) -> Table:
     """Receive a recording with every variant, and score it where its truth lies beside it.
+
+    Its first packets are read and received once before, so that no kernel is loaded or compiled while time
+    runs. The bound is of the frames as the first variant decodes them; several links have none.
 
     Args:
         url: The recording, plugins asked first.
@@ -33,20 +140,79 @@ def compare_recording(
         InputError: The recording or its truth cannot be read.
     """
     registry = Registry.load() if registry is None else registry
-
-    def opened() -> EventSource:
-        source = open_source(url, registry)
-        try:
-            for link in (link for variant in variants for link in variant.links.values()):
-                check_sensor(source, url, link.camera)
-        except ConfigError:
-            source.close()
-            raise
-        return source
-
     path = truth_path(url)
     truth = read_truth(path, registry) if path.exists() else None
-    return measure_recording(url, opened, variants, truth, lambda s: advance(s.position_bytes, s.size_bytes))
+    if truth is not None:
+        for variant in variants:
+            check_link(truth, variant.links, f"{url}: --variant {variant.name}")
+    with open_source(url, registry) as source:
+        for link in (link for variant in variants for link in variant.links.values()):
+            check_sensor(source, url, link.camera)
+        _warm(source, variants)
+    bound = _bound_of(variants[0].links)
+    lanes = [_Lane(variant.links, None if n else bound) for n, variant in enumerate(variants)]
+    first_us = last_us = 0
+    reading = Stopwatch()
+    with open_source(url, registry) as source:
+        for number, events in enumerate(_timed(source.chunks(), reading)):
+            first_us = first_us if number else int(events.t_us[0])
+            last_us = int(events.t_us[-1])
+            # Who comes first brings the events into the cache: each in turn.
+            turn = number % len(lanes)
+            for lane in lanes[turn:] + lanes[:turn]:
+                lane.feed(events)
+            if bound is not None:
+                bound.settle()
+            advance(source.position_bytes, source.size_bytes)
+    for lane in lanes:
+        lane.feed(None)
+    sigma_m = np.empty(0)
+    if bound is not None:
+        bound.settle()
+        sigma_m = np.array(bound.sigma_m, np.float64)
+    recorded_s = (last_us - first_us) * 1e-6
+    rows = tuple(
+        Row(variant.name, lane.measured(url, truth, recorded_s, reading.processor_s))
+        for variant, lane in zip(variants, lanes, strict=True)
+    )
+    return Table(url, rows, Moments.of(sigma_m))
+
+
+def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events]:
+    """The same pieces, the time that it takes to get them counted."""
+    while True:
+        with watch.running():
+            piece = next(pieces, None)
+        if piece is None:
+            return
+        yield piece
+
+
+def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
+    """Receive the first packets with every variant."""
+    lanes = [_Lane(variant.links) for variant in variants]
+    packets = [link.packet for variant in variants for link in variant.links.values()]
+    enough_us = _WARM_PACKETS * max(packet.packet_chips * packet.chip_us for packet in packets)
+    first_us = None
+    for events in source.chunks():
+        first_us = int(events.t_us[0]) if first_us is None else first_us
+        for lane in lanes:
+            lane.feed(events)
+        if events.t_us[-1] - first_us >= enough_us:
+            break
+    for lane in lanes:
+        lane.feed(None)
+
+
+def _bound_of(links: Mapping[str, Link]) -> _Bound | None:
+    """What gives the bound of each frame; None where the bound's model does not hold, or not for all."""
+    if len(links) > 1:
+        return None
+    (link,) = links.values()
+    try:
+        return _Bound(frame_bound(link))
+    except ConfigError:
+        return None
 
 
 def comparison_of(

@@ -21,7 +21,7 @@ from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import summarize
 from evlcp_sdk.study.compare.campaigns import of_campaign
 from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, Times
-from evlcp_sdk.study.compare.run import _Watch
+from evlcp_sdk.study.compare.recordings import _Watch
 from evlcp_sdk.study.compare.table import BOUND_NAME, COLUMNS, Comparison, Row, Table, total_of
 from evlcp_sdk.study.compare.variants import load_variants
 from evlcp_sdk.study.jobs import Inline
