@@ -18,7 +18,7 @@ from typing import Annotated, Any
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.specs import SpecError, build, parse_value, read_toml
+from evlcp_sdk.specs import SpecError, build, parse_value, read_toml, toml_value
 from evlcp_sdk.study.tally import Tally
 
 __all__ = [
@@ -419,7 +419,7 @@ def _cases(
         for values in itertools.product(*axes.values()):
             chosen = dict(zip(axes, values, strict=True))
             overrides = [
-                f"{key}={_toml(_located(value, folder.resolve()) if key.endswith('link') else value)}"
+                f"{key}={toml_value(_located(value, folder.resolve()) if key.endswith('link') else value)}"
                 for key, value in (fixed | chosen | variant).items()
             ]
             try:
@@ -442,9 +442,3 @@ def _flat(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 def _located(base: Any, folder: Path) -> Any:
     """A file is named from the campaign's folder; a preset has no suffix."""
     return str(folder / base) if isinstance(base, str) and base.endswith(".toml") else base
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, list):
-        return f"[{', '.join(map(_toml, value))}]"
-    return json.dumps(value, ensure_ascii=False) if isinstance(value, bool | str) else repr(value)

@@ -9,13 +9,12 @@ former self.
 import json
 import sqlite3
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Self
 from urllib.parse import quote
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
+from evlcp_sdk.errors import ConfigError, InputError, OutputError
 from evlcp_sdk.files import check_output
 from evlcp_sdk.study.campaign.plan import Plan, plan_from_dict
 from evlcp_sdk.study.tally import Statistics
@@ -36,22 +35,13 @@ CREATE TABLE IF NOT EXISTS result (
 
 def _connect(path: Path, *, create: bool) -> sqlite3.Connection:
     """A connection that believes nothing of what a file says but its rows."""
-    if create:
-        base = sqlite3.connect(path, timeout=30, isolation_level=None)
-    else:
+    mode = "mode=rwc"
+    if not create:
         wal = path.with_name(f"{path.name}-wal")
         # Where nobody writes, no file beside it is needed, so that the folder may be read-only, too.
         mode = "mode=ro" if wal.exists() and wal.stat().st_size else "mode=ro&immutable=1"
-        url = f"file:{quote(str(path.absolute()))}?{mode}"
-        base = sqlite3.connect(url, timeout=30, isolation_level=None, uri=True)
-    try:
-        base.execute("PRAGMA trusted_schema = OFF")
-        base.execute("PRAGMA cell_size_check = ON")
-        if not create:
-            base.execute("PRAGMA query_only = ON")
-    except sqlite3.DatabaseError:
-        base.close()
-        raise
+    url = f"file:{quote(str(path.absolute()))}?{mode}"
+    base = sqlite3.connect(url, timeout=30, isolation_level=None, uri=True)
     base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, _MOST_BYTES)
     base.setlimit(sqlite3.SQLITE_LIMIT_ATTACHED, 0)
     return base
@@ -94,65 +84,58 @@ class Store:
             raise InputError(f"{path}: no results file there")
         if create:
             check_output(path)
-        try:
-            self._base = _connect(path, create=create)
-            (version,) = self._base.execute("PRAGMA user_version").fetchone()
-            found = _schema_of(self._base)
-            if version not in (0, SCHEMA) or (version == 0 and (found or not create)):
-                raise InputError(
-                    f"{path}: not a results file of this SDK (schema {version}, expected {SCHEMA})"
-                )
-            if version and found != _SCHEMA:
-                raise InputError(
-                    f"{path}: not a results file of this SDK: other tables than evlcp sweep makes"
-                )
-            if create:
-                self._base.execute("PRAGMA journal_mode = WAL")
-                self._base.execute("PRAGMA synchronous = FULL")
-                if version == 0:
-                    with self._writing():
-                        # All or nothing: tables of no version are somebody else's.
-                        script = f"BEGIN IMMEDIATE; {_TABLES} PRAGMA user_version = {SCHEMA}; COMMIT"
-                        self._base.executescript(script)
-            else:
-                # A page that is its own child would be read for ever.
-                (state,) = self._base.execute("PRAGMA quick_check(1)").fetchone()
-                if state != "ok":
-                    raise InputError(f"{path}: damaged results file: {' '.join(state.split())}")
-        except sqlite3.DatabaseError as fault:
-            self._close()
-            if not isinstance(fault, sqlite3.OperationalError):
+        with ExitStack() as opened:
+            try:
+                self._base = opened.enter_context(closing(_connect(path, create=create)))
+                self._check(create=create)
+            except sqlite3.OperationalError as fault:
+                if create:
+                    raise OutputError(f"{path}: cannot be written: {fault}") from fault
+                raise InputError(f"{path}: {fault}") from fault
+            except (sqlite3.DatabaseError, UnicodeDecodeError) as fault:
                 raise _no_store(path, fault) from fault
-            if create:
-                raise OutputError(f"{path}: cannot be written: {fault}") from fault
-            raise InputError(f"{path}: {fault}") from fault
-        except UnicodeDecodeError as fault:
-            self._close()
-            raise _no_store(path, fault) from fault
-        except EvlcpError:
-            self._close()
-            raise
+            opened.pop_all()
 
-    def _close(self) -> None:
-        if hasattr(self, "_base"):
-            self._base.close()
+    def _check(self, *, create: bool) -> None:
+        """Refuse what is not a results file; make the tables of a new one."""
+        self._base.execute("PRAGMA trusted_schema = OFF")
+        self._base.execute("PRAGMA cell_size_check = ON")
+        if not create:
+            self._base.execute("PRAGMA query_only = ON")
+        (version,) = self._base.execute("PRAGMA user_version").fetchone()
+        found = _schema_of(self._base)
+        other = f"{self.path}: not a results file of this SDK"
+        if version not in (0, SCHEMA) or (version == 0 and (found or not create)):
+            raise InputError(f"{other} (schema {version}, expected {SCHEMA})")
+        if version and found != _SCHEMA:
+            raise InputError(f"{other}: other tables than evlcp sweep makes")
+        if create:
+            self._base.execute("PRAGMA journal_mode = WAL")
+            self._base.execute("PRAGMA synchronous = FULL")
+            if version == 0:
+                with self._writing():
+                    # All or nothing: tables of no version are somebody else's.
+                    script = f"BEGIN IMMEDIATE; {_TABLES} PRAGMA user_version = {SCHEMA}; COMMIT"
+                    self._base.executescript(script)
+            return
+        # A page that is its own child would be read for ever.
+        (state,) = self._base.execute("PRAGMA quick_check(1)").fetchone()
+        if state != "ok":
+            raise InputError(f"{self.path}: damaged results file: {' '.join(state.split())}")
 
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._close()
+    def __exit__(self, *fault: object) -> None:
+        self._base.close()
 
     @contextmanager
     def _writing(self) -> Iterator[None]:
         try:
             yield
         except sqlite3.DatabaseError as fault:
-            raise OutputError(
-                f"{self.path}: cannot be written: {fault}; what was finished is kept"
-            ) from fault
+            text = f"{self.path}: cannot be written: {fault}; what was finished is kept"
+            raise OutputError(text) from fault
 
     @contextmanager
     def _reading(self) -> Iterator[None]:
@@ -220,7 +203,7 @@ class Store:
 
 
 def _no_store(path: Path, fault: Exception) -> InputError:
-    said = (str(fault).splitlines() or [""])[0]
+    line = (str(fault).splitlines() or [""])[0]
     return InputError(
-        f"{path}: damaged, or no results file of evlcp sweep ({type(fault).__name__}: {said:.200})"
+        f"{path}: damaged, or no results file of evlcp sweep ({type(fault).__name__}: {line:.200})"
     )
