@@ -39,18 +39,9 @@ class Picture:
     regions: tuple[Region, ...]
     number: int
 
-    def image(self, over: EventImage | None = None) -> EventImage:
-        """The events, painted: by whoever looks, not by the receiver.
-
-        Args:
-            over: A picture that is no longer needed; memory that is new to a process takes longer to get than
-                a picture takes to paint.
-        """
-        if over is None or (over.width, over.height) != (self.width, self.height):
-            image = EventImage(self.width, self.height)
-        else:
-            image = over
-            image.clear()
+    def image(self) -> EventImage:
+        """The events, painted: by whoever looks, not by the receiver."""
+        image = EventImage(self.width, self.height)
         # Pieces follow one another, and each reaches into the window.
         oldest = self.pieces[0]
         first = int(np.searchsorted(oldest.t_us, self.t_us - self.window_us, "right"))

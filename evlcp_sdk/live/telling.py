@@ -14,7 +14,6 @@ from evlcp_sdk.live.pictures import Picture, PictureSlot
 from evlcp_sdk.results.columns import frame_columns
 from evlcp_sdk.results.lines import FrameSaid, fix_line, frame_said, said_text
 from evlcp_sdk.results.packets_jsonl import message_line
-from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, ReceivedMessage
 
@@ -81,7 +80,6 @@ class Teller:
         self._sites_told = not sites
         self._bars: dict[int, Frame] = {}
         self._shot: Shot | None = None
-        self._image: EventImage | None = None
         self._turn_s = 0.0
         self.untold, self.fault = 0, ""
         self._mine = outlet.subscribe(_KINDS, most=MOST_WAITING)
@@ -126,9 +124,8 @@ class Teller:
         """The newest picture; the same again until there is another."""
         picture = self._pictures.newest
         if picture is not None and (self._shot is None or self._shot.number != picture.number):
-            self._image = picture.image(self._image)
             latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _LATEST_US]
-            self._shot = Shot(picture.number, _told(picture, latest), self._image.png())
+            self._shot = Shot(picture.number, _told(picture, latest), picture.image().png())
         return self._shot
 
     def _keep(self, frame: Frame) -> None:

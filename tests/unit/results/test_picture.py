@@ -6,20 +6,10 @@ import zlib
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from PIL import Image
 
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.values import Events
-
-
-def painted(
-    cells: NDArray[np.uint8], x: NDArray[np.int64], y: NDArray[np.int64], p: NDArray[np.int64]
-) -> None:
-    """The kernel's twin."""
-    height, width = cells.shape
-    inside = (x < width) & (y < height)
-    np.bitwise_or.at(cells, (y[inside], x[inside]), (1 << p[inside]).astype(np.uint8))
 
 
 def stream_of(png: bytes) -> bytes:
@@ -30,7 +20,7 @@ def stream_of(png: bytes) -> bytes:
     return png[at + 4 : at + 4 + size]
 
 
-@pytest.mark.parametrize("size", [(5, 4), (3, 7), (16, 1), (1, 2), (1, 1), (34, 50), (640, 480), (1280, 720)])
+@pytest.mark.parametrize("size", [(5, 4), (3, 7), (16, 1), (1, 2), (1, 1), (34, 50), (640, 480)])
 @pytest.mark.parametrize("density", [0.0, 0.0003, 0.01, 0.3, 3.0])
 def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
     width, height = size
@@ -41,7 +31,9 @@ def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
         # Some lie outside.
         x, y, p = rng.integers(0, width + 2, n), rng.integers(0, height + 1, n), rng.integers(0, 2, n)
         image.paint(Events.of(np.arange(n), x, y, p))
-        painted(cells, x, y, p)
+        for column, row, sign in zip(x.tolist(), y.tolist(), p.tolist(), strict=True):
+            if row < height and column < width:
+                cells[row, column] |= 1 << sign
     assert (image.cells == cells).all()
     told = image.png()
     # A row of a PNG begins with its filter; pixels are two bits each, the left one highest.
@@ -55,13 +47,3 @@ def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
         assert picture.getpalette()[:12] == [16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235]
     image.clear()
     assert not image.cells.any()
-
-
-@pytest.mark.parametrize("gap", [*range(1, 40), 257, 258, 259, 260, 261, 516, 517, 518, 775, 2600])
-def test_runs_of_every_length_are_packed(gap: int) -> None:
-    """A pixel, nothing for so many bytes, and a pixel again; and so at each place of a word of 8 bytes."""
-    for first in range(8):
-        image = EventImage(4 * (first + gap + 2), 1)
-        image.paint(Events.of([0, 1], [4 * first, 4 * (first + gap + 1) + 3], [0, 0], [1, 0]))
-        rows = bytes(first + 1) + b"\x80" + bytes(gap) + b"\x01"
-        assert zlib.decompress(stream_of(image.png())) == rows
