@@ -1,9 +1,7 @@
 """`evlcp compare` on the shipped recording and on a campaign's results."""
 
 import csv
-import io
 import json
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rich.console import Console
 
 from evlcp_sdk.sim import read_truth
 from evlcp_sdk.study.campaign.collect import collect
@@ -124,29 +121,6 @@ def test_text_and_files(
         assert {k: v for k, v in one.items() if k not in TIMES} == {
             k: v for k, v in other.items() if k not in TIMES
         }
-
-
-@pytest.mark.parametrize("width", [80, 150])
-def test_no_figure_is_cut_on_a_narrow_screen(
-    evlcp: Evlcp, recording: Path, monkeypatch: pytest.MonkeyPatch, width: int
-) -> None:
-    said = io.StringIO()
-    screen = Console(file=said, width=width, force_terminal=True, no_color=True, soft_wrap=True)
-    monkeypatch.setattr("evlcp_sdk.cli.compare.console", lambda: screen)
-    done = evlcp("compare", recording, *OPTIONS[:4], "-o", recording.with_suffix(".csv"))
-    assert done.code == 0
-    text = re.sub(r"\x1b\[[0-9;]*m", "", said.getvalue())
-    lines = text.split("* is the best of its column")[0].splitlines()[1:]
-    assert max(map(len, lines)) <= width
-    assert "…" not in text
-    heads = [line.split() for line in lines if line.startswith("variant ")]
-    assert heads[0][1] == "frames"
-    assert len(heads) == (2 if width == 80 else 1)
-    assert sum(line.startswith("filtered ") for line in lines) == len(heads)
-    with recording.with_suffix(".csv").open(newline="") as file:
-        for row in csv.DictReader(file):
-            assert f"{float(row['rmse_m']):.4f}" in text
-            assert f"{float(row['bias_m']):+.4f}" in text
 
 
 @pytest.mark.parametrize(

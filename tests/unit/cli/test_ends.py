@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 import evlcp_sdk.io.describe
-from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.errors import OWN_FAULT
 
 Evlcp = Callable[..., Any]
@@ -88,20 +87,6 @@ def test_ctrl_c_during_imports_is_one_line(demo_raw: Path) -> None:
         assert process.wait() == 130
 
 
-def test_a_module_interrupted_while_it_is_imported(
-    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    class Interrupt:
-        def find_spec(self, name: str, *_: object) -> None:
-            if name == "evlcp_sdk.cli._app":
-                raise KeyboardInterrupt
-
-    monkeypatch.delitem(sys.modules, "evlcp_sdk.cli._app", raising=False)
-    monkeypatch.setattr(sys, "meta_path", [Interrupt(), *sys.meta_path])
-    done = evlcp("info", tmp_path / "none.raw")
-    assert (done.code, done.err) == (130, "evlcp: interrupted\n")
-
-
 def test_ctrl_c_in_a_callback_is_not_lost(tmp_path: Path) -> None:
     """Python only reports what is raised there, as in those that imports end with."""
     (tmp_path / "falls.py").write_text(
@@ -174,11 +159,6 @@ def test_too_little_memory_is_no_fault_of_ours(
     monkeypatch.setattr(evlcp_sdk.io.describe, "describe", broken)
     done = evlcp("info", demo_raw)
     assert (done.code, done.err) == (1, "evlcp: not enough memory: Unable to allocate 12.9 GiB\n")
-
-
-def test_what_is_said_moves_no_cursor(capsys: pytest.CaptureFixture[str]) -> None:
-    complain("a\x1b]0;title\x07\x9b2J\r.raw: no\nb\udcff\t\n\n")
-    assert capsys.readouterr().err == ("evlcp: a\\x1b]0;title\\x07\\x9b2J\\x0d.raw: no\nevlcp: b\\udcff\t\n")
 
 
 @pytest.mark.parametrize("stream", ["stdout", "stderr"])

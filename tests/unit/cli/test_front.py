@@ -4,7 +4,7 @@ import pytest
 import typer.main
 from typer import rich_utils
 
-from evlcp_sdk.cli._app import _OWN, _called_late, add_plugin_commands, make_app
+from evlcp_sdk.cli._app import _called_late, add_plugin_commands, make_app
 from evlcp_sdk.plugin.registry import Registry
 
 
@@ -36,29 +36,6 @@ def test_the_first_page_says_what_typers_own_would(width, capsys, monkeypatch):
     assert commands(ours) == commands(theirs)
     assert _words(ours) == _words(theirs)
     assert max(map(len, ours.splitlines())) == width
-
-
-def test_a_command_is_built_when_it_is_asked_for():
-    app = make_app()
-    add_plugin_commands(app, Registry.load())
-    late, built = _called_late(app), typer.main.get_command(app)
-    with late.context_class(late, info_name="evlcp") as context:
-        names = late.list_commands(context)
-        assert names == built.list_commands(context)
-        for number, name in enumerate(names):
-            one, other = late.get_command(context, name), built.get_command(context, name)
-            assert type(one) is type(other)
-            assert len(late.commands) == number + 1
-            assert [p.opts for p in one.get_params(context)] == [p.opts for p in other.get_params(context)]
-            assert getattr(one, "commands", {}).keys() == getattr(other, "commands", {}).keys()
-            assert (one.help, one.hidden) == (other.help, other.hidden)
-        assert late.get_command(context, "recieve") is None
-
-
-def test_our_modules_add_the_command_that_they_are_named_after():
-    for module in _OWN:
-        (command,) = make_app(module).registered_commands
-        assert command.name == module.replace("_", "-")
 
 
 def _words(page):

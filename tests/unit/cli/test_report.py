@@ -19,7 +19,6 @@ from evlcp_sdk.study.campaign.report import POSITION_HEAD, page, position_rows, 
 from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.compare.campaigns import of_campaign
-from evlcp_sdk.study.intervals import measure
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.report.test_markup import HOSTILE, Elements
@@ -100,15 +99,6 @@ def test_a_smaller_figure_is_better_and_a_kept_bound_agrees(summary: Summary) ->
             (one,) = beside_paper([Series({}, {"speed_kmh": 30}, link, (at,))], [reference])
             assert one.verdict == verdict, (reference, factor)
             assert verdict_of(reference.value * factor, reference) == verdict
-
-
-def test_a_seed_is_one_recording_over_all_distances(summary: Summary) -> None:
-    for series in summary.series:
-        assert len(series.recordings) == 2
-        assert sum(series.recordings, Statistics()) == series.statistics
-        for at, recordings in series.segments:
-            assert Tally.together(recordings) == series.statistics.segments[at]
-            assert measure(recordings, "rmse_m").recordings == 2
 
 
 def test_json_has_every_figure(summary: Summary) -> None:

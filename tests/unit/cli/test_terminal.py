@@ -13,7 +13,7 @@ import pytest
 from rich.console import Console
 
 from evlcp_sdk.cli import _common
-from evlcp_sdk.cli._common import bytes_bar, log_on_stderr, read_so_far
+from evlcp_sdk.cli._common import bytes_bar, log_on_stderr
 from evlcp_sdk.io import write_events
 from evlcp_sdk.printable import printable
 from evlcp_sdk.values import Events
@@ -83,12 +83,6 @@ def test_commands_print_by_the_one_way_only() -> None:
             continue
         others = [name for name in ("typer.echo(", " Console(", "=Console(", " print(") if name in text]
         assert not others, path
-
-
-def test_a_bar_says_how_much_was_read() -> None:
-    assert read_so_far(1_000_000, 8_000_000, 1.0) == "1.0 of 8.0 MB"
-    assert read_so_far(1_000_000, None, 1.0) == "1.0 MB"
-    assert read_so_far(0, None, 3.4) == "3 s"
 
 
 def test_the_log_is_said_on_stderr(capsys: pytest.CaptureFixture[str]) -> None:

@@ -5,7 +5,6 @@ import re
 import sqlite3
 import struct
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -98,19 +97,6 @@ def bag(path: Path, messages: list[bytes], topics: tuple[str, ...] = ("/events",
 
 
 WORDS = np.array([0x8001, 0x6000, 0x0005, 0x2007, 0x6001, 0x2008], "<u2").tobytes()
-
-
-@pytest.mark.parametrize("frame_id", ["", "a", "ab", "abc", "abcdefgh"])
-@pytest.mark.parametrize("order", ["<", ">"])
-def test_fields_stand_where_their_size_says(frame_id: str, order: str, tmp_path: Path) -> None:
-    messages = [packed(n, WORDS, frame_id, order) for n in (4, 5, 9)]
-    with open_source(bag(tmp_path / "a.db3", messages)) as source:
-        events, _ = source.read()
-        assert (source.width, source.height) == (640, 480)
-        assert events.x.tolist()[:2] == [7, 8]
-        assert events.y.tolist()[:2] == [5, 5]
-        assert events.t_us.tolist()[:2] == [4096, 4097]
-        assert source.losses["packets_lost"].count == 3
 
 
 @pytest.fixture(scope="module")
@@ -218,17 +204,6 @@ def test_a_driver_that_begins_anew(messages: list[bytes], tmp_path: Path) -> Non
     words = [bytes(_of_cdr(Path("a"), data).data) for data in messages]
     again = [packed(n, words[n + 40], size=(1280, 720)) for n in range(len(words) - 40)]
     same_as_the_recording(bag(tmp_path / "a.db3", messages[:40] + again))
-
-
-def test_a_bag_is_read_by_another_thread_than_opened_it(tmp_path: Path) -> None:
-    """As a live run does."""
-    path = bag(tmp_path / "a.db3", [packed(n, WORDS) for n in range(5)])
-    with open_source(path) as source:
-        here, _ = source.read()
-    with open_source(path) as source, ThreadPoolExecutor(1) as pool:
-        there, _ = pool.submit(source.read).result(30)
-    assert len(here) > 0
-    assert there.t_us.tolist() == here.t_us.tolist()
 
 
 def test_what_is_wrong_with_a_bag_is_said(tmp_path: Path) -> None:

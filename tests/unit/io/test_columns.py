@@ -124,24 +124,6 @@ def test_arrays(name: str, events: Events, tmp_path: Path) -> None:
         same(tmp_path / "a.npy", events)
 
 
-def test_structured(events: Events, tmp_path: Path) -> None:
-    c = columns_of(events)
-    records = np.zeros(N, [("x", "<u2"), ("y", "<u2"), ("t", "<i8"), ("p", "u1")])
-    for name in "xytp":
-        records[name] = c[name]
-    np.save(tmp_path / "a.npy", records)
-    np.savez(tmp_path / "a.npz", records)
-    for name in ("a.npy", "a.npz"):
-        same(tmp_path / name, events)
-
-
-def test_float32_of_microseconds(events: Events, tmp_path: Path) -> None:
-    c = columns_of(events)
-    table = table_of({**c, "t": c["t"] - 60_000}, "xytp", np.float32)
-    np.save(tmp_path / "a.npy", table)
-    same(tmp_path / "a.npy", events, -60_000)
-
-
 @pytest.mark.parametrize("before_us", [200, 7000])
 @pytest.mark.parametrize("end", [1 << 32, 1 << 31, 1 << 24], ids=["uint32", "int32", "24 bits"])
 def test_counters_go_round(end: int, before_us: int, events: Events, tmp_path: Path) -> None:
@@ -261,15 +243,6 @@ def test_whole_milliseconds_are_said(suffix: str, events: Events, tmp_path: Path
     with open_source(path) as source:
         assert source.header["step"] == "times are rounded to 1 ms"
         assert "in ms, guessed" in source.header["time"]
-
-
-def test_times_since_1970_of_six_digits_are_said(events: Events, tmp_path: Path) -> None:
-    text = "".join(
-        f"{1.7e9 + t / 1e6:.6g},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True)
-    )
-    (tmp_path / "a.csv").write_text("t,p\n" + text)
-    with open_source(tmp_path / "a.csv") as source:
-        assert source.header["step"] == "times are rounded to 1 s"
 
 
 def test_frames_are_those_of_the_recording(demo_raw: Path, tmp_path: Path, evlcp: Callable[..., Any]) -> None:

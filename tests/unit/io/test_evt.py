@@ -72,25 +72,6 @@ def test_kernel_equals_its_twin_for_any_words_and_splits(name, words):
     check()
 
 
-def test_runs_of_rows_columns_and_times_between_other_words_equal_the_twin():
-    rng = np.random.default_rng(5)
-    for capacity in (12, 70, 77, 90, 300, 5000):
-        # Times go on, so that most events stay; some are beyond the sensor.
-        kinds = rng.choice(
-            [0x0, 0x2, 0x2, 0x6, 0x3, 0x4, 0x8, 0xA, 0xE], 4000, p=[*[0.2485] * 4, *[0.0012] * 5]
-        )
-        low = (np.cumsum(kinds == 0x6) & 0xFFF) * (kinds == 0x6)
-        value = np.where(kinds == 0x6, low, rng.integers(0, 660, len(kinds)))
-        value[kinds == 0x8] = np.cumsum(kinds == 0x8)[kinds == 0x8] // 2
-        array = np.concatenate([[0x8000], kinds << 12 | value]).astype("<u2")
-        events, triggers, decoder = decode("EVT3", array, [1000], capacity, at=100)
-        twin = TWINS["EVT3"](array.tobytes(), WIDTH, HEIGHT, 100)
-        assert len(twin.events) > 1000
-        assert rows(events, ("t_us", "x", "y", "p")) == twin.events
-        assert rows(triggers, ("t_us", "channel", "value")) == twin.triggers
-        assert {kind: (loss.count, loss.first) for kind, loss in decoder.losses.items()} == twin.losses
-
-
 def test_whole_vectors_among_other_words_equal_the_twin():
     rng = np.random.default_rng(6)
     for capacity in (12, 39, 41, 90, 5000):
@@ -115,12 +96,6 @@ def test_whole_vectors_among_other_words_equal_the_twin():
         assert {kind: (loss.count, loss.first) for kind, loss in decoder.losses.items()} == twin.losses
 
 
-def test_low_time_is_zero_after_time_high_changes_and_stays_when_it_is_repeated():
-    words = np.array([0x8001, 0x6123, 0x8001, 0x0005, 0x2007, 0x8002, 0x2007], "<u2")
-    events, _, _ = decode("EVT3", words, [])
-    assert events.t_us.tolist() == [0x1123, 0x2000]
-
-
 def test_a_step_that_the_next_words_do_not_follow_is_not_believed():
     words = np.array([0x8800, 0x0001, 0x2001, 0x8000, 0x2002, 0x87FF, 0x2003, 0x8000, 0x2004], "<u2")
     events, _, decoder = decode("EVT3", words, [])
@@ -130,11 +105,6 @@ def test_a_step_that_the_next_words_do_not_follow_is_not_believed():
     assert decoder.counts["rollovers"] == 1
     words = np.array([0x88000000, 0x00000001, 0x80000000, 0x00000002], "<u4")
     assert decode("EVT2", words, [])[0].t_us.tolist() == [1 << 33, 1 << 34]
-
-
-def test_steps_of_time_high_by_more_than_one_are_counted_as_gaps():
-    words = np.array([0x8001, 0x8002, 0x8005, 0x87FF, 0x8FFE, 0x8FFF, 0x8000, 0x8001, 0x8008], "<u2")
-    assert decode("EVT3", words, [])[2].counts == {"rollovers": 1, "time_gaps": 4, "other_words": 0}
 
 
 @pytest.mark.parametrize(("name", "bits", "low"), [("EVT3", 12, 12), ("EVT2", 28, 6)])
@@ -159,14 +129,6 @@ def test_one_flipped_bit_of_a_time_costs_its_own_events(name, bits, low, tmp_pat
         assert right >= len(events) - 2 * own
         assert len(got) - right <= own
         assert source.counts["rollovers"] == 0
-
-
-def test_others_are_followed_by_any_number_of_continued_words():
-    words = np.array([0x8001, 0x0001, 0xE014, 0xF015, 0xF000, 0x7000, 0x2001, 0xE0FF, 0x2002], "<u2")
-    events, _, decoder = decode("EVT3", words, [])
-    assert events.x.tolist() == [1, 2]
-    assert decoder.counts["other_words"] == 5
-    assert decoder.losses == {}
 
 
 @st.composite
@@ -261,19 +223,6 @@ def test_evt3_writer_states_every_time_step_and_only_whole_vectors(tmp_path):
         0x2800 | 1279,
         *(0x3800 | 1248, 0x4000, 0x4000 | 0b11 << 10, 0x5000 | 0b10000011),
     ]
-
-
-def test_header_of_a_written_file(tmp_path):
-    write_events(tmp_path / "a.raw", Events.empty(), 1280, 720)
-    assert (tmp_path / "a.raw").read_text().splitlines() == [
-        "% evt 3.0",
-        "% format EVT3;height=720;width=1280",
-        "% geometry 1280x720",
-        "% integrator_name Prophesee",
-        "% system_ID 49",
-        "% end",
-    ]
-    assert len(read_events(tmp_path / "a.raw")) == 0
 
 
 BAD_WRITES = {
@@ -429,23 +378,6 @@ def test_words_are_found_again_where_bytes_are_missing(name, fault, tmp_path):
         if askew:
             assert losses["bytes_askew"].count < CODECS[name].word.itemsize
             assert -4 < losses["bytes_askew"].first - at < 600
-
-
-@pytest.mark.parametrize("name", ["EVT3", "EVT2"])
-def test_any_buffer_and_any_piece_give_the_same_where_bytes_are_missing(name, tmp_path):
-    path = tmp_path / "a.raw"
-    write_events(path, crowd(150_000, 400_000), WIDTH, HEIGHT, format=name)
-    data = bytearray(path.read_bytes())
-    rng = np.random.default_rng(5)
-    for at in sorted(rng.integers(3000, len(data), 30).tolist(), reverse=True):
-        del data[at : at + int(rng.integers(1, 4))]
-    path.write_bytes(data)
-    found = []
-    for buffer_bytes, max_events in ((1 << 20, 1 << 20), (1, 1000), (600_001, 77), (524_288, 65_536)):
-        with RawSource(path, buffer_bytes) as source:
-            found.append((key(Events.concat(source.chunks(max_events))).tolist(), source.losses))
-    assert all(one == found[0] for one in found)
-    assert found[0][1]["bytes_askew"].count >= 10
 
 
 @pytest.mark.parametrize("name", ["EVT3", "EVT2"])

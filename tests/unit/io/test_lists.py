@@ -1,14 +1,13 @@
 """Lists of times and polarities without places."""
 
 import gzip
-from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.fields import fields_of, time_unit
+from evlcp_sdk.io.fields import fields_of
 from evlcp_sdk.io.open import open_source, read_events
 
 RNG = np.random.default_rng(5)
@@ -123,13 +122,6 @@ def test_an_empty_list_has_no_events(tmp_path: Path) -> None:
     assert len(read_events(tmp_path / "a.csv")) == 0
 
 
-def test_the_name_of_the_column_counts_more_than_a_guess() -> None:
-    assert time_unit(T_US, "ms").name == "ms"
-    columns = fields_of(["Time [ms]", "Polarity"])
-    assert columns is not None
-    assert columns.unit == "ms"
-
-
 T_S = T_US * 1e-6
 EPOCH_US = 1_600_000_000_000_000
 X = RNG.integers(300, 340, 3000)
@@ -215,16 +207,6 @@ def test_headings_of_many_kinds(name: str, encoding: str, tmp_path: Path) -> Non
     np.testing.assert_array_equal(events.p, P)
 
 
-def test_a_first_row_that_is_wrong_is_no_title(tmp_path: Path) -> None:
-    for first in ("17,3", "nine,1"):
-        (tmp_path / "a.csv").write_text("t,p\n" + first + "\n" + text(T_US, P))
-        with pytest.raises(InputError, match="line 2"), open_source(tmp_path / "a.csv") as source:
-            source.read()
-    (tmp_path / "b.csv").write_text("17,3\n" + text(T_US, P))
-    with pytest.raises(InputError, match="line 1: found '17,3'"):
-        open_source(tmp_path / "b.csv")
-
-
 @pytest.mark.parametrize("many", [1, 40])
 @pytest.mark.parametrize("form", ["%.3f s", "%.6f s", "%.0f ms", "%.1f ms", "%.0f us", "%.0f ns"])
 @pytest.mark.parametrize("first_us", [0, 37_123_000, 259_200_012_000])
@@ -245,18 +227,6 @@ def test_times_to_the_millisecond_say_their_unit(many: int, form: str, first_us:
         assert "guessed" in source.header["time"]
 
 
-def test_text_that_is_none_is_refused_or_read_and_ends_in_no_fault(tmp_path: Path) -> None:
-    whole = text(T_US, P, head="t,p").encode("utf-16")
-    for damaged in (
-        whole[:2001],
-        whole[:2000] + b"\x00\xd8" + whole[2000:],
-        b't,p\n"' + b"9" * 200_000 + b"\n",
-    ):
-        (tmp_path / "a.csv").write_bytes(damaged)
-        with suppress(InputError), open_source(tmp_path / "a.csv") as source:
-            source.read()
-
-
 def test_two_arrays_without_names_and_where_the_pixels_are(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", P, T_S)
     np.savez(tmp_path / "b.npz", t=T_US, p=P, x=5, y=6)
@@ -266,25 +236,6 @@ def test_two_arrays_without_names_and_where_the_pixels_are(tmp_path: Path) -> No
             events, _ = source.read()
         np.testing.assert_array_equal(events.t_us, T_US)
         np.testing.assert_array_equal(events.p, P)
-
-
-PLACED = {
-    "x,y,t,p": text(X, Y, T_US, P, head="x,y,t,p"),
-    "t x y p": text(T_S, X, Y, P, mark=" ", form="%.9f"),
-    "x y t p": text(X, Y, T_US, SIGNS, mark="\t"),
-    "t p x y": text(T_US, P, X, Y, mark=";"),
-    "named": text(P, X, Y, T_S * 1e3, head="pol,col,row,time (ms)", form="%.3f"),
-}
-
-
-@pytest.mark.parametrize("name", PLACED)
-def test_a_list_with_places_keeps_them(name: str, tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(PLACED[name])
-    with open_source(tmp_path / "a.csv") as source:
-        assert source.header["pixels"] == "as its columns x and y say"
-        events, _ = source.read()
-    for found, wanted in zip((events.t_us, events.x, events.y, events.p), (T_US, X, Y, P), strict=True):
-        np.testing.assert_array_equal(found, wanted)
 
 
 def records(names: list[str], *columns: np.ndarray) -> np.ndarray:
@@ -351,25 +302,6 @@ def test_times_since_1970_say_their_unit(factor: float, unit: str, form: str, tm
         assert source.header["time"].startswith(f"in {unit}, guessed: times since 1970")
         events, _ = source.read()
     np.testing.assert_allclose(events.t_us - EPOCH_US, T_US, atol=1)
-
-
-def test_rows_in_any_order_are_sorted_and_counted(tmp_path: Path) -> None:
-    order = np.random.default_rng(1).permutation(3000)
-    shuffled = text(T_US[order], P[order], head="t_us,p")
-    by_polarity = np.argsort(P, kind="stable")
-    for name, rows in (
-        ("shuffled", shuffled),
-        ("one by one", text(T_US[by_polarity], P[by_polarity], head="t_us,p")),
-    ):
-        (tmp_path / "a.csv").write_text(rows)
-        with open_source(tmp_path / "a.csv") as source:
-            events, _ = source.read()
-            late = source.counts["rows_out_of_order"]
-            assert not source.losses
-        np.testing.assert_array_equal(events.t_us, T_US)
-        np.testing.assert_array_equal(events.p, P)
-        t = T_US[order] if name == "shuffled" else T_US[by_polarity]
-        assert late == (t < np.maximum.accumulate(t)).sum()
 
 
 def test_what_a_list_does_not_say_is_told(tmp_path: Path) -> None:

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import evlcp_sdk.io
 from evlcp_sdk.errors import InputError, PluginWarning
 from evlcp_sdk.io import EventSource, open_source, read_events, write_events
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -59,33 +58,6 @@ def recording(tmp_path: Path) -> Path:
 
 
 @pytest.mark.usefixtures("installed")
-def test_io_sees_the_camera_of_a_plugin() -> None:
-    with evlcp_sdk.io.open_source("cam:0") as source:
-        assert isinstance(source, CameraSource)
-        assert source.read()[0].t_us.tolist() == EVENTS.t_us.tolist()
-    assert source.closed
-    assert read_events("cam:0").x.tolist() == EVENTS.x.tolist()
-
-
-def test_the_registry_that_is_given_is_asked() -> None:
-    with open_source("cam:0", Registry.load(Camera())) as source:
-        assert isinstance(source, CameraSource)
-    with pytest.raises(InputError, match="cam:0"):
-        open_source("cam:0")
-
-
-@pytest.mark.usefixtures("installed")
-def test_the_public_face_sees_it() -> None:
-    with evlcp_sdk.open("cam:0") as source:
-        assert isinstance(source, CameraSource)
-    reception = evlcp_sdk.receive("cam:0")
-    assert list(reception) == []
-    assert reception.counts["events"] == 50
-    assert isinstance(reception.source, CameraSource)
-    assert reception.source.closed
-
-
-@pytest.mark.usefixtures("installed")
 def test_the_command_line_sees_it(evlcp: Callable[..., Any], tmp_path: Path) -> None:
     done = evlcp("info", "cam:0", "--json")
     assert done.code == 0
@@ -101,12 +73,6 @@ def test_what_the_plugin_leaves_goes_to_the_readers(recording: Path) -> None:
     assert len(read_events(recording)) == 50
     assert len(read_events(f"file:{recording}")) == 50
     assert len(read_events(recording.as_uri())) == 50
-
-
-def test_a_uri_with_a_blank(recording: Path) -> None:
-    named = recording.rename(recording.with_name("my night.raw"))
-    assert "%20" in named.as_uri()
-    assert len(read_events(named.as_uri())) == 50
 
 
 def test_an_unknown_scheme_is_one_line(evlcp: Callable[..., Any]) -> None:

@@ -20,7 +20,7 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import RawSource, ReplaySource, open_source, write_events
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription, warm
+from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import live, receive
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
@@ -197,14 +197,6 @@ def test_distances_are_measured_of_every_nth_frame(demo_raw: Path) -> None:
     assert [f.soft.symbols.tolist() for f in frames[0]] == [f.soft.symbols.tolist() for f in frames[1]]
 
 
-def test_a_listener_that_never_takes_is_not_waited_for(demo_raw: Path) -> None:
-    outlet = Outlet()
-    stalled = outlet.subscribe(most=1)
-    live(f"replay:{demo_raw}?speed=50", outlet=outlet, budget=PATIENT, warm=False)
-    assert stalled.dropped > 0
-    assert [news.kind for news in stalled.take()] == ["end"]
-
-
 def test_it_ends_when_it_is_asked_to(demo_raw: Path) -> None:
     asked = threading.Event()
     outlet = Outlet()
@@ -235,19 +227,6 @@ def test_a_damaged_recording_is_not_waited_for(demo_raw: Path, tmp_path: Path) -
 
 def test_a_recording_is_replayed_at_its_own_pace(demo_raw: Path) -> None:
     assert live(demo_raw, budget=PATIENT, warm=False)["processing"]["elapsed_s"] > 0.05
-
-
-def test_a_source_that_fails_gives_what_came_before(demo_raw: Path) -> None:
-    class Failing(Burst):
-        def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-            piece = super().take(max_events)
-            if piece is None:
-                raise InputError("cam: unplugged")
-            return piece
-
-    summary = live(Failing(demo_raw), budget=PATIENT, warm=False)
-    assert (summary["status"], summary["error"]) == ("failed", "cam: unplugged")
-    assert summary["counts"]["frames"] > 0
 
 
 def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
@@ -352,10 +331,3 @@ def test_what_positions_need_is_loaded_before_the_first_event() -> None:
         cwd=Path(__file__).parents[3],
     )
     assert found.stdout.strip() == "[]"
-
-
-def test_a_wrong_name_is_said_before_kernels_are_loaded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(warm, "warm_up", lambda *_, **__: pytest.fail("kernels are loaded for nothing"))
-    for name in ("nothing.raw", "replay:nothing.raw", "bag:nothing", "hdf5:nothing.hdf5"):
-        with pytest.raises(InputError, match="No such file"):
-            live(name)

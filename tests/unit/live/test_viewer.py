@@ -284,14 +284,6 @@ def test_a_recording_is_what_came(tmp_path: Path) -> None:
     assert (triggers.t_us.tolist(), triggers.value.tolist()) == ([2_500, 3_004], [1, 0])
 
 
-def test_where_no_folder_can_be_made_a_recording_says_so(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    recorder = Recorder(Outlet(), tmp_path / "file" / "in", 1280, 720)
-    recorder.start()
-    _until(lambda: not recorder.state["recording"])
-    assert recorder.state["fault"] == f"{tmp_path / 'file' / 'in'}: cannot be made: Not a directory"
-
-
 @pytest.mark.parametrize("why", ["disk", "clock"])
 def test_what_was_recorded_stays_where_a_recording_has_to_end(
     why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -460,39 +452,3 @@ def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> Non
             f"127.0.0.1:{stage.port}"
         }
         assert base64.b64decode(second.screenshot()).startswith(b"\x89PNG")
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_a_browser_shows_a_view_apart_and_may_be_killed(tmp_path: Path) -> None:
-    outlet = Outlet()
-    with Services(Serving(view=True, apart=True), outlet, LINKS, name="apart") as services:
-        stage = Stage(outlet, services)
-        with Browser(tmp_path / "a") as browser:
-            browser.open(stage.url)
-            _until(lambda: browser.value("shown.connects") == 1)
-            for n in range(30):
-                stage.frame(n)
-
-            def drawn() -> bool:
-                stage.picture(round(time.monotonic() * 1e6))
-                return bool(browser.value("shown.pictures") >= 3)
-
-            _until(drawn)
-            _until(lambda: browser.value("shown.frames") == 30)
-            told = browser.value("shown.last")
-            assert [frame["symbols"] for frame in told] == [
-                FRAMES[n % len(FRAMES)].soft.symbols.tolist() for n in range(30 - len(told), 30)
-            ]
-            assert not [m for m in browser.heard if m["method"] == "Runtime.exceptionThrown"]
-        # It is killed; what comes is shown to the next one.
-        began = time.perf_counter()
-        for n in range(30):
-            stage.frame(n)
-            stage.picture(round(time.monotonic() * 1e6))
-        assert time.perf_counter() - began < 10
-        with stage.connect() as link:
-            assert "about" in json.loads(link.recv(5))
-            link.send('{"next": true}')
-            stage.frame(1)
-            assert unpacked(link.recv(5))[0]["dropped"] == 0
-        outlet.close()

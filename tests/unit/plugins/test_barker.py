@@ -1,7 +1,7 @@
 """Barker codes and packet synchronization, on events whose timing is known."""
 
-from dataclasses import astuple, replace
-from itertools import groupby, pairwise
+from dataclasses import astuple
+from itertools import groupby
 
 import barker_twins as twins
 import numpy as np
@@ -13,8 +13,6 @@ from evlcp_barker.preamble import OUTSTANDS, find_peaks, time_preamble
 from evlcp_barker.synchronization import BarkerSync
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.pilots import WhPilots
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.air.codebook import BARKER13, Codebook, chips_of_values
@@ -29,7 +27,6 @@ BOOKS = {
 }
 FORMAT = PacketFormat.of(BOOKS["wh4x2"], FRAMES)
 PERIOD_US = FORMAT.packet_chips * twins.CHIP_US
-NO_EVENTS = np.empty(0, np.int64), np.empty(0, np.uint8)
 
 
 def packets_of(rng, n, profile="wh4x2"):
@@ -61,13 +58,6 @@ def numbers(locks):
 
 
 # Codes and kernels
-
-
-def test_the_preamble_correlates_with_nothing_but_itself():
-    lags = np.correlate(BARKER13, BARKER13, "full")
-    assert lags[12] == 13
-    assert np.abs(np.delete(lags, 12)).max() == 1
-    assert_array_equal(WhPilots().preamble(), Barker13Pilots().preamble())
 
 
 def test_barker_pilots_are_told_apart():
@@ -314,20 +304,6 @@ def test_what_agrees_less_than_the_lock_repeats_none():
     assert len({round(start / 10) for start in starts}) == len(starts)
 
 
-def test_a_bound_that_is_given_counts():
-    """Half of the events are noise: a third of them tells."""
-    book = book_of(SLOW["chips of 2"])
-    packet = PacketFormat.of(book, FRAMES)
-    rng = np.random.default_rng(2)
-    chips = packet_chips(rng.integers(0, 64, (FRAMES, CLUSTERS)), book)
-    bar = twins.events_of(chips, rng, START_US)
-    n = len(bar[0])
-    t, p = among(bar, rng.integers(0, bar[0][-1], n), rng.integers(0, 2, n))
-    for least, many in ((0.0, 1), (0.2, 1), (0.5, 0)):
-        sync = BarkerSync(min_correlation=least).compile(book, packet)
-        assert len(sync.step(sync.init(), t, p, int(t[-1]) + 5000)[1]) == many
-
-
 # Timing
 
 
@@ -354,46 +330,13 @@ def test_packet_start_clock_and_delays(seed, ppm, delay_us):
         assert 0.8 < lock.quality <= 1
 
 
-@pytest.mark.parametrize("rate_hz", [5_000, 20_000])
-def test_other_chip_rates(rate_hz):
-    rng = np.random.default_rng(0)
-    t, p = twins.events_of(packets_of(rng, 4), rng, START_US)
-    scale = FORMAT.chip_rate_hz / rate_hz
-    sync = BarkerSync().compile(BOOKS["wh4x2"], replace(FORMAT, chip_rate_hz=rate_hz))
-    t = np.rint(t * scale).astype(np.int64)
-    _, locks = sync.step(sync.init(), t, p, int(160_000 * scale))
-    assert len(locks) == 4
-    apart = np.diff([lock.packet_t_us for lock in locks])
-    assert_allclose(apart, PERIOD_US * scale, atol=3 * scale)
-
-
 # Steps
 
 
 RNG = np.random.default_rng(3)
 STREAM = twins.events_of(packets_of(RNG, 4), RNG, START_US, ppm=30, missing_off=0.2)
 END_US = int(STREAM[0][-1]) // 1000 * 1000 + 5000
-BIN_US = 10
 WHOLE, _ = locks_of(*STREAM, cuts=[END_US])
-
-
-def assert_same(locks):
-    """Equal locks but for rounding: times are counted from the oldest step that is remembered."""
-    assert_allclose([astuple(k) for k in locks], [astuple(k) for k in WHOLE], atol=1e-9)
-
-
-@settings(max_examples=60)
-@given(st.lists(st.integers(0, END_US // BIN_US), max_size=60))
-def test_any_steps_give_the_same_locks(cuts):
-    locks, _ = locks_of(*STREAM, cuts=[*sorted(BIN_US * c for c in cuts), END_US])
-    assert_same(locks)
-    assert len(WHOLE) == 4
-
-
-@pytest.mark.parametrize("step_us", [213, 1005])
-def test_steps_need_not_be_whole_correlation_steps(step_us):
-    locks, _ = locks_of(*STREAM, cuts=range(0, END_US + step_us, step_us))
-    assert_same(locks)
 
 
 def test_a_lock_does_not_wait_for_the_next_packet():
@@ -410,43 +353,7 @@ def told(state):
     return tuple(v.tolist() if isinstance(v, np.ndarray) else v for v in vars(state).values())
 
 
-def test_the_state_passed_in_is_not_changed():
-    sync = synchronizer()
-    state = sync.init()
-    for begin, end in pairwise(range(0, END_US + 1, 5000)):
-        part = (STREAM[0] >= begin) & (STREAM[0] < end)
-        t, p = STREAM[0][part], STREAM[1][part]
-        for array in (state.counts, t, p):
-            array.setflags(write=False)
-        before = told(state)
-        after, locks = sync.step(state, t, p, end)
-        again, locks_again = sync.step(state, t, p, end)
-        assert told(state) == before
-        assert (told(after), locks) == (told(again), locks_again)
-        state = after
-    assert state.clock.packet == 3
-
-
-def test_memory_does_not_grow():
-    rng = np.random.default_rng(0)
-    _, state = locks_of(*twins.events_of(packets_of(rng, 12), rng, START_US))
-    assert (state.clock.packet, state.clock.preambles) == (11, 8)
-    # A preamble, a guard on both sides, and a time step.
-    assert state.counts.shape[1] < 10 * (26 + 2 * 3 + 10) + 10
-
-
 # What is no preamble
-
-
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("pilots", [True, False])
-def test_random_data_has_no_preamble(profile, pilots):
-    rng = np.random.default_rng(1)
-    chips = packets_of(rng, 150, profile).reshape(150, -1, CLUSTERS)[:, 26:]
-    if not pilots:
-        chips = chips.reshape(150, FRAMES, 32, CLUSTERS)[:, :, 16:]
-    locks, _ = locks_of(*twins.events_of(chips.reshape(-1, CLUSTERS), rng, START_US))
-    assert locks == []
 
 
 @pytest.mark.parametrize("events", [50, 5000])
@@ -455,25 +362,6 @@ def test_a_flash_is_no_preamble(events):
     t = np.sort(rng.integers(20_000, 20_100, events))
     t = np.concatenate([[0], t, t + 300, [90_000]])
     assert locks_of(t, np.ones(len(t), np.uint8))[0] == []
-
-
-def test_too_few_events_are_no_preamble():
-    t, p = STREAM
-    few = np.random.default_rng(0).random(len(t)) < 0.05
-    in_preamble = few & (t < START_US + 2600)
-    assert 0 < in_preamble.sum() < 100
-    assert locks_of(t[few], p[few])[0] == []
-
-
-def test_no_events_no_lock():
-    sync = synchronizer()
-    state = sync.init()
-    for until in (0, 10, 1000, 100_000):
-        state, locks = sync.step(state, *NO_EVENTS, until)
-        assert locks == []
-    # An empty start does not spoil what follows.
-    _, locks = sync.step(state, STREAM[0] + 100_000, STREAM[1], END_US + 100_000)
-    assert_allclose([k.packet_t_us - 100_000 for k in locks], [k.packet_t_us for k in WHOLE], atol=1e-6)
 
 
 @pytest.mark.parametrize("symbol", [3, 38])
@@ -628,37 +516,3 @@ def test_a_panel_behind_is_no_latency(rate_hz, seed):
     assert len(locks) >= 5
     assert np.ptp(starts_of(locks)[1:]) < 8
     assert max(abs(lock.chip_us / twins.CHIP_US - 1) for lock in locks) < 30e-6
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_leaves_behind_are_no_latency(seed):
-    rng = np.random.default_rng(seed)
-    bar = twins.events_of(packets_of(rng, 6), rng, START_US, per_edge=6)
-    n = 2 * len(bar[0])
-    locks, _ = locks_of(*among(bar, rng.integers(0, bar[0][-1], n), rng.integers(0, 2, n)))
-    steady, _ = locks_of(*bar)
-    assert starts_of(locks).mean() == pytest.approx(starts_of(steady).mean(), abs=2.5)
-
-
-def test_positive_events_alone_are_enough():
-    rng = np.random.default_rng(13)
-    t, p = twins.events_of(packets_of(rng, 6), rng, START_US, per_edge=4)
-    locks, _ = locks_of(t[p == 1], p[p == 1])
-    assert_allclose(numbers(locks), np.arange(6), atol=2e-3)
-    for lock in locks:
-        # No negative event says where their window is: it is that of the positive ones.
-        assert lock.delay_off_us == lock.delay_on_us
-
-
-def test_a_weak_preamble_counts_where_data_are_quiet():
-    """Rows read up to 60 us apart, and two in five pixels answer one chip late."""
-    rng = np.random.default_rng(14)
-    t, p = twins.events_of(packets_of(rng, 5), rng, START_US, per_edge=4)
-    t = t + rng.integers(0, 60, len(t)) + 100 * (rng.random(len(t)) < 0.4)
-    order = np.argsort(t, kind="stable")
-    t, p = t[order], p[order]
-    locks, _ = locks_of(t, p)
-    assert max(lock.quality for lock in locks) < 0.5
-    # The first comes before data are known.
-    assert_allclose(np.diff(numbers(locks)), 1, atol=2e-3)
-    assert len(locks) == 4

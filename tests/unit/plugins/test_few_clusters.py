@@ -124,10 +124,3 @@ def test_joint_scale_refuses_pilots_of_other_codes() -> None:
     )
     with pytest.raises(ConfigError, match=r"the pilots are others; try ranging\.id = 'poc'"):
         link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
-
-
-def test_one_cluster_has_no_distance() -> None:
-    for name in set(RANGINGS) - {"none"}:
-        link = link_with("1 clusters", f"ranging.id={name}")
-        with pytest.raises(ConfigError):
-            link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)

@@ -5,14 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import JointScaleRanging, _together, core_of, find_bar, known_codes, profile
+from evlcp_joint.ranging import JointScaleRanging, _together, core_of, find_bar, profile
 from numpy.testing import assert_allclose
 from scipy.stats import norm, theilslopes
 
-from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedRing
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.bar import BarLayout, LedColumns
 from evlcp_sdk.study.bound import bar_bound
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
 
@@ -80,16 +78,6 @@ def view_of(
 
 def measured(view: FrameView, **parameters: float) -> Range:
     return JointScaleRanging(**parameters).compile(LINK.camera, LINK.bar, LINK.codebook)(view)
-
-
-@pytest.mark.parametrize("distance_m", [30.0, 41.7, 50.0, 66.6, 80.0, 100.0])
-@pytest.mark.parametrize("shift_px", [-0.4, 0.0, 0.25])
-def test_ideal_images_give_their_distance(distance_m: float, shift_px: float) -> None:
-    # A little noise, as without it whole events of three at most put all pixels of a row into one step.
-    found = measured(view_of(distance_m, shift_px=shift_px, noise=0.5))
-    assert found.distance_m == pytest.approx(distance_m, rel=3e-3)
-    assert found.sigma_m < 4e-3 * distance_m
-    assert found.pairs == 15
 
 
 @pytest.mark.parametrize(
@@ -182,17 +170,6 @@ def test_sigma_is_the_spread() -> None:
     # 60 draws tell a spread to a tenth; the rest is for pixel phases, which repeat.
     assert 0.6 < np.std(errors) < 1.5
     assert abs(np.mean(errors)) < 0.5
-
-
-def test_too_few_clusters_give_no_distance() -> None:
-    found = measured(view_of(50.0, dark=tuple(range(0, 16, 2))))
-    assert np.isnan(found.distance_m)
-    assert found.pairs == 0
-
-
-def test_rings_are_refused() -> None:
-    with pytest.raises(ConfigError, match="needs an even column"):
-        JointScaleRanging().compile(CameraModel(), BarLayout(LedRing()), LINK.codebook)
 
 
 def side_by_side(view: FrameView) -> FrameView:
@@ -463,18 +440,6 @@ def test_the_line_is_theil_sen() -> None:
         assert line[at] == pytest.approx(np.median(y - line[at + 1] * x))
     middles[2:] = np.nan
     assert not _kernels.fit_line(middles, line)
-
-
-def test_codes_are_known_between_clusters_that_are_seen_and_read() -> None:
-    rng = np.random.default_rng(4)
-    symbols, seen = rng.integers(-1, 64, K), rng.random(K) < 0.8
-    symbols[[3, 9]] = -1
-    codes, known = known_codes(PILOTS, WORDS, symbols, seen)
-    np.testing.assert_array_equal(codes, np.concatenate([PILOTS, WORDS[np.maximum(symbols, 0)]], axis=1))
-    both, read = seen[1:] & seen[:-1], (symbols[1:] >= 0) & (symbols[:-1] >= 0)
-    want = np.zeros((K + 1, 16), bool)
-    want[1:-1, :8], want[1:-1, 8:] = both[:, None], (both & read)[:, None]
-    np.testing.assert_array_equal(known, want)
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -125,27 +125,6 @@ def test_a_stray_position_is_no_jolt() -> None:
     assert errors[:, 0].max() < 2
 
 
-def test_without_jolts_nothing_changes() -> None:
-    true = shaken(400)
-    measured = true + np.random.default_rng(5).normal(0, 0.25, true.shape)
-    assert_allclose(position_errors(measured, true), position_errors(measured, true, jolt_px_s=0.0))
-
-
-def test_states_are_not_changed_and_predict_goes_straight_on() -> None:
-    filter_ = distance_filter()
-    assert filter_.predict(filter_.init(), 0) is None
-    state = filter_.init()
-    for k in range(50):
-        state, _, _ = filter_.step(state, k * 1000.0, np.array([10 + 0.01 * k]), 0.01)
-    before = state.mean.copy(), state.covariance.copy()
-    expected = filter_.predict(state, 60_000.0)
-    assert expected is not None
-    assert expected[0][0] == pytest.approx(10.6, abs=0.02)
-    filter_.step(state, 51_000.0, np.array([20.0]), 0.01)
-    assert_allclose(state.mean, before[0])
-    assert_allclose(state.covariance, before[1])
-
-
 def test_the_receiver_filters_only_when_asked() -> None:
     assert NoTracking().compile().distance is None
     for override, filtered in (("tracking.id=none", False), ("tracking.id=kalman", True)):

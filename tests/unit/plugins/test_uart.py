@@ -509,12 +509,6 @@ def test_a_list_without_places_is_received_by_the_command(tmp_path: Path) -> Non
     assert [int(f.soft.symbols[0]) for p in packets for f in p.frames] == sent.tolist()
 
 
-def test_noise_says_nothing() -> None:
-    rng = np.random.default_rng(0)
-    t_us = np.sort(rng.integers(0, 600_000, 4000))
-    assert read_characters(t_us, rng.integers(0, 2, 4000).astype(np.uint8), 3125.0, Uart(7, "even", 2)) == []
-
-
 def test_a_bar_of_clusters_is_refused() -> None:
     with pytest.raises(ConfigError, match="framing 'uart': a bar of 16 clusters, expected one"):
         resolve({"framing": {"id": "uart"}})
@@ -671,15 +665,6 @@ def test_a_lamp_that_reads_as_one_character_is_said(tmp_path: Path, evlcp: Calla
     (lamp,) = (one for one in said["lamp"] if one["code"] == "one-character")
     assert "characters are 0xf0: a lamp that blinks once in a character's time" in lamp["text"]
     assert said["text"] == []
-
-
-def test_a_clear_light_of_another_code_is_none_of_characters() -> None:
-    """Pair codes at the rate of bits, as those of a bar: an edge in the middle of each pair."""
-    rng = np.random.default_rng(0)
-    values = rng.integers(0, 2, 120)
-    levels = np.stack([values, 1 - values], 1).reshape(-1)
-    light = seen(rng, levels, 100.0)
-    assert read_characters(light.t_us, light.p, 10_000.0, Uart(7, "even", 2)) == []
 
 
 @pytest.mark.parametrize("seed", [3, 7])

@@ -226,24 +226,6 @@ def test_motion_taken_back(seed):
 # Separation
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_presence_follows_a_permutation_of_the_clusters(seed):
-    rng = np.random.default_rng(seed)
-    where = rng.permutation(CLUSTERS)
-    sums = image_of(CODES, where)
-    found = WhCorrelation().compile(book_of())(sums)
-    want = np.zeros((CLUSTERS, CLUSTERS, 3), bool)
-    want[np.arange(CLUSTERS), where, 1] = True
-    assert_array_equal(found.selected, want)
-    assert_array_equal(found.probability == 0, np.broadcast_to(~want.any(0), want.shape))
-    assert_array_equal(found.pixels == 1, want.repeat(2, 1).repeat(2, 2))
-    # And the other way round: other pilots in the same picture.
-    order = rng.permutation(CLUSTERS)
-    other = WhCorrelation().compile(book_of(pilots=CODES[order]))(sums)
-    assert_allclose(other.probability, found.probability[order], rtol=1e-6)
-    assert_array_equal(other.selected, found.selected[order])
-
-
 @pytest.mark.parametrize("silent", ["second", "first", "some"])
 def test_a_value_is_read_from_the_chip_that_is_seen(silent):
     sums = image_of(CODES, range(CLUSTERS))
@@ -273,18 +255,6 @@ def test_a_cell_shows_no_cluster_until_enough_values_are_seen(seen, shown):
     assert found.probability.any() == shown
     # Four values are half a code: the two clusters that begin with it share the probability.
     assert found.selected.any() == (seen == 8)
-
-
-def test_read_only_and_strided_sums_are_taken():
-    sums = image_of(CODES, range(CLUSTERS))
-    want = WhCorrelation().compile(book_of())(sums)
-    strided = np.repeat(sums, 2, 2)[:, :, ::2]
-    strided.setflags(write=False)
-    found = WhCorrelation().compile(book_of())(strided)
-    assert_array_equal(found.probability, want.probability)
-    assert_array_equal(found.pixels, want.pixels)
-    symbols = WhTransform().compile(book_of())(found, framed(strided)).symbols
-    assert_array_equal(symbols, WhTransform().compile(book_of())(want, framed(sums)).symbols)
 
 
 # Decoding
@@ -346,42 +316,6 @@ def test_a_dark_cluster_says_nothing():
     assert_array_equal(soft.llr[5], np.zeros(6))
     assert (soft.llr[np.arange(CLUSTERS) != 5] != 0).all()
     assert_array_equal(np.delete(soft.symbols, 5), np.delete(np.arange(CLUSTERS), 5))
-
-
-def test_no_events_are_no_certainty():
-    book = book_of()
-    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS)))
-    soft = WhTransform().compile(book)(presence, framed(np.zeros((16, 32, 6), np.int16)))
-    assert soft.quality == 0
-    assert not soft.llr.any()
-
-
-def test_noise_lowers_certainty_and_quality():
-    book = book_of("raw8")
-    symbols = np.arange(CLUSTERS)
-    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS), 4))
-    clean = image_of(book.codeword_edges[symbols], range(CLUSTERS), 4)
-    last = np.inf
-    for share in (0.05, 0.2, 0.4):
-        noisy = np.where(np.random.default_rng(1).random(clean.shape) < share, -clean, clean)
-        soft = WhTransform().compile(book)(presence, framed(noisy))
-        sure = float(np.median(np.abs(soft.llr)))
-        assert sure < last
-        last = sure
-
-
-def test_a_dim_cluster_is_unsure():
-    """A cluster of which one stray cell is seen, at little presence, says little, whatever it says."""
-    book = book_of()
-    rng = np.random.default_rng(4)
-    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS), 4))
-    sums = image_of(book.codeword_edges[np.arange(CLUSTERS)], range(CLUSTERS), 4)
-    sums = np.where(rng.random(sums.shape) < 0.1, -sums, sums)
-    presence.probability[5] = 0
-    presence.probability[5, 0, 0] = 0.02
-    soft = WhTransform().compile(book)(presence, framed(sums))
-    others = np.delete(np.abs(soft.llr), 5, axis=0)
-    assert np.abs(soft.llr[5]).max() < 0.05 * np.median(others)
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -9,7 +9,6 @@ import pytest
 from matplotlib.figure import Figure
 
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.report.colours import cluster_colours
 from evlcp_sdk.report.figures import (
     FigureProbe,
     Figures,
@@ -17,7 +16,6 @@ from evlcp_sdk.report.figures import (
     draw_distance,
     draw_presence,
     draw_regions,
-    off_neighbours,
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
@@ -68,11 +66,6 @@ def test_the_image_counts_events_on_the_sensor() -> None:
     assert probe.image[6, 5] == probe.image.sum() == 2
 
 
-def test_the_clearest_frame_is_shown() -> None:
-    probe = told(FigureProbe(CameraModel()), 1, 6)
-    assert probe.clearest[0].frame.frame == 3
-
-
 @pytest.mark.parametrize("transmitters", [0, 1, 2, 7])
 def test_any_number_of_transmitters(transmitters: int, tmp_path: Path) -> None:
     names = ["regions.png", "presence.png", "distance.png"]
@@ -113,44 +106,6 @@ def test_a_reflection_is_named_as_one() -> None:
         named = [title for title in every if title.startswith("transmitter")]
         assert [title.startswith(f"transmitter {n}") for n, title in enumerate(named)] == [True, True]
         assert ["(reflection of 0)" in title for title in named] == [False, True]
-
-
-def test_a_straight_line_is_not_off_its_neighbours() -> None:
-    t_s = np.cumsum(np.random.default_rng(1).uniform(0.003, 0.009, 200))
-    assert np.abs(off_neighbours(t_s, 50 - 8.3 * t_s)).max() < 1e-9
-    noise = np.random.default_rng(2).normal(0, 0.02, 200)
-    off = off_neighbours(t_s, 50 - 8.3 * t_s + noise)
-    # As much as the noise itself, so that sigmas can be held against it.
-    assert np.sqrt(np.mean(off**2)) == pytest.approx(0.02, rel=0.15)
-    assert np.corrcoef(off, noise)[0, 1] > 0.9
-    for few in range(3):
-        assert off_neighbours(t_s[:few], t_s[:few] ** 2).tolist() == [0.0] * few
-
-
-def test_presence_says_what_is_seen() -> None:
-    figure = draw_presence(told(FigureProbe(CameraModel()), 1, 2), "REC.raw")
-    said = " ".join(figure.get_supxlabel().split())
-    assert "squares of 2 x 2 px" in said
-    figure.draw_without_rendering()
-    (label,) = [text for text in figure.texts if text.get_text() == figure.get_supxlabel()]
-    assert label.get_window_extent().x1 <= figure.bbox.x1
-
-
-def test_sigmas_are_seen_beside_each_distance() -> None:
-    figure = draw_distance(told(FigureProbe(CameraModel()), 2, 12), "REC.raw")
-    far, off, *_ = figure.get_axes()
-    assert len(figure.get_axes()) == 5
-    assert far.get_ylabel() == "distance, m"
-    low, high = off.get_ylim()
-    # Distances fall by 11 m; a sigma is 0.1 m.
-    assert 0.2 <= high - low < 0.5
-
-
-def test_neighbouring_clusters_differ_in_colour() -> None:
-    colours = cluster_colours(16)
-    apart = np.abs(colours[1:] - colours[:-1]).max(1)
-    assert apart.min() > 0.2
-    assert len(np.unique(colours, axis=0)) == 16
 
 
 def test_many_regions_and_transmitters_keep_a_bounded_share() -> None:

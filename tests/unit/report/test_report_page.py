@@ -13,7 +13,7 @@ import pytest
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.navigator import PositionPlan
-from evlcp_sdk.report.motion import Motion, MotionProbe, cluster_map, sent_chips
+from evlcp_sdk.report.motion import Motion, MotionProbe, cluster_map
 from evlcp_sdk.report.page import Report
 from evlcp_sdk.report.plots import Plot, ellipse
 from evlcp_sdk.results.folder import ResultFolder
@@ -112,16 +112,6 @@ def test_the_slow_motion_is_what_was_sent(result: Path) -> None:
     for k in range(16):
         seen = sums[1:, clusters == k].sum(1)
         assert np.corrcoef(seen, change[:, k])[0, 1] > 0.8
-
-
-def test_a_symbol_that_is_not_given_is_neither_light_nor_dark() -> None:
-    symbols = np.arange(16)
-    symbols[5] = -1
-    soft = SoftSymbols(symbols, np.zeros((16, 6), np.float32), 0.5)
-    frame = Frame(0, 0, 0, 0.0, soft, Range(math.nan, math.nan, 0), None, 0.0, 0.0)
-    chips = sent_chips(frame, LINK.codebook)
-    assert (chips[5, LINK.packet.pilot_chips :] == -1).all()
-    assert set(np.delete(chips, 5, 0).ravel()) == {0, 1}
 
 
 def view_of(height: int, width: int, clusters: int = 16) -> FrameView:

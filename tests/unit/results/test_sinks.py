@@ -13,7 +13,7 @@ from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 from evlcp_sdk.plugin.records import installed_sinks
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.folder import ResultFolder, read_summary
+from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.run import receive, receive_to_folder
 from evlcp_sdk.values import Packet
@@ -48,13 +48,6 @@ def test_a_format_is_one_file_and_one_hook(demo_raw: Path, tmp_path: Path) -> No
     table = receive_to_folder(demo_raw, tmp_path, registry=registry)
     assert "sinks" not in table
     assert {p.name for p in tmp_path.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
-
-
-def test_sinks_do_not_stay_in_the_registry(demo_raw: Path, tmp_path: Path) -> None:
-    registry = Registry.load(distances)
-    assert not registry.hook.evlcp_stage_finished.get_hookimpls()
-    receive_to_folder(demo_raw, tmp_path, registry=registry, sinks=["distances", "figures"])
-    assert not registry.hook.evlcp_stage_finished.get_hookimpls()
 
 
 class Failing(Sink):
@@ -179,30 +172,10 @@ class Counting(Sink):
         return 5
 
 
-class Clearing(Sink):
-    def conclude(self, summary: Any) -> None:
-        summary["counts"].clear()
-        summary.clear()
-
-
-def test_a_sink_that_clears_the_summary_clears_its_own_copy(demo_raw: Path, tmp_path: Path) -> None:
-    registry = Registry.load(bring("clears", f"{__name__}:Clearing"))
-    summary = receive_to_folder(demo_raw, tmp_path, registry=registry, sinks=["clears"])
-    assert summary["counts"]
-    assert read_summary(tmp_path)["counts"] == summary["counts"]
-
-
 class Watching(Sink):
     @hookimpl
     def evlcp_stage_finished(self, stage: str) -> None:
         raise KeyError(stage)
-
-
-def test_the_list_of_plugins_asks_for_formats() -> None:
-    registry = Registry.load(bring("frames", "a:B"))
-    with pytest.warns(PluginWarning, match="has one of this name"):
-        rows = table_of(registry)["broken"]
-    assert [row["reason"] for row in rows] == ["sink 'frames': evlcp-sdk has one of this name"]
 
 
 def test_the_command_line_asks_for_formats(evlcp: Any, demo_raw: Path, tmp_path: Path) -> None:

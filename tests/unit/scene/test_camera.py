@@ -7,7 +7,6 @@ from hypothesis import strategies as st
 from scipy.optimize import approx_fprime, root
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 BENT = CameraModel(
@@ -84,13 +83,6 @@ def test_slopes_are_the_numerical_ones(x: float, y: float, z: float) -> None:
     np.testing.assert_allclose(
         BENT.distort_slope(direction), approx_fprime(direction, BENT.distort, 1e-7), atol=2e-3
     )
-
-
-def test_the_configuration_has_the_keys() -> None:
-    camera = resolve({"camera": {"k1": -0.1, "centre_x_px": 641.5}}).camera
-    assert camera == CameraModel(k1=-0.1, centre_x_px=641.5)
-    assert camera.centre_px == (641.5, 360.0)
-    assert camera.distance_m(0.06, 6.0) == pytest.approx(72.016, abs=1e-3)
 
 
 def test_sigmas_and_correlations_make_the_covariance() -> None:

@@ -27,7 +27,6 @@ from evlcp_sdk.sim import (
     simulation,
     truth_of,
 )
-from evlcp_sdk.sim.scene import WiperSpec
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.values import Events
@@ -60,19 +59,6 @@ def test_threads_pieces_and_runs_do_not_matter() -> None:
     assert max(map(len, pieces)) == 777
     assert same(events, Events.concat(pieces))
     assert not same(events, every(SHORT, seed=1))
-
-
-@pytest.mark.parametrize("blocks", [1, 3])
-def test_how_many_blocks_are_worked_out_together_does_not_matter(
-    blocks: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    bar = replace(SHORT.bars[0], cover_s=((0.004, 0.0135, 0, 4),))
-    wiper = WiperSpec(share=0.8, at_s=0.003, lasts_s=0.012)
-    scene = replace(SHORT, bars=(bar, *SHORT.bars[1:]), wiper=wiper, duration_s=0.0145)
-    events = every(scene)
-    assert len(events) > 30_000
-    monkeypatch.setattr(simulation, "_STRETCH", blocks)
-    assert same(events, every(scene))
 
 
 def test_what_is_worked_out_anew_less_often_changes_next_to_no_event(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -154,14 +140,6 @@ def test_dark_and_passed_bars_give_nothing() -> None:
     assert len(events) > 0
     # 74 ms on it is nearer than 50 cm, and behind the camera soon after; it leaves the image before.
     assert events.t_us[-1] < 74_000
-
-
-def test_only_the_lit_part_of_the_sensor_is_active() -> None:
-    scene = Scene(duration_s=0.02, sensor=QUIET)
-    events = every(scene)
-    place = np.array(truth_of(scene).to_table()["bar_centre_px"])[0]
-    assert np.abs(events.x - place[0].mean()).max() < 30
-    assert np.abs(events.y - place[1].mean()).max() < 69 + 30
 
 
 def test_a_bar_that_leans_is_seen_leaning() -> None:

@@ -17,7 +17,6 @@ from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Modulation
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BarSpec,
@@ -30,12 +29,9 @@ from evlcp_sdk.sim import (
     scene_of_truth,
     scene_table,
     simulate,
-    sites_of,
     truth_of,
 )
-from evlcp_sdk.sim.leds import lit_strips
-from evlcp_sdk.sim.light import BarLight, sources_of
-from evlcp_sdk.sim.optics import led_light_w_m2
+from evlcp_sdk.sim.light import BarLight
 from evlcp_sdk.sim.scene import LensSpec, links_of
 from evlcp_sdk.sim.world import bar_axis
 from evlcp_sdk.values import Events
@@ -111,18 +107,6 @@ def test_overrides_reach_links(tmp_path: Path) -> None:
     assert links_of(load_scene("night")) == (resolve({}),)
 
 
-def test_another_algorithm_brings_its_own_parameters() -> None:
-    scene = resolve_scene(
-        {
-            "link": {"error-correction": {"id": "polar", "rate": 0.25}},
-            "bars": [{}, {"link": {"error-correction": {"id": "none"}}}],
-        }
-    )
-    first, second = links_of(scene)
-    assert first.table["error-correction"]["rate"] == 0.25
-    assert second.table["error-correction"]["id"] == "none"
-
-
 @pytest.mark.parametrize(
     ("table", "says"),
     [
@@ -164,13 +148,6 @@ def test_a_fault_in_a_file_of_a_link_names_the_file(tmp_path: Path) -> None:
         with pytest.raises(ConfigError) as refused:
             load()
         assert str(refused.value).startswith(place)
-
-
-def test_too_many_columns_are_told() -> None:
-    wide = {"rows": 1, "columns": 65, "cluster_rows": 1}
-    pilots = {"bar": wide | {"columns": 33}}
-    with pytest.raises(ConfigError, match="66 columns and rows of LEDs and 0 lamps, expected at most 64"):
-        sources_of(resolve_scene({"link": pilots, "bars": [{}, {}]}))
 
 
 def turned(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -325,22 +302,6 @@ def test_two_columns_are_two_bars_side_by_side(tmp_path: Path) -> None:
     scene = Scene(duration_s=0.02, motion=STILL, bars=(both,))
     one, two = every(scene), every(replace(scene, bars=tuple(apart)))
     assert all((getattr(one, name) == getattr(two, name)).all() for name in ("t_us", "x", "y", "p"))
-
-
-def test_the_light_of_a_row_is_that_of_its_leds() -> None:
-    bar, lens = BarSpec(), LensSpec()
-    (one,), (wide,) = (lit_strips(bar, BarLayout(LedGrid(columns=n, cluster_columns=n))) for n in (1, 4))
-    widths = (0.005, 0.005 + 3 * 0.01)
-    lights = [led_light_w_m2(bar, strip, lens) for strip in (one, wide)]
-    assert lights[0] == pytest.approx(51, abs=0.5)
-    assert lights[1] * widths[1] == pytest.approx(4 * lights[0] * widths[0])
-    assert led_light_w_m2(replace(bar, led_w_m2=7.0), wide, lens) == 7.0
-
-
-def test_a_site_is_as_long_as_the_link_s_bar() -> None:
-    world = {"latitude_deg": 35.0, "longitude_deg": 137.0}
-    scene = resolve_scene({"world": world, "bars": [{}, {"link": {"bar": {"rows": 48}}}]})
-    assert [site.length_m for site in sites_of(scene)] == pytest.approx([0.96, 0.48])
 
 
 LINKS: dict[str, dict[str, Any]] = {

@@ -110,17 +110,6 @@ def test_a_campaign_counts_messages(received: tuple[Truth, list[Packet]]) -> Non
     assert message_tallies([], replace(known, bars=(replace(bar, payload="symbols"),)), coder) == []
 
 
-def test_chunks_do_not_matter(received: tuple[Truth, list[Packet]]) -> None:
-    _, packets = received
-    scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
-    whole, receiver = Events.concat(simulate(scene, 3)), Receiver(load_link())
-    again = receiver.feed(whole) + receiver.close()
-    assert [(p.packet, p.block, p.messages) for p in again] == [
-        (p.packet, p.block, p.messages) for p in packets
-    ]
-    assert receiver.counts["messages"] == sum(len(p.messages) for p in packets) > 0
-
-
 def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> None:
     key, chips, rec, out = (tmp_path / n for n in ("k.pem", "chips.npy", "rec.raw", "out"))
     site = tmp_path / "site.toml"

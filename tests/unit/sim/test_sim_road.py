@@ -28,7 +28,6 @@ from evlcp_sdk.sim import (
     SensorSpec,
     Simulation,
     WiperSpec,
-    load_scene,
     resolve_scene,
     scene_of_truth,
     scene_table,
@@ -97,16 +96,6 @@ def test_an_image_is_a_dimmer_bar_at_another_place(kind: str, tmp_path: Path) ->
     else:
         second = replace(second, x_m=first.x_m + 0.4)
     alike(every(replace(scene, reflections=(image,))), every(replace(scene, bars=(first, second))))
-
-
-def test_an_image_leans_as_a_mirror_shows_it() -> None:
-    bar = BarSpec(lean_deg=10.0, tilt_deg=20.0, x_m=0.5)
-    scene = Scene(bars=(bar,), reflections=(ReflectionSpec("road", gap_m=0.2), ReflectionSpec("rail")))
-    (light,) = Simulation(scene).bars
-    direct, road, rail = (one.strip.cuts_m() for one in (*light.strips, *light.images))
-    low = direct[:, 1].max()
-    np.testing.assert_allclose(road * [1, -1, 1] + [0, 2 * low + 0.2, 0], direct, atol=1e-12)
-    np.testing.assert_allclose(rail * [-1, 1, 1] + [1.0 + 0.1, 0, 0], direct, atol=1e-12)
 
 
 def test_a_window_turns_the_light() -> None:
@@ -294,17 +283,6 @@ def test_a_pothole_strikes_rings_and_decays() -> None:
     assert np.diff(place[:, 1])[50] == pytest.approx(0.8 * FOCAL_PX / 1000, rel=0.03)
 
 
-def test_yaw_may_shake_less_than_pitch() -> None:
-    places = [
-        truth_of(Scene(duration_s=0.2, motion=replace(STILL, vib_rate_rad_s=0.06, vib_yaw_share=share)))
-        for share in (1.0, 0.5)
-    ]
-    full, less = (truth.bars[0].centre_px for truth in places)
-    still = truth_of(Scene(duration_s=0.2, motion=STILL)).bars[0].centre_px
-    np.testing.assert_allclose(less[:, 1] - still[:, 1], full[:, 1] - still[:, 1], atol=0.02)
-    np.testing.assert_allclose(less[:, 0] - still[:, 0], (full[:, 0] - still[:, 0]) / 2, atol=0.05)
-
-
 def panned(tmp_path: Path, **background: Any) -> Scene:
     """A camera that turns to the right by 0.3 degrees in 40 ms, and then rests."""
     lines = ["t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg"]
@@ -474,12 +452,6 @@ def test_covers_that_cover_nothing_are_told(bar: dict[str, Any], says: str) -> N
     with pytest.raises(ConfigError) as fault:
         Simulation(resolve_scene({"bars": [bar]}))
     assert says in str(fault.value)
-
-
-def test_overrides_make_what_they_set() -> None:
-    scene = load_scene("night", ["reflections.share=0.4", "wiper.share=0.5", "bars.covered=[1, 2]"])
-    assert [(one.kind, one.share) for one in scene.reflections] == [("road", 0.4)]
-    assert (scene.wiper.share, scene.bars[0].covered) == (0.5, (1, 2))
 
 
 @pytest.mark.skipif(not TOOL.exists(), reason="the scorers of ../shared are not there")

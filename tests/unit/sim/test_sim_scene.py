@@ -24,7 +24,6 @@ from evlcp_sdk.sim import (
     load_scene,
     preset_names,
     resolve_scene,
-    scene_table,
     truth_of,
 )
 from evlcp_sdk.sim.light import BarLight, LampLight
@@ -33,13 +32,6 @@ from evlcp_sdk.sim.optics import blur_sigma_px, step_table
 
 LINK = resolve({})
 EXAMPLES = Path(__file__).parents[3] / "examples" / "scenes"
-
-
-@pytest.mark.parametrize("name", preset_names())
-def test_presets_are_scenes(name: str) -> None:
-    scene = load_scene(name)
-    assert scene.name == name
-    assert resolve_scene(json.loads(json.dumps(scene_table(scene)))) == scene
 
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("*.toml")), ids=lambda p: p.stem)
@@ -89,14 +81,6 @@ def test_wrong_overrides_are_told(override: str, says: str) -> None:
     with pytest.raises(ConfigError, match="--set") as fault:
         load_scene("night", [override])
     assert says in str(fault.value)
-
-
-def test_overrides_reach_their_place() -> None:
-    scene = load_scene("two-bars", ["bars.ppm=3.0", "bars.1.x_m=2.5", "duration_s=0.1", "name=other"])
-    assert [bar.ppm for bar in scene.bars] == [3.0, 3.0]
-    assert (scene.bars[1].x_m, scene.duration_s, scene.name) == (2.5, 0.1, "other")
-    assert load_scene("night", {"motion.distance_m": np.float64(70)}).motion.distance_m == 70
-    assert load_scene("night", {"lens.halo": 0.0}).lens.halo == 0
 
 
 def test_files_that_are_no_scenes_are_told(tmp_path: Path) -> None:
@@ -318,14 +302,6 @@ def test_simulate_tells_what_is_wrong(
     assert done.code == code
     assert says in done.err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_the_simulator_sees_through_the_camera_model() -> None:
-    camera = CameraModel(centre_x_px=600.0, centre_y_px=380.0, k1=-0.2, p1=1e-3)
-    points = np.array([[1.0, -0.5, 20.0], [-3.0, 1.0, 60.0]])
-    place, depth = project(points, np.zeros((1, 3)), np.zeros((1, 3)), camera)
-    np.testing.assert_allclose(place[0], camera.project(points))
-    np.testing.assert_allclose(depth[0], [20, 60])
 
 
 @pytest.mark.parametrize(

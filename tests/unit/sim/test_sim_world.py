@@ -9,7 +9,7 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.attitude import AttitudeLog
-from evlcp_sdk.scene.sites import LocalAxes, load_sites, to_toml
+from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.world import attitude_log, rendered, scene_to_enu, sites_said
@@ -95,12 +95,6 @@ def test_without_a_world_there_are_no_sites() -> None:
         sites_of(scene)
 
 
-def test_a_wrong_key_is_told() -> None:
-    with pytest.raises(ConfigError, match=r"world\.lattitude_deg"):
-        resolve_scene({"world": {"lattitude_deg": 1.0}})
-    assert load_scene("night", ["world.heading_deg=90"]).world.heading_deg == 90.0  # type: ignore[union-attr]
-
-
 def test_an_imu_tells_the_attitude_and_one_error(tmp_path: Path) -> None:
     scene = load_scene("drive-30kmh", {"duration_s": 0.05, "world.heading_deg": 359.5, "motion.yaw_deg": 1.0})
     assert scene.world is not None
@@ -147,12 +141,6 @@ def test_what_an_imu_does_not_know(known: str) -> None:
     assert (log is None) == (known == "none")
     if log is not None:
         assert (log.heading_deg is None) == (known == "gravity")
-
-
-def test_sites_come_back_from_their_file(tmp_path: Path) -> None:
-    file = tmp_path / "site.toml"
-    file.write_text(to_toml(sites_of(SCENE)))
-    assert load_sites(file) == sites_of(SCENE)
 
 
 def test_what_is_said_of_sites_is_wrong_as_told() -> None:
