@@ -84,10 +84,12 @@ def tampered(abstract: type, inner: Any) -> Callable[[Change], Any]:
         def compile(self, *given: Any) -> Any:
             return self.change(inner.compile(*given))
 
+        def codebook(self, clusters: int) -> Any:
+            return inner.codebook(clusters)
+
     return Tampered
 
 
-synchronization = tampered(Synchronization, BarkerSync())
 separation = tampered(Separation, WhCorrelation())
 decoding = tampered(Decoding, WhTransform())
 ranging = tampered(Ranging, CentroidRanging())
@@ -210,52 +212,87 @@ def twins(codes: Any) -> Any:
 
 
 @dataclass(frozen=True)
-class Sync:
-    """A synchronizer whose `step` is changed."""
+class Stepping:
+    """A synchronizer, detector or deframer in whose `step` something is changed; its state is a list."""
 
     inner: Any
     change: Change
 
     def init(self) -> Any:
-        return self.inner.init()
+        return [self.inner.init(), b""]
 
     def step(self, state: Any, *given: Any) -> Any:
         return self.change(self.inner, state, *given)
 
+    def close(self, state: Any) -> Any:
+        return state, self.inner.close(state[0])[1]
 
-def stepping(change: Change) -> Any:
-    return synchronization(lambda inner: Sync(inner, change))
+    def counts(self, state: Any) -> Any:
+        return self.inner.counts(state[0])
+
+
+def stepping(abstract: type, inner: Any, change: Change) -> Any:
+    return tampered(abstract, inner)(lambda made: Stepping(made, change))
+
+
+def giving(change: Change) -> Change:
+    """A step whose results are changed."""
+
+    def step(inner: Any, state: Any, *given: Any) -> Any:
+        then, found = inner.step(state[0], *given)
+        return [then, state[1]], change(found)
+
+    return step
+
+
+def mutating(inner: Any, state: Any, *given: Any) -> Any:
+    state[0], found = inner.step(state[0], *given)
+    return state, found
+
+
+def sync(change: Change) -> Any:
+    return stepping(Synchronization, BarkerSync(), change)
 
 
 def locks_changed(change: Change) -> Any:
-    def step(inner: Any, state: Any, *given: Any) -> Any:
-        state, locks = inner.step(state, *given)
-        return state, [change(lock) for lock in locks]
-
-    return stepping(step)
+    return sync(giving(lambda locks: [change(lock) for lock in locks]))
 
 
 def amnesic(inner: Any, state: Any, *given: Any) -> Any:
-    return inner.step(inner.init(), *given)
-
-
-@dataclass(frozen=True)
-class MutatingSync:
-    """A synchronizer that keeps its state in one box."""
-
-    inner: Any
-
-    def init(self) -> Any:
-        return [self.inner.init()]
-
-    def step(self, state: Any, *given: Any) -> Any:
-        state[0], locks = self.inner.step(state[0], *given)
-        return state, locks
+    return state, inner.step(inner.init(), *given)[1]
 
 
 def credulous(inner: Any, state: Any, t_us: Any, p: Any, until_us: int) -> Any:
-    state, locks = inner.step(state, t_us, p, until_us)
-    return state, [*locks, *([SyncLock(float(until_us), 100.0, 0.0, 0.0, 0.9)] if len(t_us) > 10 else [])]
+    then, locks = inner.step(state[0], t_us, p, until_us)
+    invented = [SyncLock(float(until_us), 100.0, 0.0, 0.0, 0.9)] if len(t_us) > 10 else []
+    return [then, b""], [*locks, *invented]
+
+
+def detection(change: Change) -> Any:
+    return stepping(Detection, Whole(), change)
+
+
+def grown(inner: Any, state: Any, start_us: int, events: Any) -> Any:
+    found, regions = inner.step(state[0], start_us, events)
+    state[0] = replace(found, number=found.number + 1)
+    return state, regions
+
+
+def framing(change: Change) -> Any:
+    return stepping(Framing, Uart(), change)
+
+
+def forgetful_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
+    """Every step but those of many events is forgotten."""
+    if len(events) < 200:
+        return state, []
+    found, frames = inner.step(state[0], events, until_us)
+    return [found, b""], frames
+
+
+def growing_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
+    found, frames = inner.step(state[0], events, until_us)
+    return [found, state[1] + bytes(1 << 17)], frames
 
 
 @dataclass(frozen=True)
@@ -362,25 +399,22 @@ class TamperedCode:
     """A code whose ends are changed."""
 
     inner: Any
-    change_coded: Change
-    change_llr: Change
-    change_found: Change
+    change: Mapping[str, Change]
     message_bits: int
     coded_bits: int
 
+    def _changed(self, name: str, value: Any) -> Any:
+        return self.change[name](value) if name in self.change else value
+
     def encode(self, bits: Any) -> Any:
-        return self.change_coded(self.inner.encode(bits))
+        return self._changed("coded", self.inner.encode(self._changed("bits", bits)))
 
     def decode(self, llr: Any) -> Any:
-        return self.change_found(self.inner.decode(self.change_llr(llr)))
+        return self._changed("found", self.inner.decode(self._changed("llr", llr)))
 
 
-def code_changed(
-    coded: Change = lambda coded: coded, llr: Change = lambda llr: llr, found: Change = lambda found: found
-) -> Any:
-    return correction(
-        lambda inner: TamperedCode(inner, coded, llr, found, inner.message_bits, inner.coded_bits)
-    )
+def code_changed(**change: Change) -> Any:
+    return correction(lambda inner: TamperedCode(inner, change, inner.message_bits, inner.coded_bits))
 
 
 def credulous_code(found: Any) -> Any:
@@ -393,140 +427,16 @@ def gullible_code(found: Any) -> Any:
     return replace(found, ok=found.ok or found.flipped > 0)
 
 
-@dataclass(frozen=True)
-class Deaf(ErrorCorrection):
+def without_first(bits: Any) -> Any:
     """The first bit of a message is not sent."""
-
-    def compile(self, coded_bits: int) -> Any:
-        @dataclass(frozen=True)
-        class Code:
-            inner: Any
-            message_bits: int
-            coded_bits: int
-
-            def encode(self, bits: Any) -> Any:
-                sent = bits.copy()
-                sent[:1] = 0
-                return self.inner.encode(sent)
-
-            def decode(self, llr: Any) -> Any:
-                return self.inner.decode(llr)
-
-        inner = Polar().compile(coded_bits)
-        return Code(inner, inner.message_bits, inner.coded_bits)
+    sent = bits.copy()
+    sent[:1] = 0
+    return sent
 
 
-@dataclass(frozen=True)
-class Uncorrected(ErrorCorrection):
-    """A polar code from which only a word without errors is read."""
-
-    def compile(self, coded_bits: int) -> Any:
-        inner = Polar().compile(coded_bits)
-
-        def found(of: Any) -> Any:
-            return replace(of, ok=of.ok and not of.flipped)
-
-        return TamperedCode(inner, lambda x: x, lambda x: x, found, inner.message_bits, inner.coded_bits)
-
-
-@dataclass(frozen=True)
-class BrokenDetector:
-    """A detector of the whole image with a step of its own."""
-
-    inner: Any
-    change: Callable[..., Any]
-
-    def init(self) -> Any:
-        return [self.inner.init()]
-
-    def step(self, state: Any, start_us: int, events: Any) -> Any:
-        return self.change(self.inner, state, start_us, events)
-
-
-@dataclass(frozen=True)
-class BrokenDetection(Detection):
-    """The whole image, spoilt."""
-
-    change: Any = None
-
-    def compile(self, *given: Any) -> Any:
-        return BrokenDetector(Whole().compile(*given), self.change)
-
-
-def detecting(change: Callable[..., Any]) -> BrokenDetection:
-    def fresh(inner: Any, state: Any, start_us: int, events: Any) -> Any:
-        found, regions = inner.step(state[0], start_us, events)
-        return [found], change(regions)
-
-    return BrokenDetection(fresh)
-
-
-def grown(inner: Any, state: list[Any], start_us: int, events: Any) -> Any:
-    found, regions = inner.step(state[0], start_us, events)
-    state[0] = replace(found, number=found.number + 1)
-    return state, regions
-
-
-@dataclass(frozen=True)
-class BrokenDeframer:
-    """The reader of characters with a step of its own."""
-
-    inner: Any
-    change: Callable[..., Any]
-
-    def init(self) -> Any:
-        return [self.inner.init(), b""]
-
-    def step(self, state: Any, events: Any, until_us: int) -> Any:
-        return self.change(self.inner, state, events, until_us)
-
-    def close(self, state: Any) -> Any:
-        found, heard = self.inner.close(state[0])
-        return [found, state[1]], heard
-
-    def counts(self, state: Any) -> Any:
-        return self.inner.counts(state[0])
-
-
-@dataclass(frozen=True)
-class BrokenFraming(Framing):
-    """Characters, spoilt."""
-
-    change: Any = None
-
-    def codebook(self, clusters: int) -> Any:
-        return Uart().codebook(clusters)
-
-    def compile(self, *given: Any) -> Any:
-        return BrokenDeframer(Uart().compile(*given), self.change)
-
-
-def framing(change: Callable[..., Any]) -> BrokenFraming:
-    """Characters whose frames are changed."""
-
-    def step(inner: Any, state: Any, events: Any, until_us: int) -> Any:
-        found, heard = inner.step(state[0], events, until_us)
-        return [found, state[1]], change(heard)
-
-    return BrokenFraming(step)
-
-
-def forgetful_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
-    """Every step but those of many events is forgotten."""
-    if len(events) < 200:
-        return state, []
-    found, heard = inner.step(state[0], events, until_us)
-    return [found, b""], heard
-
-
-def spoiling_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
-    state[0], heard = inner.step(state[0], events, until_us)
-    return state, heard
-
-
-def growing_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
-    found, heard = inner.step(state[0], events, until_us)
-    return [found, state[1] + bytes(1 << 17)], heard
+def uncorrected(found: Any) -> Any:
+    """Only a word without errors is read."""
+    return replace(found, ok=found.ok and not found.flipped)
 
 
 BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
@@ -568,16 +478,20 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
         ("comes-back", TamperedModulation(twins), "are equal"),
     ],
     "detection": [
-        ("shapes", detecting(lambda regions: [*regions, *regions]), "regions of different ids"),
-        ("shapes", detecting(lambda regions: []), "a region in a recording"),
-        ("state-kept", BrokenDetection(grown), "not to change what follows"),
+        ("shapes", detection(giving(lambda regions: [*regions, *regions])), "regions of different ids"),
+        ("shapes", detection(giving(lambda regions: [])), "a region in a recording"),
+        ("state-kept", detection(grown), "not to change what follows"),
     ],
     "framing": [
-        ("clean", framing(lambda heard: []), "got 0"),
-        ("clean", framing(lambda heard: [replace(h, t_us=h.t_us + 200) for h in heard]), "chips off"),
-        ("any-split", BrokenFraming(forgetful_framing), "the same frames from events fed"),
-        ("state-kept", BrokenFraming(spoiling_framing), "not to change the state"),
-        ("bounded", BrokenFraming(growing_framing), "a state of at most"),
+        ("clean", framing(giving(lambda frames: [])), "got 0"),
+        (
+            "clean",
+            framing(giving(lambda frames: [replace(f, t_us=f.t_us + 200) for f in frames])),
+            "chips off",
+        ),
+        ("any-split", framing(forgetful_framing), "the same frames from events fed"),
+        ("state-kept", framing(mutating), "not to change the state"),
+        ("bounded", framing(growing_framing), "a state of at most"),
     ],
     "synchronization": [
         ("shapes", locks_changed(lambda lock: replace(lock, quality=2.0)), "quality from 0 to 1"),
@@ -591,10 +505,10 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
             locks_changed(lambda lock: replace(lock, chip_us=lock.chip_us * 1.0001)),
             "within 58 ppm",
         ),
-        ("finds-time", stepping(lambda inner, state, *given: (state, [])), "one lock a packet"),
-        ("any-split", stepping(amnesic), "the same locks from events fed"),
-        ("state-kept", synchronization(MutatingSync), "not to change the state"),
-        ("no-lock-in-noise", stepping(credulous), "no lock in noise"),
+        ("finds-time", sync(lambda inner, state, *given: (state, [])), "one lock a packet"),
+        ("any-split", sync(amnesic), "the same locks from events fed"),
+        ("state-kept", sync(mutating), "not to change the state"),
+        ("no-lock-in-noise", sync(credulous), "no lock in noise"),
     ],
     "separation": [
         (
@@ -655,11 +569,11 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
         ("comes-back", code_changed(found=lambda f: replace(f, bits=f.bits ^ 1)), "bits wrong"),
         ("comes-back", code_changed(found=lambda f: replace(f, flipped=1)), "no bit flipped"),
         ("comes-back", code_changed(llr=lambda x: -x), "ok from clean LLRs"),
-        ("every-bit", Deaf(), "message bit 0 of 456"),
+        ("every-bit", code_changed(bits=without_first), "message bit 0 of 456"),
         ("knows-nothing", code_changed(found=credulous_code), "not ok where none of 960"),
         ("no-message-in-noise", code_changed(found=gullible_code), "no message in random LLRs"),
         ("errors-found", code_changed(found=gullible_code), "a message of 456 bits that was not sent"),
-        ("corrects", Uncorrected(), "the message with 9 of 960 bits wrong"),
+        ("corrects", code_changed(found=uncorrected), "the message with 9 of 960 bits wrong"),
         ("corrects", code_changed(found=lambda f: replace(f, flipped=0)), "9 flipped with 9 of 960"),
         ("clean-link", code_changed(llr=lambda x: x[::-1]), "message 0 of a clean recording"),
     ],
