@@ -1,6 +1,5 @@
 """Scores against the independent scorers, against plain loops for other links, and by hand."""
 
-import hashlib
 import importlib.util
 import json
 import subprocess
@@ -267,33 +266,6 @@ def test_what_cannot_be_scored_is_told(
     assert done.code == 3
     assert says in done.err
     assert len(done.err.splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("settings", "says"),
-    [
-        ((), ""),
-        (("ranging.id=centroid", "error-correction.id=none"), ""),
-        (("air.chip_rate_hz=5000.0",), "air.chip_rate_hz: sent with 10000.0, received with 5000.0"),
-        (("pilots.id=barker13",), 'pilots.id: sent with "wh", received with "barker13"'),
-        (("modulation.id=wh8",), 'modulation.id: sent with "wh4x2", received with "wh8"'),
-        (("bar.rows=48",), "bar.rows: sent with 96, received with 48"),
-    ],
-)
-def test_a_result_of_another_link_is_refused(
-    settings: tuple[str, ...], says: str, tmp_path: Path, evlcp: Callable[..., Any]
-) -> None:
-    link = load_link(overrides=settings)
-    truth = plain(truth_of(Scene(duration_s=0.05)).to_table())
-    folder, path = write(tmp_path, GOOD, truth)
-    summary = {"configuration": {section: dict(keys) for section, keys in link.table.items()}}
-    digest = hashlib.sha256(GOOD.encode()).hexdigest()
-    summary["files"] = {"frames.csv": {"bytes": len(GOOD), "sha256": digest}}
-    (folder / "summary.json").write_text(json.dumps(summary))
-    done = evlcp("score", folder, path, "--json")
-    assert done.code == (2 if says else 0)
-    assert done.err == (f"evlcp: {folder}: bar 0 was sent with another link: {says}\n" if says else "")
-    assert (done.out == "") is bool(says)
 
 
 @pytest.mark.parametrize(

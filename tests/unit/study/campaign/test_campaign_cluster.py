@@ -67,10 +67,10 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
 
 
 def test_workers_may_die_and_come(cluster: Cluster, tmp_path: Path) -> None:
-    """200 tasks; two of three workers are killed in the middle and one comes."""
-    plan = fake_plan(25, 2, 4, seconds=0.02)
+    """64 tasks; two of three workers are killed in the middle and one comes."""
+    plan = fake_plan(8, 2, 4, seconds=0.02)
     workers = [cluster.add_worker() for _ in range(3)]
-    deaths = {30: 0, 90: 1}
+    deaths = {10: 0, 30: 1}
 
     def watch(progress: Progress) -> None:
         for done in [d for d in deaths if progress.done >= d]:
@@ -82,9 +82,9 @@ def test_workers_may_die_and_come(cluster: Cluster, tmp_path: Path) -> None:
         found = store.results()
     assert not deaths
     assert progress.faults == ()
-    assert progress.done == 200
+    assert progress.done == 64
     with Store(tmp_path / "inline.sqlite", create=True) as store:
-        collect(fake_plan(25, 2, 4), store, Inline(), run_fake)
+        collect(fake_plan(8, 2, 4), store, Inline(), run_fake)
         assert store.results() == found
 
 
@@ -122,8 +122,9 @@ def test_a_scheduler_that_dies_keeps_what_was_finished(cluster: Cluster, tmp_pat
     assert sum(totals, Statistics()).tasks == 200
 
 
-def test_no_scheduler() -> None:
+def test_no_scheduler(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
+    monkeypatch.setattr("evlcp_sdk.study.jobs._CONNECT_S", 0.5)
     with pytest.raises(ConfigError, match=r"^--dask tcp://127\.0\.0\.1:9: no Dask scheduler answers there$"):
         DaskCluster("tcp://127.0.0.1:9")
     with pytest.raises(ConfigError, match="no Dask scheduler answers there"):

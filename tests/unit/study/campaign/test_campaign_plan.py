@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import ConfigError
@@ -100,6 +100,7 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
     assert shared(environment={"evlcp-sdk": "2"}) == 0
 
 
+@settings(max_examples=20)
 @given(st.dictionaries(st.text(max_size=4), st.one_of(st.integers(), st.text(max_size=4), st.booleans())))
 def test_a_digest_knows_no_order(table: dict[str, Any]) -> None:
     assert digest_of(table) == digest_of(dict(reversed(table.items())))
