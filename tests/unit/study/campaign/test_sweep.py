@@ -177,8 +177,11 @@ def test_a_road_is_swept_in_steps_by_the_default_link_and_the_papers() -> None:
     assert len(digests) == len(plan.scenes)
 
 
-def test_the_demo(evlcp: Evlcp, tmp_path: Path) -> None:
+def test_the_demo(evlcp: Evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("plotly", reason="the extra report is not installed")
+    short = demo_campaign().read_text().replace("seeds = 5", "seeds = 1").replace("s = 0.3", "s = 0.1")
+    (tmp_path / "short.toml").write_text(short)
+    monkeypatch.setattr("evlcp_sdk.cli.demo.demo_campaign", lambda: tmp_path / "short.toml")
     done = evlcp("demo", "-o", tmp_path / "out")
     assert done.code == 0
     for begin in (80, 50, 40, 30):
