@@ -91,11 +91,6 @@ _SQUARES = {"rmse_m": ("squares_nm2", "ranged"), "position_rmse_m": ("position_s
 def measure(recordings: Sequence[Tally], kind: str) -> Figure:
     """A figure of independent recordings.
 
-    Args:
-        recordings: What was counted of each.
-        kind: `ber`, `rmse_m`, `gross_share`, `found_share`, `lost_share` (messages that were not read),
-            `wrong_share` (messages that were read wrong, of those that were read) or `position_rmse_m`.
-
     >>> round(measure([Tally(frames_found=10, bits=1000)] * 10, "ber").high, 4)
     0.0362
     """
@@ -142,11 +137,6 @@ def ratio_interval(
     recordings hold the true ratio in 7 of 10 cases). Of few recordings the draws know the tails too little:
     their quantiles are not taken for less than those of Student's t, nor for more than twice these, as draws
     of nearly equal recordings have errors near 0.
-
-    Args:
-        parts: Of each recording, e.g. wrong bits; one of them not 0.
-        wholes: Of each recording, e.g. bits; all over 0.
-        confidence: Share of such intervals that hold the true ratio.
     """
     above, below = np.array(parts, np.float64), np.array(wholes, np.float64)
     n = len(above)

@@ -89,13 +89,7 @@ class BarFrames:
 
     @classmethod
     def of(cls, bar: SentBar, truth: Truth, *, covers: bool) -> "BarFrames":
-        """Those of a bar.
-
-        Args:
-            bar: The bar.
-            truth: The truth that it is in.
-            covers: Mind what hides its clusters; a frame of which nothing is to be seen is then not sent.
-        """
+        """Those of a bar; with `covers`, one of which nothing is to be seen is not sent."""
         packet = bar.link.packet
         rate_hz = bar.rate_hz
         numbers = range(packet.frames)
@@ -162,13 +156,9 @@ def match(
 
     A frame that names its link is put beside those of bars that send with it. A frame that is cut by an end
     of the recording, or by something that hides all of the bar, is neither found nor unmatched, unless the
-    sent frame nearest to it was found before.
-
-    Args:
-        frames: The decoded frames, in their order: of two beside the same sent one, the first is it.
-        truth: What was sent.
-        road: Mind what a road adds: leave out what is said to be a reflection, and mind what hides clusters.
-        links: The receiver's links by name, where it has several; None for one.
+    sent frame nearest to it was found before. Of two beside the same sent one, the first is it. On a `road`,
+    what is said to be a reflection is left out, and what hides clusters is minded; `links` are the receiver's
+    by name, where it has several.
     """
     bars = tuple(BarFrames.of(bar, truth, covers=road) for bar in truth.bars if bar.lit)
     pairs: tuple[list[tuple[GivenFrame, int]], ...] = tuple([] for _ in bars)
@@ -230,13 +220,7 @@ def sent_packets(bar: SentBar, truth: Truth) -> tuple[Floats, NDArray[np.bool_],
 def check_link(truth: Truth, link: Link | Mapping[str, Link], name: str, *, messages: bool = False) -> None:
     """Refuse a link that a bar of the truth does not send with: a mismatch is an error, never a wrong answer.
 
-    Of several links, each bar has to send with one.
-
-    Args:
-        truth: What was sent.
-        link: The link that it is received with; several by name.
-        name: What a fault names as its place, e.g. the recording.
-        messages: Also hold bars that send messages to the link's error correction.
+    Of several links, each bar has to send with one; with `messages`, also with their error correction.
 
     Raises:
         ConfigError: They differ; says where.

@@ -29,12 +29,7 @@ __all__ = [
 
 
 def bar_tallies(sent: BarFrames, pairs: Iterable[tuple[GivenFrame, int]]) -> list[tuple[int, Tally]]:
-    """What is counted of one bar: a tally a sent frame and one a decoded one, each with its segment's start.
-
-    Args:
-        sent: The frames that it sent.
-        pairs: (decoded frame, number of the sent one).
-    """
+    """Tallies of one bar, each with the start of its segment: one a sent frame, one a decoded."""
     bits = sent.bar.link.codebook.bits_per_symbol
     segments = [segment_of(at) for at in sent.distance_m.tolist()]
     tallies = [(segment, Tally(frames_sent=1)) for segment in segments]
@@ -81,13 +76,8 @@ def statistics_of(
 ) -> Statistics:
     """Hold decoded frames against the truth.
 
-    Args:
-        frames: The decoded frames.
-        truth: What was sent.
-        events: Events that the sensor sent.
-        packets: Decoded packets.
-        others: What `message_tallies` and `position_tallies` gave.
-        links: The receiver's links by name, where it has several; None for one.
+    `others` are what `message_tallies` and `position_tallies` gave; `links` are the
+    receiver's by name, where it has several.
     """
     frames = list(frames)
     matched = match(frames, truth, links=links)
@@ -121,13 +111,7 @@ def without_truth(frames: Iterable[GivenFrame], packets: int) -> Statistics:
 
 
 def message_tallies(packets: Iterable[Packet], truth: Truth, coder: BlockCoder) -> list[tuple[int, Tally]]:
-    """Hold the blocks of packets against what was sent: one tally a packet, with the start of its segment.
-
-    Args:
-        packets: The received packets.
-        truth: What was sent.
-        coder: How packets carry blocks.
-    """
+    """Hold the blocks of packets against what was sent: one tally a packet, with the start of its segment."""
     bars = [bar for bar in truth.bars if bar.sends_frames and bar.payload != "symbols"]
     sent = [sent_packets(bar, truth) for bar in bars]
     tallies = [
@@ -159,10 +143,7 @@ def sites_seen(
 ) -> list[BarSite]:
     """Sites of a truth's bars, each with the number that the receiver gave to its transmitter.
 
-    Args:
-        packets: The received packets.
-        truth: What was sent.
-        sites: What is said of the bars' places, in their order; None for the truth.
+    `sites` are what is said of the bars' places, in their order; None for the truth.
     """
     said = list(truth.sites if sites is None else sites)
     first: dict[int, Frame] = {}
@@ -187,13 +168,6 @@ def position_tallies(
     """Hold positions and track that follow from packets against the truth, tallies a time by the nearest bar.
 
     Which transmitter stands where is what the image shows, so that no beacon is needed.
-
-    Args:
-        packets: The received packets.
-        truth: What was sent, with its `sites`.
-        link: The link they were received with.
-        attitude: What is said of the camera's attitude; None for nothing.
-        sites: What is said of the bars' places, in their order; None for the truth.
     """
     navigator = Navigator(link, PositionPlan(tuple(sites_seen(packets, truth, sites))), attitude)
     placed = navigator.feed(packets)

@@ -31,13 +31,7 @@ _FARTHEST_M = 200
 def score_frames(
     frames: Iterable[GivenFrame], truth: Truth, links: Mapping[str, Link] | None = None
 ) -> dict[str, Any]:
-    """Both scores as JSON values: the plain one's keys, and the road score under `road`.
-
-    Args:
-        frames: The decoded frames.
-        truth: What was sent.
-        links: The receiver's links by name, where it has several: each bar's row names its; None for one.
-    """
+    """Both scores as JSON values: the plain one's keys, and the road score under `road`."""
     frames = list(frames)
     plain, road = (_score(frames, truth, links, road=road) for road in (False, True))
     return plain | {"road": road}
@@ -101,10 +95,6 @@ def links_of_result(folder: Path | str, registry: Registry | None = None) -> dic
     """The links that a result was received with, from its `summary.json`; none without that file.
 
     Of one link, the name is empty.
-
-    Args:
-        folder: What `evlcp receive -o` wrote.
-        registry: Where algorithms are found; None for all that are installed.
 
     Raises:
         InputError: The file cannot be read, or does not say a configuration.

@@ -162,11 +162,7 @@ class Tally:
 
     @classmethod
     def distance(cls, error_m: float, sigma_m: float = math.nan) -> Self:
-        """One distance.
-
-        Args:
-            error_m: Its error, m.
-            sigma_m: The standard deviation that comes with it, m; NaN for none.
+        """One distance; its sigma is NaN for none.
 
         >>> Tally.distance(-0.05).histogram
         {-3: 1}
@@ -194,14 +190,7 @@ class Tally:
         protected: bool = False,
         beyond: bool = False,
     ) -> Self:
-        """One position that was given.
-
-        Args:
-            error_m: Its error in space, m.
-            nees: That squared in its own sigmas.
-            excluded: A part was left out.
-            protected: It has both protection levels.
-            beyond: Its error is beyond one of these.
+        """One position that was given; its NEES is its error in space squared in its own sigmas.
 
         >>> Tally.fix(0.012, 2.5).position_histogram
         {2: 1}
@@ -404,12 +393,7 @@ class Statistics:
 
     @classmethod
     def of(cls, tallies: Iterable[tuple[int, Tally]], **counts: int) -> Self:
-        """Statistics from tallies in any order, several a segment.
-
-        Args:
-            tallies: Each with the start of its segment, m.
-            counts: The other fields.
-        """
+        """Statistics from tallies in any order, several a segment."""
         found: dict[int, list[Tally]] = {}
         for start, tally in tallies:
             found.setdefault(start, []).append(tally)

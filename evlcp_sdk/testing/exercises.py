@@ -42,13 +42,7 @@ FRAME_US = 3200.0
 
 
 def subject_of(role: str, algorithm: Any, link: Link | None = None) -> Subject:
-    """An algorithm under test, under the id by which a configuration selects it, if any does.
-
-    Args:
-        role: The role that it fills.
-        algorithm: The algorithm.
-        link: What the rest of the link is; None for the default.
-    """
+    """An algorithm under test, under the id by which a configuration selects it, if any does."""
     if link is not None and link.algorithms[role] == algorithm:
         return Subject(role, algorithm, link, link.table[role]["id"])
     target = f"{type(algorithm).__module__}:{type(algorithm).__qualname__}"

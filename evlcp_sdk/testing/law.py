@@ -129,13 +129,7 @@ def compiled(make: Callable[[], Any]) -> Any:
 
 
 def judge(law: Law, subject: Subject, excuses: Mapping[str, str]) -> Verdict:
-    """Hold a subject against a law; an excuse must be needed, or it is a failure itself.
-
-    Args:
-        law: The law.
-        subject: The algorithm.
-        excuses: Name of a law to the reason why it is known to be broken.
-    """
+    """Hold a subject against a law; an excuse must be needed, or it is a failure itself."""
     reason = excuses.get(law.name)
     try:
         law.hold(subject)

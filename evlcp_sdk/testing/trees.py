@@ -22,14 +22,7 @@ def mapped(value: Any, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Any:
 
 
 def difference(got: Any, wanted: Any, tolerance: float = 0.0, name: str = "result") -> str | None:
-    """Where two values differ, None where they do not; NaN equals NaN.
-
-    Args:
-        got: A value.
-        wanted: What it should be.
-        tolerance: Relative and absolute tolerance of floats; 0 for equal.
-        name: What the value is called.
-    """
+    """Where two values differ, None where they do not; NaN equals NaN."""
     if isinstance(wanted, np.ndarray):
         if not isinstance(got, np.ndarray):
             return f"{name}: {type(got).__name__}, not an array"

@@ -102,13 +102,6 @@ def collect(
 ) -> Progress:
     """Run what a campaign still needs, and keep every result as it comes.
 
-    Args:
-        plan: The campaign.
-        store: Where results are kept, and those of earlier runs are found.
-        executor: Where jobs run.
-        run: What runs a job.
-        watch: Gets how far it is, at first and after each job.
-
     Returns:
         How far it came; its `faults` say which jobs failed. They are tried again by the next run.
 

@@ -259,17 +259,7 @@ def make_plan(
     merge: Sequence[str] = (),
     environment: Mapping[str, Any] | None = None,
 ) -> Plan:
-    """Every scene with every link and every seed.
-
-    Args:
-        name: Name of the campaign.
-        scenes: The scenes.
-        links: The links.
-        seeds: The seeds, in the order in which they count.
-        rule: When a point has enough.
-        merge: Labels over which a report adds points up.
-        environment: Code and versions, part of every task's id.
-    """
+    """Every scene with every link and every seed."""
     environment = dict(environment or {})
 
     def id_of(scene: Case, link: Case, seed: int) -> str:

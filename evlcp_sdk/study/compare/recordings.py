@@ -218,13 +218,7 @@ def _bound_of(links: Mapping[str, Link]) -> _Bound | None:
 def comparison_of(
     tables: Sequence[Table], variants: Sequence[Variant], versions: Mapping[str, str]
 ) -> Comparison:
-    """The tables of recordings, with one of them all behind where there are several.
-
-    Args:
-        tables: Of `compare_recording`, in the order in which they are shown.
-        variants: Those that they compare.
-        versions: Of the packages that took part.
-    """
+    """The tables of recordings, with one of them all behind where there are several."""
     notes = []
     for table in tables:
         beside = truth_path(table.name)
