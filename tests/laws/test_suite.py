@@ -4,7 +4,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,11 +18,10 @@ from evlcp_sdk import simulate
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.plugin.roles import ROLES, Decode, Decoding, Filter, Modulation, Ranging, Tracker, Tracking
+from evlcp_sdk.plugin.roles import ROLES, Decode, Decoding, Modulation, Ranging
 from evlcp_sdk.testing import check, laws_of, suite
 from evlcp_sdk.testing.law import Law, Subject, Verdict, judge
 from evlcp_sdk.testing.links import LINK
-from evlcp_sdk.testing.trees import difference
 from evlcp_sdk.values import PresenceMap, SoftSymbols
 from firmware_host.board.bank import random_symbols
 
@@ -134,36 +133,6 @@ def test_wrong_names_are_refused(role: str, excuses: dict[str, str], said: str) 
         check(role, CentroidRanging(), excuses)
 
 
-def test_the_receiver_begins_a_filter_with_its_init() -> None:
-    class Latest(Filter):
-        def init(self) -> Any:
-            return ()
-
-        def predict(self, state: Any, t_us: float) -> Any:
-            return (state[0], 0.1) if state else None
-
-        def step(self, state: Any, t_us: float, value: Any, sigma: float) -> Any:
-            assert state == () or len(state) == 1
-            return (value.copy(),), value.copy(), sigma
-
-    @dataclass(frozen=True)
-    class Latests(Tracking):
-        def compile(self) -> Tracker:
-            return Tracker(position=Latest(), distance=Latest())
-
-    law = next(law for law in laws_of("tracking") if law.name == "clean-link")
-    law.hold(Subject("tracking", Latests()))
-
-
-def test_difference_says_where() -> None:
-    from evlcp_sdk.values import Range
-
-    a = Range(1.0, float("nan"), 2)
-    assert difference([a], [a]) is None
-    assert difference([replace(a, pairs=3)], [a]) == "result[0].pairs: 3, not 2"
-    assert difference([a, a], [a]) == "result: 2 entries, not 1"
-
-
 def test_the_command_says_one_line_a_law(evlcp: Evlcp) -> None:
     done = evlcp("check", "ranging", "centroid")
     *lines, last = done.out.splitlines()
@@ -256,12 +225,6 @@ def test_the_algorithm_under_test_is_blamed_by_its_own_name() -> None:
         assert found[law].status == "failed"
         assert "ranging algorithm 'Crashing': KeyError: 'cluster'" in found[law].detail
         assert "poc" not in found[law].detail
-
-
-def test_an_installed_algorithm_is_blamed_by_its_id(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CentroidRanging, "compile", Crashing.compile)
-    found = {o.law.name: o for o in check("ranging", CentroidRanging())}
-    assert "ranging algorithm 'centroid': KeyError: 'cluster'" in found["clean-link"].detail
 
 
 OTHER = (

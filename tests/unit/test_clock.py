@@ -91,14 +91,6 @@ def test_a_clock_that_few_agree_on_costs_its_own_events(leap_us: int, many: int)
     assert clock.counts["clock_leaps"] == clock.counts["clock_restarts"] == 0
 
 
-def test_a_pause_of_a_second_is_no_leap() -> None:
-    events = even(5)
-    events.t_us[300:] += LEAP_US - 50
-    got, clock = taken(events, [])
-    assert [t + 5 for t, *_ in got] == events.t_us.tolist()
-    assert clock.counts["clock_leaps"] == 0
-
-
 def test_what_is_held_is_bounded() -> None:
     clock = CameraClock(WIDTH, HEIGHT)
     clock.take(even(10**12))
@@ -128,12 +120,6 @@ def test_order_is_checked_event_by_event(seed: int, n: int) -> None:
         since = np.empty(n, np.int64)
         assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, -7, since) == want
         assert np.array_equal(since, e.t_us + 7)
-
-
-@pytest.mark.parametrize(("x", "y"), [(WIDTH, 0), (0, HEIGHT), (65_535, 65_535)])
-def test_the_first_event_too_may_be_off_the_sensor(x: int, y: int) -> None:
-    e = Events.of([5], [x], [y], [1])
-    assert not _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, 0, np.empty(1, np.int64))
 
 
 @pytest.mark.parametrize("size", [1, 17, 400])

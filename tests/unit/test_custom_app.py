@@ -73,14 +73,6 @@ def test_slope_and_deviation_are_those_of_numpy(app: ModuleType) -> None:
         assert display.speed(bar) == pytest.approx((-slope, math.sqrt(covariance[0, 0])), rel=1e-6)
 
 
-def test_two_distances_are_too_few(app: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
-    display = app.SpeedDisplay()
-    display.evlcp_stage_finished("frame", frame(0.0, 50.0))
-    display.evlcp_stage_finished("frame", frame(3200.0, 49.0))
-    assert all(math.isnan(v) for v in display.speed(0))
-    assert capsys.readouterr().out.count("too early") == 2
-
-
 def test_the_plugins_commands_are_there_and_a_fault_is_one_line(tmp_path: Path) -> None:
     said = run("--help").stdout
     assert "speed" in said

@@ -16,100 +16,19 @@ from evlcp_sdk.plugin import roles
 
 FACE = Path(evlcp.__file__)
 
-NAMES = [
-    "Algorithm",
-    "Alternative",
-    "Attitude",
-    "AttitudeLog",
-    "BarLayout",
-    "BarSite",
-    "Beacon",
-    "Bend",
-    "BlockError",
-    "CameraModel",
-    "Code",
-    "Codebook",
-    "CodebookMismatchError",
-    "ConfigError",
-    "Corrected",
-    "Decode",
-    "Decoding",
-    "Deframer",
-    "Detection",
-    "Detector",
-    "ErrorCorrection",
-    "EventSource",
-    "Events",
-    "EvlcpError",
-    "FailedBar",
-    "Filter",
-    "Fix",
-    "Frame",
-    "FrameView",
-    "Framing",
-    "GnssLog",
-    "Heard",
-    "InputError",
-    "InterruptedRunError",
-    "LedColumns",
-    "LedGrid",
-    "LedRing",
-    "LedTable",
-    "Link",
-    "Loss",
-    "Measure",
-    "Message",
-    "MessageKind",
-    "Modulation",
-    "OutputError",
-    "Packet",
-    "PacketFormat",
-    "Pilots",
-    "Place",
-    "PluginError",
-    "PluginWarning",
-    "PositionPlan",
-    "PresenceMap",
-    "Range",
-    "Ranging",
-    "RawFormatError",
-    "ReceivedMessage",
-    "Receiver",
-    "Reception",
-    "Region",
-    "Registry",
-    "ReplaySource",
-    "ResultFolder",
-    "Run",
-    "Separate",
-    "Separation",
-    "Settled",
-    "SimulatedSource",
-    "Sink",
-    "SinkRecord",
-    "SoftSymbols",
-    "StreamError",
-    "SyncLock",
-    "Synchronization",
-    "Synchronizer",
-    "Tracker",
-    "Tracking",
-    "Triggers",
-    "UnknownAlgorithmError",
-    "UnpluggedError",
-    "compose",
-    "diagnose",
-    "frames_table",
-    "hookimpl",
-    "load_link",
-    "load_sites",
-    "open",
-    "read_events",
-    "receive",
-    "receive_to_folder",
-    "simulate",
-    "write_events",
-]
+FACE_NAMES = """
+    Algorithm Alternative Attitude AttitudeLog BarLayout BarSite Beacon Bend BlockError CameraModel Code
+    Codebook CodebookMismatchError ConfigError Corrected Decode Decoding Deframer Detection Detector
+    ErrorCorrection EventSource Events EvlcpError FailedBar Filter Fix Frame FrameView Framing GnssLog
+    Heard InputError InterruptedRunError LedColumns LedGrid LedRing LedTable Link Loss Measure Message
+    MessageKind Modulation OutputError Packet PacketFormat Pilots Place PluginError PluginWarning
+    PositionPlan PresenceMap Range Ranging RawFormatError ReceivedMessage Receiver Reception Region
+    Registry ReplaySource ResultFolder Run Separate Separation Settled SimulatedSource Sink SinkRecord
+    SoftSymbols StreamError SyncLock Synchronization Synchronizer Tracker Tracking Triggers
+    UnknownAlgorithmError UnpluggedError compose diagnose frames_table hookimpl load_link load_sites
+    open read_events receive receive_to_folder simulate write_events
+"""
+NAMES = FACE_NAMES.split()
 
 
 def test_the_names_are_these() -> None:
@@ -193,33 +112,6 @@ def test_what_is_composed_is_sent_and_received() -> None:
     }
 
 
-def test_a_link_may_be_a_file(demo_raw: Path, tmp_path: Path) -> None:
-    file = tmp_path / "link.toml"
-    file.write_text("[ranging]\nid = 'centroid'\n[air]\nframes_per_packet = 10\n")
-    with evlcp.receive(demo_raw, file) as reception:
-        assert reception.link.digest == evlcp.load_link(file).digest
-    assert evlcp.receive_to_folder(demo_raw, tmp_path, str(file))["digest"] == evlcp.load_link(file).digest
-    assert evlcp.compose(file, text="a", sequence=1).tolist() == evlcp.compose(text="a", sequence=1).tolist()
-    with pytest.raises(evlcp.ConfigError, match=r"gone\.toml: cannot be read"):
-        evlcp.receive(demo_raw, "gone.toml")
-
-
-def test_compose_beacon_and_data_follow_one_another() -> None:
-    site = evlcp.BarSite(9, 35.0, 137.0, 50.0, heading_deg=90.0)
-    link = evlcp.load_link()
-    coder = link.block_coder()
-    symbols = evlcp.compose(link, data=b"\x00\xff", text="é", beacon=site, sequence=5, repeat=2)
-    assert symbols.shape == (6, 10, 16)
-    assert np.array_equal(symbols[::2], symbols[1::2])
-    assert symbols.dtype == np.int64
-    alone = [
-        evlcp.compose(link, **{kind: value}, transmitter_id=9, sequence=5)  # type: ignore[arg-type]
-        for kind, value in (("beacon", site), ("text", "é"), ("data", b"\x00\xff"))
-    ]
-    assert np.array_equal(symbols[::2], np.concatenate(alone))
-    assert coder.digest == bytes.fromhex(link.codebook.digest)[:4]
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -279,11 +171,3 @@ def test_a_simulation_sends_the_link_that_it_is_given() -> None:
     sent = bar.symbols.reshape(-1, 16).tolist()
     assert frames
     assert all(frame.soft.symbols.tolist() in sent for frame in frames)
-
-
-def test_a_simulation_that_is_closed_ends() -> None:
-    with evlcp.simulate("night", overrides={"duration_s": 0.05}) as source:
-        next(source.chunks(1000))
-    assert source.take(1000) is None
-    with pytest.raises(evlcp.ConfigError, match="link and overrides are of a preset or a file"):
-        evlcp.simulate({"bars": [{}]}, overrides=["duration_s=1"])

@@ -12,8 +12,6 @@ from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.io.patience import open_until
-from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.signals import ENDING, heard_by, interrupt, stop_on_request, waiting
 
 MAIN = "from evlcp_sdk.cli.main import main; main()"
@@ -81,22 +79,6 @@ def test_what_is_ignored_stays_ignored() -> None:
         signal.signal(signal.SIGHUP, before)
 
 
-def test_who_heard_before_hears_again() -> None:
-    def mine(_number: int, _frame: object) -> None:
-        heard.append("mine")
-
-    heard: list[str] = []
-    before = signal.signal(signal.SIGTERM, mine)
-    try:
-        with heard_by(lambda *_: (heard.append("inner"), restore()), signal.SIGTERM) as restore:  # type: ignore[func-returns-value]
-            signal.raise_signal(signal.SIGTERM)
-            signal.raise_signal(signal.SIGTERM)
-        assert heard == ["inner", "mine"]
-        assert signal.getsignal(signal.SIGTERM) is mine
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 def test_a_request_ends_a_wait_and_nothing_else() -> None:
     with stop_on_request() as stopped:
         also = stopped.or_when(lambda: False)
@@ -117,15 +99,6 @@ def test_a_request_ends_a_wait_and_nothing_else() -> None:
         assert not stopped()
     with waiting(lambda: True):
         pass
-
-
-def test_a_file_is_opened_whatever_was_asked(demo_raw: Path) -> None:
-    with stop_on_request() as stopped:
-        signal.raise_signal(signal.SIGTERM)
-        with open_until(demo_raw, Registry.load(), stopped) as source:
-            assert source.take(1) is not None
-        with pytest.raises(KeyboardInterrupt):
-            open_until("udp://127.0.0.1:0", Registry.load(), stopped)
 
 
 def free_port() -> int:

@@ -29,13 +29,6 @@ class Outer:
             raise ConfigError("count = 13: expected another")
 
 
-def test_a_right_table_becomes_the_dataclass_with_every_default() -> None:
-    table: dict[str, Any] = {"count": 2, "rows": [{"width_m": 3}, {}], "maybe": {"name": "y"}}
-    wanted = Outer(2, rows=(Inner(3.0), Inner()), maybe=Inner(name="y"))
-    assert build(Outer, table) == wanted
-    assert isinstance(build(Outer, table).rows[0].width_m, float)
-
-
 @pytest.mark.parametrize(
     ("table", "says"),
     [
@@ -97,8 +90,3 @@ def test_an_integer_beyond_64_bits_is_a_line(digits: str) -> None:
     (line,) = caught.value.lines()
     assert len(line) < 250
     assert line.endswith(": expected a valid integer")
-
-
-def test_the_largest_integers_are_read() -> None:
-    assert parse_value("9223372036854775807") == 2**63 - 1
-    assert parse_toml("a = -9223372036854775808", "") == {"a": -(2**63)}

@@ -1,13 +1,11 @@
 """Time that is counted: the processor's, without what kernels take before they can be called."""
 
-import math
 import time
 
 import numpy as np
-import pytest
 
 from evlcp_sdk.kernels import COMPILING, njit
-from evlcp_sdk.stopwatch import Stopwatch, times_real_time
+from evlcp_sdk.stopwatch import Stopwatch
 
 
 def busy(seconds: float) -> None:
@@ -54,22 +52,3 @@ def test_a_kernel_s_time_is_counted_once() -> None:
     assert after > before
     assert summed(np.ones(3)) == 3
     assert COMPILING.elapsed_s == after
-
-
-def test_what_ends_by_a_fault_is_counted() -> None:
-    watch = Stopwatch()
-
-    def fail() -> None:
-        with watch.running():
-            busy(0.01)
-            raise KeyError
-
-    with pytest.raises(KeyError):
-        fail()
-    assert watch.processor_s >= 0.01
-
-
-def test_times_real_time() -> None:
-    assert times_real_time(3.0, 1.5) == 2
-    assert math.isnan(times_real_time(0.0, 1.5))
-    assert math.isnan(times_real_time(3.0, 0.0))

@@ -16,7 +16,7 @@ import pytest
 from evlcp_sdk.errors import PluginError, PluginWarning, UnknownAlgorithmError
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.plugin.roles import ROLES, Ranging
+from evlcp_sdk.plugin.roles import ROLES
 
 
 class Brings:
@@ -107,17 +107,6 @@ def test_two_algorithms_with_one_name_are_told_when_asked_for(monkeypatch: pytes
     assert caught.value.exit_code == 2
 
 
-def test_entry_points_may_have_one_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(
-        monkeypatch,
-        ("poc", "evlcp-sdk", lambda: Brings(ranging("poc"))),
-        ("poc", "evlcp-fast-poc", lambda: Brings(ranging("fast"))),
-    )
-    registry = Registry.load()
-    assert registry.find("ranging", "fast").distribution == "evlcp-fast-poc"
-    assert registry.broken == ()
-
-
 class Typo(Brings):
     @hookimpl
     def evlcp_algoritms(self) -> None: ...
@@ -188,16 +177,6 @@ def test_a_broken_plugin_is_left_out_and_told(fault: str, monkeypatch: pytest.Mo
     assert asked.value.exit_code == 2
 
 
-def test_the_algorithm_of_a_broken_plugin_is_known_as_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    install(monkeypatch, ("bad", "evlcp-cam", lambda: Typo(ranging("mine"))))
-    with pytest.warns(PluginWarning):
-        registry = Registry.load()
-    with pytest.raises(PluginError, match=r"^ranging algorithm 'mine': plugin bad of evlcp-cam 1\.0 is"):
-        registry.find("ranging", "mine")
-    with pytest.raises(UnknownAlgorithmError, match=r"named 'other' \(installed: none\)$"):
-        registry.find("ranging", "other")
-
-
 def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
     class Bad:
         @hookimpl
@@ -218,13 +197,6 @@ def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
     assert [answer for _, answer in answers] == ["source of cam:0"]
     assert registry.plugins("evlcp_stage_finished") == []
     assert registry.ask("evlcp_open_events", url="cam:0") == answers
-
-
-def test_the_own_object_of_a_program_must_fit() -> None:
-    with pytest.raises(PluginError, match="plugin Typo: has the hook 'evlcp_algoritms', which this SDK"):
-        Registry.load(Typo())
-    with pytest.raises(PluginError, match=r"plugin OtherArguments: .*nothing"):
-        Registry.load(OtherArguments())
 
 
 BROKEN_STRANGER = "plugin stranger of evlcp-stranger 2.0 is broken and left out"
@@ -329,21 +301,6 @@ def test_a_target_that_cannot_be_used(target: str, told: str) -> None:
     with pytest.raises(PluginError, match=r"^ranging algorithm 'x' of Brings-\w+: ") as caught:
         registry.load_class("ranging", "x")
     assert told in str(caught.value)
-
-
-def test_the_built_in_algorithms_fill_every_role() -> None:
-    registry = Registry.load()
-    for role in ROLES.values():
-        assert registry.find(role.name, role.default).distribution == "evlcp-sdk"
-    for entry in registry.installed():
-        cls = registry.load_class(entry.algorithm.role, entry.algorithm.id)
-        assert issubclass(cls, ROLES[entry.algorithm.role].abstract)
-        assert entry.algorithm.revision >= 1
-        assert cls() == cls(), f"{cls.__name__}: every parameter needs a default"
-    assert [e.algorithm.role for e in registry.installed("ranging")] == ["ranging"] * len(
-        registry.installed("ranging")
-    )
-    assert ROLES["ranging"].abstract is Ranging
 
 
 def test_listing_plugins_imports_no_kernel() -> None:
