@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +17,6 @@ from evlcp_wh.decoding import WhTransform
 from evlcp_wh.modulation import Wh8
 from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
-from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook, chips_of_values
 from evlcp_sdk.errors import ConfigError
@@ -134,22 +133,10 @@ class Thawed(Ranging):
 
 
 @dataclass(frozen=True)
-class Mute(CentroidRanging):
-    pass
-
-
-@dataclass(frozen=True)
 class MuteField(CentroidRanging):
     """A parameter that nobody explains."""
 
     knob: float = 1.0
-
-
-@dataclass(frozen=True)
-class NoJson(CentroidRanging):
-    """A parameter that JSON has no word for."""
-
-    knob: Annotated[complex, Field(description="A phase.")] = 1j
 
 
 @dataclass(frozen=True)
@@ -442,11 +429,8 @@ def uncorrected(found: Any) -> Any:
 BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
     "form": [
         ("defaults", NoDefault(focus_m=1.0), "a default of field 'focus_m'"),
-        ("defaults", WhPilots(), "an instance of Ranging"),
         ("frozen", Thawed(), "frozen=True"),
-        ("described", Mute(), "a docstring of class Mute"),
         ("described", MuteField(), "field 'knob' as Annotated"),
-        ("round-trip", NoJson(), "got TypeError"),
         ("round-trip", Forgetful(), "min_clusters=7"),
         ("picklable", ranging(lambda function: function), "pickle"),
         ("compiles", Refusing(), "got: a panel of 7 x 3 clusters only"),
@@ -462,7 +446,6 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
     ],
     "pilots": [
         ("shapes", TamperedPilots(lambda codes: codes.astype(float)), "uint8"),
-        ("shapes", TamperedPilots(lambda codes: codes[:3]), "to have 4 rows"),
         ("pilots-apart", TamperedPilots(star), "correlate by 0.25 at most"),
         (
             "sharp-preamble",
@@ -473,7 +456,6 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
     ],
     "modulation": [
         ("shapes", TamperedModulation(lambda words: words[:1]), "two codewords or more, got 1"),
-        ("shapes", TamperedModulation(lambda words: 2 * words), "chips 0 and 1"),
         ("codewords-distinct", TamperedModulation(twins), "16 codewords of different edges, got 15"),
         ("comes-back", TamperedModulation(twins), "are equal"),
     ],

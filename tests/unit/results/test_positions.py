@@ -386,14 +386,6 @@ def test_a_run_without_sites_drops_an_earlier_ones_positions(tmp_path: Path) -> 
     assert {p.name for p in tmp_path.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
 
 
-def test_a_run_that_breaks_off_leaves_nothing(tmp_path: Path) -> None:
-    plan = PositionPlan((SITE,))
-    with ResultWriter(tmp_path, LINK, plan=plan) as results:
-        results.write(packets(5))
-        assert list(tmp_path.glob(f"{STAGE_PREFIX}*/fixes.csv"))
-    assert not list(tmp_path.iterdir())
-
-
 def test_kml_is_read_back(tmp_path: Path) -> None:
     write(tmp_path, packets(6), PositionPlan((SITE,)), ["kml"], zero=ZERO)
     names = {"k": "http://www.opengis.net/kml/2.2"}
