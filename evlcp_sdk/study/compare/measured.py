@@ -6,42 +6,15 @@ from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.tally import Statistics, Tally
 
-__all__ = ["STAGES", "Measured", "Moments", "Times", "median"]
+__all__ = ["STAGES", "Measured", "Times", "median", "rms"]
 
 STAGES = ("separation", "decoding", "ranging")
 """The stages that every frame goes through, and whose time is measured."""
-
-
-@dataclass(frozen=True)
-class Moments:
-    """Number and sum of squares of some values; adds.
-
-    >>> Moments.of(np.array([3.0, -4.0])).rms
-    3.5355339059327378
-    """
-
-    count: int = 0
-    squares: float = 0.0
-
-    @classmethod
-    def of(cls, values: NDArray[np.float64]) -> "Moments":
-        """Those of the finite values of an array."""
-        values = values[np.isfinite(values)]
-        return cls(len(values), float((values**2).sum()))
-
-    def __add__(self, other: "Moments") -> "Moments":
-        return Moments(self.count + other.count, self.squares + other.squares)
-
-    @property
-    def rms(self) -> float:
-        """Root mean square; NaN without values."""
-        return math.sqrt(self.squares / self.count) if self.count else math.nan
 
 
 @dataclass(frozen=True)
@@ -118,3 +91,8 @@ class Measured:
 def median(values: Sequence[float]) -> float:
     """Median; NaN without values."""
     return float(np.median(values)) if values else math.nan
+
+
+def rms(values: Sequence[float]) -> float:
+    """Root mean square; NaN without values."""
+    return float(np.sqrt(np.mean(np.square(values)))) if values else math.nan

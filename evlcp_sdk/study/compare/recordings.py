@@ -5,10 +5,9 @@ all see the same and time is measured in one run. What comes out is counted as t
 counts.
 """
 
+import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-
-import numpy as np
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import EventSource, open_source
@@ -20,7 +19,7 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim.truth import Truth, read_truth, truth_path
 from evlcp_sdk.stopwatch import Stopwatch
 from evlcp_sdk.study.bound import frame_bound
-from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, Times
+from evlcp_sdk.study.compare.measured import STAGES, Measured, Times
 from evlcp_sdk.study.compare.table import Comparison, Row, Table, total_of
 from evlcp_sdk.study.compare.variants import Variant
 from evlcp_sdk.study.frames import GivenFrame, frames_of
@@ -166,16 +165,15 @@ def compare_recording(
             advance(source.position_bytes, source.size_bytes)
     for lane in lanes:
         lane.feed(None)
-    sigma_m = np.empty(0)
     if bound is not None:
         bound.settle()
-        sigma_m = np.array(bound.sigma_m, np.float64)
+    bounds_m = () if bound is None else tuple(m for m in bound.sigma_m if math.isfinite(m))
     recorded_s = (last_us - first_us) * 1e-6
     rows = tuple(
         Row(variant.name, lane.measured(url, truth, recorded_s, reading.processor_s))
         for variant, lane in zip(variants, lanes, strict=True)
     )
-    return Table(url, rows, Moments.of(sigma_m))
+    return Table(url, rows, bounds_m)
 
 
 def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events]:

@@ -5,12 +5,12 @@ import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from evlcp_sdk.files import defused
 from evlcp_sdk.report.markup import Bar, Markup, bars, details, document, table
-from evlcp_sdk.study.compare.measured import STAGES, Measured, Moments, median
+from evlcp_sdk.study.compare.measured import STAGES, Measured, median, rms
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, measure
 
 __all__ = ["BOUND_NAME", "COLUMNS", "MARK", "Column", "Comparison", "Row", "Table", "total_of"]
@@ -130,13 +130,13 @@ class Table:
     Attributes:
         name: Of the recording.
         rows: One a variant.
-        bound_m: The frames' Cramer-Rao bounds, m.
+        bounds_m: The frames' Cramer-Rao bounds, m.
         together: It is of all the other tables' recordings.
     """
 
     name: str
     rows: tuple[Row, ...]
-    bound_m: Moments = field(default_factory=Moments)
+    bounds_m: tuple[float, ...] = ()
     together: bool = False
 
     def best(self) -> tuple[frozenset[str], ...]:
@@ -176,8 +176,8 @@ class Table:
                     low, high = _ends(row.measured, column.key)
                     text = column.cell(row.measured)
                     bars.append(Bar(row.variant, abs(rank), text, low, high, best=column.key in keys))
-            if column.key == "rmse_m" and self.bound_m.count:
-                bound_m = self.bound_m.rms
+            if column.key == "rmse_m" and self.bounds_m:
+                bound_m = rms(self.bounds_m)
                 bars.append(Bar(BOUND_NAME, bound_m, _text(bound_m, ".4f"), bound_m, bound_m, dim=True))
             found.append((column.title, bars))
         return found
@@ -195,8 +195,8 @@ class Table:
                 is_best = column.key in keys
                 line.append((column.cell(row.measured) + (MARK if is_best else ""), is_best))
             lines.append(line)
-        if self.bound_m.count:
-            bound = [_text(self.bound_m.rms, ".4f") if c.key == "rmse_m" else "" for c in columns]
+        if self.bounds_m:
+            bound = [_text(rms(self.bounds_m), ".4f") if c.key == "rmse_m" else "" for c in columns]
             lines.append([(text, False) for text in (BOUND_NAME, *bound)])
         return ["variant", *(c.title for c in columns)], lines
 
@@ -237,7 +237,7 @@ class Table:
                 "recorded_s": m.times.recorded_s,
                 "cpu_s": m.times.cpu_s if m.times.cpu_s else None,
                 "times_real_time": m.times_real_time,
-                "cramer_rao_bound_m": self.bound_m.rms,
+                "cramer_rao_bound_m": rms(self.bounds_m),
                 "best": sorted(keys),
             }
             found.append(
@@ -333,4 +333,5 @@ def total_of(tables: Sequence[Table], name: str = "all") -> Table:
     rows = []
     for same in zip(*(one.rows for one in tables), strict=True):
         rows.append(Row(same[0].variant, sum((row.measured for row in same), Measured())))
-    return Table(name, tuple(rows), sum((one.bound_m for one in tables), Moments()), together=True)
+    bounds_m = tuple(bound for one in tables for bound in one.bounds_m)
+    return Table(name, tuple(rows), bounds_m, together=True)
