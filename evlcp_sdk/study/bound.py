@@ -53,7 +53,7 @@ _NOISE = 0.1
 """Of a row's value, in full values, when that is weighed."""
 
 _LEAST_FREE = 0.1
-"""Of a row's residual; a row that decides a parameter by itself says nothing of the noise."""
+"""Of a row's residual; a row that decides a parameter by itself shows nothing of the noise."""
 
 _LEAST_BOUNDARIES = 3
 """Boundaries without which spacing, position and drift cannot be separated."""
@@ -71,7 +71,7 @@ _SEAM_SIGMAS = 4.0
 
 @dataclass(frozen=True)
 class BarBound:
-    """Smallest standard deviations of what one frame says of a bar; infinite where no pixel shows it.
+    """Smallest standard deviations of what one frame shows of a bar; infinite where no pixel shows it.
 
     Attributes:
         distance_m: Of its distance.
@@ -104,7 +104,7 @@ def bar_bound(
     Args:
         link: For the camera, the bar and its codes; the bar is one even column of clusters.
         distance_m: Distance of the bar, m.
-        symbols: What the frame says, integers (K,).
+        symbols: The frame's, integers (K,).
         blur_px: Width (sigma) of a boundary in the image, px.
         noise: Standard deviation of one pixel's value, in full values.
         columns: Pixels across the bar.
@@ -150,7 +150,7 @@ def _check_positive(**quantities: float) -> None:
 
 
 def _sigmas(information: Array) -> Array:
-    """Standard deviation of each parameter, the others unknown, too; infinite where nothing says it."""
+    """Standard deviation of each parameter, the others unknown, too; infinite where nothing shows it."""
     own = np.sqrt(np.maximum(np.diag(information), 0.0))
     known = own > 0
     found = np.full(len(own), np.inf)
@@ -396,7 +396,7 @@ def _line(light: NDArray[np.float32]) -> tuple[float, float]:
 
 @dataclass(frozen=True)
 class LayoutBound:
-    """Smallest standard deviations of what one frame says; infinite where it says nothing.
+    """Smallest standard deviations of what one frame shows; infinite where it shows nothing.
 
     Attributes:
         x_px: Of the layout's place in the image, to the right.
@@ -435,7 +435,7 @@ def layout_bound(
     Args:
         link: For the camera, the layout and its codes.
         distance_m: Its distance, m.
-        symbols: What the frame says, integers (K,).
+        symbols: The frame's, integers (K,).
         blur_px: Sigma of a point in the image, px.
         noise: Standard deviation of one pixel's value, in full values.
         gain: Share of a full value that is seen.

@@ -15,7 +15,7 @@ __all__ = ["GivenFrame", "frames_of", "given", "read_frames"]
 
 @dataclass(frozen=True)
 class GivenFrame:
-    """What a receiver says of one frame.
+    """One decoded frame.
 
     Attributes:
         transmitter: Number of the transmitter.
@@ -26,7 +26,7 @@ class GivenFrame:
         filtered_m: The distance filtered over time, m; NaN for none.
         x_px: Column of the bar's centre, px.
         y_px: Row of the same, px.
-        echo_of: Transmitter whose reflection this is said to be; None for a frame of its own.
+        echo_of: Transmitter whose reflection this is declared; None for a frame of its own.
         link: Name of the link, where a receiver has several; empty where it has one.
     """
 

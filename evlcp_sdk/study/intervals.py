@@ -24,7 +24,7 @@ __all__ = [
 ]
 
 FEWEST_RECORDINGS = 5
-"""With fewer recordings than this there is no interval: what would be said of the tails is guessed more than
+"""With fewer recordings than this there is no interval: what is known of the tails is guessed more than
 measured. At five, nine of ten intervals hold the true value where rates differ by a factor of e."""
 
 INTERVALS = (
@@ -113,7 +113,7 @@ def measure(recordings: Sequence[Tally], kind: str) -> Figure:
         each = [a / b for a, b in zip(parts, wholes, strict=True)]
         low, high = min(each), max(each)
     elif share and 2 * part > whole:
-        # Of the rarer of both, whose logarithm says more.
+        # Of the rarer of both, whose logarithm shows more.
         low, high = (1 - v for v in ratio_interval(np.subtract(wholes, parts), wholes)[::-1])
     else:
         low, high = ratio_interval(parts, wholes)

@@ -74,7 +74,7 @@ class BarFrames:
     Attributes:
         bar: The bar.
         start_us: Start of each after the scene's, us, float64 (n,).
-        symbols: What each says, int64 (n, clusters).
+        symbols: Symbols of each, int64 (n, clusters).
         distance_m: Distance in the middle of its pilot, or of its info segment without one, m, float64 (n,).
         hidden: Clusters that are hidden all the time, bool (n, clusters).
         cut: Clusters that are hidden at any time, bool (n, clusters).
@@ -136,7 +136,7 @@ class Matched:
         bars: What the bars that are lit sent, in the truth's order.
         pairs: For each of these bars, (decoded frame, number of the sent one), in the order of decoding.
         unmatched: Decoded frames beside which there is no sent one, or one that was found before.
-        echoes: Decoded frames that are said to be reflections and were left out.
+        echoes: Decoded frames that are declared reflections and were left out.
     """
 
     bars: tuple[BarFrames, ...]
@@ -157,7 +157,7 @@ def match(
     A frame that names its link is put beside those of bars that send with it. A frame that is cut by an end
     of the recording, or by something that hides all of the bar, is neither found nor unmatched, unless the
     sent frame nearest to it was found before. Of two beside the same sent one, the first is it. On a `road`,
-    what is said to be a reflection is left out, and what hides clusters is minded; `links` are the receiver's
+    what is declared a reflection is left out, and what hides clusters is minded; `links` are the receiver's
     by name, where it has several.
     """
     bars = tuple(BarFrames.of(bar, truth, covers=road) for bar in truth.bars if bar.lit)
@@ -223,7 +223,7 @@ def check_link(truth: Truth, link: Link | Mapping[str, Link], name: str, *, mess
     Of several links, each bar has to send with one; with `messages`, also with their error correction.
 
     Raises:
-        ConfigError: They differ; says where.
+        ConfigError: They differ; with the place.
     """
     for i, bar in enumerate(truth.bars):
         if bar.lit and bar.sends_frames:

@@ -37,14 +37,14 @@ def bar_tallies(sent: BarFrames, pairs: Iterable[tuple[GivenFrame, int]]) -> lis
         wrong = visible = erased = unseen = claimed = 0
         cut, hidden = sent.cut[number].tolist(), sent.hidden[number].tolist()
         for k, true in enumerate(sent.symbols[number].tolist()):
-            said = frame.symbols[k] if k < len(frame.symbols) else -1
+            given = frame.symbols[k] if k < len(frame.symbols) else -1
             if hidden[k]:
                 unseen += 1
-                claimed += said >= 0
+                claimed += given >= 0
             elif not cut[k]:
                 visible += 1
-                erased += said < 0
-                wrong += (said ^ true).bit_count() if said >= 0 else 0
+                erased += given < 0
+                wrong += (given ^ true).bit_count() if given >= 0 else 0
         tally = Tally(
             frames_found=1,
             bits=bits * (visible - erased),
@@ -143,9 +143,9 @@ def sites_seen(
 ) -> list[BarSite]:
     """Sites of a truth's bars, each with the number that the receiver gave to its transmitter.
 
-    `sites` are what is said of the bars' places, in their order; None for the truth.
+    `sites` are what is reported of the bars' places, in their order; None for the truth.
     """
-    said = list(truth.sites if sites is None else sites)
+    found = list(truth.sites if sites is None else sites)
     first: dict[int, Frame] = {}
     for packet in packets:
         for frame in packet.frames:
@@ -153,9 +153,9 @@ def sites_seen(
                 first.setdefault(packet.transmitter, frame)
     for number, frame in first.items():
         nearest = nearest_bar(truth.bars, truth, frame.t_us - truth.t0_us, frame.x_px, frame.y_px)
-        if nearest is not None and nearest[1] <= NEAREST_PX and said[nearest[0]].transmitter is None:
-            said[nearest[0]] = replace(said[nearest[0]], transmitter=number)
-    return said
+        if nearest is not None and nearest[1] <= NEAREST_PX and found[nearest[0]].transmitter is None:
+            found[nearest[0]] = replace(found[nearest[0]], transmitter=number)
+    return found
 
 
 def position_tallies(

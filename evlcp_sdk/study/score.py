@@ -1,7 +1,7 @@
 """Decoded frames held against the truth of a recording: two scores of the same rows.
 
 The plain score counts every row, and every cluster of every frame: a symbol that is not given counts as all
-bits wrong. The road score knows what a road adds: rows that are said to be reflections are left out, a symbol
+bits wrong. The road score knows what a road adds: rows that are declared reflections are left out, a symbol
 that is not given is erased and no error, and one of a hidden cluster is claimed.
 """
 

@@ -369,7 +369,7 @@ class Statistics:
         duration_us: Simulated time, us.
         packets: Decoded packets.
         rows: Decoded frames.
-        echoes: Those of them that the receiver says are a reflection; they count nowhere else.
+        echoes: Those of them that the receiver declares a reflection; they count nowhere else.
         unmatched: Those of them that match no sent one.
         stated: Distances that come with a standard deviation, of matched frames and others.
         sigma_squares_nm2: Sum of the squares of these standard deviations, nm^2.

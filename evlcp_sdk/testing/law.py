@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 Status = Literal["ok", "failed", "skipped", "excused"]
-"""`excused`: fails, as the author said it would, with a reason."""
+"""`excused`: fails, as the author declared it would, with a reason."""
 
 
 class LawError(AssertionError):

@@ -17,7 +17,7 @@ class IdealBar:
     """A transmitter in the image that sends given symbols; its centre moves on a circle.
 
     Attributes:
-        symbols: What it says, int64 (packets, frames, clusters).
+        symbols: What it sends, int64 (packets, frames, clusters).
         x_px: Column of its centre, px.
         y_px: Row of its centre, px.
         cluster_px: Spacing of its clusters in the image, px.

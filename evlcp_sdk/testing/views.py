@@ -115,7 +115,7 @@ def ideal_frame(
 
 
 def ideal_soft(codebook: Codebook, symbols: ArrayLike) -> SoftSymbols:
-    """What a perfect decoding says of the symbols (K,)."""
+    """What a perfect decoding gives for the symbols (K,)."""
     s = np.asarray(symbols, np.int64)
     bits = s[:, None] >> np.arange(codebook.bits_per_symbol - 1, -1, -1) & 1
     return SoftSymbols(s, (_CONFIDENT * (1 - 2 * bits)).astype(np.float32), 1.0)

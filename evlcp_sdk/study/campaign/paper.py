@@ -22,7 +22,7 @@ class Reference:
         from_m: Start of the distances it holds for, m.
         to_m: Their end, m.
         value: The figure.
-        bound: The paper says at most this, not this.
+        bound: The paper gives it as an upper bound.
     """
 
     measure: Measure

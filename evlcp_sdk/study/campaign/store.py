@@ -34,7 +34,7 @@ CREATE TABLE IF NOT EXISTS result (
 
 
 def _connect(path: Path, *, create: bool) -> sqlite3.Connection:
-    """A connection that believes nothing of what a file says but its rows."""
+    """A connection that believes nothing of a file but its rows."""
     mode = "mode=rwc"
     if not create:
         wal = path.with_name(f"{path.name}-wal")

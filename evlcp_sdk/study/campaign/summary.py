@@ -231,7 +231,7 @@ class PaperComparison:
         ours: The measured one; where the paper gives a bound, that of the worst segment.
         from_m: Start of the distances that ours was measured at, m.
         to_m: Their end, m.
-        verdict: Ours beside the paper's, as `verdict_of` says.
+        verdict: Ours beside the paper's, as `verdict_of` finds.
     """
 
     reference: Reference

@@ -50,7 +50,7 @@ def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
         if base is None:
             raise ConfigError("base: missing; expected a preset or a scene file")
         scene = load_scene(base, settings, registry)
-        # What is only said of a scene is not seen.
+        # What is only reported of a scene is not seen.
         return Case(value=scene, identity=_identity(scene), group=digest_of(_identity(rendered(scene))))
 
     def link_of(base: str | None, settings: Sequence[str]) -> Case:
@@ -110,7 +110,7 @@ def _identity(scene: Scene) -> Any:
 def run_job(job: Job) -> list[tuple[str, Statistics]]:
     """Render the job's scene once, receive it with the link of every task, compare it with the truth.
 
-    A bar that says no link sends with that of the tasks, which are alike in what is on air.
+    A bar without a link of its own sends with that of the tasks, which are alike in what is on air.
 
     Raises:
         ConfigError: This installation would not give what the task's id promises, or the scene sends with
@@ -125,7 +125,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     scene = _sending(job.scene, job.tasks[0].link[0])
     simulation = Simulation(scene, job.seed, registry=registry)
     truth = truth_of(simulation, registry=registry)
-    links, heard = [], []
+    links, decoded = [], []
     received: dict[str, tuple[Receiver, list[Packet]]] = {}
     attitudes = []
     for task in job.tasks:
@@ -138,12 +138,12 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         attitude = None if world is None else attitude_log(task.scene, job.seed, simulation.path)
         links.append(link)
         attitudes.append(attitude)
-        # What is said of sites, and what is made of it, makes no difference to what is received.
+        # What is reported of sites, and what is made of it, makes no difference to what is received.
         read = {section: dict(keys) for section, keys in link.table.items() if section not in _OF_POSITIONS}
         key = digest_of([read, None if world is None else asdict(replace(world, survey_sigma_m=0.0))])
         if key not in received:
             received[key] = Receiver(link, attitude=attitude), []
-        heard.append(received[key][1])
+        decoded.append(received[key][1])
     number = 0
     for events in simulation.stream():
         number += len(events)
@@ -152,11 +152,11 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     for receiver, packets in received.values():
         packets += receiver.close()
     results = []
-    for task, link, attitude, packets in zip(job.tasks, links, attitudes, heard, strict=True):
+    for task, link, attitude, packets in zip(job.tasks, links, attitudes, decoded, strict=True):
         others = message_tallies(packets, truth, link.block_coder()) if _sends_messages(truth) else []
         if scene.world is not None:
-            said = sites_said(_sending(task.scene, task.link[0]), job.seed, registry)
-            others += position_tallies(packets, truth, link, attitude, said)
+            sites = sites_said(_sending(task.scene, task.link[0]), job.seed, registry)
+            others += position_tallies(packets, truth, link, attitude, sites)
         counted = statistics_of(frames_of(packets), truth, events=number, packets=len(packets), others=others)
         results.append((task.id, counted))
     return results

@@ -30,7 +30,7 @@ _LEGEND = {
     "us_per_frame": "us/frame is the median processor time of separation, decoding and ranging",
     "times_real_time": "x real time is recorded time over the processor time of reading and receiving",
 }
-"""What has to be said of a column, by its key."""
+"""What has to be known of a column, by its key."""
 
 
 @dataclass(frozen=True)
@@ -292,10 +292,10 @@ class Comparison:
     def legend(self) -> str:
         """What the columns are that the tables have."""
         present = {column.key for one in self.tables for column in one.columns()}
-        said = [text for key, text in _LEGEND.items() if key in present]
+        notes = [text for key, text in _LEGEND.items() if key in present]
         if any(keys for one in self.tables for keys in one.best()):
-            said.insert(0, f"{MARK} is the best of its column")
-        return "; ".join(said) + "."
+            notes.insert(0, f"{MARK} is the best of its column")
+        return "; ".join(notes) + "."
 
     @property
     def title(self) -> str:
