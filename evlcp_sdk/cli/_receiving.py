@@ -178,10 +178,10 @@ def say_alike(links: "Sequence[Link]") -> None:
     """Say on stderr, before anything is read, which links a receiver cannot tell apart."""
     if len(links) < 2:
         return
-    from evlcp_sdk.diagnosis.warnings import alike_warnings
+    from evlcp_sdk.diagnosis.warnings import check_alike
     from evlcp_sdk.link.several import named_links
 
-    for warning in alike_warnings(named_links(links)):
+    for warning in check_alike(named_links(links)):
         complain(f"warning: {warning}")
 
 

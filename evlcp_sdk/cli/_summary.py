@@ -18,7 +18,7 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
     from rich.table import Table
     from rich.text import Text
 
-    from evlcp_sdk.diagnosis.warnings import Diagnostic
+    from evlcp_sdk.diagnosis.facts import Diagnostic
 
     out = console(stderr=stderr)
     recording, processing = summary["recording"], summary["processing"]

@@ -1,54 +1,53 @@
 """The stages that light passes on its way to a message, each passed or failed with the count that says so."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-import numpy as np
-
+from evlcp_sdk.diagnosis.facts import SURE, Diagnostic, Facts, count_missing_codewords, has_rate
 from evlcp_sdk.diagnosis.light import LightSource
-from evlcp_sdk.diagnosis.probe import SURE, Trial
-from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import Seen, codewords_never, saturation
-from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.diagnosis.warnings import check_saturation
 from evlcp_sdk.spelling import counted
 
-__all__ = ["Check", "Facts", "checks_of"]
+__all__ = ["Check", "checks_of"]
 
 Verdict = Literal["pass", "doubt", "fail", "skip"]
 """Of a stage: passed; passed, but near its limit; failed; not reached."""
 
-FEW_NEGATIVE = 0.1
+Found = Diagnostic | str | None
+"""What a stage finds: something wrong, or the count by which it is passed; None where it is not reached."""
+
+_VERDICTS: dict[str, Verdict] = {
+    "damaged": "doubt",
+    "profile": "fail",
+    "preamble": "skip",
+    "messages": "skip",
+    "no-messages": "skip",
+}
+"""Of what is wrong, or is not looked for, whether frames are read or not."""
+
+_FEW_NEGATIVE = 0.1
 """Share of negative events below which they are missing: as much light goes as comes."""
 
-BLIND_CHIPS = 1.1
+_BLIND_CHIPS = 1.1
 """Time from event to event of a pixel, in chips, above which edges one chip apart are lost."""
 
-SMALLEST_PX, SMALL_PX = 1.5, 2.5
+_SMALLEST_PX, _SMALL_PX = 1.5, 2.5
 """Pixels a cluster below which clusters cannot be told apart, and below which errors are to be expected: two
 sampled points a cluster are the least, and the pixels between two clusters show both."""
 
-SMEARED_CLUSTERS, SHARP_PX = 2.0, 5.0
+_SMEARED_CLUSTERS, _SHARP_PX = 2.0, 5.0
 """Width of a source, in clusters, above which the light of each covers its neighbours on both sides, and up
 to how many px wide a column of LEDs in focus may look."""
 
-RARE_CHIPS, WEAK = 5.0, 0.35
+_RARE_CHIPS, _WEAK = 5.0, 0.35
 """Median time between rises, in chips, and mean of the comb, beyond both of which light is too weak: a code
 rises every 2.7 chips, and jitter of 20 us leaves .45 of the mean at 10 kHz."""
 
-ROW_US, SLOW_SHARE = 0.2, 0.7
+_ROW_US, _SLOW_SHARE = 0.2, 0.7
 """What an IMX636 takes to read a row, by its latency against the lit area, and the share of a chip above
 which reading a bar's rows, one after another, mixes its edges with the next chip's."""
-
-ACCEPTED_SHARE = 0.8
-"""Share of the frames due that are accepted, below which something is wrong with all of them."""
-
-NEAR_RATE = 0.8
-"""Share of its largest mean that a source has at the link's rate if that is its rate, or a multiple."""
-
-_FEW = 4
-"""Frames of which nothing is said."""
 
 _UNSEEN_SHARE = 0.05
 """Share of unseen clusters of which something is said."""
@@ -64,27 +63,11 @@ _GLOW_PX = 32
 _SOME = 0.02
 """Share of all events below which what blinks is not worth a word where nothing sends chips."""
 
-_MIN_CODE = 1000
-"""Rises from which a source may be a bar: one of 20 x 3 px has them in 5 ms; leaves and edges that pass have
-some hundred."""
-
-_MOST = 0.6
-"""Share of the frames that a recording has room for, from which a bar is read whatever happens beside it."""
-
 _BLURRED_SHARE = 0.2
 """Width of what flickers, as a share of its length, above which its light is too weak for being spread."""
 
 _SAME_RATE = 0.03
 """How far two rates may be apart and be one."""
-
-_BESIDE = 0.1
-"""Events of a source, of those of the largest, below which it is the halo of a lamp rather than a bar."""
-
-_ASIDE_M = 1e-9
-"""Way from a bar's first cluster to its last, in one direction, below which there is none."""
-
-_EDGE_PX = 8
-"""Seam of the picture: a source that comes so near may go on outside."""
 
 
 @dataclass(frozen=True)
@@ -106,223 +89,93 @@ class Check:
     next_step: str = ""
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What is known of a recording.
-
-    Attributes:
-        link: The link that it was received with.
-        events: How many there are.
-        seen: Its length, and the events of each millisecond.
-        sources: What blinks, by events.
-        restless: Box of where far more happens than elsewhere, px; None for nowhere.
-        counts: The receiver's counts.
-        tally: Its figures.
-        losses: What the reader skipped, in words.
-        trials: Links that were tried, the one given first.
-    """
-
-    link: Link
-    events: int
-    seen: Seen
-    sources: Sequence[LightSource]
-    restless: tuple[int, int, int, int] | None
-    counts: Mapping[str, int]
-    tally: RunTally
-    losses: Sequence[str] = ()
-    trials: Sequence[Trial] = ()
-
-    @property
-    def bar(self) -> LightSource | None:
-        """The source that is most likely to be a bar of the link, by its rhythm; None where there is none."""
-        rate = self.link.packet.chip_rate_hz
-        large = [one for one in self.sources if one.rises >= _MIN_CODE]
-        fit = [one for one in large if one.kind != "lamp" and _has_rate(one, rate)]
-        codes = [one for one in large if one.kind == "code"]
-        # Frames that are accepted are of a bar, however regular its light looks.
-        first = next(iter(fit or codes or (large if self.heard else [])), None)
-        if first is None or self.reads or first.events >= _BESIDE * self.sources[0].events:
-            return first
-        return None
-
-    @property
-    def at_edge(self) -> bool:
-        """Whether the bar's source touches the edge of the picture."""
-        if self.bar is None:
-            return False
-        left, top, right, bottom = self.bar.box_px
-        width, height = self.link.camera.width, self.link.camera.height
-        return min(left, top) < _EDGE_PX or right > width - _EDGE_PX or bottom > height - _EDGE_PX
-
-    @property
-    def reads(self) -> bool:
-        """Whether most frames are accepted."""
-        frames, rejected = self.counts["frames"], self.counts.get("frames_rejected", 0)
-        if frames >= _FEW and frames >= ACCEPTED_SHARE * (frames + rejected):
-            return True
-        # What is no bar may lose its frames elsewhere in the picture.
-        form = self.link.packet
-        sent = form.frames / (form.packet_chips * form.chip_us * 1e-6) * self.seen.duration_us * 1e-6
-        return any(
-            one.frames >= max(_FEW, ACCEPTED_SHARE * (one.last_frame - one.first_frame + 1), _MOST * sent)
-            for one in self.tally.own
-        )
-
-    @property
-    def heard(self) -> bool:
-        """Whether some frames are accepted: more than chance gives."""
-        return self.counts["frames"] >= _FEW
-
-    @property
-    def sure(self) -> bool:
-        """Whether most frames are accepted, and their symbols are sure."""
-        return self.reads and self.tally.quality >= SURE
-
-    @property
-    def better(self) -> Trial | None:
-        """Another link that fits, the best of those tried."""
-        fit = [trial for trial in self.trials if trial.changes and trial.fits and trial.quality >= SURE]
-        return max(fit, key=lambda one: one.rank, default=None)
-
-    @property
-    def cluster_px(self) -> float:
-        """From cluster to cluster, px: in frames that are read, else by the bar's source; NaN without one."""
-        read = [one for one in self.tally.own if one.sized]
-        if read:
-            one = max(read, key=lambda tally: tally.sized)
-            return math.hypot(*one.along_px) / one.sized / self.steps_along
-        if self.bar is None:
-            return math.nan
-        # A source shows the clusters at the ends whole.
-        return max(self.bar.wide_px, self.bar.high_px) / (self.steps_along + 1)
-
-    @property
-    def steps_along(self) -> float:
-        """How many steps from cluster to neighbour it is from the link's first to its last."""
-        centres_m = self.link.bar.cluster_centres_m()
-        if len(centres_m) < 2:
-            return 1.0
-        step_m = min(math.dist(centres_m[0], other) for other in centres_m[1:])
-        return math.dist(centres_m[0], centres_m[-1]) / step_m
-
-    @property
-    def order(self) -> tuple[int, int]:
-        """1 where columns, and rows, of clusters grow as in the bar, -1 where they fall, 0 unknown."""
-        centres_m = self.link.bar.cluster_centres_m()
-        way_m = centres_m[-1] - centres_m[0]
-        along_px = np.sum([one.along_px for one in self.tally.own], 0) if self.tally.own else np.zeros(2)
-        right, down = np.sign(along_px * np.where(np.abs(way_m) > _ASIDE_M, way_m, 0.0)).astype(int).tolist()
-        return right, down
-
-    @property
-    def across_px(self) -> float:
-        """Its extent across that, px."""
-        if self.bar is None:
-            return math.nan
-        return min(self.bar.wide_px, self.bar.high_px)
-
-
-def _has_rate(source: LightSource, rate_hz: float) -> bool:
-    return source.strength_at(rate_hz) >= NEAR_RATE * source.strength
-
-
 def checks_of(facts: Facts) -> list[Check]:
     """All stages, in the order in which light passes them.
 
-    Those behind one that fails are skipped.
+    Those behind one that fails are skipped. What is wrong where frames are read all the same is a doubt.
     """
-    found: list[Check] = []
-    for stage, judge in _STAGES:
-        failed = bool(found) and "fail" in (one.verdict for one in found)
-        found.append(Check(stage, "skip", stage, "not reached") if failed else judge(facts))
-    return found
+    checks: list[Check] = []
+    for stage, find in _STAGES:
+        found = None if any(one.verdict == "fail" for one in checks) else find(facts)
+        if isinstance(found, Diagnostic):
+            verdict = _VERDICTS.get(found.code, "doubt" if facts.reads else "fail")
+            checks.append(Check(stage, verdict, found.code, found.text, found.next_step))
+        else:
+            checks.append(Check(stage, "skip" if found is None else "pass", stage, found or "not reached"))
+    return checks
 
 
-def _events(facts: Facts) -> Check:
+def _events(facts: Facts) -> Found:
     if not facts.events:
-        return Check(
-            "events", "fail", "empty", "no events", "record again: `evlcp info` says what is in the file"
-        )
-    said = f"{facts.events:,} events in {facts.seen.duration_us * 1e-6:.3f} s"
+        return Diagnostic("empty", "no events", "record again: `evlcp info` says what is in the file")
+    said = f"{facts.events:,} events in {facts.duration_us * 1e-6:.3f} s"
     if facts.losses:
-        return Check(
-            "events",
-            "doubt",
-            "damaged",
-            f"{said}; lost: {'; '.join(facts.losses)}",
-            "copy or record it again; what is left was read",
+        lost = f"{said}; lost: {'; '.join(facts.losses)}"
+        return Diagnostic("damaged", lost, "copy or record it again; what is left was read")
+    return said
+
+
+def _readout(facts: Facts) -> Found:
+    passed = f"at most {facts.peak_mev_s:.3g} Mev/s, not at a limit"
+    return next(check_saturation(facts), passed)
+
+
+def _light(facts: Facts) -> Found:
+    if facts.reads:
+        return _unread(facts) or _sources_said(facts)
+    if not facts.sources:
+        return _without_rhythm(facts)
+    if facts.bar is not None and not _is_lamp(facts.bar, facts):
+        return _sources_said(facts)
+    lamps = [one for one in facts.sources if one.kind == "lamp"]
+    if lamps:
+        rates = ", ".join([_hz(one.rate_hz) for one in lamps[:4]] + ["..."] * (len(lamps) > 4))
+        return Diagnostic(
+            "lamp",
+            f"{counted(len(lamps), 'lamp')} blinking ({rates}), nothing sends chips",
+            f"is a bar in the picture ({_view(facts)}), and on (`evlcp board status`)?",
         )
-    return Check("events", "pass", "events", said)
+    first = facts.sources[0]
+    if first.kind != "code" and first.events < _SOME * facts.events:
+        return _without_rhythm(facts)
+    said = f"{_sources_said(facts)}, but too rarely to recognise a code"
+    long_px, wide_px = max(first.wide_px, first.high_px), min(first.wide_px, first.high_px)
+    if wide_px > _BLURRED_SHARE * long_px:
+        said = f"{said}: {wide_px:.0f} px wide, {long_px:.0f} px long, its light is spread"
+        return Diagnostic("defocus", said, _SHARPER)
+    return Diagnostic("dim", said, _BRIGHTER)
 
 
-def _readout(facts: Facts) -> Check:
-    for full in saturation(facts.seen):
-        verdict: Verdict = "doubt" if facts.reads else "fail"
-        return Check("readout", verdict, full.code, full.text, full.next_step)
-    return Check("readout", "pass", "readout", f"at most {facts.seen.peak_mev_s:.3g} Mev/s, not at a limit")
-
-
-def _light(facts: Facts) -> Check:
-    width, height = facts.link.camera.width, facts.link.camera.height
-    focal = facts.link.camera.focal_px
-    view = (
+def _view(facts: Facts) -> str:
+    """How much the camera sees."""
+    width, height, focal = facts.link.camera.width, facts.link.camera.height, facts.link.camera.focal_px
+    return (
         f"the picture is {2 * math.degrees(math.atan(width / 2 / focal)):.1f} by"
         f" {2 * math.degrees(math.atan(height / 2 / focal)):.1f} degrees, {50 * width / focal:.1f} by"
         f" {50 * height / focal:.1f} m at 50 m"
     )
-    if facts.reads:
-        return _unread(facts) or Check("light", "pass", "light", _sources_said(facts))
-    if not facts.sources:
-        return _without_rhythm(facts, view)
-    bar = facts.bar
-    if bar is None or _is_lamp(bar, facts):
-        lamps = [one for one in facts.sources if one.kind == "lamp"]
-        rates = ", ".join(_hz(one.rate_hz) for one in lamps[:4])
-        if lamps:
-            return Check(
-                "light",
-                "fail",
-                "lamp",
-                f"{counted(len(lamps), 'lamp')} blinking ({rates}{', ...' if len(lamps) > 4 else ''}),"
-                " nothing sends chips",
-                f"is a bar in the picture ({view}), and on (`evlcp board status`)?",
-            )
-        first = facts.sources[0]
-        if first.kind != "code" and first.events < _SOME * facts.events:
-            return _without_rhythm(facts, view)
-        said = f"{_sources_said(facts)}, but too rarely to recognise a code"
-        long_px, wide_px = max(first.wide_px, first.high_px), min(first.wide_px, first.high_px)
-        if wide_px > _BLURRED_SHARE * long_px:
-            said = f"{said}: {wide_px:.0f} px wide, {long_px:.0f} px long, its light is spread"
-            return Check("light", "fail", "defocus", said, _SHARPER)
-        return Check("light", "fail", "dim", said, _BRIGHTER)
-    return Check("light", "pass", "light", _sources_said(facts))
 
 
-def _unread(facts: Facts) -> Check | None:
+def _unread(facts: Facts) -> Diagnostic | None:
     """Light of a code where no frame is read, beside one that is; None where there is none."""
-    link_hz = facts.link.packet.chip_rate_hz
+    link_hz, camera = facts.link.packet.chip_rate_hz, facts.link.camera
     # The centre of a bar that has an end out of the picture may lie outside it, too.
-    last = (facts.link.camera.width - 1, facts.link.camera.height - 1)
     places = [
-        tuple(float(min(max(at, 0.0), most)) for at, most in zip(one.last_px, last, strict=True))
-        for one in facts.tally.transmitters.values()
+        (min(max(x, 0.0), camera.width - 1.0), min(max(y, 0.0), camera.height - 1.0))
+        for x, y in (one.last_px for one in facts.tally.transmitters.values())
     ]
     read = [one.box_px for one in facts.sources if any(_gap_px(one.box_px, (*at, *at)) <= 0 for at in places)]
     for source in facts.sources:
-        left, top, right, bottom = source.box_px
-        code = source.kind == "code" and source.rises >= _MIN_RISES
-        same = _has_rate(source, link_hz)
+        same = has_rate(source, link_hz)
         long_px, wide_px = sorted((source.wide_px, source.high_px), reverse=True)
         likely = source.rate_hz >= _LEAST_RATE * link_hz and long_px >= _SLENDER * wide_px
-        if not code or not (same or likely):
+        if source.kind != "code" or source.rises < _MIN_RISES or not (same or likely):
             continue
         # A bar's own glow may stand a little apart.
         if any(_gap_px(source.box_px, other) < _GLOW_PX for other in read):
             continue
-        return Check(
-            "light",
-            "doubt",
+        left, top, right, bottom = source.box_px
+        return Diagnostic(
             "unread",
             f"{_sources_said(facts)}; no frame is read of the one in columns {left} to {right}, rows {top} to"
             f" {bottom}, {_hz(link_hz if same else source.rate_hz)}",
@@ -341,32 +194,29 @@ def _gap_px(one: tuple[float, ...], other: tuple[float, ...]) -> float:
 
 def _is_lamp(source: LightSource, facts: Facts) -> bool:
     """Whether a source is rather the light of a lamp, with periods missing, than a bar of another rate."""
-    if facts.heard or _has_rate(source, facts.link.packet.chip_rate_hz) or facts.better is not None:
+    same_rate = has_rate(source, facts.link.packet.chip_rate_hz)
+    if facts.some_frames or same_rate or facts.better is not None:
         return False
     lamps = [one.rate_hz for one in facts.sources if one.kind == "lamp"]
     same = (abs(times * source.rate_hz / rate - 1) < _SAME_RATE for rate in lamps for times in (0.5, 1, 2))
     return facts.sources[0].kind == "lamp" or any(same)
 
 
-def _without_rhythm(facts: Facts, view: str) -> Check:
+def _without_rhythm(facts: Facts) -> Diagnostic:
     """What is said where nothing blinks that is worth a word."""
     if facts.restless is not None:
         left, top, right, bottom = facts.restless
-        return Check(
-            "light",
-            "fail",
+        return Diagnostic(
             "dim",
             f"something flickers in columns {left} to {right}, rows {top} to {bottom}, without any rhythm:"
             " light that is too weak for its chips, or something that moves",
             _BRIGHTER,
         )
-    return Check(
-        "light",
-        "fail",
+    return Diagnostic(
         "dark",
         "nothing blinks: no rhythm between 60 Hz and 25 kHz anywhere",
-        f"is a bar in the picture ({view}), and on (`evlcp board status`)? One that is too weak, too far"
-        " or behind a strong blur shows no rhythm, either",
+        f"is a bar in the picture ({_view(facts)}), and on (`evlcp board status`)? One that is too weak, too"
+        " far or behind a strong blur shows no rhythm, either",
     )
 
 
@@ -378,216 +228,164 @@ _BRIGHTER = (
 )
 
 
-def _polarity(facts: Facts) -> Check:
-    bar = facts.bar
-    if bar is None:
-        return Check("polarity", "skip", "polarity", "not reached")
-    said = f"{bar.negative_share:.0%} of the bar's events are negative"
-    for few, name, bias in (
-        (bar.negative_share, "negative", "off"),
-        (1 - bar.negative_share, "positive", "on"),
-    ):
-        if few < FEW_NEGATIVE:
-            return Check(
-                "polarity",
-                "doubt" if facts.reads else "fail",
+def _polarity(facts: Facts) -> Found:
+    if facts.bar is None:
+        return None
+    negative = facts.bar.negative_share
+    for few, name, bias in ((negative, "negative", "off"), (1 - negative, "positive", "on")):
+        if few < _FEW_NEGATIVE:
+            return Diagnostic(
                 f"no-{name}",
                 f"only {few:.0%} of the bar's events are {name}",
                 f"{'no' if few < 0.02 else 'few'} {name} events: set bias_diff_{bias} so that there are more",
             )
-    return Check("polarity", "pass", "polarity", said)
+    return f"{negative:.0%} of the bar's events are negative"
 
 
-def _pixels(facts: Facts) -> Check:
-    bar = facts.bar
-    if bar is None:
-        return Check("pixels", "skip", "pixels", "not reached")
-    chips = bar.blind_us * 1e-6 * facts.link.packet.chip_rate_hz
-    if chips > BLIND_CHIPS:
-        return Check(
-            "pixels",
-            "doubt" if facts.reads else "fail",
+def _pixels(facts: Facts) -> Found:
+    if facts.bar is None:
+        return None
+    blind_us = facts.bar.blind_us
+    chips = blind_us * 1e-6 * facts.link.packet.chip_rate_hz
+    if chips > _BLIND_CHIPS:
+        return Diagnostic(
             "refractory",
-            f"a pixel is silent for {bar.blind_us:.0f} us after an event, {chips:.1f} chips: edges that come"
+            f"a pixel is silent for {blind_us:.0f} us after an event, {chips:.1f} chips: edges that come"
             " sooner are lost",
             "a shorter refractory time (bias_refr), or a lower air.chip_rate_hz at both ends",
         )
-    return Check(
-        "pixels",
-        "pass",
-        "pixels",
-        f"pixels answer again within {bar.blind_us:.0f} us" if bar.blind_us else "pixels answer at once",
-    )
+    return f"pixels answer again within {blind_us:.0f} us" if blind_us else "pixels answer at once"
 
 
-def _brightness(facts: Facts) -> Check:
-    bar = facts.bar
-    if bar is None:
-        return Check("brightness", "skip", "brightness", "not reached")
-    chips = bar.typical_us * 1e-6 * facts.link.packet.chip_rate_hz
-    said = f"a pixel of it rises every {chips:.1f} chips"
-    if not facts.reads and chips > RARE_CHIPS and bar.strength < WEAK:
-        return Check(
-            "brightness", "fail", "dim", f"{said}, and late by many microseconds: it is too weak", _BRIGHTER
-        )
-    return Check("brightness", "pass", "brightness", said)
-
-
-def _rate(facts: Facts) -> Check:
-    bar, link = facts.bar, facts.link.packet.chip_rate_hz
-    if bar is None:
-        return Check("chip rate", "skip", "chip rate", "not reached")
-    better = dict(facts.better.changes).get("air.chip_rate_hz") if facts.better is not None else None
-    if not facts.reads and (better is not None or not _has_rate(bar, link)):
-        rate = bar.rate_hz if better is None else better
-        return Check(
-            "chip rate",
-            "fail",
-            "rate",
-            f"blinks at {_hz(rate)}, the link says {_hz(link)}",
-            f"--set air.chip_rate_hz={rate:g}"
-            + ("" if better is not None else ", or the rate that it is sent with"),
-        )
-    return Check("chip rate", "pass", "chip rate", f"{_hz(link)}, as the link says")
-
-
-def _size(facts: Facts) -> Check:
+def _size(facts: Facts) -> Found:
     px = facts.cluster_px
     if not px > 0:
-        return Check("size", "skip", "size", "not reached")
+        return None
     said = f"{px:.1f} px a cluster"
-    if px >= (SMALL_PX if facts.reads else SMALLEST_PX):
-        return _readout_of_rows(facts) or Check("size", "pass", "size", said)
+    if px >= (_SMALL_PX if facts.reads else _SMALLEST_PX):
+        return _rows(facts) or said
     far_m = facts.link.camera.focal_px * facts.link.bar.length_m / (px * (facts.steps_along + 1))
-    return Check(
-        "size",
-        "doubt" if facts.reads else "fail",
+    return Diagnostic(
         "far",
         f"{said}, as of a bar {far_m:.0f} m away",
         f"{said}: nearer, or a longer lens" + ("" if facts.reads else " (or fewer, larger clusters)"),
     )
 
 
-def _readout_of_rows(facts: Facts) -> Check | None:
+def _rows(facts: Facts) -> Diagnostic | None:
     """A bar of more rows than are read in a chip; None where it is not, or is read all the same."""
     chip_us = facts.link.packet.chip_us
     rows = 0.0 if facts.bar is None else facts.bar.high_px
-    if facts.sure or facts.better is not None or rows * ROW_US < SLOW_SHARE * chip_us:
+    if facts.sure or facts.better is not None or rows * _ROW_US < _SLOW_SHARE * chip_us:
         return None
-    return Check(
-        "size",
-        "doubt" if facts.reads else "fail",
+    return Diagnostic(
         "near",
-        f"{rows:.0f} rows high: a sensor that reads a row in {ROW_US:g} us takes {rows * ROW_US:.0f} us for"
+        f"{rows:.0f} rows high: a sensor that reads a row in {_ROW_US:g} us takes {rows * _ROW_US:.0f} us for"
         f" them, a chip lasts {chip_us:.0f}",
         "further away, a shorter lens, the camera turned by 90 degrees, so that the bar lies along rows, or a"
         " lower air.chip_rate_hz at both ends",
     )
 
 
-def _focus(facts: Facts) -> Check:
+def _focus(facts: Facts) -> Found:
     bar, px = facts.bar, facts.cluster_px
     if bar is None or not px > 0:
-        return Check("focus", "skip", "focus", "not reached")
-    said = f"{facts.across_px:.0f} px across, {px:.1f} px a cluster along it"
-    if not facts.sure and facts.across_px > max(SMEARED_CLUSTERS * px, SHARP_PX):
-        return Check(
-            "focus",
-            "doubt" if facts.reads else "fail",
+        return None
+    across_px = min(bar.wide_px, bar.high_px)
+    said = f"{across_px:.0f} px across, {px:.1f} px a cluster along it"
+    if not facts.sure and across_px > max(_SMEARED_CLUSTERS * px, _SHARP_PX):
+        return Diagnostic(
             "defocus",
             f"{said}: the light of each cluster covers its neighbours, or the layout is another one",
             f"{_SHARPER}; if the picture is sharp, compare [bar] with the transmitter's: `evlcp config` at"
             " both ends",
         )
-    return Check("focus", "pass", "focus", said)
+    return said
 
 
-def _preamble(facts: Facts) -> Check:
+def _brightness(facts: Facts) -> Found:
+    bar = facts.bar
+    if bar is None:
+        return None
+    chips = bar.typical_us * 1e-6 * facts.link.packet.chip_rate_hz
+    said = f"a pixel of it rises every {chips:.1f} chips"
+    if not facts.reads and chips > _RARE_CHIPS and bar.strength < _WEAK:
+        return Diagnostic("dim", f"{said}, and late by many microseconds: it is too weak", _BRIGHTER)
+    return said
+
+
+def _rate(facts: Facts) -> Found:
+    bar, link = facts.bar, facts.link.packet.chip_rate_hz
+    if bar is None:
+        return None
+    better = dict(facts.better.changes).get("air.chip_rate_hz") if facts.better is not None else None
+    if not facts.reads and (better is not None or not has_rate(bar, link)):
+        rate = bar.rate_hz if better is None else better
+        return Diagnostic(
+            "rate",
+            f"blinks at {_hz(rate)}, the link says {_hz(link)}",
+            f"--set air.chip_rate_hz={rate:g}"
+            + ("" if better is not None else ", or the rate that it is sent with"),
+        )
+    return f"{_hz(link)}, as the link says"
+
+
+def _preamble(facts: Facts) -> Found:
     if "preambles" not in facts.counts:
-        return Check("preamble", "skip", "preamble", "not looked for: the link's framing has none")
-    heard, regions = facts.counts["preambles"], facts.counts["regions_opened"]
+        return Diagnostic("preamble", "not looked for: the link's framing has none")
     packet_us = facts.link.packet.packet_chips * facts.link.packet.chip_us
-    if not facts.reads and facts.seen.duration_us < 2 * packet_us:
-        return Check(
-            "preamble",
-            "fail",
+    if not facts.reads and facts.duration_us < 2 * packet_us:
+        return Diagnostic(
             "short",
-            f"the recording lasts {facts.seen.duration_us * 1e-3:.1f} ms, a packet {packet_us * 1e-3:.1f} ms",
+            f"the recording lasts {facts.duration_us * 1e-3:.1f} ms, a packet {packet_us * 1e-3:.1f} ms",
             "record some packets: the next preamble may come after the end",
         )
-    if not heard:
-        return Check(
-            "preamble",
-            "fail",
+    preambles, regions = facts.counts["preambles"], facts.counts["regions_opened"]
+    where = f"detected in {regions} region{'s' * (regions != 1)}"
+    if not preambles:
+        return Diagnostic(
             "no-preamble",
-            f"none detected in {regions} region{'s' * (regions != 1)}",
+            f"none {where}",
             "compare pilots.id, its parameters and air.chip_rate_hz with the transmitter's: `evlcp config` at"
             " both ends",
         )
-    return Check(
-        "preamble", "pass", "preamble", f"{heard} detected in {regions} region{'s' * (regions != 1)}"
-    )
+    return f"{preambles} {where}"
 
 
-def _frames(facts: Facts) -> Check:
-    frames, rejected = facts.counts["frames"], facts.counts.get("frames_rejected", 0)
-    said = f"{frames} of {frames + rejected} accepted"
-    if facts.reads and facts.at_edge and (unseen := _unseen_share(facts)) > _UNSEEN_SHARE:
-        return Check(
-            "frames",
-            "doubt",
-            "outside",
-            f"{said}, {unseen:.0%} of their clusters unseen; the source touches the picture's edge",
-            "turn the camera so that the whole bar is in the picture",
-        )
+def _frames(facts: Facts) -> Found:
+    frames, due = facts.counts["frames"], facts.counts["frames"] + facts.counts.get("frames_rejected", 0)
+    said, better = f"{frames} of {due} accepted", facts.better
+    turn = "turn the camera so that the whole bar is in the picture"
     if facts.reads:
-        return Check("frames", "pass", "frames", said)
-    better = facts.better
-    changes = dict(better.changes) if better is not None else {}
-    if better is not None and "air.frames_per_packet" in changes:
-        return Check(
-            "frames",
-            "fail",
-            "frames-per-packet",
-            f"{said}; with {changes['air.frames_per_packet']} frames a packet {better.frames} of"
-            f" {better.frames + better.rejected}",
-            better.options(),
-        )
+        given, erased = (sum(getattr(one, name) for one in facts.tally.own) for name in ("given", "erased"))
+        unseen = erased / max(given + erased, 1)
+        if not facts.at_edge or unseen <= _UNSEEN_SHARE:
+            return said
+        where = "of their clusters unseen; the source touches the picture's edge"
+        return Diagnostic("outside", f"{said}, {unseen:.0%} {where}", turn)
     if better is not None:
-        return Check(
-            "frames", "fail", "link", f"{said}; another link reads {better.frames}", better.options()
-        )
+        each = dict(better.changes).get("air.frames_per_packet")
+        if each is None:
+            return Diagnostic("link", f"{said}; another link reads {better.frames}", better.options())
+        of = better.frames + better.rejected
+        said += f"; with {each} frames a packet {better.frames} of {of}"
+        return Diagnostic("frames-per-packet", said, better.options())
     if facts.at_edge:
-        return Check(
-            "frames",
-            "fail",
-            "outside",
-            f"{said}; the source touches the picture's edge",
-            "turn the camera so that the whole bar is in the picture",
-        )
-    return Check(
-        "frames",
-        "fail",
+        return Diagnostic("outside", f"{said}; the source touches the picture's edge", turn)
+    return Diagnostic(
         "frames",
         f"{said}: the clusters do not stand where the link's bar has them",
         "compare [bar] and [pilots] with the transmitter's: `evlcp config` at both ends",
     )
 
 
-def _unseen_share(facts: Facts) -> float:
-    given, erased = sum(one.given for one in facts.tally.own), sum(one.erased for one in facts.tally.own)
-    return erased / max(given + erased, 1)
-
-
-def _orientation(facts: Facts) -> Check:
+def _orientation(facts: Facts) -> Found:
     right, down = facts.order
     if -1 not in facts.order:
-        return Check("orientation", "pass", "orientation", "clusters stand as in the link's bar")
+        return "clusters stand as in the link's bar"
     # Of a column, left and right are not seen.
     how = "mirrored" if right * down == -1 else "upside down"
-    return Check(
-        "orientation",
-        "doubt",
+    return Diagnostic(
         how.replace(" ", "-"),
         f"the bar is {how} in the picture; its symbols and distances are right, positions are not",
         "turn the camera, or flip rows where it is read"
@@ -595,20 +393,18 @@ def _orientation(facts: Facts) -> Check:
     )
 
 
-def _codewords(facts: Facts) -> Check:
-    many = facts.link.codebook.carrying
-    never = max((codewords_never(one, facts.link) for one in facts.tally.own), default=0)
-    frames, quality = sum(one.frames for one in facts.tally.own), facts.tally.quality
+def _codewords(facts: Facts) -> Found:
+    many, own, quality = facts.link.codebook.carrying, facts.tally.own, facts.tally.quality
+    never = max((count_missing_codewords(one, facts.link) for one in own), default=0)
     if not never and quality >= SURE:
-        return Check("codewords", "pass", "codewords", f"all of {many} that should occur do")
+        return f"all of {many} that should occur do"
     better = facts.better
     name = dict(better.changes).get("modulation.id") if better is not None else None
+    frames = sum(one.frames for one in own)
     unsure = f"mean quality of {frames} frames {quality:.2f}: their symbols are not sure"
     if not never and name is None and (facts.trials or facts.at_edge):
-        return Check("codewords", "doubt", "noisy", unsure, _BRIGHTER)
-    return Check(
-        "codewords",
-        "fail",
+        return Diagnostic("noisy", unsure, _BRIGHTER)
+    return Diagnostic(
         "profile",
         f"only {many - never} of {many} symbols ever occur" if never else unsure,
         f"was this sent with {name}? try {better.options()}"
@@ -617,24 +413,18 @@ def _codewords(facts: Facts) -> Check:
     )
 
 
-def _messages(facts: Facts) -> Check:
+def _messages(facts: Facts) -> Found:
     tried = facts.counts.get("blocks_tried", 0)
-    read = facts.counts.get("blocks_decoded", 0) + facts.counts.get("blocks_combined", 0)
     if not tried:
-        return Check("messages", "skip", "messages", "not looked for")
-    said = f"{read} of {tried} packets carry a block that can be read"
-    if read:
-        return Check("messages", "pass", "messages", said)
-    return Check(
-        "messages",
-        "skip",
-        "no-messages",
-        said,
-        "right for symbols without messages; else compare error-correction.id with the transmitter's",
-    )
+        return Diagnostic("messages", "not looked for")
+    said = f"{facts.blocks_read} of {tried} packets carry a block that can be read"
+    if facts.blocks_read:
+        return said
+    step = "right for symbols without messages; else compare error-correction.id with the transmitter's"
+    return Diagnostic("no-messages", said, step)
 
 
-_STAGES: tuple[tuple[str, Callable[[Facts], Check]], ...] = (
+_STAGES: tuple[tuple[str, Callable[[Facts], Found]], ...] = (
     ("events", _events),
     ("readout", _readout),
     ("light", _light),
@@ -650,7 +440,7 @@ _STAGES: tuple[tuple[str, Callable[[Facts], Check]], ...] = (
     ("codewords", _codewords),
     ("messages", _messages),
 )
-"""Name and judge, in the order in which light passes them."""
+"""Name and check, in the order in which light passes them."""
 
 
 def _sources_said(facts: Facts) -> str:

@@ -8,11 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.diagnosis.checks import Check, Facts, checks_of
+from evlcp_sdk.diagnosis.checks import Check, checks_of
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
 from evlcp_sdk.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
 from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import Diagnostic, Seen, other_codewords, warnings_of
+from evlcp_sdk.diagnosis.warnings import find_warnings
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
@@ -129,17 +130,21 @@ def diagnosis_of(
     for packet in receiver.close():
         tally.add(packet)
     sources, frequency_hz = survey.found()
-    seen = Seen(
+    facts = Facts(
+        link,
+        tally,
+        receiver.counts,
         survey.first_us,
         survey.last_us,
         receiver.lit_us,
         survey.readout,
         sum(loss.count for loss in source.losses.values()),
-        partial(other_codewords, link, registry),
-    )
-    losses = [str(loss) for loss in source.losses.values()]
-    facts = Facts(
-        link, source.counts["events"], seen, sources, survey.restless(), receiver.counts, tally, losses
+        reads_messages=link.messages.decode,
+        others=partial(other_codewords, link, registry),
+        events=source.counts["events"],
+        sources=sources,
+        restless=survey.restless(),
+        losses=[str(loss) for loss in source.losses.values()],
     )
     checks = checks_of(facts)
     trials: tuple[Trial, ...] = ()
@@ -147,20 +152,18 @@ def diagnosis_of(
     if failed and sources and not facts.at_edge and _has_preambles(receiver):
         trials = tuple(better_links(link, sample.events(), registry, _rates(sources, link)))
         checks = checks_of(replace(facts, trials=trials))
-    reads = link.messages.decode
-    warnings = warnings_of(tally, receiver.counts, link, seen=seen, reads_messages=reads)
     return Diagnosis(
         name,
         _headline(checks, tally),
         tuple(checks),
         tuple(sources),
         trials,
-        tuple(warnings),
+        tuple(find_warnings(facts)),
         receiver.counts,
         survey.cell_px,
         frequency_hz,
         survey.signs,
-        seen.duration_us * 1e-6,
+        facts.duration_us * 1e-6,
     )
 
 

@@ -4,8 +4,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from evlcp_sdk.diagnosis.facts import SURE, count_missing_codewords
 from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import codewords_never
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
@@ -26,10 +26,6 @@ MOST_EVENTS = 2_000_000
 
 _FEW_FRAMES = 4
 """Frames below which a link that was tried is no find: chance gives one or two."""
-
-SURE = 0.8
-"""Mean quality of frames from which their symbols are the link's; below, light may be too weak, or the
-modulation another one."""
 
 _GAIN = 0.2
 """How much more of the frames a change must bring to be kept though it does not fit: chance brings .1."""
@@ -109,7 +105,7 @@ def try_link(link: Link, events: Events, changes: Sequence[tuple[str, Any]] = ()
         receiver.counts["frames"],
         receiver.counts.get("frames_rejected", 0),
         tally.quality,
-        max((codewords_never(one, link) for one in tally.own), default=0),
+        max((count_missing_codewords(one, link) for one in tally.own), default=0),
         link.codebook.carrying,
     )
 

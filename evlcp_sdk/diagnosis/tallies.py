@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter, OrderedDict
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +47,7 @@ class TransmitterTally:
         packet_frames: Frames that a packet has.
         nominal_packet_us: Length of a packet that the configuration states, us.
         link: Name of its link, where there are several.
+        number: Its number.
 
     Attributes:
         first_us: Start of its first frame, us; its last one starts at `last_us`.
@@ -86,6 +88,7 @@ class TransmitterTally:
     firsts: list[int] = field(default_factory=list)
     last_px: tuple[float, float] = (math.nan, math.nan)
     link: str = ""
+    number: int = 0
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
@@ -215,7 +218,7 @@ class RunTally:
         tally = self.transmitters.get(packet.transmitter)
         packet_us = self._packets_us[packet.link]
         if tally is None:
-            tally = TransmitterTally(packet.sent, packet_us, link=packet.link)
+            tally = TransmitterTally(packet.sent, packet_us, link=packet.link, number=packet.transmitter)
             self.transmitters[packet.transmitter] = tally
         tally.add(packet)
         for message in packet.messages:
@@ -234,9 +237,11 @@ class RunTally:
             self.others += 1
             self.others_frames += self.transmitters.popitem(last=False)[1].frames
 
-    def of_link(self, name: str) -> dict[int, TransmitterTally]:
-        """Figures by number of the transmitters of a link."""
-        return {number: one for number, one in self.transmitters.items() if one.link == name}
+    def of_link(self, name: str) -> RunTally:
+        """The same of the transmitters of a link alone."""
+        part = copy(self)
+        part.transmitters = OrderedDict((n, one) for n, one in self.transmitters.items() if one.link == name)
+        return part
 
     @property
     def own(self) -> list[TransmitterTally]:

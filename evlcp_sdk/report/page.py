@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from evlcp_sdk.diagnosis.warnings import Diagnostic
+from evlcp_sdk.diagnosis.facts import Diagnostic
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import cluster_colours, transmitter_colour

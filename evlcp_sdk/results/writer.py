@@ -5,14 +5,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
+from evlcp_sdk.diagnosis.facts import Facts, other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import PositionTally, RunTally
-from evlcp_sdk.diagnosis.warnings import LinkPart, Seen, other_codewords
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links, placing_links
 from evlcp_sdk.plugin.records import choose_sinks, installed_sinks
@@ -161,7 +162,7 @@ class ResultWriter:
             OutputError: A file cannot be written, e.g. the disk is full.
             PluginError: A sink fails.
         """
-        positions = None
+        positions: dict[str, Any] = {}
         if self._navigator is not None:
             fixes, settled = self._navigator.close()
             self._place(fixes)
@@ -170,7 +171,10 @@ class ResultWriter:
             positions = self._positions.to_dict(self._navigator)
         first_us, last_us = recording.get("first_us"), recording.get("last_us")
         read = recording.get("counts", {})
-        seen = Seen(
+        facts = Facts(
+            next(iter(self._links.values())),
+            self._tally,
+            counts,
             math.nan if first_us is None else first_us,
             math.nan if last_us is None else last_us,
             lit_us,
@@ -179,32 +183,36 @@ class ResultWriter:
             guessed=str(recording.get("guessed", "")),
             step_us=recording.get("step_us", 0),
             skipped=(read.get("silences_skipped", 0), read.get("silences_skipped_us", 0)),
+            positions=positions,
         )
         parts = {
-            name: LinkPart(
-                link,
-                (link_counts or {}).get(name, counts),
-                messages_off(link) is None,
-                partial(other_codewords, link, self._registry),
+            name: replace(
+                facts,
+                link=link,
+                tally=self._tally.of_link(name),
+                counts=(link_counts or {}).get(name, counts),
+                reads_messages=messages_off(link) is None,
+                others=partial(other_codewords, link, self._registry),
+                positions=positions if name == self._placing else {},
             )
             for name, link in self._links.items()
         }
+        if len(parts) == 1:
+            (facts,) = parts.values()
+        else:
+            reads = any(one.reads_messages for one in parts.values())
+            facts = replace(facts, reads_messages=reads, parts=parts)
         table = summary_of(
             status,
-            parts,
-            self._tally,
+            facts,
             recording=recording,
             processing=processing,
-            counts=counts,
             losses=losses,
             versions=self._registry.versions(),
-            seen=seen,
             error=error,
-            positions=positions,
             sinks={} if self._sinks is None else self._sinks.finish(),
             live=live,
             pps=None if self._pulses is None else self._pulses.to_dict(),
-            placing=self._placing,
         )
         table["files"] = {}
         if self._sinks is not None and self._folder is not None:

@@ -43,7 +43,7 @@ def loop(
     """
     import json
 
-    from evlcp_sdk.diagnosis.warnings import Diagnostic
+    from evlcp_sdk.diagnosis.facts import Diagnostic
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
     from firmware_host.loop import loop as steps

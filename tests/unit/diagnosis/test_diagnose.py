@@ -12,11 +12,11 @@ from typer.testing import CliRunner
 
 from evlcp_sdk.cli._app import make_app
 from evlcp_sdk.diagnosis import _kernels
-from evlcp_sdk.diagnosis.checks import Facts, checks_of
+from evlcp_sdk.diagnosis.checks import checks_of
 from evlcp_sdk.diagnosis.diagnose import Diagnosis, diagnosis_of, infer_link
+from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey, comb
 from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
-from evlcp_sdk.diagnosis.warnings import Seen
 from evlcp_sdk.io import open_source
 from evlcp_sdk.io.open import write_events
 from evlcp_sdk.link.resolve import load_link
@@ -106,8 +106,7 @@ def judged(
         one.last_px = 410.0, 375.0
     counts = dict.fromkeys(("preambles", "regions_opened"), 3)
     counts |= {"frames": frames, "frames_rejected": rejected}
-    seen = Seen(0.0, duration_us)
-    checks = checks_of(Facts(LINK, 10**6, seen, sources, None, counts, tally))
+    checks = checks_of(Facts(LINK, tally, counts, 0.0, duration_us, events=10**6, sources=sources))
     wrong = [one for one in checks if one.verdict in ("fail", "doubt")]
     assert all(one.next_step for one in wrong)
     return wrong[0].code if wrong else ""
@@ -185,7 +184,7 @@ def test_a_framing_without_a_preamble_is_judged_by_its_frames(code: str) -> None
 def test_a_panel_looks_like_a_bar_out_of_focus_and_is_said_to_be_one_perhaps() -> None:
     counts = {"preambles": 0, "regions_opened": 1, "frames": 0, "frames_rejected": 0}
     panel = replace(BAR, wide_px=51.0, high_px=77.0)
-    checks = checks_of(Facts(LINK, 10**6, Seen(0.0, 2e5), (panel,), None, counts, RunTally(LINK.packet)))
+    checks = checks_of(Facts(LINK, RunTally(LINK.packet), counts, 0.0, 2e5, events=10**6, sources=(panel,)))
     (one,) = [one for one in checks if one.stage == "focus"]
     assert (one.code, one.verdict) == ("defocus", "fail")
     assert "layout is another one" in one.said

@@ -1,15 +1,18 @@
 """What looks wrong is said, and nothing of what looks right."""
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from evlcp_sdk.diagnosis.facts import Facts, other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import Seen, notes_of, other_codewords, warnings_of
+from evlcp_sdk.diagnosis.warnings import find_notes, find_warnings
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
@@ -74,7 +77,11 @@ def tally_of(
 
 
 def told(tally: RunTally, link: Link = LINK, **counts: int) -> list[str]:
-    return [str(doubt) for doubt in warnings_of(tally, counts, link)]
+    return [str(doubt) for doubt in find_warnings(Facts(link, tally, counts))]
+
+
+def facts_of(positions: dict[str, Any], link: Link = LINK) -> Facts:
+    return Facts(link, RunTally(link.packet), {}, positions=positions)
 
 
 RANDOM = np.random.default_rng(1).integers(0, 64, (6, 10, 16))
@@ -134,13 +141,13 @@ def test_frames_rejected_and_blocks_that_cannot_be_read() -> None:
 def test_blocks_are_doubted_where_there_is_something_to_read() -> None:
     # Random symbols are no blocks: that is said plainly.
     random = {"blocks_tried": 6, "blocks_failed": 6}
-    assert warnings_of(tally_of(RANDOM), random, LINK) == []
-    (note,) = notes_of(tally_of(RANDOM), random)
+    assert find_warnings(Facts(LINK, tally_of(RANDOM), random)) == []
+    (note,) = find_notes(Facts(LINK, tally_of(RANDOM), random))
     assert (note.code, str(note)) == (
         "no-messages",
         "no messages: none of 6 packets has a block that can be read",
     )
-    assert notes_of(tally_of(RANDOM), random, reads_messages=False) == []
+    assert find_notes(Facts(LINK, tally_of(RANDOM), random, reads_messages=False)) == []
     # Packets that repeat one another are.
     (line,) = told(tally_of(RANDOM), blocks_tried=6, blocks_failed=6, blocks_alike=4)
     assert line.startswith("none of 6 packets has a block that can be read, though 4 of them repeat others")
@@ -167,16 +174,17 @@ def test_the_modulation_that_was_sent() -> None:
     inside = np.array([i for i, word in enumerate(ours) if word in theirs])
     assert len(inside) == 16
     sent = inside[np.random.default_rng(2).integers(0, 16, (6, 10, 16))]
-    seen = Seen(others=lambda: other_codewords(LINK, Registry.load()))
-    (doubt,) = warnings_of(tally_of(sent), {"blocks_tried": 9, "blocks_failed": 9}, LINK, seen=seen)
+    others = partial(other_codewords, LINK, Registry.load())
+    counts = {"blocks_tried": 9, "blocks_failed": 9}
+    (doubt,) = find_warnings(Facts(LINK, tally_of(sent), counts, others=others))
     assert (doubt.code, doubt.transmitter) == ("profile", 0)
     assert doubt.text == "only 16 of 64 symbols ever occur, 9 of 9 blocks unreadable"
     assert doubt.next_step == "was this sent with wh8? try --set modulation.id=wh8"
     noisy = np.where(np.random.default_rng(3).random(sent.shape) < 0.02, RANDOM, sent)
-    (doubt,) = warnings_of(tally_of(noisy), {}, LINK, seen=seen)
+    (doubt,) = find_warnings(Facts(LINK, tally_of(noisy), {}, others=others))
     assert doubt.code in ("profile", "codewords") or len(np.unique(noisy)) == 64
     # All the same, which every modulation has.
-    (doubt,) = warnings_of(tally_of(sent * 0), {}, LINK, seen=seen)
+    (doubt,) = find_warnings(Facts(LINK, tally_of(sent * 0), {}, others=others))
     assert doubt.code == "codewords"
 
 
@@ -192,17 +200,17 @@ def test_the_modulation_that_was_sent() -> None:
 def test_light_without_frames(start_us: float, lit_us: tuple[float, float] | None, says: str | None) -> None:
     """Six packets of 34.6 ms, the last frame 31.4 ms before their end, in a recording of a second."""
     tally = tally_of(RANDOM, every_us=3200.0, start_us=start_us)
-    seen = Seen(5e3, 1.005e6, None if lit_us is None else {0: lit_us})
-    found = warnings_of(tally, {}, LINK, seen=seen)
+    facts = Facts(LINK, tally, {}, 5e3, 1.005e6, None if lit_us is None else {0: lit_us})
+    found = find_warnings(facts)
     assert [doubt.code for doubt in found] == ["coverage"] * (says is not None)
     assert says is None or found[0].text == says
     # Where nothing is received is said in any case, but a road without bars is nothing wrong.
-    (note,) = notes_of(tally, {}, seen=seen)
+    (note,) = find_notes(facts)
     first_ms = round((start_us - 5e3) / 1e3)
     assert note.text == (
         f"frames in 208 ms of 1000 ms: nothing before {first_ms} ms, nothing after {first_ms + 202} ms"
     )
-    assert notes_of(tally, {}, seen=Seen(5e3, 3e5)) == []
+    assert find_notes(replace(facts, last_us=3e5)) == []
 
 
 def test_distances_that_the_size_contradicts() -> None:
@@ -237,7 +245,7 @@ def test_a_readout_at_its_limit() -> None:
         readout = ReadoutTally()
         for piece in np.array_split(t_us, 7):
             readout.add(Events.of(piece, piece * 0, piece * 0, piece * 0))
-        found = warnings_of(RunTally(LINK.packet), {}, LINK, seen=Seen(0.0, 3e5, readout=readout))
+        found = find_warnings(Facts(LINK, RunTally(LINK.packet), {}, 0.0, 3e5, readout=readout))
         assert [doubt.code for doubt in found] == ["saturated"] * capped
         assert not capped or "hold 3 Mev/s" in found[0].text
 
@@ -262,7 +270,7 @@ def test_events_that_were_dropped() -> None:
     assert told(nothing, events=1_000_000, dropped_backward=90) == []
     (line,) = told(nothing, events=50_000, dropped_backward=90, dropped_off_sensor=20)
     assert line.startswith("110 events or words dropped (90 backward, 20 off sensor)")
-    (doubt,) = warnings_of(nothing, {"events": 50_000}, LINK, seen=Seen(losses=200))
+    (doubt,) = find_warnings(Facts(LINK, nothing, {"events": 50_000}, lost=200))
     assert "200 in the file" in doubt.text
 
 
@@ -272,13 +280,11 @@ def test_bars_at_no_known_place_are_named_by_their_ids() -> None:
         ({}, "received: no id: compare"),
     ):
         positions = dict(NO_POSITIONS, refused={"no-site": 4}, heard=heard)
-        found = warnings_of(RunTally(LINK.packet), {}, LINK, positions=positions)
+        found = find_warnings(facts_of(positions))
         assert [says in str(one) for one in found if one.code == "no-site"] == [True]
         # A bar more beside those that are known is none.
         known = dict(positions, fixes=9)
-        assert all(
-            one.code != "no-site" for one in warnings_of(RunTally(LINK.packet), {}, LINK, positions=known)
-        )
+        assert all(one.code != "no-site" for one in find_warnings(facts_of(known)))
 
 
 @pytest.mark.parametrize(
@@ -295,7 +301,7 @@ def test_a_bar_that_is_not_used_for_a_mistyped_id(
     heard: dict[str, int], unseen: list[int], says: str | None
 ) -> None:
     positions = dict(NO_POSITIONS, fixes=9, heard=heard, bars={"0": 7}, sites_unseen=unseen)
-    doubts = warnings_of(RunTally(LINK.packet), {}, LINK, positions=positions)
+    doubts = find_warnings(facts_of(positions))
     found = [str(one) for one in doubts if one.code == "unknown-id"]
     assert [says in one for one in found] == [True] if says else not found
 
@@ -311,12 +317,12 @@ def test_symbols_that_are_wrong_by_the_receivers_own_account(quality: float, sai
 
 
 def test_what_is_not_found_is_looked_for_elsewhere() -> None:
-    (note,) = notes_of(RunTally(LINK.packet), {"events": 9})
+    (note,) = find_notes(Facts(LINK, RunTally(LINK.packet), {"events": 9}))
     assert (note.code, note.next_step) == (
         "nothing-found",
         "`evlcp diagnose` says what blinks, and what to try",
     )
-    assert notes_of(RunTally(LINK.packet), {"events": 0}) == []
+    assert find_notes(Facts(LINK, RunTally(LINK.packet), {"events": 0})) == []
 
 
 def test_a_misfit_names_what_would_explain_it() -> None:
@@ -336,9 +342,7 @@ def test_a_misfit_names_what_would_explain_it() -> None:
         ),
     ):
         positions = dict(NO_POSITIONS, refused={"misfit": 10}, suspects=suspects, focal_mm_fits=fits_mm)
-        (doubt,) = [
-            d for d in warnings_of(RunTally(LINK.packet), {}, LINK, positions=positions) if d.code == "misfit"
-        ]
+        (doubt,) = [d for d in find_warnings(facts_of(positions)) if d.code == "misfit"]
         assert says in str(doubt)
 
 
@@ -357,8 +361,7 @@ def test_a_reflection_is_not_doubted() -> None:
     assert line.startswith("transmitter 0: its clusters stand the other way round")
     assert told(tally_of(RANDOM, points=head_down, echo_of=3)) == []
     tally = tally_of(RANDOM, points=head_down, echo_of=3)
-    seen = Seen(0.0, 1e6, lit_us={0: (0.0, 9e5)})
-    assert warnings_of(tally, {}, LINK, seen=seen) == []
+    assert find_warnings(Facts(LINK, tally, {}, 0.0, 1e6, lit_us={0: (0.0, 9e5)})) == []
 
 
 def test_what_blinks_without_a_preamble() -> None:
@@ -420,6 +423,6 @@ def test_what_a_drive_tells_of_its_errors(
     row["determined"] = sigma < 0.18
     positions = dict(NO_POSITIONS, fixes=1, learnt=[row])
     link = load_link(overrides=["camera_sigma.focal_mm=0.2"])
-    found = [str(doubt) for doubt in warnings_of(RunTally(link.packet), {}, link, positions=positions)]
+    found = [str(doubt) for doubt in find_warnings(facts_of(positions, link))]
     assert len(found) == (hint is not None)
     assert hint is None or hint in found[0]

@@ -8,8 +8,9 @@ import pytest
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import warnings_of
+from evlcp_sdk.diagnosis.warnings import find_warnings
 from evlcp_sdk.io import write_events
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import Measure, Ranging
@@ -123,7 +124,7 @@ def test_events_that_are_of_no_pixel(tmp_path: Path) -> None:
         receiver, tally = Receiver(link), RunTally(link.packet)
         for packet in [*(p for e in beside.chunks() for p in receiver.feed(e)), *receiver.close()]:
             tally.add(packet)
-    (one,) = warnings_of(tally, receiver.counts, link)
+    (one,) = find_warnings(Facts(link, tally, receiver.counts))
     assert (one.code, "off sensor" in one.text) == ("dropped", True)
 
 
@@ -158,5 +159,5 @@ def test_more_than_there_is_room_for() -> None:
     with rendered((), 0.12, {}) as source:
         for packet in [*(p for e in source.chunks() for p in receiver.feed(e)), *receiver.close()]:
             tally.add(packet)
-    found = {one.code: one for one in warnings_of(tally, receiver.counts, link)}
+    found = {one.code: one for one in find_warnings(Facts(link, tally, receiver.counts))}
     assert "events of regions forgotten early" in found["no-room"].text

@@ -5,8 +5,9 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.cli._receiving import say_alike
+from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import LinkPart, Seen, warnings_of_links
+from evlcp_sdk.diagnosis.warnings import find_warnings
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import alike_links, load_links, named_links
@@ -76,8 +77,8 @@ def test_links_alike_are_warned_of_before_anything_is_read(tmp_path: Path) -> No
     off = load_link(
         None, ["bar.rows=1", "bar.columns=1", "bar.cluster_rows=1", "framing.id=uart", "framing.idle=off"]
     )
-    parts = {name: LinkPart(link, {}, True) for name, link in (("lamp", lamp), ("off", off))}
-    (told,) = warnings_of_links(RunTally({}), {}, parts, seen=Seen())
+    parts = {name: Facts(link, RunTally({}), {}) for name, link in (("lamp", lamp), ("off", off))}
+    (told,) = find_warnings(Facts(lamp, RunTally({}), {}, parts=parts))
     assert told.code == "alike-links"
     assert "'lamp' and 'off'" in told.text
 
