@@ -15,7 +15,7 @@ import numpy as np
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.detection import same_place
+from evlcp_sdk.rx.followed import same_place
 from evlcp_sdk.values import Packet, Region, changed
 
 __all__ = ["Contest", "ContestedPacket", "explained_us"]

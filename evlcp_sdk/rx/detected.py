@@ -2,7 +2,8 @@
 
 import math
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -11,10 +12,12 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Detector
-from evlcp_sdk.rx.detection import BACKFILL_STEPS, Followed, same_place
+from evlcp_sdk.rx.detection import BACKFILL_STEPS
+from evlcp_sdk.rx.followed import Followed, same_place
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.places import Places
+from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.values import Events, Region
 
 __all__ = ["DetectedRegions"]
@@ -25,18 +28,16 @@ tracker: a slow light is known after its first character. Not more, as they are 
 when it is found, and a shaking camera has seen it elsewhere before."""
 
 
-class DetectedRegions:
+class DetectedRegions(RegionTracker):
     """Holds the events of the regions that a detector gives; a framing may not move them.
 
     Args:
         link: The resolved configuration.
         detector: What its detection compiled to.
         limits: How much is held.
-
-    Attributes:
-        alive: The regions that are followed.
-        counts: What was left out for want of room.
     """
+
+    goes_ahead = False
 
     def __init__(self, link: Link, detector: Detector, limits: Limits = LIMITS) -> None:
         self._guard = Guard(link, "detection")
@@ -112,6 +113,12 @@ class DetectedRegions:
             start_us, many = oldest.forget()
             self.counts["dropped_no_room"] += many
             oldest.cut_us = oldest.first_us = start_us + self._step_us
+
+    def ahead(
+        self, start_us: int, until_us: int, events: Events, meant: Collection[int]
+    ) -> AbstractContextManager[None]:
+        """Never asked for: a detector says where regions are at the end of a step."""
+        return nullcontext()
 
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""

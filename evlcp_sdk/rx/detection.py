@@ -4,7 +4,6 @@ import math
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,9 +12,11 @@ from numpy.typing import NDArray
 from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
+from evlcp_sdk.rx.followed import SAME_PX, Followed, Piece, same_place
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.places import Places, region_of
 from evlcp_sdk.rx.rhythm import Rhythm, select
+from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
@@ -24,16 +25,13 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["BACKFILL_STEPS", "SAME_PX", "Followed", "RegionFollower", "same_place"]
+__all__ = ["BACKFILL_STEPS", "MARGIN_PX", "RegionFollower"]
 
 MARGIN_PX = 5
 """Seam around a region: how far it may move in a step, 1.5 px/ms and more, and how far it is blurred."""
 
 _LEAST_RISES = 20
 """Rises of candidate pixels in a step that a new region needs: a cluster at 100 m has as many, noise few."""
-
-SAME_PX = 5.0
-"""How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
 
 _CELL_SHIFT = 2
 """Cells of 4 x 4 px: no larger than the gap at which two bars are two, and few enough to label each step."""
@@ -45,9 +43,6 @@ _AGE_CHIPS = 5
 """Age of a measured centre. A moving bar's leading end counts once its pixels have risen in rhythm twice,
 some six chips late and more where events go missing; its trailing end stays for the six chips of the
 measurement. In recordings and simulated scenes the centre is 3 to 8 chips late."""
-
-_HEIGHTS = 9
-"""Measured heights whose median is a region's: a bar ahead grows by a percent in so many steps at 80 km/h."""
 
 _STRAY_PX = 2.0
 """How much too long a region may be before what is too much must be strays: an edge is good to a pixel."""
@@ -87,111 +82,10 @@ BACKFILL_STEPS = 12
 _COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
 
 Box = tuple[int, int, int, int]
-Piece = tuple[int, Events]
 
 
-@dataclass
-class Followed:
-    """A region followed over time, and its events since the first.
-
-    Attributes:
-        id: Number of the region, from 0.
-        positions: Where it was measured, oldest first.
-        pieces: Its events, one entry a time step: (start of the step, us; events).
-        first_us: Start of the first step of which it has events, us.
-        filter: State of the filter of its centre, None without one.
-        heights: As measured lately, px; of a bar of known size, those of steps in which both ends were seen.
-        size_px: (width, height) of the whole bar, by what its frames show, px; None before the first.
-        lit_px: Upper and lower edge, from the bar's centre, of the part that its newest frame showed, px;
-            None where it showed both ends.
-        strips_px: Of a bar whose light stands in strips of columns, (middle from the bar's centre, half the
-            width) of each, px, float64 (n, 2); None of others, and before the first frame.
-        shown_us: When its newest frame showed its place, us; None before the first.
-        outgrown: The region before that, which may have held other bars: (right, down) of its centre from
-            this one's, width and height, px, and until when that matters, us.
-        released: True once it has faded or was merged into another; it gets no more events.
-        opened_us: End of the step in which it was found, us.
-        cut_us: Until when its events were forgotten for want of room, us; None where none were.
-        held_bytes: What its pieces take.
-    """
-
-    id: int
-    positions: Places
-    first_us: int
-    pieces: deque[Piece] = field(default_factory=deque)
-    released: bool = False
-    filter: Any = None
-    heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
-    size_px: tuple[float, float] | None = None
-    lit_px: tuple[float, float] | None = None
-    strips_px: NDArray[np.float64] | None = None
-    shown_us: float | None = None
-    outgrown: tuple[float, float, float, float, float] | None = None
-    opened_us: int = 0
-    cut_us: int | None = None
-    held_bytes: int = 0
-
-    def __post_init__(self) -> None:
-        self.hold(self.pieces)
-
-    def hold(self, pieces: deque[Piece]) -> None:
-        """Take other events instead of those held."""
-        self.pieces = pieces
-        self.held_bytes = sum(held_bytes(events) for _, events in pieces)
-
-    def add(self, start_us: int, events: Events) -> None:
-        """Take the events of the next step."""
-        self.pieces.append((start_us, events))
-        self.held_bytes += held_bytes(events)
-
-    def forget(self) -> tuple[int, int]:
-        """Drop the events of the oldest step; its start, us, and how many they were."""
-        start_us, events = self.pieces.popleft()
-        self.held_bytes -= held_bytes(events)
-        return start_us, len(events)
-
-    def take_back(self) -> None:
-        """Drop the newest events, as if they had not been added."""
-        self.held_bytes -= held_bytes(self.pieces.pop()[1])
-
-    def events_between(self, from_us: float, until_us: float) -> int:
-        """How many of its events there are from one time to before another."""
-        return sum(
-            int(np.diff(np.searchsorted(events.t_us, (from_us, until_us)))[0])
-            for start_us, events in self.pieces
-            if start_us < until_us
-        )
-
-    @property
-    def latest(self) -> Region:
-        """The newest position."""
-        return self.positions.latest
-
-    def covers(self, t_us: float, point_px: tuple[float, float]) -> bool:
-        """Whether a point on the sensor (column, row) is inside the region at a time."""
-        (x, y), (width, height) = self.positions.place_at(t_us), self.positions.size_at(t_us)
-        return abs(point_px[0] - x) <= width / 2 and abs(point_px[1] - y) <= height / 2
-
-    def holds(self, other: "Followed", t_us: float, same_px: float) -> bool:
-        """Whether another region is a part of this bar, or the same bar, its centre so near at a time."""
-        mine, its = self.latest, other.latest
-        when = t_us if other.size_px is not None else its.t_us
-        (x, y), (u, v) = self.positions.place_at(when), other.positions.place_at(when)
-        right, down = abs(u - x), abs(v - y)
-        if other.size_px is not None:
-            return max(right, down) <= same_px
-        # Half of it, or more, in each direction.
-        return right <= mine.width_px / 2 + same_px and down <= mine.height_px / 2
-
-    def forget_before(self, t_us: float, step_us: int, places_us: float) -> None:
-        """Drop events older than a time, and positions older than another: others ask where it was."""
-        while self.pieces and self.pieces[0][0] + step_us <= t_us:
-            self.forget()
-        self.positions.forget_before(places_us)
-
-
-class RegionFollower:
-    """Streams time steps of events into the regions that blink.
+class RegionFollower(RegionTracker):
+    """Finds what blinks in the rhythm of the chips, and follows it: the tracker of the receiver.
 
     Args:
         spec: Parameters.
@@ -203,11 +97,9 @@ class RegionFollower:
         limits: How much is held.
         gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
         rhythm: Scores of the pixels, of another follower in the same rhythm; None for its own.
-
-    Attributes:
-        alive: The regions that are followed.
-        counts: What was left out for want of room.
     """
+
+    goes_ahead = True
 
     def __init__(
         self,
@@ -770,12 +662,6 @@ class RegionFollower:
                 if shown == 0 or apart_px <= SAME_PX or (shown == 1 and same_place(one, other)):
                     younger.released = True
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
-
-
-def same_place(one: Region, other: Region) -> bool:
-    """Whether the centre of one of two regions lies in the other."""
-    right, down = abs(one.x_px - other.x_px), abs(one.y_px - other.y_px)
-    return any(right <= at.width_px / 2 and down <= at.height_px / 2 for at in (one, other))
 
 
 def _clear(box: Box, others: list[Box]) -> Box:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.delays import LONGEST_ROW_US
-from evlcp_sdk.rx.detection import SAME_PX
+from evlcp_sdk.rx.followed import SAME_PX
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.placement import Placement

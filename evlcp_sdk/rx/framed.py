@@ -11,18 +11,19 @@ import numpy as np
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
-from evlcp_sdk.rx.detected import DetectedRegions
-from evlcp_sdk.rx.detection import Followed, RegionFollower, same_place
 from evlcp_sdk.rx.echoes import EchoQueue, Sighting
+from evlcp_sdk.rx.followed import Followed, same_place
+from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.values import Frame, Heard, Range, Region, SyncLock
 
-__all__ = ["HeardFraming"]
+__all__ = ["PluginFraming"]
 
 _COUNTED = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
 
@@ -55,8 +56,8 @@ class _Listener:
     last: tuple[int, int] = (-1, -1)
 
 
-class HeardFraming:
-    """Lets a framing listen to the regions of a stream, and puts its frames on the way of all frames.
+class PluginFraming(Framer):
+    """Lets a plugin's framing listen to the regions of a stream, and puts its frames on the way of all.
 
     Args:
         link: The resolved configuration.
@@ -68,12 +69,9 @@ class HeardFraming:
         name: Name of the link, that its frames have; empty for none.
         numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
 
-    Attributes:
-        counts: What was found so far.
-        lit: When the light of its transmitters was there.
-        ranging_every: Of no effect: frames that a framing gives have no distance.
-        patience_us: How late a frame may be given, us.
     """
+
+    cut_by_the_end = False
 
     def __init__(
         self,
@@ -82,7 +80,7 @@ class HeardFraming:
         judged: EchoQueue,
         clock: CameraClock,
         announcer: Announcer,
-        regions: RegionFollower | DetectedRegions,
+        regions: RegionTracker,
         name: str = "",
         numbers: Iterator[int] | None = None,
     ) -> None:

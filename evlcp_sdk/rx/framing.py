@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable, Collection, Iterator, Sequence
+from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +12,10 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.delays import RowDelays
-from evlcp_sdk.rx.detected import DetectedRegions
-from evlcp_sdk.rx.detection import MARGIN_PX, SAME_PX, Followed, RegionFollower, same_place
+from evlcp_sdk.rx.detection import MARGIN_PX
 from evlcp_sdk.rx.echoes import EchoQueue, Sighting
+from evlcp_sdk.rx.followed import SAME_PX, Followed, same_place
+from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.lit import LitTimes
@@ -21,6 +23,7 @@ from evlcp_sdk.rx.look import Look, Looker
 from evlcp_sdk.rx.reading import FrameReader, ReadableFrame, Reading
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Missed, Transmitter, Transmitters
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.values import Frame, Region, SyncLock, changed
@@ -62,7 +65,18 @@ _COUNTS = (
 )
 
 
-class PacketFraming:
+class Skipped(StrEnum):
+    """Why a frame that was due is not given; its value is the count that it belongs to."""
+
+    DARK = "frames_dark"
+    """A bar that was seen before has few events by now."""
+    REJECTED = "frames_rejected"
+    """It does not show its clusters where the bar has them."""
+    UNREAD = "frames_unread"
+    """It shows them, and no symbol that is sure."""
+
+
+class PacketFraming(Framer):
     """Finds the packets of the regions of a stream, decodes their frames, and sets the regions right by them.
 
     Args:
@@ -77,18 +91,15 @@ class PacketFraming:
         name: Name of the link, that its frames have; empty for none.
         numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
 
-    Attributes:
-        counts: What was found and dropped so far.
-        lit: When the light of its transmitters was there.
-        ranging_every: See `Receiver`.
-        patience_us: How late a frame may be given, us.
     """
+
+    cut_by_the_end = True
 
     def __init__(
         self,
         link: Link,
         steps: Steps,
-        regions: RegionFollower | DetectedRegions,
+        regions: RegionTracker,
         judged: EchoQueue,
         clock: CameraClock,
         announcer: Announcer,
@@ -165,7 +176,7 @@ class PacketFraming:
     @property
     def due_us(self) -> float:
         """When the next frame can be decoded, us; infinite where that waits for the end of a time step."""
-        if isinstance(self._regions, DetectedRegions):
+        if not self._regions.goes_ahead:
             return math.inf
         due_us = math.inf
         for one in self._transmitters.alive:
@@ -175,7 +186,7 @@ class PacketFraming:
 
     def ahead(self, step: TimeStep) -> None:
         """Decode the frames that are due in the part so far of a time step."""
-        if isinstance(self._regions, DetectedRegions):
+        if not self._regions.goes_ahead:
             return
         self._joined.clear()
         self._due.clear()
@@ -269,7 +280,7 @@ class PacketFraming:
             return
         pilot, said = transmitter.pilot, transmitter.said
         found = self._decode(transmitter, due)
-        if isinstance(found, str):
+        if isinstance(found, Skipped):
             transmitter.pilot, transmitter.said, transmitter.tried = pilot, said, due.number
             return
         self._take(transmitter, due, found)
@@ -282,18 +293,18 @@ class PacketFraming:
         while most > 0 and (due := transmitter.grid.due(until_us)) is not None:
             most -= 1
             found = self._decode(transmitter, due)
-            if found == "frames_rejected" and self._put_together(transmitter):
+            if found is Skipped.REJECTED and self._put_together(transmitter):
                 continue
             if transmitter.region.id in self._joined:
                 # Another region shows the frame.
                 transmitter.grid.frame += 1
                 return
-            if isinstance(found, str):
+            if isinstance(found, Skipped):
                 transmitter.grid.frame += 1
-                if found != "frames_dark":
+                if found is not Skipped.DARK:
                     self._lit_in(transmitter, due)
                 self.counts[found] += 1
-                transmitter.missed += Missed(found == "frames_rejected", found == "frames_unread")
+                transmitter.missed += Missed(found is Skipped.REJECTED, found is Skipped.UNREAD)
                 continue
             self._take(transmitter, due, found)
 
@@ -311,32 +322,32 @@ class PacketFraming:
         if transmitter.number is not None:
             self.lit.note(transmitter.number, transmitter.lit_us, start_us)
 
-    def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | str:
-        """Read a frame; of one that is not given, the count that it belongs to."""
+    def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | Skipped:
+        """Read a frame, or say why it is not given."""
         shown = self._readable(transmitter, due)
-        return (
-            shown if isinstance(shown, str) else self._told(transmitter, due, shown, self._reader.read(shown))
-        )
+        if isinstance(shown, Skipped):
+            return shown
+        return self._frame_of(transmitter, due, shown, self._reader.read(shown))
 
-    def _readable(self, transmitter: Transmitter, due: DueFrame) -> ReadableFrame | str:
-        """What is to be read of a frame; of one that does not show its clusters, the count it belongs to."""
+    def _readable(self, transmitter: Transmitter, due: DueFrame) -> ReadableFrame | Skipped:
+        """What is to be read of a frame, or why there is nothing."""
         self._announcer.start()
         look = self._look(transmitter, due)
         if look is None:
-            return "frames_dark" if _went_dark(transmitter, due, self._packet) else "frames_rejected"
+            return Skipped.DARK if _went_dark(transmitter, due, self._packet) else Skipped.REJECTED
         if transmitter.number is None and self._echoes.shown(due.start_us, look.centre_px):
             # The same bar once more: where the first region was then is not known as well as what it showed.
             self._regions.drop(transmitter.region)
             self._let_go(transmitter.region)
-            return "frames_rejected"
+            return Skipped.REJECTED
         ranged = due.has_pilot and self._is_ranged()
         attitude = self._attitude_at(self._clock.camera_us(look.middle_us)) if due.has_pilot else None
         return ReadableFrame(look, due.index, due.has_pilot, self._before(transmitter, due), ranged, attitude)
 
-    def _told(
+    def _frame_of(
         self, transmitter: Transmitter, due: DueFrame, shown: ReadableFrame, reading: Reading
-    ) -> Sighting | str:
-        """A frame by what was read of it; of one that is not given, the count that it belongs to."""
+    ) -> Sighting | Skipped:
+        """A frame by what was read of it, or why it is not given."""
         transmitter.said = due.number, reading.symbols
         distance, soft = reading.distance, reading.soft
         self.counts["frames_askew"] += reading.sight.askew
@@ -344,7 +355,7 @@ class PacketFraming:
             transmitter.number is None or not math.isfinite(distance.distance_m)
         ):
             # What says nothing is no transmitter, and of one that is known its distance may still be of use.
-            return "frames_unread"
+            return Skipped.UNREAD
         if transmitter.number is None:
             self._find_parts(transmitter.region, due.start_us)
         number = self._transmitters.number(transmitter)

@@ -10,7 +10,8 @@ from evlcp_sdk.plugin.roles import Tracker
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.echoes import Echoes, EchoQueue
-from evlcp_sdk.rx.framed import HeardFraming
+from evlcp_sdk.rx.framed import PluginFraming
+from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.inbox import MessageAssembler
@@ -18,6 +19,7 @@ from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
 from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
@@ -63,7 +65,7 @@ class LinkListener:
         self._judged = EchoQueue(Echoes(link.packet, len(link.codebook.codewords)))
         with Guard(link, "framing", may_refuse=True):
             deframer = link.algorithm("framing").compile(link.codebook, link.packet)
-        self._framing: PacketFraming | HeardFraming
+        self._framing: Framer
         if deframer is None:
             self._framing = PacketFraming(
                 link,
@@ -78,7 +80,7 @@ class LinkListener:
                 numbers,
             )
         else:
-            self._framing = HeardFraming(
+            self._framing = PluginFraming(
                 link, deframer, self._judged, clock, self._announcer, self._regions, name, numbers
             )
         self._messages = MessageAssembler.of(link, clock_zero)
@@ -160,7 +162,7 @@ class LinkListener:
 
     def end_at(self, end_us: float) -> None:
         """Let the stream end at a time, us: frames that are cut by it are not given."""
-        if isinstance(self._framing, PacketFraming):
+        if self._framing.cut_by_the_end:
             self._judged.ends_us = end_us
 
     def finish(self) -> list[Packet]:
@@ -205,9 +207,7 @@ class LinkListener:
         return changed(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)
 
 
-def _regions_of(
-    link: Link, tracker: Tracker, limits: Limits, rhythm: Rhythm | None
-) -> RegionFollower | DetectedRegions:
+def _regions_of(link: Link, tracker: Tracker, limits: Limits, rhythm: Rhythm | None) -> RegionTracker:
     """What finds and follows the regions of a stream."""
     with Guard(link, "detection", may_refuse=True):
         detector = link.algorithm("detection").compile(link.camera, link.codebook, link.packet)

@@ -12,7 +12,8 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.detection import MARGIN_PX, Followed
+from evlcp_sdk.rx.detection import MARGIN_PX
+from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
 from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed, plain

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.delays import LONGEST_ROW_US, RowDelay
-from evlcp_sdk.rx.detection import Followed
+from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.look import Pilot

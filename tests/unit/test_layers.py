@@ -91,8 +91,9 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 
 RX = (
     {"early", "limits", "lit", "places", "rhythm"},
-    {"guard", "trust"},
-    {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges", "timeline"},
+    {"followed", "guard", "timeline", "trust"},
+    {"framer", "tracker"},
+    {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges"},
     {"contest", "detected", "points", "spread", "steps"},
     {"look"},
     {"echoes", "reading", "transmitters"},

@@ -10,7 +10,8 @@ import pytest
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.detection import Followed, RegionFollower, _clear, _cut_off
+from evlcp_sdk.rx.detection import RegionFollower, _clear, _cut_off
+from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.places import Places
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
