@@ -5,8 +5,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from evlcp_sdk.diagnosis.facts import SURE, Diagnostic, Facts, count_missing_codewords, has_rate
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, has_rate
 from evlcp_sdk.diagnosis.light import LightSource
+from evlcp_sdk.diagnosis.tallies import SURE, count_missing_codewords
 from evlcp_sdk.diagnosis.warnings import check_saturation
 from evlcp_sdk.spelling import counted
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.readout import ReadoutTally
-from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
+from evlcp_sdk.diagnosis.tallies import SURE, RunTally
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
@@ -20,17 +20,10 @@ if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.light import LightSource
     from evlcp_sdk.diagnosis.probe import Trial
 
-__all__ = ["SURE", "Diagnostic", "Facts", "count_missing_codewords", "has_rate", "other_codewords"]
-
-SURE = 0.8
-"""Mean quality of frames from which their symbols are the link's; below, light may be too weak, or the
-modulation another one."""
+__all__ = ["Diagnostic", "Facts", "has_rate", "other_codewords"]
 
 NEAR_RATE = 0.8
 """Share of its largest mean that a source has at the link's rate if that is its rate, or a multiple."""
-
-_BY_CHANCE = 1e-6
-"""Probability of a finding by chance below which it is stated."""
 
 _FEW = 4
 """Frames of which nothing is said."""
@@ -238,22 +231,6 @@ class Facts:
 def has_rate(source: LightSource, rate_hz: float) -> bool:
     """Whether a source may have a rate, or a multiple of it."""
     return source.strength_at(rate_hz) >= NEAR_RATE * source.strength
-
-
-def count_missing_codewords(one: TransmitterTally, link: Link) -> int:
-    """How many codewords never occur in what a transmitter sent, 0 where that may be chance.
-
-    Packets may repeat one another, so that all of them say no more than one.
-    """
-    codewords = link.codebook.carrying
-    never = codewords - sum(symbol < codewords for symbol in one.values)
-    if not one.given or not never:
-        return 0
-    # Equally likely codewords; the union of all sets of so many bounds the chance that they never occur.
-    ways = math.lgamma(codewords + 1) - math.lgamma(never + 1) - math.lgamma(codewords - never + 1)
-    given = min(one.given, link.packet.frames * link.codebook.clusters)
-    chance = ways + given * math.log1p(-never / codewords)
-    return never if chance < math.log(_BY_CHANCE) else 0
 
 
 def other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.uint8]]:

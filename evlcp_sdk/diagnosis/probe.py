@@ -4,8 +4,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from evlcp_sdk.diagnosis.facts import SURE, count_missing_codewords
-from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.diagnosis.tallies import SURE, RunTally, count_missing_codewords
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.formatting import number_or_none, sigmas
 from evlcp_sdk.late import Late
+from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
 
 if TYPE_CHECKING:
@@ -21,7 +22,14 @@ if TYPE_CHECKING:
 else:
     refusals, trajectory = (Late(f"evlcp_sdk.place.{name}") for name in ("refusals", "trajectory"))
 
-__all__ = ["MOST_MESSAGES", "PositionTally", "RunTally", "TransmitterTally"]
+__all__ = [
+    "MOST_MESSAGES",
+    "SURE",
+    "PositionTally",
+    "RunTally",
+    "TransmitterTally",
+    "count_missing_codewords",
+]
 
 _CELL_M = 0.01
 _FARTHEST_M = 1_000.0
@@ -31,6 +39,13 @@ _MOST_TRANSMITTERS = 1024
 """Transmitters with figures of their own; of more, those not received for longest are only counted."""
 
 _MOST_CLOCK_ERROR = 0.01
+
+SURE = 0.8
+"""Mean quality of frames from which their symbols are the link's; below, light may be too weak, or the
+modulation another one."""
+
+_BY_CHANCE = 1e-6
+"""Probability of a finding by chance below which it is stated."""
 
 MOST_MESSAGES = 20
 """Messages that a summary shows, the newest."""
@@ -189,6 +204,22 @@ class TransmitterTally:
             "distance_last_m": number_or_none(self.last_m, 4),
             "distance_median_m": number_or_none(self.median_m(), 2),
         }
+
+
+def count_missing_codewords(one: TransmitterTally, link: Link) -> int:
+    """How many codewords never occur in what a transmitter sent, 0 where that may be chance.
+
+    Packets may repeat one another, so that all of them say no more than one.
+    """
+    codewords = link.codebook.carrying
+    never = codewords - sum(symbol < codewords for symbol in one.values)
+    if not one.given or not never:
+        return 0
+    # Equally likely codewords; the union of all sets of so many bounds the chance that they never occur.
+    ways = math.lgamma(codewords + 1) - math.lgamma(never + 1) - math.lgamma(codewords - never + 1)
+    given = min(one.given, link.packet.frames * link.codebook.clusters)
+    chance = ways + given * math.log1p(-never / codewords)
+    return never if chance < math.log(_BY_CHANCE) else 0
 
 
 class RunTally:

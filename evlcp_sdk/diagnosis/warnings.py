@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, count_missing_codewords
-from evlcp_sdk.diagnosis.tallies import TransmitterTally
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts
+from evlcp_sdk.diagnosis.tallies import TransmitterTally, count_missing_codewords
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import alike_links
 from evlcp_sdk.spelling import counted
