@@ -61,10 +61,8 @@ TWO_COLUMNS = {"rows": 24, "columns": 2, "led_pitch_m": 0.04, "cluster_rows": 3}
 
 LINKS: dict[str, Settings] = {
     "5 kchip/s": {"air.chip_rate_hz": 5000.0},
-    "8 kchip/s": {"air.chip_rate_hz": 8000.0},
     "20 kchip/s": {"air.chip_rate_hz": 20_000.0},
     "4 clusters": column(4, 6),
-    "8 clusters": column(8, 6),
     "32 clusters": column(32, 3),
     "a panel": {f"bar.{key}": value for key, value in PANEL.items()},
     "two columns": {f"bar.{key}": value for key, value in TWO_COLUMNS.items()},
