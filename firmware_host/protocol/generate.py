@@ -389,35 +389,31 @@ _MARK = "<!-- What follows is generated from protocol.toml by firmware_host.prot
 
 
 def markdown(definition: dict[str, Any]) -> str:
-    """The messages and numbers as Markdown tables."""
-    out = ["", "## Messages", ""]
-    out += ["| type | message | kind | meaning |", "|---|---|---|---|"]
-    for m, _, _ in _messages(definition):
-        out.append(f"| 0x{m['type']:02x} | [{m['name'].upper()}](#{m['name']}) | {m['kind']} | {m['doc']} |")
+    """The messages and numbers as Markdown, their fields and values as columns."""
+    out = ["", "## Messages"]
     for m, request, reply in _messages(definition):
-        out += ["", f"### {m['name'].upper()}", "", m["doc"], ""]
-        if not request and not reply:
-            out.append("Request and reply are empty.")
-            continue
-        out += ["| | field | type | meaning |", "|---|---|---|---|"]
+        out += ["", f"### {m['name'].upper()}", "", f"0x{m['type']:02x}, {m['kind']}. {m['doc']}"]
+        rows = []
         for kind, fields in (("request", request), ("reply", reply)):
             for f in fields:
                 many = f"[{f.count}]" if f.count > 1 else ""
-                rest = ", the rest" if f.base == "bytes" and not f.count else ""
+                rest = " to the end" if f.base == "bytes" and not f.count else ""
                 later = f" Since {definition['protocol']['major']}.{f.since}." if f.since else ""
-                out.append(f"| {kind} | `{f.name}` | {f.base}{many}{rest} | {f.doc}{later} |")
+                first = "" if f is not fields[0] else kind
+                rows.append((first, f.name, f"{f.base}{many}{rest}", f"{f.doc}{later}"))
+        if rows:
+            out += ["", *_columns(rows)]
     for name, table in definition["enums"].items():
-        out += [
-            "",
-            f"## Numbers of {name}",
-            "",
-            table["doc"],
-            "",
-            "| value | name | meaning |",
-            "|---|---|---|",
-        ]
-        out += [f"| {e['value']} | {k.upper()} | {e['doc']} |" for k, e in table.items() if k != "doc"]
+        out += ["", f"## Numbers of {name}", "", table["doc"], ""]
+        out += _columns([(str(e["value"]), k.upper(), e["doc"]) for k, e in table.items() if k != "doc"])
     return "\n".join([*out, ""])
+
+
+def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
+    """A fenced block of left-aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+    return ["```text", *lines, "```"]
 
 
 def generated_files() -> dict[Path, str]:
