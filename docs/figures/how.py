@@ -1,4 +1,4 @@
-"""The pictures of docs/how: real output of the receiver on the recording that comes with the package.
+"""The pictures of docs/how.md: real output of the receiver on the recording that comes with the package.
 
     python docs/figures/how.py docs/images
 

@@ -33,6 +33,7 @@ ROOT = Path(__file__).parents[2]
 PAGES = (
     "index",
     "quickstart",
+    "how",
     "cli",
     "outputs",
     "messages",
@@ -44,7 +45,6 @@ PAGES = (
     "campaigns",
     "compare",
     "paper",
-    "rates",
     "roles",
     "air-interface",
     "uart",
@@ -58,7 +58,6 @@ FILES = [
     ROOT / "README.md",
     ROOT / "CONTRIBUTING.md",
     *(ROOT / "docs" / f"{page}.md" for page in PAGES),
-    *sorted((ROOT / "docs" / "how").glob("*.md")),
 ]
 HOOKS = [name for name in vars(hookspecs) if name.startswith("evlcp_")]
 
