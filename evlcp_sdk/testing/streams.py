@@ -84,7 +84,7 @@ def _any_split(subject: Subject) -> None:
     cuts = {
         "all at once": [],
         "at random": np.sort(rng.integers(1, last, 200)).tolist(),
-        "every 137 us": range(137, last, 137),
+        "every 437 us": range(437, last, 437),
     }
     for how, until_us in cuts.items():
         got = feed(machine, events, [*until_us, last + _FLUSH_US])

@@ -51,7 +51,7 @@ def compare_and_film(folder: Path, links: list[Path], score: dict[str, Any]) -> 
         total = row.measured.statistics.total()
         assert total.frames_found == sum(bar["frames_found"] for bar in score["bars"])
         assert (total.bit_errors, row.measured.statistics.unmatched) == (0, 0)
-    assert table.bound_m.count == 0
+    assert table.bounds_m == ()
     told = film(folder / "two.raw", folder / "two.webp", links, for_ms=2.0, longest_px=200)
     assert len(told["transmitters"]) == 2
 
