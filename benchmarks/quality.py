@@ -22,9 +22,9 @@ from scipy.stats import binom
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, truth_of
-from evlcp_sdk.study.campaign.task import plan_of
 from evlcp_sdk.study.frames import given
 from evlcp_sdk.study.match import match
+from evlcp_sdk.study.task import plan_of
 from evlcp_sdk.values import Events
 
 CAMPAIGN = Path(__file__).parents[1] / "examples" / "campaigns" / "road.toml"

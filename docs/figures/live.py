@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--at-s", type=float, default=0.3, help="of the recording's time")
     given = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).parents[2]))
-    from tests.unit.study.campaign.browser import Browser
+    from tests.unit.study.browser import Browser
 
     links, outlet, sites = load_links(None), Outlet(), load_sites(given.sites)
     attitude = AttitudeLog.read(given.attitude)

@@ -23,10 +23,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
 from evlcp_sdk.sim import Scene, simulate, truth_of
-from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import summarize
-from evlcp_sdk.study.campaign.task import plan_of
+from evlcp_sdk.study.store import Store
+from evlcp_sdk.study.summary import summarize
 from evlcp_sdk.study.tally import Statistics, Tally
+from evlcp_sdk.study.task import plan_of
 from evlcp_sdk.values import Events
 
 ROOT = Path(__file__).parents[2]

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from evlcp_sdk.cli._common import complain, console
 
 if TYPE_CHECKING:
-    from evlcp_sdk.study.campaign.collect import Progress
+    from evlcp_sdk.study.collect import Progress
 
 __all__ = ["progress_bar", "show_faults"]
 

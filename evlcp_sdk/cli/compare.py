@@ -16,8 +16,8 @@ from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
-    from evlcp_sdk.study.compare.table import Comparison, Table
-    from evlcp_sdk.study.compare.variants import Variant
+    from evlcp_sdk.study.comparison import Comparison, Table
+    from evlcp_sdk.study.variants import Variant
 
 __all__ = ["compare", "register"]
 
@@ -123,9 +123,9 @@ def _is_campaign(url: str) -> bool:
 
 
 def _of_results(path: Path) -> Comparison:
-    from evlcp_sdk.study.campaign.store import Store
-    from evlcp_sdk.study.campaign.summary import summarize
-    from evlcp_sdk.study.compare.campaigns import of_campaign
+    from evlcp_sdk.study.comparison import of_campaign
+    from evlcp_sdk.study.store import Store
+    from evlcp_sdk.study.summary import summarize
 
     with Store(path) as store:
         return of_campaign(summarize(store))
@@ -140,8 +140,8 @@ def _of_recordings(
 ) -> tuple[int, Comparison]:
     from evlcp_sdk.errors import InterruptedRunError
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.study.compare.recordings import comparison_of
-    from evlcp_sdk.study.compare.variants import load_variants
+    from evlcp_sdk.study.compare import comparison_of
+    from evlcp_sdk.study.variants import load_variants
 
     if not texts:
         raise typer.BadParameter("name at least one, e.g. --variant paper:", param_hint="--variant")
@@ -170,7 +170,7 @@ def _of_recordings(
 
 def _run(job: CompareJob, *, variants: tuple[Variant, ...]) -> Table:
     """Compare the variants on one recording, here or in a worker."""
-    from evlcp_sdk.study.compare.recordings import compare_recording
+    from evlcp_sdk.study.compare import compare_recording
 
     with _bar(job) as advance:
         return compare_recording(job.url, variants, advance=advance)

@@ -14,7 +14,7 @@ from evlcp_sdk.plugin.hooks import hookimpl
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from evlcp_sdk.study.campaign.summary import Summary
+    from evlcp_sdk.study.summary import Summary
     from evlcp_sdk.values import Frame
 
 __all__ = ["demo", "demo_campaign", "demo_files", "register"]
@@ -80,11 +80,11 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import Outputs, output_fault
     from evlcp_sdk.study.campaign.charts import charts_of, save_charts
-    from evlcp_sdk.study.campaign.collect import collect
     from evlcp_sdk.study.campaign.report import page
-    from evlcp_sdk.study.campaign.store import Store
-    from evlcp_sdk.study.campaign.summary import summarize
-    from evlcp_sdk.study.campaign.task import plan_of, run_job
+    from evlcp_sdk.study.collect import collect
+    from evlcp_sdk.study.store import Store
+    from evlcp_sdk.study.summary import summarize
+    from evlcp_sdk.study.task import plan_of, run_job
 
     plan = plan_of(demo_campaign())
     if not as_json:
@@ -128,8 +128,8 @@ def show_drive(summary: Summary) -> None:
     """Print wrong bits, BER with 95 % confidence, and RMSE of each segment of distance beside the paper's."""
     from rich.table import Table
 
-    from evlcp_sdk.study.campaign.summary import beside_paper
     from evlcp_sdk.study.intervals import measure
+    from evlcp_sdk.study.summary import beside_paper
     from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
     (series,) = summary.series

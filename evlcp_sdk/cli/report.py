@@ -11,7 +11,7 @@ from evlcp_sdk.cli._common import Json, console, echo
 from evlcp_sdk.cli._tables import print_table
 
 if TYPE_CHECKING:
-    from evlcp_sdk.study.campaign.summary import Summary
+    from evlcp_sdk.study.summary import Summary
     from evlcp_sdk.study.tally import Tally
 
 __all__ = ["register", "report", "show_paper", "show_positions", "show_series"]
@@ -55,8 +55,8 @@ def report(
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.study.campaign.charts import charts_of, save_charts
     from evlcp_sdk.study.campaign.report import page
-    from evlcp_sdk.study.campaign.store import Store
-    from evlcp_sdk.study.campaign.summary import summarize
+    from evlcp_sdk.study.store import Store
+    from evlcp_sdk.study.summary import summarize
 
     if markdown and as_json:
         raise typer.BadParameter("give one of --markdown and --json", param_hint="--json")
@@ -163,7 +163,7 @@ def _positions_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
 
 def _paper_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
     from evlcp_sdk.study.campaign.report import comparison_rows
-    from evlcp_sdk.study.campaign.summary import beside_paper
+    from evlcp_sdk.study.summary import beside_paper
 
     rows = [list(row) for row in comparison_rows(beside_paper(summary.series))]
     return ["figure", "distance", "series", "paper", "here", "95 %", "verdict"], rows

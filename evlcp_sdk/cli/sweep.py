@@ -60,9 +60,9 @@ def sweep(
     from dataclasses import asdict
 
     from evlcp_sdk.errors import InterruptedRunError
-    from evlcp_sdk.study.campaign.collect import collect, progress_of
-    from evlcp_sdk.study.campaign.store import Store
-    from evlcp_sdk.study.campaign.task import plan_of, run_job
+    from evlcp_sdk.study.collect import collect, progress_of
+    from evlcp_sdk.study.store import Store
+    from evlcp_sdk.study.task import plan_of, run_job
 
     plan = plan_of(campaign, overrides or [])
     path = out or Path(f"{plan.name}.sqlite")

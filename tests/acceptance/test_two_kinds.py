@@ -19,11 +19,11 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes, load_sites
 from evlcp_sdk.sim.truth import read_truth
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.study.compare.recordings import compare_recording
-from evlcp_sdk.study.compare.variants import load_variants
+from evlcp_sdk.study.compare import compare_recording
 from evlcp_sdk.study.frames import frames_of, read_frames
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.score import links_of_result, score_frames
+from evlcp_sdk.study.variants import load_variants
 
 LAMP = """
 [bar]

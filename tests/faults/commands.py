@@ -21,17 +21,17 @@ from matplotlib.figure import Figure
 
 import evlcp_sdk.report.figures
 import evlcp_sdk.run
-import evlcp_sdk.study.campaign.task as task
+import evlcp_sdk.study.task as task
 from evlcp_sdk.cli.main import main
 from evlcp_sdk.errors import EvlcpError, InputError
 from evlcp_sdk.files import STAGE_PREFIX, read_json
 from evlcp_sdk.io.open import write_events
 from evlcp_sdk.results.folder import check_result_file, read_summary
-from evlcp_sdk.study.campaign.collect import collect
-from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.jobs import Inline
+from evlcp_sdk.study.store import Store
 from evlcp_sdk.values import Events, Packet
-from tests.unit.study.campaign.fake import fake_plan, run_fake
+from tests.unit.study.fake import fake_plan, run_fake
 
 HOW = ("fails", "dies", "stays full")
 

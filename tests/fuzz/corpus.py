@@ -24,10 +24,10 @@ from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import load_sites
 from evlcp_sdk.sim.scene import load_scene
 from evlcp_sdk.sim.truth import read_truth
-from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import summarize
-from evlcp_sdk.study.campaign.task import plan_of
 from evlcp_sdk.study.frames import read_frames
+from evlcp_sdk.study.store import Store
+from evlcp_sdk.study.summary import summarize
+from evlcp_sdk.study.task import plan_of
 from evlcp_sdk.values import Events, Triggers
 from firmware_host.board.bank import read_masks
 from firmware_host.board.fleet import read_inventory

@@ -14,12 +14,12 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.study.campaign.collect import collect
-from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.jobs import Inline
+from evlcp_sdk.study.store import Store
 from tests.fuzz.corpus import Kind, kinds
 from tests.fuzz.mutate import damaged
-from tests.unit.study.campaign.fake import fake_plan, run_fake
+from tests.unit.study.fake import fake_plan, run_fake
 
 NAMES = (
     *(

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 import evlcp_sdk
-from tests.unit.study.campaign.browser import CHROMIUM, Browser
+from tests.unit.study.browser import CHROMIUM, Browser
 
 ROOT = Path(__file__).parents[2]
 

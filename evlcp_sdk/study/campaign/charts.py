@@ -14,9 +14,9 @@ from evlcp_sdk.files import Outputs, output_fault
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
 from evlcp_sdk.report.figures import plain
 from evlcp_sdk.report.markup import escape
-from evlcp_sdk.study.campaign.paper import PAPER_NAME, Measure
-from evlcp_sdk.study.campaign.summary import Series, Summary, reference_marks
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure
+from evlcp_sdk.study.paper import PAPER_NAME, Measure
+from evlcp_sdk.study.summary import Series, Summary, reference_marks
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
 
 __all__ = ["Chart", "Dot", "Line", "Mark", "charts_of", "decades", "draw", "save_charts"]

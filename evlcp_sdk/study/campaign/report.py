@@ -13,10 +13,10 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.report.markup import Markup, details, document, escape, table, tiles
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.study.campaign.charts import Chart, Line, charts_of, decades
-from evlcp_sdk.study.campaign.paper import PAPER_NAME
-from evlcp_sdk.study.campaign.plan import digest_of
-from evlcp_sdk.study.campaign.summary import AGREEMENT, PaperComparison, Series, Summary, beside_paper
 from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
+from evlcp_sdk.study.paper import PAPER_NAME
+from evlcp_sdk.study.plan import digest_of
+from evlcp_sdk.study.summary import AGREEMENT, PaperComparison, Series, Summary, beside_paper
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
 __all__ = ["POSITION_HEAD", "comparison_rows", "page", "position_rows", "title_of"]

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.sim import read_truth
-from evlcp_sdk.study.campaign.collect import collect
-from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.jobs import Inline
-from tests.unit.study.campaign.fake import fake_plan, run_fake
+from evlcp_sdk.study.store import Store
+from tests.unit.study.fake import fake_plan, run_fake
 
 Evlcp = Callable[..., Any]
 REC_WH8 = (

@@ -12,18 +12,18 @@ from evlcp_sdk.cli.report import as_markdown
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.study.campaign.charts import charts_of, save_charts
-from evlcp_sdk.study.campaign.collect import collect
-from evlcp_sdk.study.campaign.paper import PAPER
-from evlcp_sdk.study.campaign.plan import Case, Job, Plan, make_plan
 from evlcp_sdk.study.campaign.report import POSITION_HEAD, page, position_rows, title_of
-from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import Series, Summary, beside_paper, summarize, verdict_of
-from evlcp_sdk.study.compare.campaigns import of_campaign
+from evlcp_sdk.study.collect import collect
+from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
+from evlcp_sdk.study.paper import PAPER
+from evlcp_sdk.study.plan import Case, Job, Plan, make_plan
+from evlcp_sdk.study.store import Store
+from evlcp_sdk.study.summary import Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.report.test_markup import HOSTILE, Elements
-from tests.unit.study.campaign.browser import CHROMIUM, Browser
-from tests.unit.study.campaign.fake import run_fake
+from tests.unit.study.browser import CHROMIUM, Browser
+from tests.unit.study.fake import run_fake
 
 TWO = "two clusters <!--<script>"
 """In a script element, such a name would keep its end tag from ending it."""

@@ -10,10 +10,10 @@ from typing import Any
 
 import pytest
 
-from evlcp_sdk.study.campaign.collect import collect
-from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.jobs import Inline
-from tests.unit.study.campaign.fake import fake_plan, run_fake
+from evlcp_sdk.study.store import Store
+from tests.unit.study.fake import fake_plan, run_fake
 
 Evlcp = Callable[..., Any]
 

@@ -24,7 +24,7 @@ from evlcp_sdk.report.diagnosis_page import page
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import SimulatedSource, simulate
 from evlcp_sdk.values import Events
-from tests.unit.study.campaign.browser import CHROMIUM, Browser
+from tests.unit.study.browser import CHROMIUM, Browser
 
 LINK = load_link()
 

@@ -35,7 +35,7 @@ from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Events, Fix, ReceivedMessage, Triggers
 from tests.unit.report.test_markup import HOSTILE
 from tests.unit.results.test_positions import SITE, packets
-from tests.unit.study.campaign.browser import CHROMIUM, Browser
+from tests.unit.study.browser import CHROMIUM, Browser
 
 websockets = pytest.importorskip("websockets", reason="the extra live is not installed")
 from websockets.exceptions import ConnectionClosedError, InvalidStatus  # noqa: E402

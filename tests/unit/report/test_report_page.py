@@ -23,7 +23,7 @@ from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
 from tests.unit.report.test_markup import HOSTILE, Elements
 from tests.unit.results.test_positions import ATTITUDE, SITE, packets
-from tests.unit.study.campaign.browser import CHROMIUM, Browser
+from tests.unit.study.browser import CHROMIUM, Browser
 
 LINK = load_link()
 SUMMARY: dict[str, Any] = {

@@ -18,10 +18,10 @@ from evlcp_sdk.plugin.roles import Modulation
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, truth_of
 from evlcp_sdk.specs import toml_value
-from evlcp_sdk.study.campaign.task import plan_of
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
+from evlcp_sdk.study.task import plan_of
 from evlcp_sdk.values import Events
 
 Evlcp = Callable[..., Any]

@@ -9,8 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.study.campaign.plan import Case, Job, Plan, StopRule, make_plan
 from evlcp_sdk.study.jobs import Processes
+from evlcp_sdk.study.plan import Case, Job, Plan, StopRule, make_plan
 from evlcp_sdk.study.tally import Statistics, Tally
 
 
@@ -62,8 +62,8 @@ def fake_statistics(scene: int, link: int, seed: int) -> Statistics:
 
 def main(store: str, workers: str, scenes: str, links: str, seeds: str, seconds: str) -> None:
     """The process that the kill tests kill."""
-    from evlcp_sdk.study.campaign.collect import collect
-    from evlcp_sdk.study.campaign.store import Store
+    from evlcp_sdk.study.collect import collect
+    from evlcp_sdk.study.store import Store
 
     plan = fake_plan(int(scenes), int(links), int(seeds), seconds=float(seconds))
     with Store(Path(store), create=True) as file:

@@ -11,11 +11,11 @@ from evlcp_sdk.cli.demo import demo_campaign
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.sim.scene import links_of
-from evlcp_sdk.study.campaign.plan import Job
-from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import summarize
-from evlcp_sdk.study.campaign.task import plan_of, run_job
 from evlcp_sdk.study.jobs import Inline
+from evlcp_sdk.study.plan import Job
+from evlcp_sdk.study.store import Store
+from evlcp_sdk.study.summary import summarize
+from evlcp_sdk.study.task import plan_of, run_job
 from tests.conftest import ROOT
 
 Evlcp = Callable[..., Any]

@@ -19,12 +19,11 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim.truth import Truth, read_truth, truth_path
 from evlcp_sdk.stopwatch import Stopwatch
 from evlcp_sdk.study.bound import frame_bound
-from evlcp_sdk.study.compare.measured import STAGES, Measured, Times
-from evlcp_sdk.study.compare.table import Comparison, Row, Table, total_of
-from evlcp_sdk.study.compare.variants import Variant
+from evlcp_sdk.study.comparison import STAGES, Comparison, Measured, Row, Table, Times, total_of
 from evlcp_sdk.study.frames import GivenFrame, frames_of
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import statistics_of, without_truth
+from evlcp_sdk.study.variants import Variant
 from evlcp_sdk.values import Events, FrameView, Range
 
 __all__ = ["compare_recording", "comparison_of"]

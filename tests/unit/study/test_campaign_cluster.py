@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import ConfigError, EvlcpError
-from evlcp_sdk.study.campaign.collect import Counted, Progress, collect
-from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.collect import Counted, Progress, collect
 from evlcp_sdk.study.jobs import DaskCluster, Inline
+from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics
 from tests.conftest import ROOT
-from tests.unit.study.campaign.fake import fake_plan, run_fake
+from tests.unit.study.fake import fake_plan, run_fake
 
 QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 

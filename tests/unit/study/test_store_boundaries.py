@@ -15,17 +15,16 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.study.campaign.charts import charts_of
-from evlcp_sdk.study.campaign.collect import collect
-from evlcp_sdk.study.campaign.plan import Case, make_plan
 from evlcp_sdk.study.campaign.report import page
-from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import Summary, summarize
-from evlcp_sdk.study.compare.campaigns import of_campaign
-from evlcp_sdk.study.compare.table import Comparison
+from evlcp_sdk.study.collect import collect
+from evlcp_sdk.study.comparison import Comparison, of_campaign
 from evlcp_sdk.study.jobs import Inline
+from evlcp_sdk.study.plan import Case, make_plan
+from evlcp_sdk.study.store import Store
+from evlcp_sdk.study.summary import Summary, summarize
 from tests.unit.mutants import mutants, refusal
 from tests.unit.report.test_markup import HOSTILE, Elements
-from tests.unit.study.campaign.fake import fake_plan, run_fake
+from tests.unit.study.fake import fake_plan, run_fake
 
 
 @pytest.fixture
@@ -134,7 +133,7 @@ def test_somebody_elses_folder_is_read(results: Path) -> None:
         (copied / "a.sqlite").chmod(0o444)
         code = (
             "import sys\nfrom pathlib import Path\n"
-            "from evlcp_sdk.study.campaign.store import Store\nimport os\n"
+            "from evlcp_sdk.study.store import Store\nimport os\n"
             "def read():\n    with Store(Path(sys.argv[1])) as store: return len(store.results())\n"
             # Whoever it becomes may not import anything more.
             "read(); os.setuid(65534); print(read())\n"

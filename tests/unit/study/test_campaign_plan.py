@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.study.campaign.plan import (
+from evlcp_sdk.study.plan import (
     Case,
     Plan,
     StopRule,

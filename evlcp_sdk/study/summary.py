@@ -13,11 +13,11 @@ from typing import Any, Literal
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.study.campaign.collect import Counted
-from evlcp_sdk.study.campaign.paper import PAPER, Measure, Reference
-from evlcp_sdk.study.campaign.plan import Plan
-from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.collect import Counted
 from evlcp_sdk.study.intervals import Figure, measure
+from evlcp_sdk.study.paper import PAPER, Measure, Reference
+from evlcp_sdk.study.plan import Plan
+from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
 __all__ = ["PaperComparison", "Series", "Summary", "Verdict", "beside_paper", "summarize", "verdict_of"]

@@ -4,9 +4,9 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 
-from evlcp_sdk.study.campaign.plan import Job, Plan, StopRule
-from evlcp_sdk.study.campaign.store import Store
 from evlcp_sdk.study.jobs import Executor, Fault
+from evlcp_sdk.study.plan import Job, Plan, StopRule
+from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics, Tally
 
 __all__ = ["Counted", "Progress", "RunJob", "collect", "progress_of"]

@@ -14,13 +14,13 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
-from evlcp_sdk.study.campaign.collect import Counted, Progress, collect
-from evlcp_sdk.study.campaign.plan import Plan, StopRule
-from evlcp_sdk.study.campaign.store import Store
+from evlcp_sdk.study.collect import Counted, Progress, collect
 from evlcp_sdk.study.jobs import Executor, Inline, Processes
+from evlcp_sdk.study.plan import Plan, StopRule
+from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics
 from tests.conftest import ROOT
-from tests.unit.study.campaign.fake import fake_plan, run_fake
+from tests.unit.study.fake import fake_plan, run_fake
 
 
 def collected(plan: Plan, path: Path, executor: Executor | None = None) -> tuple[Progress, list[Statistics]]:
@@ -113,7 +113,7 @@ def start(store: Path, *, seconds: float = 0.02) -> subprocess.Popen[bytes]:
     command = [
         sys.executable,
         "-m",
-        "tests.unit.study.campaign.fake",
+        "tests.unit.study.fake",
         store,
         *("2", "8", "2", "4"),
         str(seconds),

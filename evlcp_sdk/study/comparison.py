@@ -1,19 +1,122 @@
-"""The table of a comparison: columns, who is best in them, and how it is written down."""
+"""Variants of the receiver side by side: what each gave, who is best, and how it is written down."""
 
 import csv
 import io
 import json
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
+
+import numpy as np
 
 from evlcp_sdk.files import defused
 from evlcp_sdk.report.markup import Bar, Markup, bars, details, document, table
-from evlcp_sdk.study.compare.measured import STAGES, Measured, median, rms
-from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, measure
+from evlcp_sdk.stopwatch import times_real_time
+from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, Figure, measure
+from evlcp_sdk.study.summary import Series, Summary
+from evlcp_sdk.study.tally import Statistics, Tally
 
-__all__ = ["BOUND_NAME", "COLUMNS", "MARK", "Column", "Comparison", "Row", "Table", "total_of"]
+__all__ = [
+    "BOUND_NAME",
+    "COLUMNS",
+    "MARK",
+    "STAGES",
+    "Column",
+    "Comparison",
+    "Measured",
+    "Row",
+    "Table",
+    "Times",
+    "of_campaign",
+    "total_of",
+]
+
+STAGES = ("separation", "decoding", "ranging")
+"""The stages that every frame goes through, and whose time is measured."""
+
+
+@dataclass(frozen=True)
+class Times:
+    """What one variant's work took; adds over recordings.
+
+    Attributes:
+        frame_us: Time of every frame in the stages `STAGES` together, us.
+        stage_us: The same of each stage.
+        recorded_s: Duration of the recordings, s.
+        cpu_s: Processor time for reading and receiving them, as `Stopwatch` counts it, s.
+    """
+
+    frame_us: tuple[float, ...] = ()
+    stage_us: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: dict.fromkeys(STAGES, ()))
+    recorded_s: float = 0.0
+    cpu_s: float = 0.0
+
+    def __add__(self, other: "Times") -> "Times":
+        return Times(
+            self.frame_us + other.frame_us,
+            {stage: self.stage_us[stage] + other.stage_us[stage] for stage in STAGES},
+            self.recorded_s + other.recorded_s,
+            self.cpu_s + other.cpu_s,
+        )
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What one variant gave: what was counted and what it took; adds over recordings.
+
+    Attributes:
+        statistics: What was counted; without truth, nothing but rows and packets.
+        times: What it took; nothing where nobody measured.
+        recordings: By name, the tally of what shares nothing with the others: a recording, or all of a
+            campaign's with one seed.
+    """
+
+    statistics: Statistics = field(default_factory=Statistics)
+    times: Times = field(default_factory=Times)
+    recordings: Mapping[str, Tally] = field(default_factory=dict)
+
+    def __add__(self, other: "Measured") -> "Measured":
+        ours, theirs = self.recordings, other.recordings
+        together = {name: ours.get(name, Tally()) + theirs.get(name, Tally()) for name in {**ours, **theirs}}
+        return Measured(self.statistics + other.statistics, self.times + other.times, together)
+
+    @cached_property
+    def tally(self) -> Tally:
+        """The tally of all distances."""
+        return self.statistics.total()
+
+    @property
+    def found_share(self) -> float:
+        """Share of the sent frames that were decoded; NaN without truth."""
+        return self.tally.frames_found / self.tally.frames_sent if self.tally.frames_sent else math.nan
+
+    @cached_property
+    def ber(self) -> Figure:
+        """The bit error rate with its interval over recordings."""
+        return measure(tuple(self.recordings.values()), "ber")
+
+    @property
+    def us_per_frame(self) -> float:
+        """Time of a frame, us: the median, robust against moments in which the machine did other work."""
+        return median(self.times.frame_us)
+
+    @property
+    def times_real_time(self) -> float:
+        """Recorded time over the processor time that reading and receiving took."""
+        return times_real_time(self.times.recorded_s, self.times.cpu_s)
+
+
+def median(values: Sequence[float]) -> float:
+    """Median; NaN without values."""
+    return float(np.median(values)) if values else math.nan
+
+
+def rms(values: Sequence[float]) -> float:
+    """Root mean square; NaN without values."""
+    return float(np.sqrt(np.mean(np.square(values)))) if values else math.nan
+
 
 BOUND_NAME = "Cramer-Rao bound"
 """Name of the reference row."""
@@ -335,3 +438,44 @@ def total_of(tables: Sequence[Table], name: str = "all") -> Table:
         rows.append(Row(same[0].variant, sum((row.measured for row in same), Measured())))
     bounds_m = tuple(bound for one in tables for bound in one.bounds_m)
     return Table(name, tuple(rows), bounds_m, together=True)
+
+
+def of_campaign(summary: Summary) -> Comparison:
+    """The links of a campaign as variants, with a table per scene.
+
+    Time, which a campaign does not keep, has no column; nor is there a bound, which needs the events.
+    """
+    links: dict[str, Mapping[str, Any]] = {}
+    scenes: dict[str, list[Row]] = {}
+    for series in summary.series:
+        scene, link = _part(series, "scene.", "the scene"), _part(series, "link.", "the link")
+        settings = [
+            f"{k.removeprefix('link.')}={v}" for k, v in series.labels.items() if k.startswith("link.")
+        ]
+        identity = series.link if isinstance(series.link, Mapping) else {}
+        links[link] = {
+            "settings": settings,
+            "digest": identity.get("digest", ""),
+            "configuration": identity.get("table", {}),
+        }
+        scenes.setdefault(scene, []).append(Row(link, _measured(series)))
+    tables = [Table(name, tuple(rows)) for name, rows in scenes.items()]
+    notes = [f"campaign {summary.name}, {summary.digest}"]
+    if len({tuple(row.variant for row in table.rows) for table in tables}) > 1:
+        notes.append("not every link receives every scene, so that there is no table of all scenes")
+    elif len(tables) > 1:
+        tables.append(total_of(tables, "all scenes"))
+    if summary.done < summary.tasks:
+        notes.append(f"{summary.done} of {summary.tasks} tasks are done")
+    return Comparison(links, tuple(tables), tuple(notes), summary.plan.environment, "scene")
+
+
+def _measured(series: Series) -> Measured:
+    recordings = {f"seed {i}": one.total() for i, one in enumerate(series.recordings)}
+    return Measured(series.statistics, recordings=recordings)
+
+
+def _part(series: Series, prefix: str, otherwise: str) -> str:
+    """The name that a series has by the labels of its scene or of its link."""
+    labels = {key: value for key, value in series.labels.items() if key.startswith(prefix)}
+    return replace(series, labels=labels).name if labels else otherwise

@@ -16,7 +16,7 @@ from urllib.parse import quote
 
 from evlcp_sdk.errors import ConfigError, InputError, OutputError
 from evlcp_sdk.files import check_output
-from evlcp_sdk.study.campaign.plan import Plan, plan_from_dict
+from evlcp_sdk.study.plan import Plan, plan_from_dict
 from evlcp_sdk.study.tally import Statistics
 
 __all__ = ["Store"]

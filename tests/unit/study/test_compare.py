@@ -13,17 +13,26 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.sim.truth import truth_path
-from evlcp_sdk.study.campaign.collect import collect
-from evlcp_sdk.study.campaign.store import Store
-from evlcp_sdk.study.campaign.summary import summarize
-from evlcp_sdk.study.compare.campaigns import of_campaign
-from evlcp_sdk.study.compare.measured import STAGES, Measured, Times
-from evlcp_sdk.study.compare.recordings import _Watch
-from evlcp_sdk.study.compare.table import BOUND_NAME, COLUMNS, Comparison, Row, Table, total_of
-from evlcp_sdk.study.compare.variants import load_variants
+from evlcp_sdk.study.collect import collect
+from evlcp_sdk.study.compare import _Watch
+from evlcp_sdk.study.comparison import (
+    BOUND_NAME,
+    COLUMNS,
+    STAGES,
+    Comparison,
+    Measured,
+    Row,
+    Table,
+    Times,
+    of_campaign,
+    total_of,
+)
 from evlcp_sdk.study.jobs import Inline
+from evlcp_sdk.study.store import Store
+from evlcp_sdk.study.summary import summarize
 from evlcp_sdk.study.tally import Statistics, Tally
-from tests.unit.study.campaign.fake import fake_plan, run_fake
+from evlcp_sdk.study.variants import load_variants
+from tests.unit.study.fake import fake_plan, run_fake
 
 
 def errors(*errors_m: float) -> Tally:

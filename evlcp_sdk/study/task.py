@@ -15,10 +15,10 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
 from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.sim.world import attitude_log, rendered, sites_said
-from evlcp_sdk.study.campaign.plan import Case, Job, Plan, digest_of, load_plan
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import message_tallies, position_tallies, statistics_of
+from evlcp_sdk.study.plan import Case, Job, Plan, digest_of, load_plan
 from evlcp_sdk.study.tally import Statistics
 from evlcp_sdk.values import Packet
 
@@ -31,7 +31,7 @@ _ON_AIR = ("air", "bar", "framing", "pilots", "modulation", "error-correction")
 _OF_POSITIONS = ("position", "camera_sigma")
 """Sections of a link that a receiver does not read."""
 
-_STUDY = ("frames.py", "match.py", "measure.py", "tally.py", "campaign/task.py")
+_STUDY = ("frames.py", "match.py", "measure.py", "tally.py", "task.py")
 
 
 def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
