@@ -18,6 +18,10 @@ from pydantic.fields import FieldInfo
 from sphinx.application import Sphinx
 
 import evlcp_sdk
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import ROLES
+from evlcp_sdk.testing import laws_of
+from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -62,10 +66,13 @@ def on_site(text: str, path: Path) -> str:
 def with_reference(text: str) -> str:
     """Markdown with its lines `{names} NAME ...` and `{modules} PACKAGE` as directives of autodoc.
 
-    A line `{errors}` becomes the table of all messages.
+    A line `{errors}` becomes the table of all messages, `{laws}` that of the laws of all roles, and
+    `{parameters} ROLE` that of the role's built-in algorithms.
     """
     if re.search(r"^\{errors\}$", text, re.MULTILINE):
         text = text.replace("\n{errors}\n", as_markdown(messages()))
+    text = re.sub(r"^\{laws\}$", lambda _: _laws(), text, flags=re.MULTILINE)
+    text = re.sub(r"^\{parameters\} (\S+)$", lambda line: _parameters(line[1]), text, flags=re.MULTILINE)
     text = re.sub(r"^\{names\} (.+)$", lambda line: _names(line[1].split()), text, flags=re.MULTILINE)
     return re.sub(r"^\{modules\} (\S+)$", lambda line: _modules(line[1]), text, flags=re.MULTILINE)
 
@@ -95,13 +102,40 @@ def _modules(package: str) -> str:
     )
 
 
+def _parameters(role: str) -> str:
+    """The parameters of a role's built-in algorithms."""
+    registry = Registry.load()
+    rows = ["| algorithm | parameter | default | meaning |", "|---|---|---|---|"]
+    for entry in registry.installed(role):
+        if entry.distribution == "evlcp-sdk":
+            cls = registry.load_class(role, entry.algorithm.id)
+            meanings = _described(cls)
+            for f in dataclasses.fields(cls):
+                cells = f"`{entry.algorithm.id}`", f"`{f.name}`", json.dumps(f.default), meanings[f.name]
+                rows.append(f"| {' | '.join(cells)} |")
+    return "\n".join(rows)
+
+
+def _laws() -> str:
+    """The laws of form, then those of each role."""
+    tables = {"of form": (*DESCRIPTION, *FUNCTION, *RESULT)} | {role: laws_of(role) for role in ROLES}
+    shared = {law.name for law in tables["of form"]}
+    parts = []
+    for head, laws in tables.items():
+        parts.append(f"### {head}\n\n| law | meaning |\n|---|---|")
+        parts[-1] += "".join(
+            f"\n| `{law.name}` | {law.says} |" for law in laws if head == "of form" or law.name not in shared
+        )
+    return "\n\n".join(parts)
+
+
 def _read(app: Sphinx, page: str, source: list[str]) -> None:
     """Take a page from where its text is."""
     path = ROOT / PAGES[page] if page in PAGES else Path(app.env.doc2path(page))
     if path.suffix == ".md":
         app.env.note_dependency(path)
         app.env.note_dependency(__file__)
-        if page == "errors":
+        if page in ("errors", "roles", "conformance"):
             app.env.note_reread()
         source[0] = with_reference(on_site(path.read_text(encoding="utf-8"), path))
 

@@ -1,22 +1,20 @@
 """The docs hold: their code runs, their commands work, their links lead somewhere, nothing is left out."""
 
-import dataclasses
 import importlib
 import inspect
-import json
 import re
 import shlex
 import sys
 import tomllib
 from collections.abc import Callable
+from dataclasses import fields
 from importlib.util import find_spec
 from pathlib import Path
 from shutil import which
-from typing import Any, get_type_hints
+from typing import Any
 from xml.etree.ElementTree import fromstring
 
 import pytest
-from pydantic.fields import FieldInfo
 
 import evlcp_sdk
 from evlcp_sdk.air.signing import make_key
@@ -69,11 +67,6 @@ def blocks(path: Path, language: str) -> list[str]:
 def section_of(page: str, head: str) -> str:
     """The text under a heading of the second level."""
     return (ROOT / "docs" / f"{page}.md").read_text().split(f"\n## {head}\n")[1].split("\n## ")[0]
-
-
-def law_rows(text: str) -> list[tuple[str, str]]:
-    """Name and meaning of each law in a table."""
-    return re.findall(r"^\| `([\w-]+)` \| (.+) \|$", text, re.MULTILINE)
 
 
 def needs_compiler() -> None:
@@ -203,23 +196,8 @@ def test_every_role_has_a_section_with_its_verbs_and_algorithms(role: str) -> No
     for entry in Registry.load().installed(role):
         if entry.distribution == "evlcp-sdk":
             assert f"`{entry.algorithm.id}`" in section
-
-
-@pytest.mark.parametrize("role", ROLES)
-def test_every_parameter_of_every_built_in_is_in_the_docs(role: str) -> None:
-    section = section_of("roles", role)
-    registry = Registry.load()
-    rows = []
-    for entry in registry.installed(role):
-        if entry.distribution != "evlcp-sdk":
-            continue
-        cls = registry.load_class(role, entry.algorithm.id)
-        hints = get_type_hints(cls, include_extras=True)
-        for f in dataclasses.fields(cls):
-            (told,) = [n.description for n in hints[f.name].__metadata__ if isinstance(n, FieldInfo)]
-            rows.append(f"| `{entry.algorithm.id}` | `{f.name}` | {json.dumps(f.default)} | {told} |")
-    shown = [line for line in section.splitlines() if line.startswith("| `")]
-    assert shown == rows, f"docs/roles.md, {role}: expected these rows:\n" + "\n".join(rows)
+            if fields(Registry.load().load_class(role, entry.algorithm.id)):
+                assert f"\n{{parameters}} {role}\n" in section
 
 
 @pytest.mark.parametrize("role", ROLES)
@@ -242,18 +220,6 @@ def test_the_examples_of_every_role_keep_its_laws(role: str, workplace: Path) ->
                 assert outcome.status == "ok", f"{outcome.law.name}: {outcome.detail}"
         finally:
             sys.modules.pop(first[1], None)
-
-
-@pytest.mark.parametrize("role", ROLES)
-def test_every_law_is_in_the_docs(role: str) -> None:
-    page = (ROOT / "docs" / "conformance.md").read_text()
-    form = law_rows(page.split("\n## Laws of form\n")[1].split("\n## ")[0])
-    own = law_rows(section_of("conformance", role))
-    laws = [(law.name, law.says) for law in laws_of(role)]
-    assert own == [law for law in laws if law not in form]
-    shared = {(law.name, law.says) for law in DESCRIPTION + FUNCTION + RESULT}
-    assert len(form) == len(shared)
-    assert set(form) == shared
 
 
 def test_a_law_of_form_is_of_every_role_but_two() -> None:
