@@ -57,6 +57,7 @@ FILES = [
     ROOT / "CONTRIBUTING.md",
     *(ROOT / "docs" / f"{page}.md" for page in PAGES),
 ]
+ALL = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 HOOKS = [name for name in vars(hookspecs) if name.startswith("evlcp_")]
 
 
@@ -144,7 +145,7 @@ def test_links_of_the_examples_are_links(path: Path) -> None:
     load_link(path)
 
 
-@pytest.mark.parametrize("path", FILES, ids=lambda p: p.stem)
+@pytest.mark.parametrize("path", ALL, ids=lambda p: p.stem)
 def test_links_lead_somewhere(path: Path) -> None:
     for target in re.findall(r"\]\(([^)]+)\)", path.read_text()):
         if not target.startswith("http"):
@@ -274,9 +275,7 @@ def test_the_drawing_of_the_link_is_what_its_program_draws() -> None:
     fromstring(drawing())
 
 
-@pytest.mark.parametrize(
-    "path", [*FILES[:2], *sorted((ROOT / "docs").glob("*.md"))], ids=lambda path: path.stem
-)
+@pytest.mark.parametrize("path", ALL, ids=lambda p: p.stem)
 def test_files_of_the_repository_that_a_page_names_exist(path: Path) -> None:
     rooms = "evlcp_sdk|firmware_host|plugins|examples|tests|benchmarks|docs"
     named = set(re.findall(rf"(?<![\w/.])(?:{rooms})/[\w./-]*[\w/](?!\w)", path.read_text()))
