@@ -41,9 +41,9 @@ def received(scene: str, seeds: Iterable[int], settings: tuple[str, ...], link: 
 
 
 @pytest.mark.parametrize("link", [DEFAULT, BEST], ids=["default", "best"])
-@pytest.mark.parametrize("distance_m", [79.0, 68.0, 58.0, 48.0, 38.0])
+@pytest.mark.parametrize("distance_m", [79.0, 58.0, 38.0])
 def test_a_fast_drive_that_shakes(distance_m: float, link: tuple[str, ...]) -> None:
-    """80 km/h with twice the vibration: the bit error rate of every 10 m from 80 to 30 m."""
+    """80 km/h with twice the vibration: the bit error rate far, midway and near."""
     cut = (f"motion.distance_m={distance_m}", "duration_s=0.15")
     found = received("fast-drive", (1, 2), cut, link)
     assert found.frames_found >= 0.95 * found.frames_sent
@@ -53,7 +53,7 @@ def test_a_fast_drive_that_shakes(distance_m: float, link: tuple[str, ...]) -> N
 
 @pytest.mark.parametrize("link", [DEFAULT, BEST], ids=["default", "best"])
 def test_a_low_sun_behind_the_bar(link: tuple[str, ...]) -> None:
-    found = received("low-sun", (1, 2, 3), ("duration_s=0.15",), link)
+    found = received("low-sun", (1, 2), ("duration_s=0.15",), link)
     assert found.frames_found >= 0.95 * found.frames_sent
     assert found.ber <= 0.001
     assert found.ranged == found.frames_found

@@ -1,39 +1,69 @@
 """Distances of leaning bars by a camera that knows its attitude: sigmas that are true."""
 
-import runpy
-from collections.abc import Callable
+import math
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.sim import read_truth, truth_path
+from evlcp_sdk.sim import Simulation, read_truth, resolve_scene, truth_of, truth_path
+from evlcp_sdk.sim.world import attitude_log
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import score_frames
 from tests.conftest import ROOT
 
-BENCHMARK = ROOT / "benchmarks" / "lean.py"
 PITCHED = ROOT.parent / "shared" / "recordings" / "road" / "pitch-4deg-45m.raw"
-
-Drive = Callable[..., dict[str, np.ndarray]]
-
-
-@pytest.fixture(scope="module")
-def drive() -> Drive:
-    made: Drive = runpy.run_path(str(BENCHMARK))["drive"]
-    return made
+LINK = load_link()
+SIGMA_DEG = 0.1
 
 
-@pytest.mark.parametrize("distance_m", [30, 45, 60, 80])
-def test_a_pitched_camera_that_knows_it_has_true_sigmas(drive: Drive, distance_m: int) -> None:
+def drive(distance_m: float, row_px: float, seed: int) -> list[np.ndarray]:
+    """Errors and sigmas, (n, 2), of a camera pitched by 4 degrees: without its attitude, and with it."""
+    # Attitude and bar are off to opposite sides: by one sigma of both together.
+    off_deg = math.copysign(SIGMA_DEG / math.sqrt(2), seed % 2 - 0.5)
+    up = math.radians(4.0) - math.atan(row_px / LINK.camera.focal_px)
+    scene = resolve_scene(
+        {
+            "duration_s": 0.1,
+            "motion": {"distance_m": distance_m, "pitch_deg": 4.0},
+            "background": {"light_w_m2": 0.3},
+            "world": {"latitude_deg": 35.0, "gravity_sigma_deg": 0.0, "attitude": "gravity"},
+            "bars": [{"x_m": -0.8, "y_m": -distance_m * math.tan(up), "tilt_deg": off_deg}],
+        }
+    )
+    simulation = Simulation(scene, seed)
+    events, truth, true = (
+        [*simulation.stream()],
+        truth_of(simulation),
+        attitude_log(scene, seed, simulation.path),
+    )
+    assert true is not None
+    sigma_deg = np.full(len(true.t_us), SIGMA_DEG)
+    log = replace(true, pitch_deg=true.pitch_deg - off_deg, gravity_sigma_deg=sigma_deg)
+    found = []
+    for receiver in (Receiver(LINK), Receiver(LINK, attitude=log)):
+        packets = [packet for piece in events for packet in receiver.feed(piece)] + receiver.close()
+        frames = [f for p in packets for f in p.frames if math.isfinite(f.range.distance_m)]
+        at_us = np.array([frame.points_t_us for frame in frames]) - truth.t0_us
+        true_m = np.interp(at_us, truth.t_us, truth.bars[0].distance_m)
+        errors_m = np.array([frame.range.distance_m for frame in frames]) - true_m
+        found.append(np.stack([errors_m, [frame.range.sigma_m for frame in frames]], 1))
+    return found
+
+
+@pytest.mark.parametrize("distance_m", [30.0, 80.0])
+def test_a_pitched_camera_that_knows_it_has_true_sigmas(distance_m: float) -> None:
     """Off by a sigma to either side; in the middle of the image, and above it, where a lean counts more."""
-    drives = [drive(distance_m, 4.0, row_px, seed, 0.1) for row_px in (0.0, -200.0) for seed in (11, 12)]
-    with_it, without = (np.concatenate([d[name] for d in drives]) for name in ("with", "without"))
-    assert len(with_it) > 90
-    assert 0.5 < np.mean((with_it[:, 1] / with_it[:, 2]) ** 2) < 2
-    assert np.mean(with_it[:, 1] ** 2) < 0.25 * np.mean(without[:, 1] ** 2)
+    drives = [drive(distance_m, row_px, seed) for row_px, seed in ((0.0, 11), (-200.0, 11), (-200.0, 12))]
+    without, known = (np.concatenate(parts) for parts in zip(*drives, strict=True))
+    assert len(known) > 60
+    assert 0.5 < np.mean((known[:, 0] / known[:, 1]) ** 2) < 2
+    assert np.mean(known[:, 0] ** 2) < 0.25 * np.mean(without[:, 0] ** 2)
 
 
 @pytest.mark.skipif(not PITCHED.exists(), reason="needs ../shared/recordings, which users do not have")

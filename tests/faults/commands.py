@@ -8,7 +8,7 @@ import os
 import shutil
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import redirect_stdout, suppress
 from dataclasses import dataclass, field
 from functools import cache
@@ -34,6 +34,7 @@ from evlcp_sdk.values import Events, Packet
 from tests.unit.study.fake import fake_plan, run_fake
 
 HOW = ("fails", "dies", "stays full")
+ALL = "EVLCP_ALL_FAULTS" in os.environ
 
 SHIM: Any = ctypes.CDLL(os.environ.get("LD_PRELOAD"))
 
@@ -99,6 +100,13 @@ def held(folder: Path) -> dict[str, bytes]:
     return found
 
 
+def faults_of(calls: Sequence[str]) -> Iterator[tuple[str, int, str]]:
+    """How, where and what fails: each call in one of the ways, in turn, or in all of them."""
+    for at, call in enumerate(calls):
+        for how in HOW if ALL else (HOW[at % len(HOW)],):
+            yield how, at, call
+
+
 @dataclass
 class Trial:
     """A command over what an earlier one left.
@@ -109,7 +117,7 @@ class Trial:
         seal: The file that is there only with all the others.
         check: Raises where the folder is not what a reader takes.
         stale: Files of still earlier runs.
-        in_turn: Each call meets one kind of fault, in turn, instead of all.
+        every: Of so many faults one is tried.
         calls: What the new one calls.
     """
 
@@ -118,7 +126,7 @@ class Trial:
     seal: str
     check: Callable[[Path], None] = lambda _: None
     stale: tuple[str, ...] = ()
-    in_turn: bool = False
+    every: int = 1
     calls: tuple[str, ...] = field(default=())
 
     def faults(self, work: Path) -> Iterator[str]:
@@ -145,15 +153,12 @@ class Trial:
             states.append(held(out))
         self.calls = ended.calls
         old, new = states
-        for kind, how in enumerate(HOW):
-            for at, call in enumerate(self.calls):
-                if self.in_turn and at % len(HOW) != kind:
-                    continue
-                shutil.rmtree(out)
-                shutil.copytree(before, out)
-                ended = run(self._put(self.new, out), out, at, how)
-                for text in self._wrong(ended, out, old, new, call, how):
-                    yield f"{how} at {at} ({call}), {ended}: {text}"
+        for how, at, call in list(faults_of(self.calls))[:: 1 if ALL else self.every]:
+            shutil.rmtree(out)
+            shutil.copytree(before, out)
+            ended = run(self._put(self.new, out), out, at, how)
+            for text in self._wrong(ended, out, old, new, call, how):
+                yield f"{how} at {at} ({call}), {ended}: {text}"
 
     def _put(self, arguments: tuple[str, ...], out: Path) -> tuple[str, ...]:
         return tuple(a.replace("OUT", str(out)) for a in arguments)
@@ -240,7 +245,7 @@ def sinks(work: Path, demo: Path) -> Trial:
     place = "latitude_deg = 35.0\nlongitude_deg = 137.0\nheight_m = 2.0\nheading_deg = 0.0\n"
     site.write_text(f"[[bar]]\ntransmitter_id = 0\n{place}")
     trial = receive(work, demo, "--parquet", "--mcap", "--figures", "--report", "--sites", str(site))
-    trial.in_turn = "EVLCP_ALL_FAULTS" not in os.environ
+    trial.every = 4
     return trial
 
 
@@ -279,30 +284,29 @@ def sweep(work: Path) -> tuple[list[str], tuple[str, ...]]:
     calls = run(arguments, out).calls
     assert results() == whole
     faults = []
-    for how in HOW:
-        for at, call in enumerate(calls):
-            shutil.rmtree(out)
-            out.mkdir()
-            ended = run(arguments, out, at, how)
-            where = f"{how} at {at} ({call}), {ended}: "
-            if ended.code not in (None, 0) and (
-                ended.code != 1 or ended.err.count("\n") != 1 or ": cannot be written: " not in ended.err
-            ):
-                faults.append(where + "expected one line and exit code 1")
-            try:
-                kept = results()
-            except InputError:
-                kept = {}  # nothing was kept yet, which is said
-            if not kept.items() <= whole.items() or (ended.code == 0 and kept != whole):
-                faults.append(where + "what is kept is not true")
-            try:
-                with Store(out / "r.sqlite", create=True) as store:
-                    collect(plan, store, Inline(), run_fake)
-            except EvlcpError as fault:
-                faults.append(where + f"the same command does not go on: {fault}")
-            else:
-                if results() != whole:
-                    faults.append(where + "the same command does not give the same")
+    for how, at, call in faults_of(calls):
+        shutil.rmtree(out)
+        out.mkdir()
+        ended = run(arguments, out, at, how)
+        where = f"{how} at {at} ({call}), {ended}: "
+        if ended.code not in (None, 0) and (
+            ended.code != 1 or ended.err.count("\n") != 1 or ": cannot be written: " not in ended.err
+        ):
+            faults.append(where + "expected one line and exit code 1")
+        try:
+            kept = results()
+        except InputError:
+            kept = {}  # nothing was kept yet, which is said
+        if not kept.items() <= whole.items() or (ended.code == 0 and kept != whole):
+            faults.append(where + "what is kept is not true")
+        try:
+            with Store(out / "r.sqlite", create=True) as store:
+                collect(plan, store, Inline(), run_fake)
+        except EvlcpError as fault:
+            faults.append(where + f"the same command does not go on: {fault}")
+        else:
+            if results() != whole:
+                faults.append(where + "the same command does not give the same")
     return faults, calls
 
 

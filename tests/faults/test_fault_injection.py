@@ -1,4 +1,7 @@
-"""Each write, rename and fsync fails once, and is died in once: results are whole and true, or flagged."""
+"""Each write, rename and fsync fails once, or is died in: results are whole and true, or flagged.
+
+`EVLCP_ALL_FAULTS=1` tries every fault at every call, which takes minutes.
+"""
 
 import json
 import os

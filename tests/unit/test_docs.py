@@ -25,7 +25,6 @@ from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.sim.scene import resolve_scene
 from evlcp_sdk.testing import check, laws_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
-from tests.unit.test_layers import layer_of
 
 ROOT = Path(__file__).parents[2]
 PAGES = (
@@ -301,10 +300,3 @@ def test_the_tree_of_contributing_is_the_tree() -> None:
         if path.suffix == ".py" or (path / "__init__.py").exists()
     }
     assert rooms == {path for path in told if path.startswith("evlcp_sdk/")}
-
-
-def test_the_tree_of_contributing_goes_from_the_ground_up() -> None:
-    text = next(text for text in blocks(ROOT / "CONTRIBUTING.md", "text") if "evlcp_sdk/errors.py" in text)
-    rooms = re.findall(r"^evlcp_sdk/(\w+?)(?:/|\.py) ", text, re.MULTILINE)
-    layers = [layer_of(room) for room in rooms if room != "__init__"]
-    assert layers == sorted(layers)

@@ -87,28 +87,6 @@ def test_ctrl_c_during_imports_is_one_line(demo_raw: Path) -> None:
         assert process.wait() == 130
 
 
-def test_ctrl_c_in_a_callback_is_not_lost(tmp_path: Path) -> None:
-    """Python only reports what is raised there, as in those that imports end with."""
-    (tmp_path / "falls.py").write_text(
-        "import signal, sys, weakref\n"
-        "class Finder:\n"
-        "    def find_spec(self, name, *_):\n"
-        "        if name == 'evlcp_sdk.cli._app':\n"
-        "            last = set()\n"
-        "            gone = weakref.ref(last, lambda _: signal.raise_signal(signal.SIGINT))\n"
-        "            del last\n"
-        "sys.meta_path.insert(0, Finder())\n"
-    )
-    done = subprocess.run(
-        [sys.executable, "-c", f"import falls; {MAIN}", "info", tmp_path / "none.raw"],
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert (done.returncode, done.stderr) == (130, "evlcp: interrupted\n")
-
-
 def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
     """What it imports before it can catch an interrupt is next to nothing."""
     code = "import sys; import evlcp_sdk.cli.main; print(*sys.modules)"
@@ -159,14 +137,3 @@ def test_too_little_memory_is_no_fault_of_ours(
     monkeypatch.setattr(evlcp_sdk.io.describe, "describe", broken)
     done = evlcp("info", demo_raw)
     assert (done.code, done.err) == (1, "evlcp: not enough memory: Unable to allocate 12.9 GiB\n")
-
-
-@pytest.mark.parametrize("stream", ["stdout", "stderr"])
-def test_a_closed_stream_is_no_fault(stream: str) -> None:
-    closed = {"stdout": ">&-", "stderr": "2>&-"}[stream]
-    command = f"{sys.executable} -c '{MAIN}' config --set a=1 {closed}"
-    done = subprocess.run(
-        ["bash", "-c", command], capture_output=True, text=True, check=False, env=os.environ
-    )
-    assert done.returncode == 2
-    assert "Traceback" not in done.stderr

@@ -12,7 +12,7 @@ from evlcp_sdk.cli.report import as_markdown
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.study.campaign.charts import charts_of, save_charts
-from evlcp_sdk.study.campaign.report import POSITION_HEAD, page, position_rows, title_of
+from evlcp_sdk.study.campaign.report import POSITION_HEAD, page, position_rows
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
@@ -117,17 +117,6 @@ def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> No
     assert [p.name for p in written] == [f"{c}.{kind}" for c in CHARTS for kind in ("png", "svg")]
     for path in written:
         assert path.read_bytes().startswith((b"\x89PNG", b"<?xml"))
-
-
-def test_an_empty_campaign_has_a_page(tmp_path: Path) -> None:
-    pytest.importorskip("plotly", reason="the extra report is not installed")
-    with Store(tmp_path / "a.sqlite", create=True) as store:
-        store.adopt(plan_of_two_methods())
-        nothing = summarize(store)
-    assert "0 of 40 tasks" in page(nothing)
-    assert title_of(nothing) == "two methods </script>: nothing measured yet"
-    with Outputs() as outputs:
-        assert len(save_charts(charts_of(nothing), "nothing", tmp_path, outputs)) == 10
 
 
 def test_without_plotly(summary: Summary, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,18 +53,15 @@ def test_control_characters_are_escapes_and_the_rest_is_as_it_is() -> None:
     assert printable("\udcff\r\x7f") == r"\udcff\x0d\x7f"
 
 
-@pytest.mark.parametrize("what", ["receive", "info", "missing", "option", "command", "set", "config"])
+@pytest.mark.parametrize("what", ["receive", "missing", "option", "config"])
 def test_no_control_character_reaches_a_terminal(what: str, tmp_path: Path) -> None:
     path = tmp_path / f"a{TITLE}.raw"
     write_events(path, Events.of(np.arange(5), *np.ones((3, 5), np.int64)), 1280, 720)
     (tmp_path / "link.toml").write_text('[air]\n"chip\\u001b[31m" = 5\n')
     arguments = {
         "receive": ("receive", str(path), "-o", str(tmp_path / f"out{TITLE}")),
-        "info": ("info", str(path)),
         "missing": ("info", str(tmp_path / f"b{TITLE}.raw")),
         "option": ("info", f"--{TITLE}", str(path)),
-        "command": (f"x{TITLE}",),
-        "set": ("config", "--set", f"air.{TITLE}=5"),
         "config": ("config", "-c", str(tmp_path / "link.toml")),
     }[what]
     shown = on_a_terminal(*arguments)

@@ -96,17 +96,6 @@ def test_whole_vectors_among_other_words_equal_the_twin():
         assert {kind: (loss.count, loss.first) for kind, loss in decoder.losses.items()} == twin.losses
 
 
-def test_a_step_that_the_next_words_do_not_follow_is_not_believed():
-    words = np.array([0x8800, 0x0001, 0x2001, 0x8000, 0x2002, 0x87FF, 0x2003, 0x8000, 0x2004], "<u2")
-    events, _, decoder = decode("EVT3", words, [])
-    assert events.t_us.tolist() == [0x800000, 1 << 24, 1 << 24]
-    assert decoder.losses["time_glitches"].count == 1
-    assert decoder.losses["time_doubtful"].count == 1
-    assert decoder.counts["rollovers"] == 1
-    words = np.array([0x88000000, 0x00000001, 0x80000000, 0x00000002], "<u4")
-    assert decode("EVT2", words, [])[0].t_us.tolist() == [1 << 33, 1 << 34]
-
-
 @pytest.mark.parametrize(("name", "bits", "low"), [("EVT3", 12, 12), ("EVT2", 28, 6)])
 def test_one_flipped_bit_of_a_time_costs_its_own_events(name, bits, low, tmp_path):
     t = np.arange(0, 3_000_000, 25)

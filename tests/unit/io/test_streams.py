@@ -167,16 +167,3 @@ def test_a_loop_goes_on_with_its_clock(tmp_path: Path) -> None:
     assert got.x.tolist() == [1, 2, 3] * 3
     assert triggers.t_us.tolist() == [4500, 8500, 12500]
     assert source.counts == {"events": 9, "triggers": 3}
-
-
-def test_losses_of_all_passes_add_up(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("t_us,x,y,p\n10,1,1,1\n20,1,1,1\n,1,1,1\n30,1,1,1\n")
-    with LoopSource(lambda: open_source(tmp_path / "a.csv"), for_us=600_000) as source:
-        assert len(source.read()[0]) == 9
-        assert source.losses["rows_dropped"].count == 3
-
-
-def test_a_loop_of_nothing_ends(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("t_us,x,y,p\n")
-    with open_source(f"replay:{tmp_path / 'a.csv'}?loop=1") as source:
-        assert len(source.read()[0]) == 0

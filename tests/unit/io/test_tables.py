@@ -118,16 +118,13 @@ def npz_of_text():
 
 BAD_NPZ = {
     "empty": (b"", "found no NPZ file, expected one"),
-    "not a ZIP": (b"hello", "found no NPZ file, expected one"),
     "cut": (npz()[:-300], "found no NPZ file, expected one"),
     "a column missing": (npz(p=None), "found the arrays t_us, x, y, expected t and p"),
     "floats": (npz(x=[1.5, 2.0]), "row 1: place 1.5, expected whole numbers from 0 to 65535"),
     "objects": (npz(x=[None, 1]), r"array x: found object \(2,\), expected numbers"),
     "two dimensions": (npz(x=[[1, 2], [3, 4]]), r"array x: found int64 \(2, 2\), expected numbers"),
     "unequal lengths": (npz(y=[1]), "'y': 1.*expected one length"),
-    "scalars": (npz(t_us=1, x=1, y=1, p=1), "expected one length"),
     "x too large": (npz(x=[1, 70_000]), "row 2: place 70000, expected whole numbers from 0 to 65535"),
-    "y negative": (npz(y=[-1, 0]), "row 1: place -1, expected whole numbers from 0 to 65535"),
     "polarity": (
         npz(p=[1, 7]),
         "row 2: polarity 7 beside 1, expected 0 and 1, or -1 and 1",
@@ -146,23 +143,11 @@ BAD_NPZ = {
         "found the arrays p, t_us, trigger_t_us, x, y, expected trigger_channel too",
     ),
     "a flipped byte": (npz().replace(b"\x03\x00\x00\x00\x00", b"\x03\x00\x01\x00\x00", 1), "Bad CRC-32"),
-    "no brace": (npz_headed(header()[:-2]), "array t_us: "),
-    "no header": (npz_headed(b""), "array t_us: Cannot parse header"),
-    "a header of text": (npz_headed(header("'\0\xff'")), "array t_us: "),
     "a header of code": (npz_headed(b"__import__('os')._exit(7)\n"), "array t_us: malformed"),
-    "a header of brackets": (npz_headed(b"(" * 9000), "array t_us: "),
-    "a header without keys": (npz_headed(b"{}\n"), "array t_us: Header does not contain the correct keys"),
-    "a header of 5000 digits": (npz_headed(header(shape=f"({'9' * 5000},)")), "array t_us: Cannot parse"),
-    "rows below 0": (
-        npz_headed(header(shape="(-2,)")),
-        r"array t_us: found int64 \(-2,\), expected numbers",
-    ),
     "rows beyond memory": (
         npz_headed(header(shape=f"({'9' * 30},)")),
         "'t_us': 9{30}, .*expected one length",
     ),
-    "rows of text": (npz_headed(header(shape="('a',)")), "array t_us: shape is not valid"),
-    "a record": (npz_headed(header("[('a', '<i8')]")), "array t_us: found .*expected numbers"),
     "a pickle": (npz_headed(header("'|O'")), "array t_us: found object"),
     "no NPY in it": (npz_of_text(), "found the arrays t_us, expected t and p"),
 }
@@ -337,58 +322,9 @@ def member(name, method=zipfile.ZIP_STORED, data=None):
     return file.getvalue()
 
 
-def patched(data, name, at, value):
-    """The same with two bytes of a member's local header and of its entry in the directory."""
-    spoilt = bytearray(data)
-    for magic, offset, named in ((b"PK\x03\x04", at, 30), (b"PK\x01\x02", at + 2, 46)):
-        start = -1
-        while (start := data.find(magic, start + 1)) >= 0:
-            if data[start + named :].startswith(f"{name}.npy".encode()):
-                spoilt[start + offset : start + offset + 2] = value.to_bytes(2, "little")
-    return bytes(spoilt)
-
-
-def spoilt_lzma():
-    data = bytearray(member("x", zipfile.ZIP_LZMA))
-    at = data.find(b"x.npy") + len("x.npy")
-    data[at + 12 : at + 40] = bytes(range(28))
-    return bytes(data)
-
-
 def header(text):
     line = text.encode("latin-1") + b"\n"
     return b"\x93NUMPY\x01\x00" + len(line).to_bytes(2, "little") + line + bytes(16)
-
-
-ODD_NPZ = {
-    "encrypted": (patched(member("x"), "x", 6, 1), "array x: .*encrypted, password required"),
-    "method 93": (patched(member("x"), "x", 8, 93), "array x: .*not supported"),
-    "damaged LZMA": (spoilt_lzma(), "damaged|array x"),
-    "no width": (member("width", data=header("{'descr': '<i8', 'fortran_order': False, 'shape': (0,)}")),
-        "array width: found 0 values, expected one"),
-    "two widths": (member("width", data=header("{'descr': '<i8', 'fortran_order': False, 'shape': (2,)}")),
-        "array width: found 2 values, expected one"),
-    "fewer than none": (member("x", data=header("{'descr': '<i8', 'fortran_order': False, 'shape': (-3,)}")),
-        r"array x: found int64 \(-3,\), expected numbers"),
-    "no header": (member("x", data=header("{'descr': '<i8', 'fort")), "array x: "),
-    "a list for a header": (member("x", data=header("[1]")), "array x: "),
-    "no type": (member("x", data=header("{'descr': [[]], 'fortran_order': False, 'shape': (2,)}")),
-        "array x: "),
-    "brackets": (member("x", data=header("(" * 5000)), "array x: "),
-    "zeros": (member("x", data=header("\0" * 60)), "array x: "),
-    "a long header": (member("x", data=header(" " * 60_000)), "array x: "),
-}  # fmt: skip
-
-
-@pytest.mark.parametrize(("data", "says"), ODD_NPZ.values(), ids=ODD_NPZ.keys())
-def test_odd_npz_is_one_line(data, says, tmp_path):
-    path = tmp_path / "a.npz"
-    path.write_bytes(data)
-    with pytest.raises(InputError, match=says) as caught:
-        read_events(path)
-    assert str(caught.value).startswith(f"{path}: ")
-    assert "\n" not in str(caught.value)
-    assert len(str(caught.value)) < 400
 
 
 def stretch(first_us, many=400, step_us=100):

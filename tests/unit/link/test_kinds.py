@@ -11,16 +11,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.air.blocks import Block, BlockError, Kind, Message, split
+from evlcp_sdk.air.blocks import BlockError, Kind, Message
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, Countdown, CountdownKind, MessageKind, TimeKind
-from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
+from evlcp_sdk.errors import ConfigError, PluginWarning
 from evlcp_sdk.link.compose import compose, packets_of
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.records import message_kinds
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.sim import load_scene
@@ -84,15 +83,6 @@ def test_what_a_kind_does_not_understand_is_counted_once_and_ends_nothing() -> N
     found, counts = heard([Message(15, 3, 9, b"abc")] * 2 + [Message(15, 3, 10, bytes(8))], LINK)
     assert [m.value for m in found] == [(0.0, 0.0)]
     assert (counts["messages_undecodable"], counts["messages"]) == (1, 1)
-
-
-def test_the_number_is_what_the_header_says() -> None:
-    block = next(iter(split(Message(15, 3, 9, bytes(8)), bytes(4), 40))).pack(40)
-    assert block[0] == 0x1F
-    assert Block.unpack(block, LINK.kinds).kind == 15
-    for number in (0, 16, -1):
-        with pytest.raises(ConfigError, match=f"kind = {number}, expected 1 to 15"):
-            Message(number, 3, 9, b"a")
 
 
 def test_the_kinds_go_with_the_link() -> None:
@@ -181,14 +171,3 @@ def test_of_two_kinds_of_one_number_one_stays() -> None:
         kinds = message_kinds(registry)
     assert len(kinds) == 7
     assert len(registry.broken) == 1
-
-
-def test_a_kind_cannot_change_what_every_message_says() -> None:
-    for shown, told in (
-        ({"trust": "verified"}, "shows 'trust'"),
-        ({"a": {1}}, r"to_dict\(\) fails: TypeError"),
-    ):
-        _, kind = bring(9, "odd", shown)
-        message = ReceivedMessage(0, 0, 0.0, Message(9, 1, 1, b"a"), kind, None, "unverified", "not signed")
-        with pytest.raises(PluginError, match=told):
-            message_line(message)

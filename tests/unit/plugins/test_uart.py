@@ -94,7 +94,7 @@ def test_bright_light_is_read_without_an_error(
     bit_hz: float, clock: float, mark_on: bool, late_us: tuple[float, float]
 ) -> None:
     rng = np.random.default_rng(3)
-    sent = rng.integers(0, 128, 150)
+    sent = rng.integers(0, 128, 60)
     bit_us = 1e6 / bit_hz * (1 + clock)
     events = seen(
         rng,
@@ -142,7 +142,7 @@ def test_times_that_are_coarse_are_read_in_any_pieces(
     rate_hz: float, events: tuple[float, float], late_us: tuple[float, float], grain_us: int
 ) -> None:
     """As a list rounds them, or a camera reads its events out in bunches that shift against the bits."""
-    sent = np.random.default_rng(1).integers(0, 128, 120)
+    sent = np.random.default_rng(1).integers(0, 128, 60)
     bit_us = 1e6 / rate_hz * 1.002
     light = seen(
         np.random.default_rng(9), levels_of(sent, 7, "even", 2), bit_us, events=events, late_us=late_us
@@ -177,7 +177,7 @@ def test_events_are_spread_evenly_and_none_is_lost() -> None:
         assert np.abs(np.cumsum(found[0]) - box)[:-ticks].max() < 1.01
 
 
-@pytest.mark.parametrize("seed", [12, 22])
+@pytest.mark.parametrize("seed", [12])
 def test_light_of_which_the_best_guess_is_an_illusion_is_read(seed: int) -> None:
     """Falls late by a fifth of a bit: characters a bit late explain more events, but no stop bits."""
     text = b"Shall I compare thee to a summers day? Thou art more lovely and more temperate: rough winds do "
@@ -225,7 +225,7 @@ def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet()
     # From the last data bit of the 35 on.
     cut_bits = 16 + 3 * 11 + 8.7
     for pause_bits in (16, 9):
-        for seed in range(3):
+        for seed in range(1):
             events = seen(
                 np.random.default_rng(seed),
                 levels,
@@ -247,7 +247,7 @@ def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet()
 )
 def test_any_format_is_read(data_bits: int, parity: Parity, stop_bits: int) -> None:
     rng = np.random.default_rng(data_bits)
-    sent = rng.integers(0, 1 << data_bits, 80)
+    sent = rng.integers(0, 1 << data_bits, 50)
     levels = levels_of(sent, data_bits, parity, stop_bits)
     uart = Uart(data_bits, parity, stop_bits)
     book = uart.codebook(1)
@@ -267,7 +267,7 @@ def dim(events: tuple[float, float], unseen: float, many: int) -> tuple[np.ndarr
 
 
 DIM_BIT_US = 323.2
-DIM = [((2.5, 2.0), 0.0, 300), ((4.0, 3.0), 0.03, 500), ((8.0, 6.0), 0.01, 300)]
+DIM = [((2.5, 2.0), 0.0, 120), ((4.0, 3.0), 0.03, 300), ((8.0, 6.0), 0.01, 150)]
 
 
 @pytest.mark.parametrize(("events", "unseen", "many"), DIM)
@@ -313,7 +313,7 @@ def test_errors_are_those_of_a_receiver_that_knows_the_light(
 
 def test_llrs_tell_the_truth() -> None:
     sent, _, found = dim(*DIM[1])
-    assert len(found) == 500
+    assert len(found) == 300
     right = np.array([c.value for c in found]) == sent
     quality = np.array([c.quality for c in found])
     assert quality.mean() == pytest.approx(right.mean(), abs=0.05)
@@ -563,7 +563,7 @@ def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) 
 
 @pytest.mark.parametrize(
     ("data_bits", "parity", "stop_bits", "bit_hz"),
-    [(7, "even", 2, 3125.0), (8, "none", 1, 504.0), (5, "none", 2, 10_000.0)],
+    [(7, "even", 2, 3125.0), (8, "none", 1, 504.0)],
 )
 @pytest.mark.parametrize("mark_on", [True, False])
 def test_a_light_the_other_way_round_is_read_as_it_is(

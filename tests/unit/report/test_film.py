@@ -100,15 +100,6 @@ def test_what_is_shown_holds_the_bars_and_stays_in_the_image() -> None:
     assert plan().pictures == pictures_of(20, 400) == 20e-3 * 400 * 25
 
 
-def test_events_of_a_small_picture_are_not_lost() -> None:
-    shown = Film(0.0, 100.0, 1, 0, 0, 1280, 720, 0.5, 400.0)
-    events = Events.of([1, 2, 3], [0, 641, 1279], [0, 301, 719], [1, 0, 1])
-    (picture,) = draw_film(shown, [events, Events.of([100], [0], [0], [0])], [], [], LINKS, {})
-    found = np.argwhere(kinds(picture)[:, :600])
-    assert [0, 0] in found.tolist()
-    assert [150, 320] in found.tolist()
-
-
 def test_a_film_of_a_recording(evlcp: Callable[..., Any], demo_raw: Path, tmp_path: Path) -> None:
     for name, pictures, more in (
         ("a.webp", 10, ("--for-ms", "1")),
@@ -152,12 +143,6 @@ def test_a_film_for_programs_that_play_no_pictures(tmp_path: Path) -> None:
     for picture, read in zip(drawn, again, strict=True):
         off = np.abs(read[:83, :93].astype(int) - np.asarray(picture.convert("RGB")).astype(int))
         assert off.mean() < 12
-
-
-def test_a_film_asks_for_its_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr("evlcp_sdk.report.film.find_spec", lambda name: None)
-    with pytest.raises(ConfigError, match=r"pip install 'evlcp-sdk\[mp4\]'"):
-        film(tmp_path / "never read.raw", tmp_path / "a.mp4", LINK)
 
 
 def test_what_cannot_be_filmed(demo_raw: Path, tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ import pytest
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.navigator import PositionPlan
-from evlcp_sdk.report.motion import Motion, MotionProbe, cluster_map
+from evlcp_sdk.report.motion import Motion, cluster_map
 from evlcp_sdk.report.page import Report
-from evlcp_sdk.report.plots import Plot, ellipse
+from evlcp_sdk.report.plots import Plot
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
@@ -144,28 +144,6 @@ def test_a_picture_is_bounded_whatever_its_size() -> None:
     top, left = rows.min() - 3, columns.min() - 3
     height, width = cut.clusters.shape
     assert (cut.sums == small.sums[:, top : top + height, left : left + width]).all()
-
-
-def test_the_first_and_the_largest_frames_of_some_transmitters_are_kept() -> None:
-    probe = MotionProbe(most=2)
-    for number, (height, transmitter) in enumerate([(40, 0), (60, 0), (50, 0), (40, 1), (80, 2)]):
-        view = view_of(height, 24)
-        probe.evlcp_stage_finished("view", view)
-        probe.evlcp_stage_finished("frame", frame_of(view, number, transmitter))
-        # A frame without a pilot has no view.
-        probe.evlcp_stage_finished("frame", frame_of(view, 100 + number, transmitter))
-    assert [(m.frame.transmitter, m.frame.frame) for m in probe.motions()] == [(0, 0), (0, 1), (1, 3)]
-
-
-def test_an_ellipse_holds_its_share() -> None:
-    rng = np.random.default_rng(2)
-    covariance = np.array([[4.0, 1.5], [1.5, 1.0]])
-    line = ellipse(np.array([3.0, -2.0]), covariance, 0.95) - (3.0, -2.0)
-    off = np.einsum("ni,ij,nj->n", line, np.linalg.inv(covariance), line)
-    assert off == pytest.approx(off[0])
-    drawn = rng.multivariate_normal([0, 0], covariance, 40_000)
-    inside = np.einsum("ni,ij,nj->n", drawn, np.linalg.inv(covariance), drawn) < off[0]
-    assert inside.mean() == pytest.approx(0.95, abs=0.005)
 
 
 def test_a_chart_has_gaps_where_values_are_missing() -> None:

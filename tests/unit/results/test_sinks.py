@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from evlcp_sdk.cli.plugins import table_of
-from evlcp_sdk.errors import ConfigError, PluginError, PluginWarning
+from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
 from evlcp_sdk.plugin.records import installed_sinks
 from evlcp_sdk.plugin.registry import Registry
@@ -127,34 +126,6 @@ def test_a_format_that_is_not_there(demo_raw: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"sink 'far' of .* needs no_such_package, or leave --sink far out"):
         receive_to_folder(demo_raw, tmp_path / "out", registry=Registry.load(missing), sinks=["far"])
     assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(
-    ("plugin", "told"),
-    [
-        (("frames", "a:B", "other.csv"), r"sink 'frames': evlcp-sdk has one of this name"),
-        (
-            ("other", "a:B", "frames.csv"),
-            r"sink 'other': frames.csv is a file of the sink 'frames' of evlcp-",
-        ),
-        (("other", "a:B", "summary.json"), r"sink 'other': summary.json is the summary's file"),
-        (("other", "a:B", "../x"), r"sink 'other': files = \('\.\./x',\), expected names of files in"),
-        (("other", "a:B", "/x"), r"sink 'other': files = "),
-        (("other", "a:B", ""), r"sink 'other': files = "),
-        (("other", None), r"sink 'other': target = None, expected text"),
-        ((7, "a:B"), r"sink 7: name = 7, expected text"),
-    ],
-)
-def test_a_format_that_clashes_is_left_out(plugin: Any, told: str, demo_raw: Path, tmp_path: Path) -> None:
-    registry = Registry.load(bring(*plugin))
-    with pytest.warns(PluginWarning, match=told):
-        sinks = installed_sinks(registry)
-    assert sinks.keys() == installed_sinks(Registry.load()).keys()
-    assert {sink.distribution for sink in sinks.values()} == {"evlcp-sdk"}
-    (broken,) = registry.broken
-    assert [row["reason"] for row in table_of(registry)["broken"]] == [broken.reason]
-    # The run goes on without it.
-    assert receive_to_folder(demo_raw, tmp_path, registry=registry)["status"] == "complete"
 
 
 class Unsayable(Sink):
