@@ -32,6 +32,8 @@ PAGES = (
     "quickstart",
     "how",
     "cli",
+    "receiver",
+    "live",
     "outputs",
     "messages",
     "error-correction",
