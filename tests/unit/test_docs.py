@@ -2,6 +2,7 @@
 
 import importlib
 import inspect
+import pkgutil
 import re
 import shlex
 import sys
@@ -281,6 +282,12 @@ def test_files_of_the_repository_that_a_page_names_exist(path: Path) -> None:
     rooms = "evlcp_sdk|firmware_host|plugins|examples|tests|benchmarks|docs"
     named = set(re.findall(rf"(?<![\w/.])(?:{rooms})/[\w./-]*[\w/](?!\w)", path.read_text()))
     assert not [name for name in named if "NAME" not in name and not (ROOT / name).exists()]
+
+
+@pytest.mark.parametrize("path", ALL, ids=lambda p: p.stem)
+def test_modules_that_a_page_names_exist(path: Path) -> None:
+    for name in set(re.findall(r"\b(?:evlcp_\w+|firmware_host)(?:\.\w+)+", path.read_text())):
+        pkgutil.resolve_name(name)
 
 
 def test_every_name_of_the_face_that_a_page_shows_exists() -> None:
