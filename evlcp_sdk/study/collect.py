@@ -54,6 +54,7 @@ class Counted:
         tally: The tally so far, of all segments.
         seeds: How many seeds it takes.
         complete: No more seeds are needed.
+        found: How many of its tasks have results.
     """
 
     tasks: Sequence[str]
@@ -62,12 +63,14 @@ class Counted:
     tally: Tally = field(default_factory=Tally)
     seeds: int = 0
     complete: bool = False
+    found: int = 0
 
     def __post_init__(self) -> None:
-        self.advance()
+        self.advance(sum(task in self.results for task in self.tasks))
 
-    def advance(self) -> None:
-        """Count what has come since."""
+    def advance(self, found: int) -> None:
+        """Count results that have come since, so many of them."""
+        self.found += found
         while not self.complete:
             if self.seeds == len(self.tasks) or self.rule.reached(self.tally):
                 self.complete = True
@@ -90,7 +93,7 @@ class Counted:
     @property
     def done(self) -> int:
         """Those of them that are finished."""
-        return sum(task in self.results for task in self.tasks[: self.needed])
+        return self.seeds if self.complete else self.found
 
 
 def collect(
@@ -143,7 +146,7 @@ def collect(
                 results.update(found)
                 for task, _ in found:
                     for point in points_of[task]:
-                        point.advance()
+                        point.advance(1)
             watch(_progress(points, faults))
     return _progress(points, faults)
 

@@ -110,10 +110,10 @@ class _Lane:
             cpu_s=reading_s + self.spent.processor_s,
         )
         if truth is None:
-            return Measured(without_truth(self.frames, self.packets), times)
+            return Measured({name: without_truth(self.frames, self.packets)}, times)
         several = self.links if len(self.links) > 1 else None
         counted = statistics_of(self.frames, truth, packets=self.packets, links=several)
-        return Measured(counted, times, {name: counted.total()})
+        return Measured({name: counted}, times)
 
 
 def compare_recording(

@@ -67,20 +67,24 @@ class Measured:
     """What one variant gave: what was counted and what it took; adds over recordings.
 
     Attributes:
-        statistics: What was counted; without truth, nothing but rows and packets.
+        recordings: By name, what was counted of what shares nothing with the others: a recording, or all of a
+            campaign's with one seed. Without truth, nothing but rows and packets.
         times: What it took; nothing where nobody measured.
-        recordings: By name, the tally of what shares nothing with the others: a recording, or all of a
-            campaign's with one seed.
     """
 
-    statistics: Statistics = field(default_factory=Statistics)
+    recordings: Mapping[str, Statistics] = field(default_factory=dict)
     times: Times = field(default_factory=Times)
-    recordings: Mapping[str, Tally] = field(default_factory=dict)
 
     def __add__(self, other: "Measured") -> "Measured":
-        ours, theirs = self.recordings, other.recordings
-        together = {name: ours.get(name, Tally()) + theirs.get(name, Tally()) for name in {**ours, **theirs}}
-        return Measured(self.statistics + other.statistics, self.times + other.times, together)
+        together = dict(self.recordings)
+        for name, one in other.recordings.items():
+            together[name] = together.get(name, Statistics()) + one
+        return Measured(together, self.times + other.times)
+
+    @cached_property
+    def statistics(self) -> Statistics:
+        """All recordings together."""
+        return sum(self.recordings.values(), Statistics())
 
     @cached_property
     def tally(self) -> Tally:
@@ -92,10 +96,14 @@ class Measured:
         """Share of the sent frames that were decoded; NaN without truth."""
         return self.tally.frames_found / self.tally.frames_sent if self.tally.frames_sent else math.nan
 
+    def figure(self, kind: str) -> Figure:
+        """A figure of `measure` with its interval over recordings."""
+        return measure([one.total() for one in self.recordings.values()], kind)
+
     @cached_property
     def ber(self) -> Figure:
         """The bit error rate with its interval over recordings."""
-        return measure(tuple(self.recordings.values()), "ber")
+        return self.figure("ber")
 
     @property
     def us_per_frame(self) -> float:
@@ -185,7 +193,7 @@ def _ends(m: Measured, key: str) -> tuple[float, float]:
     """The interval over recordings, of what has one; else the figure itself."""
     if key not in ("found_share", "ber", "rmse_m", "gross_share"):
         return math.nan, math.nan
-    figure = measure(tuple(m.recordings.values()), key)
+    figure = m.figure(key)
     return (figure.low, figure.high) if figure.recordings >= FEWEST_RECORDINGS else (math.nan, math.nan)
 
 
@@ -458,7 +466,8 @@ def of_campaign(summary: Summary) -> Comparison:
             "digest": identity.get("digest", ""),
             "configuration": identity.get("table", {}),
         }
-        scenes.setdefault(scene, []).append(Row(link, _measured(series)))
+        recordings = {f"seed {i}": one for i, one in enumerate(series.recordings)}
+        scenes.setdefault(scene, []).append(Row(link, Measured(recordings)))
     tables = [Table(name, tuple(rows)) for name, rows in scenes.items()]
     notes = [f"campaign {summary.name}, {summary.digest}"]
     if len({tuple(row.variant for row in table.rows) for table in tables}) > 1:
@@ -468,11 +477,6 @@ def of_campaign(summary: Summary) -> Comparison:
     if summary.done < summary.tasks:
         notes.append(f"{summary.done} of {summary.tasks} tasks are done")
     return Comparison(links, tuple(tables), tuple(notes), summary.plan.environment, "scene")
-
-
-def _measured(series: Series) -> Measured:
-    recordings = {f"seed {i}": one.total() for i, one in enumerate(series.recordings)}
-    return Measured(series.statistics, recordings=recordings)
 
 
 def _part(series: Series, prefix: str, otherwise: str) -> str:

@@ -59,11 +59,12 @@ def measured(
         "cpu_s": 0.2,
     }
     counted = Statistics.of([(30, tally), (40, error), (40, filtered)], **counts)
-    return Measured(counted, Times(**(took | (times or {}))), {"REC.raw": counted.total()})
+    return Measured({"REC.raw": counted}, Times(**(took | (times or {}))))
 
 
 BLIND = Measured(
-    Statistics(rows=5, packets=1, stated=1, sigma_squares_nm2=4 * 10**16), Times(recorded_s=0.1, cpu_s=0.1)
+    {"BLIND.raw": Statistics(rows=5, packets=1, stated=1, sigma_squares_nm2=4 * 10**16)},
+    Times(recorded_s=0.1, cpu_s=0.1),
 )
 """A variant on a recording without truth."""
 
@@ -243,7 +244,7 @@ def test_of_five_recordings_a_bar_has_its_interval() -> None:
     parts = []
     for n in range(5):
         rows = [measured(errors(error_m + 0.01 * n)) for error_m in (0.1, 0.2)]
-        parts.append(table(*(replace(m, recordings={f"{n}": m.tally}) for m in rows)))
+        parts.append(table(*(replace(m, recordings={f"{n}": m.statistics}) for m in rows)))
     first, *_ = dict(total_of(parts).charts())["RMSE, m"]
     assert 0.1 < first.low < first.value < first.high < 0.2
     whole = comparison(*parts, total_of(parts))
