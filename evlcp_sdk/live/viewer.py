@@ -20,13 +20,15 @@ from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any, Final, Protocol
 from urllib.parse import urlsplit
 
+from markupsafe import Markup
+
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.desk import cannot_listen, stop_listening
 from evlcp_sdk.live.telling import MOST_WAITING, PICTURES_PER_S, FrameNews, Line, Shot, line_text
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_colours
-from evlcp_sdk.report.markup import Markup, document
+from evlcp_sdk.report.pages import TEMPLATES, render_page
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
@@ -388,11 +390,11 @@ def page(name: str) -> str:
         part: here.joinpath(*part.split("/")).read_text("utf-8")
         for part in ("page.html", "page.js", "page.css", "uplot/uPlot.js", "uplot/uPlot.css")
     }
-    body = Markup(read["page.html"]).replace("{name}", Markup.escape(name))
-    return document(
+    return render_page(
+        TEMPLATES.from_string(read["page.html"]),
         f"{name} - live",
-        [body],
-        scripts=[read["uplot/uPlot.js"], read["page.js"]],
-        style=read["uplot/uPlot.css"] + read["page.css"],
+        [read["uplot/uPlot.js"], read["page.js"]],
         connect=True,
+        name=name,
+        style=Markup(read["uplot/uPlot.css"] + read["page.css"]),
     )

@@ -18,11 +18,12 @@ from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
 from evlcp_sdk.report.figures import Thinned, TrackProbe
-from evlcp_sdk.report.markup import Markup, details, document, table, tiles
 from evlcp_sdk.report.motion import MotionProbe
-from evlcp_sdk.report.plots import PLOT_STYLE, Plot, ellipse
+from evlcp_sdk.report.pages import render_page
+from evlcp_sdk.report.plots import Plot, ellipse
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Events, Frame, Packet
 
 __all__ = ["Report"]
@@ -36,26 +37,6 @@ _MOST_CHARACTERS = 2_000
 
 _SECONDS = 5.0
 """Length of a recording whose charts count in seconds."""
-
-_STYLE = (
-    PLOT_STYLE
-    + """
-#motion { background: var(--panel); border-radius: 0.4rem; padding: 0.8rem }
-#motion canvas { width: 100%; display: block }
-#motion .hand { display: flex; gap: 0.6rem; align-items: center; flex-wrap: wrap; margin-top: 0.6rem }
-#motion input { flex: 1 1 10rem; min-width: 8rem } #motion select { max-width: 100% }
-#motion button, #motion select { font: inherit; padding: 0.2rem 0.8rem }
-.symbols td { padding: 0.1rem 0.35rem } .symbols td[style] { background: hsl(var(--hue) 65% 88%) }
-@media (prefers-color-scheme: dark) { .symbols td[style] { background: hsl(var(--hue) 35% 25%) } }
-.messages td, .messages th { text-align: left }
-.messages td:last-child { white-space: normal; overflow-wrap: anywhere; min-width: 12rem }
-.grid { max-height: 26rem; overflow: auto }
-.warnings { padding-left: 1.1rem } .warnings li { margin: 0.3rem 0; overflow-wrap: anywhere }
-#image { max-width: 36rem } .plot + h2 { margin-top: 1rem }
-.charts { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 26rem), 1fr));
-  gap: 0 1.5rem }
-"""
-)
 
 
 @dataclass(eq=False)
@@ -132,7 +113,6 @@ class Report(Sink):
         """Write the page, which is the same for the same recording: how long it took is not in it."""
         if summary["recording"]["duration_s"] > _SECONDS:
             self._axis, self._step_ms = "s since the first event", 1000.0
-        plots: list[Plot] = []
         motions = [
             motion.to_dict(
                 link.codebook, cluster_colours(link.codebook.clusters), link.packet.chip_us, self._ms
@@ -142,28 +122,45 @@ class Report(Sink):
             if motion.frame.transmitter in self._seen or not self.run.links
             for link in [self.run.link_of(motion.frame.link)]
         ]
-        body = [
-            Markup("<h1>{}</h1>").format(self.run.name),
-            self._headline(summary),
-            _warnings(summary),
-            _motion(motions),
-            self._charts(plots),
-            self._map(plots),
-            self._messages_table(),
-            self._symbols(),
-            _configuration(summary),
-        ]
-        told: dict[str, Any] = {plot.id: plot.told for plot in plots}
-        script = files("evlcp_sdk.report").joinpath("report.js").read_text(encoding="utf-8")
-        data = {"report": {"plots": told, "motions": motions}}
-        page = document(f"{self.run.name}: report", body, [script], data, _STYLE)
+        distances, quality, image = self._charts()
+        places = self._map()
+        plots = [*distances, quality, image] * bool(self._seen) + (places or [])
+        messages = [*self._messages, *self._latest]
+        # What is said where the pointer is, is known once a chart is drawn.
+        held = {plot.id: plot.markup() for plot in plots}
+        page = render_page(
+            "recording.html",
+            f"{self.run.name}: report",
+            [files("evlcp_sdk.report").joinpath("report.js").read_text(encoding="utf-8")],
+            {"report": {"plots": {plot.id: plot.told for plot in plots}, "motions": motions}},
+            name=self.run.name,
+            summary=summary,
+            figures=self._headline(summary),
+            warnings=[
+                (Diagnostic(**{**one, "next_step": ""}), one["next_step"]) for one in summary["warnings"]
+            ],
+            notes=[Diagnostic(**one) for one in summary["notes"]],
+            counts={name: value for name, value in summary["counts"].items() if value},
+            motions=motions,
+            held=held,
+            distances=distances,
+            seen=self._seen,
+            received=sum(seen.count for seen in self._seen.values()),
+            shown=sum(len(seen.frames) for seen in self._seen.values()),
+            places=places,
+            placed=len(self._track.points) > 0,
+            messages=messages,
+            left_out=self._many_messages - len(messages),
+            symbols=self._symbols(),
+        )
         self.folder.open("report.html").write(page)
 
     def _ms(self, t_us: float) -> float:
         """Time since the first event, ms."""
         return (t_us - (self._first_us or 0)) * 1e-3
 
-    def _headline(self, summary: Mapping[str, Any]) -> Markup:
+    def _headline(self, summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
+        """The figures that a reader looks for first: what each is, its value, and a note."""
         recording = summary["recording"]
         own = [t for t in summary["transmitters"] if t["echo_of"] is None]
         given = sum(t["symbols_given"] for t in own)
@@ -201,16 +198,10 @@ class Report(Sink):
         figures += [
             ("recording", f"{recording['duration_s']:.3g} s", f"{recording['counts']['events']:,} events"),
         ]
-        head = Markup("<p>{}</p>").format(summary["result"])
-        if summary["status"] != "complete":
-            said = ": ".join(part for part in (summary["status"], summary["error"]) if part)
-            head += Markup('<p class="no">{}</p>').format(said)
-        return head + tiles(figures)
+        return figures
 
-    def _charts(self, plots: list[Plot]) -> Markup:
-        """Distance and quality over time, and where in the image."""
-        if not self._seen:
-            return Markup("")
+    def _charts(self) -> tuple[list[Plot], Plot, Plot]:
+        """Distance of each transmitter and quality over time, and where in the image."""
         camera = self.run.link.camera
         distances: list[Plot] = []
         quality = Plot("quality", self._axis, "quality", y_limits=(-0.03, 1.06))
@@ -243,26 +234,13 @@ class Report(Sink):
             image.dots(places[:, 0], places[:, 1], colour, who, said)
             if len(frames) and np.isfinite(places[-1]).all():
                 image.name(float(places[-1, 0]), float(places[-1, 1]), str(number))
-        heard = sum(seen.count for seen in self._seen.values())
-        shown = sum(len(seen.frames) for seen in self._seen.values())
-        note = "Point at a dot for its values."
-        if shown < heard:
-            note += f" {shown:,} of {heard:,} frames are shown, evenly spread; frames.csv has all."
-        parts = [Markup('<h2>Distance and quality</h2><p class="note">{}</p>').format(note)]
-        drawn = [plot for plot in distances if not plot.empty]
-        if not drawn:
-            parts.append(Markup('<p class="note">No frame has a distance.</p>'))
-        held = Markup("\n").join(plot.markup() for plot in drawn)
-        parts.append(Markup('<div class="charts">{}</div>').format(held))
-        parts += [quality.markup(), Markup("<h2>Where in the image</h2>"), image.markup()]
-        plots += [*drawn, quality, image]
-        return Markup("\n").join(parts)
+        return [plot for plot in distances if not plot.empty], quality, image
 
-    def _map(self, plots: list[Plot]) -> Markup:
-        """Fixes and bars in local metres, and the sigmas over time."""
+    def _map(self) -> list[Plot] | None:
+        """Fixes and bars in local metres, and the sigmas over time; None where no positions are computed."""
         navigator = self.run.navigator
         if navigator is None:
-            return Markup("")
+            return None
         points = list(self._track.points)
         plan = Plot("map", "east, m", "north, m", aspect=4 / 3)
         close = Plot("track", "east, m", "north, m", aspect=4 / 3)
@@ -300,34 +278,14 @@ class Report(Sink):
             place = f"{who}\neast {east:z.3f} m\nnorth {north:z.3f} m\nup {up:z.3f} m"
             plan.dots([east], [north], "var(--ink)", "bar", [place])
             plan.name(east, north, who)
-        parts = []
-        for plot in (plan, close, height, spread):
-            if not plot.empty:
-                parts.append(plot.markup())
-                plots.append(plot)
-        if not points:
-            parts.append(Markup('<p class="note">No position was found: counts and warnings say why.</p>'))
-        return Markup('<h2>Map</h2><div class="charts">{}</div>').format(Markup("\n").join(parts))
+        return [plot for plot in (plan, close, height, spread) if not plot.empty]
 
-    def _messages_table(self) -> Markup:
-        if not self._many_messages:
-            return Markup("")
-        rows = [*self._messages, *self._latest]
-        left = self._many_messages - len(rows)
-        note = f"{left:,} between the first and the last ones are left out; packets.jsonl has all." * (
-            left > 0
-        )
-        head = ("ms", "kind", "from", "trust", "what it says")
-        held = Markup('<h2>Messages</h2><div class="messages">{}</div><p class="note">{}</p>')
-        return held.format(table(head, rows), note)
-
-    def _symbols(self) -> Markup:
-        """The symbols of the first frames of each transmitter, as a grid."""
-        parts = []
+    def _symbols(self) -> list[tuple[str, int, int, list[Any]]]:
+        """The symbols of the first frames of each transmitter: title, clusters, codewords, and rows."""
+        tables = []
         for number, seen in sorted(self._seen.items()):
             rows = []
             book = self.run.link_of(seen.link).codebook
-            most = max(len(book.codewords), 1)
             for frame in seen.first:
                 depth = frame.range
                 found = f"{depth.distance_m:.2f} ± {depth.sigma_m:.2f}"
@@ -337,25 +295,11 @@ class Report(Sink):
                     found if math.isfinite(depth.distance_m) else "-",
                     f"{frame.soft.quality:.2f}",
                 )
-                rows.append(
-                    Markup("<tr>{}{}</tr>").format(
-                        Markup("").join(Markup("<td>{}</td>").format(text) for text in start),
-                        Markup("").join(_cell(symbol, most) for symbol in frame.soft.symbols.tolist()),
-                    )
-                )
-            clusters = book.clusters
-            names = ("frame", "ms", "distance, m", "quality", *map(str, range(clusters)))
-            head = Markup("").join(Markup("<th>{}</th>").format(name) for name in names)
-            more = seen.count - len(seen.first)
-            title = f"{_who(number, seen.echo_of, seen.link)}: {seen.count:,} frame{'s' * (seen.count != 1)}"
-            title += f", the first {len(seen.first)}" * (more > 0)
-            held = Markup(
-                '<p class="note">{}</p><div class="grid"><table class="symbols"><tr>{}</tr>{}</table></div>'
-            )
-            parts.append(held.format(title, head, Markup("\n").join(rows)))
-        if not parts:
-            return Markup("")
-        return Markup("<h2>Symbols</h2>") + Markup("\n").join(parts)
+                rows.append((start, frame.soft.symbols.tolist()))
+            title = f"{_who(number, seen.echo_of, seen.link)}: {counted(seen.count, 'frame')}"
+            title += f", the first {len(seen.first)}" * (seen.count > len(seen.first))
+            tables.append((title, book.clusters, max(len(book.codewords), 1), rows))
+        return tables
 
 
 def _enlarged(points: Sequence[Settled]) -> int:
@@ -365,12 +309,6 @@ def _enlarged(points: Sequence[Settled]) -> int:
     sizes = [math.sqrt(max(np.linalg.eigvalsh(point.fix.covariance_m2[:2, :2]))) for point in points]
     size_m = float(np.median(sizes))
     return next((factor for factor in (1, 10, 100) if factor * size_m > 0.01 * extent_m), 1000)
-
-
-def _cell(symbol: int, most: int) -> Markup:
-    if symbol < 0:
-        return Markup("<td>-</td>")
-    return Markup('<td style="--hue:{}">{}</td>').format(round(300 * symbol / most), symbol)
 
 
 def _who(number: int, echo_of: int | None, link: str) -> str:
@@ -386,68 +324,3 @@ def _said(frame: Frame, ms: float) -> str:
         lines.append(f"{depth.distance_m:.4f} ± {depth.sigma_m:.4f} m")
     lines.append(f"quality {frame.soft.quality:.4f}")
     return "\n".join(lines)
-
-
-def _warnings(summary: Mapping[str, Any]) -> Markup:
-    """What looks wrong, with the next step; and what there was none of."""
-    held = Markup("<li>{}{}</li>")
-    step = Markup('<div class="note">{}</div>')
-    items = [
-        held.format(str(Diagnostic(**{**told, "next_step": ""})), step.format(told["next_step"]))
-        for told in summary["warnings"]
-    ]
-    items += [
-        held.format(f"lost: {loss['count']} {loss['meaning']} (first at {loss['unit']} {loss['first']})", "")
-        for loss in summary["losses"].values()
-    ]
-    if items:
-        shown = Markup('<h2>Warnings</h2><ul class="warnings">{}</ul>').format(Markup("").join(items))
-    elif summary["transmitters"]:
-        shown = Markup('<p class="yes">Nothing looks wrong.</p>')
-    else:
-        shown = Markup('<p class="note">What blinks in it, and which stage stops it: evlcp diagnose.</p>')
-    for note in summary["notes"]:
-        shown += Markup('<p class="note">{}</p>').format(str(Diagnostic(**note)))
-    return shown
-
-
-def _motion(motions: Sequence[Mapping[str, Any]]) -> Markup:
-    if not motions:
-        return Markup("")
-    options = Markup("").join(
-        Markup('<option value="{}">{}</option>').format(n, motion["name"]) for n, motion in enumerate(motions)
-    )
-    return Markup(
-        "<h2>The bar in slow motion</h2>"
-        '<p class="note">First the events of each chip: yellow where it gets brighter, blue where darker;'
-        " then the clusters where the pilot shows them, lit as they send by the symbols that were decoded;"
-        " then the chips of each cluster, pilot and symbol, whose number stands behind them.</p>"
-        '<div id="motion"><canvas role="img" aria-label="events and clusters, chip by chip"></canvas>'
-        '<div class="hand"><button type="button">Play</button>'
-        '<input type="range" min="0" max="1" step="1" value="0" aria-label="chip">'
-        '<select aria-label="frame"{}>{}</select></div><output class="note"></output></div>'
-    ).format(Markup(" hidden") if len(motions) == 1 else "", options)
-
-
-def _configuration(summary: Mapping[str, Any]) -> Markup:
-    counts = {name: value for name, value in summary["counts"].items() if value}
-    links = summary.get("links") or {"": summary}
-    parts = [
-        Markup("<h2>Configuration and counts</h2>"),
-        *(
-            Markup('<p class="digest">{}; SHA-256 of the configuration{} {}</p>').format(
-                summary["recording"]["path"], f" of {name}" if name else "", link["digest"]
-            )
-            for name, link in links.items()
-        ),
-        *(
-            details(f"configuration of {name}" if name else "configuration", link["configuration"])
-            for name, link in links.items()
-        ),
-        details("counts", counts),
-        details("transmitters", summary["transmitters"]),
-    ]
-    if "positions" in summary:
-        parts.append(details("positions", summary["positions"]))
-    parts.append(details("versions", summary["versions"]))
-    return Markup("\n").join(parts)

@@ -9,37 +9,24 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from markupsafe import Markup
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.report.markup import Markup
+from evlcp_sdk.report.pages import TEMPLATES
 
-__all__ = ["PLOT_STYLE", "Plot", "ellipse"]
-
-PLOT_STYLE = """
-.plot { margin: 0.4rem 0 1.2rem } .plot .legend { color: var(--dim); font-size: 0.85rem }
-.legend i { display: inline-block; width: 0.8em; height: 0.8em; border-radius: 50%; margin-right: 0.3em }
-.legend span { white-space: nowrap; margin-right: 0.7em }
-.area { position: relative; margin: 1.5rem 0.5rem 2.6rem 3.4rem; border-left: 1px solid var(--dim);
-  border-bottom: 1px solid var(--dim); touch-action: pan-y }
-.area svg { position: absolute; inset: 0; width: 100%; height: 100%; overflow: hidden }
-.area path { fill: none; vector-effect: non-scaling-stroke } .area path.grid { stroke: var(--line) }
-@media (prefers-color-scheme: dark) { .area svg, .legend i { filter: brightness(1.3) } }
-.area span { position: absolute; color: var(--dim); font-size: 0.75rem; line-height: 1; white-space: nowrap }
-.area .x { top: calc(100% + 0.4rem); transform: translateX(-50%) }
-.area .y { right: calc(100% + 0.4rem); transform: translateY(-50%) }
-.area .xname { top: calc(100% + 1.5rem); right: 0 }
-.area .yname { left: -3.2rem; bottom: calc(100% + 0.5rem) }
-.area .named { transform: translate(0.5rem, -50%); color: var(--ink) }
-.area .tip { position: absolute; z-index: 1; pointer-events: none; background: var(--paper);
-  color: var(--ink); border: 1px solid var(--dim); border-radius: 0.3rem; padding: 0.25rem 0.5rem;
-  font-size: 0.8rem; white-space: pre; max-width: 15rem }
-.area .at { position: absolute; width: 9px; height: 9px; margin: -6px; border: 2px solid var(--ink);
-  border-radius: 50%; pointer-events: none }
-"""
+__all__ = ["Plot", "ellipse"]
 
 _SIDE = 2000
 """Steps of a chart's box in either direction."""
+
+_STYLES = {
+    "band": "fill:{0};fill-opacity:0.25",
+    "line": "stroke:{0};stroke-width:1.6px",
+    "dots": "stroke:{0};stroke-width:5px;stroke-linecap:round",
+    "ring": "stroke:{0};stroke-width:1px;stroke-opacity:0.7",
+}
+"""How shapes are drawn, the lowest first."""
 
 
 @dataclass(eq=False)
@@ -79,8 +66,8 @@ class Plot:
         points = _points(x, y)
         known = _known(points)
         self._shapes.append(("dots", colour, points[known]))
-        for (px, py), text in zip(points[known].tolist(), _picked(said, known), strict=False):
-            self._said.append((px, py, text))
+        said = [text for text, good in zip(said, known.tolist(), strict=False) if good]
+        self._said += [(px, py, text) for (px, py), text in zip(points[known].tolist(), said, strict=False)]
         if name:
             self._legend[name] = colour
 
@@ -115,75 +102,36 @@ class Plot:
 
     def markup(self) -> Markup:
         """The chart."""
-        (x0, x1), (y0, y1) = self._limits()
+        (x0, x1), (y0, y1) = limits = self._limits()
 
-        def placed(points: NDArray[np.float64]) -> NDArray[np.float64]:
-            share = (points - (x0, y0)) / (x1 - x0, y1 - y0)
+        def place(points: Sequence[tuple[float, float]] | NDArray[np.float64]) -> NDArray[np.float64]:
+            """Where points are in the box, as shares of it."""
+            share = (np.reshape(points, (-1, 2)) - (x0, y0)) / (x1 - x0, y1 - y0)
             if not self.down:
                 share[:, 1] = 1 - share[:, 1]
             return share
 
-        paths = []
-        ticks = []
-        for which, low, high in (("x", x0, x1), ("y", y0, y1)):
-            for value in _ticks(low, high, 5):
-                at = np.array([[value, y0] if which == "x" else [x0, value]])
-                share = float(placed(at)[0, int(which == "y")])
-                side = "left" if which == "x" else "top"
-                ticks.append(
-                    Markup('<span class="{}" style="{}:{}%">{}</span>').format(
-                        which, side, f"{100 * share:.2f}", f"{value:.6g}"
-                    )
-                )
-                step = round(_SIDE * share)
-                grid = f"M{step} 0V{_SIDE}" if which == "x" else f"M0 {step}H{_SIDE}"
-                paths.append(Markup('<path class="grid" d="{}"/>').format(grid))
-        styles = {
-            "band": "fill:{0};fill-opacity:0.25",
-            "line": "stroke:{0};stroke-width:1.6px",
-            "dots": "stroke:{0};stroke-width:5px;stroke-linecap:round",
-            "ring": "stroke:{0};stroke-width:1px;stroke-opacity:0.7",
-        }
-        for kind in styles:
-            for shape, colour, points in self._shapes:
-                if shape == kind and len(points):
-                    style = styles[kind].format(colour)
-                    paths.append(
-                        Markup('<path style="{}" d="{}"/>').format(style, _path(placed(points), kind))
-                    )
-        names = []
-        for x, y, text in self._names:
-            ((px, py),) = (100 * placed(np.array([[x, y]]))).tolist()
-            names.append(
-                Markup('<span class="named" style="left:{}%;top:{}%">{}</span>').format(
-                    f"{px:.2f}", f"{py:.2f}", text
-                )
-            )
+        across, upwards = (_ticks(*one) for one in limits)
+        at = place([(x, y) for x, y, _ in self._said]).tolist()
         self.told = [
-            (*(round(1000 * float(v)) for v in placed(np.array([[x, y]]))[0]), text)  # type: ignore[misc]
-            for x, y, text in self._said
+            (round(1000 * x), round(1000 * y), text)
+            for (x, y), (_, _, text) in zip(at, self._said, strict=True)
         ]
-        legend = Markup("").join(
-            Markup('<span><i style="background:{}"></i>{}</span> ').format(colour, name)
-            for name, colour in self._legend.items()
+        shown = TEMPLATES.get_template("plot.html").render(
+            plot=self,
+            side=_SIDE,
+            columns=list(zip(across, place([(x, y0) for x in across])[:, 0].tolist(), strict=True)),
+            rows=list(zip(upwards, place([(x0, y) for y in upwards])[:, 1].tolist(), strict=True)),
+            paths=[
+                (style.format(colour), _path(place(points), kind))
+                for kind, style in _STYLES.items()
+                for shape, colour, points in self._shapes
+                if shape == kind and len(points)
+            ],
+            names=[(*place([(x, y)])[0].tolist(), text) for x, y, text in self._names],
+            legend=self._legend,
         )
-        height = "height:15rem" if self.aspect is None else f"aspect-ratio:{self.aspect:.4f}"
-        return Markup(
-            '<div class="plot" id="{}"><div class="legend">{}</div><div class="area" style="{}">'
-            '<svg viewBox="0 0 {} {}" preserveAspectRatio="none" aria-hidden="true">{}</svg>{}{}'
-            '<span class="xname">{}</span><span class="yname">{}</span></div></div>'
-        ).format(
-            self.id,
-            legend,
-            height,
-            _SIDE,
-            _SIDE,
-            Markup("").join(paths),
-            Markup("").join(ticks),
-            Markup("").join(names),
-            self.x_name,
-            self.y_name,
-        )
+        return Markup(shown)
 
     def _limits(self) -> tuple[tuple[float, float], tuple[float, float]]:
         shown = [points for _, _, points in self._shapes if len(points)]
@@ -203,8 +151,8 @@ class Plot:
         return (x0, x1), (y0, y1)
 
 
-def _ticks(low: float, high: float, most: int) -> list[float]:
-    return [float(v) for v in MaxNLocator(most).tick_values(low, high) if low <= v <= high]
+def _ticks(low: float, high: float) -> list[float]:
+    return [float(v) for v in MaxNLocator(5).tick_values(low, high) if low <= v <= high]
 
 
 def _points(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
@@ -213,10 +161,6 @@ def _points(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
 
 def _known(points: NDArray[np.float64]) -> NDArray[np.bool_]:
     return np.isfinite(points[:, 0]) & np.isfinite(points[:, 1])
-
-
-def _picked(said: Sequence[str], known: NDArray[np.bool_]) -> Iterable[str]:
-    return (text for text, good in zip(said, known.tolist(), strict=False) if good)
 
 
 def _runs(known: NDArray[np.bool_]) -> Iterable[slice]:

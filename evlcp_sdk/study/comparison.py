@@ -10,9 +10,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from evlcp_sdk.files import defused
-from evlcp_sdk.report.markup import Bar, Markup, bars, details, document, table
+from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, Figure, measure
 from evlcp_sdk.study.summary import Series, Summary
@@ -227,6 +228,34 @@ COLUMNS = (
 
 
 @dataclass(frozen=True)
+class Bar:
+    """A figure as a bar.
+
+    Attributes:
+        name: What it is of.
+        value: Its length, at least 0.
+        text: The figure as it is written.
+        low: Lower end of its interval; NaN where there is none.
+        high: Upper end.
+        best: It is to stand out.
+        dim: It is a reference.
+    """
+
+    name: str
+    value: float
+    text: str
+    low: float = math.nan
+    high: float = math.nan
+    best: bool = False
+    dim: bool = False
+
+    @property
+    def end(self) -> float:
+        """Where it ends, with its interval."""
+        return max(v for v in (self.value, self.high) if math.isfinite(v))
+
+
+@dataclass(frozen=True)
 class Row:
     """A variant's line."""
 
@@ -418,25 +447,15 @@ class Comparison:
 
     def to_html(self) -> str:
         """One self-contained page: first the table of all, with its figures as bars."""
-        body = [Markup("<h1>Variants compared: {}</h1>").format(self.title)]
-        for number, one in enumerate(sorted(self.tables, key=lambda one: not one.together)):
+        tables = []
+        for one in sorted(self.tables, key=lambda one: not one.together):
             head, lines = one.cells()
             rows = [
                 [Markup("<b>{}</b>").format(text) if best else text for text, best in row] for row in lines
             ]
-            body += [Markup("<h2>{}</h2>").format(one.name), table(head, rows)]
-            charts = Markup("").join(bars(title, drawn) for title, drawn in one.charts())
-            if charts:
-                held = '<div class="charts">{}</div>'
-                folded = f'<details><summary class="note">as bars</summary>{held}</details>'
-                body.append(Markup(folded if number else held).format(charts))
-        body += [Markup('<p class="note">{}</p>').format(text) for text in (self.legend, *self.notes)]
-        body.append(Markup("<h2>Configuration and digests</h2>"))
-        for name, values in self.variants.items():
-            about = ", ".join(values["settings"]) or "the link as it is"
-            body.append(details(f"{name}: {about}; SHA-256 {values['digest']}", values))
-        body.append(details("versions", dict(self.versions)))
-        return document(f"Variants compared: {self.title}", body)
+            tables.append((one.name, head, rows, one.charts()))
+        title = f"Variants compared: {self.title}"
+        return render_page("comparison.html", title, comparison=self, tables=tables)
 
 
 def total_of(tables: Sequence[Table], name: str = "all") -> Table:

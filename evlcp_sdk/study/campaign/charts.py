@@ -5,6 +5,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from markupsafe import escape
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Drawing
 from matplotlib.patheffects import withStroke
@@ -13,7 +14,6 @@ from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 from evlcp_sdk.files import Outputs, output_fault
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
 from evlcp_sdk.report.figures import plain
-from evlcp_sdk.report.markup import escape
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure
 from evlcp_sdk.study.paper import PAPER_NAME, Measure
 from evlcp_sdk.study.summary import Series, Summary, reference_marks

@@ -5,14 +5,16 @@ network for anything.
 """
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
+from markupsafe import Markup, escape
+
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.report.markup import Markup, details, document, escape, table, tiles
+from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.spelling import counted
-from evlcp_sdk.study.campaign.charts import Chart, Line, charts_of, decades
+from evlcp_sdk.study.campaign.charts import Chart, charts_of, decades
 from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
 from evlcp_sdk.study.paper import PAPER_NAME
 from evlcp_sdk.study.plan import digest_of
@@ -32,24 +34,28 @@ def page(summary: Summary) -> str:
         from plotly.offline import get_plotlyjs
     except ImportError as fault:
         raise ConfigError("a report needs the extra: pip install 'evlcp-sdk[report]'") from fault
-    charts, title, beside = charts_of(summary), title_of(summary), beside_paper(summary.series)
-    body = [
-        Markup("<h1>{}</h1>").format(title),
-        Markup("<p>{}</p>").format(" ".join(_about(summary))),
-        tiles(_headlines(summary, beside)),
-    ]
-    for chart in charts:
-        body.append(Markup('<h2>{}</h2><div class="chart" id="{}"></div>').format(chart.title, chart.id))
-        body.append(_legend(chart))
-        body.append(Markup('<p class="note">{}</p>').format(chart.note))
-    body += [
-        _paper_table(beside),
-        _positions_table(summary),
-        _figures_table(summary),
-        _configuration(summary),
-    ]
-    drawn = {chart.id: _plotly(chart) for chart in charts}
-    return document(title, body, (get_plotlyjs(), _SCRIPT), {_DATA: drawn}, _STYLE)
+    charts, beside = charts_of(summary), beside_paper(summary.series)
+    rule = summary.plan.rule
+    return render_page(
+        "campaign.html",
+        title_of(summary),
+        (get_plotlyjs(), _SCRIPT),
+        {_DATA: {chart.id: _plotly(chart) for chart in charts}},
+        summary=summary,
+        about=_about(summary),
+        figures=_headlines(summary, beside),
+        charts=[(chart, _keys(chart)) for chart in charts],
+        beside=_paper_rows(beside),
+        paper=PAPER_NAME,
+        agreement=AGREEMENT,
+        segment_m=SEGMENT_M,
+        positions=position_rows(summary),
+        position_head=POSITION_HEAD,
+        intervals=INTERVALS,
+        all_figures=_all_figures(summary),
+        ends=(_limit(rule.max_bits, "bits"), _limit(rule.max_errors, "wrong bits")),
+        cases=_cases(summary),
+    )
 
 
 def title_of(summary: Summary) -> str:
@@ -128,15 +134,6 @@ def _headlines(summary: Summary, beside: Sequence[PaperComparison]) -> list[tupl
 
 _SAID = {"better": "better", "agrees": "agree", "worse": "worse"}
 
-_STYLE = """
-.chart { height: 400px } .key { display: flex; flex-wrap: wrap; gap: 0.1rem 0.4rem; margin: 0.2rem 0 }
-.key button { display: flex; align-items: center; gap: 0.4rem; padding: 0.15rem 0.4rem; border: 0;
-  background: none; color: var(--ink); font: inherit; font-size: 0.83rem; text-align: left; cursor: pointer;
-  overflow-wrap: anywhere }
-.key button[aria-pressed=false] { opacity: 0.4 } .key svg { flex: none; width: 34px; height: 12px }
-@media (max-width: 600px) { .chart { height: 330px } }
-"""
-
 _SWATCHES = {
     "circle": '<circle cx="17" cy="6" r="4"/>',
     "diamond": '<path d="M17 1l5 5-5 5-5-5z"/>',
@@ -144,31 +141,19 @@ _SWATCHES = {
     "cross": '<path d="M15 2h4v2h2v4h-2v2h-4v-2h-2v-4h2z"/>',
 }
 _DASHES = {"solid": "none", "dash": "8 4", "dot": "2 3", "dashdot": "8 3 2 3"}
-_SWATCH = Markup('<svg viewBox="0 0 34 12" color="{}" fill="currentColor" stroke="currentColor">{}{}</svg>')
-_STROKE = Markup('<path d="M0 6H34" stroke-width="{}" stroke-dasharray="{}"/>')
 
 
-def _legend(chart: Chart) -> Markup:
+def _keys(chart: Chart) -> Iterator[tuple[Sequence[int], str, float, str, str, str]]:
     """What each line is, below the chart: each shows or hides its own, whose numbers it has."""
-    entries = []
     for number, line in enumerate(chart.lines):
-        entries.append((str(number), _swatch(line, plain=chart.steps), line.name))
+        symbol = "" if chart.steps else _SWATCHES[line.symbol]
+        yield [number], line.colour, 1.6, _DASHES[line.dash], Markup(symbol), line.name
     marks: dict[str, list[int]] = {}
     for number, mark in enumerate(chart.marks, len(chart.lines)):
         marks.setdefault(mark.name, []).append(number)
     for name, numbers in marks.items():
         mark = chart.marks[numbers[0] - len(chart.lines)]
-        stroke = _STROKE.format(3, "8 4" if mark.clusters == 2 else "none")
-        entries.append((" ".join(map(str, numbers)), _SWATCH.format("inherit", stroke, ""), name))
-    button = Markup('<button type="button" aria-pressed="true" data-lines="{}">{}<span>{}</span></button>')
-    return Markup('<div class="key" data-chart="{}">{}</div>').format(
-        chart.id, Markup("").join(button.format(*entry) for entry in entries)
-    )
-
-
-def _swatch(line: Line, *, plain: bool) -> Markup:
-    symbol = "" if plain else _SWATCHES[line.symbol]
-    return _SWATCH.format(line.colour, _STROKE.format(1.6, _DASHES[line.dash]), Markup(symbol))
+        yield numbers, "inherit", 3, "8 4" if mark.clusters == 2 else "none", "", name
 
 
 _DATA = "charts"
@@ -272,22 +257,12 @@ def _plotly(chart: Chart) -> dict[str, Any]:
     return {"data": data, "layout": layout, "ink": list(range(first, first + len(chart.marks)))}
 
 
-def _paper_table(comparisons: Sequence[PaperComparison]) -> Markup:
-    if not comparisons:
-        return Markup("")
+def _paper_rows(comparisons: Sequence[PaperComparison]) -> list[list[str]]:
     rows = []
     for cells, one in zip(comparison_rows(comparisons), comparisons, strict=True):
-        said = Markup('<span class="{}">{}</span>').format(_MARKED[one.verdict], cells[-1])
-        rows.append([*cells[:-1], said])
-    note = (
-        f"A figure agrees when ours lies within {AGREEMENT:.0%} of it, and is better where it is smaller."
-        f" A bound agrees when the worst segment of {SEGMENT_M} m keeps it."
-    )
-    return Markup('<h2>{}</h2>{}<p class="note">{}</p>').format(
-        f"Beside {PAPER_NAME}",
-        table(("figure", "distance", "series", "paper", "here", "95 %", "verdict"), rows),
-        note,
-    )
+        verdict = Markup('<span class="{}">{}</span>').format(_MARKED[one.verdict], cells[-1])
+        rows.append([*cells[:-1], verdict])
+    return rows
 
 
 _MARKED = {"better": "yes", "agrees": "", "worse": "no"}
@@ -355,25 +330,8 @@ def position_rows(summary: Summary) -> list[tuple[str, ...]]:
     return rows
 
 
-_POSITIONS_SAID = (
-    "Contradicted: refused as parts contradict one another; kept: given, of those and of what is given. Left"
-    " out: given without a part, which is named. NEES: the mean of the squared error in its own sigmas,"
-    " ideally 3. Silent: given with an error beyond the 99.73 % bound of its own covariance, as chance makes"
-    " 1 in 370; not covered: silent, and without a protection level or beyond it. Beyond: protected, and"
-    " beyond a level."
-)
-
-
-def _positions_table(summary: Summary) -> Markup:
-    rows = position_rows(summary)
-    if not rows:
-        return Markup("")
-    return Markup('<h2>Positions</h2><p class="note">{}</p>{}').format(
-        _POSITIONS_SAID, table(POSITION_HEAD, rows)
-    )
-
-
-def _figures_table(summary: Summary) -> Markup:
+def _all_figures(summary: Summary) -> tuple[Sequence[str], list[tuple[str, ...]]]:
+    """Head and rows of the table of each series and segment."""
     messages = any(t.messages_sent for one in summary.series for t in one.statistics.segments.values())
     positions = any(
         t.fixes or t.fixes_refused for one in summary.series for t in one.statistics.segments.values()
@@ -402,7 +360,7 @@ def _figures_table(summary: Summary) -> Markup:
         *(("messages", "read wrong") if messages else ()),
         *(_POSITION_HEAD if positions else ()),
     )
-    return Markup('<h2>All figures</h2><p class="note">{}</p>{}').format(INTERVALS, table(head, rows))
+    return head, rows
 
 
 _POSITION_HEAD = ("positions", "RMSE in space, m", "half within, m", "95 % within, m", "NEES, ideally 3")
@@ -428,28 +386,15 @@ def _shown(figure: Figure, form: str) -> str:
     return Markup('{} <span class="note">{}</span>').format(f"{figure.value:{form}}", figure.interval(form))
 
 
-def _configuration(summary: Summary) -> Markup:
-    plan, rule = summary.plan, summary.plan.rule
-    head = Markup(
-        '<h2>Configuration and digests</h2>\n<p class="digest">campaign {}</p>\n'
-        "<p>Seeds {} to {}; a point ends at {} or {}.</p>"
-    )
-    ends = (_limit(rule.max_bits, "bits"), _limit(rule.max_errors, "wrong bits"))
-    parts = [
-        head.format(summary.digest, plan.seeds[0], plan.seeds[-1], *ends),
-        details("code and versions", plan.environment),
-    ]
-    for kind, cases in (("scene", plan.scenes), ("link", plan.links)):
+def _cases(summary: Summary) -> Iterator[tuple[str, Any]]:
+    """Each scene and link with what it is."""
+    for kind, cases in (("scene", summary.plan.scenes), ("link", summary.plan.links)):
         for case in cases:
             labels = ", ".join(f"{k} {v}" for k, v in case.labels.items()) or "the only one"
             identity = case.identity
-            digest = (
-                identity["digest"]
-                if isinstance(identity, dict) and "digest" in identity
-                else digest_of(identity)
-            )
-            parts.append(details(f"{kind}: {labels}; SHA-256 {digest}", identity))
-    return Markup("\n").join(parts)
+            known = isinstance(identity, dict) and "digest" in identity
+            digest = identity["digest"] if known else digest_of(identity)
+            yield f"{kind}: {labels}; SHA-256 {digest}", identity
 
 
 def _limit(value: int | None, what: str) -> str:

@@ -21,7 +21,7 @@ from evlcp_sdk.study.plan import Case, Job, Plan, make_plan
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.tally import Statistics, Tally
-from tests.unit.report.test_markup import HOSTILE, Elements
+from tests.unit.report.test_pages import HOSTILE, Elements
 from tests.unit.study.browser import CHROMIUM, Browser
 from tests.unit.study.fake import run_fake
 

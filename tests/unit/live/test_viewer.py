@@ -33,7 +33,7 @@ from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Events, Fix, ReceivedMessage, Triggers
-from tests.unit.report.test_markup import HOSTILE
+from tests.unit.report.test_pages import HOSTILE
 from tests.unit.results.test_positions import SITE, packets
 from tests.unit.study.browser import CHROMIUM, Browser
 

@@ -21,7 +21,7 @@ from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
-from tests.unit.report.test_markup import HOSTILE, Elements
+from tests.unit.report.test_pages import HOSTILE, Elements
 from tests.unit.results.test_positions import ATTITUDE, SITE, packets
 from tests.unit.study.browser import CHROMIUM, Browser
 

@@ -23,7 +23,7 @@ from evlcp_sdk.study.plan import Case, make_plan
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import Summary, summarize
 from tests.unit.mutants import mutants, refusal
-from tests.unit.report.test_markup import HOSTILE, Elements
+from tests.unit.report.test_pages import HOSTILE, Elements
 from tests.unit.study.fake import fake_plan, run_fake
 
 

@@ -8,8 +8,9 @@ from html.parser import HTMLParser
 from typing import Any
 
 import pytest
+from markupsafe import Markup
 
-from evlcp_sdk.report.markup import Markup, details, document, table, tiles
+from evlcp_sdk.report.pages import TEMPLATES, render_page
 
 HOSTILE = (
     "</script><script>document.title='caught'</script><img src=x onerror=\"document.title='caught'\">'\"&"
@@ -55,16 +56,31 @@ def hash_of(script: str) -> str:
     return f"'sha256-{base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()}'"
 
 
+PARTS = """
+{% extends "base.html" %}
+{% from "parts.html" import details, table, tiles %}
+{% block body %}
+{{ text }}<h1>{{ text }}</h1>
+{{ table([text, bold], [[text, slanted]]) }}
+{{ details(text, values) }}
+{{ tiles([(text, text, text)]) }}
+{% endblock %}
+"""
+
+
 def test_text_stays_text_wherever_it_enters() -> None:
     values: Any = {HOSTILE: [HOSTILE]}
-    body = [
+    text = render_page(
+        TEMPLATES.from_string(PARTS),
         HOSTILE,
-        Markup("<h1>{}</h1>").format(HOSTILE),
-        table([HOSTILE, Markup("<b>bold</b>")], [[HOSTILE, Markup("<i>{}</i>").format(HOSTILE)]]),
-        details(HOSTILE, values),
-        tiles([(HOSTILE, HOSTILE, HOSTILE)]),
-    ]
-    page = Elements(document(HOSTILE, body, ["run()"], {"held": values}))
+        ["run()"],
+        {"held": values},
+        text=HOSTILE,
+        bold=Markup("<b>bold</b>"),
+        slanted=Markup("<i>{}</i>").format(HOSTILE),
+        values=values,
+    )
+    page = Elements(text)
     assert {tag for tag, _ in page.tags} == {
         *("html", "head", "meta", "link", "title", "style", "body", "h1", "div", "table", "tr", "th", "td"),
         *("b", "i", "details", "summary", "pre", "script", "span"),
@@ -78,16 +94,17 @@ def test_text_stays_text_wherever_it_enters() -> None:
 
 def test_only_the_scripts_of_a_page_may_run() -> None:
     scripts = ["one()", "two('\r\n')"]
-    page = Elements(document("a", [], scripts, {"held": 1}))
+    page = Elements(render_page("base.html", "a", scripts, {"held": 1}))
     assert page.policy["script-src"] == [hash_of(s) for s in page.scripts[1:]]
     assert page.policy["script-src"] == [hash_of("one()"), hash_of("two('\n')")]
     assert page.policy["default-src"] == page.policy["base-uri"] == page.policy["form-action"] == ["'none'"]
-    assert Elements(document("a", ["no script"])).policy["script-src"] == ["'none'"]
-    head = document("a", []).partition("<title>")[0]
+    text = render_page("base.html", "a")
+    assert Elements(text).policy["script-src"] == ["'none'"]
+    head = text.partition("<title>")[0]
     # What stands before the policy is not bound by it.
     assert not re.search("<(script|style|link)", head.partition("Content-Security-Policy")[0])
 
 
 def test_a_script_that_ends_its_element_is_refused() -> None:
     with pytest.raises(ValueError, match="would end its own element"):
-        document("a", [], ["x = '</SCRIPT>'"])
+        render_page("base.html", "a", ["x = '</SCRIPT>'"])
