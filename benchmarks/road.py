@@ -41,8 +41,8 @@ from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.run import receive_to_folder
+from evlcp_sdk.rx.alignment import FrameAligner
 from evlcp_sdk.rx.detection import RegionFollower
-from evlcp_sdk.rx.look import Looker
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.steps import Steps
 from evlcp_sdk.sim import Truth, read_truth, truth_path
@@ -60,7 +60,7 @@ TARGETS = Path(__file__).with_suffix(".toml")
 PARTS: Mapping[str, tuple[tuple[type, str], ...]] = {
     "regions": ((RegionFollower, "step"),),
     "synchronization": ((Steps, "synchronize"),),
-    "image": ((Looker, "look"),),
+    "image": ((FrameAligner, "look"),),
     "separation": ((Steps, "separate"),),
     "decoding": ((Steps, "decode"),),
     "ranging": ((Steps, "measure"),),

@@ -27,12 +27,12 @@ else:
 __all__ = [
     "Alternative",
     "Bend",
+    "DecodedFrame",
     "Events",
     "FailedBar",
     "Fix",
     "Frame",
     "FrameView",
-    "Heard",
     "Packet",
     "PresenceMap",
     "Range",
@@ -420,7 +420,7 @@ class Frame:
 
 
 @dataclass(frozen=True, eq=False)
-class Heard:
+class DecodedFrame:
     """A frame that a framing found in a region's events.
 
     Attributes:

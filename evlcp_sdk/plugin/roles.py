@@ -23,7 +23,16 @@ if TYPE_CHECKING:
     from evlcp_sdk.air.frames import PacketFormat
     from evlcp_sdk.scene.bar import BarLayout
     from evlcp_sdk.scene.camera import CameraModel
-    from evlcp_sdk.values import Events, FrameView, Heard, PresenceMap, Range, Region, SoftSymbols, SyncLock
+    from evlcp_sdk.values import (
+        DecodedFrame,
+        Events,
+        FrameView,
+        PresenceMap,
+        Range,
+        Region,
+        SoftSymbols,
+        SyncLock,
+    )
 
 __all__ = [
     "ROLES",
@@ -115,7 +124,7 @@ class Deframer(Protocol):
     def init(self) -> Any:
         """State before a region's first event."""
 
-    def step(self, state: Any, events: Events, until_us: int) -> tuple[Any, list[Heard]]:
+    def step(self, state: Any, events: Events, until_us: int) -> tuple[Any, list[DecodedFrame]]:
         """Take a region's events up to `until_us`; give the frames that are certain by then, in order.
 
         Args:
@@ -124,7 +133,7 @@ class Deframer(Protocol):
             until_us: All events before this time have been given.
         """
 
-    def close(self, state: Any) -> tuple[Any, list[Heard]]:
+    def close(self, state: Any) -> tuple[Any, list[DecodedFrame]]:
         """End the region: give the new state and the frames that are left."""
 
     def counts(self, state: Any) -> Mapping[str, int]:

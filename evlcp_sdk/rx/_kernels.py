@@ -1536,7 +1536,7 @@ def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least
 
 
 @njit
-def believe(
+def calibrate_llr(
     read: Array,
     llr: Array,
     seen: Array,

@@ -28,12 +28,12 @@ class EarlyFrames:
         self._told: dict[int, deque[tuple[int, int]]] = {}
         self.withdrawn = 0
 
-    def decoded(self, frame: Frame, *, holds: bool) -> None:
+    def decoded(self, frame: Frame, *, owns: bool) -> None:
         """Take a frame, in order of its transmitter's.
 
         Args:
             frame: The frame, on the camera's clock.
-            holds: Its transmitter holds its place now.
+            owns: Its transmitter owns its place now.
         """
         number = frame.transmitter
         if number not in self._waiting:
@@ -44,10 +44,10 @@ class EarlyFrames:
             gone, _ = self._waiting.popitem(last=False)
             del self._told[gone]
         self._waiting[number].append(frame)
-        if holds:
+        if owns:
             self._tell_waiting(number)
 
-    def given(self, packet: Packet, *, holds: bool) -> None:
+    def given(self, packet: Packet, *, owns: bool) -> None:
         """Take a packet that is given: tell those of its frames that were not; all that wait if it holds."""
         if self._tell is None:
             return
@@ -55,7 +55,7 @@ class EarlyFrames:
         for frame in packet.frames:
             if (frame.packet, frame.frame) not in told:
                 self._tell(frame)
-        if holds and packet.transmitter in self._waiting:
+        if owns and packet.transmitter in self._waiting:
             self._tell_waiting(packet.transmitter)
 
     def refused(self, packet: Packet) -> None:

@@ -48,15 +48,15 @@ class Framer(ABC):
         """Where the transmitters are that have a number and are in sight, by number."""
 
     @abstractmethod
-    def leave(self, taken: Sequence[Region], holding: Collection[int]) -> None:
+    def leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
         """Let regions go in places that are others', but for those of transmitters that hold theirs."""
 
     @abstractmethod
-    def disclaim(self, place: Region) -> int:
+    def discard_place(self, place: Region) -> int:
         """Count no frame that was not read in a place that is another link's; return how many they were."""
 
     @abstractmethod
-    def disown(self, number: int) -> int:
+    def discard_packet(self, number: int) -> int:
         """Count no frame that was not read where a packet was another link's; return how many they were."""
 
     @abstractmethod

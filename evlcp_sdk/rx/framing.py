@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.rx.alignment import AlignedFrame, FrameAligner
 from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detection import MARGIN_PX
-from evlcp_sdk.rx.echoes import EchoQueue, Sighting
 from evlcp_sdk.rx.followed import SAME_PX, Followed, same_place
 from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.lit import LitTimes
-from evlcp_sdk.rx.look import Look, Looker
 from evlcp_sdk.rx.reading import FrameReader, ReadableFrame, Reading
+from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.tracker import RegionTracker
@@ -100,7 +100,7 @@ class PacketFraming(Framer):
         link: Link,
         steps: Steps,
         regions: RegionTracker,
-        judged: EchoQueue,
+        judged: ReflectionQueue,
         clock: CameraClock,
         announcer: Announcer,
         attitude_at: Callable[[float], Attitude | None],
@@ -120,7 +120,7 @@ class PacketFraming(Framer):
         self._transmitters = Transmitters(
             link.packet, self._step_us, limits, numbers, link.codebook.chips_after
         )
-        self._looker = Looker(
+        self._aligner = FrameAligner(
             link.packet,
             link.regions,
             link.bar.cluster_centres_m(),
@@ -128,12 +128,12 @@ class PacketFraming(Framer):
             self._steps.separate,
             (link.camera.width, link.camera.height),
         )
-        self._reader = FrameReader(link, steps, self._looker)
+        self._reader = FrameReader(link, steps, self._aligner)
         self._codebook = link.codebook
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
         self._unknown.setflags(write=False)
         self._rows = RowDelays(link.codebook.preamble)
-        self._echoes = judged.echoes
+        self._reflections = judged.reflections
         self._judged = judged
         self._joined: set[int] = set()
         self._ended: deque[tuple[tuple[float, float], Missed]] = deque(maxlen=_MOST_ENDED)
@@ -202,17 +202,17 @@ class PacketFraming(Framer):
         """Where the transmitters are that have a number and are in sight, by number."""
         return self._transmitters.places
 
-    def leave(self, taken: Sequence[Region], holding: Collection[int]) -> None:
+    def leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
         """Let regions go in places that are others', but for those of transmitters that hold theirs."""
         for region in list(self._regions.alive):
             known = region in self._transmitters
-            if known and self._transmitters[region].number in holding:
+            if known and self._transmitters[region].number in owning:
                 continue
             if any(same_place(region.latest, place) for place in taken):
                 self._regions.drop(region)
                 self._let_go(region)
 
-    def disclaim(self, place: Region) -> int:
+    def discard_place(self, place: Region) -> int:
         """Count no frame that was not read in a place that is another link's; return how many they were."""
         missed = Missed()
         for transmitter in self._transmitters.alive:
@@ -223,17 +223,17 @@ class PacketFraming(Framer):
             if same_place(changed(place, x_px=x, y_px=y), place):
                 self._ended.remove(one)
                 missed += ended
-        return self._disclaimed(missed)
+        return self._discarded(missed)
 
-    def disown(self, number: int) -> int:
+    def discard_packet(self, number: int) -> int:
         """Count no frame that was not read where a packet was another link's; return how many they were."""
         missed = self._missed_by.pop(number, Missed())
         for transmitter in self._transmitters.alive:
             if transmitter.number == number:
                 missed, transmitter.missed = missed + transmitter.missed, Missed()
-        return self._disclaimed(missed)
+        return self._discarded(missed)
 
-    def _disclaimed(self, missed: Missed) -> int:
+    def _discarded(self, missed: Missed) -> int:
         self.counts["frames_rejected"] -= missed.rejected
         self.counts["frames_unread"] -= missed.unread
         return missed.total
@@ -308,7 +308,7 @@ class PacketFraming(Framer):
                 continue
             self._take(transmitter, due, found)
 
-    def _take(self, transmitter: Transmitter, due: DueFrame, found: Sighting) -> None:
+    def _take(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         """Hand a frame on."""
         transmitter.grid.frame += 1
         self._lit_in(transmitter, due)
@@ -322,7 +322,7 @@ class PacketFraming(Framer):
         if transmitter.number is not None:
             self.lit.note(transmitter.number, transmitter.lit_us, start_us)
 
-    def _decode(self, transmitter: Transmitter, due: DueFrame) -> Sighting | Skipped:
+    def _decode(self, transmitter: Transmitter, due: DueFrame) -> FrameDetection | Skipped:
         """Read a frame, or say why it is not given."""
         shown = self._readable(transmitter, due)
         if isinstance(shown, Skipped):
@@ -332,21 +332,23 @@ class PacketFraming(Framer):
     def _readable(self, transmitter: Transmitter, due: DueFrame) -> ReadableFrame | Skipped:
         """What is to be read of a frame, or why there is nothing."""
         self._announcer.start()
-        look = self._look(transmitter, due)
-        if look is None:
+        aligned = self._align(transmitter, due)
+        if aligned is None:
             return Skipped.DARK if _went_dark(transmitter, due, self._packet) else Skipped.REJECTED
-        if transmitter.number is None and self._echoes.shown(due.start_us, look.centre_px):
+        if transmitter.number is None and self._reflections.shown(due.start_us, aligned.centre_px):
             # The same bar once more: where the first region was then is not known as well as what it showed.
             self._regions.drop(transmitter.region)
             self._let_go(transmitter.region)
             return Skipped.REJECTED
         ranged = due.has_pilot and self._is_ranged()
-        attitude = self._attitude_at(self._clock.camera_us(look.middle_us)) if due.has_pilot else None
-        return ReadableFrame(look, due.index, due.has_pilot, self._before(transmitter, due), ranged, attitude)
+        attitude = self._attitude_at(self._clock.camera_us(aligned.middle_us)) if due.has_pilot else None
+        return ReadableFrame(
+            aligned, due.index, due.has_pilot, self._before(transmitter, due), ranged, attitude
+        )
 
     def _frame_of(
         self, transmitter: Transmitter, due: DueFrame, shown: ReadableFrame, reading: Reading
-    ) -> Sighting | Skipped:
+    ) -> FrameDetection | Skipped:
         """A frame by what was read of it, or why it is not given."""
         transmitter.said = due.number, reading.symbols
         distance, soft = reading.distance, reading.soft
@@ -377,12 +379,12 @@ class PacketFraming(Framer):
             points_px=reading.points_px,
             points_sigma_px=reading.sigma_px,
             points_flank_px=reading.flank_px,
-            points_t_us=shown.look.middle_us,
-            echo_of=self._echoes.echo_of(number),
+            points_t_us=shown.aligned.middle_us,
+            echo_of=self._reflections.echo_of(number),
             link=self._name,
         )
         self._announcer.frame(frame)
-        return Sighting.of(frame, shown.look.placement, reading.spread)
+        return FrameDetection.of(frame, shown.aligned.placement, reading.spread)
 
     def _is_ranged(self) -> bool:
         """Whether the turn of a frame with a pilot has come to be ranged."""
@@ -406,22 +408,24 @@ class PacketFraming(Framer):
             return self._unknown
         return np.where(symbols >= 0, book.codewords[symbols, -1].astype(np.int8), np.int8(-1))
 
-    def _look(self, transmitter: Transmitter, due: DueFrame) -> Look | None:
+    def _align(self, transmitter: Transmitter, due: DueFrame) -> AlignedFrame | None:
         """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
         region = transmitter.region
         others: list[tuple[float, tuple[float, float], tuple[float, float]]] = []
         most_px = 0.0
         for _ in range(_LOOKS):
             whole = region.size_px is not None
-            look, transmitter.pilot = self._looker.look(region, due, transmitter.pilot)
-            if look is None or not due.has_pilot:
+            aligned, transmitter.pilot = self._aligner.align(region, due, transmitter.pilot)
+            if aligned is None or not due.has_pilot:
                 break
             # What the first look shows beside the bar is out of the second one's sight.
-            others += [(look.middle_us, *self._looker.box(look, other)) for other in look.others]
-            off_px = self._regions.shape(region, look.middle_us, *self._looker.box(look, look.placement))
-            self._regions.light(region, self._looker.lit_rows(look), self._looker.strips(look))
+            others += [(aligned.middle_us, *self._aligner.box(aligned, other)) for other in aligned.others]
+            off_px = self._regions.shape(
+                region, aligned.middle_us, *self._aligner.box(aligned, aligned.placement)
+            )
+            self._regions.light(region, self._aligner.lit_rows(aligned), self._aligner.strips(aligned))
             most_px = max(most_px, off_px)
-            if off_px > 0 and not self._join(region, look.middle_us):
+            if off_px > 0 and not self._join(region, aligned.middle_us):
                 return None
             # Within half of the seam, motion in the frame is known as well as by its next look.
             if off_px == 0 or (whole and off_px <= MARGIN_PX / 2):
@@ -429,13 +433,13 @@ class PacketFraming(Framer):
             self._regions.gather(region, due.start_us, due.read_us)
         if most_px > MARGIN_PX / 2:
             self._regions.gather(region)
-        if look is None:
+        if aligned is None:
             return None
         for middle_us, centre_px, size_px in others:
             known = any(one.covers(middle_us, centre_px) for one in self._regions.alive)
             if not known and self._regions.has_room():
                 self._due.append(self._regions.beside(region, middle_us, centre_px, size_px))
-        return look
+        return aligned
 
     def _join(self, region: Followed, t_us: float) -> bool:
         """Let other regions of the bar seen at a time go; False if this one goes, as the other is known."""
@@ -471,7 +475,7 @@ class PacketFraming(Framer):
 
     def _was_part(self, missed: Missed) -> None:
         """Count the frames that a part of a bar could not show apart from those that no bar shows."""
-        self.counts["frames_of_parts"] += self._disclaimed(missed)
+        self.counts["frames_of_parts"] += self._discarded(missed)
 
     def _find_parts(self, region: Followed, t_us: float) -> None:
         """Look among the regions that ended for parts of a bar whose first frame is read."""

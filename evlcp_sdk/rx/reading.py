@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.codebook import edges_of_chips
 from evlcp_sdk.air.frames import chips_behind
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.belief import believed, still_lit
-from evlcp_sdk.rx.look import Look, Looker
+from evlcp_sdk.rx.alignment import AlignedFrame, FrameAligner
+from evlcp_sdk.rx.llr_calibration import calibrate_llr, still_lit
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.spread import Spread, neighbours
@@ -30,7 +30,7 @@ class ReadableFrame:
     """A frame that shows its clusters, and what its reading depends on beside.
 
     Attributes:
-        look: What it shows.
+        aligned: What it shows.
         index: Its number in the packet.
         has_pilot: Whether it has one: only such a frame has a distance and points.
         before: The chip that each cluster sent before its info segment, int8 (K,); -1 if not known.
@@ -38,7 +38,7 @@ class ReadableFrame:
         attitude: The camera's, as far as it is known.
     """
 
-    look: Look
+    aligned: AlignedFrame
     index: int
     has_pilot: bool
     before: NDArray[np.int8]
@@ -84,13 +84,13 @@ class FrameReader:
         looker: What the frames were looked at with.
     """
 
-    def __init__(self, link: Link, steps: Steps, looker: Looker) -> None:
+    def __init__(self, link: Link, steps: Steps, aligner: FrameAligner) -> None:
         centres_m, book = link.bar.cluster_centres_m(), link.codebook
         self._camera = link.camera
         self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
         self._pilot_chips = link.packet.pilot_chips
         self._least_activity = book.least_activity
-        self._steps, self._looker = steps, looker
+        self._steps, self._aligner = steps, aligner
         self._layout = layout_of(centres_m)
         self._pairs = neighbours(self._layout)
         self._pilots, self._every = book.pilots.astype(np.int64), book.edge_every
@@ -106,28 +106,30 @@ class FrameReader:
         Raises:
             PluginError: The decoding or the ranging fails, or gives what it may not.
         """
-        look = shown.look
-        sums = look.sums
-        soft = self._steps.decode(look.presence, look.sums_and_next, shown.before, self._behind[shown.index])
-        lit = still_lit(sums, look.presence, self._pilot_chips, self._least_activity)
-        given = believed(soft, look.placement.seen & lit)
+        aligned = shown.aligned
+        sums = aligned.sums
+        soft = self._steps.decode(
+            aligned.presence, aligned.sums_and_next, shown.before, self._behind[shown.index]
+        )
+        lit = still_lit(sums, aligned.presence, self._pilot_chips, self._least_activity)
+        given = calibrate_llr(soft, aligned.placement.seen & lit)
         if not shown.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             return Reading(
-                soft.symbols, given, _NO_RANGE, *_NO_POINTS, look.centre_px, BarSight(), spread=None
+                soft.symbols, given, _NO_RANGE, *_NO_POINTS, aligned.centre_px, BarSight(), spread=None
             )
         distance = _NO_RANGE
         if shown.ranged:
-            whole = self._looker.whole(look)
-            distance = self._steps.measure(FrameView(sums, look.offset_px, whole, soft))
+            whole = self._aligner.whole(aligned)
+            distance = self._steps.measure(FrameView(sums, aligned.offset_px, whole, soft))
         heard = sums[: self._pilot_chips]
-        points_px, sigma_px, flank_px = self._find_points(look.presence, look.placement, heard)
-        points_px = points_px + look.corner_px
-        centre_px = self._looker.centre(look, points_px)
+        points_px, sigma_px, flank_px = self._find_points(aligned.presence, aligned.placement, heard)
+        points_px = points_px + aligned.corner_px
+        centre_px = self._aligner.centre(aligned, points_px)
         sight = BarSight()
         if self._is_column:
             sight = sight_of(self._camera, points_px, sigma_px, shown.attitude)
         elif not self._camera.is_pinhole:
             sight = BarSight(magnification=magnification_of(self._camera, points_px))
-        spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, look.placement)
+        spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, aligned.placement)
         return Reading(soft.symbols, given, distance, points_px, sigma_px, flank_px, centre_px, sight, spread)

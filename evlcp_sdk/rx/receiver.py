@@ -10,10 +10,10 @@ import pluggy
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
-from evlcp_sdk.rx.contest import Contest, ContestedPacket
+from evlcp_sdk.rx.arbitration import ArbitratedPacket, LinkArbiter
 from evlcp_sdk.rx.early import EarlyFrames
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.listener import LinkListener
+from evlcp_sdk.rx.link_receiver import LinkReceiver
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
@@ -79,8 +79,8 @@ class Receiver:
         if len(links) > 1:
             limits = replace(limits, region_bytes=limits.region_bytes // len(links))
         rhythms, numbers = _rhythms(links), count()
-        self._listeners = [
-            LinkListener(
+        self._receivers = [
+            LinkReceiver(
                 one,
                 self._clock,
                 hook,
@@ -94,11 +94,11 @@ class Receiver:
             )
             for name, one in links.items()
         ]
-        self._contest: Contest | None = None
+        self._arbiter: LinkArbiter | None = None
         self._early = EarlyFrames(on_frame)
         if len(links) > 1:
-            wait_us = max(listener.patience_us for listener in self._listeners)
-            self._contest = Contest(list(links.values()), wait_us, first.regions.step_us)
+            wait_us = max(one.patience_us for one in self._receivers)
+            self._arbiter = LinkArbiter(list(links.values()), wait_us, first.regions.step_us)
         self._closed = False
         self.left: list[Packet] = []
 
@@ -108,37 +108,37 @@ class Receiver:
 
         Starts of the first and the last frame that was due while it was, given or not, camera clock, us.
         """
-        return {number: lit for listener in self._listeners for number, lit in listener.lit_us.items()}
+        return {number: lit for one in self._receivers for number, lit in one.lit_us.items()}
 
     @property
     def regions(self) -> tuple[Region, ...]:
         """Where the regions that are followed were seen last, on the camera's clock."""
-        return tuple(region for listener in self._listeners for region in listener.regions)
+        return tuple(region for one in self._receivers for region in one.regions)
 
     @property
     def ranging_every(self) -> int:
         """The distance of every n-th frame with a pilot is measured, 1: of all; for when time is short."""
-        return self._listeners[0].ranging_every
+        return self._receivers[0].ranging_every
 
     @ranging_every.setter
     def ranging_every(self, every: int) -> None:
-        for listener in self._listeners:
-            listener.ranging_every = every
+        for one in self._receivers:
+            one.ranging_every = every
 
     @property
     def counts(self) -> dict[str, int]:
         """What was taken, found and dropped so far, by all links together."""
         total: Counter[str] = Counter()
-        for listener in self._listeners:
-            total.update(listener.counts)
+        for one in self._receivers:
+            total.update(one.counts)
         crowded = {"dropped_crowded": self._timeline.dropped}
-        withdrawn = {"frames_withdrawn": self._early.withdrawn} if self._contest is not None else {}
+        withdrawn = {"frames_withdrawn": self._early.withdrawn} if self._arbiter is not None else {}
         return self._clock.counts | crowded | dict(total) | withdrawn
 
     @property
     def link_counts(self) -> dict[str, dict[str, int]]:
         """What each of several links found and dropped so far, by its name; nothing of a single link."""
-        return {one.name: one.counts for one in self._listeners} if self._contest is not None else {}
+        return {one.name: one.counts for one in self._receivers} if self._arbiter is not None else {}
 
     def feed(self, events: Events) -> list[Packet]:
         """Take the next events of the stream; return the packets that are complete.
@@ -165,65 +165,65 @@ class Receiver:
         if self._closed:
             return []
         self._closed = True
-        for listener in self._listeners:
-            listener.end_at(self._clock.last_us)
+        for one in self._receivers:
+            one.end_at(self._clock.last_us)
         packets = [packet for step in self._timeline.close() for packet in self._run(step)]
-        ends = [listener.finish() for listener in self._listeners]
-        if self._contest is None:
-            packets += self._listeners[0].read(ends[0])
+        ends = [one.finish() for one in self._receivers]
+        if self._arbiter is None:
+            packets += self._receivers[0].read(ends[0])
         else:
             for number, found in enumerate(ends):
-                self._contest.add(number, found, self._clock.last_us)
-            packets += self._judged(self._contest.close())
-        for listener in self._listeners:
-            listener.close()
+                self._arbiter.add(number, found, self._clock.last_us)
+            packets += self._judged(self._arbiter.close())
+        for one in self._receivers:
+            one.close()
         return packets
 
     def _waits(self) -> bool:
         """Whether anything waits for the next step."""
-        return any(self._listeners) or bool(self._contest)
+        return any(self._receivers) or bool(self._arbiter)
 
     def _due_us(self) -> float:
         """When the next frame can be decoded, us."""
-        return min(listener.due_us for listener in self._listeners)
+        return min(one.due_us for one in self._receivers)
 
     def _run(self, step: TimeStep) -> list[Packet]:
         """Give each link a time step; give the packets that are complete, of the links that fit."""
         if not step.whole:
-            for listener in self._listeners:
-                listener.ahead(step)
+            for one in self._receivers:
+                one.ahead(step)
             return []
-        contest = self._contest
-        if contest is None:
-            (listener,) = self._listeners
-            return listener.read(listener.step(step, [], set()))
-        for number, listener in enumerate(self._listeners):
-            found = listener.step(step, contest.taken(number), contest.holding)
-            contest.see(number, listener.places)
-            contest.add(number, found, step.end_us)
-        return self._judged(contest.step(step.end_us))
+        arbiter = self._arbiter
+        if arbiter is None:
+            (one,) = self._receivers
+            return one.read(one.step(step, [], set()))
+        for number, one in enumerate(self._receivers):
+            found = one.step(step, arbiter.taken(number), arbiter.owning)
+            arbiter.see(number, one.places)
+            arbiter.add(number, found, step.end_us)
+        return self._judged(arbiter.step(step.end_us))
 
     def _decoded(self, frame: Frame) -> None:
         """Take a frame of one of several links."""
-        assert self._contest is not None
-        self._early.decoded(frame, holds=frame.transmitter in self._contest.holding)
+        assert self._arbiter is not None
+        self._early.decoded(frame, owns=frame.transmitter in self._arbiter.owning)
 
-    def _judged(self, judged: Sequence[ContestedPacket]) -> list[Packet]:
+    def _judged(self, judged: Sequence[ArbitratedPacket]) -> list[Packet]:
         """Read what is given; count what is not."""
         packets = []
         for one in judged:
-            listener = self._listeners[one.link]
+            mine = self._receivers[one.link]
             if not one.fits:
-                listener.refuse(one.packet)
+                mine.refuse(one.packet)
                 self._early.refused(one.packet)
                 continue
-            given = listener.read([one.packet])
-            assert self._contest is not None
-            self._early.given(given[0], holds=one.packet.transmitter in self._contest.holding)
+            given = mine.read([one.packet])
+            assert self._arbiter is not None
+            self._early.given(given[0], owns=one.packet.transmitter in self._arbiter.owning)
             packets += given
-            for other in self._listeners:
-                if other is not listener:
-                    other.disclaim(one.place)
+            for other in self._receivers:
+                if other is not mine:
+                    other.discard_place(one.place)
         return packets
 
 

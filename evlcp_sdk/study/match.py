@@ -14,7 +14,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.shared import differences
-from evlcp_sdk.rx.echoes import FOLLOWED_CHIPS
+from evlcp_sdk.rx.reflections import FOLLOWED_CHIPS
 from evlcp_sdk.sim.truth import SentBar, Truth
 from evlcp_sdk.study.frames import GivenFrame
 

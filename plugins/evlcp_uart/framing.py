@@ -13,7 +13,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Deframer, Framing
-from evlcp_sdk.values import Events, Heard, SoftSymbols
+from evlcp_sdk.values import DecodedFrame, Events, SoftSymbols
 from evlcp_uart.characters import BitOrder, Characters, Parity
 from evlcp_uart.decoder import CLOCK_SHARE, Character, CharacterDecoder, CharacterState
 
@@ -132,11 +132,11 @@ class _Packets:
     def init(self) -> _Heard:
         return _Heard(self.decoder.init())
 
-    def step(self, state: _Heard, events: Events, until_us: int) -> tuple[_Heard, list[Heard]]:
+    def step(self, state: _Heard, events: Events, until_us: int) -> tuple[_Heard, list[DecodedFrame]]:
         decoder, found = self.decoder.step(state.decoder, events.t_us, events.p, until_us)
         return self._number(replace(state, decoder=decoder), found)
 
-    def close(self, state: _Heard) -> tuple[_Heard, list[Heard]]:
+    def close(self, state: _Heard) -> tuple[_Heard, list[DecodedFrame]]:
         decoder, found = self.decoder.close(state.decoder)
         state, heard = self._number(replace(state, decoder=decoder), found)
         if state.waiting:
@@ -148,8 +148,8 @@ class _Packets:
     def counts(self, state: _Heard) -> Mapping[str, int]:
         return state.decoder.given
 
-    def _number(self, state: _Heard, found: list[Character]) -> tuple[_Heard, list[Heard]]:
-        heard: list[Heard] = []
+    def _number(self, state: _Heard, found: list[Character]) -> tuple[_Heard, list[DecodedFrame]]:
+        heard: list[DecodedFrame] = []
         for one in found:
             if state.grid is not None:
                 state, more = self._give(state, (one,))
@@ -178,7 +178,7 @@ class _Packets:
         earlier = (t_us - state.waiting[0].t_us) / (state.waiting[0].bit_us * self.packet.packet_chips)
         return replace(state, grid=_Grid(t_us, math.ceil(earlier - 0.05)))
 
-    def _give(self, state: _Heard, found: tuple[Character, ...]) -> tuple[_Heard, list[Heard]]:
+    def _give(self, state: _Heard, found: tuple[Character, ...]) -> tuple[_Heard, list[DecodedFrame]]:
         """Characters by packet and place in it; one off the grid begins a packet."""
         heard = []
         grid, last = state.grid, state.last
@@ -199,7 +199,7 @@ class _Packets:
             heard.append(self._heard(one, packet, frame, grid.t_us))
         return replace(state, grid=grid, waiting=(), last=last), heard
 
-    def _heard(self, one: Character, packet: int, frame: int, first_us: float) -> Heard:
+    def _heard(self, one: Character, packet: int, frame: int, first_us: float) -> DecodedFrame:
         soft = SoftSymbols(np.array([one.value]), one.llr[None], one.quality)
         start_us = first_us - self.packet.preamble_chips * one.bit_us
-        return Heard(packet, frame, start_us, one.t_us, one.bit_us, soft)
+        return DecodedFrame(packet, frame, start_us, one.t_us, one.bit_us, soft)

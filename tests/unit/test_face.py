@@ -20,7 +20,7 @@ FACE_NAMES = """
     Algorithm Alternative Attitude AttitudeLog BarLayout BarSite Beacon Bend BlockError CameraModel Code
     Codebook CodebookMismatchError ConfigError Corrected Decode Decoding Deframer Detection Detector
     ErrorCorrection EventSource Events EvlcpError FailedBar Filter Fix Frame FrameView Framing GnssLog
-    Heard InputError InterruptedRunError LedColumns LedGrid LedRing LedTable Link Loss Measure Message
+    DecodedFrame InputError InterruptedRunError LedColumns LedGrid LedRing LedTable Link Loss Measure Message
     MessageKind Modulation OutputError Packet PacketFormat Pilots Place PluginError PluginWarning
     PositionPlan PresenceMap Range Ranging RawFormatError ReceivedMessage Receiver Reception Region
     Registry ReplaySource ResultFolder Run Separate Separation Settled SimulatedSource Sink SinkRecord

@@ -93,12 +93,12 @@ RX = (
     {"early", "limits", "lit", "places", "rhythm"},
     {"followed", "guard", "timeline", "trust"},
     {"framer", "tracker"},
-    {"belief", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges"},
-    {"contest", "detected", "points", "spread", "steps"},
-    {"look"},
-    {"echoes", "reading", "transmitters"},
-    {"framed", "framing"},
-    {"listener"},
+    {"llr_calibration", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges"},
+    {"arbitration", "detected", "points", "spread", "steps"},
+    {"alignment"},
+    {"reflections", "reading", "transmitters"},
+    {"plugin_framing", "framing"},
+    {"link_receiver"},
     {"receiver"},
 )
 """The receiver from its stages up to what joins them: a module imports from below its own row only."""

@@ -278,11 +278,11 @@ def test_beacons_tell_who_and_where() -> None:
     assert_right(fixes)
     assert not any(f.verified for f in fixes)
     # Without a file, a verified beacon's own place is believed; an unverified one's only if so configured.
-    for trust, believed, given in (
+    for trust, calibrate_llr, given in (
         ("verified", "verified", True), ("unverified", "verified", False),
         ("unverified", "any", True), ("verified", "none", False),
     ):  # fmt: skip
-        p = positioner([], beacons=believed)
+        p = positioner([], beacons=calibrate_llr)
         fixes = p.feed(packets_of(RIGHT, 0, 6, messages={0: (heard(RIGHT, trust, 0),)})) + p.close()  # type: ignore[arg-type]
         if given:
             assert_right(fixes)

@@ -16,7 +16,7 @@ from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Detection, Modulation, Pilots, Ranging, Tracking
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.values import Heard, SoftSymbols
+from evlcp_sdk.values import DecodedFrame, SoftSymbols
 
 Evlcp = Callable[..., Any]
 
@@ -29,13 +29,13 @@ def boom(*_: object) -> Any:
     raise KeyError("boom")
 
 
-def heard(t_us: float, packet: int = 0, frame: int = 0, chip_us: float = 100.0, **soft: Any) -> Heard:
+def heard(t_us: float, packet: int = 0, frame: int = 0, chip_us: float = 100.0, **soft: Any) -> DecodedFrame:
     given = {
         "symbols": np.array([65]),
         "llr": np.ones((1, 8), np.float32),
         "quality": 0.9,
     }
-    return Heard(packet, frame, t_us, t_us, chip_us, SoftSymbols(**given | soft))
+    return DecodedFrame(packet, frame, t_us, t_us, chip_us, SoftSymbols(**given | soft))
 
 
 class Steps:
@@ -180,7 +180,7 @@ CHIPS = "codebook codewords: expected a 2-D array of chips 0 and 1"
 SAYS: dict[tuple[str, str], str] = {
     **{("framing", name): says for name, says in STEP_FAULTS.items()},
     **{("detection", name): says for name, says in STEP_FAULTS.items()},
-    ("framing", "gives fives"): "gave int, expected Heard",
+    ("framing", "gives fives"): "gave int, expected DecodedFrame",
     ("detection", "gives fives"): "gave int, expected Region",
     ("framing", "time is NaN"): "gave t_us = nan, expected a number from ",
     ("framing", "LLR is NaN"): "gave llr of other values, expected finite ones",

@@ -167,8 +167,8 @@ def test_a_message_is_a_line_after_its_packet(tmp_path: Path) -> None:
     assert lines[2] == {"kind": "data"} | unsigned | {"data": "00ff"}
     place = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 52.0, "user": "0102"}
     place |= {"heading_deg": 90.0, "tilt_deg": 1.0, "length_m": 0.96}
-    believed = {"verified": True, "trust": "verified", "reason": "signed then", "age_s": 2.5}
-    assert lines[3] == {"kind": "beacon"} | believed | shared | place
+    calibrate_llr = {"verified": True, "trust": "verified", "reason": "signed then", "age_s": 2.5}
+    assert lines[3] == {"kind": "beacon"} | calibrate_llr | shared | place
     assert (lines[4]["verified"], lines[4]["trust"], lines[4]["reason"]) == (False, "forged", "replayed")
 
 

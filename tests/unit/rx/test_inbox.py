@@ -329,8 +329,8 @@ def test_every_forgery_of_ten_thousand_is_found_out(signed: Signed, tmp_path: Pa
             moved_beacon = Message(Kind.BEACON, 7, sequence + 1, replace(PLACE, height_m=0.0).pack())
             shown = [moved_beacon, signing.sign(moved_beacon, CODER.digest, other.key)]
         told = show(shown, 1)
-        believed = [m for m in told if m.trust == "verified"]
-        flagged += bool(told) and told[-1].trust == "forged" and not believed
+        calibrate_llr = [m for m in told if m.trust == "verified"]
+        flagged += bool(told) and told[-1].trust == "forged" and not calibrate_llr
     # Some tampered bytes are a place that cannot be: counted, and never handed on.
     assert flagged + assembler.counts["messages_undecodable"] == 10_000
     assert flagged > 9_000

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.rx.contest import explained_us
+from evlcp_sdk.rx.arbitration import explained_us
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.receiver import Receiver

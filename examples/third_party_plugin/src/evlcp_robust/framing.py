@@ -92,9 +92,11 @@ class _Flashes:
     def init(self) -> _State:
         return _State(np.empty(0))
 
-    def step(self, state: _State, events: evlcp.Events, until_us: float) -> tuple[_State, list[evlcp.Heard]]:
+    def step(
+        self, state: _State, events: evlcp.Events, until_us: float
+    ) -> tuple[_State, list[evlcp.DecodedFrame]]:
         state = self._flashes(state, events.t_us[events.p == 1], until_us)
-        heard: list[evlcp.Heard] = []
+        heard: list[evlcp.DecodedFrame] = []
         # A flash is known a chip after it began.
         known_us = until_us - self.packet.chip_us
         while True:
@@ -121,9 +123,9 @@ class _Flashes:
             )
             if soft is not None:
                 chip_us = self.packet.chip_us
-                heard.append(evlcp.Heard(now.number, now.frame, now.t_us, start_us, chip_us, soft))
+                heard.append(evlcp.DecodedFrame(now.number, now.frame, now.t_us, start_us, chip_us, soft))
 
-    def close(self, state: _State) -> tuple[_State, list[evlcp.Heard]]:
+    def close(self, state: _State) -> tuple[_State, list[evlcp.DecodedFrame]]:
         return self.step(state, evlcp.Events.empty(), math.inf)
 
     def counts(self, state: _State) -> Mapping[str, int]:

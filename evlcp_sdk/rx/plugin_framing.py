@@ -11,17 +11,17 @@ import numpy as np
 from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
-from evlcp_sdk.rx.echoes import EchoQueue, Sighting
 from evlcp_sdk.rx.followed import Followed, same_place
 from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.packets import PacketAssembler
+from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.tracker import RegionTracker
-from evlcp_sdk.values import Frame, Heard, Range, Region, SyncLock
+from evlcp_sdk.values import DecodedFrame, Frame, Range, Region, SyncLock
 
 __all__ = ["PluginFraming"]
 
@@ -77,7 +77,7 @@ class PluginFraming(Framer):
         self,
         link: Link,
         deframer: Deframer,
-        judged: EchoQueue,
+        judged: ReflectionQueue,
         clock: CameraClock,
         announcer: Announcer,
         regions: RegionTracker,
@@ -90,7 +90,7 @@ class PluginFraming(Framer):
         self._codebook, self._packet = link.codebook, link.packet
         self._step_us = link.regions.step_us
         self._judged = judged
-        self._echoes = judged.echoes
+        self._reflections = judged.reflections
         self._camera_us: Callable[[float], float] = clock.camera_us
         self._announcer = announcer
         self._regions = regions
@@ -142,11 +142,11 @@ class PluginFraming(Framer):
         """Where the transmitters are that have a number and are in sight, by number."""
         return {one.number: one.region.latest for one in self._listeners.values() if one.number is not None}
 
-    def leave(self, taken: Sequence[Region], holding: Collection[int]) -> None:
+    def leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
         """Let regions go in places that are others', but for those of transmitters that hold theirs."""
         for region in list(self._regions.alive):
             listener = self._listeners.get(region.id)
-            if listener is not None and listener.number in holding:
+            if listener is not None and listener.number in owning:
                 continue
             if any(same_place(region.latest, place) for place in taken):
                 self._regions.drop(region)
@@ -155,11 +155,11 @@ class PluginFraming(Framer):
                     self._judged.end(listener.packets)
                     del self._listeners[region.id]
 
-    def disclaim(self, place: Region) -> int:
+    def discard_place(self, place: Region) -> int:
         """Nothing: a framing says what it receives, not what it rejects."""
         return 0
 
-    def disown(self, number: int) -> int:
+    def discard_packet(self, number: int) -> int:
         """Nothing, likewise."""
         return 0
 
@@ -176,11 +176,11 @@ class PluginFraming(Framer):
         self._take(listener, heard)
         self._judged.end(listener.packets)
 
-    def _take(self, listener: _Listener, heard: list[Heard]) -> None:
+    def _take(self, listener: _Listener, heard: list[DecodedFrame]) -> None:
         """Number a region's frames, say where they were seen, and hand them on."""
         self._count(listener)
         for one in heard:
-            self._guard.expect(one, Heard)
+            self._guard.expect(one, DecodedFrame)
             self._guard.expect_symbols(one.soft, self._codebook)
             self._guard.expect_number(one.frame, "frame", 0, self._packet.frames - 1)
             for name in ("t_us", "packet_t_us"):
@@ -210,7 +210,7 @@ class PluginFraming(Framer):
                 filtered=None,
                 x_px=float(x[0]),
                 y_px=float(y[0]),
-                echo_of=self._echoes.echo_of(listener.number),
+                echo_of=self._reflections.echo_of(listener.number),
                 link=self._name,
             )
             self.counts["frames"] += 1
@@ -223,7 +223,9 @@ class PluginFraming(Framer):
                 number, one.packet, one.frame, chips, False, one.packet_t_us, one.t_us, end_us, lock, end_us
             )
             light = listener.events / len(heard)
-            self._judged.add(listener.packets, due, Sighting(frame, light, self._codebook.clusters, False))
+            self._judged.add(
+                listener.packets, due, FrameDetection(frame, light, self._codebook.clusters, False)
+            )
         if heard:
             listener.events = 0
 

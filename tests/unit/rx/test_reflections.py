@@ -13,10 +13,17 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.rx.echoes import Echoes, EchoQueue, Sighting, brighter, originals, repeats
 from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.rx.reflections import (
+    FrameDetection,
+    ReflectionQueue,
+    Reflections,
+    brighter,
+    originals,
+    repeats,
+)
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols, SyncLock
 
@@ -36,7 +43,7 @@ def sighting(
     x_px: float | None = None,
     light: float = 100.0,
     mirrored: bool = False,
-) -> Sighting:
+) -> FrameDetection:
     """The frame of a number since the start."""
     packet, index = divmod(number, FORMAT.frames)
     t_us = packet * PERIOD_US + FORMAT.frame_start_chip(index) * FORMAT.chip_us + late_us
@@ -44,7 +51,7 @@ def sighting(
     none = Range(math.nan, math.nan, 0)
     x_px = 400.0 + 40 * transmitter if x_px is None else x_px
     frame = Frame(transmitter, packet, index, t_us, soft, none, None, x_px, y_px)
-    return Sighting(frame, light, int((symbols >= 0).sum()), mirrored)
+    return FrameDetection(frame, light, int((symbols >= 0).sum()), mirrored)
 
 
 def said(number: int, seed: int = 0) -> Symbols:
@@ -78,7 +85,7 @@ def test_independent_payloads_are_never_taken_for_one() -> None:
     """Two transmitters on one clock with other data: 2,000 pairs of 100 frames, none is a reflection."""
     rng = np.random.default_rng(2)
     for _ in range(200):
-        echoes = Echoes(FORMAT, CODEWORDS)
+        echoes = Reflections(FORMAT, CODEWORDS)
         for n in range(100):
             symbols = rng.integers(0, CODEWORDS, (5, 16))
             echoes.judge(sighting(k, n, s, late_us=k) for k, s in enumerate(symbols))
@@ -88,7 +95,7 @@ def test_independent_payloads_are_never_taken_for_one() -> None:
 @pytest.mark.parametrize("right", [16, 12, 8])
 def test_the_first_frame_is_enough(right: int) -> None:
     rng = np.random.default_rng(3)
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, misread(said(0), right, rng), light=70)])
     assert (echoes.echo_of(0), echoes.echo_of(1)) == (None, 0)
 
@@ -96,7 +103,7 @@ def test_the_first_frame_is_enough(right: int) -> None:
 def test_a_reflection_of_which_most_is_misread_is_found_within_a_packet() -> None:
     rng = np.random.default_rng(4)
     for _ in range(50):
-        echoes = Echoes(FORMAT, CODEWORDS)
+        echoes = Reflections(FORMAT, CODEWORDS)
         for n in range(10):
             echoes.judge([sighting(0, n, said(n)), sighting(1, n, misread(said(n), 4, rng), light=70)])
         assert echoes.echo_of(1) == 0
@@ -107,22 +114,22 @@ def test_a_partial_reflection(clusters: int) -> None:
     """Only some clusters of the mirror image are seen: those are compared."""
     part = said(0)
     part[: 16 - clusters] = -1
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, part, light=70)])
     assert echoes.echo_of(1) == 0
     # As bright as the bar, whichever is first.
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     echoes.judge([sighting(0, 0, part), sighting(1, 0, said(0))])
     assert echoes.echo_of(0) == 1
     # What is hidden of the one is all that is seen of the other: nothing is known.
     rest = np.where(part < 0, said(0), -1)
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     echoes.judge([sighting(0, 0, rest), sighting(1, 0, part, light=70)])
     assert echoes.echo_of(1) is None
 
 
 def test_frames_at_other_times_are_not_compared() -> None:
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(20):
         echoes.judge([sighting(0, n, said(n)), sighting(1, n, said(n), late_us=60)])
     assert echoes.echo_of(0) is echoes.echo_of(1) is None
@@ -135,7 +142,7 @@ def test_frames_at_other_times_are_not_compared() -> None:
 def test_a_bar_with_two_reflections(order: tuple[int, ...]) -> None:
     """In whatever order they were numbered: both are reflections of the bar, none of a reflection."""
     bar, road, rail = order
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(3):
         echoes.judge(
             [
@@ -149,7 +156,7 @@ def test_a_bar_with_two_reflections(order: tuple[int, ...]) -> None:
 
 def test_what_comes_late_is_judged_by_what_was_before() -> None:
     """A reflection is heard two packets late: it starts with the frames before its lock."""
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(25):
         echoes.judge([sighting(0, n, said(n))])
     echoes.judge([sighting(1, n, said(n), light=70) for n in range(5, 25)])
@@ -158,7 +165,7 @@ def test_what_comes_late_is_judged_by_what_was_before() -> None:
 
 def test_one_image_seen_by_two_regions_is_no_reflection() -> None:
     for off_px, echo_of in ((0.0, None), (4.0, None), (6.0, 0)):
-        echoes = Echoes(FORMAT, CODEWORDS)
+        echoes = Reflections(FORMAT, CODEWORDS)
         for n in range(10):
             echoes.judge([sighting(0, n, said(n), x_px=400.0), sighting(1, n, said(n), x_px=400.0 + off_px)])
         assert echoes.echo_of(1) == echo_of
@@ -167,7 +174,7 @@ def test_one_image_seen_by_two_regions_is_no_reflection() -> None:
 def test_the_verdict_is_stable() -> None:
     rng = np.random.default_rng(5)
     for light in (100.0, 85.0, 50.0, 30.0):
-        echoes, verdicts = Echoes(FORMAT, CODEWORDS), []
+        echoes, verdicts = Reflections(FORMAT, CODEWORDS), []
         for n in range(200):
             # Frame by frame, now the one has more light, now the other.
             now = light * math.exp(rng.normal(0, 0.15))
@@ -183,7 +190,7 @@ def test_light_tells_the_bar_unless_one_stands_upside_down() -> None:
     for light in (0.05, 0.3, 3.0):
         assert brighter(light) == -brighter(-light) > 0
     for light in (70, 150, 500):
-        echoes = Echoes(FORMAT, CODEWORDS)
+        echoes = Reflections(FORMAT, CODEWORDS)
         for n in range(5):
             image = sighting(0, n, said(n), light=light, mirrored=True)
             echoes.judge([image, sighting(1, n, said(n))])
@@ -191,7 +198,7 @@ def test_light_tells_the_bar_unless_one_stands_upside_down() -> None:
 
 
 def test_a_bar_that_appears_after_its_reflection_takes_its_place() -> None:
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(10):
         echoes.judge([sighting(0, n, said(n), light=60, mirrored=True)])
         assert echoes.echo_of(0) is None
@@ -204,7 +211,7 @@ def test_a_bar_that_appears_after_its_reflection_takes_its_place() -> None:
 
 
 def test_a_reflection_outlives_its_bar_by_a_second() -> None:
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, said(0), light=70)])
     for n in range(1, 400):
         echoes.judge([sighting(1, n, said(n), light=70)])
@@ -216,7 +223,7 @@ def test_a_reflection_outlives_its_bar_by_a_second() -> None:
 
 
 def test_memory_is_bounded() -> None:
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(2000):
         echoes.judge([sighting(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
         assert sum(map(len, echoes._seen.values())) <= 4 * (3 * FORMAT.frames + 1)
@@ -229,7 +236,7 @@ def test_the_order_within_a_step_does_not_matter(order: list[int], seed: int) ->
     rng = np.random.default_rng(seed)
     found = []
     for way in (range(4), order):
-        echoes = Echoes(FORMAT, CODEWORDS)
+        echoes = Reflections(FORMAT, CODEWORDS)
         rng = np.random.default_rng(seed)
         for n in range(4):
             every = [
@@ -256,7 +263,7 @@ def test_originals_against_every_choice() -> None:
 
 def test_the_queue_marks_what_the_next_step_tells() -> None:
     """A bar locks a step after its reflection: the reflection's frames have waited."""
-    queue = EchoQueue(Echoes(FORMAT, CODEWORDS))
+    queue = ReflectionQueue(Reflections(FORMAT, CODEWORDS))
     grid = PacketGrid(FORMAT)
     grid.restart(SyncLock(0.0, FORMAT.chip_us, 0.0, 0.0, 1.0), 0.0)
     due = grid.due(1e9)
@@ -371,7 +378,7 @@ def test_two_bars_on_one_clock_are_two() -> None:
 
 
 def test_what_was_shown_then_and_there_is_known() -> None:
-    echoes = Echoes(FORMAT, CODEWORDS)
+    echoes = Reflections(FORMAT, CODEWORDS)
     one = sighting(0, 3, said(3), x_px=300.0, y_px=350.0)
     echoes.judge([one])
     t_us = one.frame.t_us

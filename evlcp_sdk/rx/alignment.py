@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["Look", "Looker", "Pilot", "polarity_sums"]
+__all__ = ["AlignedFrame", "FrameAligner", "Pilot", "polarity_sums"]
 
 _LEAST_CLUSTERS = 0.5
 """Share of the clusters that must be in their place in a frame: fewer may be another bar's."""
@@ -56,7 +56,7 @@ class Pilot:
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class AlignedFrame:
     """A frame with the bar held still.
 
     Attributes:
@@ -92,7 +92,7 @@ class Look:
         return centre.real, centre.imag
 
 
-class Looker:
+class FrameAligner:
     """Looks at one frame after the other; a pilot is handed on to the frames after it.
 
     Args:
@@ -128,8 +128,10 @@ class Looker:
             np.arange(packet.frame_chips + self._after, dtype=np.float64) + 0.5
         )
 
-    def look(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> tuple[Look | None, Pilot | None]:
-        """Look at a frame.
+    def align(
+        self, region: Followed, due: DueFrame, pilot: Pilot | None
+    ) -> tuple[AlignedFrame | None, Pilot | None]:
+        """Hold a frame's image still, and find its clusters.
 
         Args:
             region: The bar's.
@@ -184,7 +186,7 @@ class Looker:
             centre_y - (size[1] - 1) / 2 - sum(rests_y) / many,
         )
         middle_us = chip_us - lock.chip_us / 2
-        look = Look(
+        aligned = AlignedFrame(
             sums,
             offset_px[:, :chips],
             pilot.presence,
@@ -193,63 +195,65 @@ class Looker:
             corner_px,
             middle_us,
         )
-        return look, pilot
+        return aligned, pilot
 
-    def centre(self, look: Look, points_px: NDArray[np.float64]) -> tuple[float, float]:
+    def centre(self, aligned: AlignedFrame, points_px: NDArray[np.float64]) -> tuple[float, float]:
         """Column and row of the bar's centre on the sensor, px, by its clusters' points, float64 (K, 2).
 
         Points are finer than the cells that placed the layout; without any, those count.
         """
-        placed = look.placement
+        placed = aligned.placement
         off = _kernels.mean_off(points_px, placed.places(self._layout))
         if off is None:
-            return look.centre_px
+            return aligned.centre_px
         centre = placed.shift + off
         return centre.real, centre.imag
 
-    def box(self, look: Look, placement: Placement) -> tuple[tuple[float, float], tuple[float, float]]:
+    def box(
+        self, aligned: AlignedFrame, placement: Placement
+    ) -> tuple[tuple[float, float], tuple[float, float]]:
         """Centre (column, row) on the sensor and (width, height) of a whole bar, hidden parts too, px.
 
         Args:
-            look: A frame.
+            aligned: A frame.
             placement: The bar's own or that of another instance, taken to be as wide.
         """
-        places, right_px, down_px = self._spots(look, placement)
+        places, right_px, down_px = self._spots(aligned, placement)
         left, right, top, bottom = _kernels.bounds_of(places)
         left, right, top, bottom = left - right_px, right + right_px, top - down_px, bottom + down_px
-        x, y = look.corner_px
+        x, y = aligned.corner_px
         return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
 
-    def whole(self, look: Look) -> PresenceMap:
+    def whole(self, aligned: AlignedFrame) -> PresenceMap:
         """What a frame shows, without the clusters that the edge of the sensor cuts.
 
         They would be measured by what is left of them, nearer to the others than they are: those whose
         middle is nearer to it than half a spacing. A line of clusters stays as it is.
         """
-        if self._layout.line or look.placement.scale == 0:
-            return look.presence
-        places, right_px, down_px = self._spots(look, look.placement)
-        x, y = places.real + look.corner_px[0], places.imag + look.corner_px[1]
+        if self._layout.line or aligned.placement.scale == 0:
+            return aligned.presence
+        places, right_px, down_px = self._spots(aligned, aligned.placement)
+        x, y = places.real + aligned.corner_px[0], places.imag + aligned.corner_px[1]
         width, height = self._sensor_px
         cut = (x < right_px) | (x > width - 1 - right_px) | (y < down_px) | (y > height - 1 - down_px)
         if not cut.any():
-            return look.presence
-        presence = look.presence
+            return aligned.presence
+        presence = aligned.presence
         images = {name: getattr(presence, name) for name in ("probability", "selected", "pixels", "prior")}
         kept = {name: image.copy() for name, image in images.items() if image is not None}
         for image in kept.values():
             image[cut] = 0
         return changed(presence, **kept)
 
-    def lit_rows(self, look: Look) -> tuple[float, float] | None:
+    def lit_rows(self, aligned: AlignedFrame) -> tuple[float, float] | None:
         """Upper and lower edge of the clusters that a frame shows, from the whole bar's centre, px.
 
         None where it shows both ends.
         """
-        placement = look.placement
+        placement = aligned.placement
         if placement.scale == 0 or False not in placement.seen.tolist():
             return None
-        places, _, down_px = self._spots(look, placement)
+        places, _, down_px = self._spots(aligned, placement)
         _, _, top, bottom = _kernels.bounds_of(places)
         rows = places.imag[placement.seen]
         first, last, centre = float(rows.min()), float(rows.max()), (top + bottom) / 2
@@ -257,15 +261,15 @@ class Looker:
             return None
         return first - down_px - centre, last + down_px - centre
 
-    def strips(self, look: Look) -> NDArray[np.float64] | None:
+    def strips(self, aligned: AlignedFrame) -> NDArray[np.float64] | None:
         """Columns that a bar's light stands in: (middle from the bar's centre, half of the width), px.
 
         float64 (n, 2); None where there is one strip, or none that is dark for as far as a bar may move in a
         step lies between two.
         """
-        if not self._apart or look.placement.scale == 0:
+        if not self._apart or aligned.placement.scale == 0:
             return None
-        places, right_px, _ = self._spots(look, look.placement)
+        places, right_px, _ = self._spots(aligned, aligned.placement)
         across = np.sort(places.real)
         ends = np.flatnonzero(np.diff(across) > 2 * (right_px + MARGIN_PX))
         if not len(ends):
@@ -274,10 +278,12 @@ class Looker:
         centre = (across[0] + across[-1]) / 2
         return np.stack([(first + last) / 2 - centre, (last - first) / 2 + right_px], 1)
 
-    def _spots(self, look: Look, placement: Placement) -> tuple[NDArray[np.complex128], float, float]:
+    def _spots(
+        self, aligned: AlignedFrame, placement: Placement
+    ) -> tuple[NDArray[np.complex128], float, float]:
         """Where an instance's clusters are in the image, and how far each reaches to its sides, px."""
-        selected, grid = look.presence.selected, look.presence.grid_px
-        own, layout = look.placement, self._layout
+        selected, grid = aligned.presence.selected, aligned.presence.grid_px
+        own, layout = aligned.placement, self._layout
         if own.scale == 0:
             row, column = np.nonzero(selected.any(0))
             places = (column + 1j * row) * grid + (grid - 1) / 2 * (1 + 1j)

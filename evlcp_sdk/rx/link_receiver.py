@@ -9,13 +9,13 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Tracker
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
-from evlcp_sdk.rx.echoes import Echoes, EchoQueue
-from evlcp_sdk.rx.framed import PluginFraming
 from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.plugin_framing import PluginFraming
+from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
 from evlcp_sdk.rx.timeline import TimeStep
@@ -25,10 +25,10 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Frame, Packet, Region, changed
 
-__all__ = ["LinkListener"]
+__all__ = ["LinkReceiver"]
 
 
-class LinkListener:
+class LinkReceiver:
     """Follows the regions of a stream by one link, receives and decodes what they send, reads its messages.
 
     Args:
@@ -62,7 +62,7 @@ class LinkListener:
         self._announcer = Announcer(hook, clock.camera_us, on_frame)
         tracker = tracker_of(link)
         self._regions = _regions_of(link, tracker, limits, rhythm)
-        self._judged = EchoQueue(Echoes(link.packet, len(link.codebook.codewords)))
+        self._judged = ReflectionQueue(Reflections(link.packet, len(link.codebook.codewords)))
         with Guard(link, "framing", may_refuse=True):
             deframer = link.algorithm("framing").compile(link.codebook, link.packet)
         self._framing: Framer
@@ -141,18 +141,18 @@ class LinkListener:
         """Decode the frames that are due in the part so far of a time step."""
         self._framing.ahead(step)
 
-    def step(self, step: TimeStep, taken: list[Region], holding: set[int]) -> list[Packet]:
+    def step(self, step: TimeStep, taken: list[Region], owning: set[int]) -> list[Packet]:
         """Follow the regions through a time step; receive and decode what they send.
 
         Args:
             step: The events.
             taken: Places that other links hold.
-            holding: Numbers of the transmitters that hold theirs.
+            owning: Numbers of the transmitters that own theirs.
         """
         if step.after_gap:
             self._regions.skip()
         if taken:
-            self._framing.leave(taken, holding)
+            self._framing.leave(taken, owning)
         self._announcer.start()
         regions = self._regions.step(step.start_us, step.events, taken)
         for region in regions:
@@ -188,11 +188,11 @@ class LinkListener:
     def refuse(self, packet: Packet) -> None:
         """Count a packet that another link fits better."""
         self._of_others += len(packet.frames)
-        self._rejected_of_others += self._framing.disown(packet.transmitter)
+        self._rejected_of_others += self._framing.discard_packet(packet.transmitter)
 
-    def disclaim(self, place: Region) -> None:
+    def discard_place(self, place: Region) -> None:
         """Count frames that were rejected in another link's place apart from those that no link reads."""
-        self._rejected_of_others += self._framing.disclaim(place)
+        self._rejected_of_others += self._framing.discard_place(place)
 
     def close(self) -> None:
         """End the stream: what messages still lack is missing."""

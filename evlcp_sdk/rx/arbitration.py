@@ -18,7 +18,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.followed import same_place
 from evlcp_sdk.values import Packet, Region, changed
 
-__all__ = ["Contest", "ContestedPacket", "explained_us"]
+__all__ = ["ArbitratedPacket", "LinkArbiter", "explained_us"]
 
 _CLEARLY = 1.25
 """How many times more light one link explains than another before nothing else matters."""
@@ -26,7 +26,7 @@ _CLEARLY = 1.25
 _HELD = 2.0
 """What light counts of a link that holds the place: what wavers by less changes nothing."""
 
-_HOLDS = 0.5
+_OWNS = 0.5
 """Share of the light that a packet explains by which its transmitter holds its place."""
 
 _MOST_KNOWN = 1024
@@ -52,7 +52,7 @@ def explained_us(packet: Packet, form: PacketFormat) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class ContestedPacket:
+class ArbitratedPacket:
     """A packet, and whether it is given.
 
     Attributes:
@@ -93,7 +93,7 @@ class _Shown:
     whole_us: float
 
 
-class Contest:
+class LinkArbiter:
     """Lets packets wait, and gives those of the link that fits their place.
 
     Args:
@@ -114,16 +114,16 @@ class Contest:
         self._frames = 0
         self._places: list[Mapping[int, Region]] = [{} for _ in links]
         self._known: dict[int, Region] = {}
-        self._holding: set[int] = set()
+        self._owning: set[int] = set()
 
     def __bool__(self) -> bool:
         """Whether anything waits."""
         return bool(self._waiting)
 
     @property
-    def holding(self) -> set[int]:
+    def owning(self) -> set[int]:
         """Numbers of the transmitters that hold their places."""
-        return self._holding
+        return self._owning
 
     def taken(self, link: int) -> list[Region]:
         """Places that transmitters of other links hold, with the gap below which areas are one."""
@@ -132,7 +132,7 @@ class Contest:
             for other, places in enumerate(self._places)
             if other != link
             for number, place in places.items()
-            if number in self._holding
+            if number in self._owning
         ]
 
     def see(self, link: int, places: Mapping[int, Region]) -> None:
@@ -144,7 +144,7 @@ class Contest:
         while len(self._known) > _MOST_KNOWN:
             number = next(iter(self._known))
             del self._known[number]
-            self._holding.discard(number)
+            self._owning.discard(number)
 
     def add(self, link: int, packets: Sequence[Packet], now_us: float) -> None:
         """Take packets that a link has decoded by now."""
@@ -160,7 +160,7 @@ class Contest:
             self._waiting.append(_Shown(link, packet, place, *times, light_us, whole_us))
             self._frames += len(packet.frames)
 
-    def step(self, now_us: float) -> list[ContestedPacket]:
+    def step(self, now_us: float) -> list[ArbitratedPacket]:
         """Judge the packets that have waited long enough."""
         judged = []
         while self._waiting and (self._waiting[0].leaves_us <= now_us or self._frames > _MOST_FRAMES):
@@ -169,19 +169,19 @@ class Contest:
             self._frames -= len(shown.packet.frames)
             self._judged.append(self._waiting.popleft())
             number = shown.packet.transmitter
-            if fits and shown.light_us >= _HOLDS * shown.whole_us:
-                self._holding.add(number)
+            if fits and shown.light_us >= _OWNS * shown.whole_us:
+                self._owning.add(number)
             else:
-                self._holding.discard(number)
+                self._owning.discard(number)
             judged.append(
-                ContestedPacket(shown.link, shown.packet, _grown(shown.place, 2 * self._gap_px), fits)
+                ArbitratedPacket(shown.link, shown.packet, _grown(shown.place, 2 * self._gap_px), fits)
             )
         oldest_us = now_us - 2 * self._wait_us - self._longest_us
         while self._judged and (self._judged[0].leaves_us < oldest_us or len(self._judged) > _MOST_FRAMES):
             self._judged.popleft()
         return judged
 
-    def close(self) -> list[ContestedPacket]:
+    def close(self) -> list[ArbitratedPacket]:
         """End the stream: judge all that waits."""
         return self.step(float("inf"))
 
@@ -202,7 +202,7 @@ class Contest:
         light, whole = dict.fromkeys((shown.link,), 0.0), dict.fromkeys((shown.link,), 0.0)
         for other in about:
             if (number := other.packet.transmitter) in rivals:
-                held = _HELD if number in self._holding else 1.0
+                held = _HELD if number in self._owning else 1.0
                 light[other.link] = light.get(other.link, 0.0) + held * other.light_us
                 whole[other.link] = whole.get(other.link, 0.0) + other.whole_us
         best, *others = sorted(light)

@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import hadamard
-from evlcp_sdk.rx.belief import believed, still_lit
+from evlcp_sdk.rx.llr_calibration import calibrate_llr, still_lit
 from evlcp_sdk.values import PresenceMap, SoftSymbols
 
 ALL = np.ones(16, bool)
@@ -36,7 +36,7 @@ def test_of_frames_with_quality_q_one_less_q_are_wrong(noise: float, least: floa
     wrong, doubt = [], []
     for _ in range(400):
         sent, read = sent_and_read(rng, noise, scale)
-        soft = believed(read, ALL)
+        soft = calibrate_llr(read, ALL)
         given = soft.symbols >= 0
         wrong.append((soft.symbols != sent)[given].any())
         doubt.append(1 - soft.quality)
@@ -49,7 +49,7 @@ def test_what_is_rather_wrong_is_not_given() -> None:
     hidden = right = 0
     for _ in range(300):
         sent, read = sent_and_read(rng, 1.6, 1.0)
-        soft = believed(read, ALL)
+        soft = calibrate_llr(read, ALL)
         hidden += int((soft.symbols < 0).sum())
         right += int((read.symbols == sent)[soft.symbols < 0].sum())
         # Their LLRs say so: they stay, for the error correction.
@@ -62,12 +62,12 @@ def test_what_is_rather_wrong_is_not_given() -> None:
 def test_of_what_is_not_seen_nothing_is_given() -> None:
     _, read = sent_and_read(np.random.default_rng(0), 0.1, 1.0)
     seen = np.arange(16) != 5
-    soft = believed(read, seen)
+    soft = calibrate_llr(read, seen)
     assert soft.symbols[5] == -1
     assert not soft.llr[5].any()
     np.testing.assert_array_equal(soft.symbols[seen], read.symbols[seen])
     assert soft.quality > 0.999
-    for none in (believed(read, ~ALL), believed(SoftSymbols(read.symbols, 0 * read.llr, 1.0), ALL)):
+    for none in (calibrate_llr(read, ~ALL), calibrate_llr(SoftSymbols(read.symbols, 0 * read.llr, 1.0), ALL)):
         assert (none.symbols == -1).all()
         assert not none.llr.any()
         assert none.quality == 0

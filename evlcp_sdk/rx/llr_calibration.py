@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["believed", "still_lit"]
+__all__ = ["calibrate_llr", "still_lit"]
 
 _FRAME_WORTH = 6.0
 """LLRs of a cluster that those of all its frame are worth: light and shaking are much the same for all,
@@ -55,7 +55,7 @@ def still_lit(
     return over > 0
 
 
-def believed(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
+def calibrate_llr(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
     """A frame as a decoding read it, with what can be believed.
 
     Decoders are surer than they are right, or less, each in its own way: pixels share light and motion.
@@ -72,7 +72,7 @@ def believed(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
         seen: Clusters that are in sight, bool (K,); nothing is given of the others, and their LLRs are 0.
     """
     symbols, llr = np.empty_like(soft.symbols), np.empty_like(soft.llr)
-    quality = _kernels.believe(
+    quality = _kernels.calibrate_llr(
         soft.symbols,
         soft.llr,
         seen,

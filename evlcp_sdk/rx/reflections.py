@@ -23,7 +23,15 @@ from evlcp_sdk.rx.placement import Placement
 from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet, changed
 
-__all__ = ["FOLLOWED_CHIPS", "EchoQueue", "Echoes", "Sighting", "brighter", "originals", "repeats"]
+__all__ = [
+    "FOLLOWED_CHIPS",
+    "FrameDetection",
+    "ReflectionQueue",
+    "Reflections",
+    "brighter",
+    "originals",
+    "repeats",
+]
 
 FOLLOWED_CHIPS = 2.5
 """The last events of a frame come late, some later than its clock says: it is whole if its light goes on for
@@ -73,7 +81,7 @@ _REMEMBER_US = 1e6
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class FrameDetection:
     """A decoded frame, and what tells a bar from its reflection.
 
     Attributes:
@@ -91,7 +99,7 @@ class Sighting:
     spread: Spread | None = None
 
     @classmethod
-    def of(cls, frame: Frame, placed: Placement, spread: Spread | None) -> "Sighting":
+    def of(cls, frame: Frame, placed: Placement, spread: Spread | None) -> "FrameDetection":
         """What a frame's image shows, by where it shows the layout."""
         seen = max(sum(placed.seen.tolist()), 1)
         return cls(frame, placed.cells / seen, seen, placed.mirrored, spread)
@@ -185,7 +193,7 @@ class _Pair:
     compared: int = 0
     last_us: float = -math.inf
 
-    def add(self, one: Sighting, other: Sighting, codewords: int) -> None:
+    def add(self, one: FrameDetection, other: FrameDetection, codewords: int) -> None:
         """Take a frame in common."""
         change = repeats(one.frame.soft.symbols, other.frame.soft.symbols, codewords)
         self.evidence = min(max(self.evidence + change, -2 * _SURE), 2 * _SURE)
@@ -216,7 +224,7 @@ class _Pair:
         return turned + light + _WHOLE * self.seen / lit
 
 
-class Echoes:
+class Reflections:
     """Judges which transmitter is a reflection of which, from the frames that they have in common.
 
     Args:
@@ -228,7 +236,7 @@ class Echoes:
         self._codewords = codewords
         self._chip_us = packet.chip_us
         self._keep_us = _LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us
-        self._seen: dict[int, deque[Sighting]] = {}
+        self._seen: dict[int, deque[FrameDetection]] = {}
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._echo_of: dict[int, int] = {}
         self._now_us = -math.inf
@@ -240,14 +248,14 @@ class Echoes:
     def shown(self, t_us: float, centre_px: tuple[float, float]) -> bool:
         """Whether a transmitter has shown a frame that began at this time in this place."""
         for known in self._seen.values():
-            for sighting in known:
-                frame = sighting.frame
+            for detection in known:
+                frame = detection.frame
                 off_px = max(abs(frame.x_px - centre_px[0]), abs(frame.y_px - centre_px[1]))
                 if off_px <= SAME_PX and abs(frame.t_us - t_us) < self._chip_us / 2:
                     return True
         return False
 
-    def judge(self, seen: Iterable[Sighting]) -> None:
+    def judge(self, seen: Iterable[FrameDetection]) -> None:
         """Take the frames of a time step, in any order.
 
         Args:
@@ -257,19 +265,19 @@ class Echoes:
         if not fresh:
             return
         self._now_us = max(self._now_us, fresh[-1].frame.t_us)
-        for sighting in fresh:
+        for detection in fresh:
             for number, known in self._seen.items():
-                if number != sighting.frame.transmitter and (other := self._beside(sighting, known)):
-                    first, second = sorted((sighting, other), key=lambda s: s.frame.transmitter)
+                if number != detection.frame.transmitter and (other := self._beside(detection, known)):
+                    first, second = sorted((detection, other), key=lambda s: s.frame.transmitter)
                     key = first.frame.transmitter, second.frame.transmitter
                     self._pairs.setdefault(key, _Pair()).add(first, second, self._codewords)
-            self._seen.setdefault(sighting.frame.transmitter, deque()).append(sighting)
+            self._seen.setdefault(detection.frame.transmitter, deque()).append(detection)
         self._forget()
         self._decide()
 
-    def _beside(self, sighting: Sighting, known: deque[Sighting]) -> Sighting | None:
+    def _beside(self, detection: FrameDetection, known: deque[FrameDetection]) -> FrameDetection | None:
         """Another transmitter's frame elsewhere in the image, begun within half a chip; None without one."""
-        frame = sighting.frame
+        frame = detection.frame
         nearest, least_us = None, math.inf
         # In order of time: from the newest back, until they are farther away again.
         for other in reversed(known):
@@ -314,11 +322,11 @@ class _Waiting:
 
     packets: PacketAssembler
     due: DueFrame | None = None
-    sighting: Sighting | None = None
+    detection: FrameDetection | None = None
 
 
 @dataclass
-class EchoQueue:
+class ReflectionQueue:
     """Keeps decoded frames for one time step, so that a bar and its reflection are judged together.
 
     Their frames end within a chip of each other, but maybe not in the same step, and a transmitter that is
@@ -331,7 +339,7 @@ class EchoQueue:
         cut: Frames so near to the end of the stream that they were not given.
     """
 
-    echoes: Echoes
+    reflections: Reflections
     ends_us: float = math.inf
     cut: int = 0
     _old: list[_Waiting] = field(default_factory=list)
@@ -341,9 +349,9 @@ class EchoQueue:
         """Whether anything waits."""
         return bool(self._old or self._new)
 
-    def add(self, packets: PacketAssembler, due: DueFrame, sighting: Sighting) -> None:
+    def add(self, packets: PacketAssembler, due: DueFrame, detection: FrameDetection) -> None:
         """Take a frame, and where it goes."""
-        self._new.append(_Waiting(packets, due, sighting))
+        self._new.append(_Waiting(packets, due, detection))
 
     def end(self, packets: PacketAssembler) -> None:
         """Take the end of a transmitter's frames, or of the stream."""
@@ -352,7 +360,7 @@ class EchoQueue:
     def step(self) -> list[Packet]:
         """End a time step; give the packets that are complete with the frames of the step before it."""
         if self._new:
-            self.echoes.judge(w.sighting for w in self._new if w.sighting is not None)
+            self.reflections.judge(w.detection for w in self._new if w.detection is not None)
         due, self._old, self._new = self._old, self._new, []
         return [packet for waiting in due for packet in self._emit(waiting)]
 
@@ -361,13 +369,13 @@ class EchoQueue:
         return self.step() + self.step()
 
     def _emit(self, waiting: _Waiting) -> list[Packet]:
-        if waiting.sighting is None or waiting.due is None:
+        if waiting.detection is None or waiting.due is None:
             return waiting.packets.flush()
-        due, frame = waiting.due, waiting.sighting.frame
+        due, frame = waiting.due, waiting.detection.frame
         if due.end_us + FOLLOWED_CHIPS * due.lock.chip_us > self.ends_us:
             self.cut += 1
             return []
-        echo_of = self.echoes.echo_of(frame.transmitter)
+        echo_of = self.reflections.echo_of(frame.transmitter)
         if echo_of != frame.echo_of:
             frame = changed(frame, echo_of=echo_of)
         return waiting.packets.add(frame, due.packet_us, due.lock.chip_us)

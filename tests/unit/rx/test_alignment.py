@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
-from evlcp_sdk.rx.look import polarity_sums
+from evlcp_sdk.rx.alignment import polarity_sums
 from evlcp_sdk.values import Events, SyncLock
 
 CHIPS, SIZE = 12, (8, 14)
