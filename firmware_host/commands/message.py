@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -13,81 +14,97 @@ from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, progr
 from firmware_host.commands.stream import Ahead, said_of, table_of
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
-
     import numpy as np
     from numpy.typing import NDArray
+
+    from evlcp_sdk.link.resolve import Link
+    from firmware_host.board.messages import Content
 
 __all__ = ["keygen", "message"]
 
 _MOST_NUMBER = 2**32 - 1
 
+Text = Annotated[str | None, typer.Option(metavar="TEXT", help="Send a text.")]
+DataFile = Annotated[Path | None, typer.Option(metavar="FILE", help="Send a file's bytes.")]
+BeaconFile = Annotated[Path | None, typer.Option(metavar="site.toml", help="Send where the transmitter is.")]
+User = Annotated[str, typer.Option(metavar="TEXT", help="The beacon's own bytes, as text.")]
+Time = Annotated[bool, typer.Option("--time", help="Send the time.")]
+CountdownS = Annotated[
+    float | None, typer.Option(metavar="SECONDS", help="Send how long a signal still shows.", min=0.0)
+]
+Signal = Annotated[str, typer.Option(help="What it shows: red, green and the like.")]
+NextSignal = Annotated[str, typer.Option("--next", help="What it shows then.")]
+KeyFile = Annotated[
+    Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
+]
+TransmitterId = Annotated[
+    int | None,
+    typer.Option("--id", min=0, max=_MOST_NUMBER, help="Transmitter id; the site's, or 0, without it."),
+]
+Sequence = Annotated[
+    int | None,
+    typer.Option(
+        min=0, max=_MOST_NUMBER, help="Sequence number; seconds since 1970 without it, so that it rises."
+    ),
+]
+Repeat = Annotated[int, typer.Option(min=1, max=1000, help="Send each packet so often in a row.")]
+SymbolsOut = Annotated[
+    Path | None, typer.Option("-o", "--out", metavar="FILE.json", help="Write the symbols.")
+]
+ChipsOut = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE.npy", help="Write the chips: uint8, a row per chip, a column per cluster."),
+]
+Port = Annotated[
+    str | None,
+    typer.Option(
+        help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board';"
+        " EVLCP_PORT without it, unless -o or --chips is given."
+    ),
+]
+Baud = Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)]
+BoardKey = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", envvar="EVLCP_BOARD_KEY", help="The board's key, if it has one."),
+]
+Every = Annotated[
+    float | None,
+    typer.Option(
+        metavar="SECONDS",
+        min=1.0,
+        help="Send it anew so often, to a board: with the time, with what is left, and in the text"
+        " {time}, {left} and {n}; end with Ctrl-C, or when nothing is left.",
+    ),
+]
+Count = Annotated[int | None, typer.Option(min=1, help="With --every: end after so many.")]
+JsonObject = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, with the symbols.")]
+
 
 def message(
-    text: Annotated[str | None, typer.Option(metavar="TEXT", help="Send a text.")] = None,
-    file: Annotated[Path | None, typer.Option(metavar="FILE", help="Send a file's bytes.")] = None,
-    beacon: Annotated[
-        Path | None, typer.Option(metavar="site.toml", help="Send where the transmitter is.")
-    ] = None,
-    user: Annotated[str, typer.Option(metavar="TEXT", help="The beacon's own bytes, as text.")] = "",
-    time: Annotated[bool, typer.Option("--time", help="Send the time.")] = False,
-    countdown: Annotated[
-        float | None, typer.Option(metavar="SECONDS", help="Send how long a signal still shows.", min=0.0)
-    ] = None,
-    signal: Annotated[str, typer.Option(help="What it shows: red, green and the like.")] = "red",
-    next_signal: Annotated[str, typer.Option("--next", help="What it shows then.")] = "green",
-    key: Annotated[
-        Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
-    ] = None,
-    transmitter_id: Annotated[
-        int | None,
-        typer.Option("--id", min=0, max=_MOST_NUMBER, help="Transmitter id; the site's, or 0, without it."),
-    ] = None,
-    sequence: Annotated[
-        int | None,
-        typer.Option(
-            min=0, max=_MOST_NUMBER, help="Sequence number; seconds since 1970 without it, so that it rises."
-        ),
-    ] = None,
-    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Send each packet so often in a row.")] = 1,
-    out: Annotated[
-        Path | None, typer.Option("-o", "--out", metavar="FILE.json", help="Write the symbols.")
-    ] = None,
-    chips: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE.npy", help="Write the chips: uint8, a row per chip, a column per cluster."
-        ),
-    ] = None,
-    port: Annotated[
-        str | None,
-        typer.Option(
-            help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board';"
-            " EVLCP_PORT without it, unless -o or --chips is given."
-        ),
-    ] = None,
-    baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = 1_000_000,
-    board_key: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", envvar="EVLCP_BOARD_KEY", help="The board's key, if it has one."),
-    ] = None,
-    every: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=1.0,
-            help="Send it anew so often, to a board: with the time, with what is left, and in the text"
-            " {time}, {left} and {n}; end with Ctrl-C, or when nothing is left.",
-        ),
-    ] = None,
-    count: Annotated[int | None, typer.Option(min=1, help="With --every: end after so many.")] = None,
+    text: Text = None,
+    file: DataFile = None,
+    beacon: BeaconFile = None,
+    user: User = "",
+    time: Time = False,
+    countdown: CountdownS = None,
+    signal: Signal = "red",
+    next_signal: NextSignal = "green",
+    key: KeyFile = None,
+    transmitter_id: TransmitterId = None,
+    sequence: Sequence = None,
+    repeat: Repeat = 1,
+    out: SymbolsOut = None,
+    chips: ChipsOut = None,
+    port: Port = None,
+    baud: Baud = 1_000_000,
+    board_key: BoardKey = None,
+    every: Every = None,
+    count: Count = None,
     ahead: Ahead = 2,
     stay: KeepAlive = False,
     link_file: LinkFile = None,
     overrides: Overrides = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object on stdout, with the symbols.")
-    ] = False,
+    as_json: JsonObject = False,
 ) -> None:
     """Put a text, a file or a beacon on packets: symbols, chips, or a board that plays them.
 
@@ -99,112 +116,104 @@ def message(
 
     A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
-    import dataclasses
-    import json
-    import os
-    from contextlib import suppress
-    from math import ceil
-    from time import gmtime, strftime
     from time import time as clock_s
 
-    from evlcp_sdk.air.blocks import Message
-    from evlcp_sdk.air.kinds import Countdown
     from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.files import Outputs
-    from evlcp_sdk.link.compose import each_packet, messages_of, packets_of, utf8
+    from evlcp_sdk.link.compose import utf8
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.signals import stop_on_request
-    from firmware_host.board.bank import bank_of
-    from firmware_host.board.board import Settings, provision
+    from firmware_host.board.messages import Content
     from firmware_host.board.sites import site_that_sends
-    from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
-    if text is None and file is None and beacon is None and not time and countdown is None:
-        raise ConfigError(
-            "give what to send: --text TEXT, --file FILE, --beacon site.toml, --time or --countdown SECONDS"
-        )
-    if every is None and count is not None:
-        raise ConfigError("--count belongs to --every SECONDS")
-    if every is not None and (out is not None or chips is not None):
-        raise ConfigError("--every sends what changes, to a board: -o and --chips hold what stays")
-    if beacon is None and (key is not None or user):
-        raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
+    for wrong, why in (
+        (
+            text is None and file is None and beacon is None and not time and countdown is None,
+            "give what to send: --text TEXT, --file FILE, --beacon site.toml, --time or --countdown SECONDS",
+        ),
+        (every is None and count is not None, "--count belongs to --every SECONDS"),
+        (
+            every is not None and (out is not None or chips is not None),
+            "--every sends what changes, to a board: -o and --chips hold what stays",
+        ),
+        (
+            beacon is None and (key is not None or bool(user)),
+            "--key and --user belong to a beacon: give --beacon site.toml, too",
+        ),
+    ):
+        if wrong:
+            raise ConfigError(why)
     for option, given in (("--text", text), ("--user", user)):
         utf8(given or "", option)
-    data = None if file is None else _read(file)
-    site = None if beacon is None else site_that_sends(beacon, transmitter_id, "--id")
-    ends_s = None if countdown is None else clock_s() + countdown
-
-    def made(at_s: float, number: int | None) -> list[Message]:
-        """What is said at a time; of those that change, the one of a number."""
-        other: dict[str, Any] = {}
-        left_s = 0.0 if ends_s is None else max(0.0, ends_s - at_s)
-        if time:
-            other["time"] = at_s
-        if ends_s is not None:
-            other["countdown"] = Countdown(signal, next_signal, left_s)
-        said = text
-        if text is not None and number is not None:
-            said = text.replace("{time}", strftime("%H:%M:%S", gmtime(at_s))).replace("{n}", str(number))
-            said = said.replace("{left}", f"{left_s:.0f}")
-        first = sequence if sequence is not None else int(begun_s)
-        return messages_of(
-            link,
-            text=said,
-            data=data,
-            beacon=site,
-            user=user.encode(),
-            key=key,
-            other=other,
-            transmitter_id=transmitter_id,
-            sequence=first + (number or 0),
-        )
-
-    begun_s = clock_s()
-    packet_s = link.packet.packet_chips / link.air.chip_rate_hz
+    content = Content(
+        text=text,
+        data=None if file is None else _read(file),
+        site=None if beacon is None else site_that_sends(beacon, transmitter_id, "--id"),
+        user=user.encode(),
+        key=key,
+        time=time,
+        ends_s=None if countdown is None else clock_s() + countdown,
+        signals=(signal, next_signal),
+        transmitter_id=transmitter_id,
+        sequence=int(clock_s()) if sequence is None else sequence,
+    )
     if every is not None:
-        port = port or os.environ.get("EVLCP_PORT") or None
-        if port is None:
+        line = _line(port, baud, board_key)
+        if line is None:
             raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
-        coder = link.block_coder()
-        # what is wrong is known before the board waits for it
-        takes_s = len(packets_of(made(begun_s, 0), coder, repeat)) * packet_s
-        if takes_s > every:
-            raise ConfigError(
-                f"--every {every:g}: what is to be sent takes {takes_s:.4g} s on air,"
-                f" {takes_s / packet_s:.0f} packets of {1e3 * packet_s:.4g} ms;"
-                f" give --every {ceil(takes_s)} or more, or send less"
-            )
-        with BoardLine(port, baud, key=board_key).open() as board:
-            stream = board.stream(link, ahead)
-
-            def next_one(number: int) -> Iterator[NDArray[np.int64]] | None:
-                at_s = clock_s() + stream.delay_s
-                over = ends_s is not None and number and at_s > ends_s + every
-                if over or (count is not None and number >= count):
-                    return None
-                return each_packet(made(at_s, number), coder, repeat)
-
-            with suppress(KeyboardInterrupt), stop_on_request() as asked, stream:
-                stream.play(next_one, every, asked)
-        say(said_of(stream), table_of(stream), as_json)
+        _send_anew(content, link, line, repeat, every, count, ahead, as_json=as_json)
         return
-    messages = made(begun_s, None)
-    symbols = packets_of(messages, link.block_coder(), repeat)
-    table = symbols_table(symbols, link, messages=True)
-    with Outputs() as outputs:
-        if chips is not None:
-            from firmware_host.board.bank import symbol_chips
+    symbols, summary = _compose(content, link, repeat)
+    written = _write(symbols, link, out, chips)
+    line = _line(port, baud, board_key, only_named=bool(written))
+    if line is None and not written and not as_json:
+        _tell(summary, written, plays=False)
+        raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
+    _program(symbols, link, line, summary, written, stay=stay, as_json=as_json)
 
-            outputs.write_array(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chips)
-        if out is not None:
-            outputs.write_text(json.dumps(table) + "\n", out)
-        outputs.commit()
-    written = [str(path) for path in (out, chips) if path is not None]
-    port = port or (None if written else os.environ.get("EVLCP_PORT") or None)
-    summary: dict[str, Any] = {
+
+def _line(port: str | None, baud: int, key: Path | None, *, only_named: bool = False) -> BoardLine | None:
+    """The line of a board: the one that is named, or else that of the environment; None for no board."""
+    port = port or (None if only_named else os.environ.get("EVLCP_PORT") or None)
+    return None if port is None else BoardLine(port, baud, key=key)
+
+
+def _send_anew(
+    content: Content,
+    link: Link,
+    line: BoardLine,
+    repeat: int,
+    every_s: float,
+    count: int | None,
+    ahead: int,
+    *,
+    as_json: bool,
+) -> None:
+    """Send content anew until it ends; say how that went."""
+    from contextlib import suppress
+
+    from evlcp_sdk.signals import stop_on_request
+    from firmware_host.board.messages import check_interval, send_anew
+
+    # What is wrong is known before the board waits for it.
+    check_interval(content, link, repeat, every_s)
+    with line.open() as board:
+        stream = board.stream(link, ahead)
+        with suppress(KeyboardInterrupt), stop_on_request() as stopped, stream:
+            send_anew(stream, content, link, repeat, every_s, count, stopped)
+    say(said_of(stream), table_of(stream), as_json)
+
+
+def _compose(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64], dict[str, Any]]:
+    """Symbols of the packets that say it now, and what they are."""
+    from time import time as clock_s
+
+    from evlcp_sdk.link.compose import packets_of
+    from firmware_host.board.messages import packet_s
+
+    messages = content.at(link, clock_s())
+    symbols = packets_of(messages, link.block_coder(), repeat)
+    return symbols, {
         "messages": [
             {
                 "kind": m.kind_name,
@@ -215,18 +224,53 @@ def message(
             for m in messages
         ],
         "packets": len(symbols),
-        "duration_s": round(len(symbols) * packet_s, 6),
+        "duration_s": round(len(symbols) * packet_s(link), 6),
     }
-    if port is None:
+
+
+def _write(symbols: NDArray[np.int64], link: Link, out: Path | None, chips: Path | None) -> list[str]:
+    """Write symbols and chips where that is asked for; the files."""
+    import json
+
+    from evlcp_sdk.files import Outputs
+    from firmware_host.board.bank import symbol_chips
+    from firmware_host.board.symbols import symbols_table
+
+    with Outputs() as outputs:
+        if chips is not None:
+            outputs.write_array(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chips)
+        if out is not None:
+            outputs.write_text(json.dumps(symbols_table(symbols, link, messages=True)) + "\n", out)
+        outputs.commit()
+    return [str(path) for path in (out, chips) if path is not None]
+
+
+def _program(
+    symbols: NDArray[np.int64],
+    link: Link,
+    line: BoardLine | None,
+    summary: dict[str, Any],
+    written: list[str],
+    *,
+    stay: bool,
+    as_json: bool,
+) -> None:
+    """Program a board, if there is one, with packets; say what was done."""
+    import dataclasses
+
+    from firmware_host.board.bank import bank_of
+    from firmware_host.board.board import Settings, provision
+    from firmware_host.board.symbols import symbols_table
+
+    table = symbols_table(symbols, link, messages=True)
+    if line is None:
         if as_json:
             print_json(summary | {"board": None} | table)
-            return
-        _tell(summary, written, plays=False)
-        if not written:
-            raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
+        else:
+            _tell(summary, written, plays=False)
         return
     bank = bank_of(symbols, link)
-    with BoardLine(port, baud, key=board_key).open() as board:
+    with line.open() as board:
         with progress_bar("programming") as progress:
             programmed = provision(board, bank, Settings(), True, progress)
         if as_json:
