@@ -249,7 +249,7 @@ def info_activity(sums, weight, grid, pilot_chips, least):
     return (weight * (info - least * pilot)).sum((1, 2))
 
 
-def believe(read, llr, seen, frame_worth, expected_worth, spread, least, together):
+def calibrate_llr(read, llr, seen, frame_worth, expected_worth, spread, least, together):
     seen = seen & (read >= 0)
     size = np.abs(llr.astype(float))
     if not size[seen].any():

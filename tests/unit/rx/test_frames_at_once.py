@@ -188,13 +188,13 @@ def test_frames_that_another_link_takes_are_counted_where_they_were_told() -> No
     early = EarlyFrames(lambda frame: heard.append((frame.packet, frame.frame)))
     one, two, three = (packet_of(number, 2) for number in range(3))
     for frame in (*one.frames, *two.frames):
-        early.decoded(frame, holds=False)
+        early.decoded(frame, owns=False)
     assert heard == []
     early.refused(one)
-    early.decoded(three.frames[0], holds=False)
-    early.given(two, holds=True)
+    early.decoded(three.frames[0], owns=False)
+    early.given(two, owns=True)
     assert heard == [(1, 0), (1, 1), (2, 0)]
-    early.decoded(three.frames[1], holds=True)
+    early.decoded(three.frames[1], owns=True)
     assert heard == [(1, 0), (1, 1), (2, 0), (2, 1)]
     assert early.withdrawn == 0
     early.refused(three)

@@ -527,8 +527,8 @@ def test_llrs_are_scaled_to_tell_the_truth(seed, scale):
     llr = (scale * rng.normal(0.5, 1, (6, 4))).astype(np.float32)
     read, seen = rng.integers(-1, 16, 6), rng.random(6) < 0.8
     symbols, scaled = np.empty_like(read), np.empty_like(llr)
-    quality = _kernels.believe(read, llr, seen, 12.0, 6.0, 0.5, 0.6, 1.7, symbols, scaled)
-    want_symbols, want, want_quality = twins.believe(read, llr, seen, 12.0, 6.0, 0.5, 0.6, 1.7)
+    quality = _kernels.calibrate_llr(read, llr, seen, 12.0, 6.0, 0.5, 0.6, 1.7, symbols, scaled)
+    want_symbols, want, want_quality = twins.calibrate_llr(read, llr, seen, 12.0, 6.0, 0.5, 0.6, 1.7)
     assert_array_equal(symbols, want_symbols)
     assert_allclose(scaled, want, rtol=1e-5)
     assert quality == pytest.approx(want_quality, rel=1e-5)

@@ -186,10 +186,10 @@ def test_any_split_gives_the_same_within_limits() -> None:
 def test_a_stream_that_has_ended_takes_no_memory() -> None:
     receiver = Receiver(LINK)
     receiver.feed(CROWD)
-    assert receiver._listeners[0]._regions._recent
+    assert receiver._receivers[0]._regions._recent
     receiver.close()
-    assert not receiver._listeners[0]._regions._recent
-    assert not receiver._listeners[0]._regions.alive
+    assert not receiver._receivers[0]._regions._recent
+    assert not receiver._receivers[0]._regions.alive
     assert receiver.counts["events"] == len(CROWD)
 
 

@@ -435,7 +435,7 @@ def test_memory_does_not_grow() -> None:
     period = 2 * LINK.packet.packet_chips * 100
     for n in range(12):
         receiver.feed(ideal_events(LINK, bar, t0_us=n * period))
-    (region,) = receiver._listeners[0]._regions.alive
+    (region,) = receiver._receivers[0]._regions.alive
     assert len(region.pieces) < 10
     assert len(region.positions) < 50
 

@@ -145,8 +145,8 @@ def test_a_place_that_is_left_is_free_for_another_link() -> None:
 
 def test_links_share_the_room_for_events() -> None:
     receiver = Receiver([BAR, WH8, LAMP])
-    assert {listener._regions._limits.region_bytes for listener in receiver._listeners} == {16 << 20}
-    one, other, lamp = (listener._regions for listener in receiver._listeners)
+    assert {listener._regions._limits.region_bytes for listener in receiver._receivers} == {16 << 20}
+    one, other, lamp = (listener._regions for listener in receiver._receivers)
     assert isinstance(one, RegionFollower)
     assert isinstance(other, RegionFollower)
     assert one._rhythm is other._rhythm
