@@ -1,0 +1,134 @@
+"""Messages that a board sends: once, again and again, or anew every so often."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
+from time import gmtime, strftime
+from time import time as clock_s
+from typing import TYPE_CHECKING, Any
+
+from evlcp_sdk.air.blocks import Message
+from evlcp_sdk.air.kinds import Countdown
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.link.compose import each_packet, messages_of, packets_of
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from evlcp_sdk.link.resolve import Link
+    from evlcp_sdk.scene.sites import BarSite
+    from firmware_host.board.stream import Stream
+
+__all__ = ["Content", "check_interval", "packet_s", "send_anew"]
+
+
+@dataclass(frozen=True)
+class Content:
+    """What is to be sent, some of which changes with the time.
+
+    Attributes:
+        text: A text; where it is sent anew, `{time}`, `{left}` and `{n}` in it are filled in.
+        data: Bytes.
+        site: Where the transmitter is, for a beacon.
+        user: The beacon's own bytes.
+        key: File of the private key that signs it.
+        time: The time is sent.
+        ends_s: When what a signal shows ends, seconds since 1970.
+        signals: What it shows, and what then.
+        transmitter_id: Whose messages they are; None for the site's, or 0.
+        sequence: Number of the first.
+    """
+
+    text: str | None = None
+    data: bytes | None = None
+    site: BarSite | None = None
+    user: bytes = b""
+    key: Path | None = None
+    time: bool = False
+    ends_s: float | None = None
+    signals: tuple[str, str] = ("red", "green")
+    transmitter_id: int | None = None
+    sequence: int = 0
+
+    def at(self, link: Link, at_s: float, number: int | None = None) -> list[Message]:
+        """The messages of a time, seconds since 1970; of those sent anew, the ones of this number.
+
+        Raises:
+            ConfigError: They do not fit.
+        """
+        left_s = 0.0 if self.ends_s is None else max(0.0, self.ends_s - at_s)
+        other: dict[str, Any] = {"time": at_s} if self.time else {}
+        if self.ends_s is not None:
+            other["countdown"] = Countdown(*self.signals, left_s)
+        text = self.text
+        if text is not None and number is not None:
+            text = text.replace("{time}", strftime("%H:%M:%S", gmtime(at_s))).replace("{n}", str(number))
+            text = text.replace("{left}", f"{left_s:.0f}")
+        return messages_of(
+            link,
+            text=text,
+            data=self.data,
+            beacon=self.site,
+            user=self.user,
+            key=self.key,
+            other=other,
+            transmitter_id=self.transmitter_id,
+            sequence=self.sequence + (number or 0),
+        )
+
+
+def packet_s(link: Link) -> float:
+    """How long a packet is on air, s."""
+    return link.packet.packet_chips / link.air.chip_rate_hz
+
+
+def check_interval(content: Content, link: Link, repeat: int, every_s: float) -> None:
+    """See that what is sent anew every so often takes no longer on air.
+
+    Raises:
+        ConfigError: It does.
+    """
+    many = len(packets_of(content.at(link, clock_s(), 0), link.block_coder(), repeat))
+    takes_s = many * packet_s(link)
+    if takes_s > every_s:
+        raise ConfigError(
+            f"--every {every_s:g}: what is to be sent takes {takes_s:.4g} s on air,"
+            f" {many} packets of {1e3 * packet_s(link):.4g} ms;"
+            f" give --every {ceil(takes_s)} or more, or send less"
+        )
+
+
+def send_anew(
+    stream: Stream,
+    content: Content,
+    link: Link,
+    repeat: int,
+    every_s: float,
+    count: int | None,
+    stopped: Callable[[], bool],
+) -> None:
+    """Send content anew every so often, until nothing is left of a countdown, or so many times.
+
+    Args:
+        stream: Of a board.
+        content: What is sent.
+        link: How.
+        repeat: So often each packet in a row.
+        every_s: From one time to the next, s.
+        count: How many times; None for no end.
+        stopped: Ends it.
+    """
+    coder = link.block_coder()
+
+    def next_one(number: int) -> Iterator[NDArray[np.int64]] | None:
+        at_s = clock_s() + stream.delay_s
+        over = content.ends_s is not None and number and at_s > content.ends_s + every_s
+        if over or (count is not None and number >= count):
+            return None
+        return each_packet(content.at(link, at_s, number), coder, repeat)
+
+    stream.play(next_one, every_s, stopped)
