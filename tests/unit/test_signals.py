@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.signals import ENDING, heard_by, interrupt, stop_on_request, waiting
+from evlcp_sdk.signals import ENDING, stop_on_request, waiting
 
 MAIN = "from evlcp_sdk.cli.main import main; main()"
 
@@ -64,18 +64,6 @@ def test_a_simulation_that_is_told_to_end_leaves_nothing(tmp_path: Path) -> None
     out, said = process.communicate(timeout=60)
     assert (process.returncode, out, said.splitlines()[-1:]) == (130, "", ["evlcp: interrupted"])
     assert list(tmp_path.iterdir()) == []
-
-
-def test_what_is_ignored_stays_ignored() -> None:
-    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
-    try:
-        with heard_by(interrupt, signal.SIGHUP, signal.SIGTERM):
-            signal.raise_signal(signal.SIGHUP)
-            with pytest.raises(KeyboardInterrupt):
-                signal.raise_signal(signal.SIGTERM)
-        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
-    finally:
-        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_request_ends_a_wait_and_nothing_else() -> None:

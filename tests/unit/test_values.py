@@ -24,7 +24,6 @@ from evlcp_sdk.values import (
     ReceivedMessage,
     SoftSymbols,
     Triggers,
-    plain,
 )
 
 EVENTS = Events.of(
@@ -219,16 +218,3 @@ def test_a_library_that_is_missing_is_named(
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(evlcp.ConfigError, match=rf"{library} is not installed.*evlcp-sdk\[{extra}\]"):
         getattr(EVENTS, method)()
-
-
-def test_an_array_that_lies_as_kernels_take_it_is_not_copied() -> None:
-    whole = np.arange(24).reshape(4, 6)
-    assert plain(whole) is whole
-    assert np.shares_memory(plain(whole[1:]), whole)
-    locked = whole.copy()
-    locked.flags.writeable = False
-    for odd in (whole[:, :3], whole[::2], whole.T, locked):
-        made = plain(odd)
-        assert made.flags.carray
-        np.testing.assert_array_equal(made, odd)
-        assert not np.shares_memory(made, odd)

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evlcp_barker.pilots import Barker13Pilots
 from evlcp_edges.dimmed import DimmedPilots, DimmedWh4x2
 from evlcp_edges.modulation import Nrz, Ppm
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
@@ -199,15 +198,6 @@ def test_c_table_holds_the_words() -> None:
     words = re.findall(r"0x([0-9a-f]{4})u", text)
     assert words == VECTORS["pilot_words"] + VECTORS["info_words"]["wh4x2"]
     assert f"{int(VECTORS['preamble_chips'], 2):08x}" in text
-
-
-def test_more_clusters_need_longer_pilots() -> None:
-    codes = WhPilots().codes(20)
-    assert codes.shape == (20, 32)
-    assert len(np.unique(codes, axis=0)) == 20
-    assert Barker13Pilots().codes(26).shape == (26, 26)
-    with pytest.raises(ConfigError, match="at most 26"):
-        Barker13Pilots().codes(27)
 
 
 @pytest.mark.parametrize(

@@ -15,9 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-import typer
 
-from evlcp_sdk.cli._app import _built, make_app
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, write_events
 from evlcp_sdk.place.nmea import checksum
@@ -106,21 +104,6 @@ def test_a_plain_receive_loads_what_it_needs_and_lets_the_collector_rest_until_t
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     assert done.stdout.splitlines()[-1] == "[] 50000 True True"
-
-
-def test_options_that_are_not_given_are_what_typer_makes_of_them() -> None:
-    app = make_app("receive")
-    (info,) = app.registered_commands
-    command = _built("receive", info)
-    plain = typer.main.get_group(app).commands["receive"]
-    for given in (
-        ["a.raw"],
-        ["a.raw", "b.raw", "-o", "out", "--set", "a.b=1", "--pitch-deg", "2", "--strict"],
-    ):
-        found, expected = (one.make_context("receive", list(given)).params for one in (command, plain))
-        assert found == expected
-    with pytest.raises(Exception, match="recordings"):
-        command.make_context("receive", [])
 
 
 def test_version(evlcp: Evlcp) -> None:
@@ -700,20 +683,6 @@ def test_satellites_by_nmea_are_in_the_track(evlcp: Evlcp, street: Path, tmp_pat
     done = evlcp(*receive, "-o", tmp_path / "late", "--clock-zero", "2026-03-01T11:00:00Z")
     summary = json.loads((tmp_path / "late" / "summary.json").read_text())
     assert summary["positions"]["gnss_outside"] == 2
-
-
-def test_an_attitude_of_another_time_is_warned_of(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
-    outside = "none of the attitude's 2 lines is within the recording's time"
-    missing = "positions have no attitude: its file does not reach there, or lacks lines"
-    for start_us, lasts_us, told in ((0, 200_000, None), (10**12, 200_000, outside), (0, 200, missing)):
-        imu = tmp_path / "imu.csv"
-        imu.write_text(
-            f"t_us,pitch_deg,roll_deg,heading_deg\n{start_us},4,0,0\n{start_us + lasts_us},4,0,0\n"
-        )
-        args = ("receive", street / "rec.raw", "--sites", street / "site.toml", "--attitude", imu)
-        done = evlcp(*args, "-o", tmp_path / f"{start_us}-{lasts_us}")
-        said = " ".join((done.out + done.err).split())
-        assert [text in said for text in (outside, missing)] == [told == outside, told == missing]
 
 
 def test_live_takes_what_receive_takes(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:

@@ -272,26 +272,6 @@ def test_any_buffer_and_any_piece_give_the_same_events(tmp_path):
             assert all(np.array_equal(getattr(got, c), getattr(events, c)) for c in ("t_us", "x", "y", "p"))
 
 
-def test_a_second_stream_goes_on_where_the_first_stopped(tmp_path):
-    events = Events.of(range(10), range(10), [0] * 10, [1] * 10)
-    write_events(tmp_path / "a.raw", events, 640, 480)
-    with open_source(tmp_path / "a.raw") as source:
-        first = next(source.chunks(3))
-        second = next(source.chunks(2))
-        rest, _ = source.read()
-        assert source.read()[0].t_us.tolist() == []
-    assert [*first.t_us, *second.t_us, *rest.t_us] == list(range(10))
-
-
-def test_pieces_stay_valid(tmp_path):
-    events = Events.of(range(100), range(100), [0] * 100, [1] * 100)
-    write_events(tmp_path / "a.raw", events, 640, 480)
-    with open_source(tmp_path / "a.raw") as source:
-        got = list(source.chunks(20))
-    assert len(got) >= 5
-    assert Events.concat(got).t_us.tolist() == list(range(100))
-
-
 PRECISE = {
     "low time after a rollover": [0x8FFF, 0x6005, 0x0001, 0x2001, 0x8000, 0x2002],
     "low time after a glitch": [0x8005, 0x0001, 0x8004, 0x6005, 0x8003, 0x2002],
@@ -367,37 +347,3 @@ def test_words_are_found_again_where_bytes_are_missing(name, fault, tmp_path):
         if askew:
             assert losses["bytes_askew"].count < CODECS[name].word.itemsize
             assert -4 < losses["bytes_askew"].first - at < 600
-
-
-@pytest.mark.parametrize("name", ["EVT3", "EVT2"])
-def test_words_of_reserved_types_alone_are_no_reason_to_read_askew(name, tmp_path):
-    path = tmp_path / "a.raw"
-    write_events(path, crowd(60_000, 200_000), WIDTH, HEIGHT, format=name)
-    with open_source(path) as source:
-        before = source.read()[0]
-    data = path.read_bytes()
-    start = data.index(b"% end\n") + 6
-    words = np.frombuffer(data, CODECS[name].word, offset=start).copy()
-    bits = 8 * words.itemsize - 4
-    # Every 20th word behind the first buffer's worth that is looked at as the file is opened.
-    odd = np.arange(40_000, len(words), 20)
-    words[odd] = (words[odd] & ((1 << bits) - 1)) | 0xB << bits
-    path.write_bytes(data[:start] + words.tobytes())
-    with open_source(path) as source:
-        got, losses = source.read()[0], source.losses
-    assert losses["reserved_words"].count == len(odd)
-    assert "bytes_askew" not in losses
-    assert len(got) > 0.6 * len(before)
-
-
-def test_events_are_believed_from_the_first_good_time_on():
-    """Behind a TIME_HIGH that no others follow, a block of words and more: none of them is dropped."""
-    words = [0x8010, 0x0001, 0x6000, 0x2001, 0x8700, 0x2002, 0x8010, 0x6001]
-    words += [0x2003] * 2000 + [0x8011, 0x8012, 0x6000, 0x2004]
-    array = np.array(words, "<u2")
-    twin = TWINS["EVT3"](array.tobytes(), WIDTH, HEIGHT)
-    for splits in ([], [10, 700, 900]):
-        events, _, decoder = decode("EVT3", array, splits, capacity=5000)
-        assert rows(events, ("t_us", "x", "y", "p")) == twin.events
-        assert len(events) == 2002
-        assert decoder.losses["time_doubtful"].count == 1

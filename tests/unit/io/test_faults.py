@@ -130,21 +130,6 @@ def test_another_encoding_than_declared(written, declared, n, tmp_path):
     assert caught.value.offset >= len(header)
 
 
-def test_noise_behind_a_header(tmp_path):
-    noise = np.random.default_rng(3).integers(0, 1 << 16, 5000)
-    with pytest.raises(RawFormatError, match="reserved type"):
-        open_source(raw(tmp_path / "a.raw", noise))
-
-
-@pytest.mark.parametrize("size", [3, 9_000_000])
-def test_words_without_any_time(size, tmp_path):
-    path = raw(tmp_path / "a.raw", np.full(size, 0x2001))
-    with open_source(path) as source, pytest.raises(RawFormatError) as caught:
-        source.read()
-    assert "no TIME_HIGH in" in caught.value.found
-    assert caught.value.offset == len(HEADER)
-
-
 LOSSES = {
     "words before the first TIME_HIGH": ([0x0003, 0x2804, 0x6001, *GOOD], b"", "words_before_time", 3, 0, 1),
     "odd trailing byte": (GOOD, b"\x01", "odd_bytes", 1, 8, 1),
@@ -214,28 +199,11 @@ def test_loss_in_evt2(words, tail, kind, count, first, events, tmp_path):
     assert (source.losses[kind].count, source.losses[kind].first) == (count, len(header) + first)
 
 
-def test_first_offset_is_found_across_buffers(tmp_path):
-    words = np.full(2_000_000, 0x2001)
-    words[:2] = 0x8001, 0x0003
-    words[1_500_000] = 0x2000 | 700
-    with open_source(raw(tmp_path / "a.raw", words)) as source:
-        events, _ = source.read()
-    assert len(events) == 2_000_000 - 3
-    assert source.losses["outside_sensor"].first == len(HEADER) + 3_000_000
-
-
 @pytest.mark.parametrize("name", ["dir.raw", "dir.npz", "dir.es"])
 def test_directory(name, tmp_path):
     (tmp_path / name).mkdir()
     with pytest.raises(InputError, match=f"{name}: "):
         open_source(tmp_path / name)
-
-
-def test_closed_source_is_an_error(tmp_path):
-    with open_source(raw(tmp_path / "a.raw", np.full(2_000_000, 0x8001))) as source:
-        pass
-    with pytest.raises(InputError, match="closed"):
-        source.read()
 
 
 def test_pieces_of_no_events_are_refused(tmp_path):

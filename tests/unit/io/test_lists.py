@@ -95,28 +95,6 @@ def test_a_fault_is_one_line_with_its_place(text: str, message: str, tmp_path: P
         read_events(tmp_path / "a.csv")
 
 
-def test_polarities_of_pieces_far_apart_are_of_one_kind(tmp_path: Path) -> None:
-    """A zero among -1 and 1, a hundred thousand rows after the first."""
-    t_us = np.arange(300_000) * 7
-    p = np.where(t_us % 2, 1, -1)
-    p[200_000] = 0
-    (tmp_path / "a.csv").write_text("t,p\n" + "".join(f"{a},{b}\n" for a, b in zip(t_us, p, strict=True)))
-    np.savez(tmp_path / "a.npz", t=t_us, p=p)
-    with pytest.raises(InputError, match="line 200002: polarity 0 beside -1 and 1,"):
-        read_events(tmp_path / "a.csv")
-    with pytest.raises(InputError, match="row 200001: polarity 0 beside -1 and 1,"):
-        read_events(tmp_path / "a.npz")
-
-
-@pytest.mark.parametrize("head", ["time/us", "t [\u00b5s]", "t / us"])
-def test_units_as_older_programs_write_them(head: str, tmp_path: Path) -> None:
-    rows = "".join(f"{t},{p}\n" for t, p in zip(T_US, P, strict=True))
-    (tmp_path / "a.csv").write_bytes(f"{head},p\n{rows}".encode("latin-1"))
-    with open_source(tmp_path / "a.csv") as source:
-        assert source.header["time"] == "in us, as its column says"
-        np.testing.assert_array_equal(source.read()[0].t_us, T_US)
-
-
 def test_an_empty_list_has_no_events(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text("t,p\n")
     assert len(read_events(tmp_path / "a.csv")) == 0

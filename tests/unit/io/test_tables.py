@@ -204,15 +204,6 @@ def test_damaged_gzip_is_an_error(tmp_path):
         read_events(tmp_path / "a.csv.gz")
 
 
-def test_csv_is_the_same_bytes_each_time(tmp_path):
-    events = Events.of([1, 22, 333], [0, 10, 65535], [9, 99, 100], [1, 0, 1])
-    write_events(tmp_path / "a.csv", events)
-    assert (tmp_path / "a.csv").read_bytes() == HEAD + b"1,0,9,1\n22,10,99,0\n333,65535,100,1\n"
-    write_events(tmp_path / "a.csv.gz", events)
-    write_events(tmp_path / "b.csv.gz", events)
-    assert (tmp_path / "a.csv.gz").read_bytes() == (tmp_path / "b.csv.gz").read_bytes()
-
-
 def test_csv_has_no_place_for_triggers(tmp_path):
     with pytest.raises(StreamError, match=r"a\.csv: 1 triggers, which a CSV file has no place for"):
         write_events(tmp_path / "a.csv", Events.empty(), triggers=Triggers.of([1], [0], [1]))
@@ -367,12 +358,3 @@ def test_a_clock_may_restart_and_leap(name, size, tmp_path):
     assert np.array_equal(got.t_us, np.concatenate([part.t_us for part in parts]))
     assert source.losses == {}
     assert source.counts["clock_restarts"] == 2
-
-
-@pytest.mark.parametrize("name", ["a.npz", "a.csv"])
-def test_pauses_of_a_sparse_table_are_kept(name, tmp_path):
-    events = Events.of([0, 10**7, 10**9, 10**12, 10**12 + 5], [1] * 5, [2] * 5, [1] * 5)
-    for size in (1, 100):
-        with open_source(saved(tmp_path / name, events)) as source:
-            assert Events.concat(source.chunks(size)).t_us.tolist() == events.t_us.tolist()
-        assert source.losses == {}

@@ -84,16 +84,6 @@ def test_constant_bytes_do_not_make_constant_symbols(overrides: tuple[str, ...])
         assert (symbols[1:] == symbols[:-1]).mean() < 0.1
 
 
-def test_blocks_with_other_headers_differ_in_half_their_bits_on_air() -> None:
-    coder = coder_of()
-    message = Message(Kind.DATA, 7, 3, bytes(40 * 100))
-    air = np.array([coder.air_bits(b.pack(57)) for b in split(message, coder.digest, 57)]).astype(int)
-    apart = np.array([(a != b).sum() for i, a in enumerate(air) for b in air[:i]])
-    # 960 fair coins: 480, sigma 15.5; 4950 pairs lie within five sigma.
-    assert abs(apart.mean() - 480) < 5
-    assert np.abs(apart - 480).max() < 5 * 15.5
-
-
 @pytest.mark.parametrize("cluster", range(16))
 def test_a_dark_cluster_breaks_nothing(cluster: int) -> None:
     coder, rng = coder_of(), np.random.default_rng(cluster)

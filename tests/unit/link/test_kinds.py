@@ -145,26 +145,6 @@ def bring(number: Any, name: Any, shown: Mapping[str, Any] | None = None) -> tup
     return Plugin(), kind
 
 
-@pytest.mark.parametrize(
-    ("number", "name", "told"),
-    [
-        (3, "wind", r"number 3 or its name is that of 'data' of evlcp-sdk"),
-        (7, "text", r"number 7 or its name is that of 'text' of evlcp-sdk"),
-        (7, "packet", r"its name is that of a packet's line"),
-        (16, "wind", r"number = 16, expected 7 to 15"),
-        (7, None, r"name = None, expected text"),
-        ("5", "wind", r"number = '5', expected 7 to 15"),
-    ],
-)
-def test_a_kind_that_clashes_is_left_out(number: Any, name: Any, told: str) -> None:
-    registry = Registry.load(bring(number, name)[0], bring(9, "fine")[0])
-    with pytest.warns(PluginWarning, match=told):
-        kinds = message_kinds(registry)
-    assert kinds.keys() == {1, 2, 3, 4, 5, 6, 9}
-    # The next link is resolved without another word.
-    assert message_kinds(registry).keys() == kinds.keys()
-
-
 def test_of_two_kinds_of_one_number_one_stays() -> None:
     registry = Registry.load(bring(9, "here")[0], bring(9, "there")[0])
     with pytest.warns(PluginWarning, match="number 9 or its name is that of"):

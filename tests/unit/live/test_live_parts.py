@@ -1,8 +1,5 @@
 """Listeners, delays, pictures, the budget and the reader of a live run, one by one."""
 
-import asyncio
-import gc
-import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -12,7 +9,6 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.live import Budget, DelayTally, Outlet, PictureSlot, Shedder
-from evlcp_sdk.live.desk import Desk, stop_listening
 from evlcp_sdk.live.reader import ArrivalClock, Reader
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Region, Triggers
@@ -217,26 +213,3 @@ def test_a_file_waits_for_its_reader_and_a_camera_does_not() -> None:
     reader = Reader(source)
     assert len(read_all(reader, source)) == 1000
     assert reader.fault is fault
-
-
-def test_a_client_that_takes_nothing_is_let_go_at_the_end() -> None:
-    """What waits for it would keep its connection open after the run, with nobody to close it."""
-
-    async def fill(_: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        writer.write(bytes(50_000_000))
-        writer.close()
-
-    gc.disable()
-    try:
-        with Desk() as desk:
-            server = desk.call(asyncio.start_server(fill, "127.0.0.1", 0))
-            client = socket.create_connection(server.sockets[0].getsockname(), 5)
-            assert client.recv(1)
-            desk.call(stop_listening(server))
-        with client:
-            taken = 1
-            while some := client.recv(1 << 20):
-                taken += len(some)
-        assert taken < 50_000_000
-    finally:
-        gc.enable()

@@ -291,19 +291,6 @@ def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():
     assert_allclose([lock.packet_t_us for lock in locks], START_US + apart * np.arange(4), atol=50)
 
 
-def test_what_agrees_less_than_the_lock_repeats_none():
-    """Data of one cluster, off the grid of its preambles."""
-    rng = np.random.default_rng(1)
-    book = book_of(WhPilots().preamble(), 1)
-    chips = np.concatenate([packet_chips(rng.integers(0, 64, (FRAMES, 1)), book) for _ in range(12)])
-    t, p = twins.events_of(chips, rng, START_US, per_edge=6)
-    sync = BarkerSync(min_correlation=0.5).compile(book, FORMAT)
-    _, locks = sync.step(sync.init(), t, p, int(t[-1]) + 5000)
-    starts = [lock.packet_t_us for lock in locks]
-    assert len(starts) >= 12
-    assert len({round(start / 10) for start in starts}) == len(starts)
-
-
 # Timing
 
 
@@ -362,16 +349,6 @@ def test_a_flash_is_no_preamble(events):
     t = np.sort(rng.integers(20_000, 20_100, events))
     t = np.concatenate([[0], t, t + 300, [90_000]])
     assert locks_of(t, np.ones(len(t), np.uint8))[0] == []
-
-
-@pytest.mark.parametrize("symbol", [3, 38])
-def test_constant_data_is_no_preamble(symbol):
-    rng = np.random.default_rng(1)
-    one = packet_chips(np.full((FRAMES, CLUSTERS), symbol), BOOKS["wh4x2"])
-    t, p = twins.events_of(np.concatenate([one] * 12), rng, START_US)
-    begun = t > START_US + 10_000
-    right = numbers(locks_of(t[begun], p[begun])[0])
-    assert_allclose(right[4:], np.rint(right[4:]), atol=1e-3)
 
 
 # Keeping a lock and finding it again
@@ -443,19 +420,6 @@ def test_latency_is_no_clock(ppm, by_us, packets):
             assert window - before == pytest.approx(by_us if dark else 0, abs=4)
         # A jump of 50 us from one packet to the next looks like 1445 ppm.
         assert abs(lock.chip_us / usual.chip_us - 1) < 50e-6
-
-
-def test_one_polarity_alone_may_come_later():
-    rng = np.random.default_rng(10)
-    chips = packets_of(rng, 10)
-    t, p = twins.events_of(chips, rng, START_US)
-    number = (t - START_US) / PERIOD_US
-    t = t + np.where((number > 4.9) & (p == 0), 25, 0)
-    order = np.argsort(t, kind="stable")
-    locks, _ = locks_of(t[order], p[order])
-    apart = np.array([lock.delay_off_us - lock.delay_on_us for lock in locks])
-    assert_allclose(apart[5:] - apart[:5].mean(), 25, atol=3)
-    assert np.abs(np.array([lock.chip_us for lock in locks]) / twins.CHIP_US - 1).max() < 15e-6
 
 
 @pytest.mark.parametrize("tolerance_ppm", [20.0, 100.0])

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import JointScaleRanging, _together, core_of, find_bar, profile
+from evlcp_joint.ranging import JointScaleRanging, find_bar, profile
 from numpy.testing import assert_allclose
 from scipy.stats import norm, theilslopes
 
@@ -117,23 +117,6 @@ def test_unknown_symbols_leave_the_pilot_of_their_clusters() -> None:
     assert np.mean(sigma_m, 0)[0] < np.mean(sigma_m, 0)[1], sigma_m
 
 
-def test_a_reflection_beside_the_bar_does_not_matter() -> None:
-    view = view_of(50.0, noise=0.5, seed=4)
-    beside = np.pad(view.sums, ((0, 0), (0, 0), (0, 24)))
-    dim = np.random.default_rng(1).random(view.sums.shape) < 0.4
-    beside[:, :, 24:] += view.sums * dim
-    cells = view.presence.selected
-    selected = np.pad(cells, ((0, 0), (0, 0), (0, 12)))
-    selected[:, :, 12:] |= cells & (np.random.default_rng(2).random(cells.shape) < 0.6)
-    presence = PresenceMap(
-        selected.astype(np.float32), 2, selected, np.zeros((K, *beside.shape[1:]), np.float32)
-    )
-    found = measured(FrameView(beside, view.offset_px, presence, view.soft))
-    alone = measured(view)
-    assert found.distance_m == pytest.approx(alone.distance_m, abs=0.3 * alone.sigma_m)
-    assert found.pairs == 15
-
-
 @pytest.mark.parametrize("shift", [0, 7])
 def test_values_that_the_fit_does_not_explain_give_no_distance(shift: int) -> None:
     """Noise with the cells of a bar, and a bar whose cells lie a cluster off."""
@@ -206,21 +189,6 @@ def test_two_columns_give_the_distance_of_both_and_its_sigma() -> None:
     assert one.pairs == 7
     # What is hidden is left out, a column that shows too little whole.
     assert measure(side_by_side(view_of(50.0, dark=tuple(range(16))))).pairs == 0
-
-
-def test_columns_that_disagree_are_as_unsure_as_they_differ() -> None:
-    parts = [Range(50.0, 0.1, 7, 0.5), Range(51.0, 0.1, 7, 0.5), Range(50.5, 0.2, 3, 0.5)]
-    found = _together(parts)
-    # Three boundaries tell a distance (3 / 7)^3 as well as seven.
-    one_m2 = (0.1**2 * 7**3 + 0.1**2 * 7**3 + 0.2**2 * 3**3) / 3
-    weights = np.array([7**3, 7**3, 3**3]) / one_m2
-    mean = np.average([50.0, 51.0, 50.5], weights=weights)
-    misfit = weights @ (np.array([50.0, 51.0, 50.5]) - mean) ** 2 / 2
-    assert found.distance_m == pytest.approx(mean)
-    assert found.sigma_m == pytest.approx(np.sqrt(misfit / weights.sum()))
-    assert (found.pairs, found.late_chips) == (17, 0.5)
-    assert _together(parts[:1]) == parts[0]
-    assert np.isnan(_together([]).distance_m)
 
 
 BLUR, SHARE = 0.2, 0.4
@@ -442,16 +410,6 @@ def test_the_line_is_theil_sen() -> None:
     assert not _kernels.fit_line(middles, line)
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_the_core_is_what_hangs_together_about_the_fullest(seed: int) -> None:
-    counts = np.random.default_rng(seed).integers(0, 20, 11)
-    enough = "".join("x" if c >= 0.3 * counts.max() else " " for c in counts)
-    peak = int(counts.argmax())
-    low = enough.rfind(" ", 0, peak) + 1
-    high = len(enough[:peak] + enough[peak:].partition(" ")[0]) - 1
-    assert core_of(counts) == ((low + high) / 2 - 5, (high - low) / 2)
-
-
 @pytest.mark.parametrize("tilt", [0.0, 0.1])
 def test_the_line_of_a_bar_leaves_strays_out(tilt: float) -> None:
     rng = np.random.default_rng(8)
@@ -477,15 +435,6 @@ def test_the_line_of_a_bar_leaves_strays_out(tilt: float) -> None:
     few = selected.copy()
     few[2:] = False
     assert find_bar(FrameView(sums, np.zeros((2, 2)), replace(presence, selected=few), soft), 2) is None
-
-
-def test_a_bar_lies_along_what_it_spreads_over() -> None:
-    selected, middles = np.zeros((4, 9, 9), np.bool_), np.empty((4, 2))
-    assert not _kernels.find_middles(selected, middles)
-    assert np.isnan(middles).all()
-    selected[0, 1, 5] = selected[2, 8, 6] = True
-    assert not _kernels.find_middles(selected, middles)
-    assert _kernels.find_middles(selected.swapaxes(1, 2).copy(), middles)
 
 
 def own_motion(shift: np.ndarray, information: np.ndarray, when: np.ndarray) -> np.ndarray:

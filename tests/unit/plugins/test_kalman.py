@@ -68,23 +68,6 @@ def test_sigmas_are_consistent() -> None:
     assert low < np.mean(last) < high
 
 
-def test_filtering_pays_and_an_outlier_is_left_out() -> None:
-    rng = np.random.default_rng(2)
-    t_us = np.arange(80) * FRAME_US
-    true = 45 - 8.3 * t_us * 1e-6
-    z = true + rng.normal(0, 0.1, 80)
-    z[50] += 5
-    out = run(distance_filter(), t_us, z, 0.1)
-    assert np.abs(out[30:, 0] - true[30:]).max() < 0.15
-    assert np.sqrt(np.mean((out[20:, 0] - true[20:]) ** 2)) < 0.5 * 0.1
-
-
-def test_what_changed_for_good_is_believed() -> None:
-    t_us = np.arange(60) * FRAME_US
-    z = np.where(np.arange(60) < 30, 40.0, 70.0)
-    assert run(distance_filter(), t_us, z, 0.1)[-1, 0] == pytest.approx(70, abs=0.1)
-
-
 def position_errors(measured: np.ndarray, true: np.ndarray, **parameters: float) -> np.ndarray:
     """Of the values and of the predictions a step ahead, (n, 2); 1.5 ms a step, 0.25 px of noise."""
     filter_ = KalmanTracking(**parameters).compile().position

@@ -1,7 +1,5 @@
 """Ranging by phase-only correlation: kernels against twins, exact shifts, ideal images."""
 
-from pathlib import Path
-
 import numpy as np
 import poc_twins as twins
 import pytest
@@ -29,7 +27,6 @@ SEEDS = range(10)
 CAMERA, BAR = CameraModel(), BarLayout()
 PANEL = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
 LINK = load_link()
-EXAMPLES = Path(__file__).parents[3] / "examples"
 SHAPES = [(24, 20), (25, 21), (16, 17), (48, 40)]
 
 
@@ -207,16 +204,6 @@ def test_a_shift_in_noise_and_its_bound(spacing_px, noise):
     assert 1 < ratio["blob"] < 2.8
 
 
-def test_a_peak_out_of_reach_is_not_found():
-    rng = np.random.default_rng(2)
-    spectrum = twins.band_limited(rng, 32, 32)
-    images = np.stack([twins.shifted(spectrum, (32, 32), *d) for d in [(0, 0), (0, 7.2)]])
-    correlation = phase_only_correlation(images, np.array([0]), np.array([1]))
-    far, near = (pair_shifts(correlation, full_band(32, 32), reach, 2) for reach in (8, 4))
-    assert_allclose(far, [[0, 7.2]], atol=2e-6)
-    assert np.abs(near).max() <= 5
-
-
 # Ideal images
 
 
@@ -315,23 +302,6 @@ def test_a_cluster_out_of_place_is_dropped(cluster, down):
     assert everything.sigma_m > 2 * found.sigma_m
 
 
-@pytest.mark.parametrize("hidden", [range(4), range(11, 16), (0, 1, 14, 15)])
-def test_hidden_ends_leave_the_distance(hidden):
-    maps = image_of(BAR, 50)
-    maps[list(hidden)] = 0
-    found = measured(maps)
-    assert found.distance_m == pytest.approx(50, rel=1.5e-3)
-    lit = [k for k in range(16) if k not in hidden]
-    # The outermost of what is seen may be cut off by what hides the others.
-    maps[[lit[0], lit[-1]]] = np.roll(maps[[lit[0], lit[-1]]], 4, 1)
-    assert measured(maps).distance_m == pytest.approx(50, rel=1.5e-3)
-
-
-def test_outermost_clusters_do_not_matter():
-    want = measured(image_of(BAR, 50))
-    assert measured(image_of(BAR, 50, moved={0: (5, -3), 15: (-4, 6)})) == want
-
-
 def test_sigma_is_the_error_that_noise_makes():
     rng = np.random.default_rng(8)
     maps = image_of(BAR, 70)
@@ -342,17 +312,6 @@ def test_sigma_is_the_error_that_noise_makes():
     error = np.std([r.distance_m for r in noisy])
     sigma = np.mean([r.sigma_m for r in noisy])
     assert 0.5 < sigma / error < 2
-
-
-@pytest.mark.parametrize("power", [0.0, 1.0, 2.0, 4.0])
-def test_a_pair_weighs_by_its_spacing(power):
-    maps = image_of(BAR, 50, moved={7: (0, 1)})
-    plain = {"drop_extremes": 0, "outlier_iqr": 1e6}
-    long, short = (measured(maps, clusters=pair, **plain).distance_m for pair in ((0, 15), (7, 15)))
-    both = measured(maps, clusters=(0, 7, 15), weight_power=power, **plain)
-    weights = 15**power, 8**power
-    assert both.pairs == 2
-    assert both.distance_m == pytest.approx(np.average([long, short], weights=weights), rel=1e-6)
 
 
 def test_centroid_leaves_out_the_rim_of_a_panel():
@@ -367,19 +326,6 @@ def test_centroid_leaves_out_the_rim_of_a_panel():
     assert inner(view_of(moved)) == inner(view_of(maps))
     assert inner(view_of(maps)).distance_m == pytest.approx(30, rel=5e-3)
     assert every(view_of(moved)).distance_m < 0.97 * every(view_of(maps)).distance_m
-
-
-def test_two_clusters_are_one_pair():
-    link = load_link(EXAMPLES / "campaigns" / "two-clusters.toml")
-    measure = link.algorithm("ranging").compile(CAMERA, link.bar, link.codebook)
-    maps = image_of(BAR, 50)
-    found = measure(view_of(maps))
-    assert found.pairs == 1
-    assert np.isnan(found.sigma_m)
-    assert found.distance_m == pytest.approx(50, rel=2e-3)
-    others = np.delete(np.arange(16), link.algorithm("ranging").clusters)
-    maps[others] = 0
-    assert measure(view_of(maps)).distance_m == found.distance_m
 
 
 @pytest.mark.parametrize("clusters", [(3,), (3, 3), (2, 5, 2), (-1, 5), (2, 16)])

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
-from evlcp_uart.decoder import Character, _bunches, _spread
+from evlcp_uart.decoder import Character
 from evlcp_uart.framing import Uart, read_characters
 from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, OUTLIER, TICKS, Light
 
@@ -161,20 +161,6 @@ def test_times_that_are_coarse_are_read_in_any_pieces(
         again += more
     again += decoder.close(state)[1]
     assert [(one.t_us, one.value) for one in again] == [(one.t_us, one.value) for one in found]
-
-
-def test_events_are_spread_evenly_and_none_is_lost() -> None:
-    rng = np.random.default_rng(0)
-    counts = np.zeros((2, 400), np.int32)
-    counts[:, 3::5] = rng.poisson(30, (2, 80))
-    assert _bunches(counts) == 5
-    assert _bunches(rng.poisson(8, (2, 400)).astype(np.int32)) == 1
-    for ticks in (1, 2, 5, 8, 16):
-        found = _spread(counts, ticks)
-        assert (found.sum(1) == counts.sum(1)).all()
-        assert found.min() >= 0
-        box = np.cumsum(np.convolve(counts[0], np.ones(ticks) / ticks))[ticks // 2 :][:400]
-        assert np.abs(np.cumsum(found[0]) - box)[:-ticks].max() < 1.01
 
 
 @pytest.mark.parametrize("seed", [12])
@@ -514,18 +500,6 @@ def test_a_bar_of_clusters_is_refused() -> None:
         resolve({"framing": {"id": "uart"}})
 
 
-def test_tables_of_steps_that_it_has_not_are_refused() -> None:
-    with pytest.raises(
-        ConfigError, match=r"^pilots: no step of framing 'uart', which has its own; leave it out$"
-    ):
-        resolve({"bar": BAR, "framing": {"id": "uart"}, "pilots": {"id": "wh"}})
-    link = resolve({"bar": BAR, "framing": {"id": "uart"}})
-    assert "pilots" not in link.table
-    assert resolve(link.table) == link
-    with pytest.raises(ConfigError, match=r"^ranging: no step of framing 'uart'"):
-        link.algorithm("ranging")
-
-
 def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
     """The highest bit first, as a home-made transmitter may send; and what is said where it is not told."""
     text = "Rough winds do shake the darling buds of May, " * 3
@@ -687,14 +661,3 @@ def test_a_bar_in_view_is_no_light_of_characters(framing: dict[str, Any], demo_r
     with evlcp.receive(demo_raw, [link]) as packets:
         assert list(packets) == []
         assert packets.counts["regions_opened"] == 0
-
-
-def test_characters_of_one_polarity_are_not_said_to_be_sure() -> None:
-    """Of rises alone a character has several readings: as many are wrong as quality says, to a fifth."""
-    sent = np.random.default_rng(4).integers(0, 128, 200)
-    events = seen(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
-    rises = events[events.p > 0]
-    found = read_characters(rises.t_us, rises.p, 3125.0, Uart(7, "even", 2))
-    begun = {round((c.t_us - 20_000) / (11 * 320)): c for c in found}
-    right = np.mean([k in begun and begun[k].value == value for k, value in enumerate(sent.tolist())])
-    assert np.mean([c.quality for c in found]) == pytest.approx(right, abs=0.2)

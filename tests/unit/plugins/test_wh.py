@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import wh_twins as twins
-from evlcp_wh import _kernels, ml_soft, motion_feedback
+from evlcp_wh import _kernels, ml_soft
 from evlcp_wh.decoding import WhTransform, match_words
 from evlcp_wh.ml_soft import INDEPENDENT_PIXELS, LearnedDecoder, MlSoft
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
@@ -72,22 +72,6 @@ def test_presence_is_bayes_rule(shape, grid, density):
     assert_allclose(found.probability, want, rtol=1e-5, atol=2e-9)
     assert found.probability.shape == (CLUSTERS, shape[0] // grid, shape[1] // grid)
     assert_array_equal(found.selected, found.probability >= 0.5)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(
-    "pilots", [CODES, values_of(WhPilots().codes(32)), values_of(WhPilots().codes(3))], ids=len
-)
-def test_presence_of_few_and_many_clusters(seed, pilots):
-    rng = np.random.default_rng(seed)
-    sums = np.repeat(-(pilots[rng.integers(len(pilots), size=12)].T), 2, 0)
-    sums[1::2] *= -1
-    sums = (
-        (sums * (rng.random(sums.shape) < 0.8)).astype(np.int16).reshape(-1, 3, 4).repeat(2, 1).repeat(2, 2)
-    )
-    found = WhCorrelation().compile(book_of(pilots=pilots))(sums).probability
-    assert_allclose(found, twins.posterior(sums, pilots, 2, 0.1, 4), rtol=1e-5, atol=2e-9)
-    assert (found > 0.5).any()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -170,14 +154,6 @@ def test_worth_is_learned_and_summed(seed, grid, most, prior):
     assert_allclose(out, want, rtol=1e-6, atol=1e-9)
 
 
-def test_nothing_is_learned_where_nothing_shows():
-    worth = np.empty(49)
-    sums = random_sums(np.random.default_rng(0), (16, 4, 4))
-    dark = np.zeros((CLUSTERS, 2, 2), np.float32)
-    _kernels.learn_worth(pairs_of(sums, 3), 4, signs_of(CODES), dark, 2, 1.0, worth)
-    assert_allclose(worth, 0, atol=1e-12)
-
-
 @pytest.mark.parametrize("value", [-1, 1])
 def test_a_pilot_of_one_value_says_of_the_other_the_same_with_signs_changed(value):
     rng = np.random.default_rng(0)
@@ -238,23 +214,6 @@ def test_a_value_is_read_from_the_chip_that_is_seen(silent):
     found = WhCorrelation().compile(book_of())(sums)
     assert_array_equal(found.probability, whole.probability)
     assert_array_equal(found.pixels, whole.pixels)
-
-
-def test_the_second_chip_outvotes_the_first():
-    sums = image_of(CODES, range(CLUSTERS))
-    whole = WhCorrelation().compile(book_of())(sums)
-    sums[::2] *= -1
-    assert_array_equal(WhCorrelation().compile(book_of())(sums).probability, whole.probability)
-
-
-@pytest.mark.parametrize(("seen", "shown"), [(0, False), (3, False), (4, True), (8, True)])
-def test_a_cell_shows_no_cluster_until_enough_values_are_seen(seen, shown):
-    sums = image_of(CODES, range(CLUSTERS))
-    sums[2 * seen :] = 0
-    found = WhCorrelation().compile(book_of())(sums)
-    assert found.probability.any() == shown
-    # Four values are half a code: the two clusters that begin with it share the probability.
-    assert found.selected.any() == (seen == 8)
 
 
 # Decoding
@@ -360,17 +319,6 @@ def test_what_flickers_before_a_part_of_a_cluster_is_not_listened_to(decoding, m
     assert (believing.symbols != symbols).any()
 
 
-def test_what_comes_with_both_values_alike_is_worth_nothing():
-    # Codes of five values, of which one or two are +1: a plain prior would take silence for a hint.
-    pilots = np.array([[1, -1, -1, -1, -1], [1, 1, -1, -1, -1]], np.int64)
-    presence = ideal_presence(2)
-    silent = np.zeros((10, *(presence.grid_px * n for n in presence.probability.shape[1:])), np.int16)
-    worth = np.empty(49)
-    seen = presence.probability
-    _kernels.learn_worth(pairs_of(silent, 3), silent.shape[2], signs_of(pilots), seen, 2, 1.0, worth)
-    assert_allclose(worth, 0, atol=1e-12)
-
-
 def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
     """A frame of a bar that stands still while its pilot is on air and drifts away while its info is."""
     still = ideal_sums(book, symbols, missing=missing, seed=seed, **image)
@@ -417,22 +365,6 @@ def test_a_bar_that_goes_farther_than_is_searched_is_searched_farther(right_down
     if right_down in ((0, 6), (0, -6), (0, 7)):
         near = MotionFeedback(far_px=4).compile(book)(presence, sums)
         assert (near.symbols != symbols).any()
-
-
-@pytest.mark.parametrize("seed", range(6))
-def test_a_bar_that_leaves_a_bit_unsure_is_searched_farther(seed, monkeypatch):
-    """The path may go over to the same clusters a spacing back, and never come to the border."""
-    book = book_of()
-    symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
-    shape = {"cluster_px": 3, "width_px": 3}
-    sums, _ = drifting(book, symbols, (0, -5), seed=seed, **shape)
-    presence = ideal_presence(CLUSTERS, **shape)
-    soft = MotionFeedback().compile(book)(presence, sums)
-    assert_array_equal(soft.symbols, symbols)
-    assert_array_equal(soft.llr, MotionFeedback(reach_px=8).compile(book)(presence, sums).llr)
-    monkeypatch.setattr(motion_feedback, "_UNSURE_LLR", 0.0)
-    by_border = MotionFeedback().compile(book)(presence, sums)
-    assert (by_border.symbols != symbols).any()
 
 
 @pytest.mark.parametrize("seed", SEEDS)

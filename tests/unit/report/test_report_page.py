@@ -15,7 +15,6 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.report.motion import Motion, cluster_map
 from evlcp_sdk.report.page import Report
-from evlcp_sdk.report.plots import Plot
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.writer import ResultWriter
@@ -144,28 +143,6 @@ def test_a_picture_is_bounded_whatever_its_size() -> None:
     top, left = rows.min() - 3, columns.min() - 3
     height, width = cut.clusters.shape
     assert (cut.sums == small.sums[:, top : top + height, left : left + width]).all()
-
-
-def test_a_chart_has_gaps_where_values_are_missing() -> None:
-    plot = Plot("a", "x", "y", x_limits=(0, 10), y_limits=(0, 2))
-    plot.line([0, 5, math.nan, 10], [0, 1, 1, 2], "#000")
-    plot.dots([0, 5, 10], [math.nan, 1, 2], "#111", said=["none", "middle", "end"])
-    text = str(plot.markup())
-    assert plot.told == [(500, 500, "middle"), (1000, 0, "end")]
-    assert re.findall(r'd="(M[^"]*)"/>', text)[-3:] == [
-        "M0 2000L1000 1000",
-        "M2000 0",
-        "M1000 1000h0M2000 0h0",
-    ]
-    down = Plot("a", "x", "y", down=True, x_limits=(0, 10), y_limits=(0, 2))
-    down.dots([10], [2], "#111", said=["end"])
-    down.markup()
-    assert down.told == [(1000, 1000, "end")]
-    square = Plot("a", "x", "y", aspect=2.0)
-    square.dots([0, 10], [0, 10], "#111", said=["a", "b"])
-    square.markup()
-    (x0, y0, _), (x1, y1, _) = square.told
-    assert 2 * (x1 - x0) == pytest.approx(y0 - y1, abs=4)
 
 
 def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS
-from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
+from evlcp_sdk.diagnosis.tallies import TransmitterTally
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
@@ -295,13 +295,6 @@ def test_the_median_needs_no_memory_of_every_frame() -> None:
     assert max(tally.cells) == 100_000
 
 
-def test_a_jump_in_time_is_no_clock_error() -> None:
-    tally = TransmitterTally(3, 12_200.0)
-    for number, t_us in enumerate([0.0, 12_200.1, 24_400.2, 30_000.0, 42_200.1]):
-        tally.add(Packet(0, number, t_us, 100.0, (), sent=3))
-    assert tally.clock_ppm() == pytest.approx(-0.1 / 12_200 * 1e6, rel=1e-3)
-
-
 @pytest.mark.parametrize("parquet", [False, True])
 def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path, parquet: bool) -> None:
     if parquet:
@@ -319,17 +312,6 @@ def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path, parquet: boo
 
         table = pyarrow.parquet.read_table(tmp_path / "frames.parquet").to_pylist()
         assert [row["distance_filtered_m"] for row in table] == [51.0, None]
-
-
-def test_figures_of_the_newest_transmitters_are_kept() -> None:
-    tally = RunTally(LINK.packet)
-    for number in range(1030):
-        tally.add(Packet(number, 0, 1000.0 * number, 100.0, (frame(0, 0), frame(0, 1)), sent=3))
-    tally.add(Packet(6, 1, 1e7, 100.0, (frame(1, 0),), sent=3))
-    assert len(tally.transmitters) == 1024
-    assert set(range(1030)) - set(tally.transmitters) == set(range(6))
-    assert (tally.others, tally.others_frames) == (6, 12)
-    assert tally.headline() == "1024 transmitters, 2049 frames; 6 earlier ones, 12 frames"
 
 
 @pytest.mark.parametrize("kept", [False, True])

@@ -18,7 +18,6 @@ import pynmea2
 import pytest
 from PIL import Image
 
-from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import STAGE_PREFIX
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place import navigator
@@ -321,15 +320,6 @@ def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
         assert two == [pytest.approx([sign * -180, 35.1, 2.0]), way[1], way[2]]
 
 
-def test_a_refusal_that_is_a_formula_is_none_in_the_csv(tmp_path: Path) -> None:
-    with ResultFolder(tmp_path, ["fixes.csv"]) as folder:
-        sink = FixesCsv(folder, Run("", LINK))
-        sink.fix(Fix.refused(1.0, (0,), "+a", "=1+1"), None)
-        folder.finish()
-    (row,) = rows(tmp_path / "fixes.csv")
-    assert (row["refusal"], row["detail"]) == ("'+a", "'=1+1")
-
-
 def test_points_of_frames(tmp_path: Path) -> None:
     (packet,) = packets(1)
     frames = [
@@ -590,19 +580,6 @@ def test_times_by_pulses(tmp_path: Path) -> None:
         # The pulse began a second of UTC; before it, what is known beforehand holds.
         after_s = (at_us - t_us[0] * (at_us >= t_us[0])) * 1e-6
         assert (at.replace(tzinfo=UTC) - ZERO).total_seconds() == pytest.approx(after_s, abs=1.1e-3)
-
-
-def test_mcap_without_the_extra_says_how(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("evlcp_sdk.plugin.records.find_spec", lambda _name: None)
-    with pytest.raises(ConfigError, match=r"sink 'mcap' of evlcp-sdk needs the extra: .*evlcp-sdk\[mcap\]"):
-        ResultWriter(tmp_path / "out", LINK, plan=PositionPlan((SITE,)), sinks=["mcap"])
-    assert not (tmp_path / "out").exists()
-
-
-def test_what_writes_positions_needs_them(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="sink 'mcap' needs --sites"):
-        ResultWriter(tmp_path / "out", LINK, sinks=["mcap"])
-    assert not (tmp_path / "out").exists()
 
 
 def test_beacons_that_are_not_believed_give_no_positions(tmp_path: Path) -> None:

@@ -71,13 +71,6 @@ def test_the_sigma_is_that_of_gravity_and_of_plumb_bars() -> None:
     assert sight.sigma == pytest.approx(math.radians(math.hypot(0.2, 0.1)) * math.cos(math.radians(30)))
 
 
-def test_a_lens_does_not_change_the_sight() -> None:
-    attitude, bent = Attitude(4.0, 3.0), CameraModel(k1=-0.4, p1=0.002)
-    plain = sight_of(CAMERA, seen(attitude, 3.0, 3.0, PLUMB)[0], SIGMA_PX, attitude)
-    lens = sight_of(bent, seen(attitude, 3.0, 3.0, PLUMB, bent)[0], SIGMA_PX, attitude)
-    assert (lens.along, lens.across, lens.sine) == pytest.approx((plain.along, plain.across, plain.sine))
-
-
 CORNERS = [(-600.0, -320.0), (600.0, -320.0), (-600.0, 320.0), (600.0, 320.0)]
 
 
@@ -105,11 +98,6 @@ def test_distances_and_bends_of_a_distorted_bar_are_those_of_a_pinhole(
     bent, _, _ = np.polyfit(place, off_px / (spacing_px * 0.06 / depth_m), 2)
     assert sight.bow == pytest.approx(bent, abs=3e-4 + 0.03 * abs(bent))
     assert magnification_of(camera, clusters) == pytest.approx(sight.magnification, rel=1e-4)
-
-
-def test_without_distortion_nothing_is_magnified() -> None:
-    points = seen(Attitude(), 3.0, 3.0, PLUMB)[0]
-    assert (sight_of(CAMERA, points, SIGMA_PX).magnification, magnification_of(CAMERA, points)) == (1.0, 1.0)
 
 
 def test_a_part_of_a_bar_has_a_sight_and_a_point_has_none() -> None:

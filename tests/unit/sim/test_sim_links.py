@@ -90,22 +90,6 @@ def test_a_bar_lays_its_tables_over_the_scene_s(tmp_path: Path) -> None:
     assert links_of(scene_of_truth(truth_of(scene).to_table())) == links_of(scene)
 
 
-def test_overrides_reach_links(tmp_path: Path) -> None:
-    (tmp_path / "mine.toml").write_text('[pilots]\nid = "barker13"\n[air]\nchip_rate_hz = 7000.0\n')
-    both = load_scene("two-bars", ["link.air.chip_rate_hz=5000.0", "bars.1.link.modulation.id=wh8"])
-    assert [(k.air.chip_rate_hz, k.codebook.profile) for k in links_of(both)] == [
-        (5000.0, "wh4x2"),
-        (5000.0, "wh8"),
-    ]
-    every_bar = load_scene("two-bars", {"bars.link.error-correction.id": "none"})
-    assert [k.table["error-correction"]["id"] for k in links_of(every_bar)] == ["none", "none"]
-    file = load_scene("night", ["link.air.chip_rate_hz=6000.0"], link=tmp_path / "mine.toml")
-    assert [(k.air.chip_rate_hz, k.table["pilots"]["id"]) for k in links_of(file)] == [(6000.0, "barker13")]
-    one = load_scene("two-bars", {"bars.0.link": str(tmp_path / "mine.toml")})
-    assert [k.air.chip_rate_hz for k in links_of(one)] == [7000.0, 10_000.0]
-    assert links_of(load_scene("night")) == (resolve({}),)
-
-
 @pytest.mark.parametrize(
     ("table", "says"),
     [
@@ -136,19 +120,6 @@ def test_faults_of_links_are_told_with_their_path(table: dict[str, Any], says: s
     assert len(str(fault.value).splitlines()) == 1
 
 
-def test_a_fault_in_a_file_of_a_link_names_the_file(tmp_path: Path) -> None:
-    file, scene = tmp_path / "link.toml", tmp_path / "scene.toml"
-    file.write_text("[bar]\nnope = 1\n")
-    scene.write_text("[[bars]]\nlink = 'link.toml'\n")
-    for load, place in (
-        (lambda: load_scene(scene), f"{scene}: bars.0.link: {file}: bar.nope = 1: unknown key"),
-        (lambda: load_scene("night", link=file), f"preset night: link: {file}: bar.nope = 1: unknown key"),
-    ):
-        with pytest.raises(ConfigError) as refused:
-            load()
-        assert str(refused.value).startswith(place)
-
-
 def turned(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
     """Points (x right, y down, z towards the camera) in the scene, by matrices: tilted, then leaned."""
     tilt, lean = math.radians(bar.tilt_deg), math.radians(bar.lean_deg)
@@ -168,33 +139,6 @@ LAYOUTS: dict[str, dict[str, Any]] = {
     },
     "one": {"shape": "table"},
 }
-
-
-@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
-def test_every_led_shines_where_it_stands(layout: dict[str, Any]) -> None:
-    bar = BarSpec(x_m=-0.7, y_m=0.2, z_m=3.0, lean_deg=20.0, tilt_deg=35.0, width_m=0.004)
-    link = resolve({"bar": layout})
-    light = BarLight(bar, link, LensSpec(), seed=0)
-    leds, which = turned(bar, link.bar.led_positions_m()), link.bar.led_clusters()
-    lit_m2, power = 0.0, 0.0
-    shown = np.zeros(len(leds), np.int64)
-    for part in light.strips:
-        cuts = part.strip.cuts_m()
-        long_m = np.linalg.norm(np.diff(cuts, axis=0), axis=1)
-        way = (cuts[-1] - cuts[0]) / np.linalg.norm(cuts[-1] - cuts[0])
-        for start, long, k in zip(cuts[:-1], long_m, part.clusters, strict=True):
-            along = (leds - start) @ way
-            beside = np.linalg.norm(leds - start - along[:, None] * way, axis=1)
-            here = (along > -1e-9) & (along < long + 1e-9) & (beside < 1e-6)
-            assert (which[here] == k).all() or k == -1
-            assert not (k == -1 and here.any())
-            shown += here
-            area = long * part.strip.width_m * (k >= 0)
-            lit_m2, power = lit_m2 + area, power + area * part.light_w_m2
-    assert (shown == 1).all()
-    # As many watts as that many single LEDs.
-    alone = BarLight(bar, resolve({"bar": {"shape": "table"}}), LensSpec(), seed=0)
-    assert power == pytest.approx(len(leds) * alone.light_w_m2 * 0.005**2)
 
 
 @pytest.mark.parametrize(

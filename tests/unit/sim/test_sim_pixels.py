@@ -123,19 +123,6 @@ def test_pixels_do_not_depend_on_those_beside_them(tau_us: float) -> None:
             assert np.array_equal(a[:n], b)
 
 
-def test_an_interval_is_a_refractory_time_or_more() -> None:
-    for refractory in (3.0, 10.0, 50.0):
-        sensor = replace(SENSOR, refr_us=refractory, jitter_us=3.0)
-        edges = np.arange(400) * 50.0
-        light = np.where(np.arange(400) % 2, 40.0, 0.05)
-        events = pixel_events(sensor, edges, light, 2e4, pixels=20)
-        same = np.diff(events.pixel) == 0
-        assert np.diff(events.request_us)[same].min() >= refractory - 1e-9
-        assert np.diff(events.cross_us)[same].min() >= refractory - 1e-9
-        # A slow fall keeps some pixel crossing as soon as it sees again.
-        assert np.diff(events.cross_us)[same].min() < refractory + 1
-
-
 def test_missing_events_are_missing_in_the_share_asked_for() -> None:
     edges = np.arange(4000) * 400.0
     light = np.where(np.arange(4000) % 2, 20.0, 5.0)
@@ -145,18 +132,6 @@ def test_missing_events_are_missing_in_the_share_asked_for() -> None:
         sent, all_ = int((some.on == on).sum()), int((full.on == on).sum())
         interval = binomtest(all_ - sent, all_).proportion_ci(0.999)
         assert interval.low <= p <= interval.high
-
-
-def test_off_events_outnumber_on_events_the_more_the_darker_it_is() -> None:
-    sensor = replace(SENSOR, p_on_miss=0.0, p_off_miss=0.0)
-    chips = np.random.default_rng(0).integers(0, 2, 200)
-    lit = np.stack([1 - chips, chips], 1).ravel()
-    shares = []
-    for background in (5.0, 1.0, 0.2, 0.05, 0.01):
-        events = pixel_events(sensor, np.arange(400) * 100.0, background + 20.0 * lit, 4e4, pixels=30)
-        shares.append((~events.on).sum() / events.on.sum())
-    assert shares[0] == pytest.approx(1, abs=0.1)
-    assert shares == sorted(shares)
 
 
 def background_only(seconds: float, **sensor: float) -> tuple[Scene, Events]:

@@ -249,21 +249,6 @@ def test_a_pixel_sees_the_sum_of_all_light(name: str) -> None:
         assert light.max() < 1 or np.quantile(away, 0.97) < 6.0
 
 
-def test_bloom_follows_the_image() -> None:
-    """A halo of few pixels is where the bar is, also while that moves by 30 px within a block of time."""
-    turning = MotionSpec(
-        distance_m=50.0, speed_mps=0.0, vib_rate_rad_s=0.0, pothole_s=(0.0,), pothole_decay_s=9.0
-    )
-    scene = Scene(duration_s=0.004, sensor=IDEAL, motion=turning, background=EVEN)
-    scene = replace(scene, lens=replace(scene.lens, wings=False, halo=0.0, bloom=0.6, bloom_px=3.0))
-    events = every(scene)
-    centre = truth_of(scene).bars[0].centre_px
-    away = events.y - np.interp(events.t_us, np.arange(len(centre)) * 1000.0, centre[:, 1])
-    ends = [float(np.abs(away[(a <= events.t_us) & (events.t_us < a + 1000)]).max()) for a in (0, 2000)]
-    assert np.ptp(centre[:, 1]) > 20
-    assert abs(ends[0] - ends[1]) < 4
-
-
 def test_a_pothole_strikes_rings_and_decays() -> None:
     motion = MotionSpec(vib_rate_rad_s=0.0, pothole_s=(0.05, 0.3), pothole_rad_s=0.8, pothole_hz=15.0)
     t_us = np.arange(0, 2e6, 10.0)
@@ -315,16 +300,6 @@ def test_texture_that_moves_gives_the_events_of_its_own_contrast(tmp_path: Path)
         assert abs(net[y, x] * 0.223 - (path[-1] - path[0])) < 0.223 + 0.02 * (1 + count[y, x])
         assert count[y, x] * 0.223 <= np.abs(np.diff(path)).sum() + 0.05
     assert abs(float(count.mean())) > 1
-
-
-@pytest.mark.parametrize("texture_px", [3.0, 12.0])
-def test_texture_is_correlated_over_its_length(texture_px: float) -> None:
-    field = np.log(Simulation(Scene(background=BackgroundSpec(texture=0.7, texture_px=texture_px)))._texture)
-    field -= field.mean()
-    assert field.std() == pytest.approx(0.7, rel=1e-6)
-    for axis in (0, 1):
-        lagged = (field * np.roll(field, round(texture_px), axis)).mean() / field.var()
-        assert lagged == pytest.approx(math.exp(-1), abs=0.05)
 
 
 def test_background_is_simulated_around_the_sources() -> None:
@@ -435,23 +410,6 @@ def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> No
     with pytest.raises(ConfigError) as fault:
         resolve_scene(table, source="scene.toml")
     assert f"scene.toml: {says}" in str(fault.value)
-
-
-@pytest.mark.parametrize(
-    ("bar", "says"),
-    [
-        ({"covered": [16]}, "bars.0.covered = [16]: expected clusters, 0 to 15"),
-        (
-            {"cover_s": [[0.0, 0.1, 5, 2]]},
-            "bars.0.cover_s.0 = [0.0, 0.1, 5, 2]: expected the first and the last",
-        ),
-        ({"pole_s": [[0.2, 0.1]]}, "bars.0.pole_s.0 = [0.2, 0.1]: expected a time, and a later one"),
-    ],
-)
-def test_covers_that_cover_nothing_are_told(bar: dict[str, Any], says: str) -> None:
-    with pytest.raises(ConfigError) as fault:
-        Simulation(resolve_scene({"bars": [bar]}))
-    assert says in str(fault.value)
 
 
 @pytest.mark.skipif(not TOOL.exists(), reason="the scorers of ../shared are not there")

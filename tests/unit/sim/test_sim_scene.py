@@ -271,15 +271,6 @@ def test_simulate_writes_a_recording_and_its_truth(
     assert "drive-30kmh" in evlcp("simulate", "--presets").out
 
 
-def test_a_recording_without_its_truth_does_not_stay(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
-    recording = tmp_path / "a.raw"
-    (tmp_path / "a.truth.json").mkdir()
-    done = evlcp("simulate", "--preset", "night", "-o", recording, "--set", "duration_s=0.02")
-    assert done.code == 1
-    assert "a.truth.json: cannot be written: Is a directory" in done.err
-    assert not recording.exists()
-
-
 @pytest.mark.parametrize(
     ("arguments", "code", "says"),
     [
@@ -302,26 +293,3 @@ def test_simulate_tells_what_is_wrong(
     assert done.code == code
     assert says in done.err
     assert list(tmp_path.iterdir()) == []
-
-
-@pytest.mark.parametrize(
-    ("row", "says"),
-    [
-        ("0.1,1e308,0,0,0,0,0", "line 3: x_m = 1e+308: expected at most 1e+06"),
-        ("0.1,0,0,0,0,0,nan", "line 3: roll_deg = nan: expected at most 1e+06"),
-        ("inf,0,0,0,0,0,0", "line 3: t_s = inf: expected at most 1e+06"),
-        ("1e-300,0,0,0,0,0,0", "two lines or more with rising t_s, 1e-06 s apart"),
-    ],
-)
-def test_a_path_beyond_its_numbers_is_one_line(row: str, says: str, tmp_path: Path) -> None:
-    head = "t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg\n0,0,0,-40,0,0,0\n"
-    (tmp_path / "path.csv").write_text(f"{head}{row}\n9,0,0,-30,0,0,0\n")
-    (tmp_path / "scene.toml").write_text('[motion]\npath_file = "path.csv"\n')
-    with pytest.raises(ConfigError) as caught:
-        Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.2"]))
-    assert (
-        str(caught.value) == f"{tmp_path}/path.csv: {says}"
-        if "line" in says[:5]
-        else says in str(caught.value)
-    )
-    assert len(str(caught.value).splitlines()) == 1

@@ -12,7 +12,7 @@ from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.world import attitude_log, rendered, scene_to_enu, sites_said
+from evlcp_sdk.sim.world import attitude_log, scene_to_enu, sites_said
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
 SCENE = resolve_scene(
@@ -195,11 +195,3 @@ def test_what_is_said_of_the_attitude_is_wrong_as_told() -> None:
     true = np.degrees(simulation.path.at(right.t_us)[1][:, 1])
     np.testing.assert_allclose(said(attitude_errs=2.0).pitch_deg - true, 2 * (right.pitch_deg - true))
     assert set(said(attitude_errs=2.0).gravity_sigma_deg) == {0.1}
-
-
-def test_what_is_only_said_changes_no_light() -> None:
-    assert SCENE.world is not None
-    world = replace(SCENE.world, attitude="gravity", attitude_late_ms=5.0, survey_sigma_m=1.0)
-    wrong = replace(SCENE, world=world, bars=tuple(replace(bar, site_of=1) for bar in SCENE.bars))
-    assert rendered(wrong) == rendered(SCENE) != wrong
-    assert rendered(replace(SCENE, world=replace(world, heading_deg=31.0))) != rendered(SCENE)
