@@ -22,7 +22,7 @@ from scipy.stats import binom
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, truth_of
-from evlcp_sdk.study.frames import given
+from evlcp_sdk.study.frames import row_of_frame
 from evlcp_sdk.study.match import match
 from evlcp_sdk.study.task import plan_of
 from evlcp_sdk.values import Events
@@ -47,7 +47,7 @@ def judged(scene: Scene, seed: int) -> Judged:
         receiver = Receiver(link)
         packets = receiver.feed(events) + receiver.close()
         frames = [frame for packet in packets for frame in packet.frames]
-        rows = [given(frame) for frame in frames]
+        rows = [row_of_frame(frame) for frame in frames]
         quality = {id(row): frame.soft.quality for row, frame in zip(rows, frames, strict=True)}
         matched, own = match(rows, truth), found.setdefault(decoding, [])
         for sent, pairs in zip(matched.bars, matched.pairs, strict=True):

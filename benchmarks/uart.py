@@ -22,7 +22,7 @@ from evlcp_sdk.run import receive
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.sim.truth import read_truth
 from evlcp_sdk.specs import parse_value
-from evlcp_sdk.study.frames import given
+from evlcp_sdk.study.frames import row_of_frame
 from evlcp_sdk.study.match import match
 
 SETTINGS = [
@@ -78,7 +78,7 @@ def row(args: argparse.Namespace, rate: float, distance_m: float, folder: Path) 
     with receive(path, [link]) as packets:
         heard = [frame for packet in packets for frame in packet.frames]
     spent = time.process_time() - begun
-    found = match([given(frame) for frame in heard], read_truth(path.with_suffix(".truth.json")))
+    found = match([row_of_frame(frame) for frame in heard], read_truth(path.with_suffix(".truth.json")))
     sent, pairs = found.bars[0].symbols[:, 0], found.pairs[0]
     wrong = [(frame.symbols[0] ^ int(sent[number])).bit_count() for frame, number in pairs]
     lost, bits = len(sent) - len(pairs), link.codebook.bits_per_symbol

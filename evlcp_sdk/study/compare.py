@@ -20,7 +20,7 @@ from evlcp_sdk.sim.truth import Truth, read_truth, truth_path
 from evlcp_sdk.stopwatch import Stopwatch
 from evlcp_sdk.study.bound import frame_bound
 from evlcp_sdk.study.comparison import STAGES, Comparison, Measured, Row, Table, Times, total_of
-from evlcp_sdk.study.frames import GivenFrame, frames_of
+from evlcp_sdk.study.frames import FrameRow, frames_of
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import statistics_of, without_truth
 from evlcp_sdk.study.variants import Variant
@@ -90,7 +90,7 @@ class _Lane:
         self.links = links
         others = [] if bound is None else [bound]
         self.receiver = Receiver([*links.values()], Registry.load(self.watch, *others).hook)
-        self.frames: list[GivenFrame] = []
+        self.frames: list[FrameRow] = []
         self.packets = 0
         self.spent = Stopwatch()
 

@@ -10,11 +10,11 @@ from evlcp_sdk.files import read_csv
 from evlcp_sdk.results.folder import check_result_file, read_summary
 from evlcp_sdk.values import Frame, Packet
 
-__all__ = ["GivenFrame", "frames_of", "given", "read_frames"]
+__all__ = ["FrameRow", "frames_of", "read_frames", "row_of_frame"]
 
 
 @dataclass(frozen=True)
-class GivenFrame:
+class FrameRow:
     """One decoded frame.
 
     Attributes:
@@ -42,9 +42,9 @@ class GivenFrame:
     link: str = ""
 
 
-def given(frame: Frame) -> GivenFrame:
+def row_of_frame(frame: Frame) -> FrameRow:
     """What is scored of a frame."""
-    return GivenFrame(
+    return FrameRow(
         transmitter=frame.transmitter,
         t_us=frame.t_us,
         symbols=tuple(frame.soft.symbols.tolist()),
@@ -58,9 +58,9 @@ def given(frame: Frame) -> GivenFrame:
     )
 
 
-def frames_of(packets: Iterable[Packet]) -> list[GivenFrame]:
+def frames_of(packets: Iterable[Packet]) -> list[FrameRow]:
     """What is scored of packets, in order."""
-    return [given(frame) for packet in packets for frame in packet.frames]
+    return [row_of_frame(frame) for packet in packets for frame in packet.frames]
 
 
 FRAMES = "frames.csv"
@@ -71,7 +71,7 @@ _MOST = 1e18
 _NEEDED = ("transmitter", "t_us", "symbols", "distance_m", "x_px", "y_px")
 
 
-def read_frames(folder: Path | str) -> list[GivenFrame]:
+def read_frames(folder: Path | str) -> list[FrameRow]:
     """The rows of a result's `frames.csv`.
 
     Needed are the columns transmitter, t_us, symbols, distance_m, x_px and y_px; distance_sigma_m,
@@ -92,7 +92,7 @@ def read_frames(folder: Path | str) -> list[GivenFrame]:
     return [_row(row, f"{path}:{line}") for line, row in rows]
 
 
-def _row(row: Mapping[str, str | None], place: str) -> GivenFrame:
+def _row(row: Mapping[str, str | None], place: str) -> FrameRow:
     def number(name: str, *, may_lack: bool = False) -> float:
         text = row.get(name) or ""
         if not text and may_lack:
@@ -112,7 +112,7 @@ def _row(row: Mapping[str, str | None], place: str) -> GivenFrame:
             raise InputError(f"{place}: {name} = {text!r:.40}: expected a whole number") from None
 
     echo = row.get("echo_of")
-    return GivenFrame(
+    return FrameRow(
         transmitter=whole("transmitter", row["transmitter"] or ""),
         t_us=number("t_us"),
         symbols=tuple(-1 if s == "-" else whole("symbols", s) for s in (row["symbols"] or "").split()),

@@ -16,7 +16,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.shared import differences
 from evlcp_sdk.rx.reflections import FOLLOWED_CHIPS
 from evlcp_sdk.sim.truth import SentBar, Truth
-from evlcp_sdk.study.frames import GivenFrame
+from evlcp_sdk.study.frames import FrameRow
 
 __all__ = ["BarFrames", "Matched", "check_link", "find_start", "match", "nearest_bar", "sent_packets"]
 
@@ -140,13 +140,13 @@ class Matched:
     """
 
     bars: tuple[BarFrames, ...]
-    pairs: tuple[list[tuple[GivenFrame, int]], ...]
+    pairs: tuple[list[tuple[FrameRow, int]], ...]
     unmatched: int
     echoes: int
 
 
 def match(
-    frames: Iterable[GivenFrame],
+    frames: Iterable[FrameRow],
     truth: Truth,
     *,
     road: bool = True,
@@ -161,7 +161,7 @@ def match(
     by name, where it has several.
     """
     bars = tuple(BarFrames.of(bar, truth, covers=road) for bar in truth.bars if bar.lit)
-    pairs: tuple[list[tuple[GivenFrame, int]], ...] = tuple([] for _ in bars)
+    pairs: tuple[list[tuple[FrameRow, int]], ...] = tuple([] for _ in bars)
     found: tuple[set[int], ...] = tuple(set() for _ in bars)
     unmatched = echoes = 0
     senders = {

@@ -13,7 +13,7 @@ from evlcp_sdk.place.refusals import CONTRADICTIONS
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.truth import Truth
-from evlcp_sdk.study.frames import GivenFrame
+from evlcp_sdk.study.frames import FrameRow
 from evlcp_sdk.study.match import NEAREST_PX, BarFrames, find_start, match, nearest_bar, sent_packets
 from evlcp_sdk.study.tally import Statistics, Tally, in_nm, segment_of
 from evlcp_sdk.values import Frame, Packet
@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 
-def bar_tallies(sent: BarFrames, pairs: Iterable[tuple[GivenFrame, int]]) -> list[tuple[int, Tally]]:
+def bar_tallies(sent: BarFrames, pairs: Iterable[tuple[FrameRow, int]]) -> list[tuple[int, Tally]]:
     """Tallies of one bar, each with the start of its segment: one a sent frame, one a decoded."""
     bits = sent.bar.link.codebook.bits_per_symbol
     segments = [segment_of(at) for at in sent.distance_m.tolist()]
@@ -66,7 +66,7 @@ def bar_tallies(sent: BarFrames, pairs: Iterable[tuple[GivenFrame, int]]) -> lis
 
 
 def statistics_of(
-    frames: Iterable[GivenFrame],
+    frames: Iterable[FrameRow],
     truth: Truth,
     *,
     events: int = 0,
@@ -96,7 +96,7 @@ def statistics_of(
     )
 
 
-def without_truth(frames: Iterable[GivenFrame], packets: int) -> Statistics:
+def without_truth(frames: Iterable[FrameRow], packets: int) -> Statistics:
     """What is counted of decoded frames without knowing what was sent."""
     frames = list(frames)
     own = [frame for frame in frames if frame.echo_of is None]

@@ -17,7 +17,7 @@ from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.sim.truth import Truth
-from evlcp_sdk.study.frames import GivenFrame
+from evlcp_sdk.study.frames import FrameRow
 from evlcp_sdk.study.match import match
 from evlcp_sdk.study.measure import bar_tallies
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
@@ -29,7 +29,7 @@ _FARTHEST_M = 200
 
 
 def score_frames(
-    frames: Iterable[GivenFrame], truth: Truth, links: Mapping[str, Link] | None = None
+    frames: Iterable[FrameRow], truth: Truth, links: Mapping[str, Link] | None = None
 ) -> dict[str, Any]:
     """Both scores as JSON values: the plain one's keys, and the road score under `road`."""
     frames = list(frames)
@@ -38,7 +38,7 @@ def score_frames(
 
 
 def _score(
-    frames: list[GivenFrame], truth: Truth, links: Mapping[str, Link] | None, *, road: bool
+    frames: list[FrameRow], truth: Truth, links: Mapping[str, Link] | None, *, road: bool
 ) -> dict[str, Any]:
     found = match(frames, truth, road=road, links=links)
     bars = []

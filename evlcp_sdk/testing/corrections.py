@@ -9,7 +9,7 @@ from evlcp_sdk.air.frames import symbols_of_bits
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Corrected
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.exercises import compiled_subject, expect_column, link_of
+from evlcp_sdk.testing.exercises import compile_subject, expect_column, link_of
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, expect, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 
@@ -28,7 +28,7 @@ _MOST_RATE = 0.9
 
 def _codes(subject: Subject) -> list[Any]:
     """The code of each length that is not refused; that of the link's packet among them."""
-    found = [compiled_subject(subject)]
+    found = [compile_subject(subject)]
     for n in _LENGTHS:
         try:
             found.append(subject.algorithm.compile(n))
@@ -139,7 +139,7 @@ def _errors_found(subject: Subject) -> None:
 
 @law("corrects", "one bit in 100 wrong, or one in 50 not received, is put right and counted")
 def _corrects(subject: Subject) -> None:
-    code = compiled_subject(subject)
+    code = compile_subject(subject)
     if code.message_bits > _MOST_RATE * code.coded_bits:
         raise InapplicableLawError(
             f"{code.message_bits} message bits of {code.coded_bits}: no room to correct anything"
@@ -167,7 +167,7 @@ def _corrects(subject: Subject) -> None:
 def _clean_link(subject: Subject) -> None:
     link = link_of(subject)
     expect_column(link)
-    code = compiled_subject(subject)
+    code = compile_subject(subject)
     sent = [_message(code, seed) for seed in range(3)]
     book = link.codebook
     symbols = np.stack(

@@ -13,7 +13,7 @@ from evlcp_sdk.link.blocks import packet_bits
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
-from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled
+from evlcp_sdk.testing.law import InapplicableLawError, Subject, compile_or_skip
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_frame, ideal_sums, ideal_view
 from evlcp_sdk.values import Events
@@ -22,10 +22,10 @@ __all__ = [
     "ONE_CLUSTER",
     "Exercise",
     "arguments_of",
-    "compiled_subject",
+    "compile_subject",
     "exercise_of",
     "expect_column",
-    "feed",
+    "feed_events",
     "filters_of",
     "link_of",
     "link_of_one_cluster",
@@ -74,7 +74,7 @@ def link_of(subject: Subject, **air: Any) -> Link:
         except ConfigError:
             link = link_of_one_cluster()
     if subject.role == "pilots":
-        compiled(lambda: subject.algorithm.codes(link.bar.clusters))
+        compile_or_skip(lambda: subject.algorithm.codes(link.bar.clusters))
     link = link.with_algorithm(subject.role, subject.algorithm, id=subject.id)
     if not link.codebook.pairs:
         link = _of_chips(link, subject.role)
@@ -118,7 +118,7 @@ def arguments_of(subject: Subject) -> tuple[Any, ...]:
     return _ARGUMENTS[subject.role](link_of(subject))
 
 
-def compiled_subject(subject: Subject) -> Any:
+def compile_subject(subject: Subject) -> Any:
     """What the subject compiles to on its link; a role that compiles to nothing, itself.
 
     Raises:
@@ -127,7 +127,7 @@ def compiled_subject(subject: Subject) -> Any:
     if subject.role not in _ARGUMENTS:
         return subject.algorithm
     arguments = arguments_of(subject)
-    return compiled(lambda: subject.algorithm.compile(*arguments))
+    return compile_or_skip(lambda: subject.algorithm.compile(*arguments))
 
 
 def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:
@@ -147,7 +147,7 @@ def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
     Raises:
         InapplicableLawError: It leaves everything as measured.
     """
-    tracker = compiled_subject(subject)
+    tracker = compile_subject(subject)
     pairs = [("position", tracker.position, 2), ("distance", tracker.distance, 1)]
     found = [entry for entry in pairs if entry[1] is not None]
     if not found:
@@ -155,7 +155,7 @@ def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
     return found
 
 
-def feed(machine: Any, events: Events, until_us: Sequence[int]) -> list[Any]:
+def feed_events(machine: Any, events: Events, until_us: Sequence[int]) -> list[Any]:
     """What a framing's machine gives of a recording that is cut at times, and at its end."""
     state, found, begin = machine.init(), [], 0
     for until in until_us:
@@ -166,7 +166,7 @@ def feed(machine: Any, events: Events, until_us: Sequence[int]) -> list[Any]:
     return [*found, *machine.close(state)[1]]
 
 
-def track(follow: Any, values: Any, peek: Callable[[Any, float], Any] | None = None) -> list[Any]:
+def run_filter(follow: Any, values: Any, peek: Callable[[Any, float], Any] | None = None) -> list[Any]:
     """What a filter gives of measurements: (filtered, sigma); `peek` may change its state before each."""
     state, out = follow.init(), []
     for i, value in enumerate(values):
@@ -193,7 +193,7 @@ class Exercise:
 def exercise_of(subject: Subject) -> Exercise:
     """The task of the subject's role, on its link."""
     inputs, run = _EXERCISES[subject.role]
-    return Exercise(inputs(subject), lambda: partial(run, compiled_subject(subject)))
+    return Exercise(inputs(subject), lambda: partial(run, compile_subject(subject)))
 
 
 def _events(packets: int) -> Callable[[Subject], tuple[Any, ...]]:
@@ -205,7 +205,7 @@ def _detect(detector: Any, events: Events) -> Any:
 
 
 def _frame(deframer: Any, events: Events) -> Any:
-    return () if deframer is None else feed(deframer, events, [int(events.t_us[-1]) + 1])
+    return () if deframer is None else feed_events(deframer, events, [int(events.t_us[-1]) + 1])
 
 
 def _synchronize(synchronizer: Any, t_us: Any, p: Any) -> Any:
@@ -235,11 +235,11 @@ def _measurements(subject: Subject) -> tuple[Any, ...]:
 
 def _filter(tracker: Any, *values: Any) -> Any:
     filters = [follow for follow in (tracker.position, tracker.distance) if follow is not None]
-    return [track(follow, v) for follow, v in zip(filters, values, strict=True)]
+    return [run_filter(follow, v) for follow, v in zip(filters, values, strict=True)]
 
 
 def _bits_and_llr(subject: Subject) -> tuple[Any, ...]:
-    code = compiled_subject(subject)
+    code = compile_subject(subject)
     bits = np.random.default_rng(0).integers(0, 2, code.message_bits).astype(np.uint8)
     llr = (4 * (1 - 2 * code.encode(bits).astype(np.float32))).astype(np.float32)
     llr[::50] = 0

@@ -15,7 +15,7 @@ from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.specs import spec_model
 from evlcp_sdk.testing.exercises import arguments_of, exercise_of
 from evlcp_sdk.testing.law import LawError, Subject, expect, expect_same, law
-from evlcp_sdk.testing.trees import mapped
+from evlcp_sdk.testing.trees import map_arrays
 
 __all__ = ["DESCRIPTION", "FUNCTION", "RESULT"]
 
@@ -88,15 +88,15 @@ def _compiles(subject: Subject) -> None:
 @law("inputs-kept", "arrays that it is given stay as they were")
 def _inputs_kept(subject: Subject) -> None:
     task = exercise_of(subject)
-    given = mapped(task.inputs, np.copy)
+    given = map_arrays(task.inputs, np.copy)
     task.prepare()(*given)
     expect_same(given, task.inputs, "inputs to stay as they were", name="input")
 
 
 def _expect_same_from(subject: Subject, change: Callable[[NDArray[Any]], NDArray[Any]], kind: str) -> None:
     task = exercise_of(subject)
-    wanted = task.prepare()(*mapped(task.inputs, np.copy))
-    got = task.prepare()(*mapped(task.inputs, change))
+    wanted = task.prepare()(*map_arrays(task.inputs, np.copy))
+    got = task.prepare()(*map_arrays(task.inputs, change))
     expect_same(got, wanted, f"the same result from {kind}", _SAME)
 
 
@@ -125,7 +125,7 @@ def _deterministic(subject: Subject) -> None:
     try:
         np.random.seed(1)  # noqa: NPY002
         run = task.prepare()
-        first = mapped(run(*task.inputs), np.copy)
+        first = map_arrays(run(*task.inputs), np.copy)
         np.random.seed(2)  # noqa: NPY002
         start = np.random.get_state()[1].tobytes()  # type: ignore[index]  # noqa: NPY002
         expect_same(run(*task.inputs), first, "the same result when called again")
@@ -146,8 +146,8 @@ def _results_owned(subject: Subject) -> None:
     task = exercise_of(subject)
     run = task.prepare()
     first = run(*task.inputs)
-    wanted = mapped(first, np.copy)
-    mapped(first, clear)
+    wanted = map_arrays(first, np.copy)
+    map_arrays(first, clear)
     expect_same(run(*task.inputs), wanted, "a result that is changed by the caller not to change the next")
 
 

@@ -11,9 +11,9 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Decode
-from evlcp_sdk.testing.exercises import compiled_subject, expect_column, link_of, symbols_of
-from evlcp_sdk.testing.law import InapplicableLawError, Subject, compiled, expect, law
-from evlcp_sdk.testing.trees import mapped
+from evlcp_sdk.testing.exercises import compile_subject, expect_column, link_of, symbols_of
+from evlcp_sdk.testing.law import InapplicableLawError, Subject, compile_or_skip, expect, law
+from evlcp_sdk.testing.trees import map_arrays
 from evlcp_sdk.testing.views import GRID_PX, ideal_frame, ideal_presence, ideal_sums, ideal_view
 from evlcp_sdk.values import PresenceMap, Range, SoftSymbols
 
@@ -48,7 +48,7 @@ def _pilot_sums(link: Link, missing: float = 0.0, seed: int = 0) -> NDArray[np.i
 
 @law("shapes", "a PresenceMap of the documented shapes and types, probabilities in range")
 def _separation_shapes(subject: Subject) -> None:
-    link, separate = link_of(subject), compiled_subject(subject)
+    link, separate = link_of(subject), compile_subject(subject)
     sums, k = _pilot_sums(link, missing=0.2), link.codebook.clusters
     for given in (sums, sums[:, :-3, :-1]):
         found = separate(given)
@@ -67,7 +67,7 @@ def _separation_shapes(subject: Subject) -> None:
 
 @law("finds-clusters", "each cluster of an ideal image is found in its place")
 def _finds_clusters(subject: Subject) -> None:
-    link, separate = link_of(subject), compiled_subject(subject)
+    link, separate = link_of(subject), compile_subject(subject)
     shown = ideal_presence(link.codebook.clusters).pixels > 0
     for seed in range(_SEEDS):
         found = separate(_pilot_sums(link, 0.2 * (seed > 0), seed))
@@ -82,7 +82,7 @@ def _finds_clusters(subject: Subject) -> None:
 
 @law("sees-nothing", "without events there is no cluster")
 def _separates_nothing(subject: Subject) -> None:
-    link, separate = link_of(subject), compiled_subject(subject)
+    link, separate = link_of(subject), compile_subject(subject)
     found = separate(np.zeros((link.packet.pilot_chips, 40, 20), np.int16))
     expect(not found.selected.any(), f"no cell selected without events, got {found.selected.sum()}")
     expect(not found.pixels.any(), "pixels of 0 without events")
@@ -93,8 +93,8 @@ def _separation_permutes(subject: Subject) -> None:
     link = link_of(subject)
     order, book = _permuted(link.codebook)
     sums = _pilot_sums(link, missing=0.2)
-    plain = compiled_subject(subject)(sums)
-    turned = compiled(lambda: subject.algorithm.compile(book))(sums)
+    plain = compile_subject(subject)(sums)
+    turned = compile_or_skip(lambda: subject.algorithm.compile(book))(sums)
     for name in ("probability", "selected", "pixels"):
         same = np.allclose(getattr(turned, name), getattr(plain, name)[order], atol=1e-5)
         expect(same, f"{name} in another order, equal otherwise, when the pilots are in another order")
@@ -178,9 +178,9 @@ def _decoding_permutes(subject: Subject) -> None:
     order, other = _permuted(book)
     after = np.arange(book.clusters) % 3 - 1
     presence, sums, *around = ideal_frame(book, symbols_of(book), after=after, missing=0.4)
-    plain = compiled_subject(subject)(presence, sums, *around)
-    decode = compiled(lambda: subject.algorithm.compile(other))
-    turned = decode(mapped(presence, lambda a: a[order]), sums, *(sent[order] for sent in around))
+    plain = compile_subject(subject)(presence, sums, *around)
+    decode = compile_or_skip(lambda: subject.algorithm.compile(other))
+    turned = decode(map_arrays(presence, lambda a: a[order]), sums, *(sent[order] for sent in around))
     expect((turned.symbols == plain.symbols[order]).all(), "symbols in the order of the clusters")
     same = np.allclose(turned.llr, plain.llr[order], rtol=1e-3, atol=1e-3)
     expect(same, "llr in the order of the clusters")
@@ -190,8 +190,8 @@ def _decoding_permutes(subject: Subject) -> None:
 def _decodes_nothing(subject: Subject) -> None:
     book = link_of(subject).codebook
     presence, sums, *around = ideal_frame(book, symbols_of(book))
-    decode = compiled_subject(subject)
-    for seen, what in ((mapped(presence, np.zeros_like), "nothing at all"), (presence, "no events")):
+    decode = compile_subject(subject)
+    for seen, what in ((map_arrays(presence, np.zeros_like), "nothing at all"), (presence, "no events")):
         soft = decode(seen, np.zeros_like(sums), *around)
         sure = float(np.abs(soft.llr).max())
         expect(sure < 1e-3, f"llr of 0 from {what}, got {sure:.3g}")
@@ -214,7 +214,7 @@ def _measure(
     expect_column(link)
     symbols = symbols_of(link.codebook, seed)
     view = ideal_view(link.codebook, symbols, cluster_px=cluster_px, offset_px=right_down)
-    found: Range = compiled_subject(subject)(view)
+    found: Range = compile_subject(subject)(view)
     expect(isinstance(found, Range), f"a Range, got {type(found).__name__}")
     return found
 
@@ -287,7 +287,7 @@ def _scales_with_focal_length(subject: Subject) -> None:
     near = _measure(subject).distance_m
     link = link_of(subject)
     camera = replace(link.camera, focal_mm=2 * link.camera.focal_mm)
-    measure = compiled(lambda: subject.algorithm.compile(camera, link.bar, link.codebook))
+    measure = compile_or_skip(lambda: subject.algorithm.compile(camera, link.bar, link.codebook))
     far = measure(ideal_view(link.codebook, symbols_of(link.codebook))).distance_m
     what = f"twice the distance with twice the focal length, got {near:.3f} m and {far:.3f} m"
     expect(abs(far / near - 2) <= _EXACT, what)
@@ -297,10 +297,10 @@ def _scales_with_focal_length(subject: Subject) -> None:
 def _no_distance_of_nothing(subject: Subject) -> None:
     link = link_of(subject)
     expect_column(link)
-    measure = compiled_subject(subject)
+    measure = compile_subject(subject)
     view = ideal_view(link.codebook, symbols_of(link.codebook))
     for clusters, what in ((0, "no cluster"), (1, "one cluster")):
-        presence = mapped(view.presence, np.copy)
+        presence = map_arrays(view.presence, np.copy)
         for array in (presence.probability, presence.selected, presence.pixels):
             array[clusters:] = 0
         got = measure(replace(view, presence=presence))

@@ -17,7 +17,7 @@ __all__ = [
     "Status",
     "Subject",
     "Verdict",
-    "compiled",
+    "compile_or_skip",
     "expect",
     "expect_same",
     "judge",
@@ -115,7 +115,7 @@ def expect_same(got: Any, wanted: Any, what: str, tolerance: float = 0.0, name: 
     expect(differs is None, f"{what}; {differs}")
 
 
-def compiled(make: Callable[[], Any]) -> Any:
+def compile_or_skip(make: Callable[[], Any]) -> Any:
     """What `make` compiles.
 
     Raises:

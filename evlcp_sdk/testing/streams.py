@@ -10,13 +10,13 @@ import numpy as np
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.testing.exercises import (
     FRAME_US,
-    compiled_subject,
-    feed,
+    compile_subject,
+    feed_events,
     filters_of,
     link_of,
     link_of_one_cluster,
     recording_of,
-    track,
+    run_filter,
 )
 from evlcp_sdk.testing.law import Subject, expect, expect_same, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
@@ -60,7 +60,7 @@ class _Synchronizer:
 
 def _machine(subject: Subject) -> tuple[Link, Any]:
     """The link, and what turns its events into frames or locks; None where the receiver does."""
-    link, made = link_of(subject), compiled_subject(subject)
+    link, made = link_of(subject), compile_subject(subject)
     return link, _Synchronizer(made) if subject.role == "synchronization" else made
 
 
@@ -78,7 +78,7 @@ def _any_split(subject: Subject) -> None:
     if machine is None:
         return
     given, events = _GIVEN[subject.role], _recording(subject, link)
-    wanted = feed(machine, events, _steps(events))
+    wanted = feed_events(machine, events, _steps(events))
     last = int(events.t_us[-1]) + 1
     rng = np.random.default_rng(0)
     cuts = {
@@ -87,7 +87,7 @@ def _any_split(subject: Subject) -> None:
         "every 437 us": range(437, last, 437),
     }
     for how, until_us in cuts.items():
-        got = feed(machine, events, [*until_us, last + _FLUSH_US])
+        got = feed_events(machine, events, [*until_us, last + _FLUSH_US])
         expect_same(got, wanted, f"the same {given} from events fed {how} as every 1500 us", _SAME, given)
 
 
@@ -119,7 +119,7 @@ def _reads_clean(subject: Subject) -> None:
     if deframer is None:
         return
     bar, events = recording_of(link, _PACKETS, missing=0.0)
-    found = feed(deframer, events, _steps(events))
+    found = feed_events(deframer, events, _steps(events))
     sent = bar.symbols.reshape(-1, link.codebook.clusters)
     # The first packet begins with the recording: its first frame may be cut.
     expect(len(found) >= len(sent) - 1, f"{len(sent)} frames, or all but the first; got {len(found)}")
@@ -163,7 +163,7 @@ FRAMING = (
 """Laws of framing."""
 
 
-def _detected(detector: Any, events: Events, keep: Any = None) -> list[list[Region]]:
+def _detect(detector: Any, events: Events, keep: Any = None) -> list[list[Region]]:
     """The regions of each step of a recording."""
     state = detector.init()
     found = []
@@ -176,22 +176,22 @@ def _detected(detector: Any, events: Events, keep: Any = None) -> list[list[Regi
     return found
 
 
-def _seen(subject: Subject) -> tuple[Any, Events]:
+def _detector_and_events(subject: Subject) -> tuple[Any, Events]:
     """A detector, and a recording in which it finds something, if any: of a bar, or else of one light."""
-    detector = compiled_subject(subject)
+    detector = compile_subject(subject)
     events = recording_of(link_of(subject), 2, missing=0.0)[1]
-    if detector is not None and subject.link is None and not any(_detected(detector, events)):
+    if detector is not None and subject.link is None and not any(_detect(detector, events)):
         # One that looks for single lights sees none in a bar.
-        return _seen(replace(subject, link=link_of_one_cluster()))
+        return _detector_and_events(replace(subject, link=link_of_one_cluster()))
     return detector, events
 
 
 @law("shapes", "regions of finite places and sizes, each of another id; one where a bar is, or a light")
 def _regions_shapes(subject: Subject) -> None:
-    detector, events = _seen(subject)
+    detector, events = _detector_and_events(subject)
     if detector is None:
         return
-    found = _detected(detector, events)
+    found = _detect(detector, events)
     for regions in found:
         ids = [region.id for region in regions]
         expect(len(set(ids)) == len(ids), f"regions of different ids, got {ids}")
@@ -203,7 +203,7 @@ def _regions_shapes(subject: Subject) -> None:
 
 @law("state-kept", "a step leaves the state it is given, which can be pickled")
 def _detection_state_kept(subject: Subject) -> None:
-    detector, events = _seen(subject)
+    detector, events = _detector_and_events(subject)
     if detector is None:
         return
 
@@ -212,7 +212,7 @@ def _detection_state_kept(subject: Subject) -> None:
         detector.step(state, start_us, events[:50])
         return pickle.loads(pickle.dumps(state))
 
-    got, wanted = _detected(detector, events, branch), _detected(detector, events)
+    got, wanted = _detect(detector, events, branch), _detect(detector, events)
     expect_same(got, wanted, "branches and pickling not to change what follows", name="regions")
 
 
@@ -224,7 +224,7 @@ DETECTION = (_regions_shapes, _detection_state_kept)
 def _locks_shapes(subject: Subject) -> None:
     link, synchronizer = _machine(subject)
     events = _recording(subject, link)
-    for lock in feed(synchronizer, events, _steps(events)):
+    for lock in feed_events(synchronizer, events, _steps(events)):
         expect(isinstance(lock, SyncLock), f"SyncLock, got {type(lock).__name__}")
         for name in ("packet_t_us", "chip_us", "delay_on_us", "delay_off_us", "quality"):
             value = getattr(lock, name)
@@ -238,7 +238,7 @@ def _finds_time(subject: Subject) -> None:
     for ppm, start_us in ((0.0, 5000.0), (60.0, 3333.0), (-60.0, 7777.0)):
         bar = IdealBar(random_symbols(link, _PACKETS), ppm=ppm, start_us=start_us)
         events = ideal_events(link, bar)
-        locks = feed(synchronizer, events, _steps(events))
+        locks = feed_events(synchronizer, events, _steps(events))
         # The first packet's beginning is the recording's: it may be found or not.
         expect(
             _PACKETS - 1 <= len(locks) <= _PACKETS,
@@ -265,7 +265,7 @@ def _no_lock_in_noise(subject: Subject) -> None:
         n = int(rate_hz * 0.1)
         t_us = np.sort(rng.integers(0, 100_000, n))
         noise = Events.of(t_us, np.zeros(n), np.zeros(n), rng.integers(0, 2, n))
-        locks = feed(synchronizer, noise, [*range(_STEP_US, 100_000, _STEP_US), 100_000 + _FLUSH_US])
+        locks = feed_events(synchronizer, noise, [*range(_STEP_US, 100_000, _STEP_US), 100_000 + _FLUSH_US])
         expect(not locks, f"no lock in noise of {rate_hz:g} events/s, got {len(locks)}")
 
 
@@ -284,7 +284,7 @@ def _line(frames: int) -> Any:
     return (50.0 - 8.0 * np.arange(frames) * FRAME_US * 1e-6)[:, None]
 
 
-def _measured(n: int, frames: int = 200) -> Any:
+def _noisy_line(n: int, frames: int = 200) -> Any:
     """The line with noise of 0.1, float64 (frames, n)."""
     return _line(frames) + np.random.default_rng(0).normal(0, 0.1, (frames, n))
 
@@ -294,7 +294,7 @@ def _filter_shapes(subject: Subject) -> None:
     for name, follow, n in filters_of(subject):
         state = follow.init()
         expect(follow.predict(state, 0.0) is None, f"{name}: a prediction of None before any measurement")
-        for i, value in enumerate(_measured(n, 5)):
+        for i, value in enumerate(_noisy_line(n, 5)):
             given = value.copy()
             state, filtered, sigma = follow.step(state, i * FRAME_US, given, 0.1)
             expect((given == value).all(), f"{name}: the measurement to stay as it was")
@@ -324,24 +324,24 @@ def _looking_changes_nothing(subject: Subject) -> None:
         return peek
 
     for name, follow, n in filters_of(subject):
-        values = _measured(n, 40)
-        got, wanted = track(follow, values, peeking(follow, n)), track(follow, values)
+        values = _noisy_line(n, 40)
+        got, wanted = run_filter(follow, values, peeking(follow, n)), run_filter(follow, values)
         expect_same(got, wanted, "predictions, branches and pickling not to change what follows", name=name)
 
 
 @law("straight-line", "less error than measured on a straight line, none at rest")
 def _follows_a_line(subject: Subject) -> None:
     for name, follow, n in filters_of(subject):
-        values = _measured(n)
+        values = _noisy_line(n)
         late = slice(len(values) // 2, None)
-        filtered = np.array([f for f, _ in track(follow, values)])
+        filtered = np.array([f for f, _ in run_filter(follow, values)])
         off = [(v - _line(len(values)))[late] for v in (values, filtered)]
         raw, left = (float(np.sqrt((v**2).mean())) for v in off)
         expect(
             left <= raw * 1.001,
             f"{name}: no more error than measured on a straight line, {raw:.3f}, got {left:.3f}",
         )
-        end = track(follow, np.full((100, n), 42.0))[-1][0]
+        end = run_filter(follow, np.full((100, n), 42.0))[-1][0]
         expect(np.allclose(end, 42.0, atol=1e-6), f"{name}: 42 from measurements of 42, got {end}")
 
 

@@ -7,17 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["difference", "mapped"]
+__all__ = ["difference", "map_arrays"]
 
 
-def mapped(value: Any, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Any:
+def map_arrays(value: Any, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Any:
     """The same structure with every array changed."""
     if isinstance(value, np.ndarray):
         return change(value)
     if isinstance(value, tuple | list):
-        return type(value)(mapped(v, change) for v in value)
+        return type(value)(map_arrays(v, change) for v in value)
     if is_dataclass(value) and not isinstance(value, type):
-        return type(value)(**{f.name: mapped(getattr(value, f.name), change) for f in fields(value)})
+        return type(value)(**{f.name: map_arrays(getattr(value, f.name), change) for f in fields(value)})
     return value
 
 

@@ -10,7 +10,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.study.bound import bar_bound, frame_bound
 from evlcp_sdk.testing import ideal_view
-from evlcp_sdk.testing.trees import mapped
+from evlcp_sdk.testing.trees import map_arrays
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 LINK = load_link()
@@ -206,7 +206,7 @@ def test_panels_have_that_of_the_plane_and_one_cluster_none() -> None:
     with pytest.raises(ConfigError, match="layout_bound takes any"):
         bar_bound(panel, 50.0, range(16), blur_px=0.4, noise=0.1)
     nothing = ideal_view(panel.codebook, np.zeros(16, np.int64))
-    none = mapped(nothing.presence, np.zeros_like)
+    none = map_arrays(nothing.presence, np.zeros_like)
     assert np.isnan(frame_bound(panel)(replace(nothing, presence=none)).distance_m)
     with pytest.raises(ConfigError, match="needs two clusters"):
         frame_bound(load_link(overrides=["bar.rows=6"]))

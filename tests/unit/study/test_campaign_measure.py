@@ -23,7 +23,7 @@ from evlcp_sdk.sim import (
 )
 from evlcp_sdk.sim.scene import WorldSpec
 from evlcp_sdk.sim.world import attitude_log, sites_said
-from evlcp_sdk.study.frames import frames_of, given
+from evlcp_sdk.study.frames import frames_of, row_of_frame
 from evlcp_sdk.study.measure import position_tallies, statistics_of
 from evlcp_sdk.study.tally import Statistics, Tally
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
@@ -76,7 +76,7 @@ def test_each_frame_is_held_beside_the_sent_one() -> None:
         frame(9050, [5, 6], 39.9, x_px=700.0),
         frame(9050, [5, 7], 39.9),
     ]
-    found = statistics_of(map(given, frames), TRUTH, events=123, packets=4)
+    found = statistics_of(map(row_of_frame, frames), TRUTH, events=123, packets=4)
     assert (found.tasks, found.events, found.duration_us, found.unmatched) == (1, 123, 20_000, 2)
     assert (found.rows, found.packets, found.stated) == (5, 4, 4)
     assert found.sigma_m == pytest.approx(0.1)
@@ -90,7 +90,7 @@ def test_each_frame_is_held_beside_the_sent_one() -> None:
 
 
 def test_a_scene_without_bars_has_only_ghosts() -> None:
-    found = statistics_of([given(frame(20, [1, 2], float("nan")))], replace(TRUTH, bars=()))
+    found = statistics_of([row_of_frame(frame(20, [1, 2], float("nan")))], replace(TRUTH, bars=()))
     assert found == Statistics(tasks=1, duration_us=20_000, rows=1, unmatched=1)
 
 
