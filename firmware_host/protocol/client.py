@@ -190,7 +190,7 @@ class Client:
             status = SEALED
         wire = Datagram(request.TYPE, status, sequence, chosen, payload).encode()
         reply = REPLIES[request.TYPE]
-        longest = MAX_PAYLOAD if reply.LAYOUT[-1:] == (("*", 1),) else max(4, reply.fixed_bytes())
+        longest = MAX_PAYLOAD if reply.LAYOUT.endswith("*") else max(4, reply.fixed_bytes())
         self._tokens += 1
         self._queue.append(_Waiting(token, request.TYPE, wire, longest + HEADER_BYTES + CRC_BYTES + 4))
         return token

@@ -59,11 +59,11 @@ class Field:
         return _SIZES.get(self.base, 1) * self.count
 
     @property
-    def layout(self) -> tuple[str, int]:
-        """Entry of `WireMessage.LAYOUT`."""
+    def layout(self) -> str:
+        """Its code in `WireMessage.LAYOUT`."""
         if self.base == "bytes":
-            return (f"{self.count}s", 1) if self.count else ("*", 1)
-        return (_CODES[self.base] * self.count, self.count)
+            return f"{self.count}s" if self.count else "*"
+        return f"{self.count if self.count > 1 else ''}{_CODES[self.base]}"
 
     @property
     def python_type(self) -> str:
@@ -175,13 +175,9 @@ def python_module(definition: dict[str, Any]) -> str:
             else:
                 out += [f'    """{verb}"""', ""]
             out.append(f"    TYPE: ClassVar[int] = 0x{message['type']:02X}")
-            if len(fields) < 2:
-                one = "".join(f'("{code}", {count}),' for code, count in (f.layout for f in fields))
-                out.append(f"    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ({one})")
-            else:
-                out.append("    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (")
-                out += [f'        ("{code}", {count}),' for code, count in (f.layout for f in fields)]
-                out.append("    )")
+            head, codes = "    LAYOUT: ClassVar[str] = ", f'"{" ".join(f.layout for f in fields)}"'
+            short = len(head + codes) <= 110
+            out += [head + codes] if short else [f"{head}(", f"        {codes}", "    )"]
             if message.get("since", 0):
                 out.append(f"    SINCE: ClassVar[int] = {message['since']}")
             later = [f'"{f.name}": {f.since}' for f in fields if f.since]

@@ -305,11 +305,7 @@ class HelloRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x01
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("B", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "B B I"
 
     major: int
     minor: int
@@ -350,34 +346,7 @@ class HelloReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x01
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("B", 1),
-        ("H", 1),
-        ("B", 1),
-        ("B", 1),
-        ("B", 1),
-        ("B", 1),
-        ("H", 1),
-        ("B", 1),
-        ("I", 1),
-        ("B", 1),
-        ("H", 1),
-        ("I", 1),
-        ("I", 1),
-        ("H", 1),
-        ("H", 1),
-        ("H", 1),
-        ("I", 1),
-        ("12s", 1),
-        ("I", 1),
-        ("12s", 1),
-        ("I", 1),
-        ("8s", 1),
-        ("4s", 1),
-        ("H", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "B B H B B B B H B I B H I I H H H I 12s I 12s I 8s 4s H I"
     FIELD_SINCE: ClassVar[dict[str, int]] = {
         "clock_hz": 1,
         "challenge": 1,
@@ -428,14 +397,7 @@ class ConfigureRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x02
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("I", 1),
-        ("B", 1),
-        ("H", 1),
-        ("B", 1),
-        ("H", 1),
-        ("H", 1),
-    )
+    LAYOUT: ClassVar[str] = "I B H B H H"
 
     chip_rate_hz: int
     profile: int
@@ -455,10 +417,7 @@ class ConfigureReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x02
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("I", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "I I"
 
     ticks_per_chip: int
     packet_chips: int
@@ -476,12 +435,7 @@ class CodebookRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x03
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-        ("HHHHHHHHHHHHHHHH", 16),
-        ("32s", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I 16H 32s"
 
     preamble_chips: int
     preamble: int
@@ -494,7 +448,7 @@ class CodebookReply(WireMessage):
     """What the board answers to CODEBOOK."""
 
     TYPE: ClassVar[int] = 0x03
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -508,11 +462,7 @@ class WriteRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x04
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-        ("*", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I *"
 
     bank: int
     offset: int
@@ -530,11 +480,7 @@ class WriteReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x04
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-        ("H", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I H"
 
     bank: int
     offset: int
@@ -552,11 +498,7 @@ class ReadRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x05
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-        ("H", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I H"
 
     bank: int
     offset: int
@@ -574,11 +516,7 @@ class ReadReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x05
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-        ("*", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I *"
 
     bank: int
     offset: int
@@ -596,11 +534,7 @@ class CrcRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x06
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I I"
 
     bank: int
     offset: int
@@ -616,7 +550,7 @@ class CrcReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x06
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("I", 1),)
+    LAYOUT: ClassVar[str] = "I"
 
     crc: int
 
@@ -635,14 +569,7 @@ class CommitRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x07
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("B", 1),
-        ("H", 1),
-        ("I", 1),
-        ("I", 1),
-        ("32s", 1),
-    )
+    LAYOUT: ClassVar[str] = "B B H I I 32s"
 
     bank: int
     format: int
@@ -661,7 +588,7 @@ class CommitReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x07
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("I", 1),)
+    LAYOUT: ClassVar[str] = "I"
 
     commits: int
 
@@ -677,11 +604,7 @@ class StartRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x08
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("I", 1),
-        ("H", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "I H I"
     FIELD_SINCE: ClassVar[dict[str, int]] = {"at_pulse": 1, "pulse_hz": 1, "at_clock": 1}
 
     at_pulse: int = 0
@@ -694,7 +617,7 @@ class StartReply(WireMessage):
     """What the board answers to START."""
 
     TYPE: ClassVar[int] = 0x08
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -702,7 +625,7 @@ class StopRequest(WireMessage):
     """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
 
     TYPE: ClassVar[int] = 0x09
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -710,7 +633,7 @@ class StopReply(WireMessage):
     """What the board answers to STOP."""
 
     TYPE: ClassVar[int] = 0x09
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -718,7 +641,7 @@ class BlankRequest(WireMessage):
     """Dark at once, within the packet."""
 
     TYPE: ClassVar[int] = 0x0A
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -726,7 +649,7 @@ class BlankReply(WireMessage):
     """What the board answers to BLANK."""
 
     TYPE: ClassVar[int] = 0x0A
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -738,7 +661,7 @@ class LevelRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x0B
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("H", 1),)
+    LAYOUT: ClassVar[str] = "H"
 
     level_ma: int
 
@@ -748,7 +671,7 @@ class LevelReply(WireMessage):
     """What the board answers to LEVEL."""
 
     TYPE: ClassVar[int] = 0x0B
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -756,7 +679,7 @@ class StatusRequest(WireMessage):
     """What the board does, and what went wrong since reset."""
 
     TYPE: ClassVar[int] = 0x0C
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -806,46 +729,8 @@ class StatusReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x0C
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("H", 1),
-        ("B", 1),
-        ("B", 1),
-        ("B", 1),
-        ("B", 1),
-        ("H", 1),
-        ("B", 1),
-        ("H", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("H", 1),
-        ("H", 1),
-        ("H", 1),
-        ("H", 1),
-        ("h", 1),
-        ("12s", 1),
-        ("B", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("32s", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("I", 1),
-        ("B", 1),
-        ("B", 1),
+    LAYOUT: ClassVar[str] = (
+        "B H B B B B H B H I I I I I I I I I I I I H H H H h 12s B I I I 32s I I I I I B B"
     )
     FIELD_SINCE: ClassVar[dict[str, int]] = {
         "clock": 1,
@@ -907,10 +792,7 @@ class WatchdogRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x0D
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I"
 
     action: int
     timeout_ms: int
@@ -921,7 +803,7 @@ class WatchdogReply(WireMessage):
     """What the board answers to WATCHDOG."""
 
     TYPE: ClassVar[int] = 0x0D
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -933,7 +815,7 @@ class SaveRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x0E
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("B", 1),)
+    LAYOUT: ClassVar[str] = "B"
 
     autostart: int
 
@@ -948,10 +830,7 @@ class SaveReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x0E
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I"
 
     slot: int
     save_sequence: int
@@ -962,7 +841,7 @@ class RecallRequest(WireMessage):
     """Commit what the newest valid flash slot holds; only while the LEDs are dark."""
 
     TYPE: ClassVar[int] = 0x0F
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -975,10 +854,7 @@ class RecallReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x0F
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I"
 
     slot: int
     save_sequence: int
@@ -995,11 +871,7 @@ class LedTestRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x10
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("B", 1),
-        ("H", 1),
-    )
+    LAYOUT: ClassVar[str] = "B B H"
 
     first: int
     last: int
@@ -1011,7 +883,7 @@ class LedTestReply(WireMessage):
     """What the board answers to LED_TEST."""
 
     TYPE: ClassVar[int] = 0x10
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -1025,11 +897,7 @@ class StreamRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x18
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("B", 1),
-        ("32s", 1),
-    )
+    LAYOUT: ClassVar[str] = "B B 32s"
 
     bank: int
     format: int
@@ -1045,7 +913,7 @@ class StreamReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x18
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("H", 1),)
+    LAYOUT: ClassVar[str] = "H"
 
     slots: int
 
@@ -1063,13 +931,7 @@ class PushRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x19
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-        ("H", 1),
-        ("B", 1),
-        ("*", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I H B *"
 
     bank: int
     number: int
@@ -1090,12 +952,7 @@ class PushReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x19
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("I", 1),
-        ("H", 1),
-        ("I", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "I H I I"
 
     number: int
     offset: int
@@ -1112,7 +969,7 @@ class KeyRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x1A
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("16s", 1),)
+    LAYOUT: ClassVar[str] = "16s"
     SINCE: ClassVar[int] = 1
 
     key: bytes
@@ -1123,7 +980,7 @@ class KeyReply(WireMessage):
     """What the board answers to KEY."""
 
     TYPE: ClassVar[int] = 0x1A
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
     SINCE: ClassVar[int] = 1
 
 
@@ -1139,12 +996,7 @@ class ChipsRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x1B
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("I", 1),
-        ("B", 1),
-        ("B", 1),
-        ("32s", 1),
-    )
+    LAYOUT: ClassVar[str] = "I B B 32s"
     SINCE: ClassVar[int] = 2
 
     packet_chips: int
@@ -1158,7 +1010,7 @@ class ChipsReply(WireMessage):
     """What the board answers to CHIPS."""
 
     TYPE: ClassVar[int] = 0x1B
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
     SINCE: ClassVar[int] = 2
 
 
@@ -1167,7 +1019,7 @@ class UpdateStatusRequest(WireMessage):
     """Which image of the firmware runs, and where another one would go."""
 
     TYPE: ClassVar[int] = 0x20
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -1184,14 +1036,7 @@ class UpdateStatusReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x20
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("B", 1),
-        ("B", 1),
-        ("I", 1),
-        ("I", 1),
-        ("16s", 1),
-    )
+    LAYOUT: ClassVar[str] = "B B B I I 16s"
 
     running: int
     trial: int
@@ -1212,11 +1057,7 @@ class UpdateBeginRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x21
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("B", 1),
-        ("I", 1),
-        ("I", 1),
-    )
+    LAYOUT: ClassVar[str] = "B I I"
 
     image: int
     length: int
@@ -1228,7 +1069,7 @@ class UpdateBeginReply(WireMessage):
     """What the board answers to UPDATE_BEGIN."""
 
     TYPE: ClassVar[int] = 0x21
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -1241,10 +1082,7 @@ class UpdateWriteRequest(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x22
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("I", 1),
-        ("*", 1),
-    )
+    LAYOUT: ClassVar[str] = "I *"
 
     offset: int
     data: bytes
@@ -1260,10 +1098,7 @@ class UpdateWriteReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x22
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (
-        ("I", 1),
-        ("H", 1),
-    )
+    LAYOUT: ClassVar[str] = "I H"
 
     offset: int
     count: int
@@ -1274,7 +1109,7 @@ class UpdateCommitRequest(WireMessage):
     """Check the CRC of what was written; it runs on trial from the next reset on."""
 
     TYPE: ClassVar[int] = 0x23
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -1286,7 +1121,7 @@ class UpdateCommitReply(WireMessage):
     """
 
     TYPE: ClassVar[int] = 0x23
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = (("I", 1),)
+    LAYOUT: ClassVar[str] = "I"
 
     sequence: int
 
@@ -1296,7 +1131,7 @@ class UpdateRestartRequest(WireMessage):
     """Reset, a little after the answer; only while the LEDs are dark."""
 
     TYPE: ClassVar[int] = 0x24
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -1304,7 +1139,7 @@ class UpdateRestartReply(WireMessage):
     """What the board answers to UPDATE_RESTART."""
 
     TYPE: ClassVar[int] = 0x24
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -1312,7 +1147,7 @@ class UpdateConfirmRequest(WireMessage):
     """Keep the image that runs: the trial is over; only while the LEDs are dark."""
 
     TYPE: ClassVar[int] = 0x25
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -1320,7 +1155,7 @@ class UpdateConfirmReply(WireMessage):
     """What the board answers to UPDATE_CONFIRM."""
 
     TYPE: ClassVar[int] = 0x25
-    LAYOUT: ClassVar[tuple[tuple[str, int], ...]] = ()
+    LAYOUT: ClassVar[str] = ""
 
 
 REPLIES: dict[int, type[WireMessage]] = {

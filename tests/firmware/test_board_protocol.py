@@ -95,14 +95,14 @@ def test_c_header_has_the_same_sizes() -> None:
 def payloads(draw: st.DrawFn) -> WireMessage:
     cls = draw(st.sampled_from(PAYLOADS))
     values = []
-    for code, count in cls.LAYOUT:
+    for code in cls.LAYOUT.split():
         if code == "*":
             values.append(draw(st.binary(max_size=64)))
         elif code.endswith("s"):
             values.append(draw(st.binary(min_size=int(code[:-1]), max_size=int(code[:-1]))))
         else:
-            bits = {"B": 8, "H": 16, "I": 32, "h": 16}[code[0]]
-            low = -(1 << bits - 1) if code[0] == "h" else 0
+            bits, count = {"B": 8, "H": 16, "I": 32, "h": 16}[code[-1]], int(code[:-1] or 1)
+            low = -(1 << bits - 1) if code[-1] == "h" else 0
             number = st.integers(low, low + (1 << bits) - 1)
             values.append(draw(number) if count == 1 else tuple(draw(number) for _ in range(count)))
     return cls(*values)
@@ -120,7 +120,7 @@ def test_message_of_another_length_is_refused(message: WireMessage, cut: int) ->
     if len(data) >= cut and data[:-cut] and len(data) - cut < cls.fixed_bytes():
         with pytest.raises(DatagramError):
             cls.unpack(data[:-cut])
-    if not (cls.LAYOUT and cls.LAYOUT[-1][0] == "*"):
+    if not cls.LAYOUT.endswith("*"):
         # of a later minor version
         assert cls.unpack(data + b"x" * cut) == message
 
