@@ -12,7 +12,6 @@ from evlcp_sdk.values import Fix
 
 __all__ = [
     "characters",
-    "covariances",
     "integrity",
     "number_or_none",
     "sigmas",
@@ -55,11 +54,6 @@ def sigmas(covariance: NDArray[np.float64]) -> list[float]:
     """Standard deviations of a covariance, the roots of its diagonal."""
     found: list[float] = np.sqrt(np.diag(covariance)).tolist()
     return found
-
-
-def covariances(covariance: NDArray[np.float64]) -> list[float]:
-    """What a covariance of east, north and up has beside its diagonal: east-north, east-up, north-up."""
-    return [float(covariance[i, j]) for i, j in ((0, 1), (0, 2), (1, 2))]
 
 
 def integrity(fix: Fix) -> dict[str, Any]:

@@ -7,6 +7,7 @@ figures of a recording of any length take constant memory; `Figures` draws them 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from textwrap import fill
 from typing import Any, Generic, TypeVar
 
@@ -21,7 +22,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_colours, transmitter_colour
-from evlcp_sdk.report.plots import ellipse
+from evlcp_sdk.report.plots import ellipse, enlarge_ellipses
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.camera import CameraModel
@@ -32,7 +33,6 @@ __all__ = [
     "FigureProbe",
     "Figures",
     "Thinned",
-    "TrackProbe",
     "draw_distance",
     "draw_presence",
     "draw_regions",
@@ -46,6 +46,7 @@ _INK = "#333333"
 _DPI = 150
 _MOST_ZOOMS = 3
 _MOST_ELLIPSES = 40
+_MOST_PLACES = 4096
 
 T = TypeVar("T")
 
@@ -159,7 +160,7 @@ class Figures(Sink):
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self.probe = FigureProbe(run.link.camera)
-        self.track = TrackProbe()
+        self.track = Thinned[Settled](_MOST_PLACES)
 
     def events(self, events: Events) -> None:
         """Add events to the accumulated image."""
@@ -191,29 +192,14 @@ class Figures(Sink):
         figure.savefig(self.folder.path(name), format="png", dpi=_DPI)
 
 
-class TrackProbe:
-    """Keeps a bounded share of a trajectory for its figure.
-
-    Args:
-        points: How many points to keep.
-    """
-
-    def __init__(self, points: int = 4096) -> None:
-        self.points: Thinned[Settled] = Thinned(points)
-
-    def add(self, settled: Settled) -> None:
-        """Take the next fix with its places."""
-        self.points.add(settled)
-
-
 _LEVELS = {"hpl_m": "horizontal level", "vpl_m": "vertical level"}
 
 
-def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]], title: str) -> Figure:
+def draw_track(track: Iterable[Settled], bars_enu_m: Mapping[int, NDArray[np.float64]], title: str) -> Figure:
     """A map of fixes with their 95 % ellipses, the track and the bars; height, sigma, protection over time.
 
     Args:
-        probe: Has the whole trajectory.
+        track: The trajectory.
         bars_enu_m: Centre of each bar in the local axes, m, float64 (3,), by transmitter.
         title: What the figure is of.
     """
@@ -224,7 +210,7 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
     )
     plan, close, height = (parts[name] for name in ("plan", "close", "height"))
     spread, protected = parts["spread"], parts["protected"]
-    points = list(probe.points)
+    points = list(track)
     middle = np.mean([enu[:2] for enu in bars_enu_m.values()], axis=0) if bars_enu_m else np.zeros(2)
     for number, enu in sorted(bars_enu_m.items()):
         plan.plot(enu[0], enu[1], "s", ms=7, color=transmitter_colour(number))
@@ -245,7 +231,7 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
         smooth = np.array([point.smoothed.enu_m for point in points])
         t_s = np.array([point.fix.t_us for point in points]) * 1e-6
         chosen = [point.fix for point in points[:: max(1, len(points) // _MOST_ELLIPSES)]]
-        times = _magnified([fix.covariance_m2 for fix in chosen], fixed)
+        times = enlarge_ellipses([fix.covariance_m2 for fix in chosen], fixed)
         said = "95 % ellipse" + (f",\n{times} times as large" if times > 1 else "")
         for fix in chosen:
             line = ellipse(fix.enu_m[:2], fix.covariance_m2[:2, :2] * times**2, 0.95)
@@ -290,19 +276,7 @@ def draw_track(probe: TrackProbe, bars_enu_m: Mapping[int, NDArray[np.float64]],
     return figure
 
 
-def _magnified(covariances_m2: Sequence[NDArray[np.float64]], places: NDArray[np.float64]) -> int:
-    """How many times as large ellipses are to be drawn to be seen beside a track of places."""
-    extent_m = float(np.ptp(places[:, :2], axis=0).max())
-    longest_m2 = [np.linalg.eigvalsh(covariance[:2, :2]).max() for covariance in covariances_m2]
-    # 95 % lie within 2.45 sigmas; a diameter is twice that.
-    long_m = 4.9 * math.sqrt(float(np.median(longest_m2)))
-    seen = [times for times in (1, 2, 5, 10, 20, 50) if times * long_m <= _ELLIPSE_SHARE * extent_m]
-    return max(seen, default=1)
-
-
 _ELLIPSE = "#cfe5f3"
-_ELLIPSE_SHARE = 0.15
-"""Length of an ellipse beside the extent of its track, at most, where it is drawn larger than it is."""
 
 
 def draw_regions(probe: FigureProbe, title: str) -> Figure:
@@ -331,11 +305,8 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
         colour = transmitter_colour(n)
         path = list(places)
         left, upper, right, lower = _bounds(path)
-        whole.add_patch(
-            Rectangle(
-                (left - 6, upper - 6), right - left + 12, lower - upper + 12, fill=False, ec=colour, lw=1.4
-            )
-        )
+        outline = partial(Rectangle, fill=False, ec=colour, lw=1.4)
+        whole.add_patch(outline((left - 6, upper - 6), right - left + 12, lower - upper + 12))
         whole.annotate(
             str(number),
             (right + 6, upper - 6),
@@ -343,26 +314,16 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
             textcoords="offset points",
             color=colour,
             va="top",
-            path_effects=[_halo()],
+            # What sets it apart from what it is written on.
+            path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
         if number in zooms:
             axis = axes[1 + zooms.index(number)]
             pad = 0.15 * max(lower - upper, 20)
             middle, half = (left + right) / 2, max(right - left, 0.36 * (lower - upper + 2 * pad)) / 2 + 4
             axis.set(xlim=(middle - half, middle + half), ylim=(lower + pad, upper - pad))
-            first = path[0]
-            for place, style in ((first, ":"), (path[-1], "-")):
-                axis.add_patch(
-                    Rectangle(
-                        _corner(place),
-                        place.width_px,
-                        place.height_px,
-                        fill=False,
-                        ec=colour,
-                        ls=style,
-                        lw=1.4,
-                    )
-                )
+            for place, style in ((path[0], ":"), (path[-1], "-")):
+                axis.add_patch(outline(_corner(place), place.width_px, place.height_px, ls=style))
             titled(axis, f"region {number}")
     return figure
 
@@ -371,13 +332,8 @@ def draw_presence(probe: FigureProbe, title: str) -> Figure:
     """Which pixels show which cluster, in one frame of each transmitter, and the profile of each cluster."""
     shown = [probe.clearest[n] for n in sorted(probe.clearest)[:_MOST_ZOOMS]]
     figure = Figure(figsize=(6.4 * len(shown), 7.4), layout="constrained")
-    figure.supxlabel(
-        fill(_PRESENCE.format(size=shown[0].presence.grid_px), 92 * len(shown)),
-        x=0.02,
-        ha="left",
-        fontsize=9,
-        color=_INK,
-    )
+    text = fill(_PRESENCE.format(size=shown[0].presence.grid_px), 92 * len(shown))
+    figure.supxlabel(text, x=0.02, ha="left", fontsize=9, color=_INK)
     parts = figure.subfigures(1, len(shown), squeeze=False)[0]
     for part, best in zip(parts, shown, strict=True):
         number = best.frame.transmitter
@@ -464,9 +420,8 @@ def draw_distance(probe: FigureProbe, title: str) -> Figure:
         for where, values in ((axis, d), (off, line)):
             where.plot(t, values, "o", ms=2.5, color=colour, label="a frame")
         axis.fill_between(t, d - s, d + s, color=colour, alpha=0.25, lw=0)
-        off.fill_between(
-            t, -s, s, color=colour, alpha=0.25, lw=0, label="one sigma, as the ranging states it"
-        )
+        sigma_name = "one sigma, as the ranging states it"
+        off.fill_between(t, -s, s, color=colour, alpha=0.25, lw=0, label=sigma_name)
         axis.set_ylabel("distance, m")
         off.set_ylabel("off its\nneighbours, m")
         titled(axis, f"{_who(number, probe.echo_of[number])}, {known.sum()} distances")
@@ -526,24 +481,14 @@ def _corner(region: Region) -> tuple[float, float]:
 
 
 def _bounds(path: Iterable[Region]) -> tuple[float, float, float, float]:
-    left, upper, right, lower = [], [], [], []
-    for region in path:
-        x, y = _corner(region)
-        left.append(x)
-        upper.append(y)
-        right.append(x + region.width_px)
-        lower.append(y + region.height_px)
-    return min(left), min(upper), max(right), max(lower)
+    boxes = np.array([(*_corner(one), one.width_px, one.height_px) for one in path])
+    (left, upper), (right, lower) = boxes[:, :2].min(0), (boxes[:, :2] + boxes[:, 2:]).max(0)
+    return float(left), float(upper), float(right), float(lower)
 
 
 def _who(transmitter: int, echo_of: int | None) -> str:
     """A transmitter, and of which it is a reflection."""
     return f"transmitter {transmitter}" + ("" if echo_of is None else f" (reflection of {echo_of})")
-
-
-def _halo() -> withStroke:
-    """What sets a text apart from what it is written on."""
-    return withStroke(linewidth=2.5, foreground="white")
 
 
 def titled(axis: Axes, text: str) -> None:

@@ -17,10 +17,10 @@ from evlcp_sdk.diagnosis.facts import Diagnostic
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
-from evlcp_sdk.report.figures import Thinned, TrackProbe
+from evlcp_sdk.report.figures import Thinned
 from evlcp_sdk.report.motion import MotionProbe
 from evlcp_sdk.report.pages import render_page
-from evlcp_sdk.report.plots import Plot, ellipse
+from evlcp_sdk.report.plots import Plot, ellipse, enlarge_ellipses
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.spelling import counted
@@ -64,7 +64,7 @@ class Report(Sink):
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self._motion = MotionProbe(3 * max(len(run.links), 1))
-        self._track = TrackProbe(1024)
+        self._track = Thinned[Settled](1024)
         self._seen: dict[int, _Seen] = {}
         self._first_us: int | None = None
         self._messages: list[tuple[str, ...]] = []
@@ -148,7 +148,7 @@ class Report(Sink):
             received=sum(seen.count for seen in self._seen.values()),
             shown=sum(len(seen.frames) for seen in self._seen.values()),
             places=places,
-            placed=len(self._track.points) > 0,
+            placed=len(self._track) > 0,
             messages=messages,
             left_out=self._many_messages - len(messages),
             symbols=self._symbols(),
@@ -241,7 +241,7 @@ class Report(Sink):
         navigator = self.run.navigator
         if navigator is None:
             return None
-        points = list(self._track.points)
+        points = list(self._track)
         plan = Plot("map", "east, m", "north, m", aspect=4 / 3)
         close = Plot("track", "east, m", "north, m", aspect=4 / 3)
         height = Plot("height", self._axis, "up, m")
@@ -258,9 +258,10 @@ class Report(Sink):
                     points, t_ms.tolist(), fixed.tolist(), sigma.tolist(), strict=True
                 )
             ]
-            larger = _enlarged(points)
+            chosen = points[:: max(1, -(-len(points) // _MOST_ELLIPSES))]
+            larger = enlarge_ellipses([point.fix.covariance_m2 for point in chosen], fixed)
             name = "95 % ellipse" + (f", {larger} times as large" if larger > 1 else "")
-            for point in points[:: max(1, -(-len(points) // _MOST_ELLIPSES))]:
+            for point in chosen:
                 covariance = point.fix.covariance_m2[:2, :2] * larger**2
                 close.ring(ellipse(point.fix.enu_m[:2], covariance, 0.95), "#999999", name)
             for plot in (plan, close):
@@ -300,15 +301,6 @@ class Report(Sink):
             title += f", the first {len(seen.first)}" * (seen.count > len(seen.first))
             tables.append((title, book.clusters, max(len(book.codewords), 1), rows))
         return tables
-
-
-def _enlarged(points: Sequence[Settled]) -> int:
-    """How many times as large ellipses are to be drawn to be seen beside a track: 1, 10, 100 or 1000."""
-    places = np.array([point.fix.enu_m[:2] for point in points])
-    extent_m = float(np.ptp(places, axis=0).max())
-    sizes = [math.sqrt(max(np.linalg.eigvalsh(point.fix.covariance_m2[:2, :2]))) for point in points]
-    size_m = float(np.median(sizes))
-    return next((factor for factor in (1, 10, 100) if factor * size_m > 0.01 * extent_m), 1000)
 
 
 def _who(number: int, echo_of: int | None, link: str) -> str:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.report.pages import TEMPLATES
 
-__all__ = ["Plot", "ellipse"]
+__all__ = ["Plot", "ellipse", "enlarge_ellipses"]
 
 _SIDE = 2000
 """Steps of a chart's box in either direction."""
@@ -187,3 +187,17 @@ def ellipse(
     turn = np.linspace(0, 2 * np.pi, 48, endpoint=False)
     found: NDArray[np.float64] = centre + (np.column_stack([np.cos(turn), np.sin(turn)]) * long) @ ways.T
     return found
+
+
+def enlarge_ellipses(covariances_m2: Sequence[NDArray[np.float64]], places: NDArray[np.float64]) -> int:
+    """How many times as large 95 % ellipses are to be drawn to be seen beside a track of places."""
+    extent_m = float(np.ptp(places[:, :2], axis=0).max())
+    longest_m2 = [np.linalg.eigvalsh(covariance[:2, :2]).max() for covariance in covariances_m2]
+    # 95 % lie within 2.45 sigmas; a diameter is twice that.
+    long_m = 4.9 * math.sqrt(float(np.median(longest_m2)))
+    seen = [times for times in (1, 2, 5, 10, 20, 50) if times * long_m <= _ELLIPSE_SHARE * extent_m]
+    return max(seen, default=1)
+
+
+_ELLIPSE_SHARE = 0.15
+"""Length of an ellipse beside the extent of its track, at most, where it is drawn larger than it is."""

@@ -1,10 +1,9 @@
 """`alternatives.csv`: a row per pose that fits where a fix is refused, as more than one does."""
 
 import csv
-from math import isfinite
 
-from evlcp_sdk.formatting import covariances, sigmas, text_or_empty
 from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.results.columns import PLACE_COLUMNS, place_row
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Fix
@@ -12,9 +11,7 @@ from evlcp_sdk.values import Fix
 __all__ = ["ALTERNATIVE_COLUMNS", "AlternativesCsv"]
 
 ALTERNATIVE_COLUMNS = (
-    *("t_us", "number", "likelihood", "latitude_deg", "longitude_deg", "height_m"),
-    *("sigma_east_m", "sigma_north_m", "sigma_up_m"),
-    *("cov_east_north_m2", "cov_east_up_m2", "cov_north_up_m2"),
+    *("t_us", "number", "likelihood", *PLACE_COLUMNS),
     *("heading_deg", "pitch_deg", "roll_deg", "bars"),
 )
 """Columns of `alternatives.csv`."""
@@ -34,9 +31,7 @@ class AlternativesCsv(Sink):
             self._rows.writerow(
                 [
                     *(f"{fix.t_us:.1f}", number, f"{one.likelihood:.6g}"),
-                    *(f"{one.latitude_deg:.10f}", f"{one.longitude_deg:.10f}", f"{one.height_m:.4f}"),
-                    *(text_or_empty(value, 4) for value in sigmas(one.covariance_m2)),
-                    *(f"{v:.6g}" if isfinite(v) else "" for v in covariances(one.covariance_m2)),
+                    *place_row(one),
                     *(f"{angle:.4f}" for angle in (one.heading_deg, one.pitch_deg, one.roll_deg)),
                     " ".join(map(str, fix.transmitters)),
                 ]

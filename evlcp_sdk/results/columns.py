@@ -1,12 +1,25 @@
-"""What a frame has to say, by column: one list for CSV, Parquet and tables."""
+"""What a frame, and a place, has to say by column: one list for CSV, Parquet and tables."""
+
+from __future__ import annotations
 
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from evlcp_sdk.formatting import symbol_list
-from evlcp_sdk.values import Frame
+from evlcp_sdk.formatting import sigmas, symbol_list, text_or_empty
+from evlcp_sdk.values import Alternative, Fix, Frame
 
-__all__ = ["FILTERED_COLUMNS", "FRAME_COLUMNS", "LINK_COLUMN", "frame_columns", "frame_value"]
+if TYPE_CHECKING:
+    from evlcp_sdk.place.navigator import Place
+
+__all__ = [
+    "FILTERED_COLUMNS",
+    "FRAME_COLUMNS",
+    "LINK_COLUMN",
+    "PLACE_COLUMNS",
+    "frame_columns",
+    "frame_value",
+    "place_row",
+]
 
 FRAME_COLUMNS = (
     "transmitter",
@@ -28,6 +41,13 @@ FILTERED_COLUMNS = ("distance_filtered_m", "distance_filtered_sigma_m")
 
 LINK_COLUMN = "link"
 """The last column where there are several links: the name of the one."""
+
+
+PLACE_COLUMNS = (
+    *("latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m"),
+    *("cov_east_north_m2", "cov_east_up_m2", "cov_north_up_m2"),
+)
+"""Columns of a place on earth."""
 
 
 def frame_columns(*, filtered: bool, links: bool) -> tuple[str, ...]:
@@ -61,3 +81,12 @@ def frame_value(frame: Frame, column: str) -> Any:
             return math.nan if frame.filtered is None else frame.filtered.sigma_m
         case _:
             return getattr(frame, column)
+
+
+def place_row(place: Alternative | Fix | Place) -> list[str]:
+    """A place as text, by `PLACE_COLUMNS`; empty for what is not known."""
+    return [
+        *(text_or_empty(value, 10) for value in (place.latitude_deg, place.longitude_deg)),
+        *(text_or_empty(value, 4) for value in (place.height_m, *sigmas(place.covariance_m2))),
+        *(f"{v:.6g}" if math.isfinite(v) else "" for v in place.covariance_m2[[0, 0, 1], [1, 2, 2]].tolist()),
+    ]

@@ -1,11 +1,11 @@
 """`fixes.csv`: a row per fix, given or refused."""
 
 import csv
-from math import isfinite
 
 from evlcp_sdk.files import defused
-from evlcp_sdk.formatting import covariances, sigmas, text_or_empty
+from evlcp_sdk.formatting import text_or_empty
 from evlcp_sdk.place.navigator import Place
+from evlcp_sdk.results.columns import PLACE_COLUMNS, place_row
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Fix
@@ -14,31 +14,9 @@ __all__ = ["FIX_COLUMNS", "FixesCsv"]
 
 FIX_COLUMNS = (
     "t_us",
-    "latitude_deg",
-    "longitude_deg",
-    "height_m",
-    "sigma_east_m",
-    "sigma_north_m",
-    "sigma_up_m",
-    "cov_east_north_m2",
-    "cov_east_up_m2",
-    "cov_north_up_m2",
-    "heading_deg",
-    "heading_sigma_deg",
-    "pitch_deg",
-    "roll_deg",
-    "bars",
-    "verified",
-    "misfit",
-    "freedom",
-    "hpl_m",
-    "vpl_m",
-    "excluded",
-    "alarms",
-    "refusal",
-    "detail",
-    "source",
-    "contradicted",
+    *PLACE_COLUMNS,
+    *("heading_deg", "heading_sigma_deg", "pitch_deg", "roll_deg", "bars", "verified", "misfit", "freedom"),
+    *("hpl_m", "vpl_m", "excluded", "alarms", "refusal", "detail", "source", "contradicted"),
 )
 """Columns of `fixes.csv`."""
 
@@ -57,15 +35,9 @@ class FixesCsv(Sink):
         self._rows.writerow(
             [
                 f"{fix.t_us:.1f}",
-                text_or_empty(fix.latitude_deg, 10),
-                text_or_empty(fix.longitude_deg, 10),
-                text_or_empty(fix.height_m, 4),
-                *(text_or_empty(value, 4) for value in sigmas(fix.covariance_m2)),
-                *(f"{value:.6g}" if isfinite(value) else "" for value in covariances(fix.covariance_m2)),
-                text_or_empty(fix.heading_deg, 4),
-                text_or_empty(fix.heading_sigma_deg, 4),
-                text_or_empty(fix.pitch_deg, 4),
-                text_or_empty(fix.roll_deg, 4),
+                *place_row(fix),
+                *(text_or_empty(v, 4) for v in (fix.heading_deg, fix.heading_sigma_deg)),
+                *(text_or_empty(v, 4) for v in (fix.pitch_deg, fix.roll_deg)),
                 " ".join(map(str, fix.transmitters)),
                 str(int(fix.verified)),
                 text_or_empty(fix.misfit, 4),

@@ -3,24 +3,20 @@
 import csv
 from collections.abc import Sequence
 
-from evlcp_sdk.formatting import covariances, sigmas, text_or_empty
-from evlcp_sdk.place.navigator import Place, Settled
+from evlcp_sdk.formatting import text_or_empty
+from evlcp_sdk.place.navigator import Settled
+from evlcp_sdk.results.columns import PLACE_COLUMNS, place_row
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 
 __all__ = ["TRACK_COLUMNS", "TrackCsv"]
 
-_PLACE_COLUMNS = (
-    *("latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m"),
-    *("cov_east_north_m2", "cov_east_up_m2", "cov_north_up_m2"),
-)
-
 TRACK_COLUMNS = (
     "t_us",
-    *_PLACE_COLUMNS,
+    *PLACE_COLUMNS,
     "speed_m_s",
     "course_deg",
-    *(f"filtered_{name}" for name in _PLACE_COLUMNS),
+    *(f"filtered_{name}" for name in PLACE_COLUMNS),
     "left_out",
     "source",
     "focal_share",
@@ -43,19 +39,13 @@ class TrackCsv(Sink):
             self._rows.writerow(
                 [
                     f"{one.fix.t_us:.1f}",
-                    *_place_row(one.smoothed),
+                    *place_row(one.smoothed),
                     f"{one.smoothed.speed_m_s:.3f}",
                     f"{one.smoothed.course_deg:.2f}",
-                    *_place_row(one.filtered),
+                    *place_row(one.filtered),
                     int(one.filtered.left_out),
                     one.fix.source,
                     text_or_empty(one.smoothed.focal_share, 6),
                     text_or_empty(one.smoothed.focal_share_sigma, 6),
                 ]
             )
-
-
-def _place_row(place: Place) -> list[str]:
-    where = [f"{place.latitude_deg:.10f}", f"{place.longitude_deg:.10f}", f"{place.height_m:.4f}"]
-    spread = [f"{value:.4f}" for value in sigmas(place.covariance_m2)]
-    return where + spread + [f"{value:.6g}" for value in covariances(place.covariance_m2)]
