@@ -21,7 +21,7 @@ from evlcp_sdk.study.plan import Case, Job, Plan, make_plan
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.tally import Statistics, Tally
-from tests.unit.report.test_pages import HOSTILE, Elements
+from tests.unit.report.test_pages import Elements
 from tests.unit.study.browser import CHROMIUM, Browser
 from tests.unit.study.fake import run_fake
 
@@ -226,38 +226,6 @@ def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_pa
     assert off[1:5] == ("0 of 3", "2", "0.0%", "0")
     assert "<h2>Positions</h2>" in page(found)
     assert "| right | 2 of 2 | 0 | 100.0% |" in as_markdown(found)
-
-
-@pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
-def test_no_script_but_the_page_s_own_runs_in_a_browser(tmp_path: Path) -> None:
-    pytest.importorskip("plotly", reason="the extra report is not installed")
-    identity = {"n": 0, HOSTILE: HOSTILE, "digest": HOSTILE, "table": {HOSTILE: HOSTILE}}
-    plan = make_plan(
-        HOSTILE,
-        [Case({HOSTILE: HOSTILE}, {"n": n}, identity | {"n": n}) for n in range(2)],
-        [Case({"variant": HOSTILE}, 0, identity)],
-        range(2),
-        environment={HOSTILE: HOSTILE},
-    )
-    with Store(tmp_path / "a.sqlite", create=True) as store:
-        collect(plan, store, Inline(), run_fake)
-        text = page(summarize(store))
-    # What gets past the escaping all the same does not run, either.
-    assert text.count("<h2>All figures</h2>") == 1
-    injected = "<script>document.title='caught'</script><img src=x onerror=\"document.title='caught'\">"
-    injected += "<a id=trap href=\"javascript:document.title='caught'\">x</a>"
-    pages = {"a": text, "b": text.replace("<h2>All figures</h2>", f"{injected}<h2>All figures</h2>")}
-    with Browser(tmp_path / "profile") as browser:
-        for name, content in pages.items():
-            (tmp_path / f"{name}.html").write_text(content, encoding="utf-8")
-            browser.open(tmp_path / f"{name}.html")
-            assert browser.value("document.querySelectorAll('.scatterlayer .trace').length") > 4
-            browser.value("document.getElementById('trap')?.click()")
-            told = hovered(browser, "histogram")
-            assert "<img src=x" in told
-            browser.value("new Promise(done => setTimeout(done, 200))")
-            assert browser.value("document.title").startswith(f"{HOSTILE}: bit errors")
-            assert browser.value("document.querySelectorAll('img').length") == (name == "b")
 
 
 SEEN = """async id => {

@@ -57,7 +57,7 @@ def rows(table, names):
 
 @pytest.mark.parametrize(("name", "words"), [("EVT3", words3), ("EVT2", words2)])
 def test_kernel_equals_its_twin_for_any_words_and_splits(name, words):
-    @settings(max_examples=300)
+    @settings(max_examples=100)
     @given(st.lists(words, max_size=120), st.lists(st.integers(0, 200), max_size=4), st.integers(12, 80))
     def check(values, splits, capacity):
         codec = CODECS[name]
@@ -161,7 +161,7 @@ def test_round_trip_is_the_identity(name, width, height, tmp_path_factory):
     path = tmp_path_factory.mktemp("round") / "trip.raw"
     codec = CODECS[name]
 
-    @settings(max_examples=120)
+    @settings(max_examples=40)
     @given(recordings(width, height, codec.channels), st.integers(1, 50))
     def check(recording, max_events):
         events, triggers, cuts = recording

@@ -37,7 +37,7 @@ def rows(events):
 def test_round_trip_is_the_identity(name, tmp_path_factory):
     path = tmp_path_factory.mktemp("tables") / name
 
-    @settings(max_examples=100)
+    @settings(max_examples=30)
     @given(tables, st.integers(0, 60), st.integers(1, 50))
     def check(table, cut, max_events):
         events = Events.of(*(zip(*table, strict=True) if table else ([], [], [], [])))

@@ -19,7 +19,7 @@ from evlcp_sdk.testing.views import ideal_presence, ideal_sums
 from evlcp_sdk.values import PresenceMap
 
 PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
-SEEDS = range(6)
+SEEDS = range(2)
 CLUSTERS = 16
 
 

@@ -16,11 +16,8 @@ from evlcp_kalman.tracking import NoTracking
 from evlcp_wh.modulation import Wh8
 from evlcp_wh.pilots import WhPilots
 
-from evlcp_sdk.air.beacons import Beacon
-from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
-from evlcp_sdk.air.kinds import BUILT_IN_KINDS
 from evlcp_sdk.diagnosis.tallies import TransmitterTally
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import Link, load_link
@@ -31,7 +28,7 @@ from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.study.frames import read_frames
-from evlcp_sdk.values import Frame, Packet, Range, ReceivedMessage, SoftSymbols
+from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
 
 BOOK = Codebook("wh8", WhPilots().preamble(), WhPilots().codes(16), Wh8().codewords())
 LINK = Link(
@@ -139,37 +136,6 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
     assert table["transmitters"][1]["quality"] is None
     assert table["transmitters"][1]["clock_ppm"] is None
     assert table["transmitters"][1]["distance_median_m"] is None
-
-
-def test_a_message_is_a_line_after_its_packet(tmp_path: Path) -> None:
-    beacon = Beacon(35.1, 136.9, 52.0, 90.0, 1.0, 0.96, b"\x01\x02")
-
-    def received(kind: Kind, payload: bytes, **more: Any) -> ReceivedMessage:
-        meaning = BUILT_IN_KINDS[kind]
-        given = {"trust": "unverified", "reason": "not signed"} | more
-        value = meaning.unpack(payload)
-        return ReceivedMessage(1, 4, 12.3456, Message(kind, 7, 9, payload), meaning, value, **given)
-
-    messages = (
-        received(Kind.TEXT, "Tempo 30 für \n 2 km".encode()),
-        received(Kind.DATA, b"\x00\xff"),
-        received(Kind.BEACON, beacon.pack(), trust="verified", reason="signed then", age_s=2.5),
-        received(Kind.BEACON, beacon.pack(), trust="forged", reason="replayed"),
-    )
-    with ResultWriter(tmp_path, LINK) as writer:
-        writer.write([replace(packet(4, (frame(4, 0),)), messages=messages), packet(5, ())])
-        finish(writer)
-    lines = [json.loads(line) for line in (tmp_path / "packets.jsonl").read_text().splitlines()]
-    assert [line["kind"] for line in lines] == ["packet", "text", "data", "beacon", "beacon", "packet"]
-    shared = {"transmitter": 1, "packet": 4, "t_us": 12.35, "transmitter_id": 7, "sequence": 9}
-    unsigned = shared | {"verified": False, "trust": "unverified", "reason": "not signed", "age_s": None}
-    assert lines[1] == {"kind": "text"} | unsigned | {"text": "Tempo 30 für \n 2 km"}
-    assert lines[2] == {"kind": "data"} | unsigned | {"data": "00ff"}
-    place = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 52.0, "user": "0102"}
-    place |= {"heading_deg": 90.0, "tilt_deg": 1.0, "length_m": 0.96}
-    calibrate_llr = {"verified": True, "trust": "verified", "reason": "signed then", "age_s": 2.5}
-    assert lines[3] == {"kind": "beacon"} | calibrate_llr | shared | place
-    assert (lines[4]["verified"], lines[4]["trust"], lines[4]["reason"]) == (False, "forged", "replayed")
 
 
 def test_packets_too_short_for_messages_are_said(tmp_path: Path) -> None:

@@ -99,7 +99,7 @@ def test_an_imu_tells_the_attitude_and_one_error(tmp_path: Path) -> None:
     scene = load_scene("drive-30kmh", {"duration_s": 0.05, "world.heading_deg": 359.5, "motion.yaw_deg": 1.0})
     assert scene.world is not None
     errors = []
-    for seed in range(200):
+    for seed in range(60):
         simulation = Simulation(scene, seed)
         log = attitude_log(simulation.scene, seed, simulation.path)
         assert log is not None
@@ -108,8 +108,8 @@ def test_an_imu_tells_the_attitude_and_one_error(tmp_path: Path) -> None:
         assert found.heading_deg is not None
         heading = (found.heading_deg - 359.5 - np.degrees(true[0]) + 180) % 360 - 180
         errors.append([found.pitch_deg - np.degrees(true[1]), found.roll_deg - np.degrees(true[2]), heading])
-    # 200 draws of a normal error of 0.1 degrees: its spread is known to 5 %, four times that is allowed.
-    np.testing.assert_allclose(np.std(errors, 0), 0.1, rtol=0.2)
+    # 60 draws of a normal error of 0.1 degrees: its spread is known to 9 %, four times that is allowed.
+    np.testing.assert_allclose(np.std(errors, 0), 0.1, rtol=0.36)
     file = tmp_path / "attitude.csv"
     file.write_text(log.to_csv())
     again = AttitudeLog.read(file).at(20_300.0)
