@@ -84,7 +84,7 @@ def workplace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, demo_raw: Path) -
     (tmp_path / "REC.raw").symlink_to(demo_raw)
     (tmp_path / "link.toml").write_text("[camera]\nfocal_mm = 35.0\n")
     (tmp_path / "payload.bin").write_bytes(bytes(100))
-    (site,) = [text for text in blocks(ROOT / "docs" / "messages.md", "text") if "[[bar]]" in text]
+    (site,) = [text for text in blocks(ROOT / "docs" / "position.md", "text") if "[[bar]]" in text]
     (tmp_path / "site.toml").write_text(site)
     (tmp_path / "imu.csv").write_text("t_us,pitch_deg,roll_deg,heading_deg\n0,0,0,0\n1000000,0,0,0\n")
     (tmp_path / "gnss.csv").write_text(
