@@ -5,8 +5,8 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import read_csv
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import csv_number, read_csv
 from evlcp_sdk.results.folder import check_result_file, read_summary
 from evlcp_sdk.values import Frame, Packet
 
@@ -65,9 +65,6 @@ def frames_of(packets: Iterable[Packet]) -> list[FrameRow]:
 
 FRAMES = "frames.csv"
 
-_MOST = 1e18
-"""Size of the largest number: microseconds since 1970 are 1e15."""
-
 _NEEDED = ("transmitter", "t_us", "symbols", "distance_m", "x_px", "y_px")
 
 
@@ -89,31 +86,27 @@ def read_frames(folder: Path | str) -> list[FrameRow]:
     missing = [name for name in _NEEDED if name not in names]
     if missing:
         raise InputError(f"{path}: without the columns {', '.join(missing)}")
-    return [_row(row, f"{path}:{line}") for line, row in rows]
+    try:
+        return [_row(path, line, row) for line, row in rows]
+    except ConfigError as fault:
+        raise InputError(str(fault)) from fault
 
 
-def _row(row: Mapping[str, str | None], place: str) -> FrameRow:
+def _row(path: Path, line: int, row: Mapping[str, str | None]) -> FrameRow:
     def number(name: str, *, may_lack: bool = False) -> float:
-        text = row.get(name) or ""
-        if not text and may_lack:
-            return math.nan
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.inf
-        if not abs(value) <= _MOST:
-            raise InputError(f"{place}: {name} = {text!r:.40}: expected a number")
-        return value
+        text = row.get(name)
+        return math.nan if may_lack and not text else csv_number(path, line, name, text)
 
-    def whole(name: str, text: str) -> int:
+    def whole(name: str, text: str | None) -> int:
         try:
-            return int(text)
+            return int(text or "")
         except ValueError:
-            raise InputError(f"{place}: {name} = {text!r:.40}: expected a whole number") from None
+            place = f"{path}: line {line}: {name} = {text!r:.40}"
+            raise ConfigError(f"{place}: expected a whole number") from None
 
     echo = row.get("echo_of")
     return FrameRow(
-        transmitter=whole("transmitter", row["transmitter"] or ""),
+        transmitter=whole("transmitter", row["transmitter"]),
         t_us=number("t_us"),
         symbols=tuple(-1 if s == "-" else whole("symbols", s) for s in (row["symbols"] or "").split()),
         distance_m=number("distance_m", may_lack=True),

@@ -244,10 +244,18 @@ TRUE = '{"scene": {}, "bars": 3, "t_s": [], "distance_m": [], "bar_centre_px": [
     [
         (None, "{}", "frames.csv: cannot be read"),
         ("t_us,symbols\n", "{}", "frames.csv: without the columns transmitter, distance_m, x_px, y_px"),
-        (GOOD + "0,soon,1,,0,0\n", "{}", "frames.csv:2: t_us = 'soon': expected a number"),
-        (GOOD + "0,1,1,,0,0\n0,1,1 x,,0,0\n", "{}", "frames.csv:3: symbols = 'x': expected a whole number"),
-        (GOOD + "0,1,1,inf,0,0\n", "{}", "frames.csv:2: distance_m = 'inf': expected a number"),
-        (GOOD + "0,1,1,-1e308,0,0\n", "{}", "frames.csv:2: distance_m = '-1e308': expected a number"),
+        (GOOD + "0,soon,1,,0,0\n", "{}", "frames.csv: line 2: t_us = 'soon': expected a number"),
+        (
+            GOOD + "0,1,1,,0,0\n0,1,1 x,,0,0\n",
+            "{}",
+            "frames.csv: line 3: symbols = 'x': expected a whole",
+        ),
+        (GOOD + "0,1,1,inf,0,0\n", "{}", "frames.csv: line 2: distance_m = 'inf': expected a number"),
+        (
+            GOOD + "0,1,1,-1e308,0,0\n",
+            "{}",
+            "frames.csv: line 2: distance_m = '-1e308': expected at most",
+        ),
         (GOOD, "{}", "not a scene's truth: bar_centre_px, bars, distance_m, scene, t_s"),
         (GOOD, "[]", "not a scene's truth"),
         (GOOD, TRUE, "t.json: not a scene's truth: bars = 3: expected a list"),
