@@ -76,18 +76,20 @@ def njit(**options: Any) -> Callable[[F], F]: ...
 def njit(function: Any = None, /, **options: Any) -> Any:
     """As `numba.njit`, without the GIL, and cached; where no folder can be written, compiled in each process.
 
+    To divide by 0 gives what NumPy gives, which is quicker to compile than an error.
+
     Args:
         function: What is compiled at its first call.
         options: Others of `numba.njit`.
     """
 
     def compile_(given: Callable[..., Any]) -> Any:
-        kernel = numba.njit(nogil=True, **options)(given)
+        kernel = numba.njit(nogil=True, error_model="numpy", **options)(given)
         # Numba finds no folder: RuntimeError.
         with suppress(RuntimeError):
             kernel.enable_caching()
             if shutil.disk_usage(kernel.stats.cache_path).free < _ROOM_BYTES:
-                kernel = numba.njit(nogil=True, **options)(given)
+                kernel = numba.njit(nogil=True, error_model="numpy", **options)(given)
         kernel.compile = COMPILING.watched(kernel.compile)
         return kernel
 

@@ -47,7 +47,7 @@ NOISE_LIMIT = 4.0
 """Where the normal distribution of every draw is cut off, standard deviations."""
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _mix(z: Any) -> Any:
     """Return the finalizer of splitmix64: a bijection of 64-bit words that scatters them."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -55,20 +55,20 @@ def _mix(z: Any) -> Any:
     return z ^ (z >> np.uint64(31))
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _key_of(seed: Any, pixel: int) -> Any:
     """Key of a pixel's random numbers."""
     return _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
 
 
-@njit(error_model="numpy")
+@njit
 def hash_uniform(seed: Any, pixel: int, draw: int, purpose: int) -> float:
     """Uniform number in [0, 1) of one (seed, pixel, draw, purpose)."""
     z = _mix(_key_of(seed, pixel) + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03) + np.uint64(purpose))
     return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _table_at(table: Array, share: float) -> float:
     """Linear interpolation in a table of quantiles, `share` in [0, 1)."""
     z = share * (table.size - 1)
@@ -78,26 +78,26 @@ def _table_at(table: Array, share: float) -> float:
     return float(table[k] + (z - i) * (table[k + np.uint64(1)] - table[k]))
 
 
-@njit(error_model="numpy")
+@njit
 def hash_normal(seed: Any, pixel: int, draw: int, purpose: int, quantiles: Array) -> float:
     """Normal number, cut off at `NOISE_LIMIT`, from a table of the quantiles."""
     return float(_table_at(quantiles, hash_uniform(seed, pixel, draw, purpose)))
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _receptor(u_base: float, rest: float, ages: float) -> float:
     """Receptor after so many time constants; at rest after 60, when nothing of the difference is left."""
     return rest if ages > 60.0 else rest + (u_base - rest) * math.exp(-ages)
 
 
-@njit(error_model="numpy")
+@njit
 def _follow(y_from: float, y_to: float, z: float, whole: float, part: float, tau: float) -> float:
     """Return a low-pass filter's output after `part` of a ramp of `whole` us from y_from to y_to."""
     slope = (y_to - y_from) / whole
     return y_from + slope * (part - tau) + (z - y_from + slope * tau) * math.exp(-part / tau)
 
 
-@njit(error_model="numpy")
+@njit
 def _run_piece_followed(
     until: float,
     light: float,
@@ -228,7 +228,7 @@ _M_ON, _M_OFF, _M_AGE, _M_SHIFT, _M_FATE, _M_SPARE = range(26 * LANES, 32 * LANE
 _M_LATER, _M_CROSS, _M_LEVEL, _M_REQUEST, _ROOM = range(32 * LANES, 37 * LANES, LANES)
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _decay(age: float) -> float:
     """exp(-age) to 1e-14, 0 beyond 60; no branch, no call, so a loop of it is one of vector instructions."""
     within = min(age, 700.0)
@@ -251,7 +251,7 @@ def _decay(age: float) -> float:
     return (p if age <= 60.0 else 0.0) * power
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _logarithm(of: float) -> float:
     """Natural logarithm, any value where `of` is not positive; without a branch or a call, as `_decay`."""
     bits = np.float64(of).view(np.int64)
@@ -275,7 +275,7 @@ def _logarithm(of: float) -> float:
     return k * 0.693147180369123816490 + (k * 1.90821492927058770002e-10 + p * s)
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _fill(which: Array, n: int) -> int:
     """Repeat the first of `n` lanes until there are a multiple of `_EVEN`; return how many are then."""
     even = (n + _EVEN - 1) // _EVEN * _EVEN
@@ -284,14 +284,14 @@ def _fill(which: Array, n: int) -> int:
     return even
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _take(f: Array, row: int, which: Array, n: int, out: int) -> None:
     """Write the numbers of `n` lanes in a row side by side."""
     for a in range(n):
         f[out + a] = f[np.uint64(row + which[a])]
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _run_piece(
     lanes: int,
     t_us: float,
@@ -467,7 +467,7 @@ def _run_piece(
     return n
 
 
-@njit(error_model="numpy")
+@njit
 def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tuple[float, float]:
     """exp(-threshold) for ON and exp(threshold) for OFF of one pixel, with its spread."""
     on = sensor[9] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 3, quantiles))
@@ -475,7 +475,7 @@ def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tup
     return math.exp(-on), math.exp(off)
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _rest(light: float, followed: bool, f: Array, i: int) -> None:
     """Put a pixel at rest in a light, armed."""
     f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = light, 1.0 / light, math.log(light)
@@ -483,7 +483,7 @@ def _rest(light: float, followed: bool, f: Array, i: int) -> None:
     f[_REFERENCE + i] = f[_FOLLOWER + i] if followed else f[_U + i]
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _leave_empty(begin: int, end: int, f: Array, key: Array, draw: Array, code: Array) -> None:
     """Fill lanes without a pixel with one that never fires."""
     for i in range(begin, end):
@@ -494,7 +494,7 @@ def _leave_empty(begin: int, end: int, f: Array, key: Array, draw: Array, code: 
         key[i], draw[i], code[i] = np.uint64(0), 0, 0
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(fastmath={"contract"})
 def run_given_light(
     first: int,
     last: int,
@@ -542,7 +542,7 @@ def run_given_light(
     return n
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _step(table: Array, per_px: float, z: float) -> float:
     """Share of a pixel at `z` px beyond a blurred edge: 0 far before, 1 far behind; linear between nodes."""
     half = 0.5 * (table.size - 1)
@@ -555,7 +555,7 @@ def _step(table: Array, per_px: float, z: float) -> float:
     return float(table[i] + (at - i) * (table[i + 1] - table[i]))
 
 
-@njit(error_model="numpy")
+@njit
 def texture_at(field: Array, u: float, v: float) -> float:
     """Bilinear value of the periodic texture (size a power of two) at column u, row v."""
     size = field.shape[0]
@@ -568,7 +568,7 @@ def texture_at(field: Array, u: float, v: float) -> float:
     return float(top + a * (low - top))
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _place(lanes: int, f: Array, x: float, y: float, axis_x: float, axis_y: float) -> None:
     """Write where pixels are from a strip's first end (x, y), along it and to its right, px."""
     for i in range(lanes):
@@ -577,7 +577,7 @@ def _place(lanes: int, f: Array, x: float, y: float, axis_x: float, axis_y: floa
         f[_ACROSS + i] = dx * axis_y - dy * axis_x
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(fastmath={"contract"})
 def _near_weights(
     lanes: int,
     f: Array,
@@ -639,7 +639,7 @@ def _near_weights(
             weight[first + np.uint64(i)] = gain * share if seen else 0.0
 
 
-@njit(error_model="numpy", fastmath={"contract"})
+@njit(fastmath={"contract"})
 def run_pixels(
     first: int,
     last: int,
@@ -874,7 +874,7 @@ def run_pixels(
     return last, n
 
 
-@njit(error_model="numpy")
+@njit
 def background_events(
     begin_us: float,
     end_us: float,
@@ -913,7 +913,7 @@ def background_events(
     return n
 
 
-@njit(error_model="numpy")
+@njit
 def as_words(t: Array, code: Array, begin_us: float, words: Array) -> None:
     """Write requests as words, their times since `begin_us` to the nearest tick."""
     for i in range(t.size):
@@ -921,25 +921,25 @@ def as_words(t: Array, code: Array, begin_us: float, words: Array) -> None:
         words[i] = ticks << CODE_BITS | np.int64(code[i])
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _us_of(word: int, begin_us: float) -> float:
     """When a request is, us."""
     return begin_us + np.float64(word >> CODE_BITS) * (1.0 / TICKS)
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _row_of(word: int) -> Any:
     """Row of a request; without a sign it is not looked at for being negative."""
     return np.uint64(word >> (COLUMN_BITS + 1) & ((1 << COLUMN_BITS) - 1))
 
 
-@njit(error_model="numpy", inline="always")
+@njit(inline="always")
 def _column_of(word: int) -> Any:
     """Column of a request."""
     return np.uint64(word >> 1 & ((1 << COLUMN_BITS) - 1))
 
 
-@njit(error_model="numpy")
+@njit
 def sort_words(words: Array, out: Array) -> None:
     """Sort int64 words: by 22 bits of their range in two rounds, then insertion of what is left."""
     n = words.size
@@ -982,7 +982,7 @@ def sort_words(words: Array, out: Array) -> None:
         out[j] = word
 
 
-@njit(error_model="numpy")
+@njit
 def drop_blind(words: Array, begin_us: float, blind_us: Array, width: int, refractory_us: float) -> int:
     """Drop, in place, requests of pixels that are blind until `blind_us`; return how many stay."""
     kept = 0
@@ -999,7 +999,7 @@ def drop_blind(words: Array, begin_us: float, blind_us: Array, width: int, refra
     return kept
 
 
-@njit(error_model="numpy")
+@njit
 def read_out(
     words: Array,
     begin_us: float,

@@ -48,7 +48,7 @@ def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Arra
         counts[1, b] += on
 
 
-@njit(error_model="numpy")
+@njit
 def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: int, rho: Array) -> float:
     """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1).
 
@@ -86,7 +86,7 @@ def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: i
     return top
 
 
-@njit(error_model="numpy")
+@njit
 def mean_squares(
     rho: Array, counts: Array, span: int, lag: int, past: tuple[float, int, int], out: Array
 ) -> tuple[float, int]:

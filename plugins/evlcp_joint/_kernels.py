@@ -315,7 +315,7 @@ def list_steps(codes: Array, known: Array, motion: Array, reach: float, fit: Arr
     return steps, seen
 
 
-@njit(error_model="numpy")
+@njit
 def _levels(column: Array, fit: Array, row: int, lens: Array, profile: Array, work: Array) -> None:
     """What each step's boundary makes of a row, counted from its first, for a gain of 1, and the slope there.
 
@@ -350,7 +350,7 @@ def _levels(column: Array, fit: Array, row: int, lens: Array, profile: Array, wo
         work[_STEEP + j] = -steepest * step * work[_STEEP + j] * less
 
 
-@njit(error_model="numpy")
+@njit
 def equations(
     steps: Array, seen: Array, profile: Array, lens: Array, fit: Array, normal: Array, right: Array
 ) -> float:
@@ -419,7 +419,7 @@ def equations(
     return cost
 
 
-@njit(error_model="numpy")
+@njit
 def leftovers(
     steps: Array,
     seen: Array,
@@ -615,7 +615,7 @@ def fit_bar(
     return spent <= (1 - _LEAST_EXPLAINED) * squares, by_boundary, scores, normal
 
 
-@njit(error_model="numpy")
+@njit
 def assess_fit(by_boundary: Array, scores: Array, normal: Array) -> tuple[float, int, float]:
     """Variance of the spacing, px2, of `leftovers`; NaN where the normal equations have no root.
 

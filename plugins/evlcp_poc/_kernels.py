@@ -42,7 +42,7 @@ def find_middles(maps: Array, min_pixels: int, out: Array) -> None:
             out[k, axis] = place
 
 
-@njit(error_model="numpy")
+@njit
 def fit_peaks(samples: Array, size: int, band: int, shifts: Array) -> None:
     """Shift of the Dirichlet kernel that fits samples (n, m) around the middle one best (least squares), px.
 

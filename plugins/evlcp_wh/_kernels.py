@@ -63,7 +63,7 @@ def cell_values(sums: Array, grid: int, columns: int, out: Array) -> None:
                 out[i, r * columns + c] = values[(r * width + c) * grid]
 
 
-@njit(error_model="numpy")
+@njit
 def presence(values: Array, codes: Array, beside: Array, none: Array, min_seen: int, out: Array) -> None:
     """Posterior probability of each cluster in each cell, `out` (K, cells), of its values (n, cells).
 
@@ -230,7 +230,7 @@ def pair_up(sums: Array, most: int, out: Array) -> None:
             out[i, j] = np.uint16(np.int16(a * side) + b)
 
 
-@njit(error_model="numpy")
+@njit
 def learn_worth(
     pairs: Array, width: int, signs: Array, probability: Array, grid: int, prior: float, out: Array
 ) -> None:
@@ -282,7 +282,7 @@ def learn_worth(
         out[pair] = np.log((counts[1, pair] + more[1]) / second * first / (counts[0, pair] + more[0]))
 
 
-@njit(error_model="numpy")
+@njit
 def sum_worth(
     pairs: Array,
     width: int,
