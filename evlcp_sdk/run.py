@@ -642,26 +642,9 @@ def film(
         OutputError: It cannot be written.
     """
     # Matplotlib and Pillow take longer to import than other use cases to start.
-    from evlcp_sdk.report.film import (
-        FILM_KINDS,
-        MOST_MEGAPIXELS,
-        MOST_PICTURES,
-        FilmProbe,
-        check_kind,
-        draw_film,
-        pictures_of,
-        plan_film,
-        save_film,
-    )
+    from evlcp_sdk.report.film import check_film, draw_film, gather_footage, plan_film, save_film
 
-    if (kind := FILM_KINDS.get(out.suffix.lower())) is None:
-        raise ConfigError(f"{out}: a film is written as {' or '.join(f'NAME{end}' for end in FILM_KINDS)}")
-    check_kind(kind)
-    if (pictures := pictures_of(for_ms, slow)) > MOST_PICTURES:
-        raise ConfigError(
-            f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MOST_PICTURES}: show less,"
-            " or faster"
-        )
+    kind = check_film(out, for_ms, slow)
     if str(recording) == STDIN:
         raise ConfigError(
             "a film needs a file: it reads the recording twice, and standard input gives it once"
@@ -669,83 +652,29 @@ def film(
     registry = Registry.load() if registry is None else registry
     links = named_links(load_links(link, registry=registry))
     camera = next(iter(links.values())).camera
-    probe = FilmProbe()
-    frames: list[Frame] = []
-    sent_with: dict[int, str] = {}
-    start_us: float | None = None
-    first_us = last_us = None
-    longest_us = max(one.packet.packet_chips * one.packet.chip_us for one in links.values())
-    # Of several links, what one has read waits for the others.
-    late_us = _FILM_LATE_PACKETS * min(len(links), 2) * longest_us
-    with open_source(recording, registry) as source, registry.joined(probe):
-        check_sensor(source, recording, camera)
-        receiver = Receiver([*links.values()], registry.hook)
-        for events in source.chunks():
-            first_us = int(events.t_us[0]) if first_us is None else first_us
-            last_us = int(events.t_us[-1])
-            if from_ms is not None:
-                start_us = first_us + from_ms * 1e3
-            packets = receiver.feed(events)
-            sent_with |= {packet.transmitter: packet.link for packet in packets}
-            start_us = _film_frames(packets, frames, start_us, for_ms * 1e3)
-            advance(source.position_bytes, source.size_bytes)
-            if start_us is not None and last_us > start_us + for_ms * 1e3 + late_us:
-                break
-        packets = receiver.close()
-        sent_with |= {packet.transmitter: packet.link for packet in packets}
-        start_us = _film_frames(packets, frames, start_us, for_ms * 1e3)
-    if first_us is None or last_us is None:
-        raise InputError(f"{recording}: no events")
-    start_us = first_us if start_us is None else start_us
-    if start_us > last_us:
-        raise InputError(
-            f"{recording}: ends {(last_us - first_us) * 1e-3:.1f} ms after its first event, nothing to show"
-            f" from {from_ms:g} ms on"
-        )
-    until_us = start_us + for_ms * 1e3
-    regions = [region for region in probe.regions if start_us - 1e4 <= region.t_us <= until_us]
-    plan = plan_film(start_us, for_ms * 1e3, slow, frames, regions, camera, longest_px, whole=whole)
-    width, height = plan.size_px
-    if (megapixels := pictures * width * height * 1e-6) > MOST_MEGAPIXELS:
-        raise ConfigError(
-            f"{pictures} pictures of {width} x {height} px are {megapixels:.0f} megapixels, at most"
-            f" {MOST_MEGAPIXELS}: smaller, shorter, or faster"
-        )
     with open_source(recording, registry) as source:
-        drawn = list(draw_film(plan, source.chunks(), frames, regions, links, sent_with))
+        check_sensor(source, recording, camera)
+        footage = gather_footage(source, str(recording), links, registry, from_ms, for_ms * 1e3, advance)
+    plan = plan_film(footage, for_ms * 1e3, slow, camera, longest_px, whole=whole)
+    with open_source(recording, registry) as source:
+        drawn = list(draw_film(plan, source.chunks(), footage, links))
     with Outputs() as outputs:
         with outputs.told(out):
             save_film(drawn, outputs.path(out), kind)
         outputs.commit()
+    width, height = plan.size_px
     return {
         "film": str(out),
         "pictures": plan.pictures,
         "width": width,
         "height": height,
         "bytes": out.stat().st_size,
-        "from_ms": round((start_us - first_us) * 1e-3, 3),
+        "from_ms": round((footage.start_us - footage.first_us) * 1e-3, 3),
         "for_ms": for_ms,
         "slow": slow,
-        "transmitters": sorted({frame.transmitter for frame in frames}),
-        "frames": len(frames),
+        "transmitters": sorted({frame.transmitter for frame in footage.frames}),
+        "frames": len(footage.frames),
     }
-
-
-_FILM_LATE_PACKETS = 3
-"""Packets after which the frames of a time are given."""
-
-
-def _film_frames(
-    packets: Sequence[Packet], frames: list[Frame], start_us: float | None, for_us: float
-) -> float | None:
-    """Add the frames of the film's time; where it starts, by the first one where nothing else says so."""
-    found = [frame for packet in packets for frame in packet.frames]
-    if start_us is None and found:
-        start_us = min(frame.t_us for frame in found)
-    if start_us is not None:
-        # The one before the first picture is still shown in it.
-        frames += [frame for frame in found if start_us - for_us <= frame.t_us <= start_us + for_us]
-    return start_us
 
 
 def calibrate(

@@ -51,7 +51,7 @@ _ROW_US, _SLOW_SHARE = 0.2, 0.7
 which reading a bar's rows, one after another, mixes its edges with the next chip's."""
 
 _UNSEEN_SHARE = 0.05
-"""Share of unseen clusters of which something is said."""
+"""Share of unseen clusters of which more is stated."""
 
 _MIN_RISES, _LEAST_RATE, _SLENDER = 500, 0.25, 4.0
 """The same for light that is not read beside a bar that is; the least share of the link's rate that it has;
@@ -109,11 +109,11 @@ def checks_of(facts: Facts) -> list[Check]:
 def _events(facts: Facts) -> Found:
     if not facts.events:
         return Diagnostic("empty", "no events", "record again: `evlcp info` says what is in the file")
-    said = f"{facts.events:,} events in {facts.duration_us * 1e-6:.3f} s"
+    text = f"{facts.events:,} events in {facts.duration_us * 1e-6:.3f} s"
     if facts.losses:
-        lost = f"{said}; lost: {'; '.join(facts.losses)}"
+        lost = f"{text}; lost: {'; '.join(facts.losses)}"
         return Diagnostic("damaged", lost, "copy or record it again; what is left was read")
-    return said
+    return text
 
 
 def _readout(facts: Facts) -> Found:
@@ -123,11 +123,11 @@ def _readout(facts: Facts) -> Found:
 
 def _light(facts: Facts) -> Found:
     if facts.reads:
-        return _unread(facts) or _sources_said(facts)
+        return _unread(facts) or _describe_sources(facts)
     if not facts.sources:
         return _without_rhythm(facts)
     if facts.bar is not None and not _is_lamp(facts.bar, facts):
-        return _sources_said(facts)
+        return _describe_sources(facts)
     lamps = [one for one in facts.sources if one.kind == "lamp"]
     if lamps:
         rates = ", ".join([_hz(one.rate_hz) for one in lamps[:4]] + ["..."] * (len(lamps) > 4))
@@ -139,12 +139,12 @@ def _light(facts: Facts) -> Found:
     first = facts.sources[0]
     if first.kind != "code" and first.events < _SOME * facts.events:
         return _without_rhythm(facts)
-    said = f"{_sources_said(facts)}, but too rarely to recognise a code"
+    text = f"{_describe_sources(facts)}, but too rarely to recognise a code"
     long_px, wide_px = max(first.wide_px, first.high_px), min(first.wide_px, first.high_px)
     if wide_px > _BLURRED_SHARE * long_px:
-        said = f"{said}: {wide_px:.0f} px wide, {long_px:.0f} px long, its light is spread"
-        return Diagnostic("defocus", said, _SHARPER)
-    return Diagnostic("dim", said, _BRIGHTER)
+        text = f"{text}: {wide_px:.0f} px wide, {long_px:.0f} px long, its light is spread"
+        return Diagnostic("defocus", text, _SHARPER)
+    return Diagnostic("dim", text, _BRIGHTER)
 
 
 def _view(facts: Facts) -> str:
@@ -178,8 +178,8 @@ def _unread(facts: Facts) -> Diagnostic | None:
         left, top, right, bottom = source.box_px
         return Diagnostic(
             "unread",
-            f"{_sources_said(facts)}; no frame is read of the one in columns {left} to {right}, rows {top} to"
-            f" {bottom}, {_hz(link_hz if same else source.rate_hz)}",
+            f"{_describe_sources(facts)}; no frame is read of the one in columns {left} to {right}, rows"
+            f" {top} to {bottom}, {_hz(link_hz if same else source.rate_hz)}",
             f"another bar? {_BRIGHTER}"
             if same
             else "another bar, of another rate? try it with --set air.chip_rate_hz="
@@ -204,7 +204,7 @@ def _is_lamp(source: LightSource, facts: Facts) -> bool:
 
 
 def _without_rhythm(facts: Facts) -> Diagnostic:
-    """What is said where nothing blinks that is worth a word."""
+    """What is found where nothing blinks that is worth a word."""
     if facts.restless is not None:
         left, top, right, bottom = facts.restless
         return Diagnostic(
@@ -262,14 +262,14 @@ def _size(facts: Facts) -> Found:
     px = facts.cluster_px
     if not px > 0:
         return None
-    said = f"{px:.1f} px a cluster"
+    text = f"{px:.1f} px a cluster"
     if px >= (_SMALL_PX if facts.reads else _SMALLEST_PX):
-        return _rows(facts) or said
+        return _rows(facts) or text
     far_m = facts.link.camera.focal_px * facts.link.bar.length_m / (px * (facts.steps_along + 1))
     return Diagnostic(
         "far",
-        f"{said}, as of a bar {far_m:.0f} m away",
-        f"{said}: nearer, or a longer lens" + ("" if facts.reads else " (or fewer, larger clusters)"),
+        f"{text}, as of a bar {far_m:.0f} m away",
+        f"{text}: nearer, or a longer lens" + ("" if facts.reads else " (or fewer, larger clusters)"),
     )
 
 
@@ -293,15 +293,15 @@ def _focus(facts: Facts) -> Found:
     if bar is None or not px > 0:
         return None
     across_px = min(bar.wide_px, bar.high_px)
-    said = f"{across_px:.0f} px across, {px:.1f} px a cluster along it"
+    text = f"{across_px:.0f} px across, {px:.1f} px a cluster along it"
     if not facts.sure and across_px > max(_SMEARED_CLUSTERS * px, _SHARP_PX):
         return Diagnostic(
             "defocus",
-            f"{said}: the light of each cluster covers its neighbours, or the layout is another one",
+            f"{text}: the light of each cluster covers its neighbours, or the layout is another one",
             f"{_SHARPER}; if the picture is sharp, compare [bar] with the transmitter's: `evlcp config` at"
             " both ends",
         )
-    return said
+    return text
 
 
 def _brightness(facts: Facts) -> Found:
@@ -309,10 +309,10 @@ def _brightness(facts: Facts) -> Found:
     if bar is None:
         return None
     chips = bar.typical_us * 1e-6 * facts.link.packet.chip_rate_hz
-    said = f"a pixel of it rises every {chips:.1f} chips"
+    text = f"a pixel of it rises every {chips:.1f} chips"
     if not facts.reads and chips > _RARE_CHIPS and bar.strength < _WEAK:
-        return Diagnostic("dim", f"{said}, and late by many microseconds: it is too weak", _BRIGHTER)
-    return said
+        return Diagnostic("dim", f"{text}, and late by many microseconds: it is too weak", _BRIGHTER)
+    return text
 
 
 def _rate(facts: Facts) -> Found:
@@ -355,27 +355,27 @@ def _preamble(facts: Facts) -> Found:
 
 def _frames(facts: Facts) -> Found:
     frames, due = facts.counts["frames"], facts.counts["frames"] + facts.counts.get("frames_rejected", 0)
-    said, better = f"{frames} of {due} accepted", facts.better
+    text, better = f"{frames} of {due} accepted", facts.better
     turn = "turn the camera so that the whole bar is in the picture"
     if facts.reads:
         given, erased = (sum(getattr(one, name) for one in facts.tally.own) for name in ("given", "erased"))
         unseen = erased / max(given + erased, 1)
         if not facts.at_edge or unseen <= _UNSEEN_SHARE:
-            return said
+            return text
         where = "of their clusters unseen; the source touches the picture's edge"
-        return Diagnostic("outside", f"{said}, {unseen:.0%} {where}", turn)
+        return Diagnostic("outside", f"{text}, {unseen:.0%} {where}", turn)
     if better is not None:
         each = dict(better.changes).get("air.frames_per_packet")
         if each is None:
-            return Diagnostic("link", f"{said}; another link reads {better.frames}", better.options())
+            return Diagnostic("link", f"{text}; another link reads {better.frames}", better.options())
         of = better.frames + better.rejected
-        said += f"; with {each} frames a packet {better.frames} of {of}"
-        return Diagnostic("frames-per-packet", said, better.options())
+        text += f"; with {each} frames a packet {better.frames} of {of}"
+        return Diagnostic("frames-per-packet", text, better.options())
     if facts.at_edge:
-        return Diagnostic("outside", f"{said}; the source touches the picture's edge", turn)
+        return Diagnostic("outside", f"{text}; the source touches the picture's edge", turn)
     return Diagnostic(
         "frames",
-        f"{said}: the clusters do not stand where the link's bar has them",
+        f"{text}: the clusters do not stand where the link's bar has them",
         "compare [bar] and [pilots] with the transmitter's: `evlcp config` at both ends",
     )
 
@@ -418,11 +418,11 @@ def _messages(facts: Facts) -> Found:
     tried = facts.counts.get("blocks_tried", 0)
     if not tried:
         return Diagnostic("messages", "not looked for")
-    said = f"{facts.blocks_read} of {tried} packets carry a block that can be read"
+    text = f"{facts.blocks_read} of {tried} packets carry a block that can be read"
     if facts.blocks_read:
-        return said
+        return text
     step = "right for symbols without messages; else compare error-correction.id with the transmitter's"
-    return Diagnostic("no-messages", said, step)
+    return Diagnostic("no-messages", text, step)
 
 
 _STAGES: tuple[tuple[str, Callable[[Facts], Found]], ...] = (
@@ -444,14 +444,14 @@ _STAGES: tuple[tuple[str, Callable[[Facts], Found]], ...] = (
 """Name and check, in the order in which light passes them."""
 
 
-def _sources_said(facts: Facts) -> str:
+def _describe_sources(facts: Facts) -> str:
     by = {kind: sum(one.kind == kind for one in facts.sources) for kind in ("code", "lamp", "unclear")}
-    said = {
+    words = {
         "code": f"{counted(by['code'], 'source')} of chips",
         "lamp": counted(by["lamp"], "lamp"),
         "unclear": counted(by["unclear"], "unclear source"),
     }
-    return ", ".join(words for kind, words in said.items() if by[kind]) or "no source of its own"
+    return ", ".join(text for kind, text in words.items() if by[kind]) or "no source of its own"
 
 
 def _hz(rate_hz: float) -> str:

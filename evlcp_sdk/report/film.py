@@ -2,8 +2,8 @@
 
 import math
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -13,22 +13,24 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
+from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Events, Frame, Region
+from evlcp_sdk.values import Events, Frame, Packet, Region
 
 __all__ = [
     "FILM_KINDS",
-    "MOST_MEGAPIXELS",
-    "MOST_PICTURES",
     "Film",
     "FilmKind",
-    "FilmProbe",
-    "check_kind",
+    "Footage",
+    "check_film",
     "draw_film",
+    "gather_footage",
     "pictures_of",
     "plan_film",
     "save_film",
@@ -52,6 +54,10 @@ _MOST_SCALE = 8.0
 _TEXT_PX = 13
 _HEAD_PX = 20
 _COLOURS = 128
+_MOST_REGIONS = 20_000
+
+_LATE_PACKETS = 3
+"""Packets after which the frames of a time are given."""
 
 
 @dataclass(frozen=True)
@@ -92,6 +98,25 @@ class Film:
         return width, height + _HEAD_PX
 
 
+@dataclass(frozen=True, eq=False)
+class Footage:
+    """What is drawn over a film's events.
+
+    Attributes:
+        start_us: Camera clock where it starts, us.
+        first_us: The recording's first event, us.
+        frames: Frames of its time.
+        regions: Regions of its time.
+        sent_with: Name of the link of each transmitter.
+    """
+
+    start_us: float
+    first_us: float = 0.0
+    frames: Sequence[Frame] = ()
+    regions: Sequence[Region] = ()
+    sent_with: Mapping[int, str] = field(default_factory=dict)
+
+
 def pictures_of(for_ms: float, slow: float) -> int:
     """How many pictures a film of some time has.
 
@@ -105,15 +130,29 @@ def _picture_us(slow: float) -> float:
     return 1e6 / PICTURES_PER_S / slow
 
 
-class FilmProbe:
-    """Keeps the newest regions that a receiver follows; register it with `Registry.load(probe)`.
+def check_film(out: Path, for_ms: float, slow: float) -> FilmKind:
+    """The kind of a film, by its file's name.
 
-    Args:
-        most: How many to keep.
+    Raises:
+        ConfigError: There is no such kind, the extra for it is not installed, or it has too many pictures.
     """
+    if (kind := FILM_KINDS.get(out.suffix.lower())) is None:
+        raise ConfigError(f"{out}: a film is written as {' or '.join(f'NAME{end}' for end in FILM_KINDS)}")
+    if kind == "MP4" and find_spec("av") is None:
+        raise ConfigError("films as .mp4 need the extra: pip install 'evlcp-sdk[mp4]'")
+    if (pictures := pictures_of(for_ms, slow)) > MOST_PICTURES:
+        raise ConfigError(
+            f"{for_ms:g} ms at 1/{slow:g} would be {pictures} pictures, at most {MOST_PICTURES}: show less,"
+            " or faster"
+        )
+    return kind
 
-    def __init__(self, most: int = 20_000) -> None:
-        self.regions: deque[Region] = deque(maxlen=most)
+
+class _RegionProbe:
+    """Keeps the newest regions that a receiver follows."""
+
+    def __init__(self) -> None:
+        self.regions: deque[Region] = deque(maxlen=_MOST_REGIONS)
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
@@ -122,12 +161,75 @@ class FilmProbe:
             self.regions.append(value)
 
 
+def gather_footage(
+    source: EventSource,
+    name: str,
+    links: Mapping[str, Link],
+    registry: Registry,
+    from_ms: float | None,
+    for_us: float,
+    advance: Callable[[int, int | None], None] = lambda _done, _of: None,
+) -> Footage:
+    """Decode a recording until the end of what a film shows.
+
+    Args:
+        source: The recording.
+        name: What messages call it.
+        links: The configurations by name.
+        registry: Its hooks hear of the receiver's stages.
+        from_ms: Where the film starts, ms after the first event; None for the first frame that is decoded,
+            or the start where there is none.
+        for_us: How much of the recording it shows, us.
+        advance: Says how far the reading is.
+
+    Raises:
+        InputError: The recording has nothing there.
+    """
+    probe, frames, sent_with = _RegionProbe(), list[Frame](), dict[int, str]()
+    start_us = first_us = last_us = None
+    longest_us = max(one.packet.packet_chips * one.packet.chip_us for one in links.values())
+    # Of several links, what one has read waits for the others.
+    late_us = _LATE_PACKETS * min(len(links), 2) * longest_us
+
+    def keep(packets: Sequence[Packet], start_us: float | None) -> float | None:
+        """Keep frames of the film's time; where it starts, by the first one where nothing else says so."""
+        sent_with.update({packet.transmitter: packet.link for packet in packets})
+        found = [frame for packet in packets for frame in packet.frames]
+        if start_us is None and found:
+            start_us = min(frame.t_us for frame in found)
+        if start_us is not None:
+            # The one before the first picture is still shown in it.
+            frames.extend(f for f in found if start_us - for_us <= f.t_us <= start_us + for_us)
+        return start_us
+
+    with registry.joined(probe):
+        receiver = Receiver([*links.values()], registry.hook)
+        for events in source.chunks():
+            first_us = int(events.t_us[0]) if first_us is None else first_us
+            last_us = int(events.t_us[-1])
+            if from_ms is not None:
+                start_us = first_us + from_ms * 1e3
+            start_us = keep(receiver.feed(events), start_us)
+            advance(source.position_bytes, source.size_bytes)
+            if start_us is not None and last_us > start_us + for_us + late_us:
+                break
+        start_us = keep(receiver.close(), start_us)
+    if first_us is None or last_us is None:
+        raise InputError(f"{name}: no events")
+    start_us = first_us if start_us is None else start_us
+    if start_us > last_us:
+        raise InputError(
+            f"{name}: ends {(last_us - first_us) * 1e-3:.1f} ms after its first event, nothing to show"
+            f" from {from_ms:g} ms on"
+        )
+    regions = [one for one in probe.regions if start_us - 1e4 <= one.t_us <= start_us + for_us]
+    return Footage(start_us, first_us, frames, regions, sent_with)
+
+
 def plan_film(
-    start_us: float,
+    footage: Footage,
     for_us: float,
     slow: float,
-    frames: Sequence[Frame],
-    regions: Iterable[Region],
     camera: CameraModel,
     longest_px: int,
     *,
@@ -136,17 +238,20 @@ def plan_film(
     """What to show: the bars that are read, with a margin, or else what blinks, or else all.
 
     Args:
-        start_us: Camera clock where the film starts, us.
+        footage: What is there.
         for_us: How much of the recording it shows, us.
         slow: How many times slower than it was.
-        frames: Those of that time.
-        regions: The same.
         camera: Has the size of the image.
         longest_px: Longest side of a picture, but for the line above.
         whole: Show all of the image.
+
+    Raises:
+        ConfigError: It would have too many pixels.
     """
     left, top, right, bottom = 0, 0, camera.width, camera.height
-    boxes = [] if whole else [*map(_box_of_frame, frames)] or [*map(_box_of_region, regions)]
+    boxes = []
+    if not whole:
+        boxes = [*map(_box_of_frame, footage.frames)] or [*map(_box_of_region, footage.regions)]
     if boxes:
         low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
         middle, size = (low + high) / 2, high - low
@@ -160,28 +265,29 @@ def plan_film(
     longest = max(right - left, bottom - top)
     scale = min(longest_px / longest, _MOST_SCALE)
     pictures, picture_us = pictures_of(for_us * 1e-3, slow), _picture_us(slow)
-    return Film(start_us, picture_us, pictures, left, top, right - left, bottom - top, scale, slow)
+    shown = (left, top, right - left, bottom - top)
+    film = Film(footage.start_us, picture_us, pictures, *shown, scale, slow)
+    width, height = film.size_px
+    if (megapixels := pictures * width * height * 1e-6) > MOST_MEGAPIXELS:
+        raise ConfigError(
+            f"{pictures} pictures of {width} x {height} px are {megapixels:.0f} megapixels, at most"
+            f" {MOST_MEGAPIXELS}: smaller, shorter, or faster"
+        )
+    return film
 
 
 def draw_film(
-    film: Film,
-    events: Iterable[Events],
-    frames: Sequence[Frame],
-    regions: Sequence[Region],
-    links: Mapping[str, Link],
-    sent_with: Mapping[int, str],
+    film: Film, events: Iterable[Events], footage: Footage, links: Mapping[str, Link]
 ) -> Iterator[Image.Image]:
     """Draw the pictures one after another; reads no further than to the last one's events.
 
     Args:
         film: What is shown.
         events: Those of the recording.
-        frames: Frames of that time.
-        regions: Regions of that time.
+        footage: What is drawn over them.
         links: The receiver's, by name.
-        sent_with: Name of the link of each transmitter.
     """
-    overlay = _Overlay(film, frames, regions, links, sent_with)
+    overlay = _Overlay(film, footage, links)
     chip_us = min(link.packet.chip_us for link in links.values())
     lit = np.zeros((2, film.rows, film.columns), np.float32)
     # What blinks would be white all over, were a picture exposed for longer than a chip.
@@ -203,16 +309,6 @@ def draw_film(
     for rest in range(number, film.pictures):
         yield overlay.draw(rest, _picture(lit, film))
         lit *= stays
-
-
-def check_kind(kind: FilmKind) -> None:
-    """See whether films of a kind can be written here.
-
-    Raises:
-        ConfigError: The extra for it is not installed.
-    """
-    if kind == "MP4" and find_spec("av") is None:
-        raise ConfigError("films as .mp4 need the extra: pip install 'evlcp-sdk[mp4]'")
 
 
 def save_film(pictures: Sequence[Image.Image], path: Path, kind: FilmKind) -> None:
@@ -289,25 +385,16 @@ class _Overlay:
 
     Args:
         film: What is shown.
-        frames: Frames of that time.
-        regions: Regions of that time.
+        footage: What was found.
         links: Lengths of frames, number of clusters.
-        sent_with: Name of the link of each transmitter.
     """
 
-    def __init__(
-        self,
-        film: Film,
-        frames: Sequence[Frame],
-        regions: Sequence[Region],
-        links: Mapping[str, Link],
-        sent_with: Mapping[int, str],
-    ) -> None:
+    def __init__(self, film: Film, footage: Footage, links: Mapping[str, Link]) -> None:
         self._film = film
-        self._frames = sorted(frames, key=lambda frame: frame.t_us)
-        self._regions = sorted(regions, key=lambda region: region.t_us)
+        self._frames = sorted(footage.frames, key=lambda frame: frame.t_us)
+        self._regions = sorted(footage.regions, key=lambda region: region.t_us)
         self._packets = {name: link.packet for name, link in links.items()}
-        self._sent_with = sent_with
+        self._sent_with = footage.sent_with
         self._step_us = next(iter(links.values())).regions.step_us
         most = max(link.codebook.clusters for link in links.values())
         colours = (255 * cluster_colours(most)).astype(int)

@@ -126,13 +126,13 @@ class Report(Sink):
         places = self._map()
         plots = [*distances, quality, image] * bool(self._seen) + (places or [])
         messages = [*self._messages, *self._latest]
-        # What is said where the pointer is, is known once a chart is drawn.
+        # Its labels are known once a chart is drawn.
         held = {plot.id: plot.markup() for plot in plots}
         page = render_page(
             "recording.html",
             f"{self.run.name}: report",
             [files("evlcp_sdk.report").joinpath("report.js").read_text(encoding="utf-8")],
-            {"report": {"plots": {plot.id: plot.told for plot in plots}, "motions": motions}},
+            {"report": {"plots": {plot.id: plot.labels for plot in plots}, "motions": motions}},
             name=self.run.name,
             summary=summary,
             figures=self._headline(summary),
@@ -220,18 +220,18 @@ class Report(Sink):
             t = np.array([self._ms(frame.t_us) for frame in frames]) / self._step_ms
             depth = np.array([frame.range.distance_m for frame in frames])
             sigma = np.array([frame.range.sigma_m for frame in frames])
-            said = [f"{who}\n{_said(frame, self._ms(frame.t_us))}" for frame in frames]
+            labels = [f"{who}\n{_describe(frame, self._ms(frame.t_us))}" for frame in frames]
             known = np.isfinite(depth)
             distance = Plot(f"distance-{number}", self._axis, "distance, m")
             distances.append(distance)
             distance.band(t[known], (depth - sigma)[known], (depth + sigma)[known], colour)
-            distance.dots(t, depth, colour, f"{who}, with one sigma", said)
+            distance.dots(t, depth, colour, f"{who}, with one sigma", labels)
             filtered = [math.nan if f.filtered is None else f.filtered.distance_m for f in frames]
             if np.isfinite(filtered).any():
                 distance.line(t, filtered, colour)
-            quality.dots(t, [frame.soft.quality for frame in frames], colour, who, said)
+            quality.dots(t, [frame.soft.quality for frame in frames], colour, who, labels)
             places = np.array([(frame.x_px, frame.y_px) for frame in frames])
-            image.dots(places[:, 0], places[:, 1], colour, who, said)
+            image.dots(places[:, 0], places[:, 1], colour, who, labels)
             if len(frames) and np.isfinite(places[-1]).all():
                 image.name(float(places[-1, 0]), float(places[-1, 1]), str(number))
         return [plot for plot in distances if not plot.empty], quality, image
@@ -251,7 +251,7 @@ class Report(Sink):
             smooth = np.array([point.smoothed.enu_m for point in points])
             t_ms = np.array([self._ms(point.fix.t_us) for point in points])
             sigma = np.sqrt([np.diag(point.fix.covariance_m2) for point in points])
-            said = [
+            labels = [
                 f"{ms:.1f} ms, {p.fix.source}\neast {e:z.3f} ± {se:.2g} m\nnorth {n:z.3f} ± {sn:.2g} m"
                 f"\nup {u:z.3f} ± {su:.2g} m"
                 for p, ms, (e, n, u), (se, sn, su) in zip(
@@ -266,13 +266,13 @@ class Report(Sink):
                 close.ring(ellipse(point.fix.enu_m[:2], covariance, 0.95), "#999999", name)
             for plot in (plan, close):
                 plot.line(smooth[:, 0], smooth[:, 1], "#d55e00", "smoothed")
-                plot.dots(fixed[:, 0], fixed[:, 1], "#56b4e9", "fix", said)
+                plot.dots(fixed[:, 0], fixed[:, 1], "#56b4e9", "fix", labels)
             t = t_ms / self._step_ms
             height.band(t, fixed[:, 2] - sigma[:, 2], fixed[:, 2] + sigma[:, 2], "#56b4e9")
-            height.dots(t, fixed[:, 2], "#56b4e9", "fix, with one sigma", said)
+            height.dots(t, fixed[:, 2], "#56b4e9", "fix, with one sigma", labels)
             height.line(t, smooth[:, 2], "#d55e00", "smoothed")
             for i, name in enumerate(("east", "north", "up")):
-                spread.dots(t, sigma[:, i], transmitter_colour(i), name, said)
+                spread.dots(t, sigma[:, i], transmitter_colour(i), name, labels)
         for number, enu in sorted(navigator.bars_enu_m().items()):
             who = f"bar {number}"
             east, north, up = enu.tolist()
@@ -308,7 +308,7 @@ def _who(number: int, echo_of: int | None, link: str) -> str:
     return who + ("" if echo_of is None else f", reflection of {echo_of}")
 
 
-def _said(frame: Frame, ms: float) -> str:
+def _describe(frame: Frame, ms: float) -> str:
     """A frame where the pointer is."""
     depth = frame.range
     lines = [f"packet {frame.packet}, frame {frame.frame}, {ms:.1f} ms"]

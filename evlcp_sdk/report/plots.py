@@ -1,7 +1,7 @@
 """Charts of a page as SVG and HTML of our own: as wide as the page, dark by night, values where one points.
 
 A chart's lines are stretched to its box, its texts are not, so that it is read as well on a phone. What it
-tells where the pointer is comes from `Plot.told`, which the page's script reads.
+shows where the pointer is comes from `Plot.labels`, which the page's script reads.
 """
 
 import math
@@ -35,7 +35,7 @@ class Plot:
 
     Args:
         id: Of its element in the page.
-        x_name: What its x axis says, with the unit.
+        x_name: What its x axis is, with the unit.
         y_name: The same of y.
         aspect: Width by height of its box, in which x and y are then to one scale; None for a low wide box,
             filled by what is shown.
@@ -44,8 +44,8 @@ class Plot:
         x_limits: The same of x.
 
     Attributes:
-        told: What is said where the pointer is: x, y in thousandths of the box, and a text; once `markup` was
-            asked for.
+        labels: What is shown where the pointer is: x, y in thousandths of the box, and a text; once `markup`
+            was asked for.
     """
 
     id: str
@@ -55,19 +55,23 @@ class Plot:
     down: bool = False
     x_limits: tuple[float, float] | None = None
     y_limits: tuple[float, float] | None = None
-    told: list[tuple[int, int, str]] = field(default_factory=list)
+    labels: list[tuple[int, int, str]] = field(default_factory=list)
     _shapes: list[tuple[str, str, NDArray[np.float64]]] = field(default_factory=list)
-    _said: list[tuple[float, float, str]] = field(default_factory=list)
+    _labelled: list[tuple[float, float, str]] = field(default_factory=list)
     _names: list[tuple[float, float, str]] = field(default_factory=list)
     _legend: dict[str, str] = field(default_factory=dict)
 
-    def dots(self, x: ArrayLike, y: ArrayLike, colour: str, name: str = "", said: Sequence[str] = ()) -> None:
-        """Draw points; those that are not finite are left out, with what would be said of them."""
+    def dots(
+        self, x: ArrayLike, y: ArrayLike, colour: str, name: str = "", labels: Sequence[str] = ()
+    ) -> None:
+        """Draw points; those that are not finite are left out, with their labels."""
         points = _points(x, y)
         known = _known(points)
         self._shapes.append(("dots", colour, points[known]))
-        said = [text for text, good in zip(said, known.tolist(), strict=False) if good]
-        self._said += [(px, py, text) for (px, py), text in zip(points[known].tolist(), said, strict=False)]
+        labels = [text for text, good in zip(labels, known.tolist(), strict=False) if good]
+        self._labelled += [
+            (px, py, text) for (px, py), text in zip(points[known].tolist(), labels, strict=False)
+        ]
         if name:
             self._legend[name] = colour
 
@@ -112,10 +116,10 @@ class Plot:
             return share
 
         across, upwards = (_ticks(*one) for one in limits)
-        at = place([(x, y) for x, y, _ in self._said]).tolist()
-        self.told = [
+        at = place([(x, y) for x, y, _ in self._labelled]).tolist()
+        self.labels = [
             (round(1000 * x), round(1000 * y), text)
-            for (x, y), (_, _, text) in zip(at, self._said, strict=True)
+            for (x, y), (_, _, text) in zip(at, self._labelled, strict=True)
         ]
         shown = TEMPLATES.get_template("plot.html").render(
             plot=self,

@@ -70,7 +70,7 @@ class ResultWriter:
         lines: Callable[[str], None] | None = None,
         placed: Callable[[Placed], None] | None = None,
     ) -> None:
-        self._told = placed
+        self._on_placed = placed
         self._registry = Registry.load() if registry is None else registry
         self._links = named_links(link)
         first = next(iter(self._links.values()))
@@ -169,6 +169,37 @@ class ResultWriter:
             if self._sinks is not None:
                 self._sinks.settle(settled)
             positions = self._positions.to_dict(self._navigator)
+        facts = self._facts(recording, counts, losses, lit_us, link_counts or {}, positions)
+        table = summary_of(
+            status,
+            facts,
+            recording=recording,
+            processing=processing,
+            losses=losses,
+            versions=self._registry.versions(),
+            error=error,
+            sinks={} if self._sinks is None else self._sinks.finish(),
+            live=live,
+            pps=None if self._pulses is None else self._pulses.to_dict(),
+        )
+        table["files"] = {}
+        if self._sinks is not None and self._folder is not None:
+            self._sinks.conclude(table)
+            table["files"] = self._folder.digests()
+            write_summary(table, self._folder)
+            self._folder.finish()
+        return table
+
+    def _facts(
+        self,
+        recording: Mapping[str, Any],
+        counts: Mapping[str, int],
+        losses: Mapping[str, Mapping[str, Any]],
+        lit_us: Mapping[int, tuple[float, float]] | None,
+        link_counts: Mapping[str, Mapping[str, int]],
+        positions: Mapping[str, Any],
+    ) -> Facts:
+        """What is known in the end, for warnings."""
         first_us, last_us = recording.get("first_us"), recording.get("last_us")
         read = recording.get("counts", {})
         facts = Facts(
@@ -190,7 +221,7 @@ class ResultWriter:
                 facts,
                 link=link,
                 tally=self._tally.of_link(name),
-                counts=(link_counts or {}).get(name, counts),
+                counts=link_counts.get(name, counts),
                 reads_messages=messages_off(link) is None,
                 others=partial(other_codewords, link, self._registry),
                 positions=positions if name == self._placing else {},
@@ -198,29 +229,9 @@ class ResultWriter:
             for name, link in self._links.items()
         }
         if len(parts) == 1:
-            (facts,) = parts.values()
-        else:
-            reads = any(one.reads_messages for one in parts.values())
-            facts = replace(facts, reads_messages=reads, parts=parts)
-        table = summary_of(
-            status,
-            facts,
-            recording=recording,
-            processing=processing,
-            losses=losses,
-            versions=self._registry.versions(),
-            error=error,
-            sinks={} if self._sinks is None else self._sinks.finish(),
-            live=live,
-            pps=None if self._pulses is None else self._pulses.to_dict(),
-        )
-        table["files"] = {}
-        if self._sinks is not None and self._folder is not None:
-            self._sinks.conclude(table)
-            table["files"] = self._folder.digests()
-            write_summary(table, self._folder)
-            self._folder.finish()
-        return table
+            return next(iter(parts.values()))
+        reads = any(one.reads_messages for one in parts.values())
+        return replace(facts, reads_messages=reads, parts=parts)
 
     def _place(self, fixes: Iterable[Placed]) -> None:
         for placed in fixes:
@@ -229,8 +240,8 @@ class ResultWriter:
                 self._sinks.placed(placed)
             if self._lines is not None:
                 self._lines.fix(placed.fix)
-            if self._told is not None:
-                self._told(placed)
+            if self._on_placed is not None:
+                self._on_placed(placed)
 
     def __enter__(self) -> Self:
         return self

@@ -13,7 +13,7 @@ from PIL import Image
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import write_events
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.report.film import Film, draw_film, pictures_of, plan_film, save_film
+from evlcp_sdk.report.film import Film, Footage, draw_film, pictures_of, plan_film, save_film
 from evlcp_sdk.run import film
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, Range, Region, SoftSymbols
@@ -51,7 +51,7 @@ def test_a_picture_shows_the_last_chip_before_it(pieces: int) -> None:
     events = random_events(900)
     shown = Film(1000.0, 400.0, 8, 5, 3, 30, 20, 2.0, 100.0)
     cuts = np.array_split(np.arange(len(events)), pieces)
-    pictures = list(draw_film(shown, (events[c] for c in cuts), [], [], LINKS, {}))
+    pictures = list(draw_film(shown, (events[c] for c in cuts), Footage(0.0), LINKS))
     assert len(pictures) == 8
     for n, picture in enumerate(pictures):
         net = np.zeros((20, 30), int)
@@ -70,10 +70,10 @@ def test_a_film_reads_no_further_than_it_shows() -> None:
             yield Events.of([100 * n], [7], [7], [1])
 
     assert (
-        len(list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), endless(), [], [], LINKS, {}))) == 3
+        len(list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), endless(), Footage(0.0), LINKS))) == 3
     )
     # Pictures after the last event are dark.
-    dark = list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), [], [], [], LINKS, {}))
+    dark = list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), [], Footage(0.0), LINKS))
     assert [np.abs(kinds(p)).sum() for p in dark] == [0, 0, 0]
 
 
@@ -81,7 +81,7 @@ def test_what_is_shown_holds_the_bars_and_stays_in_the_image() -> None:
     camera = CameraModel()
 
     def plan(*frames: Frame, regions: tuple[Region, ...] = (), **more: Any) -> Film:
-        return plan_film(0.0, 20_000.0, 400.0, frames, regions, camera, 640, **more)
+        return plan_film(Footage(0.0, 0.0, frames, regions), 20_000.0, 400.0, camera, 640, **more)
 
     for x, y in ((640.0, 360.0), (3.0, 3.0), (1278.0, 717.0)):
         one = plan(frame_at(x, y))
@@ -132,7 +132,7 @@ def test_a_film_for_programs_that_play_no_pictures(tmp_path: Path) -> None:
     """Read again, each of its pictures is near the one that was drawn; an odd side gets one more."""
     av = pytest.importorskip("av")
     shown = Film(1000.0, 400.0, 8, 5, 3, 31, 21, 3.0, 100.0)
-    drawn = list(draw_film(shown, [random_events(900)], [], [], LINKS, {}))
+    drawn = list(draw_film(shown, [random_events(900)], Footage(0.0), LINKS))
     save_film(drawn, tmp_path / "a.mp4", "MP4")
     with av.open(tmp_path / "a.mp4") as file:
         (stream,) = file.streams
