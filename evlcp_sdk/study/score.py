@@ -27,6 +27,9 @@ __all__ = ["links_of_result", "score_frames"]
 _FARTHEST_M = 200
 """Segments from here on are not written."""
 
+_OF_ROADS = ("erased", "claimed", "bias_m", "worst_m", "nees")
+"""Figures of the road score alone."""
+
 
 def score_frames(
     frames: Iterable[FrameRow], truth: Truth, links: Mapping[str, Link] | None = None
@@ -58,33 +61,31 @@ def _figures(bar: Statistics, *, road: bool) -> dict[str, Any]:
     # A symbol that is not given counts as all bits wrong, or not at all.
     erased = 0 if road else tally.erased_bits
     counted = Tally(bits=tally.bits + erased, bit_errors=tally.bit_errors + erased)
-    figures: dict[str, Any] = {
+    figures = {
         "frames_sent": tally.frames_sent,
         "frames_found": tally.frames_found,
         "bit_errors": counted.bit_errors,
         "bits": counted.bits,
         "ber": _rounded(counted.ber, 6),
+        "erased": _rounded(tally.erased_share, 5),
+        "claimed": _rounded(tally.claimed_share, 5),
+        "rmse_m": _rounded(tally.rmse_m, 4),
+        "bias_m": _rounded(tally.bias_m, 4),
+        "worst_m": _rounded(tally.worst_m, 3),
+        "nees": _rounded(tally.nees, 2),
+        "ranged": tally.ranged,
+        "over_half_metre": _rounded(tally.gross_share, 4),
+        "segments": {
+            f"{start}-{start + SEGMENT_M}m": {
+                "n": tally.ranged,
+                "rmse_m": _rounded(tally.rmse_m, 4),
+                "bias_m": _rounded(tally.bias_m, 4),
+            }
+            for start, tally in bar.segments.items()
+            if tally.ranged and 0 <= start < _FARTHEST_M
+        },
     }
-    if road:
-        figures["erased"] = _rounded(tally.erased_share, 5)
-        figures["claimed"] = _rounded(tally.claimed_share, 5)
-    figures["rmse_m"] = _rounded(tally.rmse_m, 4)
-    if road:
-        figures["bias_m"] = _rounded(tally.bias_m, 4)
-        figures["worst_m"] = _rounded(tally.worst_m, 3)
-        figures["nees"] = _rounded(tally.nees, 2)
-    figures["ranged"] = tally.ranged
-    figures["over_half_metre"] = _rounded(tally.gross_share, 4)
-    figures["segments"] = {
-        f"{start}-{start + SEGMENT_M}m": {
-            "n": tally.ranged,
-            "rmse_m": _rounded(tally.rmse_m, 4),
-            "bias_m": _rounded(tally.bias_m, 4),
-        }
-        for start, tally in bar.segments.items()
-        if tally.ranged and 0 <= start < _FARTHEST_M
-    }
-    return figures
+    return {key: value for key, value in figures.items() if road or key not in _OF_ROADS}
 
 
 def _rounded(value: float, digits: int) -> float | None:
