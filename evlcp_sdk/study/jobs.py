@@ -14,6 +14,7 @@ from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessP
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from multiprocessing.connection import Connection
 from threading import Thread
@@ -97,16 +98,19 @@ class Processes:
         spawn = multiprocessing.get_context("spawn")
         leash, held = spawn.Pipe()
         # A pool is one process, so that its death is of one job.
+        make_pool = partial(ProcessPoolExecutor, 1, spawn, _begin, (held,))
         pools: dict[Future[Any], ProcessPoolExecutor] = {}
 
         def start(job: J) -> Future[Any]:
             idle = next((future for future in pools if future.done()), None)
-            pool = pools.pop(idle) if idle is not None else None
             # A terminal that closes is the parent's business, not that of what it starts.
             signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP})
             try:
-                if pool is None or idle is None or idle.exception() is not None:
-                    pool = ProcessPoolExecutor(1, spawn, _begin, (held,))
+                pool = make_pool() if idle is None else pools.pop(idle)
+                future = pool.submit(_attempt, function, job)
+            except BrokenProcessPool:
+                # It died with its job, or since.
+                pool = make_pool()
                 future = pool.submit(_attempt, function, job)
             finally:
                 signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGHUP})

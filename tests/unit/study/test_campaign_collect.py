@@ -7,8 +7,9 @@ import signal
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -99,6 +100,20 @@ def test_a_worker_that_dies_is_replaced(tmp_path: Path) -> None:
     progress, totals = collected(plan, tmp_path / "a.sqlite", Processes(2))
     assert not progress.faults
     assert totals == collected(fake_plan(seeds=1), tmp_path / "b.sqlite")[1]
+
+
+def die_soon(job: int) -> int:
+    threading.Timer(0.1, os._exit, [1]).start()
+    return job
+
+
+def test_a_worker_that_dies_idle_is_replaced() -> None:
+    def jobs() -> Iterator[int]:
+        yield 1
+        time.sleep(1)
+        yield 2
+
+    assert [outcome.value for outcome in Processes(1).run(die_soon, jobs())] == [1, 2]
 
 
 def test_a_job_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
