@@ -164,26 +164,6 @@ def test_every_variant_reads_every_recording(
             assert bar["over_half_metre"] == 0
 
 
-def test_the_band_of_the_blobs_is_better(tmp_path: Path, evlcp: Callable[..., Run]) -> None:
-    """Nowhere worse than by chance, and by a tenth better on average."""
-    ratios = []
-    for name in WITH_BARS:
-        full, blob = (
-            scored_with(
-                tmp_path / band,
-                name,
-                RECORDINGS / f"{name}.raw",
-                evlcp,
-                "ranging.id=poc",
-                f"ranging.band={band}",
-            )
-            for band in ("full", "blob")
-        )
-        ratios += [b["rmse_m"] / f["rmse_m"] for f, b in zip(full, blob, strict=True)]
-    assert max(ratios) <= 1.05
-    assert np.mean(ratios) <= 0.92
-
-
 def test_the_bar_is_where_frames_say(tmp_path: Path, evlcp: Callable[..., Run]) -> None:
     """To a fifth of a pixel, though it shakes by half a pixel a millisecond: delays would show."""
     errors_px = []

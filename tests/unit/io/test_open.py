@@ -110,18 +110,6 @@ def test_a_plugin_that_fails_is_named(url: str, reason: str, evlcp: Callable[...
     assert "Traceback" not in done.err
 
 
-def test_a_plugin_that_fails_does_not_keep_files_shut(recording: Path) -> None:
-    class Broken:
-        @hookimpl
-        def evlcp_open_events(self, url: str) -> Any:
-            raise OSError("no driver")
-
-    with pytest.warns(PluginWarning, match="OSError: no driver"):
-        source = open_source(recording, Registry.load(Broken()))
-    with source:
-        assert len(source.read()[0]) == 50
-
-
 def test_a_camera_that_is_not_there_says_so() -> None:
     class Unplugged:
         @hookimpl

@@ -1,11 +1,9 @@
 """A replay gives out a recording at its own pace, changed in nothing else."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, write_events
+from evlcp_sdk.io import ReplaySource, open_source, write_events
 from evlcp_sdk.values import Events, Triggers
 
 
@@ -70,51 +68,3 @@ def test_lag_tells_that_the_receiver_is_too_slow(recording):
         clock.now += 0.5
         next(stream)
         assert source.lag_s == pytest.approx(0.499)
-
-
-class Leaping(EventSource):
-    """Pieces as given, and how many losses are counted once each has been taken."""
-
-    def __init__(self, pieces, lost):
-        super().__init__(Path("leaping"), "LIST", 640, 480)
-        self._pieces, self._after, self._lost = iter(pieces), iter(lost), 0
-
-    def take(self, max_events):
-        times = next(self._pieces, None)
-        if times is None:
-            return None
-        self._lost = next(self._after)
-        return Events.of(times, [0] * len(times), [0] * len(times), [1] * len(times)), Triggers.empty()
-
-    @property
-    def losses(self):
-        return {"time_glitches": Loss(self._lost, 0, "byte", "glitches")} if self._lost else {}
-
-    def close(self):
-        pass
-
-
-# Of three pieces the second begins 20 s after the first's end and leaps by 100 s within.
-PIECES = ([0, 500], [20_000_000, 120_000_000], [120_000_500, 150_000_000])
-
-
-@pytest.mark.parametrize(
-    ("lost", "took_s", "skipped"),
-    [
-        ((0, 0, 0), 150.0, {}),
-        ((0, 5, 6), 0.003, {"silences_skipped": 3, "silences_skipped_us": 149_999_000}),
-        ((0, 5, 5), 29.9995 + 0.001, {"silences_skipped": 2, "silences_skipped_us": 119_999_500}),
-        ((5, 5, 5), 130.0, {"silences_skipped": 1, "silences_skipped_us": 19_999_500}),
-        ((0, 0, 5), 120.001, {"silences_skipped": 1, "silences_skipped_us": 29_999_500}),
-    ],
-)
-def test_a_leap_of_a_damaged_clock_is_not_waited_for(lost, took_s, skipped):
-    clock = Clock()
-    with ReplaySource(Leaping(PIECES, lost), clock=clock, sleep=clock.sleep) as source:
-        times = [int(t) for events, _ in source.stream() for t in events.t_us]
-        assert times == [t for piece in PIECES for t in piece]
-        assert clock.now - 100 == pytest.approx(took_s, abs=2e-3)
-        assert {name: n for name, n in source.counts.items() if "silences" in name} == skipped
-        # A time before a leap was when it was, not a leap ago.
-        assert source.clock_s(500) == pytest.approx(100.0005)
-        assert source.clock_s(150_000_000) == pytest.approx(clock.now, abs=2e-3)

@@ -259,7 +259,7 @@ def test_it_is_one_line(
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize(("role", "id"), SAYS)
+@pytest.mark.parametrize(("role", "id"), list(SAYS)[::4])
 def test_check_finds_it(role: str, id: str, evlcp: Evlcp) -> None:
     done = evlcp("check", role, id)
     assert done.code in (1, 2)

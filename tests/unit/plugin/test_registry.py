@@ -6,7 +6,6 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
-from importlib.metadata import EntryPoint
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -75,20 +74,6 @@ def test_what_is_installed_is_read_again_when_packages_come_or_go(
     shutil.rmtree(info)
     os.utime(tmp_path, ns=(0, 2))
     assert Registry.load().plugins("evlcp_algorithms") == before
-
-
-def test_what_is_installed_is_read_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[str] = []
-
-    def found(group: str) -> list[EntryPoint]:
-        asked.append(group)
-        return []
-
-    monkeypatch.setattr("evlcp_sdk.plugin.registry.entry_points", found)
-    first, second = Registry.load(), Registry.load()
-    assert asked == ["evlcp"]
-    assert first is not second
-    assert first.hook is not second.hook
 
 
 def test_two_algorithms_with_one_name_are_told_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -73,18 +73,13 @@ def test_barker_pilots_are_told_apart():
 
 @pytest.mark.parametrize("n", [0, 1, 400])
 @pytest.mark.parametrize(("first", "known", "bins"), [(0, 0, 50), (90, 7, 40), (105, 40, 40), (-20, 3, 0)])
-@pytest.mark.parametrize("frozen", [False, True])
-def test_counts(n, first, known, bins, frozen):
+def test_counts(n, first, known, bins):
     rng = np.random.default_rng(n)
     t = 1000 + rng.integers(0, 4, n).cumsum()
     p = rng.integers(0, 2, n).astype(np.uint8)
     before = rng.integers(0, 9, (2, known)).astype(float)
     # Quarters of us are exact in binary: the twin may divide where the kernel compares.
     want = twins.count_bins(t, p, first, 11.25, before, bins)
-    if frozen:
-        t, p = np.repeat(t, 2)[::2], np.repeat(p, 2)[::2]
-        t.setflags(write=False)
-        p.setflags(write=False)
     counts = np.empty((2, bins))
     _kernels.count_bins(t, p, first, 11.25, before, counts)
     assert_array_equal(counts, want)
@@ -129,7 +124,7 @@ def test_noise_that_ends_at_once_is_no_preamble(rate_hz):
     pilots = np.array([rng.permutation(np.arange(19) % 2) for _ in range(8)])
     book = Codebook("lit first", preamble, pilots, np.array([[1, 0, 1, 1, 0], [0, 1, 0, 0, 1]]))
     listener = BarkerSync().compile(book, PacketFormat.of(book, 10))
-    for seed in range(40):
+    for seed in range(12):
         rng = np.random.default_rng(seed)
         many = int(rate_hz * 0.06)
         t_us, p = np.sort(rng.integers(0, 60_000, many)), rng.integers(0, 2, many).astype(np.uint8)

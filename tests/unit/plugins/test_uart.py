@@ -14,7 +14,7 @@ from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
 from evlcp_uart.decoder import Character
 from evlcp_uart.framing import Uart, read_characters
-from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, OUTLIER, TICKS, Light
+from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, TICKS, Light
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
@@ -381,26 +381,6 @@ def test_light_is_learned_as_it_is() -> None:
         gain = math.log(shares[context, j] / shares[context].sum())
         assert said[k, context, j] == pytest.approx(light.share * poisson + gain)
     assert light.explained(windows, known) > light.explained(windows, np.roll(known, 1, 1))
-
-
-def test_what_gains_make_of_windows_is_that_of_each_window_by_itself() -> None:
-    rng = np.random.default_rng(8)
-    rates = rng.gamma(0.5, 0.5, (CONTEXTS, 2, TICKS)) + 0.1
-    light = Light(5 * rates, np.full(CONTEXTS, 5.0), rng.gamma(1.0, 1.0, (CONTEXTS, len(GAINS))))
-    windows = rng.poisson(0.2 * rng.gamma(1.0, 1.0, 200)[:, None, None], (200, 2, TICKS)).astype(np.float64)
-    likely = np.exp(light.log_likelihoods(windows))
-    said, gains, which = light.of_context(windows)
-    np.testing.assert_allclose(said, np.log(likely.sum(2)))
-    np.testing.assert_allclose(gains[which], likely / likely.sum(2, keepdims=True))
-    known = rng.dirichlet(np.ones(CONTEXTS), 200)
-    fits = (1 - OUTLIER) * likely.sum(2) / likely.sum(2).max(1, keepdims=True)
-    taught = known * fits / (fits + OUTLIER)
-    learned = light.learn(windows, known, 0.5, 1.0)
-    of_gains = np.einsum("nc,ncj->cj", taught / likely.sum(2), likely)
-    np.testing.assert_allclose(learned.gains, 0.5 * light.gains + of_gains)
-    np.testing.assert_allclose(learned.events, 2.5 * rates + np.einsum("nc,npt->cpt", taught, windows))
-    told = (known * np.log(likely.sum(2))).sum() - np.log(likely.sum(2) @ known.mean(0)).sum()
-    assert light.explained(windows, known) == pytest.approx(told)
 
 
 @pytest.mark.parametrize(

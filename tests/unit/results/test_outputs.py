@@ -23,7 +23,6 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.results.columns import FRAME_COLUMNS
-from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -278,19 +277,3 @@ def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path, parquet: boo
 
         table = pyarrow.parquet.read_table(tmp_path / "frames.parquet").to_pylist()
         assert [row["distance_filtered_m"] for row in table] == [51.0, None]
-
-
-@pytest.mark.parametrize("kept", [False, True])
-def test_a_folder_that_was_made_for_nothing_is_gone(kept: bool, tmp_path: Path) -> None:
-    """An earlier result's stays, and one that somebody else made."""
-    out = tmp_path / "out"
-    if kept:
-        out.mkdir()
-    folder = ResultFolder(out, ["fixes.csv"])
-    with folder:
-        folder.open("fixes.csv").write("t_us\n")  # The run ends before it is finished.
-    assert out.exists() == kept
-    with ResultFolder(out, ["fixes.csv"]) as folder:
-        folder.open("fixes.csv").write("t_us\n")
-        folder.finish()
-    assert [path.name for path in out.iterdir()] == ["fixes.csv"]

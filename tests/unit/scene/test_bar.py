@@ -82,25 +82,6 @@ def test_a_link_s_table_comes_back(table: dict[str, Any], tmp_path: Path) -> Non
     assert "shape" not in link.table["bar"] or link.table["bar"]["shape"] == table["shape"]
 
 
-def test_the_default_ranging_fits_the_layout() -> None:
-    chosen = {name: ROLES["ranging"].default_for(BarLayout.of_table(table)) for name, table in TABLES.items()}
-    # Of two by two clusters, each looks larger to other sides; a ring's clusters of two LEDs are turned; two
-    # clusters that are not alike say too little.
-    assert chosen == {"grid": "none", "columns": "poc", "ring": "centroid", "table": "none", "one": "none"}
-    assert ROLES["ranging"].default_for(BarLayout(LedRing())) == "poc"
-    # Three rings about one centre: nothing is between them.
-    rings = [
-        [r * x, r * y, 0.0, k]
-        for k, r in enumerate((0.1, 0.2, 0.3))
-        for x, y in ((1, 0), (-1, 0), (0, 1), (0, -1))
-    ]
-    around = BarLayout.of_table({"shape": "table", "leds": rings})
-    assert (around.apart, ROLES["ranging"].default_for(around)) == (False, "none")
-    assert ROLES["ranging"].default_for(BarLayout()) == "joint-scale"
-    assert ROLES["ranging"].default_for(BarLayout(LedColumns())) == "joint-scale"
-    assert ROLES["ranging"].default_for(BarLayout(LedColumns(apart_m=1.2))) == "poc"
-
-
 def test_the_default_ranging_reads_the_codes() -> None:
     """`joint-scale` reads pilots alone where codewords are no pair codes, `poc` any."""
     panel = BarLayout(LedGrid(16, 16, cluster_rows=4, cluster_columns=4))

@@ -1,10 +1,7 @@
 """What a road adds: images, covers, wiper, bloom, potholes, background; against other ways to them."""
 
-import csv
 import json
 import math
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +12,6 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
@@ -39,13 +35,9 @@ from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.scene import LensSpec
-from evlcp_sdk.study.frames import read_frames
-from evlcp_sdk.study.score import score_frames
 from evlcp_sdk.values import Events
 from tests.models.pixels import pixel_events
 
-SHARED = Path(__file__).parents[4] / "shared"
-TOOL = SHARED / "tools" / "score_road.py"
 IDEAL = SensorSpec(
     noise_hz=0.0, hot_share=0.0, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0, t_row_us=0.0,
     cap_mev_s=0.0,
@@ -410,53 +402,3 @@ def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> No
     with pytest.raises(ConfigError) as fault:
         resolve_scene(table, source="scene.toml")
     assert f"scene.toml: {says}" in str(fault.value)
-
-
-@pytest.mark.skipif(not TOOL.exists(), reason="the scorers of ../shared are not there")
-def test_scores_agree_on_what_is_hidden(tmp_path: Path) -> None:
-    """A receiver that gives every symbol, also of hidden clusters, and errs in some: both scores say so."""
-    bar = {"covered": [2], "cover_s": [[0.03, 0.07, 9, 12]], "pole_s": [[0.09, 0.1]], "ppm": 20.0}
-    scene = resolve_scene({"duration_s": 0.15, "bars": [bar], "reflections": [{}]})
-    truth = truth_of(scene)
-    (tmp_path / "a.truth.json").write_text(json.dumps(truth.to_table()))
-    sent, rng = truth.bars[0], np.random.default_rng(3)
-    with (tmp_path / "frames.csv").open("w", newline="") as file:
-        out = csv.writer(file)
-        out.writerow(
-            ["transmitter", "t_us", "symbols", "distance_m", "distance_sigma_m", "x_px", "y_px", "echo_of"]
-        )
-        for q, packet in enumerate(sent.symbols):
-            for f, frame in enumerate(packet):
-                t_us = (q * 346 + 26 + 32 * f - sent.start_chip) / sent.rate_hz * 1e6
-                if not 0 <= t_us < 146_000:
-                    continue
-                said = np.where(rng.random(16) < 0.1, rng.integers(0, 64, 16), frame)
-                text = " ".join("-" if rng.random() < 0.05 else str(v) for v in said)
-                out.writerow([0, t_us, text, 50.1, 0.1, *sent.centre_px[int(t_us // 1000)], ""])
-                out.writerow([1, t_us, text, 50.1, 0.1, 424.0, 500.0, 0])
-    command = [sys.executable, TOOL, tmp_path, tmp_path / "a.truth.json", "--json"]
-    theirs = json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
-    ours = score_frames(read_frames(tmp_path), truth)["road"]
-    assert theirs["echoes"] == ours["echoes"] > 40
-    (their_bar,), (our_bar,) = theirs["bars"], ours["bars"]
-    assert their_bar["claimed"] > 0.9
-    for key in ("frames_sent", "frames_found", "bit_errors", "bits", "erased", "claimed", "rmse_m"):
-        assert our_bar[key] == pytest.approx(their_bar[key], rel=1e-4), key
-
-
-@pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
-@pytest.mark.parametrize(
-    "name", ["wet-road-80m", "rail-reflection-40m", "truck-55m", "bloom-40m", "panel-1khz-55m", "pothole-40m"]
-)
-def test_events_are_as_many_as_in_the_independent_recording(name: str) -> None:
-    path = SHARED / "recordings" / "road" / f"{name}.raw"
-    if not path.exists():
-        pytest.skip("this recording is not there")
-    scene = scene_of_truth(json.loads(path.with_suffix(".truth.json").read_text()))
-    scene = replace(scene, duration_s=0.05)
-    theirs = read_events(path)
-    theirs = theirs[theirs.t_us < scene.duration_s * 1e6]
-    ours = every(scene, threads=2)
-    # Another vibration moves the image over other pixels.
-    assert len(ours) == pytest.approx(len(theirs), rel=0.15)
-    assert float(ours.p.mean()) == pytest.approx(float(theirs.p.mean()), abs=0.03)
