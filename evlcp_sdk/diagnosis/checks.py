@@ -21,6 +21,8 @@ Found = Diagnostic | str | None
 
 _VERDICTS: dict[str, Verdict] = {
     "damaged": "doubt",
+    "empty": "fail",
+    "no-preamble": "fail",
     "profile": "fail",
     "preamble": "skip",
     "messages": "skip",

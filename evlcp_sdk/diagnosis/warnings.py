@@ -503,10 +503,10 @@ def check_turned(facts: Facts, one: TransmitterTally) -> Found:
         )
 
 
-def check_packets(facts: Facts, one: TransmitterTally) -> Found:
+def check_packets(_facts: Facts, one: TransmitterTally) -> Found:
     """Packets without a block of a transmitter that sends some; another one may send none at all."""
     failed = one.packets - one.blocks
-    if facts.reads_messages and one.blocks and failed >= _FEW_FRAMES and failed > _FAILED_SHARE * one.packets:
+    if one.blocks and failed >= _FEW_FRAMES and failed > _FAILED_SHARE * one.packets:
         yield Diagnostic(
             "blocks-failed",
             f"{failed} of {one.packets} packets cannot be read",
