@@ -215,6 +215,8 @@ def count_missing_codewords(one: TransmitterTally, link: Link) -> int:
     never = codewords - sum(symbol < codewords for symbol in one.values)
     if not one.given or not never:
         return 0
+    if never == codewords:
+        return never
     # Equally likely codewords; the union of all sets of so many bounds the chance that they never occur.
     ways = math.lgamma(codewords + 1) - math.lgamma(never + 1) - math.lgamma(codewords - never + 1)
     given = min(one.given, link.packet.frames * link.codebook.clusters)

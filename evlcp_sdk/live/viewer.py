@@ -27,7 +27,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.desk import cannot_listen, stop_listening
 from evlcp_sdk.live.telling import MOST_WAITING, PICTURES_PER_S, FrameNews, Line, Shot, line_text
-from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_colours
+from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_hex
 from evlcp_sdk.report.pages import TEMPLATES, render_page
 
 if TYPE_CHECKING:
@@ -376,10 +376,7 @@ def _shown(link: Link) -> dict[str, Any]:
     book = link.codebook
     return {
         "symbols": 2**book.bits_per_symbol,
-        "cluster_colours": [
-            f"#{round(r * 255):02x}{round(g * 255):02x}{round(b * 255):02x}"
-            for r, g, b in cluster_colours(book.clusters).tolist()
-        ],
+        "cluster_colours": cluster_hex(book.clusters),
     }
 
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.report.colours import cluster_hex
 from evlcp_sdk.values import Frame, FrameView, PresenceMap
 
 __all__ = ["Motion", "MotionProbe", "cluster_map", "sent_chips"]
@@ -61,7 +62,6 @@ class Motion:
     def to_dict(
         self,
         codebook: Codebook,
-        colours: NDArray[np.float64],
         chip_us: float,
         ms: Callable[[float], float],
     ) -> dict[str, Any]:
@@ -69,7 +69,6 @@ class Motion:
 
         Args:
             codebook: The codes that it was sent with.
-            colours: Of the clusters, float64 (K, 3), 0 to 1.
             chip_us: Length of a chip, us.
             ms: The time that is shown, ms, of one of the camera's clock, us.
         """
@@ -91,7 +90,7 @@ class Motion:
             "clusters": self.clusters.ravel().tolist(),
             "lit": ["".join("?01"[value + 1] for value in row) for row in lit.tolist()],
             "symbols": [s if s >= 0 else None for s in self.frame.soft.symbols.tolist()],
-            "colours": [_hex(colour) for colour in colours],
+            "colours": cluster_hex(codebook.clusters),
             "upside": len(seen) > 1 and seen[0][1] > seen[-1][1],
         }
 
@@ -174,7 +173,3 @@ def sent_chips(frame: Frame, codebook: Codebook) -> NDArray[np.int8]:
 
 def _pixels(motion: Motion) -> int:
     return int((motion.clusters >= 0).sum())
-
-
-def _hex(colour: NDArray[np.float64]) -> str:
-    return "#" + "".join(f"{round(255 * value):02x}" for value in colour)

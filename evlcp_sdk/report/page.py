@@ -16,7 +16,7 @@ import numpy as np
 from evlcp_sdk.diagnosis.facts import Diagnostic
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
+from evlcp_sdk.report.colours import transmitter_colour
 from evlcp_sdk.report.figures import Thinned
 from evlcp_sdk.report.motion import MotionProbe
 from evlcp_sdk.report.pages import render_page
@@ -114,9 +114,7 @@ class Report(Sink):
         if summary["recording"]["duration_s"] > _SECONDS:
             self._axis, self._step_ms = "s since the first event", 1000.0
         motions = [
-            motion.to_dict(
-                link.codebook, cluster_colours(link.codebook.clusters), link.packet.chip_us, self._ms
-            )
+            motion.to_dict(link.codebook, link.packet.chip_us, self._ms)
             for motion in self._motion.motions()
             # What another link fitted better is not given.
             if motion.frame.transmitter in self._seen or not self.run.links

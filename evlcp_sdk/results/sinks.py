@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from copy import deepcopy
 from pathlib import Path
@@ -69,33 +69,25 @@ class Sinks:
 
     def events(self, events: Events) -> None:
         """Hand on events."""
-        for installed, sink in self._sinks:
-            with self._blame(installed):
-                sink.events(events)
+        self._each(lambda sink: sink.events(events))
 
     def packet(self, packet: Packet) -> None:
         """Hand on a packet."""
-        for installed, sink in self._sinks:
-            with self._blame(installed):
-                sink.packet(packet)
+        self._each(lambda sink: sink.packet(packet))
 
     def placed(self, placed: Placed) -> None:
         """Hand on a fix, and what it settles."""
-        for installed, sink in self._sinks:
-            with self._blame(installed):
-                sink.fix(placed.fix, placed.filtered)
-                if placed.settled:
-                    sink.settle(placed.settled)
+        self._each(lambda sink: sink.fix(placed.fix, placed.filtered))
+        if placed.settled:
+            self.settle(placed.settled)
 
     def settle(self, settled: Sequence[Settled]) -> None:
-        """Hand on the last fixes that are settled."""
-        for installed, sink in self._sinks:
-            with self._blame(installed):
-                sink.settle(settled)
+        """Hand on fixes that are settled."""
+        self._each(lambda sink: sink.settle(settled))
 
     def finish(self) -> dict[str, Mapping[str, Any]]:
         """End the sinks; return what they say, by name."""
-        said: dict[str, Mapping[str, Any]] = {}
+        found: dict[str, Mapping[str, Any]] = {}
         for installed, sink in self._sinks:
             with self._blame(installed):
                 part: object = sink.finish()
@@ -104,15 +96,18 @@ class Sinks:
                 if part:
                     # What JSON cannot say is the sink's fault, not the summary's.
                     json.dumps(dict(part), allow_nan=False)
-                    said[installed.record.name] = dict(part)
-        return said
+                    found[installed.record.name] = dict(part)
+        return found
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
         """Hand on the summary, all but its `files`."""
+        # A copy: what a sink changes in it would be missing in summary.json.
+        self._each(lambda sink: sink.conclude(deepcopy(dict(summary))))
+
+    def _each(self, call: Callable[[Sink], None]) -> None:
         for installed, sink in self._sinks:
             with self._blame(installed):
-                # A copy: what a sink changes in it would be missing in summary.json.
-                sink.conclude(deepcopy(dict(summary)))
+                call(sink)
 
     @contextmanager
     def _blame(self, installed: InstalledSink) -> Iterator[None]:

@@ -101,6 +101,9 @@ def test_codewords_that_never_occur() -> None:
     (line,) = told(tally_of(RANDOM % 16))
     assert line.startswith("transmitter 0: 48 of 64 codewords never occur in 960 symbols")
     assert line.endswith("another modulation than modulation.id")
+    # Symbols beyond those that carry data alone.
+    (line,) = told(tally_of(RANDOM * 0 + 64))
+    assert "64 of 64 codewords never occur" in line
 
 
 @pytest.mark.parametrize("ppm", [-5000.0, 600.0])
