@@ -12,7 +12,7 @@ from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet
 from evlcp_sdk.live.pictures import Picture, PictureSlot
 from evlcp_sdk.results.columns import frame_columns
-from evlcp_sdk.results.lines import FrameSaid, fix_line, frame_said, said_text
+from evlcp_sdk.results.lines import FrameValues, fix_line, format_values, frame_values
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, ReceivedMessage
@@ -21,7 +21,7 @@ __all__ = ["MOST_WAITING", "PICTURES_PER_S", "FrameNews", "Line", "Shot", "Telle
 
 PICTURES_PER_S: Final = 25
 
-FrameNews = tuple[FrameSaid, float | None]
+FrameNews = tuple[FrameValues, float | None]
 """What is said of a frame, and how late it was, ms."""
 
 Line = tuple[str, str | FrameNews]
@@ -115,7 +115,7 @@ class Teller:
             if news.kind == "frame":
                 self._keep(news.value)
                 if frames:
-                    lines.append(("frame", (frame_said(news.value, self._columns), news.late_ms)))
+                    lines.append(("frame", (frame_values(news.value, self._columns), news.late_ms)))
             else:
                 lines += ((kind, json.dumps(values)) for kind, values in self._told(news))
         return lines
@@ -187,7 +187,7 @@ def line_text(said: str | FrameNews) -> str:
     if isinstance(said, str):
         return said
     frame, late_ms = said
-    return f'{said_text(frame)[:-1]}, "late_ms": {"null" if late_ms is None else f"{late_ms:.3f}"}}}'
+    return f'{format_values(frame)[:-1]}, "late_ms": {"null" if late_ms is None else f"{late_ms:.3f}"}}}'
 
 
 def _told(picture: Picture, bars: Sequence[Frame]) -> str:

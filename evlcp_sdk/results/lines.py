@@ -9,10 +9,10 @@ from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.values import Fix, Frame, Packet
 
-__all__ = ["FrameSaid", "JsonLines", "fix_line", "frame_said", "frame_text", "said_text"]
+__all__ = ["FrameValues", "JsonLines", "fix_line", "format_frame", "format_values", "frame_values"]
 
-FrameSaid = tuple[Any, ...]
-"""What a frame's line says, as values that take little to hand to another process: see `frame_said`."""
+FrameValues = tuple[Any, ...]
+"""What a frame's line says, as values that take little to hand to another process: see `frame_values`."""
 
 
 class JsonLines:
@@ -44,7 +44,7 @@ class JsonLines:
             PluginError: A kind of messages fails.
         """
         for frame in packet.frames:
-            self._give(frame_text(frame, self._columns))
+            self._give(format_frame(frame, self._columns))
         for message in packet.messages:
             self._give(json.dumps({"line": "message"} | json.loads(message_line(message))))
 
@@ -54,17 +54,17 @@ class JsonLines:
         self._give(json.dumps(fix_line(fix) | links))
 
 
-def frame_text(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
+def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
     """The line of a frame as JSON, rounded as in `frames.csv`.
 
     Args:
         frame: The frame.
         columns: `FRAME_COLUMNS`, and others behind them.
     """
-    return said_text(frame_said(frame, columns))
+    return format_values(frame_values(frame, columns))
 
 
-def frame_said(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> FrameSaid:
+def frame_values(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> FrameValues:
     """The values of a frame's line: of `FRAME_COLUMNS`, then names and values of the columns behind them."""
     soft, found = frame.soft, frame.range
     more = columns[len(FRAME_COLUMNS) :]
@@ -84,10 +84,12 @@ def frame_said(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> FrameSai
     )
 
 
-def said_text(said: FrameSaid) -> str:
-    """The line of a frame as JSON, of what `frame_said` gives."""
+def format_values(values: FrameValues) -> str:
+    """The line of a frame as JSON, of what `frame_values` gives."""
     # Written out, as there are hundreds a second: rounding and `json` take twice as long.
-    transmitter, packet, frame, t_us, symbols, quality, distance_m, sigma_m, x_px, y_px, echo_of, more = said
+    transmitter, packet, frame, t_us, symbols, quality, distance_m, sigma_m, x_px, y_px, echo_of, more = (
+        values
+    )
     numbers = (
         f'{{"line": "frame", "transmitter": {transmitter}, "packet": {packet}, "frame": {frame},'
         f' "t_us": {t_us:.2f}, "symbols": {symbols}, "quality": {quality:.4f},'

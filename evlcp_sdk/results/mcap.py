@@ -17,7 +17,7 @@ from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.lines import frame_text
+from evlcp_sdk.results.lines import format_frame
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.attitude import Attitude
@@ -98,7 +98,7 @@ class Mcap(Sink):
     def packet(self, packet: Packet) -> None:
         """Write its frames."""
         for frame in packet.frames:
-            self._write_json("/frames", frame.t_us, frame_text(frame))
+            self._write_json("/frames", frame.t_us, format_frame(frame))
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a fix that is given, and the filtered place at its time."""

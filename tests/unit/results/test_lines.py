@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_columns, frame_value
-from evlcp_sdk.results.lines import frame_text
+from evlcp_sdk.results.lines import format_frame
 from evlcp_sdk.values import Range
 from tests.unit.results.test_positions import packets
 
@@ -18,7 +18,7 @@ def test_a_line_has_all_columns() -> None:
     soft = packet.frames[3].soft
     soft = dataclasses.replace(soft, symbols=np.where(np.arange(16) == 1, -1, soft.symbols))
     frame = dataclasses.replace(packet.frames[3], soft=soft, filtered=Range(12.34567, 0.1, 3), echo_of=2)
-    told = json.loads(frame_text(frame, (*FRAME_COLUMNS, *FILTERED_COLUMNS)))
+    told = json.loads(format_frame(frame, (*FRAME_COLUMNS, *FILTERED_COLUMNS)))
     assert list(told) == ["line", *FRAME_COLUMNS, *FILTERED_COLUMNS]
     for name in (*FRAME_COLUMNS, *FILTERED_COLUMNS):
         value = frame_value(frame, name)
@@ -37,7 +37,7 @@ def test_what_is_no_number_is_null() -> None:
         odd = dataclasses.replace(
             frame, soft=soft, range=Range(value, value, 0), x_px=value, link="nan inf None"
         )
-        told = json.loads(frame_text(odd, frame_columns(filtered=False, links=True)))
+        told = json.loads(format_frame(odd, frame_columns(filtered=False, links=True)))
         names = ("quality", "distance_m", "distance_sigma_m", "x_px", "echo_of")
         assert [told[name] for name in names] == [None] * 5
         assert (told["line"], told["link"], told["y_px"]) == ("frame", "nan inf None", round(frame.y_px, 3))
