@@ -35,11 +35,12 @@ typer.main.get_params_from_function = cache(typer.main.get_params_from_function)
 LONG = (
     "tests/unit/test_site.py",
     "tests/packaging",
+    "tests/camera",
+    "tests/unit/test_notebooks.py",
     "tests/firmware/test_board_qemu.py",
     "tests/faults",
     "tests/acceptance",
     "tests/unit/plugins/test_uart.py",
-    "tests/unit/test_kernel_caches.py",
     "tests/unit/study",
     "tests/unit/rx",
     "tests/firmware",

@@ -35,9 +35,12 @@ def test_time_for_kernels_is_left_out() -> None:
     inner = COMPILING.watched(compile_)
     outer = COMPILING.watched(lambda sig: (busy(0.05), inner(sig)))
     with watch.running():
+        began_s = time.perf_counter()
         outer(None)
+        took_s = time.perf_counter() - began_s
         busy(0.02)
-    assert 0.1 <= watch.kernels_s < 0.15
+    # The inner one's time is in the outer's, and counts once.
+    assert 0.1 <= watch.kernels_s <= took_s
     assert 0.02 <= watch.processor_s < 0.05
 
 
