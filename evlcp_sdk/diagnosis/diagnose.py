@@ -117,14 +117,12 @@ def diagnosis_of(
     registry = Registry.load() if registry is None else registry
     name = str(source.path) if name is None else name
     check_sensor(source, name, link.camera)
-    width, height = link.camera.width, link.camera.height
-    survey = LightSurvey(width, height)
-    receiver, tally = Receiver(link), RunTally(link.packet)
-    sample = _Sample()
+    survey, receiver, sample = LightSurvey(link.camera.width, link.camera.height), Receiver(link), _Sample()
+    tally = RunTally(link.packet)
     for events in source.chunks():
         for packet in receiver.feed(events):
             tally.add(packet)
-        survey.feed(_on_sensor(events, width, height))
+        survey.feed(events)
         sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
         advance(source.position_bytes, source.size_bytes)
     for packet in receiver.close():
@@ -182,11 +180,10 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
         InputError: The source cannot be read on.
     """
     registry = Registry.load() if registry is None else registry
-    width, height = link.camera.width, link.camera.height
-    survey, receiver, sample = LightSurvey(width, height), Receiver(link), _Sample()
+    survey, receiver, sample = LightSurvey(link.camera.width, link.camera.height), Receiver(link), _Sample()
     for events in source.chunks():
         receiver.feed(events)
-        survey.feed(_on_sensor(events, width, height))
+        survey.feed(events)
         sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
         if sample.full and sample.seen:
             break
@@ -228,11 +225,6 @@ class _Sample:
 
     def events(self) -> Events:
         return Events.concat(self._pieces)[:MOST_EVENTS]
-
-
-def _on_sensor(events: Events, width: int, height: int) -> Events:
-    inside = (events.x < width) & (events.y < height)
-    return events if inside.all() else events[inside]
 
 
 def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:

@@ -169,7 +169,9 @@ class LightSurvey:
         self.first_us = self.last_us = math.nan
 
     def feed(self, events: Events) -> None:
-        """Take the next events; all of them are on the sensor."""
+        """Take the next events; those outside of the sensor are left out."""
+        inside = (events.x < self.width) & (events.y < self.height)
+        events = events if inside.all() else events[inside]
         if not len(events):
             return
         if math.isnan(self.first_us):
