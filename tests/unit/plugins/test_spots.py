@@ -88,17 +88,6 @@ def test_there_is_no_light_in_noise_or_in_what_moves() -> None:
     assert not any(regions for _, regions in regions_of(link_of(500.0), noise, 0.2))
 
 
-def test_places_of_a_larger_light_are_no_lights() -> None:
-    rng = np.random.default_rng(3)
-    one = events_of(rng, 3125.0, 0.1, 60, 0.0)
-    bar = [Events.of(one.t_us, one.x, one.y + down, one.p) for down in (0, 30, 60, 90)]
-    order = np.argsort(np.concatenate([part.t_us for part in bar]), kind="stable")
-    t, x, y, p = (
-        np.concatenate([getattr(part, name) for part in bar])[order] for name in ("t_us", "x", "y", "p")
-    )
-    assert not any(regions for _, regions in regions_of(link_of(3125.0), Events.of(t, x, y, p), 0.1))
-
-
 def moved(events: Events, right: int, share: float, late_us: int, rng: np.random.Generator) -> Events:
     """Some of the events elsewhere and later, as a lens scatters light and dim pixels see it."""
     kept = rng.random(len(events)) < share
@@ -163,13 +152,6 @@ def test_a_large_light_is_one_though_its_places_come_and_go() -> None:
     places = {0: (0.0, 0.18), 40: (0.0, 0.18), 80: (0.0, 0.1), 120: (0.0, 0.18)}
     found = regions_of(link_of(10_000.0), beside_one_another(np.random.default_rng(4), places), 0.3)
     assert not any(regions for _, regions in found)
-
-
-def test_lights_that_stood_beside_others_are_given_when_these_are_gone() -> None:
-    events = beside_one_another(np.random.default_rng(4), {36: (0.0, 0.3), 0: (0.0, 0.06), 72: (0.0, 0.06)})
-    found = regions_of(link_of(10_000.0), events, 0.3)
-    assert not any(regions for start, regions in found if start < 150_000)
-    assert places_of(found, 190_000, 0) == 1
 
 
 def test_two_lights_beside_one_another_are_two() -> None:
