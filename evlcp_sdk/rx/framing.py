@@ -2,22 +2,21 @@
 
 import math
 from collections import deque
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.alignment import AlignedFrame, FrameAligner
+from evlcp_sdk.rx.context import StreamContext
 from evlcp_sdk.rx.delays import RowDelays
 from evlcp_sdk.rx.detection import MARGIN_PX
 from evlcp_sdk.rx.followed import SAME_PX, Followed, same_place
 from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.reading import FrameReader, ReadableFrame, Reading
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
@@ -25,7 +24,6 @@ from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Missed, Transmitter, Transmitters
-from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.values import Frame, Region, SyncLock, changed
 
 __all__ = ["PacketFraming"]
@@ -81,16 +79,12 @@ class PacketFraming(Framer):
 
     Args:
         link: The resolved configuration.
+        name: Name of the link, that its frames have; empty for none.
+        stream: What it is a part of.
         steps: The algorithms of the other roles.
         regions: The regions of the stream.
-        judged: Where decoded frames go.
-        clock: The stream's.
+        queue: Where decoded frames go.
         announcer: Gets every frame.
-        attitude_at: What is known of the camera's attitude at a time.
-        limits: How much it holds at the most.
-        name: Name of the link, that its frames have; empty for none.
-        numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
-
     """
 
     cut_by_the_end = True
@@ -98,27 +92,24 @@ class PacketFraming(Framer):
     def __init__(
         self,
         link: Link,
+        name: str,
+        stream: StreamContext,
         steps: Steps,
         regions: RegionTracker,
-        judged: ReflectionQueue,
-        clock: CameraClock,
+        queue: ReflectionQueue,
         announcer: Announcer,
-        attitude_at: Callable[[float], Attitude | None],
-        limits: Limits = LIMITS,
-        name: str = "",
-        numbers: Iterator[int] | None = None,
     ) -> None:
-        self._attitude_at = attitude_at
+        self._attitude_at = stream.attitude_at
         self._packet = link.packet
         self._step_us = link.regions.step_us
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
-        self._clock = clock
+        self._clock = stream.clock
         self._announcer = announcer
         self._steps = steps
         self._regions = regions
         self._name = name
         self._transmitters = Transmitters(
-            link.packet, self._step_us, limits, numbers, link.codebook.chips_after
+            link.packet, self._step_us, stream.limits, stream.numbers, link.codebook.chips_after
         )
         self._aligner = FrameAligner(
             link.packet,
@@ -133,8 +124,8 @@ class PacketFraming(Framer):
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
         self._unknown.setflags(write=False)
         self._rows = RowDelays(link.codebook.preamble)
-        self._reflections = judged.reflections
-        self._judged = judged
+        self._reflections = queue.reflections
+        self._queue = queue
         self._joined: set[int] = set()
         self._ended: deque[tuple[tuple[float, float], Missed]] = deque(maxlen=_MOST_ENDED)
         self._missed_by: dict[int, Missed] = {}
@@ -313,7 +304,7 @@ class PacketFraming(Framer):
         transmitter.grid.frame += 1
         self._lit_in(transmitter, due)
         self.counts["frames"] += 1
-        self._judged.add(transmitter.packets, due, found)
+        self._queue.add(transmitter.packets, due, found)
 
     def _lit_in(self, transmitter: Transmitter, due: DueFrame) -> None:
         """Note that a transmitter's light is there in a frame that is due."""
@@ -470,7 +461,7 @@ class PacketFraming(Framer):
             transmitter = self._transmitters[region]
             self.counts["regions_released"] += 1
             self._was_part(transmitter.missed)
-            self._judged.end(transmitter.packets)
+            self._queue.end(transmitter.packets)
             self._transmitters.release(transmitter)
 
     def _was_part(self, missed: Missed) -> None:
@@ -504,7 +495,7 @@ class PacketFraming(Framer):
                 self._was_part(missed)
             else:
                 self._ended.append((place_px, missed))
-        self._judged.end(transmitter.packets)
+        self._queue.end(transmitter.packets)
 
 
 def _in_time(transmitter: Transmitter) -> bool:

@@ -1,19 +1,17 @@
 """One link's part of a receiver: the regions that it follows, what they send, and its messages."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
-import pluggy
-
-from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Tracker
+from evlcp_sdk.rx.context import StreamContext
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.inbox import MessageAssembler
-from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.plugin_framing import PluginFraming
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
 from evlcp_sdk.rx.rhythm import Rhythm
@@ -21,8 +19,6 @@ from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
-from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Frame, Packet, Region, changed
 
 __all__ = ["LinkReceiver"]
@@ -33,57 +29,36 @@ class LinkReceiver:
 
     Args:
         link: The resolved configuration.
-        clock: The stream's.
-        hook: Where finished stages are announced; None for nowhere.
-        attitude_at: What is known of the camera's attitude at a time.
-        clock_zero: UTC of the camera clock's 0; None if it is not known.
-        limits: How much it holds at the most.
         name: Name of the link, that its frames have; empty for none.
-        numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
-        rhythm: Scores of the pixels, of another listener in the same rhythm; None for its own.
+        stream: What it is a part of.
+        rhythm: Scores of the pixels, of another link in the same rhythm; None for its own.
         on_frame: Gets each frame as soon as it is decoded; None for nobody.
     """
 
     def __init__(
         self,
         link: Link,
-        clock: CameraClock,
-        hook: pluggy.HookRelay | None,
-        attitude_at: Callable[[float], Attitude | None],
-        clock_zero: ClockZero = None,
-        limits: Limits = LIMITS,
-        name: str = "",
-        numbers: Iterator[int] | None = None,
+        name: str,
+        stream: StreamContext,
         rhythm: Rhythm | None = None,
         on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
         self.link, self.name = link, name
-        self._clock = clock
-        self._announcer = Announcer(hook, clock.camera_us, on_frame)
+        self._clock = stream.clock
+        self._announcer = Announcer(stream.hook, stream.clock.camera_us, on_frame)
         tracker = tracker_of(link)
-        self._regions = _regions_of(link, tracker, limits, rhythm)
-        self._judged = ReflectionQueue(Reflections(link.packet, len(link.codebook.codewords)))
+        self._regions = _regions_of(link, tracker, stream.limits, rhythm)
+        self._queue = ReflectionQueue(Reflections(link.packet, len(link.codebook.codewords)))
         with Guard(link, "framing", may_refuse=True):
             deframer = link.algorithm("framing").compile(link.codebook, link.packet)
+        shared = self._regions, self._queue, self._announcer
         self._framing: Framer
         if deframer is None:
-            self._framing = PacketFraming(
-                link,
-                Steps(link, self._announcer, tracker),
-                self._regions,
-                self._judged,
-                clock,
-                self._announcer,
-                attitude_at,
-                limits,
-                name,
-                numbers,
-            )
+            steps = Steps(link, self._announcer, tracker)
+            self._framing = PacketFraming(link, name, stream, steps, *shared)
         else:
-            self._framing = PluginFraming(
-                link, deframer, self._judged, clock, self._announcer, self._regions, name, numbers
-            )
-        self._messages = MessageAssembler.of(link, clock_zero)
+            self._framing = PluginFraming(link, name, stream, deframer, *shared)
+        self._messages = MessageAssembler.of(link, stream.clock_zero)
         self._given = {"frames_reflected": 0, "packets": 0}
         self._of_others = self._rejected_of_others = 0
 
@@ -121,8 +96,8 @@ class LinkReceiver:
         """What was found so far, and dropped."""
         messages = self._messages.counts if self._messages is not None else {}
         found = self._regions.counts | self._framing.counts
-        found["frames"] -= self._judged.cut
-        found["frames_at_end"] = self._judged.cut
+        found["frames"] -= self._queue.cut
+        found["frames_at_end"] = self._queue.cut
         if self.name:
             found["frames"] -= self._of_others
             found["frames_of_others"] = self._of_others + self._rejected_of_others
@@ -130,7 +105,7 @@ class LinkReceiver:
 
     def __bool__(self) -> bool:
         """Whether anything waits for the next step."""
-        return bool(self._regions.alive or self._judged)
+        return bool(self._regions.alive or self._queue)
 
     @property
     def due_us(self) -> float:
@@ -158,17 +133,17 @@ class LinkReceiver:
         for region in regions:
             self._announcer.lap("regions", region.latest)
         self._framing.step(regions, step)
-        return self._judged.step()
+        return self._queue.step()
 
     def end_at(self, end_us: float) -> None:
         """Let the stream end at a time, us: frames that are cut by it are not given."""
         if self._framing.cut_by_the_end:
-            self._judged.ends_us = end_us
+            self._queue.ends_us = end_us
 
     def finish(self) -> list[Packet]:
         """End the stream's events; give the packets that were still incomplete."""
         self._framing.close()
-        return self._judged.close()
+        return self._queue.close()
 
     def read(self, packets: list[Packet]) -> list[Packet]:
         """Read the messages that packets carry."""

@@ -1,16 +1,15 @@
 """Frames of an algorithm of the role `framing`, from the events of regions to the frames of the receiver."""
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import count
 from typing import Any
 
 import numpy as np
 
-from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
+from evlcp_sdk.rx.context import StreamContext
 from evlcp_sdk.rx.followed import Followed, same_place
 from evlcp_sdk.rx.framer import Framer
 from evlcp_sdk.rx.grid import DueFrame
@@ -61,14 +60,12 @@ class PluginFraming(Framer):
 
     Args:
         link: The resolved configuration.
-        deframer: What its framing compiled to.
-        judged: Where frames go.
-        clock: The stream's.
-        announcer: Gets every frame.
-        regions: The regions of the stream.
         name: Name of the link, that its frames have; empty for none.
-        numbers: Where the numbers of transmitters come from; None for 0, 1, 2...
-
+        stream: What it is a part of.
+        deframer: What the link's framing compiled to.
+        regions: The regions of the stream.
+        queue: Where frames go.
+        announcer: Gets every frame.
     """
 
     cut_by_the_end = False
@@ -76,27 +73,26 @@ class PluginFraming(Framer):
     def __init__(
         self,
         link: Link,
+        name: str,
+        stream: StreamContext,
         deframer: Deframer,
-        judged: ReflectionQueue,
-        clock: CameraClock,
-        announcer: Announcer,
         regions: RegionTracker,
-        name: str = "",
-        numbers: Iterator[int] | None = None,
+        queue: ReflectionQueue,
+        announcer: Announcer,
     ) -> None:
         self._guard = Guard(link, "framing")
         self._guard.expect_compiled(deframer, "init", "step", "close", "counts")
         self._deframer = deframer
         self._codebook, self._packet = link.codebook, link.packet
         self._step_us = link.regions.step_us
-        self._judged = judged
-        self._reflections = judged.reflections
-        self._camera_us: Callable[[float], float] = clock.camera_us
+        self._queue = queue
+        self._reflections = queue.reflections
+        self._camera_us: Callable[[float], float] = stream.clock.camera_us
         self._announcer = announcer
         self._regions = regions
         self._listeners: dict[int, _Listener] = {}
         self._name = name
-        self._numbers = count() if numbers is None else numbers
+        self._numbers = stream.numbers
         frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
         self.patience_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
         self.counts = dict.fromkeys(_COUNTED, 0)
@@ -152,7 +148,7 @@ class PluginFraming(Framer):
                 self._regions.drop(region)
                 if listener is not None:
                     self.counts["regions_released"] += 1
-                    self._judged.end(listener.packets)
+                    self._queue.end(listener.packets)
                     del self._listeners[region.id]
 
     def discard_place(self, place: Region) -> int:
@@ -174,7 +170,7 @@ class PluginFraming(Framer):
             given = self._deframer.close(listener.state)
         listener.state, heard = self._guard.expect_step(given, "close()")
         self._take(listener, heard)
-        self._judged.end(listener.packets)
+        self._queue.end(listener.packets)
 
     def _take(self, listener: _Listener, heard: list[DecodedFrame]) -> None:
         """Number a region's frames, say where they were seen, and hand them on."""
@@ -223,7 +219,7 @@ class PluginFraming(Framer):
                 number, one.packet, one.frame, chips, False, one.packet_t_us, one.t_us, end_us, lock, end_us
             )
             light = listener.events / len(heard)
-            self._judged.add(
+            self._queue.add(
                 listener.packets, due, FrameDetection(frame, light, self._codebook.clusters, False)
             )
         if heard:

@@ -3,7 +3,6 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import count
 
 import pluggy
 
@@ -11,6 +10,7 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.rx.arbitration import ArbitratedPacket, LinkArbiter
+from evlcp_sdk.rx.context import StreamContext
 from evlcp_sdk.rx.early import EarlyFrames
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.link_receiver import LinkReceiver
@@ -78,21 +78,11 @@ class Receiver:
         self._clock = self._timeline.clock
         if len(links) > 1:
             limits = replace(limits, region_bytes=limits.region_bytes // len(links))
-        rhythms, numbers = _rhythms(links), count()
+        stream = StreamContext(self._clock, attitude_source(attitude), clock_zero, hook, limits)
+        tell = on_frame if len(links) == 1 or on_frame is None else self._decoded
+        rhythms = _rhythms(links)
         self._receivers = [
-            LinkReceiver(
-                one,
-                self._clock,
-                hook,
-                attitude_source(attitude),
-                clock_zero,
-                limits,
-                name,
-                numbers,
-                rhythms.get(name),
-                on_frame if len(links) == 1 or on_frame is None else self._decoded,
-            )
-            for name, one in links.items()
+            LinkReceiver(one, name, stream, rhythms.get(name), tell) for name, one in links.items()
         ]
         self._arbiter: LinkArbiter | None = None
         self._early = EarlyFrames(on_frame)

@@ -91,7 +91,7 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 
 RX = (
     {"early", "limits", "lit", "places", "rhythm"},
-    {"followed", "guard", "timeline", "trust"},
+    {"context", "followed", "guard", "timeline", "trust"},
     {"framer", "tracker"},
     {"llr_calibration", "delays", "detection", "grid", "inbox", "packets", "placement", "ranges"},
     {"arbitration", "detected", "points", "spread", "steps"},
