@@ -22,8 +22,8 @@ def bar_of(recording: Path, out: Path, link: evlcp.Link) -> dict[str, float]:
     return bar  # type: ignore[no-any-return]
 
 
-@pytest.mark.parametrize(("x_m", "y_m"), [(-3.6, -1.6), (3.6, -1.6), (-3.6, 1.6), (3.6, 1.6)])
-def test_a_stated_distortion_reaches_distances_in_every_corner(
+@pytest.mark.parametrize(("x_m", "y_m"), [(-3.6, -1.6), (3.6, 1.6)])
+def test_a_stated_distortion_reaches_distances_in_opposite_corners(
     tmp_path: Path, x_m: float, y_m: float
 ) -> None:
     lens = evlcp.load_link(overrides=["camera.k1=-0.25"])

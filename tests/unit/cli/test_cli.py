@@ -449,19 +449,6 @@ def test_receive_writes_positions(evlcp: Evlcp, street: Path, tmp_path: Path) ->
             assert abs(off) * metres < 0.15
 
 
-def test_a_wrong_heading_is_named(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
-    """The camera looks north, not 12 degrees beside it."""
-    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--heading-deg", "12")
-    done = evlcp("receive", street / "rec.raw", "-o", tmp_path, "--sites", street / "site.toml", *angles)
-    assert done.code == 0
-    (one,) = [w for w in summary_of(tmp_path)["warnings"] if w["code"] in ("misfit", "excluded")]
-    assert "heading" in one["text"]
-    assert "--heading-deg" in one["next_step"]
-    assert evlcp("receive", street / "rec.raw", "-o", tmp_path, "--strict").code == 0
-    done = evlcp("receive", street / "rec.raw", "-o", tmp_path, "--strict", "--set", "modulation.id=wh8")
-    assert (done.code, "warning: transmitter 0: " in done.out) == (1, True)
-
-
 def test_what_is_found_comes_as_lines(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
     angles = ("--pitch-deg", "4", "--roll-deg", "0", "--sites", street / "site.toml")
     done = evlcp("receive", street / "rec.raw", "-o", tmp_path, *angles, "--json-lines", "-")

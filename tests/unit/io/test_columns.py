@@ -206,9 +206,8 @@ def test_late_rows_are_sorted_in(events: Events, tmp_path: Path) -> None:
         assert not source.losses
 
 
-@pytest.mark.parametrize("times", ["whole", "fractions"])
-def test_rows_that_are_no_number_are_dropped_and_counted(times: str, events: Events, tmp_path: Path) -> None:
-    rows = TEXTS["blanks after commas" if times == "whole" else "times with a fraction"](events).splitlines()
+def test_rows_that_are_no_number_are_dropped_and_counted(events: Events, tmp_path: Path) -> None:
+    rows = TEXTS["times with a fraction"](events).splitlines()
     for number, row in ((50_000, "nan,1,2,1"), (70_000, "60470,,2,1"), (79_999, "60470,1,2,NaN")):
         rows.insert(number, row)
     (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")

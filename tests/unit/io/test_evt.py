@@ -272,30 +272,6 @@ def test_any_buffer_and_any_piece_give_the_same_events(tmp_path):
             assert all(np.array_equal(getattr(got, c), getattr(events, c)) for c in ("t_us", "x", "y", "p"))
 
 
-PRECISE = {
-    "low time after a rollover": [0x8FFF, 0x6005, 0x0001, 0x2001, 0x8000, 0x2002],
-    "low time after a glitch": [0x8005, 0x0001, 0x8004, 0x6005, 0x8003, 0x2002],
-    "a column after VECT_8": [0x8000, 0x0001, 0x3002, 0x5001, 0x4001, 0x5001, 0x4001],
-    "an event earlier than a trigger": [0x8001, 0x0001, 0x6009, 0xA101, 0x6008, 0x2001, 0x6009, 0x2002],
-    "a trigger earlier than an event": [0x8001, 0x0001, 0x6009, 0x2001, 0x6008, 0xA101, 0x6009, 0xA100],
-    "a loss behind a sparse vector": [0x8001, 0x0001, 0x3000, 0x4500, 0x4111, 0x5081, 0x2001, 0x2FFF, 0x2002],
-    "a loss within a vector": [0x8001, 0x0001, 0x3000 | 630, 0x4101, 0x4111, 0x5081, 0x2002],
-    "a column far beyond the edge": [0x8001, 0x0001, 0x3FFF, *[0x4FFF] * 400, 0x3001, 0x4FFF],
-    "a master bit beside the row": [0x8001, 0x0801, 0x2001],
-}
-
-
-@pytest.mark.parametrize("words", PRECISE.values(), ids=PRECISE.keys())
-def test_kernel_equals_its_twin_where_words_seldom_meet(words):
-    array = np.array(words, "<u2")
-    twin = TWINS["EVT3"](array.tobytes(), WIDTH, HEIGHT)
-    for splits in ([], range(len(words))):
-        events, triggers, decoder = decode("EVT3", array, splits)
-        assert rows(events, ("t_us", "x", "y", "p")) == twin.events
-        assert rows(triggers, ("t_us", "channel", "value")) == twin.triggers
-        assert {kind: (loss.count, loss.first) for kind, loss in decoder.losses.items()} == twin.losses
-
-
 def key(events):
     return ((events.t_us * WIDTH + events.x) * HEIGHT + events.y) * 2 + events.p
 

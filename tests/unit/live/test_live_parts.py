@@ -100,17 +100,6 @@ def test_a_picture_shows_what_each_pixel_did() -> None:
         assert (picture.cells == cells).all()
 
 
-def test_who_waits_for_a_picture_gets_a_new_one_or_none_at_the_end() -> None:
-    slot = PictureSlot()
-    assert slot.take(0.01) is None
-    threading.Timer(0.05, lambda: slot.add(events_at([5]), 1280, 720, [])).start()
-    picture = slot.take(5.0)
-    assert picture is not None
-    assert np.count_nonzero(picture.cells) == 1
-    slot.close()
-    assert slot.take(5.0) is None
-
-
 def test_what_is_shed_and_counted_is_what_lies_outside() -> None:
     events = events_at(np.arange(50_000, 54_000))
     regions = [Region(0, 0.0, 100.0, 200.0, 20.0, 60.0), Region(1, 0.0, 1270.0, 700.0, 20.0, 60.0)]

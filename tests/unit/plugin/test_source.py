@@ -70,13 +70,6 @@ def test_a_source_that_cannot_be_closed_is_named_unless_something_failed_before(
         raise InputError("the lens cap is on")
 
 
-def test_what_a_source_says_itself_is_left_as_it_is() -> None:
-    with pytest.raises(InputError, match=r"^the lens cap is on$"):
-        Strange(lambda: raises(InputError("the lens cap is on"))).read()
-    with pytest.raises(KeyboardInterrupt):
-        Strange(lambda: raises(KeyboardInterrupt())).read()
-
-
 def test_a_receiver_is_fed_polarities_only() -> None:
     receiver = Receiver(load_link())
     n = 5000

@@ -448,18 +448,6 @@ def test_a_text_comes_through_the_receiver_in_any_pieces() -> None:
     assert [repr(p) for p in again] == [repr(p) for p in packets]
 
 
-def test_characters_of_a_packet_that_is_joined_late_are_in_their_places() -> None:
-    link = _link(frames_per_packet=30)
-    rng = np.random.default_rng(8)
-    symbols = rng.integers(0, 128, (4, 30, 1))
-    chips = np.concatenate([packet_chips(one, link.codebook)[:, 0] for one in symbols])
-    events = seen(rng, chips.tolist(), 320.0, cut_bits=16 + 11 * 12.5)
-    packets, _ = _received(link, events, 1 << 16)
-    assert [[f.frame for f in p.frames] for p in packets] == [list(range(13, 30)), *[list(range(30))] * 3]
-    for packet, sent in zip(packets, symbols, strict=True):
-        assert [int(f.soft.symbols[0]) for f in packet.frames] == sent[packet.frames[0].frame :, 0].tolist()
-
-
 def test_a_list_without_places_is_received_by_the_command(tmp_path: Path) -> None:
     from evlcp_sdk.io.open import open_source
 
