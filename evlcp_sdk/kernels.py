@@ -82,16 +82,15 @@ def njit(function: Any = None, /, **options: Any) -> Any:
         function: What is compiled at its first call.
         options: Others of `numba.njit`.
     """
-
-    options = {"nogil": True, "error_model": "numpy"} | options
+    chosen: dict[str, Any] = {"nogil": True, "error_model": "numpy"} | options
 
     def compile_(given: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**options)(given)
+        kernel = numba.njit(**chosen)(given)
         # Numba finds no folder: RuntimeError.
         with suppress(RuntimeError):
             kernel.enable_caching()
             if shutil.disk_usage(kernel.stats.cache_path).free < _ROOM_BYTES:
-                kernel = numba.njit(**options)(given)
+                kernel = numba.njit(**chosen)(given)
         kernel.compile = COMPILING.watched(kernel.compile)
         return kernel
 
