@@ -91,6 +91,8 @@ def test_the_log_is_said_on_stderr(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_bar_says_how_much_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    # A dumb terminal has no bars.
+    monkeypatch.setenv("TERM", "xterm")
     said = StringIO()
     screen = Console(file=said, force_terminal=True, width=80)
     monkeypatch.setattr(_common, "shows_bars", lambda: True)
