@@ -5,22 +5,24 @@ are ready, in any order. The module imports nothing heavy: a fresh process sets 
 it meets the function's imports.
 """
 
-import multiprocessing
+from __future__ import annotations
+
 import os
 import signal
 from collections import deque
 from collections.abc import Callable, Generator, Iterable
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from multiprocessing.connection import Connection
 from threading import Thread
-from typing import Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, explained
+
+if TYPE_CHECKING:
+    from concurrent.futures import Future, ProcessPoolExecutor
+    from multiprocessing.connection import Connection
 
 __all__ = ["DaskCluster", "Executor", "Fault", "Inline", "Outcome", "Processes", "stop_workers"]
 
@@ -95,6 +97,10 @@ class Processes:
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
         """See `Executor.run`."""
+        import multiprocessing
+        from concurrent.futures import ProcessPoolExecutor
+        from concurrent.futures.process import BrokenProcessPool
+
         spawn = multiprocessing.get_context("spawn")
         leash, held = spawn.Pipe()
         # A pool is one process, so that its death is of one job.
@@ -158,6 +164,8 @@ class DaskCluster:
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
         """See `Executor.run`."""
+        from concurrent.futures import CancelledError
+
         client = self._client
         pool = client.get_executor(pure=False, retries=0)
 
@@ -183,6 +191,8 @@ class DaskCluster:
 
 def stop_workers() -> None:
     """Ask the jobs that run in processes of this one to stop, as a terminal's Ctrl-C does."""
+    import multiprocessing
+
     for process in multiprocessing.active_children():
         # It may have ended just now.
         with suppress(ProcessLookupError):
@@ -199,12 +209,14 @@ def _attempt(function: Callable[[J], R], job: J) -> Outcome[J, R]:
 
 
 def _run(
-    start: Callable[[J], "Future[Any]"],
+    start: Callable[[J], Future[Any]],
     room: Callable[[], int],
     died: type[Exception],
     jobs: Iterable[J],
 ) -> Generator[Outcome[J, Any], None, None]:
     """Keep as many jobs under way as there is room for; one whose worker dies is started again."""
+    from concurrent.futures import FIRST_COMPLETED, wait
+
     source = ((job, 1) for job in jobs)
     again: deque[tuple[J, int]] = deque()
     running: dict[Future[Any], tuple[J, int]] = {}
