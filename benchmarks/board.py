@@ -31,7 +31,7 @@ from firmware_host.errors import BoardError
 from firmware_host.images import FlashImage
 from firmware_host.ports.rom import RomLoader, flash_image
 from firmware_host.protocol.client import RequestOutcome, Timing
-from firmware_host.protocol.requests import CommitReply, CommitRequest, StatusReply, StatusRequest
+from firmware_host.protocol.generated.requests import CommitReply, CommitRequest, StatusReply, StatusRequest
 from firmware_host.protocol.wire import WireMessage
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

@@ -35,7 +35,7 @@ from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import VerifyError
 from firmware_host.ports.transport import TraceTransport, Transport
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import DEFAULT_BAUD
+from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
 __all__ = ["RECEIVED", "RECORDING", "EmulatedLight", "Step", "light_of", "loop"]
 

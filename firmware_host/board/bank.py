@@ -14,7 +14,7 @@ from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips, pilot_w
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_numbers
 from evlcp_sdk.link.resolve import Link
-from firmware_host.protocol.requests import CLUSTERS, LEDS, ROW_BYTES, Format
+from firmware_host.protocol.generated.requests import CLUSTERS, LEDS, ROW_BYTES, Format
 from firmware_host.protocol.rows import BOARD_LEDS, masks_of_clusters, rows_of_chips
 
 __all__ = [

@@ -18,8 +18,8 @@ from firmware_host.board.session import Session
 from firmware_host.board.stream import AHEAD, Stream
 from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
-from firmware_host.protocol.profiles import DIGESTS
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.profiles import DIGESTS
+from firmware_host.protocol.generated.requests import (
     CLUSTERS,
     KEY_BYTES,
     LEDS,

@@ -27,7 +27,7 @@ from firmware_host.board.symbols import read_symbols
 from firmware_host.emulators.opening import open_port
 from firmware_host.errors import FleetError, IncompatibleError
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import DEFAULT_BAUD, Watchdog
+from firmware_host.protocol.generated.requests import DEFAULT_BAUD, Watchdog
 
 __all__ = [
     "Entry",

@@ -5,7 +5,7 @@ from pathlib import Path
 
 from evlcp_sdk.errors import InputError, OutputError
 from evlcp_sdk.files import read_secret, write_new
-from firmware_host.protocol.requests import KEY_BYTES
+from firmware_host.protocol.generated.requests import KEY_BYTES
 from firmware_host.protocol.seal import key_name
 
 __all__ = ["make_board_key", "read_board_key"]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from firmware_host.board.board import Board
 from firmware_host.errors import BoardError, LineError, NoBoardError
-from firmware_host.protocol.requests import StatusReply, Watchdog
+from firmware_host.protocol.generated.requests import StatusReply, Watchdog
 
 __all__ = ["Back", "Gone", "Unheard", "watch"]
 

@@ -15,7 +15,7 @@ from firmware_host.errors import (
 )
 from firmware_host.ports.transport import Transport, on_network
 from firmware_host.protocol.client import TRIES, Client, RequestOutcome, Timing
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     MAJOR,
     MAX_PAYLOAD,
     MINOR,

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 from firmware_host.board.board import Board
 from firmware_host.errors import BoardError, LineError, RefusedError
-from firmware_host.protocol.requests import Capability, State, Status
+from firmware_host.protocol.generated.requests import Capability, State, Status
 
 __all__ = ["start_together", "wait_for_pulse"]
 

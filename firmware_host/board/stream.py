@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from firmware_host.board.session import Session
 from firmware_host.errors import BoardError, LineError
 from firmware_host.protocol.client import RequestOutcome
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     PushReply,
     PushRequest,
     State,

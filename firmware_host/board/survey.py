@@ -8,7 +8,7 @@ from firmware_host.errors import BoardError, NoBoardError
 from firmware_host.ports.transport import open_transport
 from firmware_host.ports.usb import SerialPort, UsbFilter, serial_ports
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import HelloReply
+from firmware_host.protocol.generated.requests import HelloReply
 
 __all__ = ["Found", "ask", "find", "survey"]
 

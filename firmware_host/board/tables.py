@@ -3,7 +3,7 @@
 from enum import Enum
 from typing import Any
 
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     NO_BANK,
     BoardFault,
     Capability,

@@ -16,7 +16,7 @@ from firmware_host.board.board import Board
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.images import FlashImage
 from firmware_host.protocol.client import RequestOutcome
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     Capability,
     Status,
     UpdateBeginReply,

@@ -194,7 +194,7 @@ def keep_alive(board: "Board") -> None:
     """Stay with a board until Ctrl-C; a line on stderr where its state or its faults change."""
     from evlcp_sdk.cli._complain import complain
     from firmware_host.board.tables import name_of, names_of_bits
-    from firmware_host.protocol.requests import BoardFault, State
+    from firmware_host.protocol.generated.requests import BoardFault, State
 
     status = board.status()
     with contextlib.suppress(KeyboardInterrupt):

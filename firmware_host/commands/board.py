@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     from firmware_host.board.board import Board
     from firmware_host.board.fleet import Entry, Result, Work
     from firmware_host.board.monitor import Back, Gone, Unheard
-    from firmware_host.protocol.requests import StatusReply
+    from firmware_host.protocol.generated.requests import StatusReply
 
 __all__ = ["app"]
 
@@ -202,7 +202,7 @@ def program(
         _program_fleet(inventory, verify, stay, as_json)
         return
     from firmware_host.board.board import Settings, provision
-    from firmware_host.protocol.requests import Watchdog
+    from firmware_host.protocol.generated.requests import Watchdog
 
     action = None if watchdog is None else Watchdog[watchdog.name]
     bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
@@ -278,7 +278,7 @@ def send(
     For example: [bold]evlcp board --port unix:/tmp/board send --random 4 --seed 7[/]
     """
     from firmware_host.errors import RefusedError
-    from firmware_host.protocol.requests import NO_BANK, Status
+    from firmware_host.protocol.generated.requests import NO_BANK, Status
 
     bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
     with open_board(context) as board, progress_bar("sending") as progress:
@@ -421,7 +421,7 @@ def watchdog(
     as_json: AsJson = False,
 ) -> None:
     """Choose what the board does when the host falls silent: keep playing, idle pattern, or dark."""
-    from firmware_host.protocol.requests import Watchdog
+    from firmware_host.protocol.generated.requests import Watchdog
 
     with open_board(context) as board:
         board.watchdog(Watchdog[action.name], after_ms)
@@ -509,7 +509,7 @@ def _watch_fleet(
 
     from firmware_host.board.fleet import board_of
     from firmware_host.board.monitor import watch
-    from firmware_host.protocol.requests import StatusReply
+    from firmware_host.protocol.generated.requests import StatusReply
 
     ended, printing = threading.Event(), threading.Lock()
 
@@ -538,7 +538,7 @@ def _print_seen(seen: StatusReply | Gone | Back | Unheard, which: dict[str, Any]
     from evlcp_sdk.cli._complain import complain
     from firmware_host.board.monitor import Back, Gone, Unheard
     from firmware_host.board.tables import name_of, status_table
-    from firmware_host.protocol.requests import State
+    from firmware_host.protocol.generated.requests import State
 
     name = which.get("id") or which["port"]
     if isinstance(seen, Gone):

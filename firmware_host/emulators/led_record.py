@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
-from firmware_host.protocol.requests import CHIP_DARK, CHIP_TEST, ROW_BYTES
+from firmware_host.protocol.generated.requests import CHIP_DARK, CHIP_TEST, ROW_BYTES
 from firmware_host.protocol.rows import BOARD_LEDS, chips_of_rows
 
 __all__ = ["RECORD", "LedRecord"]

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from firmware_host.emulators.processes import start_native, start_qemu
 from firmware_host.ports.transport import Transport, open_transport
-from firmware_host.protocol.requests import DEFAULT_BAUD
+from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
 __all__ = ["open_port"]
 

@@ -158,9 +158,7 @@ def _model(name: str) -> list[str]:
     Raises:
         ToolchainError: This is no checkout.
     """
-    root = Path(__file__).parents[2]
-    if not (root / "tests" / "models" / f"{name}.py").is_file():
-        raise ToolchainError("the model of the part comes with a checkout of the sources, not with a package")
+    root = build.test_folder().parent
     code = (
         f"import runpy, sys; sys.path.insert(0, {str(root)!r});"
         f" runpy.run_module('tests.models.{name}', run_name='__main__', alter_sys=True)"

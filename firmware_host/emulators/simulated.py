@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from firmware_host import build
 from firmware_host.emulators.led_record import RECORD, LedRecord
-from firmware_host.protocol.requests import DEFAULT_BAUD, LEDS, ROW_BYTES
+from firmware_host.protocol.generated.requests import DEFAULT_BAUD, LEDS, ROW_BYTES
 
 __all__ = ["SimulatedBoard", "SimulatedLine", "UsbLine"]
 

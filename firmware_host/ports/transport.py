@@ -19,7 +19,7 @@ from evlcp_sdk.files import open_log, output_fault
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.serial_port import SerialTransport
 from firmware_host.ports.usb import device_of
-from firmware_host.protocol.requests import DEFAULT_BAUD
+from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
 __all__ = [
     "ReplayTransport",

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 
 from firmware_host.errors import DatagramError
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     CRC_BYTES,
     HEADER_BYTES,
     MAX_PAYLOAD,
@@ -120,7 +120,7 @@ class Client:
         tries: How often a request is sent before it is given up.
         retries: Counts the requests sent again.
 
-    >>> from firmware_host.protocol.requests import StatusRequest
+    >>> from firmware_host.protocol.generated.requests import StatusRequest
     >>> client = Client(Timing())
     >>> token = client.submit(StatusRequest())
     >>> wire, deadline = client.poll(0.0)

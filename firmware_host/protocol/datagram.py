@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from cobs import cobs
 
 from firmware_host.errors import DatagramError
-from firmware_host.protocol.requests import CRC_BYTES, HEADER_BYTES, MAX_PAYLOAD
+from firmware_host.protocol.generated.requests import CRC_BYTES, HEADER_BYTES, MAX_PAYLOAD
 
 __all__ = ["MAX_WIRE_BYTES", "Counts", "Datagram", "DatagramDecoder"]
 

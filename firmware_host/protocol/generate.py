@@ -368,7 +368,7 @@ def profiles_module(profiles: Sequence[str]) -> str:
         [
             '"""Codebooks of the firmware; `python -m firmware_host.protocol.generate` writes this file."""',
             "",
-            "from firmware_host.protocol.requests import Profile",
+            "from firmware_host.protocol.generated.requests import Profile",
             "",
             '__all__ = ["DIGESTS"]',
             "",
@@ -417,8 +417,8 @@ def generated_files() -> dict[Path, str]:
     definition = tomllib.loads((HERE / "protocol" / "protocol.toml").read_text())
     generated = HERE / "firmware" / "generated"
     files = {
-        HERE / "protocol" / "requests.py": python_module(definition),
-        HERE / "protocol" / "profiles.py": profiles_module(profiles_of(definition)),
+        HERE / "protocol" / "generated" / "requests.py": python_module(definition),
+        HERE / "protocol" / "generated" / "profiles.py": profiles_module(profiles_of(definition)),
         generated / "protocol.h": c_header(definition),
         generated / "codebook.h": resolve({}).codebook.to_c(),
         generated / "profiles.h": profiles_header(profiles_of(definition)),

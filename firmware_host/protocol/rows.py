@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.errors import ConfigError
-from firmware_host.protocol.requests import CLUSTERS, LEDS, ROW_BYTES
+from firmware_host.protocol.generated.requests import CLUSTERS, LEDS, ROW_BYTES
 
 __all__ = ["BOARD_LEDS", "chips_of_rows", "masks_of_clusters", "rows_of_chips"]
 

@@ -15,7 +15,7 @@ import hmac
 import struct
 from dataclasses import dataclass
 
-from firmware_host.protocol.requests import KEY_NAME_BYTES, SEAL_BYTES, SEALED
+from firmware_host.protocol.generated.requests import KEY_NAME_BYTES, SEAL_BYTES, SEALED
 
 __all__ = ["Sealer", "key_name"]
 

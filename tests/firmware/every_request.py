@@ -5,7 +5,7 @@ import zlib
 from firmware_host.board.bank import Bank
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.errors import RefusedError
-from firmware_host.protocol import requests as r
+from firmware_host.protocol.generated import requests as r
 
 __all__ = ["every_request"]
 

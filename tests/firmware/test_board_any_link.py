@@ -23,7 +23,7 @@ from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import IncompatibleError, RefusedError
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     BoardFault,
     ChipsReply,
     ChipsRequest,

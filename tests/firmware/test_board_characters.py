@@ -20,7 +20,7 @@ from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import Watchdog
+from firmware_host.protocol.generated.requests import Watchdog
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -6,7 +6,7 @@ import pytest
 
 from firmware_host.protocol.client import TRIES, Client, Timing
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     MAX_PAYLOAD,
     CrcReply,
     CrcRequest,

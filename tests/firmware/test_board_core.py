@@ -9,6 +9,8 @@ import pytest
 
 from firmware_host import build
 
+TESTS = Path(__file__).parent / "c" / "Makefile"
+
 pytestmark = pytest.mark.usefixtures("compiler")
 
 
@@ -17,7 +19,7 @@ def run(*command: str, timeout: float = 300) -> "subprocess.CompletedProcess[str
 
 
 def make(folder: Path, *targets: str) -> "subprocess.CompletedProcess[str]":
-    return run("make", "-s", "-C", str(build.FIRMWARE), f"BUILD={folder}", *targets)
+    return run("make", "-s", "-C", str(build.FIRMWARE), "-f", str(TESTS), f"BUILD={folder}", *targets)
 
 
 def test_unit_tests_under_sanitizers(tmp_path: Path) -> None:

@@ -22,7 +22,7 @@ from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
-from firmware_host.protocol.requests import State
+from firmware_host.protocol.generated.requests import State
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

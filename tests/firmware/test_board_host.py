@@ -21,7 +21,7 @@ from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine, Usb
 from firmware_host.errors import NoBoardError, RefusedError, VerifyError
 from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import BoardFault, State, Status, Watchdog
+from firmware_host.protocol.generated.requests import BoardFault, State, Status, Watchdog
 from tests.conftest import Run
 
 pytestmark = pytest.mark.usefixtures("compiler")

@@ -18,7 +18,7 @@ from firmware_host.board.session import Session
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.transport import SocketTransport
-from firmware_host.protocol.requests import State, StatusReply
+from firmware_host.protocol.generated.requests import State, StatusReply
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -15,7 +15,7 @@ from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
-from firmware_host.protocol.requests import BoardFault, State, Status
+from firmware_host.protocol.generated.requests import BoardFault, State, Status
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -21,9 +21,9 @@ from firmware_host.board.session import Session
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import IncompatibleError
 from firmware_host.ports.transport import ReplayTransport
-from firmware_host.protocol import requests
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
+from firmware_host.protocol.generated import requests
 from firmware_host.protocol.wire import WireMessage
 
 VECTORS = Path(__file__).parents[1] / "vectors"

@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from firmware_host.errors import DatagramError
 from firmware_host.protocol import generate
-from firmware_host.protocol import requests as messages
 from firmware_host.protocol.datagram import MAX_WIRE_BYTES, Datagram, DatagramDecoder
+from firmware_host.protocol.generated import requests as messages
 from firmware_host.protocol.wire import WireMessage
 from tests.firmware.wire_vectors import read_vectors
 

@@ -21,7 +21,7 @@ from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.processes import bound, start_qemu
 from firmware_host.errors import RefusedError
 from firmware_host.ports.transport import SocketTransport
-from firmware_host.protocol.requests import BoardFault, State, StatusReply, StatusRequest
+from firmware_host.protocol.generated.requests import BoardFault, State, StatusReply, StatusRequest
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -16,7 +16,7 @@ from firmware_host.board.step import start_together, wait_for_pulse
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import LineError, RefusedError
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import BoardFault, State
+from firmware_host.protocol.generated.requests import BoardFault, State
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

@@ -17,7 +17,7 @@ from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import BoardFault, State
+from firmware_host.protocol.generated.requests import BoardFault, State
 
 pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
 from tests.models.stm32 import (

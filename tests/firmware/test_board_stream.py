@@ -19,7 +19,7 @@ from firmware_host.board.stream import Stream
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine, UsbLine
 from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError, VerifyError
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     BoardFault,
     Capability,
     Format,
@@ -129,7 +129,7 @@ def test_an_empty_queue_is_named_and_shows_the_idle_pattern() -> None:
 
 def board_of_status(stream: Stream) -> object:
     """STATUS in between; nothing of the stream is under way then."""
-    from firmware_host.protocol.requests import StatusReply, StatusRequest
+    from firmware_host.protocol.generated.requests import StatusReply, StatusRequest
 
     assert not stream._flight
     return stream._session.call(StatusRequest(), StatusReply)

@@ -23,7 +23,7 @@ from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     REPLY_BIT,
     BlankReply,
     BlankRequest,

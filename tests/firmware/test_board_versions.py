@@ -21,7 +21,7 @@ from firmware_host.board.board import Settings, provision
 from firmware_host.emulators import simulated
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol import generate
-from firmware_host.protocol.requests import MINOR, State
+from firmware_host.protocol.generated.requests import MINOR, State
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -79,7 +79,7 @@ from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import IncompatibleError
-from firmware_host.protocol import requests as r
+from firmware_host.protocol.generated import requests as r
 from firmware_host.protocol.client import Timing
 
 assert firmware_host.__file__.startswith(sys.argv[1]), firmware_host.__file__
@@ -101,7 +101,9 @@ except IncompatibleError as fault:
 def test_tomorrows_host_and_todays_firmware(definition: dict[str, Any], tmp_path: Path) -> None:
     package = Path(firmware_host.__file__).parent
     shutil.copytree(package, tmp_path / "firmware_host", ignore=shutil.ignore_patterns("__pycache__"))
-    (tmp_path / "firmware_host" / "protocol" / "requests.py").write_text(generate.python_module(definition))
+    (tmp_path / "firmware_host" / "protocol" / "generated" / "requests.py").write_text(
+        generate.python_module(definition)
+    )
     paths = [str(tmp_path), str(package.parent), str(package.parent / "plugins"), *sys.path]
     done = subprocess.run(
         [sys.executable, "-c", HOST, str(tmp_path)],

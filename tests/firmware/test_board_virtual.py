@@ -31,7 +31,7 @@ from firmware_host.errors import (
     VerifyError,
 )
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.requests import (
+from firmware_host.protocol.generated.requests import (
     MAJOR,
     MINOR,
     NO_BANK,

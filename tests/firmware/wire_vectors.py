@@ -11,7 +11,7 @@ from firmware_host.protocol.datagram import Datagram
 
 __all__ = ["VECTORS", "Vector", "read_vectors"]
 
-VECTORS = Path(__file__).parents[2] / "firmware_host" / "firmware" / "tests" / "wire-vectors.txt"
+VECTORS = Path(__file__).parents[1] / "vectors" / "wire-vectors.txt"
 """The file."""
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from firmware_host.emulators.listening import listener
-from firmware_host.protocol.requests import CHIP_DARK, LEDS
+from firmware_host.protocol.generated.requests import CHIP_DARK, LEDS
 from tests.models.stm32 import UNIT_HZ, Shown, Stm32
 
 __all__ = ["main", "records", "serve"]

@@ -1,6 +1,6 @@
 """Codebooks of the firmware; `python -m firmware_host.protocol.generate` writes this file."""
 
-from firmware_host.protocol.requests import Profile
+from firmware_host.protocol.generated.requests import Profile
 
 __all__ = ["DIGESTS"]
 

@@ -1,0 +1,1 @@
+"""What `firmware_host.protocol.generate` writes from `protocol.toml` and the codebook."""
