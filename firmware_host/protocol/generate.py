@@ -6,21 +6,23 @@
 import argparse
 import sys
 import tomllib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.link.resolve import resolve
 
-__all__ = ["Field", "codebook_of", "generated_files", "main"]
+__all__ = ["Field", "Message", "codebook_of", "generated_files", "main", "render"]
 
 HERE = Path(__file__).parents[1]
 
 _SIZES = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i16": 2}
 _CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i16": "h"}
-_C_TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "u64": "uint64_t", "i16": "int16_t"}
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,23 @@ class Field:
         return f"{self.count if self.count > 1 else ''}{_CODES[self.base]}"
 
     @property
+    def bits(self) -> int:
+        """Of an element."""
+        return 8 * _SIZES[self.base]
+
+    @property
+    def c_type(self) -> str:
+        """C type of an element."""
+        return (
+            f"{'int' if self.base[0] == 'i' else 'uint'}{self.bits}_t" if self.base in _SIZES else "uint8_t"
+        )
+
+    @property
+    def since_text(self) -> str:
+        """Its entry in `WireMessage.FIELD_SINCE`."""
+        return f'"{self.name}": {self.since}'
+
+    @property
     def python_type(self) -> str:
         """Annotation."""
         if self.base == "bytes":
@@ -82,6 +101,50 @@ class Field:
         return " = 0" if self.count == 1 else f" = (0,) * {self.count}"
 
 
+@dataclass(frozen=True)
+class Message:
+    """A request and its reply.
+
+    Attributes:
+        name: Its name.
+        type: Its number.
+        kind: session, query, data or control.
+        doc: Meaning.
+        request: Fields of the request.
+        reply: Fields of the reply.
+        since: Minor version that brought it.
+    """
+
+    name: str
+    type: int
+    kind: str
+    doc: str
+    request: list[Field]
+    reply: list[Field]
+    since: int = 0
+
+    @classmethod
+    def parse(cls, table: dict[str, Any]) -> "Message":
+        """Read one message of the definition."""
+        parts = {part: [Field.parse(f) for f in table[part]] for part in ("request", "reply")}
+        for fields in parts.values():
+            if [f.since for f in fields] != sorted(f.since for f in fields):
+                raise ValueError(f"message {table['name']}: a field with `since` stands before one without")
+            if any(f.since and not f.size for f in fields):
+                raise ValueError(f"message {table['name']}: a field of any length cannot come later")
+        return cls(**table | parts)
+
+    @property
+    def request_bytes(self) -> int:
+        """Of the request, data left out."""
+        return sum(f.size for f in self.request)
+
+    @property
+    def takes_more(self) -> bool:
+        """Whether a request may be longer; the board leaves alone what a later host adds to HELLO."""
+        return self.kind == "session" or any(not f.size for f in self.request)
+
+
 def profiles_of(definition: dict[str, Any]) -> list[str]:
     """The profiles that the firmware is built with: those of the definition but `custom`, by number."""
     return [name for name in definition["enums"]["profile"] if name not in ("doc", "custom")]
@@ -96,337 +159,100 @@ def codebook_of(profile: str) -> Codebook:
     return resolve({"modulation": {"id": profile}}).codebook
 
 
-def _messages(definition: dict[str, Any]) -> Iterator[tuple[dict[str, Any], list[Field], list[Field]]]:
-    for message in definition["message"]:
-        request = [Field.parse(f) for f in message["request"]]
-        reply = [Field.parse(f) for f in message["reply"]]
-        for fields in (request, reply):
-            if [f.since for f in fields] != sorted(f.since for f in fields):
-                raise ValueError(f"message {message['name']}: a field with `since` stands before one without")
-            if any(f.since and not f.size for f in fields):
-                raise ValueError(f"message {message['name']}: a field of any length cannot come later")
-        yield message, request, reply
-
-
 _CLASSES = {"fault": "BoardFault"}
 """Classes whose name is not that of their definition, which the SDK has for something else."""
+
+_NUMBERS = {
+    "protocol": ("header_bytes", "crc_bytes", "max_payload", "window", "default_baud"),
+    "geometry": ("clusters", "leds", "row_bytes"),
+}
+"""Numbers of the definition that are constants of the Python module."""
 
 
 def _camel(name: str) -> str:
     return _CLASSES.get(name) or "".join(part.capitalize() for part in name.split("_"))
 
 
-def python_module(definition: dict[str, Any]) -> str:
-    """The Python module of the messages."""
-    protocol, geometry = definition["protocol"], definition["geometry"]
-    names = ["HEADER_BYTES", "CRC_BYTES", "MAX_PAYLOAD", "WINDOW", "DEFAULT_BAUD", "MAJOR", "MINOR"]
-    names += ["CLUSTERS", "LEDS", "ROW_BYTES", "REPLIES", "Type"]
-    names += [name.upper() for name in definition["constants"]]
-    out = [
-        '"""Messages of the driver board; `python -m firmware_host.protocol.generate` writes this file."""',
-        "",
-        "from dataclasses import dataclass",
-        "from enum import IntEnum, IntFlag",
-        "from typing import ClassVar",
-        "",
-        "from firmware_host.protocol.wire import WireMessage",
-        "",
-        "@ALL@",
-        "",
-        f"MAJOR = {protocol['major']}",
-        '"""Version of the protocol: of another major one no message is understood."""',
-        f"MINOR = {protocol['minor']}",
-        '"""Version of the protocol: what it has beyond the major version\'s first."""',
-        f"HEADER_BYTES = {protocol['header_bytes']}",
-        f"CRC_BYTES = {protocol['crc_bytes']}",
-        f"MAX_PAYLOAD = {protocol['max_payload']}",
-        f"WINDOW = {protocol['window']}",
-        f"DEFAULT_BAUD = {protocol['default_baud']}",
-        f"CLUSTERS = {geometry['clusters']}",
-        f"LEDS = {geometry['leds']}",
-        f"ROW_BYTES = {geometry['row_bytes']}",
-    ]
-    for name, entry in definition["constants"].items():
-        out += [f"{name.upper()} = 0x{entry['value']:X}", f'"""{entry["doc"]}"""']
-    out += ["", "", "class Type(IntEnum):", '    """Requests."""', ""]
-    for message, _, _ in _messages(definition):
-        out.append(f"    {message['name'].upper()} = 0x{message['type']:02X}")
-    for name, table in definition["enums"].items():
-        base = "IntFlag" if name in ("capability", "fault") else "IntEnum"
-        out += ["", "", f"class {_camel(name)}({base}):", f'    """{table["doc"]}"""', ""]
-        names.append(_camel(name))
-        for key, entry in table.items():
-            if key != "doc":
-                out += [f"    {key.upper()} = {entry['value']}", f'    """{entry["doc"]}"""']
-    for message, request, reply in _messages(definition):
-        for kind, fields in (("Request", request), ("Reply", reply)):
-            cls = f"{_camel(message['name'])}{kind}"
-            names.append(cls)
-            verb = (
-                message["doc"]
-                if kind == "Request"
-                else f"What the board answers to {message['name'].upper()}."
-            )
-            out += ["", "", "@dataclass(frozen=True, slots=True)", f"class {cls}(WireMessage):"]
-            if fields:
-                out += [f'    """{verb}', "", "    Attributes:"]
-                out += [f"        {f.name}: {f.doc}" for f in fields]
-                out += ['    """', ""]
-            else:
-                out += [f'    """{verb}"""', ""]
-            out.append(f"    TYPE: ClassVar[int] = 0x{message['type']:02X}")
-            head, codes = "    LAYOUT: ClassVar[str] = ", f'"{" ".join(f.layout for f in fields)}"'
-            short = len(head + codes) <= 110
-            out += [head + codes] if short else [f"{head}(", f"        {codes}", "    )"]
-            if message.get("since", 0):
-                out.append(f"    SINCE: ClassVar[int] = {message['since']}")
-            later = [f'"{f.name}": {f.since}' for f in fields if f.since]
-            if later:
-                head = "    FIELD_SINCE: ClassVar[dict[str, int]] = {"
-                one = f"{head}{', '.join(later)}}}"
-                out += [one] if len(one) <= 110 else [head, *(f"        {row}," for row in later), "    }"]
-            if fields:
-                out.append("")
-            out += [f"    {f.name}: {f.python_type}{f.python_default}" for f in fields]
-    out += ["", "", "REPLIES: dict[int, type[WireMessage]] = {"]
-    out += [f"    0x{m['type']:02X}: {_camel(m['name'])}Reply," for m, _, _ in _messages(definition)]
-    out += ["}", '"""The reply of each request type."""', ""]
-    constants = sorted(n for n in names if n.isupper())
-    classes = sorted(n for n in names if not n.isupper())
-    listed = "__all__ = [\n" + "".join(f'    "{n}",\n' for n in constants + classes) + "]"
-    return "\n".join(out).replace("@ALL@", listed)
+def _with_offsets(fields: Sequence[Field]) -> list[tuple[Field, int]]:
+    return list(zip(fields, accumulate((f.size for f in fields), initial=0), strict=False))
 
 
-def _c_put(field: Field, at: int) -> list[str]:
-    if field.base == "bytes":
-        return [f"    evlcp_copy(p + {at}, m->{field.name}, {field.count}u);"]
-    size = _SIZES[field.base]
-    if field.count > 1:
-        return [
-            f"    for (uint32_t i = 0; i < {field.count}u; i++)",
-            f"        evlcp_put{8 * size}(p + {at} + {size}u * i, m->{field.name}[i]);",
-        ]
-    cast = f"(u{_C_TYPES[field.base]})" if field.base.startswith("i") else ""
-    return [f"    evlcp_put{8 * size}(p + {at}, {cast}m->{field.name});"]
-
-
-def _c_get(field: Field, at: int) -> list[str]:
-    if field.base == "bytes":
-        return [f"    evlcp_copy(m->{field.name}, p + {at}, {field.count}u);"]
-    size = _SIZES[field.base]
-    if field.count > 1:
-        return [
-            f"    for (uint32_t i = 0; i < {field.count}u; i++)",
-            f"        m->{field.name}[i] = evlcp_get{8 * size}(p + {at} + {size}u * i);",
-        ]
-    cast = f"({_C_TYPES[field.base]})" if field.base.startswith("i") else ""
-    return [f"    m->{field.name} = {cast}evlcp_get{8 * size}(p + {at});"]
-
-
-_C_HELPERS = """
-static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
-{
-    for (uint32_t i = 0; i < n; i++)
-        to[i] = from[i];
-}
-
-static inline void evlcp_put8(uint8_t *p, uint8_t v)
-{
-    p[0] = v;
-}
-
-static inline void evlcp_put16(uint8_t *p, uint16_t v)
-{
-    p[0] = (uint8_t)v;
-    p[1] = (uint8_t)(v >> 8);
-}
-
-static inline void evlcp_put32(uint8_t *p, uint32_t v)
-{
-    evlcp_put16(p, (uint16_t)v);
-    evlcp_put16(p + 2, (uint16_t)(v >> 16));
-}
-
-static inline uint8_t evlcp_get8(const uint8_t *p)
-{
-    return p[0];
-}
-
-static inline uint16_t evlcp_get16(const uint8_t *p)
-{
-    return (uint16_t)(p[0] | (uint16_t)(p[1] << 8));
-}
-
-static inline uint32_t evlcp_get32(const uint8_t *p)
-{
-    return evlcp_get16(p) | (uint32_t)evlcp_get16(p + 2) << 16;
-}
-"""
-
-
-def c_header(definition: dict[str, Any]) -> str:
-    """The C header of the messages: numbers, and for each message a struct, its size, put and get."""
-    protocol, geometry = definition["protocol"], definition["geometry"]
-    out = [
-        "/* Messages of the driver board; generated from protocol.toml, do not edit. */",
-        "#ifndef EVLCP_PROTOCOL_H",
-        "#define EVLCP_PROTOCOL_H",
-        "#include <stdint.h>",
-        "",
-        f"#define EVLCP_PROTOCOL_MAJOR {protocol['major']}u",
-        f"#define EVLCP_PROTOCOL_MINOR {protocol['minor']}u",
-        f"#define EVLCP_HEADER_BYTES {protocol['header_bytes']}u",
-        f"#define EVLCP_CRC_BYTES {protocol['crc_bytes']}u",
-        f"#define EVLCP_MAX_PAYLOAD {protocol['max_payload']}u",
-        f"#define EVLCP_WINDOW {protocol['window']}u",
-        f"#define EVLCP_BAUD {protocol['default_baud']}u",
-        f"#define EVLCP_BOARD_CLUSTERS {geometry['clusters']}u",
-        f"#define EVLCP_LEDS {geometry['leds']}u",
-        f"#define EVLCP_ROW_BYTES {geometry['row_bytes']}u",
-    ]
-    for name, entry in definition["constants"].items():
-        out.append(f"#define EVLCP_{name.upper()} 0x{entry['value']:x}u /* {entry['doc']} */")
-    out += ["", "enum evlcp_type {"]
-    out += [f"    EVLCP_TYPE_{m['name'].upper()} = 0x{m['type']:02x}," for m, _, _ in _messages(definition)]
-    out.append("};")
-    for name, table in definition["enums"].items():
-        out += ["", f"/* {table['doc']} */", f"enum evlcp_{name} {{"]
-        for key, entry in table.items():
-            if key != "doc":
-                out.append(f"    EVLCP_{name.upper()}_{key.upper()} = {entry['value']}, /* {entry['doc']} */")
-        out.append("};")
-    out.append(_C_HELPERS.rstrip())
-    for message, request, reply in _messages(definition):
-        for kind, fields in (("request", request), ("reply", reply)):
-            name = f"evlcp_{message['name']}_{kind}"
-            size = sum(f.size for f in fields)
-            out += ["", f"#define {name.upper()}_BYTES {size}u"]
-            fixed = [f for f in fields if f.size]
-            if not fixed:
-                continue
-            out += [f"/* {message['doc']} */" if kind == "request" else f"/* Answer to {message['name']}. */"]
-            out.append(f"struct {name} {{")
-            for f in fixed:
-                c_type = _C_TYPES.get(f.base, "uint8_t")
-                many = f"[{f.count}]" if f.count > 1 or f.base == "bytes" else ""
-                out.append(f"    {c_type} {f.name}{many}; /* {f.doc} */")
-            out.append("};")
-            for verb, step, signature in (
-                ("put", _c_put, f"uint8_t *p, const struct {name} *m"),
-                ("get", _c_get, f"const uint8_t *p, struct {name} *m"),
-            ):
-                out += ["", f"static inline void {name}_{verb}({signature})", "{"]
-                at = 0
-                for f in fixed:
-                    out += step(f, at)
-                    at += f.size
-                out.append("}")
-    sizes = {m["name"]: sum(f.size for f in request) for m, request, _ in _messages(definition)}
-    out += [
-        "",
-        f"#define EVLCP_REQUEST_MOST {max(sizes.values())}u /* longest request, data left out */",
-        "",
-        "/* Requests: type, whether control, whether a query, whether any length may follow, and the length,",
-        "   that of the first minor version and today's; a shorter one goes on with zeros. */",
-        "#define EVLCP_SHAPES \\",
-    ]
+def _fields_table(message: Message, major: int) -> str:
     rows = []
-    for message, request, _ in _messages(definition):
-        least = sum(f.size for f in request if not f.since)
-        control, query = (str(message["kind"] == kind).lower() for kind in ("control", "query"))
-        # what a later host adds to HELLO is for the board to leave alone
-        more = "true" if message["kind"] == "session" or any(not f.size for f in request) else "false"
-        rows.append(
-            f"    {{0x{message['type']:02x}u, {control}, {query}, {more}, {least}u,"
-            f" {sizes[message['name']]}u}}"
-        )
-    out += [", \\\n".join(rows), "", "#endif", ""]
-    return "\n".join(out)
+    for kind, fields in (("request", message.request), ("reply", message.reply)):
+        for f in fields:
+            many = f"[{f.count}]" if f.count > 1 else "" if f.size else " to the end"
+            later = f" Since {major}.{f.since}." if f.since else ""
+            rows.append(("" if f is not fields[0] else kind, f.name, f"{f.base}{many}", f"{f.doc}{later}"))
+    return _columns(rows)
 
 
-def profiles_header(profiles: Sequence[str]) -> str:
-    """The C header of the codebook digests that the firmware knows."""
-    out = [
-        "/* Codebook digests of the built-in profiles; generated, do not edit. */",
-        "#ifndef EVLCP_PROFILES_H",
-        "#define EVLCP_PROFILES_H",
-        "#include <stdint.h>",
-        f"#define EVLCP_PROFILES {len(profiles)}u",
-        f"static const uint8_t evlcp_profile_digests[{len(profiles)}][32] = {{",
+def _numbers_table(enum: dict[str, Any]) -> str:
+    return _columns([(str(e["value"]), k.upper(), e["doc"]) for k, e in enum.items() if k != "doc"])
+
+
+_TEMPLATES = Environment(
+    loader=PackageLoader("firmware_host.protocol"),
+    undefined=StrictUndefined,
+    trim_blocks=True,
+    lstrip_blocks=True,
+    keep_trailing_newline=True,
+)
+_TEMPLATES.filters |= {
+    "camel": _camel,
+    "with_offsets": _with_offsets,
+    "fields_table": _fields_table,
+    "numbers_table": _numbers_table,
+}
+
+
+def render(template: str, definition: dict[str, Any]) -> str:
+    """A generated file: `requests.py`, `profiles.py`, `protocol.h`, `profiles.h` or `protocol.md`.
+
+    Raises:
+        ValueError: The definition contradicts itself.
+    """
+    messages = [Message.parse(table) for table in definition["message"]]
+    numbers = [(key.upper(), definition[part][key]) for part, keys in _NUMBERS.items() for key in keys]
+    constants = [
+        "MAJOR",
+        "MINOR",
+        "REPLIES",
+        *(n for n, _ in numbers),
+        *map(str.upper, definition["constants"]),
     ]
-    for profile in profiles:
-        digest = bytes.fromhex(codebook_of(profile).digest)
-        rows = [", ".join(f"0x{b:02x}u" for b in digest[i : i + 16]) for i in (0, 16)]
-        out.append(f"    /* {profile} */\n    {{{rows[0]},\n     {rows[1]}}},")
-    return "\n".join([*out, "};", "#endif", ""])
-
-
-def profiles_module(profiles: Sequence[str]) -> str:
-    """The Python module of the same digests."""
-    rows = [f'    Profile.{p.upper()}: "{codebook_of(p).digest}",' for p in profiles]
-    return "\n".join(
-        [
-            '"""Codebooks of the firmware; `python -m firmware_host.protocol.generate` writes this file."""',
-            "",
-            "from firmware_host.protocol.generated.requests import Profile",
-            "",
-            '__all__ = ["DIGESTS"]',
-            "",
-            "DIGESTS = {",
-            *rows,
-            "}",
-            '"""Digest of each profile\'s codebook, 64 hex digits."""',
-            "",
-        ]
+    classes = ["Type", *map(_camel, definition["enums"])]
+    classes += [f"{_camel(m.name)}{kind}" for m in messages for kind in ("Request", "Reply")]
+    return _TEMPLATES.get_template(f"{template}.j2").render(
+        definition,
+        messages=messages,
+        numbers=numbers,
+        exported=sorted(constants) + sorted(classes),
+        digests={profile: codebook_of(profile).digest for profile in profiles_of(definition)},
     )
+
+
+def _columns(rows: Sequence[tuple[str, ...]]) -> str:
+    """A fenced block of left-aligned columns."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = ("  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows)
+    return "\n".join(["```text", *lines, "```"])
 
 
 _MARK = "<!-- What follows is generated from protocol.toml by firmware_host.protocol.generate. -->\n"
 
 
-def markdown(definition: dict[str, Any]) -> str:
-    """The messages and numbers as Markdown, their fields and values as columns."""
-    out = ["", "## Messages"]
-    for m, request, reply in _messages(definition):
-        out += ["", f"### {m['name'].upper()}", "", f"0x{m['type']:02x}, {m['kind']}. {m['doc']}"]
-        rows = []
-        for kind, fields in (("request", request), ("reply", reply)):
-            for f in fields:
-                many = f"[{f.count}]" if f.count > 1 else ""
-                rest = " to the end" if f.base == "bytes" and not f.count else ""
-                later = f" Since {definition['protocol']['major']}.{f.since}." if f.since else ""
-                first = "" if f is not fields[0] else kind
-                rows.append((first, f.name, f"{f.base}{many}{rest}", f"{f.doc}{later}"))
-        if rows:
-            out += ["", *_columns(rows)]
-    for name, table in definition["enums"].items():
-        out += ["", f"## Numbers of {name}", "", table["doc"], ""]
-        out += _columns([(str(e["value"]), k.upper(), e["doc"]) for k, e in table.items() if k != "doc"])
-    return "\n".join([*out, ""])
-
-
-def _columns(rows: Sequence[tuple[str, ...]]) -> list[str]:
-    """A fenced block of left-aligned columns."""
-    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    lines = ("  ".join(text.ljust(w) for text, w in zip(row, widths, strict=True)).rstrip() for row in rows)
-    return ["```text", *lines, "```"]
-
-
 def generated_files() -> dict[Path, str]:
     """Every generated file and what it should hold."""
     definition = tomllib.loads((HERE / "protocol" / "protocol.toml").read_text())
-    generated = HERE / "firmware" / "generated"
-    files = {
-        HERE / "protocol" / "generated" / "requests.py": python_module(definition),
-        HERE / "protocol" / "generated" / "profiles.py": profiles_module(profiles_of(definition)),
-        generated / "protocol.h": c_header(definition),
-        generated / "codebook.h": resolve({}).codebook.to_c(),
-        generated / "profiles.h": profiles_header(profiles_of(definition)),
-    }
+    headers, modules = HERE / "firmware" / "generated", HERE / "protocol" / "generated"
+    places = {"requests.py": modules, "profiles.py": modules, "protocol.h": headers, "profiles.h": headers}
+    files = {folder / name: render(name, definition) for name, folder in places.items()}
+    files[headers / "codebook.h"] = resolve({}).codebook.to_c()
     page = HERE.parent / "docs" / "protocol.md"
     if page.exists():  # in a checkout; an installed package has no docs
         head = page.read_text().partition(_MARK)[0]
-        files[page] = head + _MARK + markdown(definition)
+        files[page] = head + _MARK + render("protocol.md", definition)
     return files
 
 

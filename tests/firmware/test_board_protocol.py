@@ -47,11 +47,11 @@ def test_what_comes_later_stands_at_the_end() -> None:
     table = definition()
     table["message"][1]["request"][0]["since"] = 1
     with pytest.raises(ValueError, match="configure: a field with `since` stands before one without"):
-        generate.c_header(table)
+        generate.render("protocol.h", table)
     table = definition()
     table["message"][3]["request"][-1]["since"] = 1
     with pytest.raises(ValueError, match="write: a field of any length"):
-        generate.python_module(table)
+        generate.render("requests.py", table)
 
 
 def test_types_and_names_are_unique() -> None:

@@ -51,7 +51,7 @@ def test_todays_host_and_tomorrows_firmware(
 ) -> None:
     tree = tmp_path / "firmware"
     shutil.copytree(build.FIRMWARE, tree)
-    (tree / "generated" / "protocol.h").write_text(generate.c_header(definition))
+    (tree / "generated" / "protocol.h").write_text(generate.render("protocol.h", definition))
     done = subprocess.run(["make", "-s", "-C", str(tree), f"BUILD={tmp_path}", "library"], check=False)
     assert done.returncode == 0
     monkeypatch.setattr(build, "native_library", lambda: tmp_path / "libevlcp-board.so")
@@ -102,7 +102,7 @@ def test_tomorrows_host_and_todays_firmware(definition: dict[str, Any], tmp_path
     package = Path(firmware_host.__file__).parent
     shutil.copytree(package, tmp_path / "firmware_host", ignore=shutil.ignore_patterns("__pycache__"))
     (tmp_path / "firmware_host" / "protocol" / "generated" / "requests.py").write_text(
-        generate.python_module(definition)
+        generate.render("requests.py", definition)
     )
     paths = [str(tmp_path), str(package.parent), str(package.parent / "plugins"), *sys.path]
     done = subprocess.run(
