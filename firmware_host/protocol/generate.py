@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.link.resolve import resolve
 
-__all__ = ["Field", "Message", "codebook_of", "generated_files", "main", "render"]
+__all__ = ["Field", "Exchange", "codebook_of", "generated_files", "main", "render"]
 
 HERE = Path(__file__).parents[1]
 
@@ -102,7 +102,7 @@ class Field:
 
 
 @dataclass(frozen=True)
-class Message:
+class Exchange:
     """A request and its reply.
 
     Attributes:
@@ -124,7 +124,7 @@ class Message:
     since: int = 0
 
     @classmethod
-    def parse(cls, table: dict[str, Any]) -> "Message":
+    def parse(cls, table: dict[str, Any]) -> "Exchange":
         """Read one message of the definition."""
         parts = {part: [Field.parse(f) for f in table[part]] for part in ("request", "reply")}
         for fields in parts.values():
@@ -177,7 +177,7 @@ def _with_offsets(fields: Sequence[Field]) -> list[tuple[Field, int]]:
     return list(zip(fields, accumulate((f.size for f in fields), initial=0), strict=False))
 
 
-def _fields_table(message: Message, major: int) -> str:
+def _fields_table(message: Exchange, major: int) -> str:
     rows = []
     for kind, fields in (("request", message.request), ("reply", message.reply)):
         for f in fields:
@@ -212,7 +212,7 @@ def render(template: str, definition: dict[str, Any]) -> str:
     Raises:
         ValueError: The definition contradicts itself.
     """
-    messages = [Message.parse(table) for table in definition["message"]]
+    messages = [Exchange.parse(table) for table in definition["message"]]
     numbers = [(key.upper(), definition[part][key]) for part, keys in _NUMBERS.items() for key in keys]
     constants = [
         "MAJOR",
