@@ -17,7 +17,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.link.resolve import resolve
 
-__all__ = ["Field", "Exchange", "codebook_of", "generated_files", "main", "render"]
+__all__ = ["Exchange", "Field", "codebook_of", "generated_files", "main", "render"]
 
 HERE = Path(__file__).parents[1]
 
