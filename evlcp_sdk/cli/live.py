@@ -4,59 +4,112 @@ from __future__ import annotations
 
 import threading
 from contextlib import contextmanager
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFiles, Overrides, complain, console, echo, loaded
-from evlcp_sdk.cli._receiving import (
-    AttitudeFile,
-    ClockZero,
-    Figures,
-    Gnss,
-    GravitySigmaDeg,
-    HeadingDeg,
-    HeadingSigmaDeg,
-    Mcap,
-    Parquet,
-    PitchDeg,
-    Pps,
-    Report,
-    RollDeg,
-    SinkNames,
-    Sites,
-    TimeSigmaUs,
-    WhiteSigmaDeg,
-    attitude_of,
-    clock_of,
-    clock_zero_of,
-    json_lines_of,
-    plan_of,
-    say_alike,
-    sinks_of,
-)
+from evlcp_sdk.cli._common import complain, console, echo
+from evlcp_sdk.cli._groups import with_groups
+from evlcp_sdk.cli._receiving import CameraOptions, FormatOptions, LinkOptions, json_lines_of
 from evlcp_sdk.cli._summary import delays_text, show
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
+    from evlcp_sdk.cli._receiving import LinePrinter
     from evlcp_sdk.live.loop import LiveStatus
     from evlcp_sdk.live.outlet import Outlet
-    from evlcp_sdk.live.services import Services
+    from evlcp_sdk.live.services import Services, Serving
 
 __all__ = ["register"]
 
 _HERE = "127.0.0.1"
 
 
+@dataclass(frozen=True)
+class ServingOptions:
+    """What is served beside the results."""
+
+    view: Annotated[
+        bool, typer.Option("--view", help="Serve a page to look on in a browser; its address is printed.")
+    ] = False
+    view_host: Annotated[
+        str,
+        typer.Option(
+            "--view-host",
+            metavar="ADDRESS",
+            help="Where the page is served: 0.0.0.0 for other machines, too, such as a phone.",
+        ),
+    ] = _HERE
+    view_port: Annotated[
+        int,
+        typer.Option("--view-port", min=0, max=65535, metavar="PORT", help="Its port; 0: any that is free."),
+    ] = 0
+    view_apart: Annotated[
+        bool,
+        typer.Option(
+            "--view-apart", help="The page is served by a process of its own, which costs the receiver less."
+        ),
+    ] = False
+    view_record: Annotated[
+        bool,
+        typer.Option(
+            "--view-record", help="Who looks on may start and stop recordings, into OUT or this folder."
+        ),
+    ] = False
+    nmea_port: Annotated[
+        int | None,
+        typer.Option(
+            "--nmea-port", min=0, max=65535, metavar="PORT", help="Serve positions as NMEA-0183 by TCP."
+        ),
+    ] = None
+    gpsd_port: Annotated[
+        int | None,
+        typer.Option(
+            "--gpsd-port",
+            min=0,
+            max=65535,
+            metavar="PORT",
+            help="Serve positions as gpsd does, whose usual port is 2947.",
+        ),
+    ] = None
+
+    def chosen(self, out: Path | None, *, positions: bool) -> Serving:
+        """What to serve; recordings go into `out`, or this folder."""
+        from evlcp_sdk.live.services import Serving
+
+        for name, port in (("--nmea-port", self.nmea_port), ("--gpsd-port", self.gpsd_port)):
+            if port is not None and not positions:
+                raise typer.BadParameter("needs --sites", param_hint=name)
+        for name, changed in (
+            ("--view-host", self.view_host != _HERE),
+            ("--view-port", self.view_port != 0),
+            ("--view-apart", self.view_apart),
+            ("--view-record", self.view_record),
+        ):
+            if changed and not self.view:
+                raise typer.BadParameter("needs --view", param_hint=name)
+        return Serving(
+            self.view,
+            self.view_apart,
+            self.view_host,
+            self.view_port,
+            (out or Path.cwd()) if self.view_record else None,
+            self.nmea_port,
+            self.gpsd_port,
+        )
+
+
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("live")(live)
+    app.command("live")(with_groups(live))
 
 
 def live(
+    *,
     url: Annotated[
         str,
         typer.Argument(
@@ -71,8 +124,7 @@ def live(
             "-o", "--out", metavar="OUT", help="Also write a result, as receive does, into a folder."
         ),
     ] = None,
-    link_files: LinkFiles = None,
-    overrides: Overrides = None,
+    link: LinkOptions,
     json_lines: Annotated[
         str | None,
         typer.Option(
@@ -82,23 +134,8 @@ def live(
         ),
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="The summary as one line of JSON.")] = False,
-    figures: Figures = False,
-    report: Report = False,
-    parquet: Parquet = False,
-    sites: Sites = None,
-    attitude_file: AttitudeFile = None,
-    gnss: Gnss = None,
-    heading_deg: HeadingDeg = None,
-    pitch_deg: PitchDeg = None,
-    roll_deg: RollDeg = None,
-    heading_sigma_deg: HeadingSigmaDeg = 0.5,
-    gravity_sigma_deg: GravitySigmaDeg = None,
-    white_sigma_deg: WhiteSigmaDeg = 0.0,
-    time_sigma_us: TimeSigmaUs = 0.0,
-    clock_zero: ClockZero = None,
-    pps: Pps = None,
-    mcap: Mcap = False,
-    sinks: SinkNames = None,
+    formats: FormatOptions,
+    camera: CameraOptions,
     reconnect: Annotated[
         bool,
         typer.Option("--reconnect", help="Go on when a camera that was unplugged, or a stream, is back."),
@@ -109,49 +146,7 @@ def live(
             "--waiting-ms", min=1.0, help="How long events may wait before something is left out, in ms."
         ),
     ] = 20.0,
-    view: Annotated[
-        bool, typer.Option("--view", help="Serve a page to look on in a browser; its address is printed.")
-    ] = False,
-    view_host: Annotated[
-        str,
-        typer.Option(
-            "--view-host",
-            metavar="ADDRESS",
-            help="Where the page is served: 0.0.0.0 for other machines, too, such as a phone.",
-        ),
-    ] = _HERE,
-    view_port: Annotated[
-        int,
-        typer.Option("--view-port", min=0, max=65535, metavar="PORT", help="Its port; 0: any that is free."),
-    ] = 0,
-    view_apart: Annotated[
-        bool,
-        typer.Option(
-            "--view-apart", help="The page is served by a process of its own, which costs the receiver less."
-        ),
-    ] = False,
-    view_record: Annotated[
-        bool,
-        typer.Option(
-            "--view-record", help="Who looks on may start and stop recordings, into OUT or this folder."
-        ),
-    ] = False,
-    nmea_port: Annotated[
-        int | None,
-        typer.Option(
-            "--nmea-port", min=0, max=65535, metavar="PORT", help="Serve positions as NMEA-0183 by TCP."
-        ),
-    ] = None,
-    gpsd_port: Annotated[
-        int | None,
-        typer.Option(
-            "--gpsd-port",
-            min=0,
-            max=65535,
-            metavar="PORT",
-            help="Serve positions as gpsd does, whose usual port is 2947.",
-        ),
-    ] = None,
+    serving: ServingOptions,
 ) -> None:
     """Receive in real time: results as they come, delays measured.
 
@@ -186,52 +181,28 @@ def live(
     Where the receiver cannot keep up, it leaves out, in this order, and counts: rows outside of regions, the
     distances of most frames, all outside of regions, the oldest events. Ctrl-C ends it, with its summary.
     """
-    import json
-
     from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
     from evlcp_sdk.io.open import open_source
     from evlcp_sdk.io.reconnect import ReconnectingSource
-    from evlcp_sdk.link.several import load_links, named_links
+    from evlcp_sdk.link.several import named_links
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.outlet import Outlet
-    from evlcp_sdk.live.services import Services, Serving
+    from evlcp_sdk.live.services import Services
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
     from evlcp_sdk.run import stop_on_request
 
     lines = json_lines_of(json_lines, [url], as_json=as_json)
     registry = Registry.load()
-    links = load_links(link_files, overrides or [], registry)
-    say_alike(links)
-    loaded()
-    sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
-    attitude = attitude_of(attitude_file, (heading_deg, pitch_deg, roll_deg), sigmas)
-    zero = clock_zero_of(clock_zero)
-    clock = clock_of(pps, zero)
-    plan = plan_of(sites, gnss, links, zero, mcap=mcap)
-    short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
-    asked = sinks_of(registry, short, sinks, out, positions=plan is not None)
-    for name, given in (("--nmea-port", nmea_port), ("--gpsd-port", gpsd_port)):
-        if given is not None and plan is None:
-            raise typer.BadParameter("needs --sites", param_hint=name)
-    for name, changed in (
-        ("--view-host", view_host != _HERE),
-        ("--view-port", view_port != 0),
-        ("--view-apart", view_apart),
-        ("--view-record", view_record),
-    ):
-        if changed and not view:
-            raise typer.BadParameter("needs --view", param_hint=name)
-    record_to = (Path.cwd() if out is None else out) if view_record else None
-    serving = Serving(view, view_apart, view_host, view_port, record_to, nmea_port, gpsd_port)
-    outlet = Outlet()
+    links = link.load(registry)
+    plan = camera.plan(links, mcap=formats.mcap)
+    clock = camera.clock()
+    chosen = serving.chosen(out, positions=plan is not None)
+    sinks = formats.names(registry, out, positions=plan is not None)
+    attitude, outlet = camera.attitude(), Outlet()
+    sites = plan.sites if plan is not None else ()
     services = Services(
-        serving,
-        outlet,
-        named_links(links),
-        name=Path(url).name,
-        sites=plan.sites if plan is not None else (),
-        clock_zero=clock,
+        chosen, outlet, named_links(links), name=Path(url).name, sites=sites, clock_zero=clock
     )
     with stop_on_request() as stopped, services, _going_on(outlet, silent=lines is not None):
         _say_where(services)
@@ -244,7 +215,7 @@ def live(
             plan=plan,
             attitude=attitude,
             clock_zero=clock,
-            sinks=asked,
+            sinks=sinks,
             lines=lines,
             outlet=outlet,
             pictures=services.pictures,
@@ -253,18 +224,27 @@ def live(
         )
         if services.fault:
             complain(services.fault)
-        if lines is not None:
-            lines(json.dumps({"line": "summary"} | summary))
-        elif as_json:
-            echo(json.dumps(summary))
-        else:
-            show(summary, out, stderr=False)
-        if summary["status"] in ("failed", "degraded"):
-            complain(summary["error"])
+        _print_summary(summary, out, lines, as_json=as_json)
         if stopped() and out is not None:
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")
     fault = UnpluggedError if summary["live"]["unplugged"] else InputError
     raise typer.Exit(fault.exit_code if summary["status"] == "failed" else 0)
+
+
+def _print_summary(
+    summary: dict[str, Any], out: Path | None, lines: LinePrinter | None, *, as_json: bool
+) -> None:
+    """Say how it ended, where that was asked for."""
+    import json
+
+    if lines is not None:
+        lines(json.dumps({"line": "summary"} | summary))
+    elif as_json:
+        echo(json.dumps(summary))
+    else:
+        show(summary, out, stderr=False)
+    if summary["status"] in ("failed", "degraded"):
+        complain(summary["error"])
 
 
 @contextmanager

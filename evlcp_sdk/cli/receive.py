@@ -14,44 +14,16 @@ import typer
 
 from evlcp_sdk.cli._common import (
     Dask,
-    LinkFiles,
-    Overrides,
     bytes_bar,
     complain,
     console,
     echo,
     hush,
-    loaded,
     make_executor,
     shows_bars,
 )
-from evlcp_sdk.cli._receiving import (
-    AttitudeFile,
-    ClockZero,
-    Figures,
-    Gnss,
-    GravitySigmaDeg,
-    HeadingDeg,
-    HeadingSigmaDeg,
-    LinePrinter,
-    Mcap,
-    Parquet,
-    PitchDeg,
-    Pps,
-    Report,
-    RollDeg,
-    SinkNames,
-    Sites,
-    TimeSigmaUs,
-    WhiteSigmaDeg,
-    attitude_of,
-    clock_of,
-    clock_zero_of,
-    json_lines_of,
-    plan_of,
-    say_alike,
-    sinks_of,
-)
+from evlcp_sdk.cli._groups import with_groups
+from evlcp_sdk.cli._receiving import CameraOptions, FormatOptions, LinePrinter, LinkOptions, json_lines_of
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
@@ -63,6 +35,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.signals import EndRequest
+    from evlcp_sdk.study.jobs import Executor, Outcome
 
 __all__ = ["register"]
 
@@ -85,10 +58,11 @@ class ReceiveJob:
 
 def register(app: typer.Typer) -> None:
     """Add the command."""
-    app.command("receive")(receive)
+    app.command("receive")(with_groups(receive))
 
 
 def receive(
+    *,
     recordings: Annotated[
         list[str],
         typer.Argument(
@@ -99,8 +73,7 @@ def receive(
         Path | None,
         typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be."),
     ] = None,
-    link_files: LinkFiles = None,
-    overrides: Overrides = None,
+    link: LinkOptions,
     link_mode: Annotated[
         LinkMode,
         typer.Option(
@@ -118,27 +91,12 @@ def receive(
             help="Frames, messages and fixes as lines of JSON on stdout as they come; OUT may be left out.",
         ),
     ] = None,
-    figures: Figures = False,
-    report: Report = False,
-    parquet: Parquet = False,
+    formats: FormatOptions,
     workers: Annotated[
         int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
     ] = 0,
     dask: Dask = None,
-    sites: Sites = None,
-    attitude_file: AttitudeFile = None,
-    gnss: Gnss = None,
-    heading_deg: HeadingDeg = None,
-    pitch_deg: PitchDeg = None,
-    roll_deg: RollDeg = None,
-    heading_sigma_deg: HeadingSigmaDeg = 0.5,
-    gravity_sigma_deg: GravitySigmaDeg = None,
-    white_sigma_deg: WhiteSigmaDeg = 0.0,
-    time_sigma_us: TimeSigmaUs = 0.0,
-    clock_zero: ClockZero = None,
-    pps: Pps = None,
-    mcap: Mcap = False,
-    sinks: SinkNames = None,
+    camera: CameraOptions,
 ) -> None:
     """Decode recordings: symbols and distances into OUT.
 
@@ -177,88 +135,113 @@ def receive(
     --parquet and --mcap are short for --sink figures, report, parquet and mcap; plugins bring other formats.
     An earlier result there is replaced when the new one is complete.
     """
-    import json
-
-    from evlcp_sdk.link.several import load_links
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.run import stop_on_request
 
     lines = json_lines_of(json_lines, recordings, as_json=as_json)
     jobs = _jobs(recordings, out, lines)
     registry = Registry.load()
-    links = load_links(link_files, overrides or [], registry)
-    say_alike(links)
-    loaded()
+    links = link.load(registry)
     if link_mode is LinkMode.AUTO:
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
         jobs = [_fitted(job, links[0], registry) for job in jobs]
-    sigmas = (gravity_sigma_deg, heading_sigma_deg, white_sigma_deg, time_sigma_us)
-    attitude = attitude_of(attitude_file, (heading_deg, pitch_deg, roll_deg), sigmas)
-    zero = clock_zero_of(clock_zero)
-    plan = plan_of(sites, gnss, links, zero, mcap=mcap)
-    short = {"figures": figures, "report": report, "parquet": parquet, "mcap": mcap}
-    asked = sinks_of(registry, short, sinks, out, positions=plan is not None)
+    plan = camera.plan(links, mcap=formats.mcap)
+    decode = DecodeJob(
+        links, plan, camera.attitude(), camera.zero(), camera.pps,
+        formats.names(registry, out, positions=plan is not None), lines,
+    )  # fmt: skip
     here = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not here:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
     executor = make_executor(0 if here else workers or None, dask)
-    worst, degraded, warned = 0, False, False
-    interrupted: list[Path | None] = []
+    printer = SummaryPrinter(lines, as_json)
+    _run_jobs(jobs, decode, executor, printer, registry if here else None, out)
+    raise typer.Exit(printer.worst or DEGRADED * printer.degraded or int(strict and printer.warned))
+
+
+def _run_jobs(
+    jobs: Sequence[ReceiveJob],
+    decode: DecodeJob,
+    executor: Executor,
+    printer: SummaryPrinter,
+    registry: Registry | None,
+    out: Path | None,
+) -> None:
+    """Decode all, here if a registry is given, else in workers; print how each ended.
+
+    Raises:
+        InterruptedRunError: Whoever started it ended it.
+    """
+    from evlcp_sdk.run import stop_on_request
 
     def pass_on() -> None:
-        if not here:
+        if registry is None:
             from evlcp_sdk.study.jobs import stop_workers
 
             stop_workers()
 
     with (
         stop_on_request(pass_on) as stopped,
-        _recordings_bar(0 if here else len(jobs)) as count,
+        _recordings_bar(len(jobs) if registry is None else 0) as count,
         ExitStack() as stack,
     ):
-        run = partial(
-            _decode_job,
-            links=links,
-            plan=plan,
-            attitude=attitude,
-            clock_zero=zero,
-            pps=pps,
-            sinks=asked,
-            lines=lines,
-            here=(registry, stopped) if here else None,
-        )
-        outcomes = stack.enter_context(closing(executor.run(run, _until(stopped, jobs))))
-        for outcome in outcomes:
+        run = partial(decode, here=None if registry is None else (registry, stopped))
+        for outcome in stack.enter_context(closing(executor.run(run, _until(stopped, jobs)))):
             count()
-            job, summary, fault = outcome.job, outcome.value, outcome.fault
-            if summary is None:
-                message = fault.message if fault else "no result"
-                complain(message)
-                worst = max(worst, fault.exit_code if fault else 1)
-                if as_json:
-                    failed = {"status": "failed", "error": message, "recording": {"path": job.url}}
-                    echo(json.dumps(failed))
-                continue
-            if lines is not None:
-                lines(json.dumps({"line": "summary"} | summary))
-            if as_json:
-                echo(json.dumps(summary))
-            elif lines is None or not lines.gone or job.folder is not None:
-                show(summary, job.folder, stderr=lines is not None)
-            if summary["status"] in ("failed", "degraded"):
-                complain(summary["error"])
-            if summary["status"] == "failed":
-                worst = max(worst, InputError.exit_code)
-            degraded |= summary["status"] == "degraded"
-            warned |= bool(summary["warnings"])
-            if summary["status"] == "interrupted":
-                interrupted.append(job.folder)
+            printer.show(outcome)
         if stopped():
-            folder = interrupted[0] if len(interrupted) == 1 else out
+            folder = printer.interrupted[0] if len(printer.interrupted) == 1 else out
             where = "was printed" if folder is None else f"is in {folder}"
             raise InterruptedRunError(f"interrupted; what was decoded until then {where}")
-    raise typer.Exit(worst or DEGRADED * degraded or int(strict and warned))
+
+
+class SummaryPrinter:
+    """Prints how each recording ended.
+
+    Args:
+        lines: Takes summaries as lines of JSON; None for nobody.
+        as_json: Each is one line of JSON on stdout.
+
+    Attributes:
+        worst: Exit code of the worst failure; 0 for none.
+        degraded: More of a recording was dropped than may be.
+        warned: A recording has warnings.
+        interrupted: Folders of those that were ended early.
+    """
+
+    def __init__(self, lines: LinePrinter | None, as_json: bool) -> None:
+        self._lines, self._as_json = lines, as_json
+        self.worst, self.degraded, self.warned = 0, False, False
+        self.interrupted: list[Path | None] = []
+
+    def show(self, outcome: Outcome[ReceiveJob, dict[str, Any]]) -> None:
+        """Print one."""
+        import json
+
+        job, summary, fault, lines = outcome.job, outcome.value, outcome.fault, self._lines
+        if summary is None:
+            message = fault.message if fault else "no result"
+            complain(message)
+            self.worst = max(self.worst, fault.exit_code if fault else 1)
+            if self._as_json:
+                failed = {"status": "failed", "error": message, "recording": {"path": job.url}}
+                echo(json.dumps(failed))
+            return
+        if lines is not None:
+            lines(json.dumps({"line": "summary"} | summary))
+        if self._as_json:
+            echo(json.dumps(summary))
+        elif lines is None or not lines.gone or job.folder is not None:
+            show(summary, job.folder, stderr=lines is not None)
+        status = summary["status"]
+        if status in ("failed", "degraded"):
+            complain(summary["error"])
+        if status == "failed":
+            self.worst = max(self.worst, InputError.exit_code)
+        if status == "interrupted":
+            self.interrupted.append(job.folder)
+        self.degraded |= status == "degraded"
+        self.warned |= bool(summary["warnings"])
 
 
 def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
@@ -281,33 +264,43 @@ def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
     return replace(job, link=best.link)
 
 
-def _decode_job(
-    job: ReceiveJob,
-    *,
-    links: tuple[Link, ...],
-    plan: PositionPlan | None,
-    attitude: Attitude | AttitudeLog | None,
-    clock_zero: datetime | None,
-    pps: int | None,
-    sinks: tuple[str, ...],
-    lines: LinePrinter | None,
-    here: tuple[Registry, EndRequest] | None,
-) -> dict[str, Any]:
-    """Decode a recording here, with a bar; or, without `here`, quietly in a worker."""
-    from evlcp_sdk.run import receive_to_folder, stop_on_request
+@dataclass(frozen=True)
+class DecodeJob:
+    """Decodes a recording, here with a bar; or, without `here`, quietly in a worker."""
 
-    clock = clock_of(pps, clock_zero)
-    known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock}
-    decode = partial(receive_to_folder, job.url, job.folder, job.link or links, **known, sinks=sinks)
-    if here is not None:
-        registry, stopped = here
-        ended = stopped.or_when(lambda: job.folder is None and lines is not None and lines.gone)
-        with bytes_bar(_named(job.url)) as advance:
-            return decode(registry=registry, lines=lines, advance=advance, stopped=ended)
-    hush()
-    # A terminal sends Ctrl-C to workers, too.
-    with stop_on_request() as asked:
-        return decode(stopped=asked)
+    links: tuple[Link, ...]
+    plan: PositionPlan | None
+    attitude: Attitude | AttitudeLog | None
+    clock_zero: datetime | None
+    pps: int | None
+    sinks: tuple[str, ...]
+    lines: LinePrinter | None
+
+    def __call__(self, job: ReceiveJob, here: tuple[Registry, EndRequest] | None) -> dict[str, Any]:
+        """The summary."""
+        from evlcp_sdk.run import receive_to_folder, stop_on_request
+        from evlcp_sdk.utc import PulseClock
+
+        decode = partial(
+            receive_to_folder,
+            job.url,
+            job.folder,
+            job.link or self.links,
+            plan=self.plan,
+            attitude=self.attitude,
+            clock_zero=self.clock_zero if self.pps is None else PulseClock(self.pps, self.clock_zero),
+            sinks=self.sinks,
+        )
+        if here is not None:
+            registry, stopped = here
+            lines = self.lines
+            ended = stopped.or_when(lambda: job.folder is None and lines is not None and lines.gone)
+            with bytes_bar(_named(job.url)) as advance:
+                return decode(registry=registry, lines=lines, advance=advance, stopped=ended)
+        hush()
+        # A terminal sends Ctrl-C to workers, too.
+        with stop_on_request() as asked:
+            return decode(stopped=asked)
 
 
 def _until(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[ReceiveJob]:

@@ -67,43 +67,73 @@ def simulate(
 
     A scene to start from:  [bold]evlcp simulate --preset night --show > scene.toml[/]
     """
+    if presets:
+        _list_presets(as_json=as_json)
+        return
+    if show:
+        from evlcp_sdk.sim import preset_text
+
+        if preset is None or scene_file is not None:
+            raise typer.BadParameter("--show prints a --preset", param_hint="--show")
+        echo(preset_text(preset), nl=False)
+        return
+    source = _source_of(scene_file, preset)
+    if out is None:
+        raise typer.BadParameter("where should the recording go?", param_hint="-o REC.raw")
+    _render(source, out, seed, link, overrides or [], threads, as_json=as_json)
+
+
+def _list_presets(*, as_json: bool) -> None:
+    import json
+
+    from evlcp_sdk.sim import preset_names, preset_text
+
+    if as_json:
+        echo(json.dumps(preset_names()))
+        return
+    for name in preset_names():
+        comments = (line.lstrip("# ") for line in preset_text(name).splitlines() if line.startswith("#"))
+        console().print(f"{name:14} {next(comments, '')}")
+
+
+def _source_of(scene_file: str | None, preset: str | None) -> Path | str:
+    """The scene that is meant: a file's path, or a preset's name."""
+    from evlcp_sdk.files import is_there
+    from evlcp_sdk.sim import preset_names, preset_text
+
+    if (scene_file is None) == (preset is None):
+        raise typer.BadParameter("name either a scene.toml or a --preset", param_hint="scene.toml")
+    if preset is not None:
+        preset_text(preset)  # a file of that name is not meant
+        return preset
+    assert scene_file is not None
+    if scene_file in preset_names() and not is_there(scene_file):
+        raise typer.BadParameter(
+            f"{scene_file}: no such file; for the preset: --preset {scene_file}", param_hint="scene.toml"
+        )
+    return Path(scene_file)
+
+
+def _render(
+    source: Path | str,
+    out: Path,
+    seed: int | None,
+    link: str | None,
+    overrides: list[str],
+    threads: int,
+    *,
+    as_json: bool,
+) -> None:
+    """Render a scene into files, and say how that went."""
     import json
     import time
 
     from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.files import is_there
-    from evlcp_sdk.sim import preset_names, preset_text
     from evlcp_sdk.simulated import simulate as render
 
-    if presets:
-        if as_json:
-            echo(json.dumps(preset_names()))
-            return
-        for name in preset_names():
-            about = next(
-                (line.lstrip("# ") for line in preset_text(name).splitlines() if line.startswith("#")), ""
-            )
-            console().print(f"{name:14} {about}")
-        return
-    if (scene_file is None) == (preset is None):
-        raise typer.BadParameter("name either a scene.toml or a --preset", param_hint="scene.toml")
-    if show:
-        if preset is None:
-            raise typer.BadParameter("--show prints a --preset", param_hint="--show")
-        echo(preset_text(preset), nl=False)
-        return
-    if preset is not None:
-        preset_text(preset)  # a file of that name is not meant
-    elif scene_file is not None and scene_file in preset_names() and not is_there(scene_file):
-        raise typer.BadParameter(
-            f"{scene_file}: no such file; for the preset: --preset {scene_file}", param_hint="scene.toml"
-        )
-    source: Path | str = preset if preset is not None else Path(scene_file or "")
-    if out is None:
-        raise typer.BadParameter("where should the recording go?", param_hint="-o REC.raw")
     if out.suffix != ".raw":
         raise ConfigError(f"{out}: a recording is written as NAME.raw")
-    simulated = render(source, seed, link=link, overrides=overrides or [], threads=threads)
+    simulated = render(source, seed, link=link, overrides=overrides, threads=threads)
     scene = simulated.scene
     began = time.perf_counter()
     with _progress(out.name, scene.duration_s) as advance:

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo
-from evlcp_sdk.cli._receiving import clock_zero_of, plan_of
+from evlcp_sdk.cli._receiving import CameraOptions
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from evlcp_sdk.place.survey import SurveyedBar
 
 __all__ = ["register"]
@@ -75,16 +77,11 @@ def survey(
     poses.csv is that of `evlcp calibrate`, with heading_deg, pitch_deg and roll_deg. What all poses may have
     wrong in common, by position_sigma_m and attitude_sigma_deg, is in the sigmas of the sites.
     """
-    import json
-    from dataclasses import asdict
-
     from evlcp_sdk import run
-    from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.several import load_links
     from evlcp_sdk.place.poses import read_poses
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import AttitudeLog
-    from evlcp_sdk.scene.sites import to_toml
 
     if (poses is None) == (sites is None):
         raise typer.BadParameter("give --poses, or --sites of known bars", param_hint="--poses")
@@ -96,10 +93,22 @@ def survey(
                 raise typer.BadParameter("needs --sites", param_hint=name)
         found = run.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
     else:
-        plan = plan_of(sites, gnss, links, clock_zero_of(clock_zero), mcap=False)
+        camera = CameraOptions(sites=sites, attitude_file=attitude, gnss=gnss, clock_zero=clock_zero)
+        plan = camera.plan(links)
         assert plan is not None
         known = None if attitude is None else AttitudeLog.read(attitude)
         found = run.survey_on_the_way(recordings, plan, links, attitude=known, registry=registry)
+    _write(found, out, as_json=as_json)
+
+
+def _write(found: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
+    """Write the sites, and say which they are."""
+    import json
+    from dataclasses import asdict
+
+    from evlcp_sdk.files import Outputs
+    from evlcp_sdk.scene.sites import to_toml
+
     with Outputs() as outputs:
         outputs.open(out).write(to_toml([bar.site for bar in found]))
         outputs.commit()

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, echo
+from evlcp_sdk.spelling import counted
 
 __all__ = ["register"]
 
@@ -86,21 +87,22 @@ def video(
         )
     if as_json:
         echo(json.dumps(told))
-        return
+    else:
+        _show(told, Path(recording).name)
+
+
+def _show(told: dict[str, Any], name: str) -> None:
+    """Say what was filmed."""
     screen = console()
     if told["frames"]:
-        number = len(told["transmitters"])
-        found = (
-            f"{number} transmitter{'s' * (number != 1)}, {told['frames']} frame{'s' * (told['frames'] != 1)}"
-        )
+        found = f"{counted(len(told['transmitters']), 'transmitter')}, {counted(told['frames'], 'frame')}"
     else:
         found = "no frame is decoded there"
     screen.print(
-        f"{Path(recording).name}: {told['for_ms']:g} ms from {told['from_ms']:.1f} ms on, at"
-        f" 1/{told['slow']:g}; {found}"
+        f"{name}: {told['for_ms']:g} ms from {told['from_ms']:.1f} ms on, at 1/{told['slow']:g}; {found}"
     )
     screen.print(
-        f"written: {out}, {told['pictures']} pictures of {told['width']} x {told['height']} px,"
+        f"written: {told['film']}, {told['pictures']} pictures of {told['width']} x {told['height']} px,"
         f" {told['bytes'] / 1e6:.1f} MB",
         style="dim",
     )

@@ -4,13 +4,14 @@ from pathlib import Path
 
 import pytest
 
-from evlcp_sdk.cli._receiving import say_alike
+from evlcp_sdk.cli._receiving import LinkOptions
 from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.tallies import RunTally
 from evlcp_sdk.diagnosis.warnings import find_warnings
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import alike_links, load_links, named_links
+from evlcp_sdk.plugin.registry import Registry
 
 
 @pytest.fixture
@@ -88,9 +89,9 @@ def test_links_alike_are_said_on_stderr_before_anything_is_read(
 ) -> None:
     for name, idle in (("lamp", ""), ("off", "idle = 'off'")):
         (tmp_path / f"{name}.toml").write_text(ONE_LED + TOLD.format(rate=3125.0) + idle)
-    links = load_links([tmp_path / "lamp.toml", tmp_path / "off.toml"])
-    say_alike(links)
+    files = [str(tmp_path / "lamp.toml"), str(tmp_path / "off.toml")]
+    LinkOptions(files).load(Registry.load())
     (line,) = capsys.readouterr().err.splitlines()
     assert line.startswith("evlcp: warning: what one of the links 'lamp' and 'off' sends, the other may read")
-    say_alike(links[:1])
+    LinkOptions(files[:1]).load(Registry.load())
     assert not capsys.readouterr().err
