@@ -298,18 +298,9 @@ def receive_to_folder(
         url = str(opened.path) if url == STDIN else url
         check_sensor(opened, url, links[0].camera)
         pulses = _pulses_of(clock_zero, opened, url)
-        name = Path(url).name
-        with ResultWriter(
-            folder,
-            links,
-            registry,
-            name=name,
-            plan=plan,
-            attitude=attitude,
-            clock_zero=clock_zero,
-            sinks=sinks,
-            lines=lines,
-        ) as writer:
+        known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
+        known |= {"name": Path(url).name, "sinks": sinks, "lines": lines}
+        with ResultWriter(folder, links, registry, **known) as writer:
             receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
             pieces = ((events, receiver.feed(events)) for events in _events_of(opened, pulses, stopped))
             return _run(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
@@ -384,32 +375,17 @@ def live(
             check_sensor(opened, url, links[0].camera)
             if warm and waits:
                 warm_up(links, positions=plan is not None)
-            name = Path(url).name
-            kept: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
+            known: dict[str, Any] = {"attitude": attitude, "clock_zero": clock_zero}
+            kept = known | {"name": Path(url).name, "plan": plan, "sinks": sinks, "lines": lines}
             loop: LiveLoop
             with ResultWriter(
-                folder,
-                links,
-                registry,
-                name=name,
-                **kept,
-                sinks=sinks,
-                lines=lines,
-                placed=lambda placed: loop.placed(placed),
+                folder, links, registry, **kept, placed=lambda placed: loop.placed(placed)
             ) as writer:
-                receiver = Receiver(
-                    links,
-                    registry.hook,
-                    attitude=attitude,
-                    clock_zero=clock_zero,
-                    on_frame=lambda frame: loop.frame(frame),
-                )
+                receiver = Receiver(links, registry.hook, **known, on_frame=lambda frame: loop.frame(frame))
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
                 loop = LiveLoop(opened, receiver, links, outlet, pictures, budget, pulses=pulses)
-                pieces = loop.run(stopped)
-                table = _run(
-                    opened, url, receiver, writer, pieces, loop.close, _say_nothing, stopped, loop.summary
-                )
+                run, given = loop.run(stopped), (_say_nothing, stopped, loop.summary)
+                table = _run(opened, url, receiver, writer, run, loop.close, *given)
         outlet.publish("end", float(table["recording"]["last_us"] or 0), table)
         return table
     finally:
@@ -524,33 +500,9 @@ def _run(
             writer.write(close())
     if status == "complete" and (told := _much_dropped(source, receiver)):
         status, error = "degraded", f"{url}: {told}"
-    read = source.counts["events"]
-    duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
     summary = writer.finish(
         status,
-        recording={
-            "path": url,
-            "format": source.format,
-            "bytes": source.size_bytes,
-            "width": source.width,
-            "height": source.height,
-            "first_us": first_us,
-            "last_us": last_us,
-            "duration_s": round(duration_s, 6),
-            "events_per_s": round(read / duration_s) if duration_s else None,
-            "counts": dict(source.counts),
-            "guessed": source.guessed,
-            "step_us": source.step_us,
-        },
-        processing={
-            "processor_s": round(watch.processor_s, 6),
-            "elapsed_s": round(watch.elapsed_s, 6),
-            "kernels_s": round(watch.kernels_s, 6),
-            "events_per_s": round(read / watch.processor_s),
-            "times_real_time": round(times_real_time(duration_s, watch.processor_s), 3)
-            if duration_s
-            else None,
-        },
+        **_tables_of(source, url, watch, first_us, last_us),
         counts=receiver.counts,
         losses={kind: asdict(loss) for kind, loss in source.losses.items()},
         error=error,
@@ -561,6 +513,37 @@ def _run(
     if broken is not None:
         raise broken
     return summary
+
+
+def _tables_of(
+    source: EventSource, url: str, watch: Stopwatch, first_us: int | None, last_us: int | None
+) -> dict[str, dict[str, Any]]:
+    """What the summary says of a recording, and of how it was worked off."""
+    read = source.counts["events"]
+    duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
+    recording = {
+        "path": url,
+        "format": source.format,
+        "bytes": source.size_bytes,
+        "width": source.width,
+        "height": source.height,
+        "first_us": first_us,
+        "last_us": last_us,
+        "duration_s": round(duration_s, 6),
+        "events_per_s": round(read / duration_s) if duration_s else None,
+        "counts": dict(source.counts),
+        "guessed": source.guessed,
+        "step_us": source.step_us,
+    }
+    pace = round(times_real_time(duration_s, watch.processor_s), 3) if duration_s else None
+    processing = {
+        "processor_s": round(watch.processor_s, 6),
+        "elapsed_s": round(watch.elapsed_s, 6),
+        "kernels_s": round(watch.kernels_s, 6),
+        "events_per_s": round(read / watch.processor_s),
+        "times_real_time": pace,
+    }
+    return {"recording": recording, "processing": processing}
 
 
 def _much_dropped(source: EventSource, receiver: Receiver) -> str | None:

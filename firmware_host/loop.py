@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.air.blocks import Kind
+from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs, output_fault, read_json
 from evlcp_sdk.link.compose import messages_of, packets_of
@@ -21,6 +21,7 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.sim import read_truth
+from evlcp_sdk.sim.truth import truth_path
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import score_frames
@@ -44,6 +45,9 @@ RECORDING = "loop.raw"
 
 RECEIVED = "received"
 """Name of the folder in it that has what was received."""
+
+_CHIPS = "chips.npy"
+"""What the LEDs did, chip by chip."""
 
 _LEAST_PACKETS = 8
 """Packets in view at least: a quarter of a second of the default link."""
@@ -170,6 +174,32 @@ def loop(
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
         raise output_fault(folder, fault) from fault
+    yield _message_step(text, message, symbols, link, folder)
+
+    # Every packet passes whole, a second time if the first has begun before the camera looks.
+    in_view = max(_LEAST_PACKETS, 2 * len(symbols) + 2)
+    light = light_of(symbols, link, (in_view + 2) * link.packet.packet_chips, folder / "wire.jsonl")
+    programmed = light.programmed
+    yield Step(
+        "board",
+        {"firmware": light.firmware, "payload_bytes": programmed.length, "retries": programmed.retries},
+        ("wire.jsonl",),
+    )
+    yield _light_step(light, link, folder)
+    scene = _scene_of(light, link, folder / _CHIPS, distance_m, in_view, seed)
+    yield _scene_step(scene, symbols, len(light.chips) // link.packet.packet_chips, folder, seed, advance)
+
+    decoded = _DecodedTexts()
+    yield _receiver_step(link, folder, decoded, sinks)
+    texts = list(dict.fromkeys(decoded.texts))
+    yield Step(
+        "text",
+        {"texts": texts, "packets": decoded.packets, "as_sent": text in texts},
+    )
+
+
+def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link: Link, folder: Path) -> Step:
+    """Write the link and the symbols."""
     packet = link.packet
     with Outputs() as outputs:
         outputs.write_text(to_toml(link, Registry.load()), folder / "link.toml")
@@ -177,117 +207,108 @@ def loop(
             json.dumps(symbols_table(symbols, link, messages=True)) + "\n", folder / "message.json"
         )
         outputs.commit()
-    yield Step(
-        "message",
-        {
-            "text": text,
-            "bytes": len(message.payload),
-            "packets": len(symbols),
-            "symbols": symbols.size,
-            "bits": coder.bits * len(symbols),
-            "chips": packet.packet_chips * len(symbols),
-            "duration_s": round(packet.packet_chips * len(symbols) / link.air.chip_rate_hz, 6),
-        },
-        ("link.toml", "message.json"),
-    )
+    figures = {
+        "text": text,
+        "bytes": len(message.payload),
+        "packets": len(symbols),
+        "symbols": symbols.size,
+        "bits": link.block_coder().bits * len(symbols),
+        "chips": packet.packet_chips * len(symbols),
+        "duration_s": round(packet.packet_chips * len(symbols) / link.air.chip_rate_hz, 6),
+    }
+    return Step("message", figures, ("link.toml", "message.json"))
 
-    # Every packet passes whole, a second time if the first has begun before the camera looks.
-    in_view = max(_LEAST_PACKETS, 2 * len(symbols) + 2)
-    light = light_of(symbols, link, (in_view + 2) * packet.packet_chips, folder / "wire.jsonl")
-    programmed = light.programmed
-    yield Step(
-        "board",
-        {"firmware": light.firmware, "payload_bytes": programmed.length, "retries": programmed.retries},
-        ("wire.jsonl",),
-    )
-    chips_file = folder / "chips.npy"
+
+def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
+    """Write what the LEDs did."""
     with Outputs() as outputs:
         outputs.open_binary(folder / "leds.bin").write(light.record.to_bytes())
-        outputs.write_array(light.chips, chips_file)
+        outputs.write_array(light.chips, folder / _CHIPS)
         outputs.commit()
-    yield Step(
-        "light",
-        {
-            "leds": len(link.bar.led_clusters()),
-            "chips": len(light.chips),
-            "chip_rate_hz": round(light.rate_hz, 3),
-            "on_share": round(float(light.chips.mean()), 4),
-        },
-        ("leds.bin", chips_file.name),
-    )
+    figures = {
+        "leds": len(link.bar.led_clusters()),
+        "chips": len(light.chips),
+        "chip_rate_hz": round(light.rate_hz, 3),
+        "on_share": round(float(light.chips.mean()), 4),
+    }
+    return Step("light", figures, ("leds.bin", _CHIPS))
 
-    start_chip = round(float(np.random.default_rng([seed, 1]).uniform(0, packet.packet_chips)), 1)
-    duration_s = in_view * packet.packet_chips / light.rate_hz
+
+def _scene_of(
+    light: EmulatedLight, link: Link, chips_file: Path, distance_m: float, in_view: int, seed: int
+) -> dict[str, Any]:
+    """A scene in which a still camera sees the light for so many packets."""
+    start_chip = float(np.random.default_rng([seed, 1]).uniform(0, link.packet.packet_chips))
     bar = {
         "x_m": 0.0,
         "chips_file": str(chips_file),
-        "start_chip": start_chip,
+        "start_chip": round(start_chip, 1),
         "ppm": round((light.rate_hz / link.air.chip_rate_hz - 1) * 1e6, 3),
     }
     # A still camera: by the swing of a car it sees more than a first look needs.
-    scene = {
+    return {
         "name": Path(RECORDING).stem,
-        "duration_s": duration_s,
+        "duration_s": in_view * link.packet.packet_chips / light.rate_hz,
         "link": {section: dict(keys) for section, keys in link.table.items()},
         "camera": dict(link.table["camera"]),
         "lens": {"focus_m": distance_m},
         "motion": {"distance_m": distance_m, "speed_mps": 0.0, "vib_rate_rad_s": 0.0},
         "bars": [bar],
     }
-    raw = folder / RECORDING
+
+
+def _scene_step(
+    scene: dict[str, Any],
+    symbols: NDArray[np.int64],
+    packets: int,
+    folder: Path,
+    seed: int,
+    advance: Callable[[float], None],
+) -> Step:
+    """Render the scene, whose truth says what the packets on air stand for."""
+    raw, duration_s = folder / RECORDING, scene["duration_s"]
     simulated = simulate(scene, seed)
     _, truth_file = simulated.save(raw, lambda done_s: advance(done_s / duration_s))
-    _say_symbols(truth_file, symbols, len(light.chips) // packet.packet_chips)
-    counts = simulated.simulation.counts
-    yield Step(
-        "scene",
-        {
-            "distance_m": distance_m,
-            "duration_s": round(duration_s, 6),
-            "events": counts["events"],
-            "bytes": raw.stat().st_size,
-        },
-        (raw.name, truth_file.name),
-    )
+    _add_symbols(truth_file, symbols, packets)
+    figures = {
+        "distance_m": scene["motion"]["distance_m"],
+        "duration_s": round(duration_s, 6),
+        "events": simulated.simulation.counts["events"],
+        "bytes": raw.stat().st_size,
+    }
+    return Step("scene", figures, (raw.name, truth_file.name))
 
-    heard = _Heard()
-    summary = receive_to_folder(raw, folder / RECEIVED, link, registry=Registry.load(heard), sinks=sinks)
+
+def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Sequence[str]) -> Step:
+    """Receive the recording, and compare it with its truth."""
+    raw = folder / RECORDING
+    summary = receive_to_folder(raw, folder / RECEIVED, link, registry=Registry.load(decoded), sinks=sinks)
+    counts, transmitters = summary["counts"], summary["transmitters"]
+    decoded.packets = counts["blocks_decoded"] + counts["blocks_combined"]
     # The rows as they are written, which `evlcp score` reads, too.
-    found = score_frames(read_frames(folder / RECEIVED), read_truth(truth_file))
-    (scored,) = found["bars"]
-    told = summary["transmitters"]
-    yield Step(
-        "receiver",
-        {
-            "result": summary["result"],
-            "frames": scored["frames_found"],
-            "frames_sent": scored["frames_sent"],
-            "frames_false": found["unmatched"],
-            "bits": found["road"]["bars"][0]["bits"],
-            "bit_errors": found["road"]["bars"][0]["bit_errors"],
-            "distance_m": told[0]["distance_last_m"] if told else None,
-            "rmse_m": scored["rmse_m"],
-            "warnings": summary["warnings"],
-        },
-        tuple(f"{RECEIVED}/{name}" for name in (*summary["files"], "summary.json")),
-    )
-    counted = summary["counts"]
-    texts = list(dict.fromkeys(heard.texts))
-    yield Step(
-        "text",
-        {
-            "texts": texts,
-            "packets": counted["blocks_decoded"] + counted["blocks_combined"],
-            "as_sent": text in texts,
-        },
-    )
+    found = score_frames(read_frames(folder / RECEIVED), read_truth(truth_path(raw)))
+    (scored,), (road,) = found["bars"], found["road"]["bars"]
+    figures = {
+        "result": summary["result"],
+        "frames": scored["frames_found"],
+        "frames_sent": scored["frames_sent"],
+        "frames_false": found["unmatched"],
+        "bits": road["bits"],
+        "bit_errors": road["bit_errors"],
+        "distance_m": transmitters[0]["distance_last_m"] if transmitters else None,
+        "rmse_m": scored["rmse_m"],
+        "warnings": summary["warnings"],
+    }
+    files = tuple(f"{RECEIVED}/{name}" for name in (*summary["files"], "summary.json"))
+    return Step("receiver", figures, files)
 
 
-class _Heard:
-    """Keeps the texts as the receiver announces them."""
+class _DecodedTexts:
+    """Keeps the texts as the receiver announces them, and in how many packets they came."""
 
     def __init__(self) -> None:
         self.texts: list[str] = []
+        self.packets = 0
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: object) -> None:
@@ -295,7 +316,7 @@ class _Heard:
             self.texts.append(value.value)
 
 
-def _say_symbols(truth_file: Path, symbols: NDArray[np.int64], packets: int) -> None:
+def _add_symbols(truth_file: Path, symbols: NDArray[np.int64], packets: int) -> None:
     """Say in the truth what the chips of the LEDs stand for, which `light_of` has compared with them."""
     table = read_json(truth_file)
     (bar,) = table["bars"]

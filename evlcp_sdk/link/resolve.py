@@ -261,87 +261,127 @@ def resolve(
     registry = Registry.load() if registry is None else registry
     where_leds = "--set" if ("bar", "leds_file") in overridden else source
     table = with_leds(table, before=f"{where_leds}: " if where_leds else "")
-    faults: list[str | UnknownAlgorithmError] = []
-
-    def fault(section: str, key: str | None, text: str) -> None:
-        where = "--set" if (section, key) in overridden else source
-        name = section if key is None else f"{section}.{key}"
-        faults.append(f"{where}: {name}{text}" if where else f"{name}{text}")
-
-    known = [*_SPECS, *ROLES]
-    for section, keys in table.items():
-        if section not in known:
-            from_set = (
-                next((k for k in keys if (section, k) in overridden), None)
-                if isinstance(keys, dict)
-                else None
-            )
-            fault(section, from_set, f": unknown table{nearest(section, known)}")
-        elif not isinstance(keys, Mapping):
-            fault(section, None, f" = {keys!r}: expected a table")
-
-    built: dict[str, Any] = {}
-    resolved: dict[str, dict[str, Any]] = {}
-    revisions: dict[str, int] = {}
-    of_chips: frozenset[str] = frozenset()
+    resolver = _Resolver(table, registry, source, overridden)
+    resolver.check_sections()
     # A framing says which roles there are, and what finds its transmitters.
-    for section in sorted(known, key=lambda name: (name in ROLES, name != "framing")):
-        keys = table.get(section, {})
-        if not isinstance(keys, Mapping):
-            continue
-        framing = built.get("framing")
-        if section in STEPS and framing is not None and section not in framing.roles:
-            if section in table:
-                set_key = next((key for key in keys if (section, key) in overridden), None)
-                fault(section, set_key, _unused(resolved["framing"]["id"]))
-            continue
-        keys = dict(keys)
-        head: dict[str, Any] = {}
-        if section in _SPECS:
-            cls, ours = _SPECS[section], True
-        else:
-            usual = ROLES[section].default_for(built.get("bar"), of_chips)
-            if section == "detection" and framing is not None and framing.detection:
-                usual = framing.detection
-            head["id"] = name = keys.pop("id", usual)
-            if not isinstance(name, str):
-                fault(section, "id", f" = {name!r}: expected a string")
-                continue
-            try:
-                installed = registry.find(section, name)
-                revisions[section] = installed.algorithm.revision
-                ours = installed.distribution == "evlcp-sdk"
-            except UnknownAlgorithmError as unknown:
-                told = bool(source) and (section, "id") not in overridden
-                faults.append(UnknownAlgorithmError(f"{source}: {unknown}") if told else unknown)
-                continue
-            cls = registry.load_class(section, name)
-        try:
-            if section == "bar":
-                built[section] = BarLayout.of_table(keys)
-                plain = built[section].table()
-            elif section in _SPECS:
-                built[section] = _built(cls, keys, ours=ours)
-                plain = asdict(built[section])
-            else:
-                with _named(section, {section: head}):
-                    built[section] = _built(cls, keys, ours=ours)
-                    plain = head | asdict(built[section])
-            resolved[section] = json.loads(json.dumps(plain))
-            if section == "modulation":
-                of_chips = _of_chips(built)
-        except SpecError as refused:
-            for path, text in refused.faults:
-                fault(section, path[0], "".join(f".{part}" for part in path[1:]) + text)
-        except ConfigError as refused:
-            faults.append(f"{source}: {refused}" if source else str(refused))
+    for section in sorted(_KNOWN, key=lambda name: (name in ROLES, name != "framing")):
+        resolver.resolve_section(section)
+    faults = resolver.faults
     if len(faults) == 1 and isinstance(faults[0], UnknownAlgorithmError):
         raise faults[0]
     if faults:
         raise ConfigError("\n".join(str(f) for f in faults))
+    resolved = {section: resolver.resolved[section] for section in _KNOWN if section in resolver.resolved}
+    return _assembled(resolver.built, resolved, resolver.revisions, message_kinds(registry))
 
-    resolved = {section: resolved[section] for section in known if section in resolved}
-    return _assembled(built, resolved, revisions, message_kinds(registry))
+
+_KNOWN = [*_SPECS, *ROLES]
+"""Names of a link's tables."""
+
+
+class _Resolver:
+    """Checks the tables of a link one by one, and collects what is wrong with them.
+
+    Args:
+        table: Section to keys.
+        registry: Where algorithms are found.
+        source: What faults name as their place; empty for none.
+        overridden: (section, key) that came from `--set` instead.
+
+    Attributes:
+        faults: What is wrong.
+        built: What each section describes.
+        resolved: Each section with all its defaults, plain values.
+        revisions: Of the algorithms, by role.
+    """
+
+    def __init__(
+        self,
+        table: Mapping[str, Any],
+        registry: Registry,
+        source: str,
+        overridden: frozenset[tuple[str, str]],
+    ) -> None:
+        self._table, self._registry = table, registry
+        self._source, self._overridden = source, overridden
+        self._of_chips: frozenset[str] = frozenset()
+        self.faults: list[str | UnknownAlgorithmError] = []
+        self.built: dict[str, Any] = {}
+        self.resolved: dict[str, dict[str, Any]] = {}
+        self.revisions: dict[str, int] = {}
+
+    def check_sections(self) -> None:
+        """Find sections that there are not, or that are no tables."""
+        for section, keys in self._table.items():
+            if section not in _KNOWN:
+                self._fault(section, self._key_set(section), f": unknown table{nearest(section, _KNOWN)}")
+            elif not isinstance(keys, Mapping):
+                self._fault(section, None, f" = {keys!r}: expected a table")
+
+    def resolve_section(self, section: str) -> None:
+        """Build what a section describes, and write its defaults out."""
+        keys, framing = self._table.get(section, {}), self.built.get("framing")
+        if not isinstance(keys, Mapping):
+            return
+        if section in STEPS and framing is not None and section not in framing.roles:
+            if section in self._table:
+                self._fault(section, self._key_set(section), _unused(self.resolved["framing"]["id"]))
+            return
+        try:
+            plain = self._build(section, dict(keys))
+        except SpecError as refused:
+            for path, text in refused.faults:
+                self._fault(section, path[0], "".join(f".{part}" for part in path[1:]) + text)
+        except ConfigError as refused:
+            self.faults.append(f"{self._source}: {refused}" if self._source else str(refused))
+        else:
+            if plain is not None:
+                self.resolved[section] = json.loads(json.dumps(plain))
+            if section == "modulation":
+                self._of_chips = _of_chips(self.built)
+
+    def _build(self, section: str, keys: dict[str, Any]) -> dict[str, Any] | None:
+        """Build what a section describes; give all its keys, None where its algorithm is not known."""
+        if section == "bar":
+            bar = self.built[section] = BarLayout.of_table(keys)
+            return bar.table()
+        if section in _SPECS:
+            self.built[section] = _built(_SPECS[section], keys, ours=True)
+            return asdict(self.built[section])
+        name = keys.pop("id", self._default_of(section))
+        if not isinstance(name, str):
+            self._fault(section, "id", f" = {name!r}: expected a string")
+            return None
+        try:
+            installed = self._registry.find(section, name)
+        except UnknownAlgorithmError as unknown:
+            named = self._source and (section, "id") not in self._overridden
+            self.faults.append(UnknownAlgorithmError(f"{self._source}: {unknown}") if named else unknown)
+            return None
+        self.revisions[section] = installed.algorithm.revision
+        cls, ours = self._registry.load_class(section, name), installed.distribution == "evlcp-sdk"
+        with _named(section, {section: {"id": name}}):
+            self.built[section] = _built(cls, keys, ours=ours)
+            return {"id": name} | asdict(self.built[section])
+
+    def _default_of(self, role: str) -> str:
+        """Id of the algorithm of a role that the table does not name."""
+        framing = self.built.get("framing")
+        if role == "detection" and framing is not None and framing.detection:
+            return str(framing.detection)
+        return ROLES[role].default_for(self.built.get("bar"), self._of_chips)
+
+    def _key_set(self, section: str) -> str | None:
+        """The first key of a section that came from `--set`; None for none."""
+        keys = self._table[section]
+        if not isinstance(keys, Mapping):
+            return None
+        return next((key for key in keys if (section, key) in self._overridden), None)
+
+    def _fault(self, section: str, key: str | None, text: str) -> None:
+        where = "--set" if (section, key) in self._overridden else self._source
+        name = section if key is None else f"{section}.{key}"
+        self.faults.append(f"{where}: {name}{text}" if where else f"{name}{text}")
 
 
 def _built(cls: type[Any], keys: Mapping[str, Any], *, ours: bool) -> Any:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.place.error_model import ErrorModel
@@ -341,6 +343,104 @@ class SolvedViews:
     misfit: float
 
 
+@dataclass(frozen=True)
+class _Model:
+    """What the unknowns of `solve_views` make of each view, and what is known of them beforehand.
+
+    Attributes:
+        views: What is seen.
+        camera: Where the fit starts.
+        loose: What whitens the camera's errors, float64 (7, 7).
+        common: Sigmas of errors that all views share, m and radians; None for none.
+        surveys: Sigmas of each bar's site that has any: of place, turn and length.
+    """
+
+    views: Sequence[SeenView]
+    camera: CameraModel
+    loose: Floats
+    common: tuple[float, float] | None
+    surveys: Mapping[int, tuple[float, float, float]]
+
+    @property
+    def start(self) -> Floats:
+        """The unknowns before anything is seen."""
+        first = [float(getattr(self.camera, name)) for name in PARAMETERS]
+        size = self.last.stop if self.common is not None else self.last.start
+        return np.concatenate([first, np.zeros(size - len(first))])
+
+    @property
+    def bars(self) -> dict[int, int]:
+        """Where a bar's unknowns begin: errors of its site, in sigmas, behind the views."""
+        begin = len(PARAMETERS) + 6 * len(self.views)
+        return {number: begin + _OF_BAR * i for i, number in enumerate(sorted(self.surveys))}
+
+    @property
+    def last(self) -> slice:
+        """The errors that all views share, where there are such."""
+        begin = len(PARAMETERS) + 6 * len(self.views) + _OF_BAR * len(self.surveys)
+        return slice(begin, begin + 6)
+
+    def camera_of(self, x: Floats) -> CameraModel:
+        """The camera by the unknowns."""
+        values = dict(zip(PARAMETERS, x[: len(PARAMETERS)].tolist(), strict=True))
+        values["focal_mm"] = max(values["focal_mm"], 1e-3)
+        return replace(self.camera, **values)
+
+    def parts(self, x: Floats) -> tuple[Floats, Floats]:
+        """Misses in sigmas, float64 (m,), and their slopes, float64 (m, n)."""
+        shared, start, last = len(PARAMETERS), self.start, self.last
+        misses, rows = [self.loose @ (x - start)[:shared]], [self.loose @ np.eye(shared, len(x))]
+        drift = x[last] if self.common is not None else np.zeros(6)
+        now = self.camera_of(x)
+        for i, view in enumerate(self.views):
+            at = shared + 6 * i
+            place, block = self._seen(x, view, at, now, drift)
+            for axis in (0, 1):
+                # A step that turns a point behind the camera is not to be taken.
+                off = np.nan_to_num(place[:, axis] - view.points_px[:, axis], nan=1e6)
+                misses.append(view.whiten @ off)
+                rows.append(view.whiten @ np.nan_to_num(block[:, axis]))
+            scale = np.repeat([1 / view.place_sigma_m, 1 / view.turn_sigma_rad], 3)
+            misses.append(x[at : at + 6] * scale)
+            rows.append(np.eye(len(x))[at : at + 6] * scale[:, None])
+        begin = shared + 6 * len(self.views)
+        misses.append(x[begin : last.start])
+        rows.append(np.eye(len(x))[begin : last.start])
+        if self.common is not None:
+            scale = np.repeat([1 / self.common[0], 1 / self.common[1]], 3)
+            misses.append(drift * scale)
+            rows.append(np.eye(len(x))[last] * scale[:, None])
+        return np.concatenate(misses), np.concatenate(rows)
+
+    def _seen(
+        self, x: Floats, view: SeenView, at: int, now: CameraModel, drift: Floats
+    ) -> tuple[Floats, Floats]:
+        """Where a view has its points, px, float64 (p, 2), and the slopes of these, float64 (p, 2, n)."""
+        turn = x[at + 3 : at + 6] + drift[3:]
+        rotation = Rotation.from_rotvec(turn).as_matrix() @ view.rotation
+        position = view.place_m + x[at : at + 3] + drift[:3]
+        stands, moves = view.enu_m.copy(), {}
+        for number, column in self.bars.items():
+            mine = view.bar == number
+            if mine.any():
+                moves[column] = mine, _site_slope(view.arm_m[mine], self.surveys[number])
+                stands[mine] += moves[column][1] @ x[column : column + 7]
+        place, slope = project_bars(stands, position, rotation, now)
+        for column, (mine, _) in moves.items():
+            place[mine] += x[column + 7] * view.bend_px[mine]
+        seen = (stands - position) @ rotation
+        block = np.zeros((len(place), 2, len(x)))
+        block[:, :, : len(PARAMETERS)] = _slopes(now, seen[:, :2] / seen[:, 2:], place, PARAMETERS)
+        block[:, :, at : at + 3] = slope[:, :, :3]
+        block[:, :, at + 3 : at + 6] = slope[:, :, 3:] @ _turn_slope(turn)
+        if self.common is not None:
+            block[:, :, self.last] = block[:, :, at : at + 6]
+        for column, (mine, by_site) in moves.items():
+            block[mine, :, column : column + 7] = -slope[mine][:, :, :3] @ by_site
+            block[mine, :, column + 7] = view.bend_px[mine]
+        return place, block
+
+
 def solve_views(
     views: Sequence[SeenView],
     camera: CameraModel,
@@ -355,91 +455,29 @@ def solve_views(
         loose: What whitens the camera's errors as they are known beforehand, float64 (7, 7).
         common: Sigmas of an error of place, m, and of a turn, radians, that all views share; None for none.
     """
-    from scipy.optimize import least_squares
-    from scipy.spatial.transform import Rotation
-
-    names, shared = PARAMETERS, len(PARAMETERS)
-    # Errors of sites, in sigmas, behind the views: place, turn, length and bend of each bar that has any.
     surveys = {
         number: sigma
         for view in views
         for number, sigma in view.survey.items()
         if any(sigma) or view.bend_px.any()
     }
-    bars = {number: shared + 6 * len(views) + _OF_BAR * i for i, number in enumerate(sorted(surveys))}
-    first = np.array([float(getattr(camera, name)) for name in names])
-    start = np.concatenate([first, np.zeros(6 * len(views) + _OF_BAR * len(bars))])
-    last = slice(len(start), len(start) + 6)
-    if common is not None:
-        start = np.append(start, np.zeros(6))
+    model = _Model(views, camera, loose, common, surveys)
 
-    def camera_of(x: Floats) -> CameraModel:
-        values = dict(zip(names, x[:shared].tolist(), strict=True))
-        values["focal_mm"] = max(values["focal_mm"], 1e-3)
-        return replace(camera, **values)
+    def misses_of(x: Floats) -> Floats:
+        return model.parts(x)[0]
 
-    def parts(x: Floats) -> tuple[Floats, Floats]:
-        now = camera_of(x)
-        misses, rows = [loose @ (x[:shared] - start[:shared])], [loose @ np.eye(shared, len(x))]
-        drift = x[last] if common is not None else np.zeros(6)
-        for i, view in enumerate(views):
-            at = shared + 6 * i
-            turn = x[at + 3 : at + 6] + drift[3:]
-            rotation = Rotation.from_rotvec(turn).as_matrix() @ view.rotation
-            position = view.place_m + x[at : at + 3] + drift[:3]
-            stands, moves = view.enu_m.copy(), {}
-            for number, column in bars.items():
-                mine = view.bar == number
-                if mine.any():
-                    moves[column] = mine, _site_slope(view.arm_m[mine], surveys[number])
-                    stands[mine] += moves[column][1] @ x[column : column + 7]
-            place, slope = project_bars(stands, position, rotation, now)
-            for column, (mine, _) in moves.items():
-                place[mine] += x[column + 7] * view.bend_px[mine]
-            seen = (stands - position) @ rotation
-            block = np.zeros((len(place), 2, len(x)))
-            block[:, :, :shared] = _slopes(now, seen[:, :2] / seen[:, 2:], place, names)
-            block[:, :, at : at + 3] = slope[:, :, :3]
-            block[:, :, at + 3 : at + 6] = slope[:, :, 3:] @ _turn_slope(turn)
-            if common is not None:
-                block[:, :, last] = block[:, :, at : at + 6]
-            for column, (mine, by_site) in moves.items():
-                block[mine, :, column : column + 7] = -slope[mine][:, :, :3] @ by_site
-                block[mine, :, column + 7] = view.bend_px[mine]
-            for axis in (0, 1):
-                # A step that turns a point behind the camera is not to be taken.
-                off = np.nan_to_num(place[:, axis] - view.points_px[:, axis], nan=1e6)
-                misses.append(view.whiten @ off)
-                rows.append(view.whiten @ np.nan_to_num(block[:, axis]))
-            scale = np.repeat([1 / view.place_sigma_m, 1 / view.turn_sigma_rad], 3)
-            misses.append(x[at : at + 6] * scale)
-            prior = np.zeros((6, len(x)))
-            prior[:, at : at + 6] = np.diag(scale)
-            rows.append(prior)
-        at = shared + 6 * len(views)
-        misses.append(x[at : last.start])
-        rows.append(np.eye(len(x))[at : last.start])
-        if common is not None:
-            scale = np.repeat([1 / common[0], 1 / common[1]], 3)
-            misses.append(drift * scale)
-            rows.append(np.eye(len(x))[last] * scale[:, None])
-        return np.concatenate(misses), np.concatenate(rows)
+    def slopes_of(x: Floats) -> Floats:
+        return model.parts(x)[1]
 
-    def miss(x: Floats) -> Floats:
-        return parts(x)[0]
-
-    def slope_of(x: Floats) -> Floats:
-        return parts(x)[1]
-
-    fit = least_squares(miss, start, slope_of, x_scale="jac", max_nfev=_STEPS)
-    misses, rows = parts(fit.x)
+    fit = least_squares(misses_of, model.start, slopes_of, x_scale="jac", max_nfev=_STEPS)
+    misses, rows = model.parts(fit.x)
     scale = 1 / np.sqrt((rows**2).sum(0))
     half = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
     covariance = (half @ half.T) * scale * scale[:, None]
     points = 2 * sum(len(v.points_px) for v in views)
-    freedom = max(points - shared - 3 * len(views), 1)
-    where = {number: slice(column, column + _OF_BAR) for number, column in bars.items()}
-    return SolvedViews(camera_of(fit.x), fit.x, covariance, where, float(misses @ misses) / freedom)
+    freedom = max(points - len(PARAMETERS) - 3 * len(views), 1)
+    where = {number: slice(column, column + _OF_BAR) for number, column in model.bars.items()}
+    return SolvedViews(model.camera_of(fit.x), fit.x, covariance, where, float(misses @ misses) / freedom)
 
 
 def _site_slope(arm_m: Floats, survey: tuple[float, float, float]) -> Floats:

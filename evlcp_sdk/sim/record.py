@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.sim.light import reflections_of
+from evlcp_sdk.sim.light import BarLight, reflections_of
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_sigma_px
 from evlcp_sdk.sim.scene import Scene, resolve_scene
@@ -22,6 +22,12 @@ from evlcp_sdk.sim.world import camera_on_earth, sites_of
 __all__ = ["scene_of_truth", "truth_of"]
 
 Floats = NDArray[np.float64]
+
+_OF_SENSOR = (
+    *("noise_hz", "refr_us", "th_on", "th_off", "noise_ln", "p_on_miss", "p_off_miss"),
+    *("dly_on_us", "dly_off_us", "jitter_us", "tau_sf_us", "t_row_us", "cap_mev_s"),
+)
+"""Of the sensor's parameters, those that the truth repeats."""
 
 
 def truth_of(
@@ -47,68 +53,14 @@ def truth_of(
         simulated if isinstance(simulated, Simulation) else Simulation(simulated, seed, registry=registry)
     )
     scene = simulation.scene
-    camera, sensor, motion = scene.camera, scene.sensor, scene.motion
+    camera = scene.camera
     t_s = np.arange(max(1, round(scene.duration_s * 1000))) / 1000
     position, attitude = simulation.path.at(t_s * 1e6)
     centres = np.array([b.centre_m for b in simulation.bars]).reshape(-1, 3)
     place, depth = project(centres, position, attitude, camera)
-    bars = []
-    for light in simulation.bars:
-        bar = light.bar
-        bars.append(
-            {
-                "x_m": bar.x_m,
-                "y_m": bar.y_m,
-                "z_m": bar.z_m,
-                "length_m": light.link.bar.length_m,
-                "width_m": bar.width_m,
-                "link": light.link.digest,
-                "seed": light.payload_seed,
-                "ppm": bar.ppm,
-                "start_chip": light.start_chip,
-                "led_w_m2": bar.led_w_m2,
-                "chips_file": bar.chips_file,
-                "payload": bar.payload,
-                "symbols": light.sent_symbols(scene.duration_s),
-                "covered": list(bar.covered),
-                "cover_s": [list(span) for span in bar.cover_s],
-                "pole_s": [list(span) for span in bar.pole_s],
-                **({"packet_chips": light.packet_chips} if bar.chips_file is not None else {}),
-            }
-        )
     found: dict[str, Any] = {
-        "scene": {
-            "name": scene.name,
-            "duration_s": scene.duration_s,
-            "distance_m": motion.distance_m,
-            "speed_mps": motion.speed_mps,
-            "vib_rate_rad_s": motion.vib_rate_rad_s,
-            "background_w_m2": scene.background.light_w_m2,
-            "background_texture": scene.background.texture,
-            "noise_hz": sensor.noise_hz,
-            "hot_pixels": simulation.hot_pixels,
-            "focus_m": scene.lens.focus_m,
-            "f_number": scene.lens.f_number,
-            "refr_us": sensor.refr_us,
-            "th_on": sensor.th_on,
-            "th_off": sensor.th_off,
-            "noise_ln": sensor.noise_ln,
-            "p_on_miss": sensor.p_on_miss,
-            "p_off_miss": sensor.p_off_miss,
-            "dly_on_us": sensor.dly_on_us,
-            "dly_off_us": sensor.dly_off_us,
-            "jitter_us": sensor.jitter_us,
-            "tau_sf_us": sensor.tau_sf_us,
-            "hpf_us": 0.0,
-            "t_row_us": sensor.t_row_us,
-            "cap_mev_s": sensor.cap_mev_s,
-            "halo": scene.lens.halo,
-            "seed": scene.seed,
-            "flicker_lamps": scene.flicker_lamps,
-            "t0_us": scene.t0_us,
-            **_of_a_road(scene),
-        },
-        "bars": bars,
+        "scene": _scene_of(simulation),
+        "bars": [_bar_of(light, scene.duration_s) for light in simulation.bars],
         "others": _others(simulation, position, attitude),
         "camera": {
             "focal_mm": camera.focal_mm,
@@ -121,7 +73,8 @@ def truth_of(
         "t_s": [round(float(t), 3) for t in t_s],
         "distance_m": [[round(float(v), 5) for v in column] for column in depth.T],
         "bar_centre_px": [
-            [[round(float(v), 3) for v in place[:, i, axis]] for axis in (0, 1)] for i in range(len(bars))
+            [[round(float(v), 3) for v in place[:, i, axis]] for axis in (0, 1)]
+            for i in range(len(simulation.bars))
         ],
         "camera_path": {
             "position_m": [[round(float(v), 5) for v in axis] for axis in position.T],
@@ -137,6 +90,55 @@ def truth_of(
     if simulation.done_s:
         found |= simulation.counts
     return truth_from_table(found, links={light.link.digest: light.link for light in simulation.bars})
+
+
+def _bar_of(light: BarLight, duration_s: float) -> dict[str, Any]:
+    """What the truth says of a bar and of what it sends."""
+    bar = light.bar
+    found = {
+        "x_m": bar.x_m,
+        "y_m": bar.y_m,
+        "z_m": bar.z_m,
+        "length_m": light.link.bar.length_m,
+        "width_m": bar.width_m,
+        "link": light.link.digest,
+        "seed": light.payload_seed,
+        "ppm": bar.ppm,
+        "start_chip": light.start_chip,
+        "led_w_m2": bar.led_w_m2,
+        "chips_file": bar.chips_file,
+        "payload": bar.payload,
+        "symbols": light.sent_symbols(duration_s),
+        "covered": list(bar.covered),
+        "cover_s": [list(span) for span in bar.cover_s],
+        "pole_s": [list(span) for span in bar.pole_s],
+    }
+    return found if bar.chips_file is None else found | {"packet_chips": light.packet_chips}
+
+
+def _scene_of(simulation: Simulation) -> dict[str, Any]:
+    """The parameters of a scene."""
+    scene = simulation.scene
+    sensor, motion = scene.sensor, scene.motion
+    return {
+        "name": scene.name,
+        "duration_s": scene.duration_s,
+        "distance_m": motion.distance_m,
+        "speed_mps": motion.speed_mps,
+        "vib_rate_rad_s": motion.vib_rate_rad_s,
+        "background_w_m2": scene.background.light_w_m2,
+        "background_texture": scene.background.texture,
+        "hot_pixels": simulation.hot_pixels,
+        "focus_m": scene.lens.focus_m,
+        "f_number": scene.lens.f_number,
+        **{name: getattr(sensor, name) for name in _OF_SENSOR},
+        "hpf_us": 0.0,
+        "halo": scene.lens.halo,
+        "seed": scene.seed,
+        "flicker_lamps": scene.flicker_lamps,
+        "t0_us": scene.t0_us,
+        **_of_a_road(scene),
+    }
 
 
 def _of_a_road(scene: Scene) -> dict[str, Any]:
