@@ -55,7 +55,7 @@ _OWN = (
     "check",
     "warm_up",
 )
-"""Modules of our own commands, each of which adds the one that it is named after."""
+"""Modules of our own commands, each of which has the one that it is named after."""
 
 _SOON = frozenset({"receive", "live"})
 """Commands that need neither others nor a plugin's, and would wait for these a tenth of their start; they say
@@ -210,7 +210,8 @@ def make_app(*modules: str) -> typer.Typer:
     )
     app.callback()(_root)
     for module in modules or _OWN:
-        importlib.import_module(f"evlcp_sdk.cli.{module}").register(app)
+        command = getattr(importlib.import_module(f"evlcp_sdk.cli.{module}"), module)
+        app.command(module.replace("_", "-"))(command)
     return app
 
 

@@ -8,20 +8,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibrated
 
-__all__ = ["register"]
+__all__ = ["calibrate"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("calibrate")(calibrate)
-
-
+@command
 def calibrate(
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings of bars at known sites.")

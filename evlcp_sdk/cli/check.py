@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFile, console, echo
 
 if TYPE_CHECKING:
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.testing import Verdict
 
-__all__ = ["check", "register"]
+__all__ = ["check"]
 
 _STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
 
@@ -22,11 +23,7 @@ _WIDTH = 18
 """Of a law's name, where laws are shown as they are judged: the longest is `codewords-distinct`."""
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("check")(check)
-
-
+@command
 def check(
     role: Annotated[
         str | None, typer.Argument(metavar="[ROLE", help="What the algorithm does, e.g. ranging.")

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, complain, console, echo, make_executor
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.study.comparison import Comparison, Table
     from evlcp_sdk.study.variants import Variant
 
-__all__ = ["compare", "register"]
+__all__ = ["compare"]
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -32,11 +33,7 @@ class CompareJob:
     here: bool
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("compare")(compare)
-
-
+@command
 def compare(
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings, or the RESULTS of one evlcp sweep.")

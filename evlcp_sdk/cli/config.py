@@ -7,9 +7,10 @@ from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, echo
 
-__all__ = ["register"]
+__all__ = ["config"]
 
 
 class CodebookForm(StrEnum):
@@ -19,11 +20,7 @@ class CodebookForm(StrEnum):
     C = "c"
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("config")(config)
-
-
+@command
 def config(
     link_file: LinkFile = None,
     overrides: Overrides = None,

@@ -7,17 +7,14 @@ from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, bytes_bar, complain, echo
 from evlcp_sdk.spelling import counted
 
-__all__ = ["register"]
+__all__ = ["convert"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("convert")(convert)
-
-
+@command
 def convert(
     url: Annotated[
         str, typer.Argument(metavar="SOURCE", help="A recording, a stream, a camera, or what a plugin opens.")

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, Workers, complain, console, echo
 from evlcp_sdk.plugin.hooks import hookimpl
 
@@ -17,18 +18,13 @@ if TYPE_CHECKING:
     from evlcp_sdk.study.summary import Summary
     from evlcp_sdk.values import Frame
 
-__all__ = ["demo", "demo_campaign", "demo_files", "register"]
+__all__ = ["demo", "demo_campaign", "demo_files"]
 
 DEMO_NAME = "night-50m-30kmh-cut"
 CAMPAIGN_NAME = "demo"
 
 _FIRST_S = 0.06
 """Of the first stretch, which is received before it counts: a packet at least."""
-
-
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("demo")(demo)
 
 
 def demo_files() -> tuple[Path, Path]:
@@ -47,6 +43,7 @@ def demo_campaign() -> Path:
     return shipped("campaigns", f"{CAMPAIGN_NAME}.toml")
 
 
+@command
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder of the result.")] = Path(
         "demo-out"

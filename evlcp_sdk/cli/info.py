@@ -6,16 +6,13 @@ from typing import Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, echo
 
-__all__ = ["register"]
+__all__ = ["info"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("info")(info)
-
-
+@command
 def info(
     recording: Annotated[str, typer.Argument(metavar="REC", help="A recording; - for standard input.")],
     as_json: Json = False,

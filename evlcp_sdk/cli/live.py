@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import complain, console, echo
-from evlcp_sdk.cli._groups import with_groups
 from evlcp_sdk.cli._receiving import CameraOptions, FormatOptions, LinkOptions, json_lines_of
 from evlcp_sdk.cli._summary import delays_text, show
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.live.outlet import Outlet
     from evlcp_sdk.live.services import Services, Serving
 
-__all__ = ["register"]
+__all__ = ["live"]
 
 _HERE = "127.0.0.1"
 
@@ -103,11 +103,7 @@ class ServingOptions:
         )
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("live")(with_groups(live))
-
-
+@command
 def live(
     *,
     url: Annotated[

@@ -4,21 +4,16 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-import typer
-
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, echo
 
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
 
-__all__ = ["register", "table_of"]
+__all__ = ["plugins", "table_of"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("plugins")(plugins)
-
-
+@command
 def plugins(as_json: Json = False) -> None:
     """List the roles with what they do, the installed algorithms of each, and broken plugins.
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import (
     Dask,
     bytes_bar,
@@ -22,7 +23,6 @@ from evlcp_sdk.cli._common import (
     make_executor,
     shows_bars,
 )
-from evlcp_sdk.cli._groups import with_groups
 from evlcp_sdk.cli._receiving import CameraOptions, FormatOptions, LinePrinter, LinkOptions, json_lines_of
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.signals import EndRequest
     from evlcp_sdk.study.jobs import Executor, Outcome
 
-__all__ = ["register"]
+__all__ = ["receive"]
 
 
 class LinkMode(StrEnum):
@@ -56,11 +56,7 @@ class ReceiveJob:
     link: Link | None = None
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("receive")(with_groups(receive))
-
-
+@command
 def receive(
     *,
     recordings: Annotated[

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, console, echo
 from evlcp_sdk.cli._tables import print_table
 
@@ -14,14 +15,10 @@ if TYPE_CHECKING:
     from evlcp_sdk.study.summary import Summary
     from evlcp_sdk.study.tally import Tally
 
-__all__ = ["register", "report", "show_paper", "show_positions", "show_series"]
+__all__ = ["report", "show_paper", "show_positions", "show_series"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("report")(report)
-
-
+@command
 def report(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="What evlcp sweep wrote.")],
     out: Annotated[

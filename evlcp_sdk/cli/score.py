@@ -8,16 +8,13 @@ from typing import Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, complain, console, echo
 
-__all__ = ["register", "score"]
+__all__ = ["score"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("score")(score)
-
-
+@command
 def score(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="What `evlcp receive -o OUT` wrote.")],
     truth_file: Annotated[Path, typer.Argument(metavar="REC.truth.json", help="The recording's truth.")],

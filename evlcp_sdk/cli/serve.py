@@ -7,16 +7,13 @@ from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import complain
 
-__all__ = ["register"]
+__all__ = ["serve"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("serve")(serve)
-
-
+@command
 def serve(
     url: Annotated[
         str, typer.Argument(metavar="URL", help="A recording, which is sent at its own pace, or a camera.")

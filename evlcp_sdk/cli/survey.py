@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo
 from evlcp_sdk.cli._receiving import CameraOptions
 from evlcp_sdk.spelling import counted
@@ -16,14 +17,10 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.place.survey import SurveyedBar
 
-__all__ = ["register"]
+__all__ = ["survey"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("survey")(survey)
-
-
+@command
 def survey(
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings of bars that send their ids.")

@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import typer
-
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, console, echo
 
-__all__ = ["register", "warm_up"]
+__all__ = ["warm_up"]
 
 
-def register(app: typer.Typer) -> None:
-    """Add the command."""
-    app.command("warm-up")(warm_up)
-
-
+@command
 def warm_up(as_json: Json = False) -> None:
     """Compile the kernels now, so that no later command waits for them.
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo
 from firmware_host.commands._json import AsJson, print_json, say
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, progress_bar, say_done
@@ -24,87 +26,130 @@ __all__ = ["keygen", "message"]
 
 _MOST_NUMBER = 2**32 - 1
 
-Text = Annotated[str | None, typer.Option(metavar="TEXT", help="Send a text.")]
-DataFile = Annotated[Path | None, typer.Option(metavar="FILE", help="Send a file's bytes.")]
-BeaconFile = Annotated[Path | None, typer.Option(metavar="site.toml", help="Send where the transmitter is.")]
-User = Annotated[str, typer.Option(metavar="TEXT", help="The beacon's own bytes, as text.")]
-Time = Annotated[bool, typer.Option("--time", help="Send the time.")]
-CountdownS = Annotated[
-    float | None, typer.Option(metavar="SECONDS", help="Send how long a signal still shows.", min=0.0)
-]
-Signal = Annotated[str, typer.Option(help="What it shows: red, green and the like.")]
-NextSignal = Annotated[str, typer.Option("--next", help="What it shows then.")]
-KeyFile = Annotated[
-    Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
-]
-TransmitterId = Annotated[
-    int | None,
-    typer.Option("--id", min=0, max=_MOST_NUMBER, help="Transmitter id; the site's, or 0, without it."),
-]
-Sequence = Annotated[
-    int | None,
-    typer.Option(
-        min=0, max=_MOST_NUMBER, help="Sequence number; seconds since 1970 without it, so that it rises."
-    ),
-]
-Repeat = Annotated[int, typer.Option(min=1, max=1000, help="Send each packet so often in a row.")]
-SymbolsOut = Annotated[
-    Path | None, typer.Option("-o", "--out", metavar="FILE.json", help="Write the symbols.")
-]
-ChipsOut = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.npy", help="Write the chips: uint8, a row per chip, a column per cluster."),
-]
-Port = Annotated[
-    str | None,
-    typer.Option(
-        help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board';"
-        " EVLCP_PORT without it, unless -o or --chips is given."
-    ),
-]
-Baud = Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)]
-BoardKey = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", envvar="EVLCP_BOARD_KEY", help="The board's key, if it has one."),
-]
-Every = Annotated[
-    float | None,
-    typer.Option(
-        metavar="SECONDS",
-        min=1.0,
-        help="Send it anew so often, to a board: with the time, with what is left, and in the text"
-        " {time}, {left} and {n}; end with Ctrl-C, or when nothing is left.",
-    ),
-]
-Count = Annotated[int | None, typer.Option(min=1, help="With --every: end after so many.")]
-JsonObject = Annotated[bool, typer.Option("--json", help="One JSON object on stdout, with the symbols.")]
+
+@dataclass(frozen=True)
+class ContentOptions:
+    """What is sent."""
+
+    text: Annotated[str | None, typer.Option(metavar="TEXT", help="Send a text.")] = None
+    file: Annotated[Path | None, typer.Option(metavar="FILE", help="Send a file's bytes.")] = None
+    beacon: Annotated[
+        Path | None, typer.Option(metavar="site.toml", help="Send where the transmitter is.")
+    ] = None
+    user: Annotated[str, typer.Option(metavar="TEXT", help="The beacon's own bytes, as text.")] = ""
+    time: Annotated[bool, typer.Option("--time", help="Send the time.")] = False
+    countdown: Annotated[
+        float | None, typer.Option(metavar="SECONDS", help="Send how long a signal still shows.", min=0.0)
+    ] = None
+    signal: Annotated[str, typer.Option(help="What it shows: red, green and the like.")] = "red"
+    next_signal: Annotated[str, typer.Option("--next", help="What it shows then.")] = "green"
+    key: Annotated[
+        Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
+    ] = None
+    transmitter_id: Annotated[
+        int | None,
+        typer.Option("--id", min=0, max=_MOST_NUMBER, help="Transmitter id; the site's, or 0, without it."),
+    ] = None
+    sequence: Annotated[
+        int | None,
+        typer.Option(
+            min=0, max=_MOST_NUMBER, help="Sequence number; seconds since 1970 without it, so that it rises."
+        ),
+    ] = None
+
+    def content(self) -> Content:
+        """What to send, from now on.
+
+        Raises:
+            ConfigError: Nothing, or what belongs to a beacon without one.
+            InputError: The file cannot be read.
+        """
+        from time import time as clock_s
+
+        from evlcp_sdk.errors import ConfigError
+        from evlcp_sdk.link.compose import utf8
+        from firmware_host.board.messages import Content
+        from firmware_host.board.sites import site_that_sends
+
+        if not self.time and (self.text, self.file, self.beacon, self.countdown) == (None,) * 4:
+            raise ConfigError(
+                "give what to send: --text TEXT, --file FILE, --beacon site.toml, --time or --countdown"
+                " SECONDS"
+            )
+        if self.beacon is None and (self.key is not None or self.user):
+            raise ConfigError("--key and --user belong to a beacon: give --beacon site.toml, too")
+        for option, given in (("--text", self.text), ("--user", self.user)):
+            utf8(given or "", option)
+        site = None if self.beacon is None else site_that_sends(self.beacon, self.transmitter_id, "--id")
+        return Content(
+            text=self.text,
+            data=None if self.file is None else _read(self.file),
+            site=site,
+            user=self.user.encode(),
+            key=self.key,
+            time=self.time,
+            ends_s=None if self.countdown is None else clock_s() + self.countdown,
+            signals=(self.signal, self.next_signal),
+            transmitter_id=self.transmitter_id,
+            sequence=int(clock_s()) if self.sequence is None else self.sequence,
+        )
 
 
+@dataclass(frozen=True)
+class LineOptions:
+    """A board that plays it."""
+
+    port: Annotated[
+        str | None,
+        typer.Option(
+            help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board';"
+            " EVLCP_PORT without it, unless -o or --chips is given."
+        ),
+    ] = None
+    baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = 1_000_000
+    board_key: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", envvar="EVLCP_BOARD_KEY", help="The board's key, if it has one."),
+    ] = None
+
+    def line(self, *, only_named: bool = False) -> BoardLine | None:
+        """The line that is named, or else that of the environment; None for no board."""
+        port = self.port or (None if only_named else os.environ.get("EVLCP_PORT") or None)
+        return None if port is None else BoardLine(port, self.baud, key=self.board_key)
+
+
+@command
 def message(
-    text: Text = None,
-    file: DataFile = None,
-    beacon: BeaconFile = None,
-    user: User = "",
-    time: Time = False,
-    countdown: CountdownS = None,
-    signal: Signal = "red",
-    next_signal: NextSignal = "green",
-    key: KeyFile = None,
-    transmitter_id: TransmitterId = None,
-    sequence: Sequence = None,
-    repeat: Repeat = 1,
-    out: SymbolsOut = None,
-    chips: ChipsOut = None,
-    port: Port = None,
-    baud: Baud = 1_000_000,
-    board_key: BoardKey = None,
-    every: Every = None,
-    count: Count = None,
+    *,
+    content: ContentOptions,
+    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Send each packet so often in a row.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option("-o", "--out", metavar="FILE.json", help="Write the symbols.")
+    ] = None,
+    chips: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE.npy", help="Write the chips: uint8, a row per chip, a column per cluster."
+        ),
+    ] = None,
+    board: LineOptions,
+    every: Annotated[
+        float | None,
+        typer.Option(
+            metavar="SECONDS",
+            min=1.0,
+            help="Send it anew so often, to a board: with the time, with what is left, and in the text"
+            " {time}, {left} and {n}; end with Ctrl-C, or when nothing is left.",
+        ),
+    ] = None,
+    count: Annotated[int | None, typer.Option(min=1, help="With --every: end after so many.")] = None,
     ahead: Ahead = 2,
     stay: KeepAlive = False,
     link_file: LinkFile = None,
     overrides: Overrides = None,
-    as_json: JsonObject = False,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="One JSON object on stdout, with the symbols.")
+    ] = False,
 ) -> None:
     """Put a text, a file or a beacon on packets: symbols, chips, or a board that plays them.
 
@@ -116,66 +161,29 @@ def message(
 
     A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
-    from time import time as clock_s
-
     from evlcp_sdk.errors import ConfigError
-    from evlcp_sdk.link.compose import utf8
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
-    from firmware_host.board.messages import Content
-    from firmware_host.board.sites import site_that_sends
 
     link = load_link(link_file, overrides or [], Registry.load())
-    for wrong, why in (
-        (
-            text is None and file is None and beacon is None and not time and countdown is None,
-            "give what to send: --text TEXT, --file FILE, --beacon site.toml, --time or --countdown SECONDS",
-        ),
-        (every is None and count is not None, "--count belongs to --every SECONDS"),
-        (
-            every is not None and (out is not None or chips is not None),
-            "--every sends what changes, to a board: -o and --chips hold what stays",
-        ),
-        (
-            beacon is None and (key is not None or bool(user)),
-            "--key and --user belong to a beacon: give --beacon site.toml, too",
-        ),
-    ):
-        if wrong:
-            raise ConfigError(why)
-    for option, given in (("--text", text), ("--user", user)):
-        utf8(given or "", option)
-    content = Content(
-        text=text,
-        data=None if file is None else _read(file),
-        site=None if beacon is None else site_that_sends(beacon, transmitter_id, "--id"),
-        user=user.encode(),
-        key=key,
-        time=time,
-        ends_s=None if countdown is None else clock_s() + countdown,
-        signals=(signal, next_signal),
-        transmitter_id=transmitter_id,
-        sequence=int(clock_s()) if sequence is None else sequence,
-    )
+    made = content.content()
+    if every is None and count is not None:
+        raise ConfigError("--count belongs to --every SECONDS")
     if every is not None:
-        line = _line(port, baud, board_key)
+        if out is not None or chips is not None:
+            raise ConfigError("--every sends what changes, to a board: -o and --chips hold what stays")
+        line = board.line()
         if line is None:
             raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
-        _send_anew(content, link, line, repeat, every, count, ahead, as_json=as_json)
+        _send_anew(made, link, line, repeat, every, count, ahead, as_json=as_json)
         return
-    symbols, summary = _compose(content, link, repeat)
+    symbols, summary = _compose(made, link, repeat)
     written = _write(symbols, link, out, chips)
-    line = _line(port, baud, board_key, only_named=bool(written))
+    line = board.line(only_named=bool(written))
     if line is None and not written and not as_json:
         _tell(summary, written, plays=False)
         raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
     _program(symbols, link, line, summary, written, stay=stay, as_json=as_json)
-
-
-def _line(port: str | None, baud: int, key: Path | None, *, only_named: bool = False) -> BoardLine | None:
-    """The line of a board: the one that is named, or else that of the environment; None for no board."""
-    port = port or (None if only_named else os.environ.get("EVLCP_PORT") or None)
-    return None if port is None else BoardLine(port, baud, key=key)
 
 
 def _send_anew(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides
 from firmware_host.commands._json import AsJson, say
 from firmware_host.commands._line import open_board
@@ -42,6 +43,7 @@ class Lines(StrEnum):
     SYMBOLS = "symbols"
 
 
+@command
 def stream(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="[FILE]", help="A line a message; - is stdin.")] = Path("-"),
