@@ -20,7 +20,7 @@ import numpy as np
 from numba import njit
 
 from evlcp_sdk.sim import SensorSpec, Simulation, _kernels, load_scene
-from evlcp_sdk.sim.simulation import quantile_table, seed_key, sensor_vector
+from evlcp_sdk.sim.simulation import pixel_model, requests_room
 
 
 def best(work: Callable[[], int], rounds: int) -> float:
@@ -111,16 +111,16 @@ def main() -> None:
         )
 
     spec = SensorSpec(noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
-    sensor, table = sensor_vector(spec), quantile_table()
+    model = pixel_model(spec, 0)
+    sensor = model.sensor
     bits = np.random.default_rng(0).integers(0, 2, 2000)
     light = np.where(np.stack([1 - bits, bits], 1).ravel(), 51.0, 0.05)
     edges = np.arange(light.size) * 100.0
-    room = np.empty(1 << 20), np.empty(1 << 20, np.int32), np.empty(0)
 
     def closed_form() -> int:
-        return _kernels.run_given_light(
-            0, 50, edges, light, light.size * 100.0, seed_key(0), table, np.ones_like(table), sensor, *room
-        )
+        out = requests_room(1 << 20)
+        _kernels.run_given_light(0, 50, edges, light, light.size * 100.0, model, out)
+        return int(out.made[0])
 
     closed_form()
     print(f"pixels, closed form           {best(closed_form, args.rounds):8.2f} Mev/s")

@@ -5,7 +5,7 @@ sum of a product once instead of twice (`contract`), which takes half as many in
 """
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -90,128 +90,6 @@ def _receptor(u_base: float, rest: float, ages: float) -> float:
     return rest if ages > 60.0 else rest + (u_base - rest) * math.exp(-ages)
 
 
-@njit
-def _follow(y_from: float, y_to: float, z: float, whole: float, part: float, tau: float) -> float:
-    """Return a low-pass filter's output after `part` of a ramp of `whole` us from y_from to y_to."""
-    slope = (y_to - y_from) / whole
-    return y_from + slope * (part - tau) + (z - y_from + slope * tau) * math.exp(-part / tau)
-
-
-@njit
-def _run_piece_followed(
-    until: float,
-    light: float,
-    u_base: float,
-    t_base: float,
-    z: float,
-    reference: float,
-    t_ready: float,
-    t_last_out: float,
-    armed: int,
-    draw: int,
-    on_factor: float,
-    off_factor: float,
-    code: int,
-    key: Any,
-    quantiles: Array,
-    shifts: Array,
-    sensor: Array,
-    out_t: Array,
-    out_code: Array,
-    out_cross: Array,
-    n: int,
-) -> tuple[float, float, float, float, float, int, int, int]:
-    """Let one pixel see a light, as in `_run_piece`, with a low-pass filter between receptor and comparator.
-
-    The receptor is exact; between its values, as near to one another as they must be for a ramp to hit the
-    middle between them to 0.002, the filter is solved for ramps. `reference` and `z` are log signals.
-    """
-    charge, refractory = sensor[0], sensor[1]
-    delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
-    miss_on, miss_off, tau = sensor[5], sensor[6], sensor[12]
-    threshold_on, threshold_off = -math.log(on_factor), math.log(off_factor)
-    rest = 1.0 / light
-    settled = math.log(light)
-    rate = light / charge
-    t = t_base
-    y = -math.log(u_base)
-    length = 0.25 * tau
-    word = _mix(key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03))
-    noise = math.log(_table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10))
-    fire = 0
-    while True:
-        if armed == 1:
-            if z >= reference + threshold_on - noise:
-                fire = 1
-            elif z <= reference - threshold_off - noise:
-                fire = -1
-            if fire != 0:
-                armed = 0
-                t_ready = t + refractory
-                late = delay_on if fire > 0 else delay_off
-                if jitter > 0.0:
-                    late = max(0.0, late + jitter * hash_normal(key, 0, draw, 2, quantiles))
-                request = max(t + late, t_last_out + refractory)
-                t_last_out = request
-                missed = float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10
-                if missed >= (miss_on if fire > 0 else miss_off):
-                    out_t[n] = request
-                    out_code[n] = code + int(fire > 0)
-                    if out_cross.size:
-                        out_cross[n] = t
-                    n += 1
-                fire = 0
-        elif t >= t_ready:
-            reference = z
-            armed = 1
-            draw += 1
-            word = _mix(key + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03))
-            noise = math.log(_table_at(shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10))
-        if t >= until:
-            break
-        limit = until if armed == 1 else min(until, t_ready)
-        if abs(y - settled) < 1e-5 and abs(z - settled) < 1e-5:
-            t = limit
-            continue
-        whole = min(length, limit - t)
-        last = whole == limit - t
-        middle = -math.log(_receptor(u_base, rest, rate * (t + 0.5 * whole - t_base)))
-        end = -math.log(_receptor(u_base, rest, rate * (t + whole - t_base)))
-        if abs(middle - 0.5 * (y + end)) > 2e-3 and whole > 1e-3:
-            length = 0.5 * whole
-            continue
-        length = min(2.0 * whole, tau)
-        half = 0.5 * whole
-        y_from, z_from, crossed = y, z, False
-        for k in range(2):
-            y_to = middle if k == 0 else end
-            z_to = _follow(y_from, y_to, z_from, half, half, tau)
-            if armed == 1:
-                high, low = reference + threshold_on - noise, reference - threshold_off - noise
-                if z_to >= high or z_to <= low:
-                    level = high if z_to >= high else low
-                    rising = z_to >= high
-                    before, after = 0.0, half
-                    for _ in range(20):
-                        guess = 0.5 * (before + after)
-                        beyond = _follow(y_from, y_to, z_from, half, guess, tau) >= level
-                        if beyond == rising:
-                            after = guess
-                        else:
-                            before = guess
-                    t += k * half + after
-                    z = level
-                    y = -math.log(_receptor(u_base, rest, rate * (t - t_base)))
-                    crossed = True
-                    break
-            y_from, z_from = y_to, z_to
-        if not crossed:
-            t = limit if last else t + whole
-            y, z = end, z_from
-    u_end = _receptor(u_base, rest, rate * (until - t_base))
-    return u_end, z, reference, t_ready, t_last_out, armed, draw, n
-
-
 LANES = 192
 """Most pixels that pass through time together: what is done for each is a loop of vector instructions."""
 
@@ -226,6 +104,66 @@ _ALONG, _ACROSS, _ROW_PART, _NODE_PART = range(16 * LANES, 20 * LANES, LANES)
 _M_U, _M_REST, _M_END, _M_REFERENCE, _M_READY, _M_LAST_OUT = range(20 * LANES, 26 * LANES, LANES)
 _M_ON, _M_OFF, _M_AGE, _M_SHIFT, _M_FATE, _M_SPARE = range(26 * LANES, 32 * LANES, LANES)
 _M_LATER, _M_CROSS, _M_LEVEL, _M_REQUEST, _ROOM = range(32 * LANES, 37 * LANES, LANES)
+
+
+class Batch(NamedTuple):
+    """Pixels that pass through time together, at most `LANES`.
+
+    Attributes:
+        f: Rows of numbers, float64 (_ROOM,).
+        key: Of each one's random numbers, uint64 (LANES,).
+        draw: Number of its draw, int64 (LANES,).
+        code: That of its OFF events, int64 (LANES,).
+        kind: Room, int64 (LANES,).
+        which: Lanes of those that may fire, int64 (LANES,).
+        again: Lanes of those that see again, int64 (LANES,).
+    """
+
+    f: Array
+    key: Array
+    draw: Array
+    code: Array
+    kind: Array
+    which: Array
+    again: Array
+
+
+class PixelModel(NamedTuple):
+    """What pixels have in common.
+
+    Attributes:
+        seed: Of their random numbers.
+        sensor: As of `sensor_vector`.
+        quantiles: Of the normal distribution.
+        shifts: Of the factor by which noise moves both thresholds.
+    """
+
+    seed: Any
+    sensor: Array
+    quantiles: Array
+    shifts: Array
+
+
+class Requests(NamedTuple):
+    """The events that pixels ask for.
+
+    Attributes:
+        t_us: When, float64 (n,).
+        code: Of pixel and polarity, int32 (n,).
+        cross_us: When the threshold was crossed, float64 (n,) or empty.
+        made: How many there are, int64 (1,).
+    """
+
+    t_us: Array
+    code: Array
+    cross_us: Array
+    made: Array
+
+
+@njit
+def _make_batch() -> Batch:
+    rows = np.zeros((5, LANES), np.int64)
+    return Batch(np.zeros(_ROOM), np.zeros(LANES, np.uint64), rows[0], rows[1], rows[2], rows[3], rows[4])
 
 
 @njit(inline="always")
@@ -249,6 +187,114 @@ def _decay(age: float) -> float:
     p = p * r + 1.0
     power = np.int64((1023 << 52) - (np.float64(whole).view(np.int64) << 52)).view(np.float64)
     return (p if age <= 60.0 else 0.0) * power
+
+
+@njit(inline="always")
+def _draw_noise(i: int, batch: Batch, model: PixelModel) -> tuple[Any, float]:
+    """A pixel's word of random bits in its draw, and by what factor noise moves its thresholds.
+
+    The upper half of the word decides on the noise, the lower on whether an event goes missing.
+    """
+    word = _mix(batch.key[i] + np.uint64(batch.draw[i]) * np.uint64(0xD1B54A32D192ED03))
+    return word, _table_at(model.shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
+
+
+@njit(inline="always")
+def _fire(i: int, t_us: float, on: Any, word: Any, batch: Batch, model: PixelModel, out: Requests) -> None:
+    """Let a pixel fire: it is blind for a while, and asks for its event, unless that goes missing."""
+    f, sensor = batch.f, model.sensor
+    refractory, late, jitter = sensor[1], sensor[2] if on else sensor[3], sensor[4]
+    if jitter > 0.0:
+        late = max(late + jitter * hash_normal(batch.key[i], 0, batch.draw[i], 2, model.quantiles), 0.0)
+    request = max(t_us + late, f[_LAST_OUT + i] + refractory)
+    f[_READY + i], f[_LAST_OUT + i] = t_us + refractory, request
+    if float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10 >= (sensor[5] if on else sensor[6]):
+        n = out.made[0]
+        out.t_us[n], out.code[n] = request, batch.code[i] + (1 if on else 0)
+        if out.cross_us.size:
+            out.cross_us[n] = t_us
+        out.made[0] = n + 1
+
+
+@njit
+def _follow(y_from: float, y_to: float, z: float, whole: float, part: float, tau: float) -> float:
+    """Return a low-pass filter's output after `part` of a ramp of `whole` us from y_from to y_to."""
+    slope = (y_to - y_from) / whole
+    return y_from + slope * (part - tau) + (z - y_from + slope * tau) * math.exp(-part / tau)
+
+
+@njit
+def _find_crossing(y_from: float, y_to: float, z: float, half: float, level: float, tau: float) -> float:
+    """When, in a ramp of `half` us, a low-pass filter's output passes a level, to a millionth of the ramp."""
+    rising = z < level
+    before, after = 0.0, half
+    for _ in range(20):
+        guess = 0.5 * (before + after)
+        if (_follow(y_from, y_to, z, half, guess, tau) >= level) == rising:
+            after = guess
+        else:
+            before = guess
+    return after
+
+
+@njit
+def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelModel, out: Requests) -> None:
+    """Let a pixel see its light, as in `_run_piece`, with a low-pass filter between receptor and comparator.
+
+    The receptor is exact; between its values, as near to one another as they must be for a ramp to hit the
+    middle between them to 0.002, the filter is solved for ramps. Its reference and its output are log
+    signals.
+    """
+    f, tau = batch.f, model.sensor[12]
+    light, u_base = f[_NOW + i], f[_U + i]
+    threshold_on, threshold_off = -math.log(f[_ON + i]), math.log(f[_OFF + i])
+    rest, settled, rate = 1.0 / light, math.log(light), light / model.sensor[0]
+    t, y, z, length = t_us, -math.log(u_base), f[_FOLLOWER + i], 0.25 * tau
+    word, factor = _draw_noise(i, batch, model)
+    noise, reference = math.log(factor), f[_REFERENCE + i]
+    while True:
+        high, low = reference + threshold_on - noise, reference - threshold_off - noise
+        if f[_ARMED + i] > 0.0:
+            if z >= high or z <= low:
+                f[_ARMED + i] = 0.0
+                _fire(i, t, z >= high, word, batch, model, out)
+        elif t >= f[_READY + i]:
+            reference, f[_ARMED + i] = z, 1.0
+            batch.draw[i] += 1
+            word, factor = _draw_noise(i, batch, model)
+            noise = math.log(factor)
+            high, low = reference + threshold_on - noise, reference - threshold_off - noise
+        if t >= until:
+            break
+        armed = f[_ARMED + i] > 0.0
+        limit = until if armed else min(until, f[_READY + i])
+        if abs(y - settled) < 1e-5 and abs(z - settled) < 1e-5:
+            t = limit
+            continue
+        whole = min(length, limit - t)
+        last = whole == limit - t
+        middle = -math.log(_receptor(u_base, rest, rate * (t + 0.5 * whole - t_us)))
+        end = -math.log(_receptor(u_base, rest, rate * (t + whole - t_us)))
+        if abs(middle - 0.5 * (y + end)) > 2e-3 and whole > 1e-3:
+            length = 0.5 * whole
+            continue
+        length = min(2.0 * whole, tau)
+        half = 0.5 * whole
+        crossed = False
+        for k in range(2):
+            y_to = middle if k == 0 else end
+            z_to = _follow(y, y_to, z, half, half, tau)
+            if armed and (z_to >= high or z_to <= low):
+                level = high if z_to >= high else low
+                t += k * half + _find_crossing(y, y_to, z, half, level, tau)
+                y, z = -math.log(_receptor(u_base, rest, rate * (t - t_us))), level
+                crossed = True
+                break
+            y, z = y_to, z_to
+        if not crossed:
+            t = limit if last else t + whole
+    f[_U + i] = _receptor(u_base, rest, rate * (until - t_us))
+    f[_FOLLOWER + i], f[_REFERENCE + i] = z, reference
 
 
 @njit(inline="always")
@@ -291,57 +337,154 @@ def _take(f: Array, row: int, which: Array, n: int, out: int) -> None:
         f[out + a] = f[np.uint64(row + which[a])]
 
 
-@njit(fastmath={"contract"})
-def _run_piece(
-    lanes: int,
-    t_us: float,
-    until: float,
-    f: Array,
-    bits: Array,
-    key: Array,
-    draw: Array,
-    code: Array,
-    which: Array,
-    again: Array,
-    kind: Array,
-    quantiles: Array,
-    shifts: Array,
-    sensor: Array,
-    out_t: Array,
-    out_code: Array,
-    out_cross: Array,
-    n: int,
+@njit(inline="always")
+def _see_again(blind: int, m: int, t_us: float, batch: Batch, sensor: Array) -> int:
+    """Take the light that `blind` lanes of `again` see as their reference; add those that may fire to `m` of
+    `which`; how many these are then.
+    """
+    f, kind, which, again, draw = batch.f, batch.kind, batch.which, batch.again, batch.draw
+    per_charge, widest = 1.0 / sensor[0], sensor[8]
+    # Those that see again in this piece, and of them those that may fire.
+    even = _fill(again, blind)
+    _take(f, _U, again, even, _M_U)
+    _take(f, _REST, again, even, _M_REST)
+    _take(f, _END, again, even, _M_END)
+    _take(f, _ON, again, even, _M_ON)
+    _take(f, _OFF, again, even, _M_OFF)
+    _take(f, _READY, again, even, _M_READY)
+    _take(f, _NOW, again, even, _M_AGE)
+    for a in range(even):
+        rest, end = f[_M_REST + a], f[_M_END + a]
+        kept = _decay((f[_M_READY + a] - t_us) * per_charge * f[_M_AGE + a])
+        reference = rest + (f[_M_U + a] - rest) * kept
+        f[_M_REFERENCE + a] = reference
+        on = end <= reference * f[_M_ON + a] * widest
+        off = end * widest >= reference * f[_M_OFF + a]
+        kind[a] = 1 if on | off else 0
+    for a in range(blind):
+        i = again[a]
+        f[np.uint64(_REFERENCE + i)] = f[_M_REFERENCE + a]
+        draw[np.uint64(i)] += 1
+        which[np.uint64(m)] = i
+        m += kind[a]
+    return m
+
+
+@njit(inline="always")
+def _draw_fates(m: int, batch: Batch, shifts: Array) -> int:
+    """Draw the noise of `m` lanes of `which`; those that fire by it move to the front; how many there are.
+
+    Of a word of random bits a draw, the upper half decides on the noise, the lower on whether the event goes
+    missing.
+    """
+    f, kind, which, draw, key = batch.f, batch.kind, batch.which, batch.draw, batch.key
+    bits = f.view(np.int64)
+    even = _fill(which, m)
+    for a in range(even):
+        k = np.uint64(which[a])
+        word = _mix(key[k] + np.uint64(draw[k]) * np.uint64(0xD1B54A32D192ED03))
+        bits[_M_SPARE + a] = np.int64(word)
+    # Half a word becomes the lowest bits of 2^52.
+    for a in range(even):
+        bits[_M_SHIFT + a] = (bits[_M_SPARE + a] >> 32) & 0xFFFFFFFF | 0x4330000000000000
+        bits[_M_FATE + a] = bits[_M_SPARE + a] & 0xFFFFFFFF | 0x4330000000000000
+    for a in range(even):
+        f[_M_SHIFT + a] = (f[_M_SHIFT + a] - 4503599627370496.0) * 2.3283064365386963e-10
+        f[_M_FATE + a] = (f[_M_FATE + a] - 4503599627370496.0) * 2.3283064365386963e-10
+    # By itself, so that many parts of the table are on their way at once.
+    for a in range(even):
+        f[_M_SHIFT + a] = _table_at(shifts, f[_M_SHIFT + a])
+    _take(f, _REFERENCE, which, even, _M_REFERENCE)
+    _take(f, _END, which, even, _M_END)
+    _take(f, _ON, which, even, _M_ON)
+    _take(f, _OFF, which, even, _M_OFF)
+    for a in range(even):
+        end = f[_M_END + a]
+        level = f[_M_REFERENCE + a] * f[_M_SHIFT + a]
+        low, high = level * f[_M_ON + a], level * f[_M_OFF + a]
+        on = end <= low
+        f[_M_LEVEL + a] = low if on else high
+        f[_M_ON + a] = 1.0 if on else 0.0
+        kind[a] = 1 if on | (end >= high) else 0
+    # Those that fire move to the front.
+    fires = 0
+    for a in range(m):
+        k = np.uint64(fires)
+        f[np.uint64(_M_LEVEL) + k] = f[_M_LEVEL + a]
+        f[np.uint64(_M_ON) + k] = f[_M_ON + a]
+        f[np.uint64(_M_FATE) + k] = f[_M_FATE + a]
+        which[k] = which[a]
+        fires += kind[a]
+    return fires
+
+
+@njit(inline="always")
+def _fire_together(
+    fires: int, t_us: float, until: float, batch: Batch, model: PixelModel, out: Requests
 ) -> int:
-    """Let pixels see their light from `t_us` to `until`; write their events behind `n`, return how many then.
+    """Let lanes of `which` fire, together; those that see again in the piece are `again`: how many."""
+    f, kind, which, again, draw, key = batch.f, batch.kind, batch.which, batch.again, batch.draw, batch.key
+    code, sensor, quantiles = batch.code, model.sensor, model.quantiles
+    charge, refractory, delay_on, delay_off, jitter = sensor[0], sensor[1], sensor[2], sensor[3], sensor[4]
+    miss_on, miss_off = sensor[5], sensor[6]
+    out_t, out_code, out_cross, n = out.t_us, out.code, out.cross_us, out.made[0]
+    even = _fill(which, fires)
+    _take(f, _U, which, even, _M_U)
+    _take(f, _REST, which, even, _M_REST)
+    _take(f, _READY, which, even, _M_READY)
+    _take(f, _LAST_OUT, which, even, _M_LAST_OUT)
+    if jitter > 0.0:
+        for a in range(fires):
+            k = np.uint64(which[a])
+            f[_M_LATER + a] = jitter * hash_normal(key[k], 0, draw[k], 2, quantiles)
+    for a in range(even):
+        u, rest, level = f[_M_U + a], f[_M_REST + a], f[_M_LEVEL + a]
+        ready, on = f[_M_READY + a], f[_M_ON + a] > 0.0
+        # Where it is beyond the threshold from the first, there is no way to it.
+        beyond = (u <= level) if on else (u >= level)
+        tau = 0.0 if beyond else charge * rest
+        t = max(ready, t_us)
+        t = min(max(t_us + _logarithm((u - rest) / (level - rest)) * tau, t), until)
+        late = max((delay_on if on else delay_off) + f[_M_LATER + a], 0.0)
+        ready = t + refractory
+        f[_M_CROSS + a] = t
+        f[_M_REQUEST + a] = max(t + late, f[_M_LAST_OUT + a] + refractory)
+        f[_M_READY + a] = ready
+        sent = f[_M_FATE + a] >= (miss_on if on else miss_off)
+        kind[a] = (1 if on else 0) | (2 if sent else 0) | (4 if ready < until else 0)
+    blind = 0
+    for a in range(fires):
+        i, what = which[a], kind[a]
+        f[np.uint64(_READY + i)] = f[_M_READY + a]
+        f[np.uint64(_LAST_OUT + i)] = f[_M_REQUEST + a]
+        # What is missed is written over; that is quicker than a branch which cannot be foreseen.
+        out_t[np.uint64(n)] = f[_M_REQUEST + a]
+        out_code[np.uint64(n)] = code[np.uint64(i)] + (what & 1)
+        if out_cross.size:
+            out_cross[np.uint64(n)] = f[_M_CROSS + a]
+        n += (what >> 1) & 1
+        again[np.uint64(blind)] = i
+        blind += what >> 2
+    out.made[0] = n
+    return blind
+
+
+@njit(fastmath={"contract"})
+def _run_piece(lanes: int, t_us: float, until: float, batch: Batch, model: PixelModel, out: Requests) -> None:
+    """Let pixels see their light from `t_us` to `until`, and fire.
 
     With u = exp(-y) the receptor is u(t) = 1/I + (u0 - 1/I) exp(-I t / Q), which is monotonic; so a threshold
     is crossed in a piece when u at its end lies beyond, and the time follows from one logarithm. A pixel is
     blind as long as `_READY` is not past. Those that see again are picked, those that may fire for the noise
     that is the most, and of them those that do; their next events are computed together, until there are
-    none. `shifts` are the quantiles of the factor by which
-    noise moves both thresholds. One word of random bits a draw, from the pixel's key: the upper half decides
-    on the noise, the lower on whether the event goes missing.
-
-    `f` holds the rows of a batch, `bits` is its int64 view; `which`, `again` and `kind`, int64 (LANES,), are
-    room.
+    none.
     """
-    charge, refractory = sensor[0], sensor[1]
-    delay_on, delay_off, jitter = sensor[2], sensor[3], sensor[4]
-    miss_on, miss_off, widest = sensor[5], sensor[6], sensor[8]
+    f, kind, sensor = batch.f, batch.kind, model.sensor
     if sensor[12] > 0.0:
         for i in range(lanes):
-            (
-                f[_U + i], f[_FOLLOWER + i], f[_REFERENCE + i], f[_READY + i], f[_LAST_OUT + i], armed,
-                draw[i], n,
-            ) = _run_piece_followed(
-                until, f[_NOW + i], f[_U + i], t_us, f[_FOLLOWER + i], f[_REFERENCE + i], f[_READY + i],
-                f[_LAST_OUT + i], int(f[_ARMED + i]), draw[i], f[_ON + i], f[_OFF + i], code[i], key[i],
-                quantiles, shifts, sensor, out_t, out_code, out_cross, n,
-            )  # fmt: skip
-            f[_ARMED + i] = armed
-        return n
-    per_charge = 1.0 / charge
-    span = until - t_us
+            _run_filtered(i, t_us, until, batch, model, out)
+        return
+    per_charge, widest, span = 1.0 / sensor[0], sensor[8], until - t_us
     for i in range(lanes):
         now = f[_NOW + i]
         rest = 1.0 / now
@@ -353,193 +496,75 @@ def _run_piece(
         kind[i] = 1 if (ready < t_us) & (on | off) else (2 if (ready >= t_us) & (ready < until) else 0)
     m = blind = 0
     for i in range(lanes):
-        which[np.uint64(m)] = i
+        batch.which[np.uint64(m)] = i
         m += kind[i] & 1
     for i in range(lanes):
-        again[np.uint64(blind)] = i
+        batch.again[np.uint64(blind)] = i
         blind += kind[i] >> 1
-    while True:
-        # Those that see again in this piece, and of them those that may fire.
-        even = _fill(again, blind)
-        _take(f, _U, again, even, _M_U)
-        _take(f, _REST, again, even, _M_REST)
-        _take(f, _END, again, even, _M_END)
-        _take(f, _ON, again, even, _M_ON)
-        _take(f, _OFF, again, even, _M_OFF)
-        _take(f, _READY, again, even, _M_READY)
-        _take(f, _NOW, again, even, _M_AGE)
-        for a in range(even):
-            rest, end = f[_M_REST + a], f[_M_END + a]
-            kept = _decay((f[_M_READY + a] - t_us) * per_charge * f[_M_AGE + a])
-            reference = rest + (f[_M_U + a] - rest) * kept
-            f[_M_REFERENCE + a] = reference
-            on = end <= reference * f[_M_ON + a] * widest
-            off = end * widest >= reference * f[_M_OFF + a]
-            kind[a] = 1 if on | off else 0
-        for a in range(blind):
-            i = again[a]
-            f[np.uint64(_REFERENCE + i)] = f[_M_REFERENCE + a]
-            draw[np.uint64(i)] += 1
-            which[np.uint64(m)] = i
-            m += kind[a]
-        if m == 0:
-            break
-        even = _fill(which, m)
-        for a in range(even):
-            k = np.uint64(which[a])
-            word = _mix(key[k] + np.uint64(draw[k]) * np.uint64(0xD1B54A32D192ED03))
-            bits[_M_SPARE + a] = np.int64(word)
-        # Half a word becomes the lowest bits of 2^52.
-        for a in range(even):
-            bits[_M_SHIFT + a] = (bits[_M_SPARE + a] >> 32) & 0xFFFFFFFF | 0x4330000000000000
-            bits[_M_FATE + a] = bits[_M_SPARE + a] & 0xFFFFFFFF | 0x4330000000000000
-        for a in range(even):
-            f[_M_SHIFT + a] = (f[_M_SHIFT + a] - 4503599627370496.0) * 2.3283064365386963e-10
-            f[_M_FATE + a] = (f[_M_FATE + a] - 4503599627370496.0) * 2.3283064365386963e-10
-        # By itself, so that many parts of the table are on their way at once.
-        for a in range(even):
-            f[_M_SHIFT + a] = _table_at(shifts, f[_M_SHIFT + a])
-        _take(f, _REFERENCE, which, even, _M_REFERENCE)
-        _take(f, _END, which, even, _M_END)
-        _take(f, _ON, which, even, _M_ON)
-        _take(f, _OFF, which, even, _M_OFF)
-        for a in range(even):
-            end = f[_M_END + a]
-            level = f[_M_REFERENCE + a] * f[_M_SHIFT + a]
-            low, high = level * f[_M_ON + a], level * f[_M_OFF + a]
-            on = end <= low
-            f[_M_LEVEL + a] = low if on else high
-            f[_M_ON + a] = 1.0 if on else 0.0
-            kind[a] = 1 if on | (end >= high) else 0
-        # Those that fire move to the front.
-        fires = 0
-        for a in range(m):
-            k = np.uint64(fires)
-            f[np.uint64(_M_LEVEL) + k] = f[_M_LEVEL + a]
-            f[np.uint64(_M_ON) + k] = f[_M_ON + a]
-            f[np.uint64(_M_FATE) + k] = f[_M_FATE + a]
-            which[k] = which[a]
-            fires += kind[a]
-        if fires == 0:
-            break
-        even = _fill(which, fires)
-        _take(f, _U, which, even, _M_U)
-        _take(f, _REST, which, even, _M_REST)
-        _take(f, _READY, which, even, _M_READY)
-        _take(f, _LAST_OUT, which, even, _M_LAST_OUT)
-        if jitter > 0.0:
-            for a in range(fires):
-                k = np.uint64(which[a])
-                f[_M_LATER + a] = jitter * hash_normal(key[k], 0, draw[k], 2, quantiles)
-        for a in range(even):
-            u, rest, level = f[_M_U + a], f[_M_REST + a], f[_M_LEVEL + a]
-            ready, on = f[_M_READY + a], f[_M_ON + a] > 0.0
-            # Where it is beyond the threshold from the first, there is no way to it.
-            beyond = (u <= level) if on else (u >= level)
-            tau = 0.0 if beyond else charge * rest
-            t = max(ready, t_us)
-            t = min(max(t_us + _logarithm((u - rest) / (level - rest)) * tau, t), until)
-            late = max((delay_on if on else delay_off) + f[_M_LATER + a], 0.0)
-            ready = t + refractory
-            f[_M_CROSS + a] = t
-            f[_M_REQUEST + a] = max(t + late, f[_M_LAST_OUT + a] + refractory)
-            f[_M_READY + a] = ready
-            sent = f[_M_FATE + a] >= (miss_on if on else miss_off)
-            kind[a] = (1 if on else 0) | (2 if sent else 0) | (4 if ready < until else 0)
-        blind = 0
-        for a in range(fires):
-            i, what = which[a], kind[a]
-            f[np.uint64(_READY + i)] = f[_M_READY + a]
-            f[np.uint64(_LAST_OUT + i)] = f[_M_REQUEST + a]
-            # What is missed is written over; that is quicker than a branch which cannot be foreseen.
-            out_t[np.uint64(n)] = f[_M_REQUEST + a]
-            out_code[np.uint64(n)] = code[np.uint64(i)] + (what & 1)
-            if out_cross.size:
-                out_cross[np.uint64(n)] = f[_M_CROSS + a]
-            n += (what >> 1) & 1
-            again[np.uint64(blind)] = i
-            blind += what >> 2
-        m = 0
-        if blind == 0:
-            break
+    while m + blind > 0:
+        m = _see_again(blind, m, t_us, batch, sensor)
+        fires = _draw_fates(m, batch, model.shifts) if m else 0
+        m, blind = 0, 0
+        if fires:
+            blind = _fire_together(fires, t_us, until, batch, model, out)
     for i in range(lanes):
         f[_U + i] = f[_END + i]
-    return n
 
 
 @njit
-def pixel_factors(seed: Any, pixel: int, sensor: Array, quantiles: Array) -> tuple[float, float]:
-    """exp(-threshold) for ON and exp(threshold) for OFF of one pixel, with its spread."""
-    on = sensor[9] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 3, quantiles))
-    off = sensor[10] * (1.0 + sensor[11] * hash_normal(seed, pixel, 0, 4, quantiles))
-    return math.exp(-on), math.exp(off)
+def _set_thresholds(i: int, pixel: int, batch: Batch, model: PixelModel) -> None:
+    """Draw a pixel's thresholds: exp(-threshold) for ON and exp(threshold) for OFF, with their spread."""
+    sensor, quantiles = model.sensor, model.quantiles
+    on = sensor[9] * (1.0 + sensor[11] * hash_normal(model.seed, pixel, 0, 3, quantiles))
+    off = sensor[10] * (1.0 + sensor[11] * hash_normal(model.seed, pixel, 0, 4, quantiles))
+    batch.f[_ON + i], batch.f[_OFF + i], batch.f[_LAST_OUT + i] = math.exp(-on), math.exp(off), -1e18
 
 
-@njit(inline="always")
-def _rest(light: float, followed: bool, f: Array, i: int) -> None:
+@njit
+def _rest(light: float, i: int, batch: Batch, model: PixelModel) -> None:
     """Put a pixel at rest in a light, armed."""
+    f = batch.f
     f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = light, 1.0 / light, math.log(light)
     f[_READY + i], f[_ARMED + i] = -1e18, 1.0
-    f[_REFERENCE + i] = f[_FOLLOWER + i] if followed else f[_U + i]
+    f[_REFERENCE + i] = f[_FOLLOWER + i] if model.sensor[12] > 0.0 else f[_U + i]
 
 
-@njit(inline="always")
-def _leave_empty(begin: int, end: int, f: Array, key: Array, draw: Array, code: Array) -> None:
-    """Fill lanes without a pixel with one that never fires."""
-    for i in range(begin, end):
-        f[_X + i] = f[_Y + i] = f[_NEW + i] = 0.0
-        f[_NOW + i] = f[_U + i] = f[_REFERENCE + i] = f[_ARMED + i] = 1.0
-        f[_READY + i] = f[_LAST_OUT + i] = -1e18
-        f[_ON + i], f[_OFF + i], f[_FOLLOWER + i] = 0.0, 1e300, 0.0
-        key[i], draw[i], code[i] = np.uint64(0), 0, 0
+@njit
+def _fill_up(count: int, batch: Batch) -> int:
+    """Fill lanes behind `count` pixels, to a multiple of `_EVEN`, with ones that never fire; how many there
+    are.
+    """
+    f = batch.f
+    lanes = (count + _EVEN - 1) // _EVEN * _EVEN
+    for i in range(count, lanes):
+        f[_X + i] = f[_Y + i] = f[_NEW + i] = f[_ARMED + i] = f[_FOLLOWER + i] = 0.0
+        f[_NOW + i] = f[_U + i] = f[_REFERENCE + i] = 1.0
+        f[_READY + i], f[_LAST_OUT + i], f[_ON + i], f[_OFF + i] = 1e300, -1e18, 1e-300, 1e300
+        batch.key[i], batch.draw[i], batch.code[i] = np.uint64(0), 0, 0
+    return lanes
 
 
-@njit(fastmath={"contract"})
+@njit
 def run_given_light(
-    first: int,
-    last: int,
-    edge_us: Array,
-    light: Array,
-    end_us: float,
-    seed: Any,
-    quantiles: Array,
-    shifts: Array,
-    sensor: Array,
-    out_t: Array,
-    out_code: Array,
-    out_cross: Array,
-) -> int:
+    first: int, last: int, edge_us: Array, light: Array, end_us: float, model: PixelModel, out: Requests
+) -> None:
     """Run pixels [first, last), at most `LANES`, at rest in light[0], through light[i] from edge_us[i] on.
 
-    Returns how many events there are; a code is the pixel's number << 1 | polarity.
+    A code is the pixel's number << 1 | polarity.
     """
-    f = np.zeros(_ROOM)
-    bits = f.view(np.int64)
-    key, draw = np.empty(LANES, np.uint64), np.empty(LANES, np.int64)
-    code, kind = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
-    which, again = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
-    followed = sensor[12] > 0.0
-    lanes = last - first
-    if not followed:
-        lanes = (lanes + _EVEN - 1) // _EVEN * _EVEN
-    _leave_empty(last - first, lanes, f, key, draw, code)
+    batch = _make_batch()
+    lanes = _fill_up(last - first, batch)
     for i in range(last - first):
-        key[i], draw[i], code[i] = _key_of(seed, first + i), 0, (first + i) << 1
-        f[_ON + i], f[_OFF + i] = pixel_factors(seed, first + i, sensor, quantiles)
-        f[_LAST_OUT + i] = -1e18
-        _rest(light[0], followed, f, i)
-    n = 0
+        batch.key[i], batch.code[i] = _key_of(model.seed, first + i), (first + i) << 1
+        _set_thresholds(i, first + i, batch, model)
+        _rest(light[0], i, batch, model)
     for j in range(light.size):
         until = edge_us[j + 1] if j + 1 < light.size else end_us
         for i in range(lanes):
-            f[_NOW + i] = light[j]
-            draw[i] += 1
+            batch.f[_NOW + i] = light[j]
+            batch.draw[i] += 1
         if until > edge_us[j]:
-            n = _run_piece(
-                lanes, edge_us[j], until, f, bits, key, draw, code, which, again, kind, quantiles, shifts,
-                sensor, out_t, out_code, out_cross, n,
-            )  # fmt: skip
-    return n
+            _run_piece(lanes, edge_us[j], until, batch, model, out)
 
 
 @njit(inline="always")
@@ -568,9 +593,128 @@ def texture_at(field: Array, u: float, v: float) -> float:
     return float(top + a * (low - top))
 
 
-@njit(inline="always")
-def _place(lanes: int, f: Array, x: float, y: float, axis_x: float, axis_y: float) -> None:
-    """Write where pixels are from a strip's first end (x, y), along it and to its right, px."""
+class TimeLine(NamedTuple):
+    """When something changes in a block, in order; the light on a pixel is constant in between.
+
+    Attributes:
+        t_us: When, the first where the block begins, float64 (entries,).
+        kind: What: the image moves (-2), the share of all light that passes changes (-1), or the source of
+            this number switches.
+        pose: The image's pose from then on.
+        shade: Share of all light that passes from then on.
+        row: Row of the levels that each source shows from then on, (sources, entries).
+    """
+
+    t_us: Array
+    kind: Array
+    pose: Array
+    shade: Array
+    row: Array
+
+
+class Strips(NamedTuple):
+    """Where the strips of the sources are, and how they shine.
+
+    Attributes:
+        levels: Light of each cluster as a share of full light, (rows, clusters).
+        origin: A strip's first end, px, (2, sources, poses).
+        axis: The unit vector along it, (2, sources, poses).
+        bounds: Where its clusters start and end along it, px, (sources, clusters + 1, poses).
+        width_px: Its width, (sources, poses).
+        clusters: How many it has, (sources,).
+        gain: Its full light, W/m2, (sources,).
+    """
+
+    levels: Array
+    origin: Array
+    axis: Array
+    bounds: Array
+    width_px: Array
+    clusters: Array
+    gain: Array
+
+
+class Halos(NamedTuple):
+    """Light that the lens spreads far, in several widths.
+
+    Attributes:
+        light: That of a row of levels on a grid along the strip, as a share of full light, (halos, rows, n).
+        first: Where the grid begins, px, (halos,).
+        per_px: Its nodes in a px, (halos,).
+        share: Of the light that is in each halo, (halos,).
+        every: After how many poses it follows the strip; 0: it stands where that is in the middle, (halos,).
+        table: Each one's blurred edge, as of `step_table`, (halos, m).
+        table_per_px: Nodes of that in a px, (halos,).
+    """
+
+    light: Array
+    first: Array
+    per_px: Array
+    share: Array
+    every: Array
+    table: Array
+    table_per_px: Array
+
+
+class Near(NamedTuple):
+    """The rest of the image of a point.
+
+    Attributes:
+        share: Of the light that is in it.
+        tables: Of each source, as of `strip_table`.
+        scale: Of these, px, (sources,).
+        reach: How far they are followed, px, (sources,).
+    """
+
+    share: float
+    tables: Array
+    scale: Array
+    reach: Array
+
+
+class Scenery(NamedTuple):
+    """What shines beside the sources.
+
+    Attributes:
+        turn_px: How far the texture has moved, (poses, 2).
+        every: After how many poses it is looked up.
+        field: The texture, periodic, its size a power of two.
+        light: Irradiance on the sensor, and dark current as light, W/m2, (2,).
+    """
+
+    turn_px: Array
+    every: int
+    field: Array
+    light: Array
+
+
+class _Shining(NamedTuple):
+    """Room for what is known of each source that shines on a batch: one row a source.
+
+    Attributes:
+        clusters: The first within reach, the one after the last, and the row of levels, int64 (sources, 3).
+        weight: Light of these on each pixel, W/m2, cluster by cluster, (sources, LANES * clusters).
+        part: Light of the source on each pixel, W/m2, (sources, LANES).
+        halo: Of each halo: its light on each pixel, that if all shone, and the part of a node beyond `node`.
+        node: Its node on the grid.
+        nodes: Room of `_near_weights`, int32 (2, LANES).
+        beside: Likewise, (LANES * (clusters + 1),).
+    """
+
+    clusters: Array
+    weight: Array
+    part: Array
+    halo: Array
+    node: Array
+    nodes: Array
+    beside: Array
+
+
+@njit
+def _place(lanes: int, f: Array, strips: Strips, g: int, pose: int) -> None:
+    """Write where pixels are from a strip's first end, along it and to its right, px."""
+    x, y = strips.origin[0, g, pose], strips.origin[1, g, pose]
+    axis_x, axis_y = strips.axis[0, g, pose], strips.axis[1, g, pose]
     for i in range(lanes):
         dx, dy = f[_X + i] - x, f[_Y + i] - y
         f[_ALONG + i] = dx * axis_x + dy * axis_y
@@ -579,26 +723,16 @@ def _place(lanes: int, f: Array, x: float, y: float, axis_x: float, axis_y: floa
 
 @njit(fastmath={"contract"})
 def _near_weights(
-    lanes: int,
-    f: Array,
-    strip_px: float,
-    edges: Array,
-    gain: float,
-    table: Array,
-    scale: float,
-    reach: float,
-    rows: Array,
-    nodes: Array,
-    beside: Array,
-    weight: Array,
+    of_strip: tuple[int, int, float, float], f: Array, edges: Array, near: Near, room: _Shining, a: int
 ) -> None:
-    """Write how much light each of a strip's clusters gives each pixel, when it shines.
+    """Write how much light each of a strip's clusters gives each pixel, when it shines: weight of row `a`.
 
-    `edges` (clusters + 1,) are where they start and end along it, px; `table` is that of `strip_table`,
-    followed for `reach` px. `rows` and `nodes`, int32 (LANES,), and `beside`, float64
-    (LANES * (clusters + 1),), are overwritten; `weight` is the result, W/m2, cluster by cluster float64
-    (LANES * clusters,).
+    `of_strip` are (lanes, its number, its width in px, its light that is in the near part, W/m2); `edges`
+    (clusters + 1,) are where the clusters start and end along it, px.
     """
+    lanes, g, strip_px, gain = of_strip
+    table, scale, reach = near.tables[g], near.scale[g], near.reach[g]
+    rows, nodes, beside, weight = room.nodes[0], room.nodes[1], room.beside, room.weight[a]
     columns = table.shape[1]
     flat = table.reshape(-1)
     most = table.shape[0] - 1
@@ -640,261 +774,288 @@ def _near_weights(
 
 
 @njit(fastmath={"contract"})
+def _take_clusters(
+    a: int, g: int, pose: int, size: tuple[int, int], f: Array, strips: Strips, near: Near, room: _Shining
+) -> None:
+    """Find which of a source's clusters light some of `size` (lanes, pixels), and how much each does."""
+    lanes, count = size
+    _place(lanes, f, strips, g, pose)
+    nearest = furthest = f[_ALONG]
+    beyond, reach = False, near.reach[g]
+    for i in range(count):
+        nearest, furthest = min(nearest, f[_ALONG + i]), max(furthest, f[_ALONG + i])
+        beyond |= abs(f[_ACROSS + i]) < reach + 0.5 * strips.width_px[g, pose]
+    bounds, b = strips.bounds[g], 0
+    while b < strips.clusters[g] and bounds[b + 1, pose] <= nearest - reach:
+        b += 1
+    m = b
+    while beyond and m < strips.clusters[g] and bounds[m, pose] < furthest + reach:
+        m += 1
+    room.clusters[a, 0], room.clusters[a, 1] = b, m
+    if m > b:
+        of_strip = lanes, g, strips.width_px[g, pose], strips.gain[g] * near.share
+        _near_weights(of_strip, f, bounds[b : m + 1, pose], near, room, a)
+
+
+@njit(fastmath={"contract"})
+def _shine(
+    a: int,
+    g: int,
+    poses: tuple[int, int, int],
+    size: tuple[int, int],
+    f: Array,
+    scene: tuple[Strips, Halos],
+    near: Near,
+    room: _Shining,
+) -> None:
+    """Have the light of source g, which shows a row of levels, on each pixel: part of row `a`.
+
+    `poses` are the one before, -1 for none, that of now, and the one that shows where the sources are; the
+    row is -1 - row where it has just been switched.
+    """
+    strips, halos = scene
+    before, pose, here = poses
+    lanes, _ = size
+    row = room.clusters[a, 2]
+    switched = row < 0
+    row = -1 - row if switched else row
+    room.clusters[a, 2] = row
+    stale = switched
+    for h in range(halos.share.size):
+        every = halos.every[h]
+        follows = before < 0 or (every > 0 and pose // every != before // every)
+        if follows:
+            at = strips.axis.shape[2] // 2 if every == 0 else here
+            _place(lanes, f, strips, g, at)
+            half, table, per_px = 0.5 * strips.width_px[g, at], halos.table[h], halos.table_per_px[h]
+            for i in range(lanes):
+                across = _step(table, per_px, f[_ACROSS + i] + half)
+                across -= _step(table, per_px, f[_ACROSS + i] - half)
+                room.halo[a, h, 1, i] = strips.gain[g] * halos.share[h] * across
+                node = (f[_ALONG + i] - halos.first[h]) * halos.per_px[h]
+                node = min(max(node, 0.0), halos.light.shape[2] - 1.001)
+                room.node[a, h, i] = int(node)
+                room.halo[a, h, 2, i] = node - int(node)
+        if follows or switched:
+            stale = True
+            light = halos.light[h, row]
+            for i in range(lanes):
+                k = np.uint64(room.node[a, h, i])
+                left, right = light[k], light[k + np.uint64(1)]
+                between = room.halo[a, h, 2, i]
+                room.halo[a, h, 0, i] = room.halo[a, h, 1, i] * (left + between * (right - left))
+    if pose != before:
+        _take_clusters(a, g, here, size, f, strips, near, room)
+        stale = True
+    if not stale:
+        return
+    part, weight = room.part[a], room.weight[a]
+    for i in range(lanes):
+        part[i] = 0.0
+    first = room.clusters[a, 0]
+    for b in range(first, room.clusters[a, 1]):
+        level = strips.levels[row, b]
+        if level != 0.0:
+            of = np.uint64((b - first) * LANES)
+            for i in range(lanes):
+                part[i] += weight[of + np.uint64(i)] * level
+    for h in range(halos.share.size):
+        for i in range(lanes):
+            part[i] += room.halo[a, h, 0, i]
+
+
+@njit
+def _load(
+    pixels: Array, width: int, block: int, store: tuple[Array, Array], batch: Batch, model: PixelModel
+) -> int:
+    """Take pixels into a batch; those that were not active in the block before are new."""
+    f = batch.f
+    for i in range(pixels.size):
+        pixel = pixels[i]
+        s, c = store[0][pixel], store[1][pixel]
+        batch.code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
+        batch.key[i], batch.draw[i] = _key_of(model.seed, pixel), c[DRAW]
+        f[_X + i], f[_Y + i] = pixel % width, pixel // width
+        f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = s[ON_FACTOR], s[OFF_FACTOR], s[T_LAST_OUT]
+        f[_U + i], f[_REFERENCE + i], f[_READY + i] = s[U_BASE], s[REFERENCE], s[T_READY]
+        f[_NOW + i], f[_FOLLOWER + i], f[_ARMED + i] = s[LIGHT], s[FOLLOWER], float(c[ARMED])
+        f[_NEW + i] = 1.0 if c[BLOCK] != block + 1 else 0.0
+        if s[ON_FACTOR] == 0.0:
+            _set_thresholds(i, pixel, batch, model)
+    return _fill_up(pixels.size, batch)
+
+
+@njit
+def _keep(pixels: Array, end_us: float, block: int, store: tuple[Array, Array], batch: Batch) -> None:
+    """Put a batch's pixels back."""
+    f = batch.f
+    for i in range(pixels.size):
+        s, c = store[0][pixels[i]], store[1][pixels[i]]
+        s[ON_FACTOR], s[OFF_FACTOR] = f[_ON + i], f[_OFF + i]
+        s[U_BASE], s[T_BASE], s[REFERENCE] = f[_U + i], end_us, f[_REFERENCE + i]
+        s[T_READY], s[T_LAST_OUT] = f[_READY + i], f[_LAST_OUT + i]
+        s[LIGHT], s[FOLLOWER] = f[_NOW + i], f[_FOLLOWER + i]
+        c[DRAW], c[ARMED], c[BLOCK] = batch.draw[i], int(f[_ARMED + i]), block + 2
+
+
+@njit
+def _list_entries(line: TimeLine, mask: Any, stride: int, mine: Array) -> int:
+    """The entries of a time line that a batch sees: of its sources, and every so many poses; how many."""
+    n = 0
+    for e in range(line.t_us.size):
+        what = line.kind[e]
+        if what == -2:
+            takes = line.pose[e] % stride == 0
+        else:
+            takes = what == -1 or (mask >> np.uint64(what)) & np.uint64(1) != np.uint64(0)
+        if takes:
+            mine[n] = e
+            n += 1
+    return n
+
+
+@njit(fastmath={"contract"})
+def _run_batch(
+    size: tuple[int, int],
+    of_batch: tuple[Any, int],
+    end_us: float,
+    world: tuple[TimeLine, Strips, Halos, Near, Scenery],
+    room: tuple[_Shining, Array, Array],
+    batch: Batch,
+    model: PixelModel,
+    out: Requests,
+) -> None:
+    """Run a batch of `size` (lanes, pixels) through a block; `of_batch` are its mask and its stride."""
+    line, strips, halos, near, scenery = world
+    shining, lit, mine = room
+    lanes, _ = size
+    mask, stride = of_batch
+    f, poses, many = batch.f, scenery.turn_px.shape[0], 0
+    for g in range(strips.gain.size):
+        if (mask >> np.uint64(g)) & np.uint64(1):
+            lit[many] = g
+            many += 1
+    own = _list_entries(line, mask, stride, mine)
+    pose = -1
+    for q in range(own):
+        e = mine[q]
+        t_us, until = line.t_us[e], line.t_us[mine[q + 1]] if q + 1 < own else end_us
+        before, pose = pose, line.pose[e] // stride * stride
+        # Where the sources are in the middle of these poses.
+        here = min(pose + stride // 2, poses - 1)
+        if before < 0 or pose // scenery.every != before // scenery.every:
+            for i in range(lanes):
+                u, v = f[_X + i] + scenery.turn_px[pose, 0], f[_Y + i] + scenery.turn_px[pose, 1]
+                f[_AROUND + i] = scenery.light[1] + scenery.light[0] * texture_at(scenery.field, u, v)
+        for i in range(lanes):
+            f[_TOTAL + i] = f[_AROUND + i]
+        for a in range(many):
+            row = line.row[lit[a], e]
+            if q == 0 or row != shining.clusters[a, 2]:
+                shining.clusters[a, 2] = -1 - row
+            _shine(a, lit[a], (before, pose, here), size, f, (strips, halos), near, shining)
+            for i in range(lanes):
+                f[_TOTAL + i] += shining.part[a, i]
+        shade = line.shade[e]
+        if shade != 1.0:
+            for i in range(lanes):
+                f[_TOTAL + i] = scenery.light[1] + shade * (f[_TOTAL + i] - scenery.light[1])
+        if q == 0:
+            for i in range(size[1]):
+                if f[_NEW + i] > 0.0:
+                    _rest(f[_TOTAL + i], i, batch, model)
+                    batch.draw[i] += 1
+        redraw = int(line.kind[e] >= 0)
+        for i in range(lanes):
+            total, now = f[_TOTAL + i], f[_NOW + i]
+            changes = abs(total - now) > LIGHT_STEP * now
+            f[_NOW + i] = total if changes else now
+            batch.draw[i] += redraw if changes else 0
+        if until > t_us:
+            _run_piece(lanes, t_us, until, batch, model, out)
+
+
+class Block(NamedTuple):
+    """A block of time, and the pixels that are active in it.
+
+    Attributes:
+        number: Its number.
+        end_us: When it ends.
+        pixels: Their numbers, batch by batch.
+        batches: Where in `pixels` each batch begins, and the last ends; `LANES` at the most.
+        masks: Bit i says that source i lights a batch.
+        strides: A batch sees where the sources are anew in every so many poses only.
+    """
+
+    number: int
+    end_us: float
+    pixels: Array
+    batches: Array
+    masks: Array
+    strides: Array
+
+
+@njit
 def run_pixels(
     first: int,
     last: int,
-    pixels: Array,
-    batches: Array,
-    masks: Array,
-    strides: Array,
-    width: int,
-    state: Array,
-    counters: Array,
-    block: int,
-    end_us: float,
-    line_t: Array,
-    line_kind: Array,
-    line_pose: Array,
-    line_shade: Array,
-    line_row: Array,
-    levels: Array,
-    halo: Array,
-    origin: Array,
-    axis: Array,
-    bounds: Array,
-    strip_px: Array,
-    clusters: Array,
-    gain: Array,
-    halo_first: Array,
-    halo_per_px: Array,
-    halo_share: Array,
-    halo_every: Array,
-    near_share: float,
-    near_tables: Array,
-    near_scale: Array,
-    near_reach: Array,
-    wide_table: Array,
-    wide_per_px: Array,
-    turn_px: Array,
-    texture_every: int,
-    field: Array,
-    background: Array,
-    seed: Any,
-    quantiles: Array,
-    shifts: Array,
-    sensor: Array,
-    out_t: Array,
-    out_code: Array,
+    block: Block,
+    store: tuple[Array, Array, int],
+    world: tuple[TimeLine, Strips, Halos, Near, Scenery],
+    model: PixelModel,
     most_events: int,
-) -> tuple[int, int]:
-    """Run batches [first, last) of pixels through one block of time; return (next batch, number of events).
+    out: Requests,
+) -> int:
+    """Run batches [first, last) of pixels through a block of time; return the next batch.
 
-    It ends early, at a batch for which the output might have no room. Batch j is pixels[batches[j]] up to
-    pixels[batches[j + 1]], `LANES` at the most; bit i of `masks[j]` says that source i lights them, and they
-    see where the sources are anew in every `strides[j]`-th pose only.
-
-    The light on a pixel is constant between the entries of a time line, the first where the block begins:
-    when the image moves (`line_kind` -2), when the share of all light that passes changes (-1), and when the
-    source of this number switches. `line_pose` is the image's pose from then on, `line_shade` that share,
-    `line_row` (sources, entries) the row of `levels` (rows, clusters) that a source shows; `halo` (halos,
-    rows, places) is its light in each halo on a grid along the strip, as a share of full light.
-
-    (source, pose) arrays say where each strip is: `origin` (2, sources, poses), its first end, px; `axis`,
-    the unit vector along it; `bounds` (sources, clusters + 1, poses), where its clusters start and end along
-    it, px; `strip_px`, its width; `turn_px` is how far the texture has moved, looked up every `texture_every`
-    poses. `halo_share` of the light is in each halo and `near_share` in the rest of the image of a point,
-    which `near_tables` hold, from `strip_table`, followed for `near_reach` px. A halo stands where the strip
-    is in the pose in the middle, or follows it every `halo_every[q]` poses where that is not 0. `background`
-    is (irradiance on the sensor, dark current as light), W/m2; `sensor` comes from `sensor_vector`.
+    It ends early, at a batch for which the output might have no room: `most_events` of each pixel. `store`
+    are the states and counters of all pixels, and the columns of the image.
     """
-    sources, halos, poses = gain.size, halo_share.size, turn_px.shape[0]
-    most = levels.shape[1]
-    entries = line_t.size
-    followed = sensor[12] > 0.0
-    f = np.zeros(_ROOM)
-    bits = f.view(np.int64)
-    key, draw = np.empty(LANES, np.uint64), np.empty(LANES, np.int64)
-    code, kind = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
-    which, again = np.empty(LANES, np.int64), np.empty(LANES, np.int64)
-    rows, nodes = np.empty(LANES, np.int32), np.empty(LANES, np.int32)
-    beside = np.empty(LANES * (most + 1))
-    none = np.empty(0)
-    mine = np.empty(entries + 1, np.int64)
-    lit = np.empty(sources, np.int64)
-    # Of each source that shines: its clusters within reach, their weights, and its light on the pixels.
-    low, high, shown = np.empty(sources, np.int64), np.empty(sources, np.int64), np.empty(sources, np.int64)
-    weight = np.empty((sources, LANES * most))
-    part = np.empty((sources, LANES))
-    far, between = np.empty((sources, halos, LANES)), np.empty((sources, halos, LANES))
-    place = np.empty((sources, halos, LANES), np.int64)
-    wide = np.empty((sources, halos, LANES))
-    n = 0
+    line, strips, halos, _, _ = world
+    sources, many, most = strips.gain.size, halos.share.size, strips.levels.shape[1]
+    state = store[0], store[1]
+    batch = _make_batch()
+    shining = _Shining(
+        np.empty((sources, 3), np.int64),
+        np.empty((sources, LANES * most)),
+        np.empty((sources, LANES)),
+        np.empty((sources, many, 3, LANES)),
+        np.empty((sources, many, LANES), np.int64),
+        np.empty((2, LANES), np.int32),
+        np.empty(LANES * (most + 1)),
+    )
+    room = shining, np.empty(sources, np.int64), np.empty(line.t_us.size + 1, np.int64)
     for j in range(first, last):
-        if n + LANES * most_events > out_t.size:
-            return j, n
-        begin, count, mask, stride = batches[j], batches[j + 1] - batches[j], masks[j], strides[j]
-        lanes = count if followed else (count + _EVEN - 1) // _EVEN * _EVEN
-        _leave_empty(count, lanes, f, key, draw, code)
-        for i in range(count):
-            pixel = pixels[begin + i]
-            s, c = state[pixel], counters[pixel]
-            code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
-            key[i] = _key_of(seed, pixel)
-            f[_X + i], f[_Y + i] = pixel % width, pixel // width
-            new = c[BLOCK] != block + 1
-            f[_NEW + i] = 1.0 if new else 0.0
-            if new and s[ON_FACTOR] == 0.0:
-                s[ON_FACTOR], s[OFF_FACTOR] = pixel_factors(seed, pixel, sensor, quantiles)
-                s[T_LAST_OUT] = -1e18
-            f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = s[ON_FACTOR], s[OFF_FACTOR], s[T_LAST_OUT]
-            f[_U + i], f[_REFERENCE + i], f[_READY + i] = s[U_BASE], s[REFERENCE], s[T_READY]
-            f[_NOW + i], f[_FOLLOWER + i], f[_ARMED + i] = s[LIGHT], s[FOLLOWER], float(c[ARMED])
-            draw[i] = c[DRAW]
-        shining = 0
-        for g in range(sources):
-            if (mask >> np.uint64(g)) & np.uint64(1):
-                lit[shining] = g
-                shining += 1
-        own = 0
-        for e in range(entries):
-            what = line_kind[e]
-            if what == -2:
-                takes = line_pose[e] % stride == 0
-            else:
-                takes = what == -1 or (mask >> np.uint64(what)) & np.uint64(1) != np.uint64(0)
-            if takes:
-                mine[own] = e
-                own += 1
-        pose = -1
-        for q in range(own):
-            e = mine[q]
-            t_us = line_t[e]
-            until = line_t[mine[q + 1]] if q + 1 < own else end_us
-            before = pose
-            pose = line_pose[e] // stride * stride
-            moved = pose != before
-            # Where the sources are in the middle of these poses.
-            here = min(pose + stride // 2, poses - 1)
-            if before < 0 or pose // texture_every != before // texture_every:
-                for i in range(lanes):
-                    now = texture_at(field, f[_X + i] + turn_px[pose, 0], f[_Y + i] + turn_px[pose, 1])
-                    f[_AROUND + i] = background[1] + background[0] * now
-            for i in range(lanes):
-                f[_TOTAL + i] = f[_AROUND + i]
-            for a in range(shining):
-                g = lit[a]
-                row = line_row[g, e]
-                switched = q == 0 or row != shown[a]
-                shown[a] = row
-                stale = switched
-                for h in range(halos):
-                    every = halo_every[h]
-                    follows = before < 0 or (every > 0 and pose // every != before // every)
-                    if follows:
-                        at = poses // 2 if every == 0 else here
-                        _place(lanes, f, origin[0, g, at], origin[1, g, at], axis[0, g, at], axis[1, g, at])
-                        half = 0.5 * strip_px[g, at]
-                        for i in range(lanes):
-                            across = _step(wide_table[h], wide_per_px[h], f[_ACROSS + i] + half)
-                            across -= _step(wide_table[h], wide_per_px[h], f[_ACROSS + i] - half)
-                            far[a, h, i] = gain[g] * halo_share[h] * across
-                            node = (f[_ALONG + i] - halo_first[h]) * halo_per_px[h]
-                            node = min(max(node, 0.0), halo.shape[2] - 1.001)
-                            place[a, h, i] = int(node)
-                            between[a, h, i] = node - int(node)
-                    if follows or switched:
-                        stale = True
-                        for i in range(lanes):
-                            k = np.uint64(place[a, h, i])
-                            left, right = halo[h, row, k], halo[h, row, k + np.uint64(1)]
-                            wide[a, h, i] = far[a, h, i] * (left + between[a, h, i] * (right - left))
-                if moved:
-                    _place(
-                        lanes, f, origin[0, g, here], origin[1, g, here], axis[0, g, here], axis[1, g, here]
-                    )
-                    nearest = furthest = f[_ALONG]
-                    beyond = False
-                    reach = near_reach[g]
-                    for i in range(count):
-                        nearest, furthest = min(nearest, f[_ALONG + i]), max(furthest, f[_ALONG + i])
-                        beyond |= abs(f[_ACROSS + i]) < reach + 0.5 * strip_px[g, here]
-                    b = 0
-                    while b < clusters[g] and bounds[g, b + 1, here] <= nearest - reach:
-                        b += 1
-                    m = b
-                    while beyond and m < clusters[g] and bounds[g, m, here] < furthest + reach:
-                        m += 1
-                    low[a], high[a] = b, m
-                    if m > b:
-                        _near_weights(
-                            lanes, f, strip_px[g, here], bounds[g, b : m + 1, here], gain[g] * near_share,
-                            near_tables[g], near_scale[g], reach, rows, nodes, beside, weight[a],
-                        )  # fmt: skip
-                if moved or stale:
-                    for i in range(lanes):
-                        part[a, i] = 0.0
-                    for b in range(low[a], high[a]):
-                        level = levels[row, b]
-                        if level != 0.0:
-                            of = np.uint64((b - low[a]) * LANES)
-                            for i in range(lanes):
-                                part[a, i] += weight[a, of + np.uint64(i)] * level
-                    for h in range(halos):
-                        for i in range(lanes):
-                            part[a, i] += wide[a, h, i]
-                for i in range(lanes):
-                    f[_TOTAL + i] += part[a, i]
-            shade = line_shade[e]
-            if shade != 1.0:
-                for i in range(lanes):
-                    f[_TOTAL + i] = background[1] + shade * (f[_TOTAL + i] - background[1])
-            if q == 0:
-                for i in range(count):
-                    if f[_NEW + i] > 0.0:
-                        _rest(f[_TOTAL + i], followed, f, i)
-                        draw[i] += 1
-            redraw = int(line_kind[e] >= 0)
-            for i in range(lanes):
-                total, now = f[_TOTAL + i], f[_NOW + i]
-                changes = abs(total - now) > LIGHT_STEP * now
-                f[_NOW + i] = total if changes else now
-                draw[i] += redraw if changes else 0
-            if until > t_us:
-                n = _run_piece(
-                    lanes, t_us, until, f, bits, key, draw, code, which, again, kind, quantiles, shifts,
-                    sensor, out_t, out_code, none, n,
-                )  # fmt: skip
-        for i in range(count):
-            pixel = pixels[begin + i]
-            s, c = state[pixel], counters[pixel]
-            s[U_BASE], s[T_BASE], s[REFERENCE] = f[_U + i], end_us, f[_REFERENCE + i]
-            s[T_READY], s[T_LAST_OUT] = f[_READY + i], f[_LAST_OUT + i]
-            s[LIGHT], s[FOLLOWER] = f[_NOW + i], f[_FOLLOWER + i]
-            c[DRAW], c[ARMED], c[BLOCK] = draw[i], int(f[_ARMED + i]), block + 2
-    return last, n
+        if out.made[0] + LANES * most_events > out.t_us.size:
+            return j
+        pixels = block.pixels[block.batches[j] : block.batches[j + 1]]
+        size = _load(pixels, store[2], block.number, state, batch, model), pixels.size
+        of_batch = block.masks[j], block.strides[j]
+        _run_batch(size, of_batch, block.end_us, world, room, batch, model, out)
+        _keep(pixels, block.end_us, block.number, state, batch)
+    return last
 
 
 @njit
 def background_events(
-    begin_us: float,
-    end_us: float,
-    rate_hz: float,
+    span_us: tuple[float, float],
+    rates_hz: tuple[float, float],
     hot: Array,
-    hot_rate_hz: float,
-    width: int,
-    height: int,
+    size_px: tuple[int, int],
     slot: int,
     seed: Any,
     out_t: Array,
     out_code: Array,
 ) -> int:
-    """Poisson events of all pixels (`rate_hz` together), then of the hot ones; return how many.
+    """Poisson events of all pixels, then of the hot ones, at these rates of all together; return how many.
 
     Ends early when the output is full: the caller gives room enough.
     """
+    begin_us, end_us = span_us
+    width, height = size_px
     n = 0
     for kind in range(2):
-        total = (rate_hz if kind == 0 else hot_rate_hz) * 1e-6
+        total = rates_hz[kind] * 1e-6
         if total <= 0.0:
             continue
         t = begin_us
@@ -913,14 +1074,6 @@ def background_events(
     return n
 
 
-@njit
-def as_words(t: Array, code: Array, begin_us: float, words: Array) -> None:
-    """Write requests as words, their times since `begin_us` to the nearest tick."""
-    for i in range(t.size):
-        ticks = np.float64((t[i] - begin_us) * TICKS + _NEAREST).view(np.int64)
-        words[i] = ticks << CODE_BITS | np.int64(code[i])
-
-
 @njit(inline="always")
 def _us_of(word: int, begin_us: float) -> float:
     """When a request is, us."""
@@ -937,49 +1090,6 @@ def _row_of(word: int) -> Any:
 def _column_of(word: int) -> Any:
     """Column of a request."""
     return np.uint64(word >> 1 & ((1 << COLUMN_BITS) - 1))
-
-
-@njit
-def sort_words(words: Array, out: Array) -> None:
-    """Sort int64 words: by 22 bits of their range in two rounds, then insertion of what is left."""
-    n = words.size
-    if n == 0:
-        return
-    first = last = words[0]
-    for i in range(n):
-        first, last = min(first, words[i]), max(last, words[i])
-    drop = 0
-    while (last - first) >> drop >= 1 << 22:
-        drop += 1
-    shift, eleven, part = np.uint64(drop), np.uint64(11), np.uint64(2047)
-    low, high = np.zeros(2049, np.int64), np.zeros(2049, np.int64)
-    for i in range(n):
-        key = np.uint64(words[i] - first) >> shift
-        low[(key & part) + np.uint64(1)] += 1
-        high[(key >> eleven) + np.uint64(1)] += 1
-    for b in range(2047):
-        low[b + 1] += low[b]
-        high[b + 1] += high[b]
-    half = np.empty(n, words.dtype)
-    for i in range(n):
-        key = np.uint64(words[i] - first) >> shift & part
-        half[np.uint64(low[key])] = words[i]
-        low[key] += 1
-    for i in range(n):
-        key = np.uint64(half[i] - first) >> (shift + eleven)
-        out[np.uint64(high[key])] = half[i]
-        high[key] += 1
-    before = out[0]
-    for i in range(1, n):
-        word = out[i]
-        if word >= before:
-            before = word
-            continue
-        j = i
-        while j > 0 and out[j - 1] > word:
-            out[j] = out[j - 1]
-            j -= 1
-        out[j] = word
 
 
 @njit
@@ -1002,30 +1112,28 @@ def drop_blind(words: Array, begin_us: float, blind_us: Array, width: int, refra
 @njit
 def read_out(
     words: Array,
-    begin_us: float,
+    times_us: tuple[float, float, float],
     height: int,
-    row_us: float,
-    safe_us: float,
-    cap: int,
-    cap_window_us: int,
+    limit: tuple[int, int],
     memory: Array,
     pending: Array,
-    out_t: Array,
-    out_x: Array,
-    out_y: Array,
-    out_p: Array,
+    out: tuple[Array, Array, Array, Array],
 ) -> tuple[int, int, int, int]:
-    """Serve requests row by row until `safe_us`; what is not served yet moves to the front of `words`.
+    """Serve requests row by row; what is not served yet moves to the front of `words`.
 
-    One row is served at a time, which takes `row_us` and takes all its requests along; the next is the next
-    one below with a request, and after the last row the first. More than `cap` events in a window of
-    `cap_window_us` are dropped. `words` are sorted, their times since `begin_us`; `memory` holds (time when
+    `times_us` are (when the words' times begin, what a row takes, until when). One row is served at a time,
+    which takes all its requests along; the next is the next one below with a request, and after the last row
+    the first. Of `limit` (events, window in us), more events in a window are dropped; 0 for none. `words` are
+    sorted; `memory` holds (time when
     free, last row, number of the window, events in it) and is updated. Where `pending`, bool (rows, columns),
     all False, has any room, a pixel sends nothing while a request of its waits.
 
     Returns:
         (events written, events over the cap, requests of waiting pixels, requests left).
     """
+    begin_us, row_us, safe_us = times_us
+    cap, cap_window_us = limit
+    out_t, out_x, out_y, out_p = out
     size = words.size
     # Behind each request the next one of its row that waits; a row's first stands behind the requests, and
     # `tail` is where its next belongs.

@@ -22,7 +22,16 @@ from evlcp_sdk.sim.optics import blur_of, step_table, strip_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
 from evlcp_sdk.values import Events
 
-__all__ = ["ACTIVITY_FLOOR", "MOTION_STEP_PX", "Simulation", "quantile_table", "sensor_vector", "simulate"]
+__all__ = [
+    "ACTIVITY_FLOOR",
+    "MOTION_STEP_PX",
+    "Simulation",
+    "pixel_model",
+    "quantile_table",
+    "request_words",
+    "requests_room",
+    "simulate",
+]
 
 Floats = NDArray[np.float64]
 
@@ -75,6 +84,26 @@ def quantile_table(nodes: int = 4097) -> Floats:
 def seed_key(seed: int) -> np.uint64:
     """A seed as the key of the kernels' hash."""
     return np.uint64((seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) & _MASK64)
+
+
+def pixel_model(sensor: SensorSpec, seed: int) -> _kernels.PixelModel:
+    """What the pixels of a sensor have in common."""
+    quantiles = quantile_table()
+    shifts = np.exp(sensor.noise_ln * quantiles)
+    return _kernels.PixelModel(seed_key(seed), sensor_vector(sensor), quantiles, shifts)
+
+
+def requests_room(size: int, *, crossings: bool = False) -> _kernels.Requests:
+    """Room for so many requests; with `crossings`, for when thresholds were crossed, too."""
+    cross_us = np.empty(size if crossings else 0)
+    return _kernels.Requests(np.empty(size), np.empty(size, np.int32), cross_us, np.zeros(1, np.int64))
+
+
+def request_words(t_us: Floats, code: NDArray[np.int32], begin_us: float) -> NDArray[np.int64]:
+    """Requests as words, their times since `begin_us` to the nearest tick, int64 (n,)."""
+    ticks = np.rint((t_us - begin_us) * _kernels.TICKS).astype(np.int64)
+    words: NDArray[np.int64] = ticks << _kernels.CODE_BITS | code
+    return words
 
 
 def _texture(scene: Scene) -> Floats:
@@ -161,7 +190,7 @@ def _time_line(
     levels_of: list[Floats],
     halos_of: list[list[Floats]],
     most: int,
-) -> tuple[NDArray[Any], ...]:
+) -> tuple[_kernels.TimeLine, Floats, Floats]:
     """When the light changes in a block, and what the sources show then.
 
     Args:
@@ -174,7 +203,7 @@ def _time_line(
         most: Clusters of the source with the most.
 
     Returns:
-        The arguments of `run_pixels` from `line_t` to `halo`.
+        The time line, the levels of `Strips`, and the light of `Halos`.
     """
     sources = len(switches)
     when = np.concatenate([starts_us[:1], starts_us[1:], wiped_us, *switches])
@@ -195,7 +224,7 @@ def _time_line(
             halo[q, begin : begin + count, : of[i].shape[1]] = of[i]
         begin += count
     pose, wipes = np.cumsum(kind == -2) - 1, np.cumsum(kind == -1)
-    return when, kind, pose, shade[wipes], row, levels, halo
+    return _kernels.TimeLine(when, kind, pose, shade[wipes], row), levels, halo
 
 
 def _batches(
@@ -206,7 +235,7 @@ def _batches(
     They see where the sources are anew after `most_poses` at the latest.
 
     Returns:
-        The arguments of `run_pixels` from `pixels` to `strides`.
+        Pixels, batches, masks and strides of a `Block`.
     """
     if not len(pixels):
         return pixels, np.zeros(1, np.int64), masks, np.zeros(0, np.int64)
@@ -293,13 +322,13 @@ def _part(changes: tuple[Floats, Floats], begin_us: float, end_us: float) -> tup
 
 @dataclass(frozen=True, eq=False)
 class _Block:
-    """Everything about a block of time that all pixels share: the arguments of `run_pixels`."""
+    """The active pixels of a block of time, and what they see: the arguments of `run_pixels`."""
 
     pixels: NDArray[np.int32]
     batches: NDArray[np.int64]
     masks: NDArray[np.uint64]
     strides: NDArray[np.int64]
-    shared: tuple[Any, ...]
+    world: tuple[Any, ...]
 
 
 class Simulation:
@@ -335,10 +364,7 @@ class Simulation:
         self.path = CameraPath(scene.motion, scene.duration_s, scene.seed)
         self._check_ahead()
         self._threads = max(1, threads)
-        self._key = seed_key(scene.seed)
-        self._sensor = sensor_vector(scene.sensor)
-        self._quantiles = quantile_table()
-        self._shifts = np.exp(scene.sensor.noise_ln * self._quantiles)
+        self._model = pixel_model(scene.sensor, scene.seed)
         self._texture = _texture(scene)
         self._darkest_texture = float(self._texture.min())
         self._ends_m = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
@@ -450,18 +476,9 @@ class Simulation:
         expected = (rate + hot_rate) * max(end_us - begin_us, 0.0) * 1e-6
         room = int(expected + 12 * math.sqrt(expected) + 64)
         t, code = np.empty(room), np.empty(room, np.int32)
+        size_px, key = (camera.width, camera.height), self._model.seed
         n = _kernels.background_events(
-            begin_us,
-            end_us,
-            rate,
-            self._hot,
-            hot_rate,
-            camera.width,
-            camera.height,
-            number,
-            self._key,
-            t,
-            code,
+            (begin_us, end_us), (rate, hot_rate), self._hot, size_px, number, key, t, code
         )
         return t[:n], code[:n]
 
@@ -478,32 +495,17 @@ class Simulation:
             left = (1 - 0.5 / self._threads) ** np.arange(_PARTS * self._threads)
             cuts = (len(block.masks) * np.append(1 - left, 1)).astype(int).tolist()
 
+        store = self._state, self._counters, self.scene.camera.width
+        now = _kernels.Block(number, end_us, block.pixels, block.batches, block.masks, block.strides)
+
         def run(first: int, last: int) -> list[_Requests]:
             found = []
             while first < last:
                 size = max(_ROOM, _kernels.LANES * most)
-                t, code = np.empty(size), np.empty(size, np.int32)
-                room: tuple[Any, ...] = (
-                    self._key,
-                    self._quantiles,
-                    self._shifts,
-                    self._sensor,
-                    t,
-                    code,
-                    most,
-                )
-                state = (self.scene.camera.width, self._state, self._counters, number, end_us)
-                arguments = (
-                    block.pixels,
-                    block.batches,
-                    block.masks,
-                    block.strides,
-                    *state,
-                    *block.shared,
-                    *room,
-                )
-                first, n = _kernels.run_pixels(first, last, *arguments)
-                found.append((t[:n], code[:n]))
+                out = requests_room(size)
+                first = _kernels.run_pixels(first, last, now, store, block.world, self._model, most, out)
+                n = int(out.made[0])
+                found.append((out.t_us[:n], out.code[:n]))
             return found
 
         return [partial(run, a, b) for a, b in pairwise(cuts) if a < b]
@@ -643,14 +645,16 @@ class Simulation:
             levels_of.append(levels)
             for of, share in zip(halos_of, look.halos, strict=True):
                 of.append(levels @ share)
-        shared = (
-            *_time_line(starts, wiped_us, shade, switches, levels_of, halos_of, most),
-            origin, axis, bounds, strips, clusters, gain,
-            *self._halo_grids, self._near_share, tables, near_scale, near_reach, *self._halo_tables, turn,
-            self._texture_every, self._texture,
-            np.array([scene.background.light_w_m2, sensor.dark_w_m2]),
-        )  # fmt: skip
-        return _Block(*_batches(pixels, masks, far, self._texture_every), shared)
+        line, levels, halo = _time_line(starts, wiped_us, shade, switches, levels_of, halos_of, most)
+        background = np.array([scene.background.light_w_m2, sensor.dark_w_m2])
+        world = (
+            line,
+            _kernels.Strips(levels, origin, axis, bounds, strips, clusters, gain),
+            _kernels.Halos(halo, *self._halo_grids, *self._halo_tables),
+            _kernels.Near(self._near_share, tables, near_scale, near_reach),
+            _kernels.Scenery(turn, self._texture_every, self._texture, background),
+        )
+        return _Block(*_batches(pixels, masks, far, self._texture_every), world)
 
     def seen(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
         """Where a source's clusters start and end in the image, and their depths; see `project`."""
@@ -773,17 +777,11 @@ class _Served:
         begin = number * _BLOCK_US
         later, queue = (_since(words, begin - self._begin_us) for words in (self._later, self._queue))
         self._begin_us = begin
-        parts = [later]
-        for when, code in (*signal, noise):
-            parts.append(np.empty(len(when), np.int64))
-            _kernels.as_words(when, code, begin, parts[-1])
-        unsorted = np.concatenate(parts)
+        parts = [request_words(when, code, begin) for when, code in (*signal, noise)]
         # What waits from before comes first.
-        waiting = len(queue)
-        words = np.empty(waiting + len(unsorted), np.int64)
-        words[:waiting] = queue
+        words, waiting = np.concatenate([queue, later, *parts]), len(queue)
         new = words[waiting:]
-        _kernels.sort_words(unsorted, new)
+        new.sort()
         cut = len(new)
         if not over:
             cut = int(np.searchsorted(new, int((safe - begin) * _kernels.TICKS) << _kernels.CODE_BITS))
@@ -794,10 +792,10 @@ class _Served:
         columns = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
         cap = round(sensor.cap_mev_s * sensor.cap_window_us)
         cap = max(cap, 1) if sensor.cap_mev_s > 0 else 0
+        times_us, limit = (begin, sensor.t_row_us, safe), (cap, sensor.cap_window_us)
         written, dropped, held, left = _kernels.read_out(
-            words, begin, camera.height, sensor.t_row_us, safe, cap, sensor.cap_window_us, self._memory,
-            self._pending, *columns,
-        )  # fmt: skip
+            words, times_us, camera.height, limit, self._memory, self._pending, columns
+        )
         self._queue = words[:left].copy()
         simulation.count("dropped_blind", cut - kept + held)
         simulation.count("events", written)

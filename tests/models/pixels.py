@@ -8,7 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.sim import _kernels
 from evlcp_sdk.sim.scene import SensorSpec
-from evlcp_sdk.sim.simulation import quantile_table, seed_key, sensor_vector
+from evlcp_sdk.sim.simulation import pixel_model, request_words, requests_room
 
 __all__ = [
     "MEASURED_AREA",
@@ -70,16 +70,15 @@ def pixel_events(
     """
     edges = np.ascontiguousarray(edge_us, np.float64)
     light = np.ascontiguousarray(light_w_m2, np.float64)
-    quantiles = quantile_table()
-    shifts = np.exp(sensor.noise_ln * quantiles)
+    model = pixel_model(sensor, seed)
     room = (int((end_us - edges[0]) / sensor.refr_us) + 8) * min(pixels, _kernels.LANES)
-    request, code, cross = np.empty(room), np.empty(room, np.int32), np.empty(room)
     found = []
     for first in range(0, pixels, _kernels.LANES):
-        n = _kernels.run_given_light(
-            first, min(first + _kernels.LANES, pixels), edges, light, end_us, seed_key(seed), quantiles,
-            shifts, sensor_vector(sensor), request, code, cross,
-        )  # fmt: skip
+        out = requests_room(room, crossings=True)
+        last = min(first + _kernels.LANES, pixels)
+        _kernels.run_given_light(first, last, edges, light, end_us, model, out)
+        n = int(out.made[0])
+        request, code, cross = out.t_us, out.code, out.cross_us
         pixel = code[:n].astype(np.int64) >> 1
         order = np.argsort(pixel, kind="stable")
         found.append((pixel[order], request[order], cross[order], code[order] % 2 == 1))
@@ -112,13 +111,11 @@ def latency_with_readout_us(sensor: SensorSpec, light_w_m2: float, side_px: int,
     first = np.flatnonzero(np.append(True, np.diff(one.pixel) > 0))
     code = ((one.pixel[first] // side_px) << _kernels.COLUMN_BITS | one.pixel[first] % side_px) << 1 | 1
     n = len(first)
-    words, in_order = np.empty(n, np.int64), np.empty(n, np.int64)
-    _kernels.as_words(one.request_us[first], code.astype(np.int32), 0.0, words)
-    _kernels.sort_words(words, in_order)
+    words = np.sort(request_words(one.request_us[first], code.astype(np.int32), 0.0))
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
     memory = np.array([-1e18, -1.0, -1.0, 0.0])
     _kernels.read_out(
-        in_order, 0.0, side_px, sensor.t_row_us, np.inf, 0, 200, memory, np.zeros((0, 0), np.bool_), *out
+        words, (0.0, sensor.t_row_us, np.inf), side_px, (0, 200), memory, np.zeros((0, 0), np.bool_), out
     )
     return float(out[0].mean() + 0.5)
 

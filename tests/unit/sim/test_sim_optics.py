@@ -119,17 +119,22 @@ def test_the_kernel_looks_up_what_the_table_says() -> None:
     lanes = np.zeros(_kernels._ROOM)
     lanes[_kernels._ALONG : _kernels._ALONG + pixels] = along
     lanes[_kernels._ACROSS : _kernels._ACROSS + pixels] = across
-    room = np.empty(pixels, np.int32), np.empty(pixels, np.int32), np.empty(2 * _kernels.LANES)
-    weight = np.empty(_kernels.LANES)
-    look_up = _kernels._near_weights.py_func
-    look_up(pixels, lanes, 0.7, edges, 3.0, table, 1.9, 1e40, *room, weight)
-    np.testing.assert_allclose(weight[:pixels], 3.0 * expected, rtol=0, atol=1e-11)
+    weight, none = np.empty((1, _kernels.LANES)), np.empty(0)
+    nodes = np.empty((2, pixels), np.int32)
+    room = _kernels._Shining(none, weight, none, none, none, nodes, np.empty(2 * _kernels.LANES))
+
+    def look_up(reach_px: float) -> None:
+        near = _kernels.Near(1.0, table[None], np.array([1.9]), np.array([reach_px]))
+        _kernels._near_weights.py_func((pixels, 0, 0.7, 3.0), lanes, edges, near, room, 0)
+
+    look_up(1e40)
+    np.testing.assert_allclose(weight[0, :pixels], 3.0 * expected, rtol=0, atol=1e-11)
     # What is further away than it is followed is not there.
-    look_up(pixels, lanes, 0.7, edges, 3.0, table, 1.9, 6.0, *room, weight)
+    look_up(6.0)
     near = (np.abs(across) < 6.35) & (along > -6.0)
     assert near.any()
     assert not near.all()
-    np.testing.assert_allclose(weight[:pixels], np.where(near, 3.0 * expected, 0.0), rtol=0, atol=1e-11)
+    np.testing.assert_allclose(weight[0, :pixels], np.where(near, 3.0 * expected, 0.0), rtol=0, atol=1e-11)
 
 
 def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:

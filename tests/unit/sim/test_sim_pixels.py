@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest, chisquare, kstest, norm
 
 from evlcp_sdk.sim import BarSpec, MotionSpec, Scene, SensorSpec, Simulation, _kernels
-from evlcp_sdk.sim.simulation import quantile_table, seed_key
+from evlcp_sdk.sim.simulation import quantile_table, request_words, seed_key
 from evlcp_sdk.values import Events
 from tests.models.pixels import (
     MEASURED_AREA,
@@ -177,12 +177,11 @@ def read_out(
 ) -> tuple[Events, int]:
     code = (((y << _kernels.COLUMN_BITS) | x) << 1 | 1).astype(np.int32)
     n = len(t)
-    words = np.empty(n, np.int64)
-    _kernels.as_words(t.astype(float), code, 0.0, words)
+    words = request_words(t.astype(float), code, 0.0)
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
     memory = np.array([-1e18, -1.0, -1.0, 0.0])
     written, dropped, _, left = _kernels.read_out(
-        words, 0.0, 720, row_us, math.inf, cap, window, memory, np.zeros((0, 0), bool), *out
+        words, (0.0, row_us, math.inf), 720, (cap, window), memory, np.zeros((0, 0), bool), out
     )
     assert left == 0
     return Events(*(c[:written] for c in out)), dropped
@@ -216,13 +215,10 @@ def test_sorting_is_by_time_and_pixel() -> None:
     rng = np.random.default_rng(1)
     t = np.round(rng.uniform(0, 50, 3000), 1)
     code = rng.integers(0, 1000, 3000).astype(np.int32)
-    words, out = np.empty(3000, np.int64), np.empty(3000, np.int64)
-    _kernels.as_words(t, code, 20.0, words)
-    _kernels.sort_words(words, out)
+    out = np.sort(request_words(t, code, 20.0))
     order = np.lexsort((code, t))
     np.testing.assert_allclose((out >> _kernels.CODE_BITS) / _kernels.TICKS, t[order] - 20.0, atol=1e-6)
     assert np.array_equal(out & ((1 << _kernels.CODE_BITS) - 1), code[order])
-    assert np.array_equal(out, np.sort(words))
 
 
 def test_a_pixel_is_blind_after_an_event_in_any_block() -> None:
@@ -233,8 +229,7 @@ def test_a_pixel_is_blind_after_an_event_in_any_block() -> None:
     blind, kept = np.zeros(1024**2), []
     for begin in (0.0, 4000.0):
         within = (t >= begin) & (t < begin + 4000.0)
-        words = np.empty(within.sum(), np.int64)
-        _kernels.as_words(t[within], code[within], begin, words)
+        words = request_words(t[within], code[within], begin)
         n = _kernels.drop_blind(words, begin, blind, 1024, 30.0)
         kept += list(
             zip(

@@ -30,11 +30,12 @@ from evlcp_sdk.sim import (
     simulate,
     truth_of,
 )
-from evlcp_sdk.sim._kernels import COLUMN_BITS, as_words, read_out, texture_at
+from evlcp_sdk.sim._kernels import COLUMN_BITS, read_out, texture_at
 from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.scene import LensSpec
+from evlcp_sdk.sim.simulation import request_words
 from evlcp_sdk.values import Events
 from tests.models.pixels import pixel_events
 
@@ -364,15 +365,19 @@ def test_a_pixel_that_waits_for_the_readout_sends_no_other() -> None:
     assert 500 < len(want) < 2500
     for cuts in ([math.inf], [100.0, 101.5, 260.0, math.inf]):
         memory, pending, found, blind = np.array([-1e18, -1.0, -1.0, 0.0]), np.zeros((30, 8), bool), [], 0
-        words = np.empty(3000, np.int64)
-        as_words(t, ((y << COLUMN_BITS | x) << 1).astype(np.int32), 0.0, words)
+        words = request_words(t, ((y << COLUMN_BITS | x) << 1).astype(np.int32), 0.0)
         rest, before = words[:0], 0.0
         for safe in cuts:
             new = (t >= before) & (t < safe)
             before = safe
             now = np.concatenate([rest, words[new]])
-            out = [np.empty(len(now), kind) for kind in (np.int64, np.uint16, np.uint16, np.uint8)]
-            n, _, held, left = read_out(now, 0.0, 30, 1.3, safe, 0, 200, memory, pending, *out)
+            t_us, y_px, p = (
+                np.empty(len(now), np.int64),
+                np.empty(len(now), np.uint16),
+                np.empty(len(now), np.uint8),
+            )
+            out = t_us, np.empty(len(now), np.uint16), y_px, p
+            n, _, held, left = read_out(now, (0.0, 1.3, safe), 30, (0, 200), memory, pending, out)
             rest = now[:left].copy()
             blind += held
             found += list(zip(*(out[i][:n].tolist() for i in (0, 2, 1)), strict=True))
