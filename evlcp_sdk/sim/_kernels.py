@@ -975,7 +975,7 @@ def _run_batch(
             _run_piece(lanes, t_us, until, batch, model, out)
 
 
-class Block(NamedTuple):
+class ActivePixels(NamedTuple):
     """A block of time, and the pixels that are active in it.
 
     Attributes:
@@ -999,7 +999,7 @@ class Block(NamedTuple):
 def run_pixels(
     first: int,
     last: int,
-    block: Block,
+    block: ActivePixels,
     store: tuple[Array, Array, int],
     world: tuple[TimeLine, Strips, Halos, Near, Scenery],
     model: PixelModel,

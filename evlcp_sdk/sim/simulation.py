@@ -235,7 +235,7 @@ def _batches(
     They see where the sources are anew after `most_poses` at the latest.
 
     Returns:
-        Pixels, batches, masks and strides of a `Block`.
+        Pixels, batches, masks and strides of `ActivePixels`.
     """
     if not len(pixels):
         return pixels, np.zeros(1, np.int64), masks, np.zeros(0, np.int64)
@@ -496,7 +496,7 @@ class Simulation:
             cuts = (len(block.masks) * np.append(1 - left, 1)).astype(int).tolist()
 
         store = self._state, self._counters, self.scene.camera.width
-        now = _kernels.Block(number, end_us, block.pixels, block.batches, block.masks, block.strides)
+        now = _kernels.ActivePixels(number, end_us, block.pixels, block.batches, block.masks, block.strides)
 
         def run(first: int, last: int) -> list[_Requests]:
             found = []
