@@ -39,8 +39,12 @@ class Compiling:
         self._depth = 0
         self._is_said = False
 
-    def watched(self, compile_: Callable[[Any], Any]) -> Callable[[Any], Any]:
-        """A kernel's `compile`, its time added; a kernel may need others."""
+    def watched(self, kernel: Any) -> Callable[[Any], Any]:
+        """A kernel's `compile`, its time added; a kernel may need others.
+
+        What is kept of a version whose types there are no longer is forgotten.
+        """
+        compile_: Callable[[Any], Any] = kernel.compile
 
         @wraps(compile_)
         def watched(sig: Any) -> Any:
@@ -50,6 +54,12 @@ class Compiling:
             gc.disable()
             self._depth += 1
             try:
+                return compile_(sig)
+            except (AttributeError, ImportError):
+                if kernel.stats.cache_path is None:
+                    raise
+                for index in Path(kernel.stats.cache_path).glob(f"*.{kernel.py_func.__name__}-*.nbi"):
+                    index.unlink(missing_ok=True)
                 return compile_(sig)
             finally:
                 self._depth -= 1
@@ -97,7 +107,7 @@ def njit(function: Any = None, /, **options: Any) -> Any:
             kernel.enable_caching()
             if shutil.disk_usage(kernel.stats.cache_path).free < _ROOM_BYTES:
                 kernel = numba.njit(**chosen)(given)
-        kernel.compile = COMPILING.watched(kernel.compile)
+        kernel.compile = COMPILING.watched(kernel)
         return kernel
 
     return compile_ if function is None else compile_(function)

@@ -11,6 +11,9 @@ from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
 
+Columns = tuple[Array, Array, Array, Array]
+"""Of events: t_us, x, y and p."""
+
 
 TIME_AT = 6
 """Bit of a pixel's state from which its newest time is held; below: its score, from `CLOCK_AT`: its clock."""
@@ -51,27 +54,25 @@ _ROUND = np.uint32(CLOCK_ROUND - 1)
 
 @njit
 def score_rises(
-    t_us: Array,
-    x: Array,
-    y: Array,
-    p: Array,
+    events: Columns,
     pixels: Array,
     hits: Array,
     kinds: Array,
     lows: Array,
-    soon: int,
-    tick_shift: int,
-    min_score: int,
-    most_same: int,
-    cell_shift: int,
+    limits: tuple[int, int, int],
+    shifts: tuple[int, int],
 ) -> int:
     """Score each pixel by the rhythm of its rises; add those of candidates to their cell's `hits`; how many.
 
-    `pixels` (height, width) are uint32, see `Rhythm`. A rise sooner than `soon` ticks after the one before is
-    the same; `kinds` says what a number of ticks is, the last, 0, for all beyond, and `lows` what becomes of
-    time and score, and in the bits above whether it is `AGAIN` the same time. A tick is 2^tick_shift us. A
-    rise beyond is no hit, nor is one after the same time `most_same` times.
+    `pixels` (height, width) are uint32, see `Rhythm`. A rise sooner than so many ticks after the one before,
+    the first of `limits`, is the same; `kinds` says what a number of ticks is, the last, 0, for all beyond,
+    and `lows` what becomes of time and score, and in the bits above whether it is `AGAIN` the same time. Of
+    `shifts`, a tick is 2^first us, a cell 2^second px wide. A rise with less than the least score is no hit,
+    nor is one beyond, or after the same time so often; these are the other `limits`.
     """
+    t_us, x, y, p = events
+    soon, min_score, most_same = limits
+    tick_shift, cell_shift = shifts
     width, columns = np.uint32(pixels.shape[1]), np.uint32(hits.shape[1])
     states, cells = pixels.reshape(-1), hits.reshape(-1)
     longest, least = np.uint32(kinds.size - 1), np.uint32(min_score)
@@ -147,27 +148,17 @@ def _blinks(state: int, now: int, span: int, least: int) -> bool:
 
 
 @njit
-def _mark_blinking(line: Array, now: int, span: int, least: int, blinks: Array, counts: Array) -> None:
-    """Which pixels of a line `_blinks`, 1 or 0, added to `counts`."""
-    for u in range(line.size):
-        blinks[u] = _blinks(line[u], now, span, least)
-    for u in range(line.size):
-        counts[u] += np.int32(blinks[u])
-
-
-@njit
 def measure_box(
     pixels: Array,
     box: tuple[int, int, int, int],
-    now: int,
-    span: int,
-    min_score: int,
+    awake: tuple[int, int, int],
     seam: int,
     reach: float,
     rows: Array,
 ) -> tuple[int, float, int, int, float, float]:
-    """Where in a box pixels blink in the rhythm of the chips and rose in the last `span` ticks.
+    """Where in a box pixels blink in the rhythm of the chips, and rose lately.
 
+    `awake` are (now, how many ticks ago a rise may be, the least score).
     Columns count by what they have more than the `seam` outermost ones on the darker side: a halo, or lit
     leaves; those that hold most within twice `reach` give the mean column, and rows count what they have
     within `reach` of it. An edge row that holds fewer pixels than a full one counts by its share.
@@ -175,11 +166,16 @@ def measure_box(
     Returns:
         (pixels, mean column, first column, last column, upper edge, lower edge).
     """
+    now, span, min_score = awake
     left, top, right, bottom = box
     # Many pixels at a time: all of them first, then what they say.
     blinks, counts = np.empty((bottom - top, right - left), np.uint8), np.zeros(right - left, np.int32)
     for v in range(top, bottom):
-        _mark_blinking(pixels[v, left:right], now, span, min_score, blinks[v - top], counts)
+        line, row = pixels[v, left:right], blinks[v - top]
+        for u in range(line.size):
+            row[u] = _blinks(line[u], now, span, min_score)
+        for u in range(line.size):
+            counts[u] += np.int32(row[u])
     columns, first_column, last_column = np.empty(counts.size), right, left
     for u in range(left, right):
         columns[u - left] = counts[u - left]
@@ -225,9 +221,7 @@ def measure_box(
 def measure_strips(
     pixels: Array,
     box: tuple[int, int, int, int],
-    now: int,
-    span: int,
-    min_score: int,
+    awake: tuple[int, int, int],
     expected: float,
     near: float,
     strips: Array,
@@ -240,6 +234,7 @@ def measure_strips(
     mean column would. Within `near` of the strips about `expected` first, then about what that says, and
     within the strips and a pixel; columns between them count nowhere.
     """
+    now, span, min_score = awake
     left, top, right, bottom = box
     columns, number = np.zeros(right - left), np.empty(right - left, np.int64)
     for v in range(top, bottom):
@@ -293,18 +288,10 @@ def _edges_of(rows: Array, top: int, bottom: int, full: float) -> tuple[float, f
 
 
 @njit
-def select_box(
-    t_us: Array,
-    x: Array,
-    y: Array,
-    p: Array,
-    box: tuple[int, int, int, int],
-    out_t: Array,
-    out_x: Array,
-    out_y: Array,
-    out_p: Array,
-) -> int:
+def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) -> int:
     """Copy the events inside a box (left, top, right, bottom); how many. One more than all find room."""
+    t_us, x, y, p = events
+    out_t, out_x, out_y, out_p = out
     left, top = np.uint16(box[0]), np.uint16(box[1])
     width, height = np.uint16(box[2] - box[0]), np.uint16(box[3] - box[1])
     n = np.uint64(0)
@@ -399,31 +386,29 @@ def _name_by_label(x: Array, y: Array, boxes: Array, cell_shift: int, labels: Ar
 
 @njit
 def select_boxes(
-    t_us: Array,
-    x: Array,
-    y: Array,
-    p: Array,
+    events: Columns,
     boxes: Array,
     filtered: Array,
     pixels: Array,
-    least: int,
-    same: int,
-    cell_shift: int,
-    labels: Array,
+    heard: tuple[int, int],
+    labels: tuple[int, Array],
     alone: Array,
     begins: Array,
-) -> tuple[Array, Array, Array, Array]:
+) -> Columns:
     """Events inside some boxes (n, 4), one box after the other, but for those that are not `alone` (n,).
 
     Those of a box begin at `begins` (n + 1,). Of one that is `filtered` (n,), they are events that
-    `in_rhythm` marks. Labels, see `label_boxes`, are taken of more than `FEW_BOXES`, with `alone` by them.
+    `in_rhythm` marks, by the least score and the same time so often. Labels, with their cells' shift, see
+    `label_boxes`, are taken of more than `FEW_BOXES`, with `alone` by them.
     """
+    t_us, x, y, p = events
+    least, same = heard
     many, size = len(boxes), t_us.size
     of = np.empty(size, np.uint16)
     if many <= FEW_BOXES:
         _name_few(x, y, boxes, of, alone)
     else:
-        _name_by_label(x, y, boxes, cell_shift, labels, of)
+        _name_by_label(x, y, boxes, labels[0], labels[1], of)
     if filtered.any():
         for i in range(size):
             if of[i] and filtered[of[i] - 1]:
@@ -456,22 +441,21 @@ def select_boxes(
 
 @njit
 def add_polarity(
-    t_us: Array,
-    x: Array,
-    y: Array,
-    p: Array,
-    start_on_us: float,
-    start_off_us: float,
+    events: Columns,
+    starts_us: tuple[float, float],
     chip_us: float,
-    row_us: float,
-    row_px: float,
+    row: tuple[float, float],
     shift: Array,
     sums: Array,
 ) -> None:
     """Add events to polarity sums (chips, height, width); `shift` (2, chips): the sensor pixel of (0, 0).
 
-    The starts hold in row `row_px` of the sensor; in each row after it, events come `row_us` later.
+    The starts, of positive and of negative events, hold in a row of the sensor; in each one after it, events
+    come later: `row` are by how much, us, and which that is.
     """
+    t_us, x, y, p = events
+    start_on_us, start_off_us = starts_us
+    row_us, row_px = row
     chips, height, width = sums.shape
     shift_x, shift_y = shift[0], shift[1]
     upper = row_us * (shift_y.min() - row_px)
@@ -495,7 +479,7 @@ def add_polarity(
         if still:
             # In the chips of so few events, the image seldom moves by a pixel.
             left, top = np.int32(shift_x[low]), np.int32(shift_y[low])
-            _pixels_of(x[begin:end], y[begin:end], which, left, top, many, rows, columns, where)
+            _pixels_of(x[begin:end], y[begin:end], which, (left, top), (many, rows, columns), where)
             for i in range(begin, end):
                 at = where[i - begin]
                 if at != _NOWHERE:
@@ -554,17 +538,14 @@ def _outermost(which: Array, chips: np.uint32) -> tuple[np.uint32, np.uint32]:
 
 @njit
 def _pixels_of(
-    x: Array,
-    y: Array,
-    which: Array,
-    left: np.int32,
-    top: np.int32,
-    chips: np.uint32,
-    rows: np.uint32,
-    columns: np.uint32,
-    out: Array,
+    x: Array, y: Array, which: Array, place: tuple[np.int32, np.int32], size: tuple[Any, Any, Any], out: Array
 ) -> None:
-    """Number of each event's pixel in images one after the other, `out` uint32 (n,); `_NOWHERE` outside."""
+    """Number of each event's pixel in images one after the other, `out` uint32 (n,); `_NOWHERE` outside.
+
+    `place` is the sensor pixel of (0, 0), `size` are the chips, rows and columns of the images.
+    """
+    left, top = place
+    chips, rows, columns = size
     for i in range(x.size):
         c = np.uint32(which[i])
         u, v = np.uint32(np.int32(x[i]) - left), np.uint32(np.int32(y[i]) - top)
@@ -695,24 +676,8 @@ def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -
 
 
 @njit
-def _score(
-    at: Array, cluster: Array, cells: Array, layout: Array, s: complex, shift: complex, reach: float
-) -> float:
-    """Cells of the blobs within reach of their cluster's place, those off it less by the square."""
-    score = 0.0
-    for i in range(at.size):
-        off = at[i] - (s * layout[cluster[i]] + shift)
-        square = (off.real * off.real + off.imag * off.imag) / (reach * reach)
-        if square < 1:
-            score += cells[i] * (1 - square)
-    return score
-
-
-@njit
 def best_similarity(
-    at: Array,
-    cluster: Array,
-    cells: Array,
+    blobs: tuple[Array, Array, Array],
     proposers: int,
     layout: Array,
     spacing: float,
@@ -722,10 +687,12 @@ def best_similarity(
 ) -> tuple[float, complex, complex]:
     """Score, scale and shift of the similarity that has most cells of all blobs in their place.
 
-    The first blobs propose: each pair of different clusters, or, if `scale` is not 0, each one with this
-    scale. A place reaches half a spacing and `slack` around; scales with neighbours nearer than
-    `least_spacing` do not count. Of two that score alike, the earlier is taken.
+    Of the blobs (where, of which cluster, how many cells) the first propose: each pair of different clusters,
+    or, if `scale` is not 0, each one with this scale. A place reaches half a spacing and `slack` around;
+    cells off it count less by the square; scales with neighbours nearer than `least_spacing` do not count. Of
+    two that score alike, the earlier is taken.
     """
+    at, cluster, cells = blobs
     best, best_s, best_shift = 0.0, complex(0.0, 0.0), complex(0.0, 0.0)
     known = abs(scale) > 0
     for i in range(proposers):
@@ -738,8 +705,12 @@ def best_similarity(
             gap = abs(s) * spacing
             if gap < least_spacing:
                 continue
-            shift = at[i] - s * layout[cluster[i]]
-            score = _score(at, cluster, cells, layout, s, shift, gap / 2 + slack)
+            shift, reach, score = at[i] - s * layout[cluster[i]], gap / 2 + slack, 0.0
+            for k in range(at.size):
+                off = at[k] - (s * layout[cluster[k]] + shift)
+                square = (off.real * off.real + off.imag * off.imag) / (reach * reach)
+                if square < 1:
+                    score += cells[k] * (1 - square)
             if score > best:
                 best, best_s, best_shift = score, s, shift
     return best, best_s, best_shift
@@ -747,9 +718,7 @@ def best_similarity(
 
 @njit
 def refined_similarity(
-    at: Array,
-    cluster: Array,
-    cells: Array,
+    blobs: tuple[Array, Array, Array],
     layout: Array,
     spacing: float,
     slack: float,
@@ -763,6 +732,7 @@ def refined_similarity(
     The known scale counts as if every cluster of the layout had been seen with it, with as many cells as
     those seen have on average.
     """
+    at, cluster, cells = blobs
     for _ in range(3):
         reach = abs(s) * spacing / 2 + slack
         total = 0.0
@@ -800,36 +770,9 @@ def refined_similarity(
 
 
 @njit
-def voted_similarity(
-    at: Array,
-    cluster: Array,
-    cells: Array,
-    proposers: int,
-    layout: Array,
-    spacing: float,
-    slack: float,
-    least_spacing: float,
-    scale: complex,
-) -> tuple[float, complex, complex]:
-    """Score of the `best_similarity`, and its scale and shift as refined; a score of 0 for none."""
-    score, s, shift = best_similarity(
-        at, cluster, cells, proposers, layout, spacing, slack, least_spacing, scale
-    )
-    if score > 0:
-        s, shift = refined_similarity(at, cluster, cells, layout, spacing, slack, scale, s, shift)
-    return score, s, shift
-
-
-@njit
 def _share(off: float, half: float, grid: float) -> float:
     """Part of a cell, `off` from a footprint's middle, that the footprint covers."""
     return max(min(off + grid / 2, half) - max(off - grid / 2, -half), 0.0) / grid
-
-
-@njit
-def _add_to(total: Array, part: Array) -> None:
-    for j in range(total.size):
-        total[j] += part[j]
 
 
 @njit
@@ -864,7 +807,9 @@ def across_profile(
                 many[k] += 1
     every = np.zeros((rows, columns))
     for k in range(places.size):
-        _add_to(every.reshape(-1), np.ascontiguousarray(probability[k]).reshape(-1))
+        for r in range(rows):
+            for c in range(columns):
+                every[r, c] += probability[k, r, c]
     half = spacing / 2 + grid
     wide, high = _strip(unit, half, hits.size)
     for k in range(places.size):
@@ -954,7 +899,11 @@ def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, 
     flat = np.ascontiguousarray(sums).reshape(len(sums), height * width)
     values = np.empty((length, height * width), np.int8)
     for i in range(length):
-        _values(flat[every * i], flat[every * i + 1], every > 1, values[i])
+        first, second, pairs = flat[every * i], flat[every * i + 1], np.int8(every > 1)
+        for j in range(first.size):
+            a, b = first[j], second[j]
+            up, down = np.int8(b > 0) - np.int8(b < 0), np.int8(a < 0) - np.int8(a > 0)
+            values[i, j] = up + down * np.int8(b == 0) * pairs
     agree = np.empty(height * width, np.int16)
     for k in range(clusters):
         edges = 0
@@ -965,10 +914,14 @@ def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, 
             out[k] = 0.0
             continue
         begin, end = top * grid * width, bottom * grid * width
-        agree[begin:end] = 0
+        total_of = agree[begin:end]
+        for j in range(total_of.size):
+            total_of[j] = 0
         for i in range(length):
             if codes[k, i] != 0:
-                _add_values(agree[begin:end], values[i, begin:end], np.int8(codes[k, i]))
+                value, sign = values[i, begin:end], np.int8(codes[k, i])
+                for j in range(total_of.size):
+                    total_of[j] = np.int16(total_of[j] + np.int8(value[j] * sign))
         total, place = 0.0, 0.0
         for r in range(top, bottom):
             for c in range(columns):
@@ -1006,22 +959,6 @@ def lit_clusters(
 
 
 @njit
-def _values(first: Array, second: Array, pairs: bool, out: Array) -> None:
-    """Sign of the second of two sums, `out` int8 (n,); of `pairs`, if that is 0, the first's opposite."""
-    both = np.int8(pairs)
-    for j in range(out.size):
-        a, b = first[j], second[j]
-        up, down = np.int8(b > 0) - np.int8(b < 0), np.int8(a < 0) - np.int8(a > 0)
-        out[j] = up + down * np.int8(b == 0) * both
-
-
-@njit
-def _add_values(total: Array, values: Array, sign: np.int8) -> None:
-    for j in range(total.size):
-        total[j] = np.int16(total[j] + np.int8(values[j] * sign))
-
-
-@njit
 def rows_of(image: Array) -> tuple[int, int]:
     """First row that is not 0 throughout, and the one after the last; (0, 0) without any."""
     top, bottom = 0, 0
@@ -1042,16 +979,16 @@ def spread_between(
     places: Array,
     seen: Array,
     pairs: Array,
-    half: float,
-    first: float,
-    last: float,
+    zones: tuple[float, float, float],
     out: Array,
 ) -> None:
     """Count answers of the pixels on the way from a cluster to its neighbour to the neighbour's edges.
 
     Those that come while the cluster itself stays as it is. `codes` are chips. `out` (2, 2, 3): the first of
-    the pair stays on, or off; answers and edges; before the share `first` of the way, up to `last`, beyond.
+    the pair stays on, or off; answers and edges; before the first share of the way, up to the second, beyond.
+    `zones` are how far beside the way pixels are asked, px, and these shares.
     """
+    half, first, last = zones
     chips = codes.shape[1]
     _, height, width = sums.shape
     # Chips behind the neighbour's edges, those first in which the cluster stays on, and which way they go.
@@ -1129,27 +1066,6 @@ def spread_across(
                     answers += int(sums[i, v, u] * edge[i] > 0)
                 out[0, column] += answers
                 out[1, column] += edges
-
-
-@njit
-def spread_about(
-    sums: Array,
-    codes: Array,
-    every: int,
-    places: Array,
-    seen: Array,
-    pairs: Array,
-    way: complex,
-    along: float,
-    zones: tuple[float, float, float],
-    between: Array,
-    across: Array,
-) -> None:
-    """Both `spread_between`, by (half, first, last), and, unless `way` is 0, `spread_across`."""
-    half, first, last = zones
-    spread_between(sums, codes, places, seen, pairs, half, first, last, between)
-    if way != 0:
-        spread_across(sums, codes, every, places, seen, way, along, across)
 
 
 @njit
@@ -1356,153 +1272,135 @@ def flank_px(profile: Array) -> float:
 
 
 @njit
-def place_clusters(
+def seek_clusters(
     pixels: Array,
     shown: Array,
-    layout: Array,
-    spacing: float,
-    s: complex,
-    shift: complex,
-    neighbours: Array,
+    places: Array,
+    reach: float,
     heard: Array,
     edges: Array,
-    every: int,
-    way: complex,
-    across: float,
+    line: tuple[complex, float],
     points: Array,
-    ends: Array,
-) -> tuple[float, float]:
-    """Centres of the clusters in the image, `points` (K, 2), NaN where unseen.
+) -> float:
+    """Mean places of the clusters' pixels about where they should be, `points` (K, 2), NaN where unseen.
+
+    `shown` (K,) says which clusters to seek about their `places`, half of `reach`, their spacing, and 1.5 px
+    around. `heard` are the polarity sums of a pilot, `edges` the codes' (K, n), the first that into chip 1.
+    Of a `line` (its direction in the image, how far across it light counts, px, 0 for none), the middles
+    across it are those of `middle_across`.
 
     Returns:
-        Squares left by a similarity, px^2; how wide a line's flanks are, px, see `flank_px`, NaN of no line.
-
-    `shown` (K,) says which clusters to seek about their places s * layout + shift; `neighbours` (2, K) holds
-    the cluster to the right and the one below, -1 for none; `ends` (K,) becomes 1 where a cluster has a
-    boundary on one side only, else 0, NaN where unseen. `heard` are the polarity sums of a pilot, `edges` the
-    codes' (K, n), the first that into chip 1, of which every `every`-th tells clusters apart. Where `across`
-    is not 0, the clusters stand in a line along `way` of the layout, and their middles across it are those
-    of `middle_across`.
+        How wide a line's flanks are, px, see `flank_px`, NaN of no line.
     """
     clusters, height, width = pixels.shape
-    points[:] = np.nan
-    ends[:] = np.nan
-    reach = abs(s) * spacing
+    unit, across = line
     window = 0.5 * reach + 1.5
-    seen = np.zeros(clusters, np.bool_)
     profile = np.zeros(max(height, width))
     for k in range(clusters):
+        points[k, 0] = points[k, 1] = np.nan
         if not shown[k]:
             continue
-        at = s * layout[k] + shift
+        x, y = places[k].real, places[k].imag
         sum_w, sum_x, sum_y = 0.0, 0.0, 0.0
-        for v in range(max(int(np.ceil(at.imag - window)), 0), min(int(at.imag + window), height - 1) + 1):
-            for u in range(max(int(np.ceil(at.real - window)), 0), min(int(at.real + window), width - 1) + 1):
+        for v in range(max(int(np.ceil(y - window)), 0), min(int(y + window), height - 1) + 1):
+            for u in range(max(int(np.ceil(x - window)), 0), min(int(x + window), width - 1) + 1):
                 w = pixels[k, v, u]
                 sum_w += w
                 sum_x += w * u
                 sum_y += w * v
         if sum_w > 0:
-            seen[k] = True
-            points[k, 0] = sum_x / sum_w
-            points[k, 1] = sum_y / sum_w
+            points[k, 0], points[k, 1] = sum_x / sum_w, sum_y / sum_w
             if across > 0:
-                unit = s / abs(s) * way
-                off = middle_across(
-                    heard, edges[k], points[k, 0], points[k, 1], unit, 0.5 * reach, across, profile
-                )
+                x, y = points[k, 0], points[k, 1]
+                off = middle_across(heard, edges[k], x, y, unit, 0.5 * reach, across, profile)
                 points[k, 0] -= off * unit.imag
                 points[k, 1] += off * unit.real
-    if seen.sum() < 3:
-        points[:] = np.nan
-        return 0.0, np.nan
-    for k in range(clusters):
-        if seen[k]:
-            ends[k] = 0
-    mean = points.copy()
+    return flank_px(profile)
+
+
+@njit
+def meet_neighbours(
+    mean: Array,
+    places: Array,
+    neighbours: Array,
+    way: tuple[complex, float],
+    pilot: tuple[Array, Array, int],
+    points: Array,
+    ends: Array,
+) -> None:
+    """Move clusters along a way to midway between their boundaries with their neighbours: `points` (K, 2).
+
+    `mean` (K, 2) are the middles of their pixels, NaN where unseen, `places` where they should be, and
+    `neighbours` (K,) the cluster beside each in the `way` (direction, spacing in px), -1 for none. `ends`
+    (K,) becomes 1 where a cluster has a boundary on one side only. `pilot` is as of `seek_clusters`, and
+    every how many edges tell clusters apart.
+    """
+    clusters = len(mean)
+    along, reach = way
+    heard, edges, every = pilot
+    rows = abs(along.imag) >= abs(along.real)
+    lines = heard.shape[1] if rows else heard.shape[2]
+    lights, lit = np.empty((clusters, lines)), np.zeros(clusters, np.bool_)
     centres = np.empty(clusters, np.complex128)
-    lights = np.empty((clusters, max(height, width)))
-    lit = np.empty(clusters, np.bool_)
-    for axis in range(2):
-        if neighbours[axis].max() < 0:
+    before, after = np.full(clusters, np.nan), np.full(clusters, np.nan)
+    for k in range(clusters):
+        if not np.isnan(mean[k, 0]):
+            off = (complex(mean[k, 0], mean[k, 1]) - places[k]) * along.conjugate()
+            centres[k] = places[k] + along * complex(0.0, off.imag)
+            window = 0.5 * reach + 1.5
+            lit[k] = light_along(heard, edges[k], every, centres[k], along, reach, window, lights[k])
+    for k in range(clusters):
+        other = neighbours[k]
+        if other < 0 or not (lit[k] and lit[other]):
             continue
-        along = s / abs(s) if axis == 0 else s / abs(s) * 1j
-        rows = abs(along.imag) >= abs(along.real)
-        lines = height if rows else width
-        before = np.full(clusters, np.nan)
-        after = np.full(clusters, np.nan)
-        for k in range(clusters):
-            lit[k] = False
-            if seen[k]:
-                at = s * layout[k] + shift
-                off = (complex(mean[k, 0], mean[k, 1]) - at) * along.conjugate()
-                centres[k] = at + along * complex(0.0, off.imag)
-                lit[k] = light_along(
-                    heard, edges[k], every, centres[k], along, reach, window, lights[k, :lines]
-                )
-        for k in range(clusters):
-            other = neighbours[axis, k]
-            if other < 0 or not (lit[k] and lit[other]):
-                continue
-            a, b = centres[k], centres[other]
-            start, end = (a.imag, b.imag) if rows else (a.real, b.real)
-            share = boundary_between(lights[k, :lines], lights[other, :lines], start, end)
-            if -0.5 < share < 1.5:
-                z = (a + share * (b - a)) * along.conjugate()
-                after[k] = z.real
-                before[other] = z.real
-        gap, both = 0.0, 0
-        for k in range(clusters):
-            if not np.isnan(before[k]) and not np.isnan(after[k]):
-                gap += after[k] - before[k]
-                both += 1
-        gap = gap / both if both else reach
-        for k in range(clusters):
-            if not seen[k]:
-                continue
-            has_before, has_after = not np.isnan(before[k]), not np.isnan(after[k])
-            if has_before and has_after:
-                centre = (before[k] + after[k]) / 2
-            elif has_before:
-                centre = before[k] + gap / 2
-            elif has_after:
-                centre = after[k] - gap / 2
-            else:
-                continue
-            if has_before != has_after:
-                ends[k] = 1
-            move = centre - (complex(mean[k, 0], mean[k, 1]) * along.conjugate()).real
-            points[k, 0] += move * along.real
-            points[k, 1] += move * along.imag
-    # The least-squares similarity, as complex numbers.
+        a, b = centres[k], centres[other]
+        start, end = (a.imag, b.imag) if rows else (a.real, b.real)
+        share = boundary_between(lights[k], lights[other], start, end)
+        if -0.5 < share < 1.5:
+            after[k] = before[other] = ((a + share * (b - a)) * along.conjugate()).real
+    gap, both = 0.0, 0
+    for k in range(clusters):
+        if not np.isnan(before[k] + after[k]):
+            gap += after[k] - before[k]
+            both += 1
+    gap = gap / both if both else reach
+    for k in range(clusters):
+        has_before, has_after = not np.isnan(before[k]), not np.isnan(after[k])
+        if not (has_before or has_after):
+            continue
+        centre = before[k] + gap / 2 if has_before else after[k] - gap / 2
+        if has_before and has_after:
+            centre = (before[k] + after[k]) / 2
+        else:
+            ends[k] = 1
+        move = centre - (complex(mean[k, 0], mean[k, 1]) * along.conjugate()).real
+        points[k, 0] += move * along.real
+        points[k, 1] += move * along.imag
+
+
+@njit
+def squares_left(points: Array, layout: Array) -> float:
+    """Squares, px2, that the similarity leaves that fits points (K, 2) best, without those that are NaN."""
     n = 0
     image_mean, layout_mean = complex(0.0, 0.0), complex(0.0, 0.0)
-    for k in range(clusters):
-        if seen[k]:
+    for k in range(layout.size):
+        if not np.isnan(points[k, 0]):
             n += 1
             image_mean += complex(points[k, 0], points[k, 1])
             layout_mean += layout[k]
     image_mean /= n
     layout_mean /= n
-    cross, power = complex(0.0, 0.0), 0.0
-    for k in range(clusters):
-        if seen[k]:
+    cross, power, squares = complex(0.0, 0.0), 0.0, 0.0
+    for k in range(layout.size):
+        if not np.isnan(points[k, 0]):
             c = layout[k] - layout_mean
             cross += c.conjugate() * (complex(points[k, 0], points[k, 1]) - image_mean)
             power += abs(c) ** 2
-    squares = 0.0
-    for k in range(clusters):
-        if seen[k]:
-            c = layout[k] - layout_mean
-            off = abs(complex(points[k, 0], points[k, 1]) - image_mean - cross / power * c)
-            squares += off * off
-    return squares, flank_px(profile)
-
-
-@njit
-def _count_some(values: Array, out: Array) -> None:
-    for j in range(out.size):
-        out[j] = np.int16(out[j] + np.int16(values[j] != 0))
+    for k in range(layout.size):
+        if not np.isnan(points[k, 0]):
+            off = complex(points[k, 0], points[k, 1]) - image_mean - cross / power * (layout[k] - layout_mean)
+            squares += abs(off) * abs(off)
+    return squares
 
 
 @njit
@@ -1516,7 +1414,9 @@ def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least
     flat = np.ascontiguousarray(sums).reshape(chips, height * width)
     events = np.zeros((2, height * width), np.int16)
     for c in range(chips):
-        _count_some(flat[c], events[int(c >= pilot_chips)])
+        line, some = flat[c], events[int(c >= pilot_chips)]
+        for j in range(line.size):
+            some[j] = np.int16(some[j] + np.int16(line[j] != 0))
     by_info, by_pilot = 1 / max(chips - pilot_chips, 1), least / pilot_chips
     over = np.zeros((rows, columns))
     for r in range(rows):
@@ -1540,24 +1440,23 @@ def calibrate_llr(
     read: Array,
     llr: Array,
     seen: Array,
-    frame_worth: float,
-    expected_worth: float,
-    spread: float,
-    least: float,
-    together: float,
+    expected: tuple[float, float, float],
+    sure: tuple[float, float],
     symbols: Array,
     scaled: Array,
 ) -> float:
     """Scale LLRs (K, bits) so that their sizes' variance is twice the mean, give the symbols that are sure.
 
-    A cluster's variance is pooled with that of all sizes of the frame, which is worth `frame_worth` sizes,
-    and with an expected one, `spread` of its mean squared, worth `expected_worth`. Clusters unseen, or with a
-    symbol of -1, are given LLRs of 0 and a symbol of -1; so are those less sure than `least`, but for their
-    LLRs. Of those that are wrong, `together` are in one frame.
+    A cluster's variance is pooled with that of all sizes of the frame, and with an expected one, a share of
+    its mean squared; `expected` are what the first is worth, in sizes, what the second, and the share.
+    Clusters unseen, or with a symbol of -1, are given LLRs of 0 and a symbol of -1; so are those less sure
+    than the first of `sure`, but for their LLRs. Of those that are wrong, the second are in one frame.
 
     Returns:
         Probability that all that are given are right; 0 if none is.
     """
+    frame_worth, expected_worth, spread = expected
+    least, together = sure
     clusters, bits = llr.shape
     symbols[:] = -1
     scaled[:] = 0
@@ -1588,10 +1487,10 @@ def calibrate_llr(
             for b in range(bits):
                 scaled[k, b] = llr[k, b] * scale
                 nearest = min(nearest, abs(llr[k, b] * scale))
-            sure = 1 / (1 + np.exp(-nearest))
-            if sure >= least:
+            chance = 1 / (1 + np.exp(-nearest))
+            if chance >= least:
                 symbols[k] = read[k]
-                right *= sure
+                right *= chance
                 given += 1
     return right ** (1 / together) if given else 0.0
 
@@ -1783,52 +1682,6 @@ def bounds_of(places: Array) -> tuple[float, float, float, float]:
         left, right = min(left, place.real), max(right, place.real)
         top, bottom = min(top, place.imag), max(bottom, place.imag)
     return left, right, top, bottom
-
-
-@njit
-def keep_inside(prior: Array, probability: Array, selected: Array, out: Array, chosen: Array) -> None:
-    """Probabilities, and the choice, of cells whose prior is not 0; 0 and False elsewhere."""
-    likely, before = prior.reshape(-1), np.ascontiguousarray(probability).reshape(-1)
-    was, after, now = np.ascontiguousarray(selected).reshape(-1), out.reshape(-1), chosen.reshape(-1)
-    for j in range(likely.size):
-        inside = likely[j] > 0
-        after[j] = before[j] if inside else before.dtype.type(0)
-        now[j] = was[j] & inside
-
-
-@njit
-def mask(
-    probability: Array,
-    selected: Array,
-    pixels: Array,
-    seen: Array,
-    places: Array,
-    unit: complex,
-    spacing: float,
-    grid: int,
-    bins: int,
-    edge: float,
-    prior: Array,
-    out: Array,
-    chosen: Array,
-    near: Array,
-) -> None:
-    """Presence with a layout's place taken in: `prior`, probability `out`, choice, pixels `near` a place.
-
-    Of a line, whose width shows within `bins` px from its axis and is that at `edge` of its peak; of a
-    layout of squares where there are none.
-    """
-    across = spacing
-    if bins:
-        hits, cells, profile = np.zeros(bins), np.zeros(bins), np.empty(bins)
-        across_profile(probability, seen, places, unit, spacing, grid, hits, cells)
-        wide = core_profile(hits, cells, edge, profile)
-        across = float(wide)
-        line_prior(places, unit, spacing, grid, profile[:wide], prior)
-    else:
-        block_prior(places, unit, spacing, grid, prior)
-    copy_near(pixels, places, unit, spacing, across, near)
-    keep_inside(prior, probability, selected, out, chosen)
 
 
 @njit

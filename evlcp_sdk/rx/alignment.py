@@ -16,7 +16,8 @@ from evlcp_sdk.rx.detection import MARGIN_PX
 from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
-from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed, plain
+from evlcp_sdk.rx.rhythm import columns_of
+from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed
 
 if TYPE_CHECKING:
     from evlcp_sdk.rx import _kernels
@@ -340,19 +341,7 @@ def polarity_sums(
     on_us, off_us = float(start_us + lock.delay_on_us), float(start_us + lock.delay_off_us)
     chip_us, row_us = float(lock.chip_us), float(lock.row_us)
     for e in events:
-        _kernels.add_polarity(
-            plain(e.t_us),
-            plain(e.x),
-            plain(e.y),
-            plain(e.p),
-            on_us,
-            off_us,
-            chip_us,
-            row_us,
-            row_px,
-            shift,
-            sums,
-        )
+        _kernels.add_polarity(columns_of(e), (on_us, off_us), chip_us, (row_us, row_px), shift, sums)
     return sums, rest_px
 
 

@@ -72,16 +72,6 @@ def calibrate_llr(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
         seen: Clusters that are in sight, bool (K,); nothing is given of the others, and their LLRs are 0.
     """
     symbols, llr = np.empty_like(soft.symbols), np.empty_like(soft.llr)
-    quality = _kernels.calibrate_llr(
-        soft.symbols,
-        soft.llr,
-        seen,
-        _FRAME_WORTH,
-        _EXPECTED_WORTH,
-        _EXPECTED_SPREAD,
-        _LEAST_SURE,
-        _TOGETHER,
-        symbols,
-        llr,
-    )
+    expected, sure = (_FRAME_WORTH, _EXPECTED_WORTH, _EXPECTED_SPREAD), (_LEAST_SURE, _TOGETHER)
+    quality = _kernels.calibrate_llr(soft.symbols, soft.llr, seen, expected, sure, symbols, llr)
     return SoftSymbols(symbols, llr, quality)

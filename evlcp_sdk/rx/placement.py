@@ -214,26 +214,21 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
         unit *= layout.way
     spacing_px = abs(placement.scale) * layout.spacing_m
     places = placement.places(layout)
-    grid, heard = presence.grid_px, presence.probability
-    pixels, prior = np.zeros(presence.pixels.shape, presence.pixels.dtype), np.zeros(heard.shape, heard.dtype)
-    probability, selected = np.empty(heard.shape, heard.dtype), np.empty(heard.shape, np.bool_)
-    _kernels.mask(
-        presence.probability,
-        presence.selected,
-        presence.pixels,
-        placement.seen,
-        places,
-        unit,
-        spacing_px,
-        grid,
-        math.ceil(spacing_px + _WIDEST_PX) if layout.line else 0,
-        _EDGE,
-        prior,
-        probability,
-        selected,
-        pixels,
-    )
-    return PresenceMap(probability, grid, selected, pixels, prior)
+    grid, likely = presence.grid_px, presence.probability
+    pixels, prior = np.zeros_like(presence.pixels), np.zeros_like(likely)
+    across_px = spacing_px
+    if layout.line:
+        bins = math.ceil(spacing_px + _WIDEST_PX)
+        hits, cells, profile = np.zeros(bins), np.zeros(bins), np.empty(bins)
+        _kernels.across_profile(likely, placement.seen, places, unit, spacing_px, grid, hits, cells)
+        wide = _kernels.core_profile(hits, cells, _EDGE, profile)
+        across_px = float(wide)
+        _kernels.line_prior(places, unit, spacing_px, grid, profile[:wide], prior)
+    else:
+        _kernels.block_prior(places, unit, spacing_px, grid, prior)
+    _kernels.copy_near(presence.pixels, places, unit, spacing_px, across_px, pixels)
+    inside = prior > 0
+    return PresenceMap(likely * inside, grid, presence.selected & inside, pixels, prior)
 
 
 def lit(
@@ -294,17 +289,11 @@ def _voted(
     for mirrored in ways if before is None or layout.line else (before.mirrored,):
         at_m = _turned(layout, mirrored)
         scale = 0j if before is None else before.scale
-        score, s, shift = _kernels.voted_similarity(
-            blobs.at,
-            blobs.cluster,
-            blobs.cells,
-            min(len(blobs.at), _PROPOSERS),
-            at_m,
-            layout.spacing_m,
-            slack_px,
-            _LEAST_SPACING_PX,
-            scale,
-        )
+        seen, place = (blobs.at, blobs.cluster, blobs.cells), (at_m, layout.spacing_m, slack_px)
+        proposers = min(len(blobs.at), _PROPOSERS)
+        score, s, shift = _kernels.best_similarity(seen, proposers, *place, _LEAST_SPACING_PX, scale)
+        if score > 0:
+            s, shift = _kernels.refined_similarity(seen, *place, scale, s, shift)
         if score > best_score * (_MIRRORED if mirrored else 1):
             best_score, best = score, (s, shift, mirrored)
     if best is None:

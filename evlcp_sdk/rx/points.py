@@ -64,28 +64,30 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
             if len(beside):
                 neighbours[axis, k] = beside[0]
 
+    ways = [(axis, way) for axis, way in enumerate((1 + 0j, 1j)) if neighbours[axis].max() >= 0]
+
     def find(
         presence: PresenceMap, placement: Placement, heard: NDArray[np.int16]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
         if sum(placement.seen.tolist()) < 3:
             return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan
-        points, ends = np.empty((clusters, 2)), np.empty(clusters)
-        squares, flank_px = _kernels.place_clusters(
-            presence.pixels,
-            placement.seen,
-            layout.at_m,
-            spacing_m,
-            placement.scale,
-            placement.shift,
-            neighbours,
-            heard,
-            edges,
-            every,
-            layout.way,
-            max(_ACROSS_PX, abs(placement.scale) * spacing_m / 2) if layout.line else 0.0,
-            points,
-            ends,
+        unit = placement.scale / abs(placement.scale)
+        reach_px, places = abs(placement.scale) * spacing_m, placement.scale * layout.at_m + placement.shift
+        across_px = max(_ACROSS_PX, reach_px / 2) if layout.line else 0.0
+        points = np.empty((clusters, 2))
+        line = unit * layout.way, across_px
+        flank_px = _kernels.seek_clusters(
+            presence.pixels, placement.seen, places, reach_px, heard, edges, line, points
         )
+        unseen = np.isnan(points[:, 0])
+        if np.count_nonzero(unseen) > clusters - 3:
+            return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan
+        ends, mean = np.where(unseen, np.nan, 0.0), points.copy()
+        for axis, way in ways:
+            _kernels.meet_neighbours(
+                mean, places, neighbours[axis], (unit * way, reach_px), (heard, edges, every), points, ends
+            )
+        squares = _kernels.squares_left(points, layout.at_m)
         seen = sum(end == end for end in ends.tolist())
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)

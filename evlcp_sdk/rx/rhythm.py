@@ -141,20 +141,9 @@ class Rhythm:
         if start_us != self._open_us:
             self._open_us, self._taken, self._rises = start_us, 0, 0
             self._grow_old(start_us >> self._shift)
+        limits, shifts = (self._soon, self._min_score, _SAME), (self._shift, cell_shift)
         self._rises += _kernels.score_rises(
-            plain(events.t_us[self._taken :]),
-            plain(events.x[self._taken :]),
-            plain(events.y[self._taken :]),
-            plain(events.p[self._taken :]),
-            self._pixels,
-            hits,
-            self._kinds,
-            self._lows,
-            self._soon,
-            self._shift,
-            self._min_score,
-            _SAME,
-            cell_shift,
+            columns_of(events, self._taken), self._pixels, hits, self._kinds, self._lows, limits, shifts
         )
         self._taken = events.t_us.size
         if self._shared:
@@ -191,21 +180,8 @@ class Rhythm:
             self._labels[:] = 0
             _kernels.label_boxes(boxes, _LABEL_SHIFT, self._labels, alone)
         begins = np.empty(len(boxes) + 1, np.int64)
-        columns = _kernels.select_boxes(
-            events.t_us,
-            events.x,
-            events.y,
-            events.p,
-            boxes,
-            filtered,
-            self._pixels,
-            self._min_score,
-            _LAMP,
-            _LABEL_SHIFT,
-            self._labels,
-            alone,
-            begins,
-        )
+        taken, heard, labels = columns_of(events), (self._min_score, _LAMP), (_LABEL_SHIFT, self._labels)
+        columns = _kernels.select_boxes(taken, boxes, filtered, self._pixels, heard, labels, alone, begins)
         total, found = int(begins[-1]), []
         for k, (begin, end) in enumerate(pairwise(begins.tolist())):
             if not alone[k]:
@@ -244,10 +220,10 @@ class Rhythm:
             (pixels, mean column, first column, last column, upper edge, lower edge).
         """
         score = max(self._min_score // 2, 1)
-        now, span = end_us >> self._shift, span_us >> self._shift
+        awake = end_us >> self._shift, span_us >> self._shift, score
         if strips is not None:
-            return _kernels.measure_strips(self._pixels, box, now, span, score, *strips, rows)
-        return _kernels.measure_box(self._pixels, box, now, span, score, seam_px, reach_px, rows)
+            return _kernels.measure_strips(self._pixels, box, awake, *strips, rows)
+        return _kernels.measure_box(self._pixels, box, awake, seam_px, reach_px, rows)
 
     def _grow_old(self, now: int) -> None:
         """Look at as many rows as the time since the last step asks for, at all after a gap."""
@@ -262,12 +238,21 @@ class Rhythm:
         self._row = (self._row + many) % height
 
 
+def columns_of(events: Events, first: int = 0) -> "_kernels.Columns":
+    """The columns of events from one on, as kernels take them."""
+    return (
+        plain(events.t_us[first:]),
+        plain(events.x[first:]),
+        plain(events.y[first:]),
+        plain(events.p[first:]),
+    )
+
+
 def select(events: Events, box: tuple[int, int, int, int]) -> Events:
     """Those inside a box (left, top, right, bottom), in no more memory than twice what they need."""
     room = events.t_us.size + 1
     into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
-    columns = plain(events.t_us), plain(events.x), plain(events.y), plain(events.p)
-    n = _kernels.select_box(*columns, box, *into)
+    n = _kernels.select_box(columns_of(events), box, into)
     part = [column[:n] for column in into]
     return Events.as_is(*(column.copy() for column in part) if 2 * n < room else part)
 

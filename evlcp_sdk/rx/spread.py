@@ -119,20 +119,11 @@ class Spread:
         across = np.zeros((2, 2 * _ACROSS_PX + 1), np.int64)
         spacing_px = abs(placement.scale) * layout.spacing_m
         if spacing_px > 0:
-            way = placement.scale / abs(placement.scale) * layout.way if layout.line else 0j
-            _kernels.spread_about(
-                sums,
-                pilots,
-                every,
-                placement.places(layout),
-                placement.seen,
-                pairs,
-                way,
-                spacing_px / 4,
-                (_AXIS_PX, _FROM, _TO),
-                between,
-                across,
-            )
+            places, seen = placement.places(layout), placement.seen
+            _kernels.spread_between(sums, pilots, places, seen, pairs, (_AXIS_PX, _FROM, _TO), between)
+            if layout.line:
+                way = placement.scale / abs(placement.scale) * layout.way
+                _kernels.spread_across(sums, pilots, every, places, seen, way, spacing_px / 4, across)
         return cls(between, across, spacing_px)
 
     def __add__(self, other: "Spread") -> "Spread":

@@ -45,6 +45,26 @@ def test_a_kernel_is_compiled_once_and_kept(tmp_path: Path) -> None:
     assert out[0] == "42 2 0"
 
 
+def test_what_is_kept_of_a_type_that_is_gone_is_forgotten(tmp_path: Path) -> None:
+    """Numba reads its index before it sees that the source is another."""
+    source = """
+from typing import NamedTuple
+from evlcp_sdk.kernels import njit
+class NAME(NamedTuple):
+    x: int
+    y: int
+@njit
+def add(pair):
+    return pair.x + pair.y
+MADE = NAME
+"""
+    code = "import sys; sys.path.insert(0, sys.argv[1]); import own_kernels as k; print(k.add(k.MADE(40, 2)))"
+    for name in ("Pair", "Both"):
+        (tmp_path / "own_kernels.py").write_text(source.replace("NAME", name))
+        command = [sys.executable, "-B", "-c", code, str(tmp_path)]
+        assert subprocess.run(command, capture_output=True, text=True, check=True).stdout == "42\n"
+
+
 def test_kernels_work_where_no_cache_can_be(tmp_path: Path) -> None:
     """Installed read-only, without a home: a file stands where the cache's folder would."""
     (tmp_path / "__pycache__").write_text("")

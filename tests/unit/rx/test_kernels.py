@@ -11,9 +11,10 @@ from scipy import stats
 
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.rx import _kernels
+from evlcp_sdk.rx.placement import _WIDEST_PX, Layout, Placement, masked
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.lean import BarSight, foreshortening
-from evlcp_sdk.values import Events
+from evlcp_sdk.values import Events, PresenceMap
 
 WIDTH, HEIGHT = 24, 16
 SEEDS = range(8)
@@ -235,7 +236,7 @@ def test_an_edge_row_counts_by_its_share():
     pixels = np.zeros((HEIGHT, WIDTH), np.uint32)
     pixels[4:8, 2:10] = pixels[8, 2:4] = states(1000, 0, 40)
     *_, upper, lower = _kernels.measure_box(
-        pixels, (0, 0, WIDTH, HEIGHT), 1000, 0, 5, 2, np.inf, np.empty(HEIGHT, np.int64)
+        pixels, (0, 0, WIDTH, HEIGHT), (1000, 0, 5), 2, np.inf, np.empty(HEIGHT, np.int64)
     )
     # 34 pixels in five rows: a full row counts as 6.8.
     assert (upper, lower) == pytest.approx((4, 8 + 2 / 6.8))
@@ -248,7 +249,7 @@ def test_events_in_boxes(n, freeze):
     e = frozen(events, freeze)
     for box in [(0, 0, WIDTH, HEIGHT), (0, 0, 1, 1), (3, 2, 17, 9), (10, 5, 30, 20), (4, 4, 4, 9)]:
         columns = [np.empty(n + 1, c.dtype) for c in (events.t_us, events.x, events.y, events.p)]
-        taken = _kernels.select_box(e.t_us, e.x, e.y, e.p, box, *columns)
+        taken = _kernels.select_box((e.t_us, e.x, e.y, e.p), box, tuple(columns))
         want = twins.select_box(events, box)
         for got, name in zip(columns, ("t_us", "x", "y", "p"), strict=True):
             assert_array_equal(got[:taken], getattr(want, name))
@@ -297,7 +298,8 @@ def test_polarity_sums(seed, freeze):
     e = frozen(events, freeze)
     for row, shifts in product((0.0, row_us), (moving, still, jolted)):
         sums[:] = 0
-        _kernels.add_polarity(e.t_us, e.x, e.y, e.p, start_on, start_off, chip_us, row, row_px, shifts, sums)
+        columns = e.t_us, e.x, e.y, e.p
+        _kernels.add_polarity(columns, (start_on, start_off), chip_us, (row, row_px), shifts, sums)
         want = twins.polarity_sums(events, start_on, start_off, chip_us, *shifts, shape, row, row_px)
         assert_array_equal(sums, want)
         assert sums.any()
@@ -351,18 +353,14 @@ def some_blobs(rng, clusters):
 def test_the_similarity_that_most_cells_are_for(seed, clusters, known):
     layout, s, shift, at, cluster, cells = some_blobs(np.random.default_rng(seed), clusters)
     scale = 1.01 * s if known else 0j
-    got = _kernels.best_similarity(at, cluster, cells, len(at), layout, 0.06, 1.0, 1.0, scale)
+    got = _kernels.best_similarity((at, cluster, cells), len(at), layout, 0.06, 1.0, 1.0, scale)
     assert got[0] == pytest.approx(twins.score(at, cluster, cells, layout, *got[1:], abs(got[1]) * 0.03 + 1))
     assert got[0] == pytest.approx(
         twins.best_similarity(at, cluster, cells, len(at), layout, 0.06, 1.0, 1.0, scale)
     )
-    refined = _kernels.refined_similarity(at, cluster, cells, layout, 0.06, 1.0, scale, s, shift)
+    refined = _kernels.refined_similarity((at, cluster, cells), layout, 0.06, 1.0, scale, s, shift)
     want = twins.refined_similarity(at, cluster, cells, layout, 0.06, 1.0, scale, s, shift)
     assert_allclose(refined, want, rtol=1e-9)
-    voted = _kernels.voted_similarity(at, cluster, cells, len(at), layout, 0.06, 1.0, 1.0, scale)
-    want = twins.refined_similarity(at, cluster, cells, layout, 0.06, 1.0, scale, *got[1:])
-    assert voted[0] == got[0]
-    assert_allclose(voted[1:], want, rtol=1e-9)
 
 
 @pytest.mark.parametrize("grid", [1, 2, 3])
@@ -389,30 +387,31 @@ def test_footprints(seed, grid):
     assert_allclose(near, twins.copy_near(probability, places, unit, spacing, 3.0))
 
 
-@pytest.mark.parametrize("bins", [0, 7])
+@pytest.mark.parametrize("line", [False, True])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_mask_is_the_layout_s_footprint(seed, bins):
+def test_a_mask_is_the_layout_s_footprint(seed, line):
     rng = np.random.default_rng(seed)
     unit, spacing, shape = np.exp(1j * rng.uniform(0, 2 * np.pi)), rng.uniform(1.5, 9), (5, 40, 30)
-    places = 15.3 + 20.2j + unit * spacing * (np.arange(5) - rng.uniform(1, 3))
+    layout = Layout(np.arange(5) - rng.uniform(1, 3) + 0j, 1.0, line, 1 + 0j)
+    seen = np.ones(5, np.bool_)
+    placement = Placement(unit * spacing, 15.3 + 20.2j, False, seen, 5.0, 0.0)
+    places = placement.places(layout)
     probability, pixels = rng.random((2, *shape)).astype(np.float32)
-    selected, seen = rng.random(shape) < 0.5, np.ones(5, np.bool_)
-    prior, out, near, chosen = *np.zeros((3, *shape), np.float32), np.zeros(shape, np.bool_)
-    _kernels.mask(
-        probability, selected, pixels, seen, places, unit, spacing, 1, bins, 0.5, prior, out, chosen, near
-    )
+    selected = rng.random(shape) < 0.5
+    found = masked(PresenceMap(probability, 1, selected, pixels), layout, placement)
     across = spacing
-    if bins:
+    if line:
+        bins = math.ceil(spacing + _WIDEST_PX)
         hits, cells = twins.across_profile(probability, seen, places, unit, spacing, 1, bins)
         profile = twins.core_profile(hits, cells, 0.5)
         across = len(profile)
         want = twins.line_prior(shape, places, unit, spacing, 1, profile)
     else:
         want = twins.block_prior(shape, places, unit, spacing, 1)
-    assert_allclose(prior, want, rtol=1e-4, atol=1e-5)
-    assert_array_equal(out, np.where(prior > 0, probability, 0))
-    assert_array_equal(chosen, selected & (prior > 0))
-    assert_allclose(near, twins.copy_near(pixels, places, unit, spacing, across))
+    assert_allclose(found.prior, want, rtol=1e-4, atol=1e-5)
+    assert_array_equal(found.probability, np.where(found.prior > 0, probability, 0))
+    assert_array_equal(found.selected, selected & (found.prior > 0))
+    assert_allclose(found.pixels, twins.copy_near(pixels, places, unit, spacing, across))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -463,16 +462,10 @@ def test_answers_between_and_across_clusters(seed, turn, every):
     places = 11.3 + 9.1j + turn * np.array([-4.2, 0.9, 6.1, 17.0])
     seen, pairs = np.array([True, seed != SEEDS[0], True, True]), np.array([[0, 1], [1, 0], [1, 2], [2, 3]])
     between, across = np.zeros((2, 2, 3), int), np.zeros((2, 11), int)
-    _kernels.spread_between(sums, codes, places, seen, pairs, 0.8, 0.2, 0.75, between)
+    _kernels.spread_between(sums, codes, places, seen, pairs, (0.8, 0.2, 0.75), between)
     assert_array_equal(between, twins.spread_between(sums, codes, places, seen, pairs, 0.8, 0.2, 0.75))
     _kernels.spread_across(sums, codes, every, places, seen, turn, 1.3, across)
     assert_array_equal(across, twins.spread_across(sums, codes, every, places, seen, turn, 1.3, 5))
-    for way in (turn, 0):
-        both = np.zeros_like(between), np.zeros_like(across)
-        zones = 0.8, 0.2, 0.75
-        _kernels.spread_about(sums, codes, every, places, seen, pairs, complex(way), 1.3, zones, *both)
-        assert_array_equal(both[0], between)
-        assert_array_equal(both[1], across if way else 0)
 
 
 @pytest.mark.parametrize("apart", [0.0, 0.5, -0.9])
@@ -527,7 +520,7 @@ def test_llrs_are_scaled_to_tell_the_truth(seed, scale):
     llr = (scale * rng.normal(0.5, 1, (6, 4))).astype(np.float32)
     read, seen = rng.integers(-1, 16, 6), rng.random(6) < 0.8
     symbols, scaled = np.empty_like(read), np.empty_like(llr)
-    quality = _kernels.calibrate_llr(read, llr, seen, 12.0, 6.0, 0.5, 0.6, 1.7, symbols, scaled)
+    quality = _kernels.calibrate_llr(read, llr, seen, (12.0, 6.0, 0.5), (0.6, 1.7), symbols, scaled)
     want_symbols, want, want_quality = twins.calibrate_llr(read, llr, seen, 12.0, 6.0, 0.5, 0.6, 1.7)
     assert_array_equal(symbols, want_symbols)
     assert_allclose(scaled, want, rtol=1e-5)
@@ -578,7 +571,7 @@ def test_a_wave_in_boundaries(seed, n):
 
 @pytest.mark.parametrize("grid", [1, 2, 3])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_cells_beside_a_line_and_inside_a_prior(seed, grid):
+def test_cells_beside_a_line(seed, grid):
     rng = np.random.default_rng(seed)
     selected = rng.random((4, 9, 7)) < 0.1
     on, turn = complex(*rng.uniform(0, 9, 2)), np.exp(1j * rng.uniform(0, 6))
@@ -586,12 +579,6 @@ def test_cells_beside_a_line_and_inside_a_prior(seed, grid):
         twins.farthest_off(selected, grid, on, turn)
     )
     assert _kernels.farthest_off(np.zeros_like(selected), grid, on, turn) == 0
-    prior = np.where(rng.random(selected.shape) < 0.5, rng.random(), 0).astype(np.float32)
-    probability = rng.random(selected.shape).astype(np.float32)
-    out, chosen = np.empty_like(probability), np.empty_like(selected)
-    _kernels.keep_inside(prior, probability, selected, out, chosen)
-    assert_array_equal(out, np.where(prior > 0, probability, 0))
-    assert_array_equal(chosen, selected & (prior > 0))
 
 
 @pytest.mark.parametrize("clusters", [2, 8])
