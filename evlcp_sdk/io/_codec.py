@@ -128,20 +128,13 @@ class Decoder:
         """
         used, out.events, out.triggers, askew = self._kernel(
             words,
-            at,
-            *self._bounds,
+            (at, final),
+            self._bounds,
             self._state,
             self._tally,
-            out.t_us,
-            out.x,
-            out.y,
-            out.p,
-            out.events,
-            out.trigger_t_us,
-            out.channel,
-            out.value,
-            out.triggers,
-            final,
+            (out.t_us, out.x, out.y, out.p),
+            (out.trigger_t_us, out.channel, out.value),
+            (out.events, out.triggers),
         )
         return int(used * self.codec.word.itemsize + askew)
 

@@ -72,6 +72,10 @@ from evlcp_sdk.kernels import njit
 __all__ = ["decode_evt2", "decode_evt3", "encode_evt2", "encode_evt3"]
 
 Column = NDArray[Any]
+EventColumns = tuple[Column, Column, Column, Column]
+"""t (int64), x and y (uint16), p (uint8), of one length."""
+TriggerColumns = tuple[Column, Column, Column]
+"""Times (int64), channels and values (uint8), of one length."""
 Integer = Any  # int to Python, int64 to numba
 int64: Any = np.int64
 uint16: Any = np.uint16
@@ -338,22 +342,15 @@ def _pack_evt3(
 
 @njit
 def _unpack_evt3(
-    base: Integer,
-    t: Column,
-    x: Column,
-    y: Column,
-    p: Column,
-    first: Integer,
-    stop: Integer,
-    width: Integer,
-    height: Integer,
-    last: Integer,
+    base: Integer, events: EventColumns, part: tuple[Integer, Integer], size_px: Any, last: Integer
 ) -> Any:
-    """Spread the packed events first..stop of `t` over the columns; their TIME_LOW counts from `base`.
+    """Spread the packed events of a part of their times over the columns; TIME_LOW counts from `base`.
 
     Returns whether all of them are on the sensor and none is earlier than the one before.
     """
-    start, end = uintp(first), uintp(stop)
+    t, x, y, p = events
+    width, height = size_px
+    start, end = uintp(part[0]), uintp(part[1])
     origin = base - PACKED_TIME
     for k in range(start, end):
         e = t[k]
@@ -382,18 +379,16 @@ def _sift(
     words: Column,
     word: Integer,
     at: Integer,
-    t: Column,
-    x: Column,
-    y: Column,
-    p: Column,
-    start: Integer,
-    stop: Integer,
-    width: Integer,
-    height: Integer,
+    events: EventColumns,
+    part: tuple[Integer, Integer],
+    size_px: Any,
     last: Integer,
     tally: Column,
 ) -> Integer:
-    """Close up the events start..stop (from words[word] on) over those to drop; return the new end."""
+    """Close up a part of the events (from words[word] on) over those to drop; return the new end."""
+    t, x, y, p = events
+    width, height = size_px
+    start, stop = part
     n = start
     for k in range(start, stop):
         if y[k] == UNKNOWN_ROW:
@@ -447,49 +442,110 @@ def _note_other(kind: Integer, at: Integer, tally: Column) -> None:
 
 
 @njit
-def decode_evt3(
+def _take_time(
+    words: Column, i: Integer, at: Integer, size: Integer, state: Column, tally: Column, final: Any
+) -> Integer:
+    """Take words[i], a TIME_HIGH of `size` bytes, into the state, if those that follow it agree.
+
+    Returns:
+        0; how many bytes behind it words start that agree with one another, where these do not; or -1 where
+        more words are needed to tell.
+    """
+    low_bits, types = (12, EVT3_TYPES) if size == 2 else (6, EVT2_TYPES)
+    ring = (int64(1) << (8 * size - 4)) - 1
+    high, before, here = int64(words[i]) & ring, state[HIGH], at + size * i
+    ahead = (high - before) & ring
+    if ahead > 1:
+        askew = _unlevel(words, i, at, size, types, low_bits, state, final)
+        if askew:
+            return askew
+    verdict = _judge_time(words, i, size, before, low_bits, final)
+    if verdict < 0:
+        return int64(-1)
+    state[DOUBT] = int64(verdict == 0)
+    if verdict != 1:
+        _note(tally, int64(TIME_GLITCH), here)
+    if verdict == 1 and high < before:
+        _note(tally, int64(ROLLOVERS), here)
+        state[BASE] += (ring + 1) << low_bits
+    if verdict == 1 and ahead > 1 and size == 2:
+        # An EVT2 word brings its own time, so that there is none without events.
+        _note(tally, int64(TIME_GAPS), here)
+    if verdict == 2 and high > before:
+        state[BASE] -= (ring + 1) << low_bits
+    if verdict:
+        state[HIGH] = high
+    return int64(0)
+
+
+@njit
+def _pass_doubtful(
     words: Column,
+    i: Integer,
     at: Integer,
-    width: Integer,
-    height: Integer,
     state: Column,
     tally: Column,
-    t: Column,
-    x: Column,
-    y: Column,
-    p: Column,
-    n: Integer,
-    trigger_t: Column,
-    channel: Column,
-    value: Column,
-    m: Integer,
+    room: tuple[Column, Integer],
     final: Any,
+) -> tuple[Integer, Integer]:
+    """Pass over EVT3 words up to the next TIME_HIGH, as their time is not known; count what is lost.
+
+    `room` is where events may be packed, and from where on.
+
+    Returns:
+        Where it stopped, and what `_unlevel` says there.
+    """
+    t, n = room
+    while i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
+        start = i
+        i, until = _pack_evt3(words, i, i + 1, at, state, tally, t, n)
+        for _ in range(n, until):
+            _note(tally, int64(TIME_DOUBTFUL), at + 2 * start)
+        if i == start:
+            kind = words[i] >> 12
+            if not (EVT3_TYPES >> kind) & 1:
+                askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
+                if askew:
+                    return i, askew
+            if kind == EVT3_EXT_TRIGGER:
+                _note(tally, int64(TIME_DOUBTFUL), at + 2 * i)
+            else:
+                _note_other(kind, at + 2 * i, tally)
+            i += 1
+    return i, int64(0)
+
+
+@njit
+def decode_evt3(
+    words: Column,
+    place: tuple[Integer, Any],
+    size_px: tuple[Integer, Integer],
+    state: Column,
+    tally: Column,
+    events: EventColumns,
+    triggers: TriggerColumns,
+    filled: tuple[Integer, Integer],
 ) -> tuple[Integer, Integer, Integer, Integer]:
     """Decode EVT3 words until they run out, or the columns' room for 12 events or for a trigger does.
 
     Args:
         words: uint16 (k,).
-        at: Byte offset of words[0] in the file.
-        width: Columns of the sensor; events beyond are dropped and counted.
-        height: Rows of the sensor; likewise.
+        place: Byte offset of words[0] in the file, and whether nothing comes behind these words. Else it may
+            stop before a TIME_HIGH that what follows has to confirm, within `LOOK_BYTES`.
+        size_px: Columns and rows of the sensor; events beyond are dropped and counted.
         state: int64 (STATE_SLOTS,), carried from call to call.
         tally: int64 (TALLY_ROWS, 2), added to.
-        t: Column of events to fill, int64; so x, y (uint16), p (uint8), of one length of 12 or more.
-        x: See t.
-        y: See t.
-        p: See t.
-        n: Events already in the columns.
-        trigger_t: Column of triggers to fill, int64; so channel, value (uint8).
-        channel: See trigger_t.
-        value: See trigger_t.
-        m: Triggers already in the columns.
-        final: Nothing comes behind these words. Else it may stop before a TIME_HIGH that what follows has to
-            confirm, within `LOOK_BYTES`.
+        events: Columns to fill, of 12 or more.
+        triggers: Columns to fill.
+        filled: Events and triggers already in the columns.
 
     Returns:
         Words used, events and triggers now in the columns, and how many bytes behind these words the next
         one starts.
     """
+    at, final = place
+    t, trigger_t, channel, value = events[0], triggers[0], triggers[1], triggers[2]
+    n, m = filled
     i = 0
     if state[BASE] < 0:
         while i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
@@ -501,68 +557,36 @@ def decode_evt3(
             i += 1
     askew = int64(0)
     while i < len(words) and n <= len(t) - BURST and m < len(trigger_t):
-        while state[DOUBT] and i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
-            start = i
-            i, until = _pack_evt3(words, i, i + 1, at, state, tally, t, n)
-            for _ in range(n, until):
-                _note(tally, int64(TIME_DOUBTFUL), at + 2 * start)
-            if i == start:
-                kind = words[i] >> 12
-                if not (EVT3_TYPES >> kind) & 1:
-                    askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
-                    if askew:
-                        break
-                if kind == EVT3_EXT_TRIGGER:
-                    _note(tally, int64(TIME_DOUBTFUL), at + 2 * i)
-                else:
-                    _note_other(kind, at + 2 * i, tally)
-                i += 1
-        if askew or i == len(words):
-            break
-        if state[DOUBT] and int64(words[i]) & 0xFFF == state[HIGH]:
-            state[DOUBT] = 0
+        if state[DOUBT]:
+            i, askew = _pass_doubtful(words, i, at, state, tally, (t, n), final)
+            if askew or i == len(words):
+                break
+            if int64(words[i]) & 0xFFF == state[HIGH]:
+                state[DOUBT] = 0
         start, first = i, n
         stop = i + min(len(words) - i, BLOCK_WORDS)
         i, n = _pack_evt3(words, start, stop, at, state, tally, t, n)
         is_full = n > len(t) - BURST
         base = state[BASE] + (state[HIGH] << 12)
-        if not _unpack_evt3(base, t, x, y, p, first, n, width, height, state[LAST]):
-            n = _sift(words, start, at, t, x, y, p, first, n, width, height, state[LAST], tally)
+        if not _unpack_evt3(base, events, (first, n), size_px, state[LAST]):
+            n = _sift(words, start, at, events, (first, n), size_px, state[LAST], tally)
         if n > first:
             state[LAST] = t[n - 1]
         if i == stop or is_full:
             continue
         w = int64(words[i])
         kind = w >> 12
-        here = at + 2 * i
         if kind == EVT3_TIME_HIGH:
-            high = w & 0xFFF
             before = state[HIGH]
-            if (high - before) & 0xFFF > 1:
-                askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
-                if askew:
-                    break
-            verdict = _judge_time(words, i, 2, before, 12, final)
-            if verdict < 0:
+            askew = _take_time(words, i, at, 2, state, tally, final)
+            if askew:
                 break
-            state[DOUBT] = int64(verdict == 0)
-            if verdict != 1:
-                _note(tally, int64(TIME_GLITCH), here)
-            if verdict:
-                if verdict == 1 and high < before:
-                    _note(tally, int64(ROLLOVERS), here)
-                    state[BASE] += 1 << 24
-                if verdict == 1 and (high - before) & 0xFFF > 1:
-                    _note(tally, int64(TIME_GAPS), here)
-                if verdict == 2 and high > before:
-                    state[BASE] -= 1 << 24
-                if high != before:
-                    state[HIGH] = high
-                    state[PACKED] = (state[PACKED] & KEEP[EVT3_TIME_LOW]) | PACKED_TIME << PACKED_LOW
+            if state[HIGH] != before:
+                state[PACKED] = (state[PACKED] & KEEP[EVT3_TIME_LOW]) | PACKED_TIME << PACKED_LOW
         elif kind == EVT3_EXT_TRIGGER:
             clock = base - PACKED_TIME + (state[PACKED] >> PACKED_LOW)
             if clock < state[LAST]:
-                _note(tally, int64(TIME_BACKWARD), here)
+                _note(tally, int64(TIME_BACKWARD), at + 2 * i)
             else:
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0xF, w & 1
                 state[LAST] = clock
@@ -572,7 +596,7 @@ def decode_evt3(
                 askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
                 if askew:
                     break
-            _note_other(kind, here, tally)
+            _note_other(kind, at + 2 * i, tally)
         i += 1
     if askew > 0:
         _realign(askew, at + 2 * i, state, tally)
@@ -584,24 +608,21 @@ def decode_evt3(
 @njit
 def decode_evt2(
     words: Column,
-    at: Integer,
-    width: Integer,
-    height: Integer,
+    place: tuple[Integer, Any],
+    size_px: tuple[Integer, Integer],
     state: Column,
     tally: Column,
-    t: Column,
-    x: Column,
-    y: Column,
-    p: Column,
-    n: Integer,
-    trigger_t: Column,
-    channel: Column,
-    value: Column,
-    m: Integer,
-    final: Any,
+    events: EventColumns,
+    triggers: TriggerColumns,
+    filled: tuple[Integer, Integer],
 ) -> tuple[Integer, Integer, Integer, Integer]:
     """Decode EVT2 words (uint32) until they or the columns' room run out; as `decode_evt3`."""
-    base, last, doubt = state[BASE], state[LAST], state[DOUBT]
+    at, final = place
+    width, height = size_px
+    t, x, y, p = events
+    trigger_t, channel, value = triggers
+    n, m = filled
+    base, last, doubt = state[BASE] + (state[HIGH] << 6), state[LAST], state[DOUBT]
     askew = int64(0)
     i = 0
     while i < len(words) and n < len(t) and m < len(trigger_t):
@@ -611,48 +632,27 @@ def decode_evt2(
         clock = base + ((w >> 22) & 0x3F)
         column = (w >> 11) & 0x7FF
         row = w & 0x7FF
-        i += 1
         if kind == EVT2_TIME_HIGH:
-            high = w & 0xFFFFFFF
-            if base < 0:
-                base = high << 6
-                continue
-            before = (base >> 6) & 0xFFFFFFF
-            if (high - before) & 0xFFFFFFF > 1:
-                askew = _unlevel(words, i - 1, at, 4, EVT2_TYPES, 6, state, final)
+            if state[BASE] < 0:
+                state[BASE], state[HIGH] = 0, w & 0xFFFFFFF
+            else:
+                askew = _take_time(words, i, at, 4, state, tally, final)
                 if askew:
-                    i -= 1
                     break
-            verdict = _judge_time(words, i - 1, 4, before, 6, final)
-            if verdict < 0:
-                i -= 1
-                break
-            doubt = int64(verdict == 0)
-            if verdict != 1:
-                _note(tally, int64(TIME_GLITCH), here)
-            if verdict:
-                if verdict == 1 and high < before:
-                    _note(tally, int64(ROLLOVERS), here)
-                    base += 1 << 34
-                if verdict == 2 and high > before:
-                    base -= 1 << 34
-                base += (high - before) << 6
-        elif base < 0:
+            base, doubt = state[BASE] + (state[HIGH] << 6), state[DOUBT]
+        elif state[BASE] < 0:
             _note(tally, int64(BEFORE_TIME), here)
-        elif doubt and (kind <= EVT2_CD_ON or kind == EVT2_EXT_TRIGGER):
-            _note(tally, int64(TIME_DOUBTFUL), here)
-        elif kind <= EVT2_CD_ON:
-            if column >= width or row >= height:
+        elif kind <= EVT2_CD_ON or kind == EVT2_EXT_TRIGGER:
+            if doubt:
+                _note(tally, int64(TIME_DOUBTFUL), here)
+            elif kind <= EVT2_CD_ON and (column >= width or row >= height):
                 _note(tally, int64(OUTSIDE_SENSOR), here)
             elif clock < last:
                 _note(tally, int64(TIME_BACKWARD), here)
-            else:
+            elif kind <= EVT2_CD_ON:
                 t[n], x[n], y[n], p[n] = clock, column, row, kind
                 last = clock
                 n += 1
-        elif kind == EVT2_EXT_TRIGGER:
-            if clock < last:
-                _note(tally, int64(TIME_BACKWARD), here)
             else:
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0x1F, w & 1
                 last = clock
@@ -660,12 +660,12 @@ def decode_evt2(
         elif kind in (EVT2_OTHERS, EVT2_CONTINUED):
             _note(tally, int64(OTHER_WORDS), here)
         else:
-            askew = _unlevel(words, i - 1, at, 4, EVT2_TYPES, 6, state, final)
+            askew = _unlevel(words, i, at, 4, EVT2_TYPES, 6, state, final)
             if askew:
-                i -= 1
                 break
             _note(tally, int64(RESERVED), here)
-    state[BASE], state[LAST], state[DOUBT] = base, last, doubt
+        i += 1
+    state[LAST] = last
     if askew > 0:
         _realign(askew, at + 4 * i, state, tally)
     return i, n, m, max(askew, int64(0))
@@ -676,14 +676,9 @@ def encode_evt3(
     words: Column,
     width: Integer,
     state: Column,
-    t: Column,
-    x: Column,
-    y: Column,
-    p: Column,
+    events: EventColumns,
     i: Integer,
-    trigger_t: Column,
-    channel: Column,
-    value: Column,
+    triggers: TriggerColumns,
     j: Integer,
 ) -> tuple[Integer, Integer, Integer]:
     """Encode the events from i and the triggers from j on, by time, until they or `words` run out.
@@ -693,19 +688,16 @@ def encode_evt3(
         width: Columns of the sensor.
         state: int64 (3,), carried from call to call: the number of the last TIME_HIGH, the last TIME_LOW
             and the last ADDR_Y, each -1 if there was none.
-        t: Column of events, int64, sorted; so x, y (uint16), p (uint8).
-        x: See t.
-        y: See t.
-        p: See t.
+        events: Their columns, sorted by time.
         i: First event to encode.
-        trigger_t: Column of triggers, int64, sorted; so channel, value (uint8).
-        channel: See trigger_t.
-        value: See trigger_t.
+        triggers: Their columns, likewise.
         j: First trigger to encode.
 
     Returns:
         Words written, the events and the triggers done.
     """
+    t, x, y, p = events
+    trigger_t, channel, value = triggers
     step, low, row = state[0], state[1], state[2]
     n = 0
     while (i < len(t) or j < len(trigger_t)) and n <= len(words) - 8:
@@ -766,17 +758,14 @@ def encode_evt2(
     words: Column,
     _width: Integer,
     state: Column,
-    t: Column,
-    x: Column,
-    y: Column,
-    p: Column,
+    events: EventColumns,
     i: Integer,
-    trigger_t: Column,
-    channel: Column,
-    value: Column,
+    triggers: TriggerColumns,
     j: Integer,
 ) -> tuple[Integer, Integer, Integer]:
     """Encode to EVT2 words (uint32); as `encode_evt3`, but the last TIME_HIGH is all the state."""
+    t, x, y, p = events
+    trigger_t, channel, value = triggers
     step = state[0]
     n = 0
     while (i < len(t) or j < len(trigger_t)) and n <= len(words) - 2:

@@ -30,7 +30,7 @@ EVT2_CONTINUED: Final = 0xF
 EVT2_TYPES: Final = 0b1100_0101_0000_0011
 
 # Slots of a decoder's state, int64. All of it; nothing else passes from one call to the next.
-BASE: Final = 0  # EVT3: 2^24 a rollover; EVT2: time of the last TIME_HIGH; UNKNOWN_TIME before the first, us
+BASE: Final = 0  # EVT3: 2^24 a rollover; EVT2: 2^34; UNKNOWN_TIME before the first TIME_HIGH, us
 LAST: Final = 1  # time of the last event or trigger given out, us
 PACKED: Final = 2  # EVT3 only, as all to VECTOR_AT: the last event with its time and row, see below
 COLUMN: Final = 3  # where the next vector word starts, or UNKNOWN_COLUMN or more
@@ -39,7 +39,7 @@ VECTOR_LEFT: Final = 5  # vector words still to come after the last VECT_BASE_X
 VECTOR_AT: Final = 6  # byte offset of that VECT_BASE_X
 DOUBT: Final = 7  # both: 1 behind a TIME_HIGH that is not believed
 LEVEL: Final = 8  # both: words before this byte offset are known not to stand askew
-HIGH: Final = 9  # EVT3 only: the last TIME_HIGH that is believed
+HIGH: Final = 9  # both: the last TIME_HIGH that is believed
 STATE_SLOTS: Final = 10
 
 # A step of TIME_HIGH by more than one is believed unless most of the next `FOLLOWERS` in so many bytes are

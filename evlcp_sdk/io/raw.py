@@ -408,18 +408,13 @@ class RawEncoder:
             first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
             words, self._state[0] = self._codec.prelude(first)
             yield words.tobytes()
-        event_columns = [np.ascontiguousarray(c) for c in (events.t_us, events.x, events.y, events.p)]
-        trigger_columns = [np.ascontiguousarray(c) for c in (triggers.t_us, triggers.channel, triggers.value)]
+        event_columns = tuple(np.ascontiguousarray(c) for c in (events.t_us, events.x, events.y, events.p))
+        columns = triggers.t_us, triggers.channel, triggers.value
+        trigger_columns = tuple(np.ascontiguousarray(c) for c in columns)
         i = j = 0
         while i < len(events) or j < len(triggers):
             n, i, j = self._kernel(
-                self._words,
-                self._columns,
-                self._state,
-                *event_columns,
-                i,
-                *trigger_columns,
-                j,
+                self._words, self._columns, self._state, event_columns, i, trigger_columns, j
             )
             yield self._words[:n].tobytes()
 
