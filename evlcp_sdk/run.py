@@ -692,10 +692,7 @@ def calibrate(
 
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
-    if not link.bar.in_even_line or link.bar.clusters < 2:
-        raise ConfigError(
-            "a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
-        )
+    _check_lines({"": link})
     _check_names(recordings, poses, name)
     axes = LocalAxes.of(sites)
     views: list[CalibrationView] = []
@@ -703,6 +700,15 @@ def calibrate(
         mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
         views += _views(url, mine, link, sites, axes, registry, name)
     return fit_camera(views, link.camera, ErrorModel.of(link.position), limit_px=limit_px)
+
+
+def _check_lines(links: Mapping[str, Link]) -> None:
+    for name, link in links.items():
+        if not link.bar.in_even_line or link.bar.clusters < 2:
+            which = f"link '{name}': " if name else ""
+            raise ConfigError(
+                f"{which}a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
+            )
 
 
 def _check_names(recordings: Sequence[str], poses: Sequence[KnownPose], source: str) -> None:
@@ -849,12 +855,7 @@ def survey(
     registry = Registry.load() if registry is None else registry
     links = named_links(load_links(link, registry=registry))
     placing = placing_links(links)
-    for link_name, one in placing.items():
-        if not one.bar.in_even_line or one.bar.clusters < 2:
-            which = f"link '{link_name}': " if link_name else ""
-            raise ConfigError(
-                f"{which}a survey is of bars whose clusters stand evenly in line; write a site.toml by hand"
-            )
+    _check_lines(placing)
     _check_names(recordings, poses, name)
     listed = {site.transmitter_id for site in known}
     first, like = poses[0], next(iter(placing.values()))

@@ -2,10 +2,13 @@
 
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.cli._common import console
 from evlcp_sdk.spelling import counted
+
+if TYPE_CHECKING:
+    from rich.console import Console
 
 __all__ = ["delays_text", "show"]
 
@@ -15,7 +18,6 @@ _MOST_SHOWN, _MOST_SAID = 8, 200
 
 def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) -> None:
     """Print what was found and received, what was lost, where the result is, and how fast it went."""
-    from rich.table import Table
     from rich.text import Text
 
     from evlcp_sdk.diagnosis.facts import Diagnostic
@@ -23,26 +25,7 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
     out = console(stderr=stderr)
     recording, processing = summary["recording"], summary["processing"]
     out.print(Text.assemble((Path(recording["path"]).name, "bold"), f": {summary['result']}"))
-    if summary["transmitters"]:
-        table = Table(box=None, pad_edge=False, header_style="dim")
-        several = ("link",) if "links" in summary else ()
-        for name in ("transmitter", *several, "frames", "not seen", "quality", "clock", "distance"):
-            table.add_column(name, justify="right")
-        for t in summary["transmitters"]:
-            table.add_row(
-                _who(t),
-                *([t["link"]] if several else []),
-                f"{t['frames_found']} of {t['frames_expected']}",
-                _erased(t),
-                _or_dash(t["quality"], "{:.2f}"),
-                _or_dash(t["clock_ppm"], "{:+.0f} ppm"),
-                _distances(t["distance_first_m"], t["distance_last_m"]),
-            )
-        out.print(table)
-    for t in summary["transmitters"]:
-        if said := t.get("text"):
-            more = "..." if len(said) > _MOST_SAID else ""
-            out.print(Text(f"text of {_who(t)}: {said[:_MOST_SAID]!r}{more}"))
+    _show_transmitters(summary, out)
     if text := _messages(summary["counts"]):
         out.print(text)
     for told in summary["messages"][-_MOST_SHOWN:]:
@@ -74,6 +57,33 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
         out.print(f"warning: {Diagnostic(**warning)}", style="yellow")
     if folder is not None:
         out.print(f"written: {folder}/{', '.join([*summary['files'], 'summary.json'])}", style="dim")
+
+
+def _show_transmitters(summary: Mapping[str, Any], out: "Console") -> None:
+    """Print a row for each transmitter, and the texts that they say."""
+    from rich.table import Table
+    from rich.text import Text
+
+    if summary["transmitters"]:
+        table = Table(box=None, pad_edge=False, header_style="dim")
+        several = ("link",) if "links" in summary else ()
+        for name in ("transmitter", *several, "frames", "not seen", "quality", "clock", "distance"):
+            table.add_column(name, justify="right")
+        for t in summary["transmitters"]:
+            table.add_row(
+                _who(t),
+                *([t["link"]] if several else []),
+                f"{t['frames_found']} of {t['frames_expected']}",
+                _erased(t),
+                _or_dash(t["quality"], "{:.2f}"),
+                _or_dash(t["clock_ppm"], "{:+.0f} ppm"),
+                _distances(t["distance_first_m"], t["distance_last_m"]),
+            )
+        out.print(table)
+    for t in summary["transmitters"]:
+        if said := t.get("text"):
+            more = "..." if len(said) > _MOST_SAID else ""
+            out.print(Text(f"text of {_who(t)}: {said[:_MOST_SAID]!r}{more}"))
 
 
 def _real_time(summary: Mapping[str, Any]) -> Iterator[tuple[str, str | None]]:

@@ -26,27 +26,23 @@ SOONEST_US = 60
 
 @njit
 def add_events(
-    t_us: Array,
-    x: Array,
-    y: Array,
-    p: Array,
-    last_us: Array,
-    last_p: Array,
-    rise_us: Array,
-    intervals: Array,
-    gaps: Array,
-    signs: Array,
+    events: tuple[Array, Array, Array, Array],
+    of_pixels: tuple[Array, Array, Array],
+    counts: tuple[Array, Array, Array],
     shift: int,
     calm_us: int,
 ) -> None:
     """Add events to what is counted of each cell of 2^shift px.
 
     A rise is a positive event after a negative one of its pixel, or after `calm_us` without any, and not
-    within SOONEST_US of the one before. `last_us`
-    and `rise_us` int64 and `last_p` uint8 (height, width) are of each pixel; `intervals` uint32 (rows,
-    columns, BINS) counts the times from rise to rise, `gaps` uint32 (rows, columns, SHORT) those from event
-    to event, `signs` int64 (rows, columns, 2) the events.
+    within SOONEST_US of the one before. Of each pixel are the time of its last event, int64, its polarity,
+    uint8, and its last rise, int64, all (height, width). Counted are the times from rise to rise, uint32
+    (rows, columns, BINS), those from event to event, uint32 (rows, columns, SHORT), and the events, int64
+    (rows, columns, 2).
     """
+    t_us, x, y, p = events
+    last_us, last_p, rise_us = of_pixels
+    intervals, gaps, signs = counts
     for i in range(t_us.size):
         t, row, column, sign = t_us[i], y[i], x[i], p[i]
         r, c = row >> shift, column >> shift

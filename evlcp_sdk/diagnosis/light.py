@@ -177,20 +177,12 @@ class LightSurvey:
         if math.isnan(self.first_us):
             self.first_us = float(events.t_us[0])
         self.last_us = float(events.t_us[-1])
-        _kernels.add_events(
-            events.t_us,
-            events.x,
-            events.y,
-            events.p,
-            self._last_us,
-            self._last_p,
-            self._rise_us,
-            self._intervals,
-            self._gaps,
-            self.signs,
-            self._shift,
-            _CALM_US,
+        columns = events.t_us, events.x, events.y, events.p
+        of_pixels, counts = (
+            (self._last_us, self._last_p, self._rise_us),
+            (self._intervals, self._gaps, self.signs),
         )
+        _kernels.add_events(columns, of_pixels, counts, self._shift, _CALM_US)
         self.readout.add(events)
         self._keep(events)
 

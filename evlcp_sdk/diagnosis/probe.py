@@ -144,21 +144,30 @@ def better_links(
             # Whatever the length of a packet, the first frame behind a preamble is accepted.
             continue
         start, counts = best, name == "air.frames_per_packet"
-        for value in _beside(start.link.air.frames_per_packet) if values is None else values:
-            other = _with(start.link, name, value, registry)
-            if other is None or other.digest == start.link.digest:
-                continue
-            try:
-                trial = try_link(other, events, tuple({**dict(start.changes), name: value}.items()))
-            except ConfigError:
-                # Codes that the link's own steps do not read.
-                continue
+        values = _beside(start.link.air.frames_per_packet) if values is None else values
+        for trial in _tried(start, name, values, events, registry):
             yield trial
             first = trial.frames >= _FEW_FRAMES > best.frames
             if trial.rank > best.rank and (counts or trial.fits or first or trial.share > best.share + _GAIN):
                 best = trial
             if counts and best.whole:
                 break
+
+
+def _tried(
+    start: Trial, name: str, values: Iterable[Any], events: Events, registry: Registry
+) -> Iterator[Trial]:
+    """What a link is with other values of one of its keys, where it can be read at all."""
+    for value in values:
+        other = _with(start.link, name, value, registry)
+        if other is None or other.digest == start.link.digest:
+            continue
+        try:
+            trial = try_link(other, events, tuple({**dict(start.changes), name: value}.items()))
+        except ConfigError:
+            # Codes that the link's own steps do not read.
+            continue
+        yield trial
 
 
 def _chips(link: Link | None) -> int:

@@ -268,24 +268,31 @@ def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
     Fields(time=1, polarity=0, places=None, unit=None)
     """
     if len(columns) in (3, 5):
-        # One that counts the rows, or is the same in all, says nothing.
-        kept = [k for k, column in enumerate(columns) if not _counts_rows(column)]
-        if len(kept) == len(columns):
-            kept = [k for k, column in enumerate(columns) if (column != column[0]).any()]
-        found = fields_of_values([columns[k] for k in kept]) if len(kept) == len(columns) - 1 else None
-        if found is None:
-            return None
-        places = (kept[found.places[0]], kept[found.places[1]]) if found.places else None
-        return Fields(kept[found.time], kept[found.polarity], places)
+        return _fields_without_one(columns)
     signs = [k for k, column in enumerate(columns) if _are_signs(column)]
+    if len(columns) not in (2, 4) or not signs:
+        return None
     if len(columns) == 2:
-        if not signs:
-            return None
         if len(signs) == 1:
             return Fields(1 - signs[0], signs[0])
         return Fields(0, 1) if columns[0].dtype.kind in "iuf" else Fields(1, 0)
-    if len(columns) != 4 or not signs:
+    return _fields_of_four(columns, signs)
+
+
+def _fields_without_one(columns: Sequence[NDArray[Any]]) -> Fields | None:
+    """The same where one column counts the rows, or is the same in all, and so says nothing."""
+    kept = [k for k, column in enumerate(columns) if not _counts_rows(column)]
+    if len(kept) == len(columns):
+        kept = [k for k, column in enumerate(columns) if (column != column[0]).any()]
+    found = fields_of_values([columns[k] for k in kept]) if len(kept) == len(columns) - 1 else None
+    if found is None:
         return None
+    places = (kept[found.places[0]], kept[found.places[1]]) if found.places else None
+    return Fields(kept[found.time], kept[found.polarity], places)
+
+
+def _fields_of_four(columns: Sequence[NDArray[Any]], signs: list[int]) -> Fields | None:
+    """The same of four columns, of which `signs` may be polarities."""
     # The last one, or the last but one, where places are 0 and 1, too.
     rest = [k for k in range(4) if k not in signs] if len(signs) == 1 else list(range(4))
     if len(signs) > 1:

@@ -159,23 +159,19 @@ def _columns_of(path: Path, file: Any, order: str | None) -> tuple[list[_Column]
             " without names"
         )
     if nameless:
-        _check(path, node)
-        on_its_side = node.shape[0] < node.shape[1]
-        parts = [_Column(node, k, on_its_side=on_its_side) for k in range(min(node.shape))]
-        fields: Fields | None
-        if order is not None:
-            fields = Fields(order.index("t"), order.index("p"), (order.index("x"), order.index("y")))
-        elif (fields := fields_of_values([part[:_LOOKED_AT] for part in parts])) is None:
-            raise InputError(
-                f"{path}: {at} is a table of {' x '.join(map(str, node.shape))} without names: expected to be"
-                " told what its columns are, as by hdf5:PATH?columns=txyp"
-            )
-        columns = [parts[k] for k in fields.which]
+        columns, fields = _nameless_columns(path, at, node, order)
     else:
-        fields = fields_of(names)
-        if fields is None:
+        known = fields_of(names)
+        if known is None:
             raise InputError(f"{path}: {at} has {', '.join(names) or 'no fields'}, expected x, y, p and t")
+        fields = known
         columns = [_Column(node[names[k]]) if is_group else _Column(node, names[k]) for k in fields.which]
+    _check_columns(path, at, columns)
+    return columns, fields.unit
+
+
+def _check_columns(path: Path, at: str, columns: list[_Column]) -> None:
+    """Refuse columns of other things than numbers, or of other lengths."""
     for number, column in enumerate(columns):
         _check(path, column.dataset)
         if column.kind not in ("biufS" if number == 1 else "biuf"):
@@ -183,7 +179,23 @@ def _columns_of(path: Path, file: Any, order: str | None) -> tuple[list[_Column]
     lengths = [len(column) for column in columns]
     if len(set(lengths)) > 1:
         raise InputError(f"{path}: {at} has columns of the lengths {lengths}, expected one length")
-    return columns, fields.unit
+
+
+def _nameless_columns(path: Path, at: str, table: Any, order: str | None) -> tuple[list[_Column], Fields]:
+    """The columns of a table without names, in an order that is given, or by what is in them."""
+    _check(path, table)
+    on_its_side = table.shape[0] < table.shape[1]
+    parts = [_Column(table, k, on_its_side=on_its_side) for k in range(min(table.shape))]
+    if order is not None:
+        fields = Fields(order.index("t"), order.index("p"), (order.index("x"), order.index("y")))
+        return [parts[k] for k in fields.which], fields
+    found = fields_of_values([part[:_LOOKED_AT] for part in parts])
+    if found is None:
+        raise InputError(
+            f"{path}: {at} is a table of {' x '.join(map(str, table.shape))} without names: expected to be"
+            " told what its columns are, as by hdf5:PATH?columns=txyp"
+        )
+    return [parts[k] for k in found.which], found
 
 
 def _place_of(path: Path, file: Any) -> tuple[str, Any]:

@@ -217,12 +217,10 @@ class ListSource(ColumnSource):
         self._is_ours = self._fields is None and set(COLUMNS) <= set(names)
         fields = self._fields or fields_of(names) or _fields_of_two(target, archive)
         if self._fields is None and (len(names) == 1 or fields is None):
-            for name in sorted(names, key=len):
-                if _is_table(archive, f"{name}.npy"):
-                    break
-            else:
+            tables = [name for name in sorted(names, key=len) if _is_table(archive, f"{name}.npy")]
+            if not tables:
                 raise InputError(f"{target}: found the arrays {', '.join(sorted(names))}, expected t and p")
-            return self._table(_Array(target, stack.enter_context(archive.open(f"{name}.npy"))))
+            return self._table(_Array(target, stack.enter_context(archive.open(f"{tables[0]}.npy"))))
         assert fields is not None
         if max(fields.which) >= len(names):
             raise InputError(f"{target}: found {len(names)} arrays, expected {max(fields.which) + 1}")
@@ -235,19 +233,17 @@ class ListSource(ColumnSource):
             fields, columns = replace(fields, places=None), columns[:2]
         self._fields = fields
         if self._is_ours:
-            self._triggers = [
-                NpzColumn(target, archive, name, stack) for name in TRIGGER_COLUMNS if "trigger_t_us" in names
-            ]
-            width, height = (
-                NpzColumn(target, archive, name, stack).one() if name in names else None
-                for name in ("width", "height")
-            )
-            self._size = width, height
+            self._take_own(partial(NpzColumn, target, archive, stack=stack), names)
         for group in (columns, self._triggers):
-            lengths = {column.name: column.rows for column in group}
-            if any(column.is_scalar for column in group) or len(set(lengths.values())) > 1:
-                raise InputError(f"{target}: found arrays of the lengths {lengths}, expected one length")
+            _check_lengths(target, group)
         return self._npz_pieces(columns, target.stat().st_size)
+
+    def _take_own(self, column: Callable[[str], NpzColumn], names: list[str]) -> None:
+        """Take what a file in our own names has beside events."""
+        if "trigger_t_us" in names:
+            self._triggers = [column(name) for name in TRIGGER_COLUMNS]
+        width, height = (column(name).one() if name in names else None for name in ("width", "height"))
+        self._size = width, height
 
     def _npz_pieces(self, columns: list[NpzColumn], size: int) -> Iterator[Piece]:
         time = columns[0]
@@ -611,7 +607,7 @@ class _Text:
         """
         assert self.fields is not None
         which = self.fields.which
-        kept = [line for k, line in enumerate(lines, first) if k >= self.first and _is_data(line)]
+        kept = [line for _, line in self._data(lines, first)]
         if not kept:
             return (np.empty(0, np.int64), np.empty(0, np.int64), None), 0
         if self._separator != b",":
@@ -624,18 +620,21 @@ class _Text:
             kept, cut = kept[:-1], 1
             if not kept or (found := self._loaded(kept, which)):
                 return found or (np.empty(0, np.int64), np.empty(0, np.int64), None), cut
-        table = []
-        for number, line in enumerate(lines, first):
-            if number < self.first or not _is_data(line):
-                continue
-            if not self._is_row(line):
-                if cut and number == first + len(lines) - 1:
-                    continue
-                more = ", x and y" if self.fields.places else ""
-                raise _LineError(number, f"found {show(line)}, expected a time and a polarity{more}")
-            cells = self.cells(line)
-            table.append([cells[k] or "nan" for k in which])
-        return _split(np.array(table)), cut
+        whole = lines[:-1] if cut else lines
+        return _split(np.array([self._cells_of(k, line) for k, line in self._data(whole, first)])), cut
+
+    def _data(self, lines: list[bytes], first: int) -> Iterator[tuple[int, bytes]]:
+        """Number and text of those that are rows of the table, from `first` on."""
+        return ((k, line) for k, line in enumerate(lines, first) if k >= self.first and _is_data(line))
+
+    def _cells_of(self, number: int, line: bytes) -> list[str]:
+        """The cells of a row that count."""
+        assert self.fields is not None
+        if not self._is_row(line):
+            more = ", x and y" if self.fields.places else ""
+            raise _LineError(number, f"found {show(line)}, expected a time and a polarity{more}")
+        cells = self.cells(line)
+        return [cells[k] or "nan" for k in self.fields.which]
 
     def number(self, lines: list[bytes], first: int, row: int) -> int:
         """In which line the row stands, of these from `first` on, the row from 0."""
@@ -724,3 +723,10 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _check_lengths(target: Path, columns: list[NpzColumn]) -> None:
+    """Refuse arrays of other lengths."""
+    lengths = {column.name: column.rows for column in columns}
+    if any(column.is_scalar for column in columns) or len(set(lengths.values())) > 1:
+        raise InputError(f"{target}: found arrays of the lengths {lengths}, expected one length")

@@ -162,6 +162,11 @@ def _open_file(path: Path | str) -> EventSource:
         start = b"% " if special else _first_bytes(target)
     except OSError as error:
         raise InputError(f"{path}: {error.strerror}") from error
+    return _open_kind(path, target, start, special=special)
+
+
+def _open_kind(path: Path | str, target: Path, start: bytes, *, special: bool) -> EventSource:
+    """Open a file by its first bytes and its name; `special` are pipes and the like."""
     suffix = _suffix(target)
     if start.startswith(b"% ") and suffix == ".raw":
         return RawSource(path)

@@ -81,19 +81,44 @@ def solve_pose(
     if isinstance(problem, Refusal):
         return problem
     found = _plain(problem)
-    if isinstance(found, Judged):
-        if not found.doubt:
-            pose = found.pose
-            # Two bars on gravity do not show which is which.
-            if problem.angles == 2 == len(pose.transmitters) and math.isfinite(pose.hpl_m + pose.vpl_m):
-                for _, behind in _mixed_up(views, camera, attitude, spec, sigma):
-                    pose = covering(pose, behind, spec)
-            return pose
-        doubt, tests = found.doubt, found.tests
-    else:
+    tests: Mapping[str, float]
+    if isinstance(found, Refusal):
         if found.kind != "not-determined":
             return found
         doubt, tests = found.detail, {}
+    elif found.doubt:
+        doubt, tests = found.doubt, found.tests
+    else:
+        pose = found.pose
+        # Two bars on gravity do not show which is which.
+        if problem.angles == 2 == len(pose.transmitters) and math.isfinite(pose.hpl_m + pose.vpl_m):
+            for _, behind in _mixed_up(views, camera, attitude, spec, sigma):
+                pose = covering(pose, behind, spec)
+        return pose
+    fits, unsure = _fits_without_one(problem, sigma, tests)
+    names = [name for name, _ in fits]
+    if "heading" in names:
+        fits = [fit for fit in fits if fit[0] != "attitude"]
+    most = max((tests.get(name, 0.0) for name in names), default=0.0)
+    rivals = [n for n in unsure if n in tests and most - tests[n] < max(ODDS, _CURVED * most)]
+    if len(fits) == 1:
+        name, pose = fits[0]
+        if not rivals and tests:
+            rivals = [name for name, _ in _mixed_up(views, camera, attitude, spec, sigma)]
+            if not rivals:
+                return replace(pose, excluded=(name,), failed=_failed(problem, name, pose, tests))
+        names = [name]
+    names += rivals
+    if isinstance(found, Refusal) and not names:
+        return found
+    could = f"; it may be {' or '.join(names)}" if names else ""
+    return Refusal("misfit", doubt + could, suspects=tuple(names))
+
+
+def _fits_without_one(
+    problem: Problem, sigma: CameraSigma, tests: Mapping[str, float]
+) -> tuple[list[tuple[str, Pose]], list[str]]:
+    """Which part is left out of each fit that is fine, and the parts without which there is no position."""
     fits: list[tuple[str, Pose]] = []
     unsure = []
     most = max(tests.values(), default=0.0)
@@ -113,23 +138,7 @@ def solve_pose(
             elif again is not None:
                 # It may be this part; without it there is no position that would tell.
                 unsure.append(name)
-    names = [name for name, _ in fits]
-    if "heading" in names:
-        fits = [fit for fit in fits if fit[0] != "attitude"]
-    most = max((tests.get(name, 0.0) for name in names), default=0.0)
-    rivals = [n for n in unsure if n in tests and most - tests[n] < max(ODDS, _CURVED * most)]
-    if len(fits) == 1:
-        name, pose = fits[0]
-        if not rivals and tests:
-            rivals = [name for name, _ in _mixed_up(views, camera, attitude, spec, sigma)]
-            if not rivals:
-                return replace(pose, excluded=(name,), failed=_failed(problem, name, pose, tests))
-        names = [name]
-    names += rivals
-    if isinstance(found, Refusal) and not names:
-        return found
-    could = f"; it may be {' or '.join(names)}" if names else ""
-    return Refusal("misfit", doubt + could, suspects=tuple(names))
+    return fits, unsure
 
 
 def _failed(problem: Problem, name: str, pose: Pose, tests: Mapping[str, float]) -> FailedBar | None:

@@ -224,6 +224,12 @@ class Positioner:
             ids = self._bars.ids
             which = ", ".join(self._named(n, ids.get(n)) for n in views)
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
+        return self._solved(t_us, views, sited, here, self.axes)
+
+    def _solved(
+        self, t_us: float, views: list[int], sited: list[BarView], here: LocalAxes, axes: LocalAxes
+    ) -> Fix:
+        """The fix of bars whose places are known in the axes of here; or why there is none."""
         attitude_now = self._attitude_at(t_us)
         pose = solve_pose(sited, self._camera, attitude_now, self._spec, self._camera_sigma)
         contradicts = pose.kind == "misfit" if isinstance(pose, Refusal) else bool(pose.excluded)
@@ -231,19 +237,19 @@ class Positioner:
             self._contradicts = sited, attitude_now
         if isinstance(pose, Refusal):
             refused = Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
-            others = _alternatives(pose, here, self.axes)
+            others = _alternatives(pose, here, axes)
             return replace(refused, alternatives=others, suspects=pose.suspects)
         verified = all(self._bars.verified(n) for n in pose.transmitters)
         attitude = Attitude.of_rotation(pose.rotation)
         latitude, longitude, height = (float(v) for v in here.to_geodetic(pose.enu_m))
-        turn = self.axes.turn_from(here)
+        turn = axes.turn_from(here)
         assert attitude.heading_deg is not None
         return Fix(
             t_us=t_us,
             latitude_deg=latitude,
             longitude_deg=longitude,
             height_m=height,
-            enu_m=self.axes.to_enu(latitude, longitude, height),
+            enu_m=axes.to_enu(latitude, longitude, height),
             covariance_m2=turn @ pose.covariance[:3, :3] @ turn.T,
             noise_m2=turn @ pose.noise @ turn.T,
             heading_deg=attitude.heading_deg,

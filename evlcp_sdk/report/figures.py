@@ -27,7 +27,7 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.spelling import counted
-from evlcp_sdk.values import Events, Frame, PresenceMap, Region
+from evlcp_sdk.values import Events, Fix, Frame, PresenceMap, Region
 
 __all__ = [
     "FigureProbe",
@@ -211,20 +211,7 @@ def draw_track(track: Iterable[Settled], bars_enu_m: Mapping[int, NDArray[np.flo
     plan, close, height = (parts[name] for name in ("plan", "close", "height"))
     spread, protected = parts["spread"], parts["protected"]
     points = list(track)
-    middle = np.mean([enu[:2] for enu in bars_enu_m.values()], axis=0) if bars_enu_m else np.zeros(2)
-    for number, enu in sorted(bars_enu_m.items()):
-        plan.plot(enu[0], enu[1], "s", ms=7, color=transmitter_colour(number))
-        # Away from the other bars, so that no name is on another's mark.
-        left, below = enu[0] < middle[0], enu[1] < middle[1]
-        plan.annotate(
-            f"bar {number}",
-            (enu[0], enu[1]),
-            xytext=(-7 if left else 7, -7 if below else 7),
-            textcoords="offset points",
-            ha="right" if left else "left",
-            va="top" if below else "bottom",
-            fontsize=9,
-        )
+    _draw_bars(plan, bars_enu_m)
     if points:
         fixed = np.array([point.fix.enu_m for point in points])
         live = np.array([point.filtered.enu_m for point in points])
@@ -244,23 +231,7 @@ def draw_track(track: Iterable[Settled], bars_enu_m: Mapping[int, NDArray[np.flo
                 axis.plot(way[:, 0], way[:, 1], "-", lw=1.2, color=colour, label=label)
             height.plot(t_s, way[:, 2], "-", lw=1.4, color=colour)
         height.plot(t_s, fixed[:, 2], ".", ms=3, color=_INK)
-        for i, name in enumerate(("east", "north", "up")):
-            # Those of satellites are far larger than those of bars.
-            sigma = [
-                math.sqrt(point.fix.covariance_m2[i, i]) if point.fix.source == "bars" else math.nan
-                for point in points
-            ]
-            spread.plot(t_s, sigma, lw=1.2, color=TRANSMITTER_COLOURS[i], label=name)
-        for name, style in (("hpl_m", "-"), ("vpl_m", ":")):
-            # A gap where there is none.
-            level = np.array([getattr(point.fix, name) for point in points])
-            shown = np.where(np.isfinite(level), level, np.nan)
-            protected.plot(t_s, shown, style, lw=1.4, color=_INK, label=_LEVELS[name])
-        alarmed = [t for t, point in zip(t_s, points, strict=True) if point.fix.excluded]
-        protected.plot(alarmed, np.zeros(len(alarmed)), "x", ms=5, color="#d55e00", label="a part left out")
-        for axis in (spread, protected):
-            # Beside the lines, not on them.
-            axis.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
+        _draw_integrity(spread, protected, [point.fix for point in points])
         close.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axis in (plan, close):
         axis.set(xlabel="east, m", ylabel="north, m")
@@ -274,6 +245,42 @@ def draw_track(track: Iterable[Settled], bars_enu_m: Mapping[int, NDArray[np.flo
         plain(axis)
     figure.suptitle(f"{title}: {counted(len(points), 'position')} shown", fontsize=11, color=_INK)
     return figure
+
+
+def _draw_bars(plan: Axes, bars_enu_m: Mapping[int, NDArray[np.float64]]) -> None:
+    """Mark and name the bars on a map."""
+    middle = np.mean([enu[:2] for enu in bars_enu_m.values()], axis=0) if bars_enu_m else np.zeros(2)
+    for number, enu in sorted(bars_enu_m.items()):
+        plan.plot(enu[0], enu[1], "s", ms=7, color=transmitter_colour(number))
+        # Away from the other bars, so that no name is on another's mark.
+        left, below = enu[0] < middle[0], enu[1] < middle[1]
+        plan.annotate(
+            f"bar {number}",
+            (enu[0], enu[1]),
+            xytext=(-7 if left else 7, -7 if below else 7),
+            textcoords="offset points",
+            ha="right" if left else "left",
+            va="top" if below else "bottom",
+            fontsize=9,
+        )
+
+
+def _draw_integrity(spread: Axes, protected: Axes, fixes: Sequence[Fix]) -> None:
+    """Draw sigmas, and protection levels with a gap where there are none, over time."""
+    t_s = np.array([fix.t_us for fix in fixes]) * 1e-6
+    for i, name in enumerate(("east", "north", "up")):
+        # Those of satellites are far larger than those of bars.
+        sigma = [math.sqrt(f.covariance_m2[i, i]) if f.source == "bars" else math.nan for f in fixes]
+        spread.plot(t_s, sigma, lw=1.2, color=TRANSMITTER_COLOURS[i], label=name)
+    for name, style in (("hpl_m", "-"), ("vpl_m", ":")):
+        level = np.array([getattr(fix, name) for fix in fixes])
+        shown = np.where(np.isfinite(level), level, np.nan)
+        protected.plot(t_s, shown, style, lw=1.4, color=_INK, label=_LEVELS[name])
+    alarmed = [fix.t_us * 1e-6 for fix in fixes if fix.excluded]
+    protected.plot(alarmed, np.zeros(len(alarmed)), "x", ms=5, color="#d55e00", label="a part left out")
+    for axis in (spread, protected):
+        # Beside the lines, not on them.
+        axis.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 
 _ELLIPSE = "#cfe5f3"

@@ -175,14 +175,7 @@ class Report(Sink):
                 ("bits", f"{bits:,}", not_seen),
                 ("quality", f"{quality:.1%}", "of frames expected to be right"),
             ]
-        distances = [t[key] for t in own for key in ("distance_first_m", "distance_last_m")]
-        distances = [d for d in distances if d is not None]
-        if distances:
-            first, last = distances[0], distances[-1]
-            shown = f"{first:.2f} to {last:.2f} m"
-            if len(own) > 1:
-                shown = f"{min(distances):.1f} to {max(distances):.1f} m"
-            figures.append(("distance", shown, f"{sum(t['frames_ranged'] for t in own):,} frames have one"))
+        figures += _distances(own)
         if len(summary["transmitters"]) > 1:
             echoes = len(summary["transmitters"]) - len(own)
             note = f"and {echoes} reflection{'s' * (echoes != 1)}" if echoes else ""
@@ -314,3 +307,15 @@ def _describe(frame: Frame, ms: float) -> str:
         lines.append(f"{depth.distance_m:.4f} ± {depth.sigma_m:.4f} m")
     lines.append(f"quality {frame.soft.quality:.4f}")
     return "\n".join(lines)
+
+
+def _distances(own: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:
+    """From where to where transmitters are, and how often; nothing where no frame says so."""
+    distances = [t[key] for t in own for key in ("distance_first_m", "distance_last_m")]
+    distances = [d for d in distances if d is not None]
+    if not distances:
+        return []
+    shown = f"{distances[0]:.2f} to {distances[-1]:.2f} m"
+    if len(own) > 1:
+        shown = f"{min(distances):.1f} to {max(distances):.1f} m"
+    return [("distance", shown, f"{sum(t['frames_ranged'] for t in own):,} frames have one")]

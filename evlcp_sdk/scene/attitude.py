@@ -166,25 +166,7 @@ class AttitudeLog:
             if name in names:
                 table[name] = np.array([csv_number(path, line, name, row[name]) for line, row in rows])
         t_us = table["t_us"]
-        if len(t_us) < 2:
-            raise ConfigError(f"{path}: expected two lines or more with rising t_us")
-        if (np.diff(t_us) <= 0).any():
-            i = int(np.argmax(np.diff(t_us) <= 0)) + 1
-            raise ConfigError(
-                f"{path}: line {lines[i]}: t_us = {t_us[i]:.16g}: expected more than the line before,"
-                f" {t_us[i - 1]:.16g}: rising t_us"
-            )
-        for name in ("gravity_sigma_deg", "heading_sigma_deg"):
-            if name in table and (table[name] < 0).any():
-                i = int(np.flatnonzero(table[name] < 0)[0])
-                raise ConfigError(f"{path}: line {lines[i]}: {name} = {table[name][i]:g}: expected 0 or more")
-        most = dict.fromkeys(_RATES + _FORCES, _MOST_MEASURED) | {"pitch_deg": 90.0}
-        for name, limit in most.items():
-            if name in table and (np.abs(table[name]) > limit).any():
-                i = int(np.flatnonzero(np.abs(table[name]) > limit)[0])
-                raise ConfigError(
-                    f"{path}: line {lines[i]}: {name} = {table[name][i]:g}: expected at most {limit:g}"
-                )
+        _check_values(path, lines, table)
         log = cls(
             t_us,
             table["pitch_deg"],
@@ -196,20 +178,24 @@ class AttitudeLog:
             usual.time_sigma_us,
             *(np.stack([table[n] for n in a], 1) if a[0] in table else None for a in (_RATES, _FORCES)),
         )
-        if log._push_m_s2 is not None:
-            upward = float(log._push_m_s2[:, 2].mean()) + _GRAVITY_M_S2
+        log._check_senses(path)
+        return log
+
+    def _check_senses(self, path: Path | str) -> None:
+        """Refuse forces and rates that are of other signs or measures than they should be."""
+        if self._push_m_s2 is not None:
+            upward = float(self._push_m_s2[:, 2].mean()) + _GRAVITY_M_S2
             if not 0.5 * _GRAVITY_M_S2 < upward < 1.5 * _GRAVITY_M_S2:
                 raise ConfigError(
                     f"{path}: forces hold the camera up by {upward:.1f} m/s2 on the mean, expected about 9.8:"
                     " a level camera at rest has force_down_m_s2 = -9.8"
                 )
-        times = log._times_turned()
+        times = self._times_turned()
         if times is not None and not 0.5 < times < 1.5:
             raise ConfigError(
                 f"{path}: rates turn the camera {times:.3g} times as far as its headings do, expected 1:"
                 " a turn to the right is positive about down, in degrees/s"
             )
-        return log
 
     def _times_turned(self) -> float | None:
         """How many times as far as by headings the camera turns by rates; None where nothing says so.
@@ -341,3 +327,24 @@ class AttitudeLog:
 def attitude_source(attitude: Attitude | AttitudeLog | None) -> Callable[[float], Attitude | None]:
     """The attitude at a time, us; None where nothing is known."""
     return attitude.at if isinstance(attitude, AttitudeLog) else lambda _t_us: attitude
+
+
+def _check_values(path: Path | str, lines: list[int], table: dict[str, NDArray[np.float64]]) -> None:
+    """Refuse times that do not rise, and values out of range."""
+    t_us = table["t_us"]
+    if len(t_us) < 2:
+        raise ConfigError(f"{path}: expected two lines or more with rising t_us")
+    if (np.diff(t_us) <= 0).any():
+        i = int(np.argmax(np.diff(t_us) <= 0)) + 1
+        raise ConfigError(
+            f"{path}: line {lines[i]}: t_us = {t_us[i]:.16g}: expected more than the line before,"
+            f" {t_us[i - 1]:.16g}: rising t_us"
+        )
+    most = dict.fromkeys(_RATES + _FORCES, _MOST_MEASURED) | {"pitch_deg": 90.0}
+    for name, values in table.items():
+        wrong, expected = np.abs(values) > most.get(name, math.inf), f"at most {most.get(name, math.inf):g}"
+        if name.endswith("_sigma_deg"):
+            wrong, expected = values < 0, "0 or more"
+        if wrong.any():
+            i = int(np.flatnonzero(wrong)[0])
+            raise ConfigError(f"{path}: line {lines[i]}: {name} = {values[i]:g}: expected {expected}")

@@ -198,18 +198,8 @@ class _SpotDetector:
         next_id = state.next_id
         for spot in new:
             veil = _brighter(spot, moved) is not None
-            # What is not known to be a light of its own makes way for one that is.
-            near = [other for other in moved if _apart(spot.x_px, spot.y_px, other) < 2 * self.spec.reach_px]
-            here = any(_apart(spot.x_px, spot.y_px, other) < self.spec.reach_px for other in near)
-            if here or any(other.own or veil for other in near):
-                continue
-            gone = list(near)
-            if veil:
-                veiled = [other for other in moved if not other.own]
-                gone += _dimmest(veiled, spot, _MOST_VEILED)
-            if len(moved) - len(gone) >= self.spec.most:
-                gone += _dimmest(moved, spot, self.spec.most)
-            if any(one is spot for one in gone):
+            gone = self._making_way(spot, moved, veil=veil)
+            if gone is None:
                 continue
             regions = [region for region in regions if region.id not in {one.id for one in gone}]
             moved = [one for one in moved if one.id not in {other.id for other in gone}]
@@ -223,6 +213,19 @@ class _SpotDetector:
             if spot.own and now_us - spot.found_us >= _YOUNG_US and spot.turned_us - spot.part_us > _PART_US
         ]
         return _State(tuple(moved), cells, next_id), single
+
+    def _making_way(self, spot: _Spot, moved: list[_Spot], *, veil: bool) -> list[_Spot] | None:
+        """Which spots, not known to be lights of their own, make way for a new one; None: that does."""
+        near = [other for other in moved if _apart(spot.x_px, spot.y_px, other) < 2 * self.spec.reach_px]
+        here = any(_apart(spot.x_px, spot.y_px, other) < self.spec.reach_px for other in near)
+        if here or any(other.own or veil for other in near):
+            return None
+        gone = list(near)
+        if veil:
+            gone += _dimmest([other for other in moved if not other.own], spot, _MOST_VEILED)
+        if len(moved) - len(gone) >= self.spec.most:
+            gone += _dimmest(moved, spot, self.spec.most)
+        return None if any(one is spot for one in gone) else gone
 
     def _judged(
         self,

@@ -289,17 +289,17 @@ def sum_worth(
     signs: Array,
     probability: Array,
     grid: int,
-    least: float,
     worth: Array,
-    odds: float,
+    limits: tuple[float, float],
     out: Array,
 ) -> None:
     """Presence-weighted sum of what each pixel's pair of sums is worth in the values after the pilots.
 
     As in `learn_worth`; `out` is (K, values). A pixel counts by how likely its pilot makes it that it shows
-    the cluster, not what comes with both values alike; before that, `odds` are against it. Cells that show
-    it with less than `least` are passed over.
+    the cluster, not what comes with both values alike. `limits` are the probability of cells below which they
+    are passed over, and the odds against a pixel before that.
     """
+    least, odds = limits
     clusters, rows, columns = probability.shape
     length, known = out.shape[1], signs.shape[1]
     # Mean of a pair's likelihoods with a value of -1 and with +1, over that with -1, or with +1.

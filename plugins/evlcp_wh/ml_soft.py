@@ -88,7 +88,7 @@ class LearnedDecoder:
         _kernels.learn_worth(pairs, width, self._signs, seen, grid, _PRIOR_COUNT, worth)
         values = np.zeros((len(seen), len(pairs) - self._signs.shape[1]))
         odds = (1 - _PIXEL_SHARE) / _PIXEL_SHARE
-        _kernels.sum_worth(pairs, width, self._signs, seen, grid, _MIN_WEIGHT, worth, odds, values)
+        _kernels.sum_worth(pairs, width, self._signs, seen, grid, worth, (_MIN_WEIGHT, odds), values)
         found = match_words(values, self._by_value, self._bits)
         scale = INDEPENDENT_PIXELS / 2
         llr = (found.margins * scale).astype(np.float32)

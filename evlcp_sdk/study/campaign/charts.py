@@ -268,20 +268,7 @@ def draw(chart: Chart, title: str) -> Drawing:
             axis.step(xs, ys, where="mid", color=line.colour, ls=style, lw=1.2, label=line.name)
             continue
         axis.plot(xs, ys, style, color=line.colour, lw=1.2, label=line.name)
-        for limit in (False, True):
-            dots = [d for d in line.dots if d.limit is limit]
-            if dots:
-                axis.errorbar(
-                    [d.x for d in dots],
-                    [d.y for d in dots],
-                    None if limit else [[d.y - d.low for d in dots], [d.high - d.y for d in dots]],
-                    fmt="v" if limit else _MATPLOTLIB[line.symbol],
-                    mfc="none" if limit else line.colour,
-                    color=line.colour,
-                    ms=5,
-                    capsize=2,
-                    lw=1,
-                )
+        _draw_dots(axis, line)
     for mark in chart.marks:
         axis.plot([mark.x0, mark.x1], [mark.y, mark.y], "-", color=_INK, lw=2.5 if not mark.bound else 1.2)
     if chart.marks:
@@ -306,6 +293,24 @@ def draw(chart: Chart, title: str) -> Drawing:
         for entry in legend.get_texts():
             entry.set_parse_math(False)
     return figure
+
+
+def _draw_dots(axis: Axes, line: Line) -> None:
+    """Draw figures with their intervals, and those that are limits as such."""
+    for limit in (False, True):
+        dots = [d for d in line.dots if d.limit is limit]
+        if dots:
+            axis.errorbar(
+                [d.x for d in dots],
+                [d.y for d in dots],
+                None if limit else [[d.y - d.low for d in dots], [d.high - d.y for d in dots]],
+                fmt="v" if limit else _MATPLOTLIB[line.symbol],
+                mfc="none" if limit else line.colour,
+                color=line.colour,
+                ms=5,
+                capsize=2,
+                lw=1,
+            )
 
 
 def _name_marks(axis: Axes, chart: Chart) -> None:

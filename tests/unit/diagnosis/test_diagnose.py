@@ -349,7 +349,8 @@ def test_kernel_counts_as_its_twin_does() -> None:
     given = [np.full(shape, long_ago), np.ones(shape, np.uint8), np.full(shape, long_ago)]
     counts = [np.zeros_like(one) for one in expected]
     for part in (events[:1500], events[1500:]):
-        _kernels.add_events(part.t_us, part.x, part.y, part.p, *given, *counts, 3, 400)
+        columns = part.t_us, part.x, part.y, part.p
+        _kernels.add_events(columns, tuple(given), tuple(counts), 3, 400)
     for one, other in zip(counts, expected, strict=True):
         np.testing.assert_array_equal(one, other)
 

@@ -149,7 +149,7 @@ def test_worth_is_learned_and_summed(seed, grid, most, prior):
     worth = worth.reshape(counts.shape[1:])
     assert_allclose(worth, twins.log_ratio(counts, prior), rtol=1e-6, atol=1e-9)
     out = np.zeros((CLUSTERS, 6))
-    _kernels.sum_worth(pairs, 10, signs, probability, grid, 0.2, worth.ravel(), 4.0, out)
+    _kernels.sum_worth(pairs, 10, signs, probability, grid, worth.ravel(), (0.2, 4.0), out)
     want = twins.sum_worth(sums, CODES, probability, grid, 0.2, worth, 0.2)
     assert_allclose(out, want, rtol=1e-6, atol=1e-9)
 
