@@ -19,8 +19,6 @@ knowledge. A row:
 - not covered: silent fixes that have no protection level, and say so by an alarm, or are beyond it
 - left out: fixes given without a part that is named
 - protected: fixes with both protection levels; their medians; and the share beyond one of them
-
-Behind the table: the worst rows against what was asked of them.
 """
 
 import argparse
@@ -511,10 +509,9 @@ def main() -> None:
     print("| what | " + " | ".join(head) + " |")
     print("|---" * (len(head) + 1) + "|")
     row(World(2, "gravity"), None, 5, 0, spec)
-    reached: dict[str, dict[str, float]] = {}
     for i, (name, world, wrong) in enumerate(rows):
         if given.only in name:
-            found = reached[name] = row(world, wrong, given.fixes, i, spec)
+            found = row(world, wrong, given.fixes, i, spec)
             texts = (
                 "-"
                 if math.isnan(found[key])
@@ -524,52 +521,6 @@ def main() -> None:
                 for key in head
             )
             print(f"| {name} | " + " | ".join(texts) + " |", flush=True)
-    judge(reached, given.fixes)
-
-
-def judge(reached: dict[str, dict[str, float]], fixes: int) -> None:
-    """Print what was asked beside the worst row of what is reached."""
-    clean = {name: found for name, found in reached.items() if not any(what in name for what in FAULTS)}
-    # What the tests can find at all: three bars, or two with the heading.
-    single = {
-        name: found
-        for name, found in reached.items()
-        if name not in clean and name.startswith(("3 bars", "2 bars, heading"))
-    }
-    if not clean or not single:
-        return
-
-    def worst(of: dict[str, dict[str, float]], key: str, least: bool = False) -> str:
-        known = {name: found[key] for name, found in of.items() if not math.isnan(found[key])}
-        name = (min if least else max)(known, key=lambda n: known[n])
-        return f"{known[name]:.3g} ({name})"
-
-    # All rows of one fault together, where chance matters less.
-    together = {
-        what: {
-            "excess": float(
-                np.mean([found["beyond chance"] for name, found in single.items() if what in name])
-            )
-        }
-        for what in FAULTS
-    }
-    lines = [
-        ("NEES, least", "2.4", worst(clean, "NEES", least=True)),
-        ("NEES, most", "3.6", worst(clean, "NEES")),
-        ("kept without a fault", ">= .99", worst(clean, "kept", least=True)),
-        ("silent without a fault", f"{CHANCE} by chance", worst(clean, "silent")),
-        ("silent, one fault", "<= .001", worst(single, "silent")),
-        *(
-            ("... beyond chance: " + what, "<= .001", f"{found['excess']:.4f}")
-            for what, found in together.items()
-        ),
-        ("... or not covered by a level", "<= .001", worst(single, "not covered")),
-        ("beyond a protection level", f"<= {SPEC.risk}", worst(reached, "beyond")),
-        ("fixes", "100000", str(fixes * len(reached))),
-    ]
-    print("\n| figure | asked | reached, worst row |\n|---|---|---|")
-    for line in lines:
-        print("| " + " | ".join(line) + " |")
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
-"""What the receiver finds on a road, beside the figures to reach, and what its parts cost: one table each.
+"""What the receiver finds on a road, beside the figures to reach, and how fast: one table each.
 
     python benchmarks/road.py [RECORDING or FOLDER ...] [--only NAME ...]
-        [--against LINK.toml or NAME:TABLE.KEY=VALUE,...] [--rounds 3] [--tiled 20000000]
+        [--against LINK.toml or NAME:TABLE.KEY=VALUE,...] [--rounds 3]
         [--json | --markdown]
 
 Without names, all recordings of `../shared/recordings/road` and one folder up. Each has its truth beside it,
@@ -14,8 +14,7 @@ Figures to reach are in `benchmarks/road.toml`, by the recording's name.
 `--markdown` prints the tables of docs/compare.md: what each link finds, side by side.
 
 Speed is processor time, kernels warm, the best of the rounds (0 leaves it out): recorded time and events over
-it, and its parts in milliseconds a recorded second. Then one recording is tiled in time to `--tiled` events
-(0 leaves it out). Speed is printed, and is never a miss. The exit code is 1 where a figure is missed.
+it. It is printed, and is never a miss. The exit code is 1 where a figure is missed.
 """
 
 import argparse
@@ -25,28 +24,17 @@ import os
 import runpy
 import sys
 import tempfile
-import time
 import tomllib
-from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from functools import partial, wraps
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from statistics import median
 from typing import Any
 
-from evt3_decode import tile
-
 from evlcp_sdk.errors import EvlcpError
-from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.rx.alignment import FrameAligner
-from evlcp_sdk.rx.detection import RegionFollower
-from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.rx.steps import Steps
 from evlcp_sdk.sim import Truth, read_truth, truth_path
-from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.match import match
 from evlcp_sdk.study.measure import bar_tallies
@@ -57,64 +45,10 @@ from evlcp_sdk.study.variants import load_variants
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 TARGETS = Path(__file__).with_suffix(".toml")
 
-PARTS: Mapping[str, tuple[tuple[type, str], ...]] = {
-    "regions": ((RegionFollower, "step"),),
-    "synchronization": ((Steps, "synchronize"),),
-    "image": ((FrameAligner, "look"),),
-    "separation": ((Steps, "separate"),),
-    "decoding": ((Steps, "decode"),),
-    "ranging": ((Steps, "measure"),),
-    "rest of the receiver": ((Receiver, "feed"), (Receiver, "close")),
-}
-"""The calls whose own time, without others inside, is a part; the rest is reading and writing files."""
-
 Make = Callable[[str], Link]
 """A link for recordings of a modulation."""
 
 Plain = dict[str, Any]
-
-
-class Clock:
-    """Processor time of each part, s, without that of other parts inside it."""
-
-    def __init__(self) -> None:
-        self.spent_s: Counter[str] = Counter(dict.fromkeys([*PARTS, "files"], 0.0))
-        self._open = ["files"]
-        self._since_s = time.process_time()
-
-    def turn(self) -> None:
-        """Count the time up to now."""
-        now_s = time.process_time()
-        self.spent_s[self._open[-1]] += now_s - self._since_s
-        self._since_s = now_s
-
-    def timed(self, part: str, call: Callable[..., Any]) -> Callable[..., Any]:
-        """The same call, its time counted."""
-
-        @wraps(call)
-        def run(*args: Any, **kwargs: Any) -> Any:
-            self.turn()
-            self._open.append(part)
-            try:
-                return call(*args, **kwargs)
-            finally:
-                self.turn()
-                self._open.pop()
-
-        return run
-
-    @contextmanager
-    def running(self) -> Iterator[None]:
-        """Count while inside."""
-        with ExitStack() as undo:
-            for part, calls in PARTS.items():
-                for owner, name in calls:
-                    call = getattr(owner, name)
-                    undo.callback(setattr, owner, name, call)
-                    setattr(owner, name, self.timed(part, call))
-            self._since_s = time.process_time()
-            yield
-            self.turn()
 
 
 def targets_of(table: Mapping[str, Any], name: str, bar: int) -> Plain:
@@ -166,24 +100,17 @@ def independent(tool: Path, folder: Path, truth: Path) -> Plain | None:
 
 
 def speed(path: Path, folder: Path, link: Link, rounds: int) -> Plain:
-    """Processor time of a recording and of its parts, the round with the least of them."""
-    best: Plain = {}
-    for _ in range(rounds):
-        clock = Clock()
-        with clock.running():
-            recording = receive_to_folder(path, folder, link)["recording"]
-        total_s = sum(clock.spent_s.values())
-        if not best or total_s < best["processor_s"]:
-            recorded_s, events = recording["duration_s"], recording["counts"]["events"]
-            best = {
-                "processor_s": total_s,
-                "recorded_s": recorded_s,
-                "events": events,
-                "real_time": times_real_time(recorded_s, total_s),
-                "mev_s": events / total_s / 1e6,
-                "parts_ms_per_s": {part: s / recorded_s * 1e3 for part, s in clock.spent_s.items()},
-            }
-    return best
+    """Processor time of a recording, the round with the least."""
+    found = (receive_to_folder(path, folder, link) for _ in range(rounds))
+    best = min(found, key=lambda summary: summary["processing"]["processor_s"])
+    done, recording = best["processing"], best["recording"]
+    return {
+        "processor_s": done["processor_s"],
+        "recorded_s": recording["duration_s"],
+        "events": recording["counts"]["events"],
+        "real_time": done["times_real_time"],
+        "mev_s": done["events_per_s"] / 1e6,
+    }
 
 
 def measured(path: Path, make: Make, table: Mapping[str, Any], tool: Path, rounds: int) -> Plain:
@@ -336,17 +263,10 @@ def show(head: Sequence[str], rows: Sequence[Sequence[str]]) -> None:
         print("  ".join(line[j].ljust(w) for j, w in zip(kept, widths, strict=True)).rstrip())
 
 
-SPEED_HEAD = [
-    "link",
-    "recording",
-    "Mev",
-    "x real time",
-    "Mev/s",
-    *[f"{part}, ms/s" for part in [*PARTS, "files"]],
-]
+SPEED_HEAD = ["link", "recording", "Mev", "x real time", "Mev/s"]
 
 
-def speed_line(name: str, link: str, found: Plain, real_time: float | None, mev_s: float | None) -> list[str]:
+def speed_line(name: str, link: str, found: Plain, real_time: float | None) -> list[str]:
     def least(value: float, limit: float | None, digits: int) -> str:
         said = f"{value:.{digits}f}"
         return said if limit is None else f"{said} {'>=' if value >= limit else '<'} {limit:g}"
@@ -356,8 +276,7 @@ def speed_line(name: str, link: str, found: Plain, real_time: float | None, mev_
         name,
         f"{found['events'] / 1e6:.2f}",
         least(found["real_time"], real_time, 2),
-        least(found["mev_s"], mev_s, 1),
-        *(f"{ms:.0f}" for ms in found["parts_ms_per_s"].values()),
+        f"{found['mev_s']:.1f}",
     ]
 
 
@@ -410,7 +329,7 @@ FIGURES = [
 """Of a tally, what JSON gets."""
 
 
-def plain(results: Mapping[str, Sequence[Plain]], tiled: Mapping[str, Plain]) -> Plain:
+def plain(results: Mapping[str, Sequence[Plain]]) -> Plain:
     """Everything as JSON values; null where nothing was measured."""
 
     def bar_of(bar: Plain) -> Plain:
@@ -420,10 +339,7 @@ def plain(results: Mapping[str, Sequence[Plain]], tiled: Mapping[str, Plain]) ->
         return values | {"targets": bar["targets"], "missed": bar["missed"]}
 
     return {
-        link: {
-            "recordings": [one | {"bars": [bar_of(bar) for bar in one["bars"]]} for one in found],
-            **({"tiled": tiled[link]} if link in tiled else {}),
-        }
+        link: {"recordings": [one | {"bars": [bar_of(bar) for bar in one["bars"]]} for one in found]}
         for link, found in results.items()
     }
 
@@ -434,7 +350,6 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=[], metavar="NAME")
     parser.add_argument("--against", action="append", default=[], metavar="LINK")
     parser.add_argument("--rounds", type=int, default=3)
-    parser.add_argument("--tiled", type=int, default=20_000_000)
     form = parser.add_mutually_exclusive_group()
     form.add_argument("--json", action="store_true")
     form.add_argument("--markdown", action="store_true")
@@ -455,20 +370,12 @@ def main() -> None:
         )
         for name, make in links.items():
             results[name].append(measured(path, make, table, tool, args.rounds))
-    tiled: dict[str, Plain] = {}
-    one = next((p for p in recordings if p.name.startswith(table["tiled"]["recording"])), None)
-    if args.rounds and args.tiled and one is not None:
-        with tempfile.TemporaryDirectory() as folder:
-            big = Path(folder) / one.name
-            tile(read_events(one), big, args.tiled)
-            for name, make in links.items():
-                tiled[name] = speed(big, Path(folder) / "out", make("wh4x2"), 1)
     if args.json:
-        print(json.dumps(plain(results, tiled), indent=2))
+        print(json.dumps(plain(results), indent=2))
     elif args.markdown:
         print_markdown(results)
     else:
-        print_tables(results, tiled, table)
+        print_tables(results, table)
     sys.exit(
         any("fault" in one or any(b["missed"] for b in one["bars"]) for one in results[next(iter(links))])
     )
@@ -520,9 +427,7 @@ def print_markdown(results: Mapping[str, Sequence[Plain]]) -> None:
         )
 
 
-def print_tables(
-    results: Mapping[str, Sequence[Plain]], tiled: Mapping[str, Plain], table: Mapping[str, Any]
-) -> None:
+def print_tables(results: Mapping[str, Sequence[Plain]], table: Mapping[str, Any]) -> None:
     """Print what was found, and then the speed."""
     alone = len(results) == 1
     names = {name: "" if alone else name for name in results}
@@ -541,10 +446,7 @@ def print_tables(
         for name, one in zip(results, found, strict=True):
             if "speed" in one:
                 least = table.get(one["recording"], {}).get("real_time")
-                rows.append(speed_line(one["recording"], names[name], one["speed"], least, None))
-    for name, one in tiled.items():
-        text = f"{table['tiled']['recording']}, tiled"
-        rows.append(speed_line(text, names[name], one, None, table["tiled"]["mev_s"]))
+                rows.append(speed_line(one["recording"], names[name], one["speed"], least))
     if rows:
         print()
         show(SPEED_HEAD, rows)
