@@ -48,12 +48,6 @@ class ServingOptions:
         int,
         typer.Option("--view-port", min=0, max=65535, metavar="PORT", help="Its port; 0: any that is free."),
     ] = 0
-    view_apart: Annotated[
-        bool,
-        typer.Option(
-            "--view-apart", help="The page is served by a process of its own, which costs the receiver less."
-        ),
-    ] = False
     view_record: Annotated[
         bool,
         typer.Option(
@@ -87,14 +81,12 @@ class ServingOptions:
         for name, changed in (
             ("--view-host", self.view_host != _HERE),
             ("--view-port", self.view_port != 0),
-            ("--view-apart", self.view_apart),
             ("--view-record", self.view_record),
         ):
             if changed and not self.view:
                 raise typer.BadParameter("needs --view", param_hint=name)
         return Serving(
             self.view,
-            self.view_apart,
             self.view_host,
             self.view_port,
             (out or Path.cwd()) if self.view_record else None,

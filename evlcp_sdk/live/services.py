@@ -8,7 +8,6 @@ from types import TracebackType
 from typing import Self
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.live.apart import ViewerApart
 from evlcp_sdk.live.casts import Cast
 from evlcp_sdk.live.desk import Desk
 from evlcp_sdk.live.outlet import Outlet
@@ -29,7 +28,6 @@ class Serving:
 
     Attributes:
         view: Whether there is a web view.
-        apart: Whether that has a process of its own.
         host: Where the web view listens: of this machine only, unless it is another address of it.
         port: The same; 0 for any that is free.
         record_to: Where browsers may have recordings written; None: they only look on.
@@ -38,7 +36,6 @@ class Serving:
     """
 
     view: bool = False
-    apart: bool = False
     host: str = "127.0.0.1"
     port: int = 0
     record_to: Path | None = None
@@ -80,13 +77,13 @@ class Services:
         self.pictures = PictureSlot() if serving.view else None
         self._recorder: Recorder | None = None
         self._teller: Teller | None = None
-        self.view: Viewer | ViewerApart | None = None
+        self.view: Viewer | None = None
         if self.pictures is not None:
             if serving.record_to is not None:
                 camera = next(iter(links.values())).camera
                 self._recorder = Recorder(outlet, serving.record_to, camera.width, camera.height)
             self._teller = Teller(outlet, self.pictures, links, sites)
-            self.view = (ViewerApart if serving.apart else Viewer)(
+            self.view = Viewer(
                 self._teller,
                 links,
                 name=name,
@@ -139,5 +136,5 @@ class Services:
         self._stack.__exit__(kind, value, trace)
 
 
-def _finish(desk: Desk, server: Viewer | ViewerApart | Cast) -> None:
+def _finish(desk: Desk, server: Viewer | Cast) -> None:
     desk.call(server.finish())

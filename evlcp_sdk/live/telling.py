@@ -12,20 +12,14 @@ from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.outlet import News, Outlet
 from evlcp_sdk.live.pictures import Picture, PictureSlot
 from evlcp_sdk.results.columns import frame_columns
-from evlcp_sdk.results.lines import FrameValues, fix_line, format_values, frame_values
+from evlcp_sdk.results.lines import fix_line, format_frame
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, ReceivedMessage
 
-__all__ = ["MOST_WAITING", "PICTURES_PER_S", "FrameNews", "Line", "Shot", "Teller", "line_text"]
+__all__ = ["MOST_WAITING", "PICTURES_PER_S", "Shot", "Teller"]
 
 PICTURES_PER_S: Final = 25
-
-FrameNews = tuple[FrameValues, float | None]
-"""What is said of a frame, and how late it was, ms."""
-
-Line = tuple[str, str | FrameNews]
-"""A kind of news, or `bars`, and what is said of it: JSON, which of a frame is written by who shows it."""
 
 MOST_WAITING: Final = 4000
 """Results that wait for a browser, some seconds of two bars; the oldest go."""
@@ -108,14 +102,18 @@ class Teller:
         """Listen no more."""
         self._outlet.leave(self._mine)
 
-    def take(self, *, frames: bool) -> list[Line]:
-        """What has come since, oldest first; without frames where nobody looks on."""
-        lines: list[Line] = []
+    def take(self, *, frames: bool) -> list[tuple[str, str]]:
+        """What has come since, oldest first: a kind of news, or `bars`, and what is said of it, JSON.
+
+        Args:
+            frames: Tell of frames, too; False where nobody looks on.
+        """
+        lines: list[tuple[str, str]] = []
         for news in self._mine.take(0):
             if news.kind == "frame":
                 self._keep(news.value)
                 if frames:
-                    lines.append(("frame", (frame_values(news.value, self._columns), news.late_ms)))
+                    lines.append(("frame", self._frame(news)))
             else:
                 lines += ((kind, json.dumps(values)) for kind, values in self._told(news))
         return lines
@@ -153,6 +151,10 @@ class Teller:
         }
         return [*self._bars_of(fix), (kind, fix_line(fix) | on_the_map)]
 
+    def _frame(self, news: News) -> str:
+        late = "null" if news.late_ms is None else f"{news.late_ms:.3f}"
+        return f'{format_frame(news.value, self._columns)[:-1]}, "late_ms": {late}}}'
+
     def _message(self, message: ReceivedMessage) -> tuple[str, dict[str, Any]]:
         """A message; where its kind, which may be a plugin's, fails to show it, how many did and why."""
         try:
@@ -180,14 +182,6 @@ class Teller:
 
 def _not_a_number(name: str) -> None:
     raise ValueError(f"a message kind shows {name}, which JSON has not")
-
-
-def line_text(said: str | FrameNews) -> str:
-    """A line as JSON."""
-    if isinstance(said, str):
-        return said
-    frame, late_ms = said
-    return f'{format_values(frame)[:-1]}, "late_ms": {"null" if late_ms is None else f"{late_ms:.3f}"}}}'
 
 
 def _told(picture: Picture, bars: Sequence[Frame]) -> str:

@@ -17,7 +17,7 @@ from email.utils import formatdate
 from http import HTTPStatus
 from importlib.resources import files
 from ipaddress import ip_address
-from typing import TYPE_CHECKING, Any, Final, Protocol
+from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
 
 from markupsafe import Markup
@@ -26,7 +26,8 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.desk import cannot_listen, stop_listening
-from evlcp_sdk.live.telling import MOST_WAITING, PICTURES_PER_S, FrameNews, Line, Shot, line_text
+from evlcp_sdk.live.recorder import Recorder
+from evlcp_sdk.live.telling import MOST_WAITING, PICTURES_PER_S, Teller
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_hex
 from evlcp_sdk.report.pages import TEMPLATES, render_page
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
-__all__ = ["Feed", "RecordKeeper", "Viewer", "page"]
+__all__ = ["Viewer", "page"]
 
 _MOST_BROWSERS: Final = 16
 _FINISH_S: Final = 1.0
@@ -68,47 +69,6 @@ class _Browser:
         self.waiting.append(line)
 
 
-class Feed(Protocol):
-    """What a view shows: a `Teller`, or one of another process."""
-
-    @property
-    def dropped(self) -> int:
-        """As of `Teller`."""
-
-    @property
-    def ended(self) -> bool:
-        """The same."""
-
-    async def turn(self) -> None:
-        """The same."""
-
-    def take(self, *, frames: bool) -> list[Line]:
-        """The same."""
-
-    def shot(self) -> Shot | None:
-        """The same."""
-
-    def ask(self) -> None:
-        """The same."""
-
-    def leave(self) -> None:
-        """The same."""
-
-
-class RecordKeeper(Protocol):
-    """What records as browsers ask: a `Recorder`, or one of another process."""
-
-    @property
-    def state(self) -> dict[str, Any]:
-        """As of `Recorder`."""
-
-    def start(self) -> None:
-        """Begin a file."""
-
-    def stop(self) -> None:
-        """End the file."""
-
-
 class Viewer:
     """Serves the page and what it shows; runs in the loop of a `Desk`.
 
@@ -128,14 +88,14 @@ class Viewer:
 
     def __init__(
         self,
-        feed: Feed,
+        feed: Teller,
         links: Mapping[str, Link],
         *,
         name: str,
         sites: int = 0,
         host: str = "127.0.0.1",
         port: int = 0,
-        recorder: RecordKeeper | None = None,
+        recorder: Recorder | None = None,
     ) -> None:
         self._feed, self._recorder = feed, recorder
         self._name, self._links, self._sites = name, links, sites
@@ -333,11 +293,8 @@ class Viewer:
 
     # What browsers are sent
 
-    def _tell(self, kind: str, said: str | FrameNews) -> None:
+    def _tell(self, kind: str, line: str) -> None:
         """Send something to all browsers, and keep what later ones are sent."""
-        if kind == "frame" and not self._browsers:
-            return
-        line = line_text(said)
         if kind in self._kept:
             self._kept[kind].append(line)
         elif kind != "frame":

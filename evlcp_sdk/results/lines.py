@@ -9,10 +9,7 @@ from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.values import Fix, Frame, Packet
 
-__all__ = ["FrameValues", "JsonLines", "fix_line", "format_frame", "format_values", "frame_values"]
-
-FrameValues = tuple[Any, ...]
-"""What a frame's line says, as values that take little to hand to another process: see `frame_values`."""
+__all__ = ["JsonLines", "fix_line", "format_frame"]
 
 
 class JsonLines:
@@ -61,45 +58,20 @@ def format_frame(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> str:
         frame: The frame.
         columns: `FRAME_COLUMNS`, and others behind them.
     """
-    return format_values(frame_values(frame, columns))
-
-
-def frame_values(frame: Frame, columns: Sequence[str] = FRAME_COLUMNS) -> FrameValues:
-    """The values of a frame's line: of `FRAME_COLUMNS`, then names and values of the columns behind them."""
     soft, found = frame.soft, frame.range
-    more = columns[len(FRAME_COLUMNS) :]
-    return (
-        frame.transmitter,
-        frame.packet,
-        frame.frame,
-        frame.t_us,
-        symbol_list(soft.symbols),
-        soft.quality,
-        found.distance_m,
-        found.sigma_m,
-        frame.x_px,
-        frame.y_px,
-        frame.echo_of,
-        [(name, frame_value(frame, name)) for name in more] if more else (),
-    )
-
-
-def format_values(values: FrameValues) -> str:
-    """The line of a frame as JSON, of what `frame_values` gives."""
     # Written out, as there are hundreds a second: rounding and `json` take twice as long.
-    transmitter, packet, frame, t_us, symbols, quality, distance_m, sigma_m, x_px, y_px, echo_of, more = (
-        values
-    )
     numbers = (
-        f'{{"line": "frame", "transmitter": {transmitter}, "packet": {packet}, "frame": {frame},'
-        f' "t_us": {t_us:.2f}, "symbols": {symbols}, "quality": {quality:.4f},'
-        f' "distance_m": {distance_m:.4f}, "distance_sigma_m": {sigma_m:.4f},'
-        f' "x_px": {x_px:.3f}, "y_px": {y_px:.3f}, "echo_of": {echo_of}'
+        f'{{"line": "frame", "transmitter": {frame.transmitter}, "packet": {frame.packet},'
+        f' "frame": {frame.frame}, "t_us": {frame.t_us:.2f}, "symbols": {symbol_list(soft.symbols)},'
+        f' "quality": {soft.quality:.4f}, "distance_m": {found.distance_m:.4f},'
+        f' "distance_sigma_m": {found.sigma_m:.4f}, "x_px": {frame.x_px:.3f}, "y_px": {frame.y_px:.3f},'
+        f' "echo_of": {frame.echo_of}'
     )
     text = (
         numbers.replace("None", "null").replace("nan", "null").replace("-inf", "null").replace("inf", "null")
     )
-    for name, value in more:
+    for name in columns[len(FRAME_COLUMNS) :]:
+        value = frame_value(frame, name)
         text += f', "{name}": {json.dumps(number_or_none(value, 4) if isinstance(value, float) else value)}'
     return text + "}"
 

@@ -264,7 +264,7 @@ def test_what_is_wrong_with_a_replay_is_said(url: str, told: str, demo_raw: Path
 
 
 def test_what_the_page_is_asked_for_needs_a_page(evlcp: Callable[..., Any], demo_raw: Path) -> None:
-    for given in (["--view-record"], ["--view-apart"], ["--view-port", "8080"], ["--view-host", "0.0.0.0"]):
+    for given in (["--view-record"], ["--view-port", "8080"], ["--view-host", "0.0.0.0"]):
         done = evlcp("live", f"replay:{demo_raw}", *given)
         assert done.code == 2
         assert f"Invalid value for {given[0]}: needs --view" in done.err

@@ -222,10 +222,9 @@ class Failing(TextKind):
         return {"text": value}
 
 
-@pytest.mark.parametrize("apart", [False, True])
-def test_a_message_that_cannot_be_shown_is_counted_and_said(apart: bool) -> None:
+def test_a_message_that_cannot_be_shown_is_counted_and_said() -> None:
     outlet = Outlet()
-    with Services(Serving(view=True, apart=apart), outlet, LINKS, name="a name") as services:
+    with Services(Serving(view=True), outlet, LINKS, name="a name") as services:
         stage = Stage(outlet, services)
         with stage.connect() as link:
             link.recv(5)
@@ -313,51 +312,6 @@ def _until(true: Callable[[], bool], most_s: float = 10.0) -> None:
     while not true():
         assert time.monotonic() < until
         time.sleep(0.01)
-
-
-def test_a_process_of_its_own_shows_the_same(tmp_path: Path) -> None:
-    outlet = Outlet()
-    serving = Serving(view=True, apart=True, record_to=tmp_path)
-    with Services(serving, outlet, LINKS, name="apart") as services:
-        stage = Stage(outlet, services)
-        assert stage.ask("/")[0] == 403
-        assert stage.ask("/" + stage.url.split("/", 3)[3])[0] == 200
-        with (
-            pytest.raises(ConfigError, match="a port of it that is free"),
-            Services(Serving(view=True, apart=True, port=stage.port), Outlet(), LINKS, name="x"),
-        ):
-            pass
-        with stage.connect() as link:
-            assert json.loads(link.recv(5))["about"]["may_record"] is True
-            link.send('{"next": true}')
-            stage.frame(0)
-            head, _ = unpacked(link.recv(5))
-            assert head["news"][0]["symbols"] == FRAMES[0].soft.symbols.tolist()
-            link.send('{"next": true}')
-            for n in range(1000):
-                stage.picture(20_000 + n)
-                time.sleep(0.01)
-                if services.pictures is not None and services.pictures.newest is not None:
-                    break
-            head, picture = unpacked(link.recv(5))
-            with Image.open(io.BytesIO(picture)) as shown:
-                assert np.argwhere(np.array(shown)).tolist() == [[7, 5]]
-            link.send('{"record": true}')
-            _until(lambda: outlet.wanted("events"))
-            publish(outlet, 2_000)
-            link.send('{"record": false}')
-            _until(lambda: any(tmp_path.glob("live-*.raw")))
-            link.send('{"next": true}')
-            outlet.publish("end", 0, {"status": "complete", "error": None, "result": "done"})
-            outlet.close()
-            lines: list[str] = []
-            while True:
-                head, _ = unpacked(link.recv(5))
-                lines += [line["line"] for line in head["news"]]
-                if "end" in lines:
-                    break
-                # Behind the end nobody may listen any more.
-                link.send('{"next": true}')
 
 
 def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
