@@ -1,7 +1,6 @@
 """What the `evlcp` command line consists of, plugins' commands included."""
 
 import importlib
-import inspect
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +12,6 @@ from typer.core import TyperGroup
 from typer.models import CommandInfo, TyperInfo
 
 from evlcp_sdk.cli._common import echo, hush, loaded, log_on_stderr
-from evlcp_sdk.cli._front import print_front
 from evlcp_sdk.printable import printable
 
 if TYPE_CHECKING:
@@ -78,21 +76,6 @@ class _Commands(TyperGroup):
                 self.commands[name] = _built(name, self.late[name])
         return super().get_command(ctx, cmd_name)
 
-    def first_words(self, ctx: Any) -> list[tuple[str, str]]:
-        """Name and help of each command that is shown."""
-        rows = []
-        for name in self.list_commands(ctx):
-            info = self.late.get(name)
-            if isinstance(info, CommandInfo):
-                said = info.short_help or info.help or inspect.getdoc(info.callback)
-                hidden = info.hidden
-            else:
-                command = self.commands[name] if info is None else _built(name, _childless(info))
-                said, hidden = command.short_help or command.help, command.hidden
-            if not hidden:
-                rows.append((name, said or ""))
-        return rows
-
     def make_context(self, *args: Any, **more: Any) -> Any:
         with _printable_faults():
             return super().make_context(*args, **more)
@@ -103,9 +86,6 @@ class _Commands(TyperGroup):
             loaded()
         with _printable_faults():
             return super().invoke(ctx)
-
-    def format_help(self, ctx: Any, formatter: Any) -> None:
-        print_front(self, ctx)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         found = super().resolve_command(ctx, args)
@@ -170,16 +150,6 @@ def _leave_unset(parameter: Any) -> None:
     process = parameter.process_value
     unset = () if parameter.multiple or parameter.nargs == -1 else None
     parameter.process_value = lambda ctx, value: unset if value is None else process(ctx, value)
-
-
-def _childless(info: TyperInfo) -> TyperInfo:
-    """A group without its commands."""
-    group = copy(info)
-    group.typer_instance = copy(info.typer_instance)
-    if group.typer_instance is not None:
-        group.typer_instance.registered_commands = []
-        group.typer_instance.registered_groups = []
-    return group
 
 
 def _called_late(app: typer.Typer) -> Any:
