@@ -129,9 +129,10 @@ def _solve(matrix: Floats, side: Floats, damping: float) -> Floats | None:
     damped = matrix.copy()
     damped.flat[:: len(matrix) + 1] *= 1 + damping
     scale = 1 / np.sqrt(np.maximum(np.diag(damped), 1e-300))
+    scaled = damped * scale * scale[:, None]
     try:
-        root = np.linalg.cholesky(damped * scale * scale[:, None])
+        np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError:
         return None
-    found: Floats = np.linalg.solve(root.T, np.linalg.solve(root, side * scale)) * scale
+    found: Floats = np.linalg.solve(scaled, side * scale) * scale
     return found

@@ -164,18 +164,19 @@ def _solve(problem: Problem, fit: Fit) -> _Solution | None:
     bars = len(problem.transmitters)
     rows = equations.rows.reshape(-1, 2, equations.rows.shape[1])
     miss = equations.miss.reshape(-1, 2)
-    info, right = np.zeros((bars, SHARED, SHARED)), np.zeros((bars, SHARED))
-    gain, own = np.zeros((bars, LOCAL, SHARED)), np.zeros((bars, LOCAL))
-    for bar in range(bars):
-        mine, first = problem.bar == bar, SHARED + LOCAL * bar
-        shared = rows[mine, :, :SHARED].reshape(-1, SHARED)
-        local = rows[mine, :, first : first + LOCAL].reshape(-1, LOCAL)
-        off, between = miss[mine].ravel(), local.T @ shared
-        both = np.column_stack([between, local.T @ off - fit.local[bar]])
-        follow = np.linalg.solve(local.T @ local + np.eye(LOCAL), both)
-        gain[bar], own[bar] = follow[:, :-1], follow[:, -1]
-        info[bar] = shared.T @ shared - between.T @ gain[bar]
-        right[bar] = shared.T @ off - between.T @ own[bar]
+    # Of each bar what its own errors, the shared unknowns and the misses say of one another.
+    size = LOCAL + SHARED + 1
+    whole_bar = np.empty((bars, size, size))
+    for bar, mine in enumerate(problem.parts):
+        first, part = SHARED + LOCAL * bar, rows[mine].reshape(-1, rows.shape[2])
+        of_bar = np.column_stack([part[:, first : first + LOCAL], part[:, :SHARED], miss[mine].ravel()])
+        whole_bar[bar] = of_bar.T @ of_bar
+    whole_bar[:, :LOCAL, -1] -= fit.local
+    between = whole_bar[:, :LOCAL, LOCAL:]
+    follow = np.asarray(np.linalg.solve(whole_bar[:, :LOCAL, :LOCAL] + np.eye(LOCAL), between), np.float64)
+    gain, own = follow[:, :, :-1], follow[:, :, -1]
+    left = whole_bar[:, LOCAL:-1, LOCAL:] - between[:, :, :-1].transpose(0, 2, 1) @ follow
+    info, right = left[:, :, :-1], left[:, :, -1]
     angles = equations.angles[:, :SHARED]
     whole = info.sum(0) + angles.T @ angles
     whole.flat[LENS * (SHARED + 1) :: SHARED + 1] += 1.0

@@ -96,6 +96,37 @@ class Equations:
         return matrix, side
 
 
+@dataclass(frozen=True, eq=False)
+class _Known:
+    """What is the same of a problem wherever it is made linear: of each point, with the sigmas of its bar.
+
+    Attributes:
+        place: Sigma of its bar's place, m, float64 (n, 1).
+        turn: Of the turn, radians.
+        stretched: Its arm from its bar's centre by one sigma of the bar's length, m, float64 (n, 3).
+        arm: What a turn does to it, float64 (n, 3, 3).
+        root: A root of the covariance of its bar's shift in the image, px, float64 (n, 2, 2).
+        even: What makes its errors even in all directions, float64 (n, 2, 2).
+    """
+
+    place: Floats
+    turn: Floats
+    stretched: Floats
+    arm: Floats
+    root: Floats
+    even: Floats
+
+    @classmethod
+    def of(cls, problem: Problem) -> "_Known":
+        known: _Known | None = vars(problem).get("_known")
+        if known is None:
+            sigma, arm_m = problem.bar_sigma[problem.bar], problem.points[:, 3:6]
+            root, even = _symmetric(sigma[:, 3:6]), _symmetric(sigma[:, 6:9])
+            known = cls(sigma[:, :1], sigma[:, 1:2], arm_m * sigma[:, 2:3], skewed(arm_m), root, even)
+            vars(problem)["_known"] = known
+        return known
+
+
 def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
     """The problem at a point; None where a point is behind the camera.
 
@@ -104,23 +135,20 @@ def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
         at: The point.
         huber: Misses in sigmas beyond which a point weighs less.
     """
-    points, bar = problem.points, problem.bar
-    own, sigma, arm = at.local[bar], problem.bar_sigma[bar], skewed(points[:, 3:6])
-    place, turn, length = sigma[:, 0:1], sigma[:, 1:2], sigma[:, 2:3]
-    offset = points[:, :3] - at.position + place * own[:, 3:6] + length * own[:, 2:3] * points[:, 3:6]
-    offset += _by(turn * own[:, 6:9], arm)
+    points, known, own = problem.points, _Known.of(problem), at.local[problem.bar]
+    offset = points[:, :3] - at.position + known.place * own[:, 3:6] + own[:, 2:3] * known.stretched
+    offset += _by(known.turn * own[:, 6:9], known.arm)
     seen = offset @ at.rotation
     if not (seen[:, 2] > 0).all():
         return None
     camera = _erring(problem.camera, problem.lens_root @ at.lens) if at.lens.any() else problem.camera
     direction = seen[:, :2] / seen[:, 2:]
     expected = camera.distort(direction)
-    root, even = _symmetric(sigma[:, 3:6]), _symmetric(sigma[:, 6:9])
-    miss = _by((points[:, 6:8] - expected - _by(own[:, :2], root)) * points[:, 8:9], even)
+    miss = _by((points[:, 6:8] - expected - _by(own[:, :2], known.root)) * points[:, 8:9], known.even)
     size = np.hypot(miss[:, 0], miss[:, 1])
     weight = huber / np.maximum(size, huber) if huber < math.inf else np.ones(len(size))
     cost = float((np.where(size > huber, huber * (2 * size - huber), size**2)).sum())
-    white = even * (np.sqrt(weight) * points[:, 8])[:, None, None]
+    white = known.even * (np.sqrt(weight) * points[:, 8])[:, None, None]
     by_point = _by_point(white @ camera.distort_slope(direction), direction, seen[:, 2], at.rotation)
     rows = np.zeros((len(points), 2, SHARED + at.local.size))
     rows[:, :, :3] = -by_point
@@ -131,16 +159,16 @@ def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
         rows[:, :, LENS:SHARED] = white @ (_by_lens(camera, direction, expected) @ problem.lens_root)
     local = np.concatenate(
         [
-            white @ root,
-            by_point @ (points[:, 3:6] * length)[:, :, None],
-            by_point * place[:, :, None],
-            by_point @ arm * -turn[:, :, None],
+            white @ known.root,
+            by_point @ known.stretched[:, :, None],
+            by_point * known.place[:, :, None],
+            by_point @ known.arm * -known.turn[:, :, None],
         ],
         -1,
     )
-    for number in range(len(at.local)):
+    for number, mine in enumerate(problem.parts):
         first = SHARED + LOCAL * number
-        rows[bar == number, :, first : first + LOCAL] = local[bar == number]
+        rows[mine, :, first : first + LOCAL] = local[mine]
     angles, angles_miss = _attitude(problem, at.rotation, rows.shape[2])
     errors = np.concatenate([at.lens, at.local.ravel()])
     return Equations(

@@ -149,6 +149,12 @@ class Problem:
     free: NDArray[np.bool_]
     shaken_rad: float
 
+    @cached_property
+    def parts(self) -> list[slice]:
+        """Where each bar's points are."""
+        ends = np.cumsum(np.bincount(self.bar, minlength=len(self.bar_sigma))).tolist()
+        return [slice(first, end) for first, end in zip([0, *ends], ends, strict=False)]
+
     @classmethod
     def of(
         cls,

@@ -79,6 +79,8 @@ class CameraModel:
 
     def distort(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
         """Where directions (x / z, y / z), float64 (..., 2), are seen: (column, row), px, the same shape."""
+        if self.is_pinhole:
+            return direction * self.focal_px + self.centre_px
         u, v = direction[..., 0], direction[..., 1]
         r2 = u * u + v * v
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -88,6 +90,8 @@ class CameraModel:
 
     def distort_slope(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives of `distort`, px, float64 (..., 2, 2): of column and row by the direction's parts."""
+        if self.is_pinhole:
+            return np.broadcast_to(self.focal_px * np.eye(2), (*direction.shape[:-1], 2, 2))
         u, v = direction[..., 0], direction[..., 1]
         r2 = u * u + v * v
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
