@@ -33,10 +33,10 @@ from scipy import special
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.judgement import Pose
+from evlcp_sdk.place.fit_assessment import Pose
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.pose import solve_pose
-from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -304,7 +304,7 @@ def row(world: World, fault: Fault | None, fixes: int, seed: int, spec: ErrorMod
         if fault is not None:
             fault(here, rng)
         found = solve_pose(here.views, here.camera, here.attitude, spec, here.sigma)
-        if isinstance(found, Refusal):
+        if isinstance(found, Rejection):
             # What the geometry does not allow has nothing to do with faults.
             allowed += found.kind in ("misfit", "not-determined")
             continue

@@ -43,13 +43,13 @@ if TYPE_CHECKING:
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.outlet import Outlet
     from evlcp_sdk.live.pictures import PictureSlot
+    from evlcp_sdk.place.bar_registry import BarRegistry
     from evlcp_sdk.place.calibration import Calibrated, CalibrationView
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.place.observations import BarView
     from evlcp_sdk.place.points import SeenPoints
     from evlcp_sdk.place.poses import KnownPose
     from evlcp_sdk.place.survey import SurveyedBar
-    from evlcp_sdk.place.whereabouts import Whereabouts
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.scene.sites import BarSite, LocalAxes
 
@@ -733,10 +733,10 @@ def _views(
     source: str,
 ) -> list[CalibrationView]:
     """What a recording shows at the times of known poses."""
+    from evlcp_sdk.place.bar_registry import BarRegistry
     from evlcp_sdk.place.observations import BarView
-    from evlcp_sdk.place.whereabouts import Whereabouts
 
-    who = Whereabouts(sites, link.position)
+    who = BarRegistry(sites, link.position)
     seen, _ = _seen_at(url, poses, {"": link}, registry, who, source)
     for how in who.contradicted.values():
         raise ConfigError(f"{url}: {how}")
@@ -769,7 +769,7 @@ def _seen_at(
     poses: Sequence[KnownPose],
     links: Mapping[str, Link],
     registry: Registry,
-    who: Whereabouts,
+    who: BarRegistry,
     source: str,
 ) -> tuple[list[dict[int, SeenPoints]], dict[int, str]]:
     """What `points_at` gives of each transmitter at the times of known poses; the link of each.
@@ -846,10 +846,10 @@ def survey(
         InputError: A recording cannot be read.
         ConfigError: A pose belongs to none of the recordings, or has no attitude, or too little was seen.
     """
+    from evlcp_sdk.place.bar_registry import BarRegistry
     from evlcp_sdk.place.error_model import ErrorModel
     from evlcp_sdk.place.observations import BarView
     from evlcp_sdk.place.survey import survey as survey_bars
-    from evlcp_sdk.place.whereabouts import Whereabouts
     from evlcp_sdk.scene.sites import LocalAxes
 
     registry = Registry.load() if registry is None else registry
@@ -862,10 +862,10 @@ def survey(
     axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)
     views: list[CalibrationView] = []
     sends: dict[int, str] = {}
-    heard: list[Whereabouts] = []
+    heard: list[BarRegistry] = []
     for url in recordings:
         mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
-        who = Whereabouts((), like.position)
+        who = BarRegistry((), like.position)
         seen, link_of = _seen_at(url, mine, links, registry, who, name)
         heard.append(who)
         ids = who.ids

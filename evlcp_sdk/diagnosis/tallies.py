@@ -16,11 +16,11 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
 
 if TYPE_CHECKING:
-    from evlcp_sdk.place import refusals, trajectory
-    from evlcp_sdk.place.learnt import Learnt
+    from evlcp_sdk.place import rejections, trajectory
+    from evlcp_sdk.place.estimated_biases import EstimatedBias
     from evlcp_sdk.place.navigator import Navigator, Placed
 else:
-    refusals, trajectory = (Late(f"evlcp_sdk.place.{name}") for name in ("refusals", "trajectory"))
+    rejections, trajectory = (Late(f"evlcp_sdk.place.{name}") for name in ("rejections", "trajectory"))
 
 __all__ = [
     "MOST_MESSAGES",
@@ -359,7 +359,9 @@ class PositionTally:
             "fixes": self.given,
             "fixes_verified": self.verified,
             "last": None if self.last is None else _last(self.last),
-            "refused": {kind: self.refused[kind] for kind in refusals.REFUSALS if self.refused[kind]},
+            "refused": {
+                kind: self.refused[kind] for kind in rejections.REJECTION_REASONS if self.refused[kind]
+            },
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
             "suspects": dict(sorted(self.suspects.items())),
@@ -370,7 +372,7 @@ class PositionTally:
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
             "sites_contradicted": {str(n): how for n, how in positioner.contradicted.items()},
-            "learnt": [_learnt_row(one) for one in navigator.learnt()],
+            "learnt": [_learnt_row(one) for one in navigator.estimated_biases()],
             "origin": asdict(axes) if axes is not None else None,
             "bars_exact": [n for n, s in positioner.stands_at.items() if s.position_sigma_m is None],
             "heard": {str(n): one for n, one in sorted(positioner.ids.items())},
@@ -390,7 +392,7 @@ def _last(fix: Fix) -> dict[str, Any]:
     }
 
 
-def _learnt_row(one: Learnt) -> dict[str, Any]:
+def _learnt_row(one: EstimatedBias) -> dict[str, Any]:
     numbers = {name: getattr(one, name) for name in ("correction", "sigma", "stated_sigma")}
     return {
         "part": one.part,

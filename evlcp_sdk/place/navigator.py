@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.estimated_biases import EstimatedBias, estimate_biases, focal_share
 from evlcp_sdk.place.gnss import GnssLog, attitude_of, gnss_fix
-from evlcp_sdk.place.learnt import Learnt, focal_share, learnt
 from evlcp_sdk.place.positioner import BarKind, Positioner
 from evlcp_sdk.place.trajectory import (
     GNSS,
@@ -248,10 +248,12 @@ class Navigator:
     def _heading(self, t_us: float) -> tuple[float, float] | None:
         return None if self._state is None else heading_at(self._state, t_us, self._imu)
 
-    def learnt(self) -> list[Learnt]:
+    def estimated_biases(self) -> list[EstimatedBias]:
         """What the drive says so far of standing errors: of the camera, the attitude, the IMU, the sites."""
         link, sites = self._link, self.positioner.stands_at
-        return learnt(self._standing, link.camera, link.camera_sigma, self._attitude, sites, self._spec)
+        return estimate_biases(
+            self._standing, link.camera, link.camera_sigma, self._attitude, sites, self._spec
+        )
 
     def bars_enu_m(self) -> dict[int, Floats]:
         """Centres of the bars whose places are known, in the local axes, m, float64 (3,) each."""

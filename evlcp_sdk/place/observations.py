@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.points import SeenPoints
-from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
@@ -163,7 +163,7 @@ class Problem:
         attitude: Attitude | None,
         spec: ErrorModel,
         sigma: CameraSigma,
-    ) -> "Problem | Refusal":
+    ) -> "Problem | Rejection":
         """What the views give, or why that is too little for a position."""
         between = between_of(views)
         kept: list[int] = []
@@ -179,14 +179,14 @@ class Problem:
                 parts.append(_rows_of(view, whole, spec))
                 sigmas.append(_sigmas_of(view, whole, spec, between))
         if not kept:
-            return Refusal(
+            return Rejection(
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
             )
         points = np.concatenate(parts)
         bar = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
         shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
         told = _told(attitude, points, bar, len(kept), shaken_rad)
-        if isinstance(told, Refusal):
+        if isinstance(told, Rejection):
             return told
         known = sigma.known
         free = np.empty(14, np.bool_)
@@ -217,16 +217,16 @@ class Problem:
         """
         return max(2 * len(self.points) + self.angles - 6, 1)
 
-    def told(self, attitude: Attitude | None) -> "Problem | Refusal":
+    def told(self, attitude: Attitude | None) -> "Problem | Rejection":
         """The same where this is known of the attitude, or why that is too little."""
         told = _told(attitude, self.points, self.bar, len(self.transmitters), self.shaken_rad)
-        if isinstance(told, Refusal):
+        if isinstance(told, Rejection):
             return told
         free = self.free.copy()
         free[3:6] = told.pop("turns")
         return replace(self, attitude=attitude, free=free, **told)
 
-    def without(self, bar: int) -> "Problem | Refusal":
+    def without(self, bar: int) -> "Problem | Rejection":
         """The same without a bar, by its place among `transmitters`, or why the others are too few."""
         kept = self.bar != bar
         others = self.bar[kept]
@@ -274,11 +274,11 @@ def _told(
     """
     compass = attitude is not None and attitude.heading_deg is not None
     if not compass and bars == 1:
-        return Refusal("heading-unknown", "one bar gives a position only with the camera's heading known")
+        return Rejection("heading-unknown", "one bar gives a position only with the camera's heading known")
     if attitude is None:
         if bars < 3 or _flatness(points, bar, bars) < _INLINE:
             many = "two bars give" if bars == 2 else "bars in line give"
-            return Refusal("gravity-unknown", f"{many} a position only with gravity known")
+            return Rejection("gravity-unknown", f"{many} a position only with gravity known")
         return {
             "level": np.eye(3),
             "felt": np.zeros(3),

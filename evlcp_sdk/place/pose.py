@@ -15,12 +15,12 @@ from itertools import combinations
 import numpy as np
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.failed import failed_bar
+from evlcp_sdk.place.fault_estimate import estimate_fault
 from evlcp_sdk.place.fit import fit_pose
-from evlcp_sdk.place.judgement import FOCAL, Judged, Pose, covering, judged, misfits
+from evlcp_sdk.place.fit_assessment import FOCAL, AssessedPose, Pose, assess_fit, covering, misfits
 from evlcp_sdk.place.model import Fit
 from evlcp_sdk.place.observations import BarView, Problem
-from evlcp_sdk.place.refusals import Candidate, Refusal
+from evlcp_sdk.place.rejections import Candidate, Rejection
 from evlcp_sdk.place.starts import ODDS, is_hopeless, likely_starts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -57,7 +57,7 @@ def solve_pose(
     attitude: Attitude | None = None,
     spec: ErrorModel | None = None,
     sigma: CameraSigma | None = None,
-) -> Pose | Refusal:
+) -> Pose | Rejection:
     """Fit position and attitude to all image points.
 
     Huber's loss over the miss of each point in its sigmas; Levenberg-Marquardt from closed-form starts: with
@@ -78,11 +78,11 @@ def solve_pose(
     spec = ErrorModel() if spec is None else spec
     sigma = CameraSigma() if sigma is None else sigma
     problem = Problem.of(views, camera, attitude, spec, sigma)
-    if isinstance(problem, Refusal):
+    if isinstance(problem, Rejection):
         return problem
     found = _plain(problem)
     tests: Mapping[str, float]
-    if isinstance(found, Refusal):
+    if isinstance(found, Rejection):
         if found.kind != "not-determined":
             return found
         doubt, tests = found.detail, {}
@@ -109,10 +109,10 @@ def solve_pose(
                 return replace(pose, excluded=(name,), failed=_failed(problem, name, pose, tests))
         names = [name]
     names += rivals
-    if isinstance(found, Refusal) and not names:
+    if isinstance(found, Rejection) and not names:
         return found
     could = f"; it may be {' or '.join(names)}" if names else ""
-    return Refusal("misfit", doubt + could, suspects=tuple(names))
+    return Rejection("misfit", doubt + could, suspects=tuple(names))
 
 
 def _fits_without_one(
@@ -122,8 +122,8 @@ def _fits_without_one(
     fits: list[tuple[str, Pose]] = []
     unsure = []
     most = max(tests.values(), default=0.0)
-    likely: list[tuple[str, Problem | Refusal]] = []
-    others: list[tuple[str, Problem | Refusal]] = []
+    likely: list[tuple[str, Problem | Rejection]] = []
+    others: list[tuple[str, Problem | Rejection]] = []
     for part in _without(problem, sigma):
         hopeless = tests.get(part[0], most) < _HOPELESS * most and most > _FAR
         (others if hopeless else likely).append(part)
@@ -132,7 +132,7 @@ def _fits_without_one(
         if len(fits) == 1:
             break
         for name, other in parts:
-            again = other if isinstance(other, Refusal) else _explained(other)
+            again = other if isinstance(other, Rejection) else _explained(other)
             if isinstance(again, Pose):
                 fits.append((name, again))
             elif again is not None:
@@ -145,7 +145,7 @@ def _failed(problem: Problem, name: str, pose: Pose, tests: Mapping[str, float])
     """The bar of a name; None where that is another part."""
     for i, number in enumerate(problem.transmitters):
         if name == f"bar {number}":
-            return failed_bar(problem, i, pose, tests[name], len(tests)) if name in tests else None
+            return estimate_fault(problem, i, pose, tests[name], len(tests)) if name in tests else None
     return None
 
 
@@ -164,15 +164,15 @@ def fitting_focal_mm(
     spec = ErrorModel() if spec is None else spec
     sigma = CameraSigma() if sigma is None else sigma
 
-    def tried(focal_mm: float, free: float) -> Problem | Refusal:
+    def tried(focal_mm: float, free: float) -> Problem | Rejection:
         other = replace(camera, focal_mm=focal_mm)
         step_mm = float(np.hypot(sigma.focal_mm, free * focal_mm))
         return Problem.of(views, other, attitude, spec, replace(sigma, focal_mm=step_mm, correlation=()))
 
     def misfit(focal_mm: float, free: float) -> float:
         problem = tried(focal_mm, free)
-        starts = () if isinstance(problem, Refusal) else likely_starts(problem)
-        if isinstance(problem, Refusal) or not starts:
+        starts = () if isinstance(problem, Rejection) else likely_starts(problem)
+        if isinstance(problem, Rejection) or not starts:
             return math.inf
         tries = starts[:1] if is_hopeless(problem, starts[0]) else starts
         return min(fit_pose(problem, start).cost for start in tries)
@@ -185,8 +185,8 @@ def fitting_focal_mm(
         if math.isinf(fit[around]):
             return math.nan
     given = tried(around, _FREE_FOCAL / 5)
-    found = given if isinstance(given, Refusal) else _plain(given)
-    return around if isinstance(found, Judged) and not found.doubt else math.nan
+    found = given if isinstance(given, Rejection) else _plain(given)
+    return around if isinstance(found, AssessedPose) and not found.doubt else math.nan
 
 
 def _mixed_up(
@@ -214,7 +214,7 @@ def _mixed_up(
     return found
 
 
-def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Problem | Refusal]]:
+def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Problem | Rejection]]:
     """The same without each part that may be at fault, and its name."""
     bars, attitude = problem.transmitters, problem.attitude
     if len(bars) > 1:
@@ -228,47 +228,47 @@ def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Proble
     yield FOCAL, problem.seen_by(replace(sigma, focal_mm=focal_mm, correlation=()))
 
 
-def _plain(problem: Problem) -> Judged | Refusal:
+def _plain(problem: Problem) -> AssessedPose | Rejection:
     """The pose by all that is given, whether it is to be believed or not."""
     starts = likely_starts(problem)
     if not starts:
-        return Refusal("not-determined", "no place from which the bars would be seen so")
+        return Rejection("not-determined", "no place from which the bars would be seen so")
     first = fit_pose(problem, starts[0])
     if is_hopeless(problem, starts[0]) and misfits(problem, first):
         # What is off matters, not where exactly the fit would end, nor how surely it is there.
-        found = judged(problem, first)
-        return (
-            found if isinstance(found, Judged) else Refusal("not-determined", "nothing explains what is seen")
-        )
+        found = assess_fit(problem, first)
+        if isinstance(found, AssessedPose):
+            return found
+        return Rejection("not-determined", "nothing explains what is seen")
     fits = [fit for fit in (first, *(fit_pose(problem, start) for start in starts[1:])) if fit.settled]
     if not fits:
-        return Refusal("not-determined", "the fit does not settle: the bars do not determine a position")
+        return Rejection("not-determined", "the fit does not settle: the bars do not determine a position")
     return _settled(problem, fits)
 
 
-def _explained(problem: Problem) -> Pose | Refusal | None:
+def _explained(problem: Problem) -> Pose | Rejection | None:
     """The pose by all that is given; None where that does not fit together; a refusal: it may do."""
     starts = likely_starts(problem)
     if not starts:
-        return Refusal("not-determined", "no place from which the bars would be seen so")
+        return Rejection("not-determined", "no place from which the bars would be seen so")
     if is_hopeless(problem, starts[0]):
-        return None if starts[0].settled else Refusal("not-determined", "the fit does not settle")
+        return None if starts[0].settled else Rejection("not-determined", "the fit does not settle")
     fits = [fit for start in starts if (fit := fit_pose(problem, start)).settled]
     if not fits:
-        return Refusal("not-determined", "the fit does not settle")
+        return Rejection("not-determined", "the fit does not settle")
     if all(misfits(problem, fit) for fit in fits):
         return None
     found = _settled(problem, fits)
-    if isinstance(found, Refusal):
+    if isinstance(found, Rejection):
         return found
     return None if found.doubt else found.pose
 
 
-def _settled(problem: Problem, fits: Sequence[Fit]) -> Judged | Refusal:
-    """The likeliest of some fits, judged; refused where another one is as likely."""
+def _settled(problem: Problem, fits: Sequence[Fit]) -> AssessedPose | Rejection:
+    """The likeliest of some fits, assessed; refused where another one is as likely."""
     best = min(fits, key=lambda fit: fit.cost)
-    found = judged(problem, best)
-    if isinstance(found, Refusal):
+    found = assess_fit(problem, best)
+    if isinstance(found, Rejection):
         return found
     known = [best]
     for other in sorted(fits, key=lambda fit: fit.cost):
@@ -277,7 +277,7 @@ def _settled(problem: Problem, fits: Sequence[Fit]) -> Judged | Refusal:
     if len(known) > 1:
         apart_m = float(np.linalg.norm(known[1].position - best.position))
         detail = f"two positions {apart_m:.2f} m apart fit the image alike"
-        return Refusal("two-solutions", detail, tuple(_candidate(problem, fit, best) for fit in known))
+        return Rejection("two-solutions", detail, tuple(_candidate(problem, fit, best) for fit in known))
     return found
 
 
@@ -291,6 +291,6 @@ def _apart(fit: Fit, others: Sequence[Fit], pose: Pose) -> bool:
 
 
 def _candidate(problem: Problem, fit: Fit, best: Fit) -> Candidate:
-    found = judged(problem, fit)
-    spread = found.pose.covariance[:3, :3] if isinstance(found, Judged) else np.full((3, 3), math.nan)
+    found = assess_fit(problem, fit)
+    spread = found.pose.covariance[:3, :3] if isinstance(found, AssessedPose) else np.full((3, 3), math.nan)
     return Candidate(fit.position, fit.rotation, spread, math.exp((best.cost - fit.cost) / 2))

@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.place.bar_registry import BarRegistry
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at
 from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
-from evlcp_sdk.place.refusals import Refusal
-from evlcp_sdk.place.whereabouts import Whereabouts
+from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -85,7 +85,7 @@ class Positioner:
         self._spec = ErrorModel() if spec is None else spec
         self._links: dict[int, str] = {}
         only = next(iter(self._kinds.values())).link if len(self._kinds) == 1 else ""
-        self._bars = Whereabouts(sites, self._spec, only)
+        self._bars = BarRegistry(sites, self._spec, only)
         self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
         self._contradicts: tuple[list[BarView], Attitude | None] | None = None
@@ -232,10 +232,10 @@ class Positioner:
         """The fix of bars whose places are known in the axes of here; or why there is none."""
         attitude_now = self._attitude_at(t_us)
         pose = solve_pose(sited, self._camera, attitude_now, self._spec, self._camera_sigma)
-        contradicts = pose.kind == "misfit" if isinstance(pose, Refusal) else bool(pose.excluded)
+        contradicts = pose.kind == "misfit" if isinstance(pose, Rejection) else bool(pose.excluded)
         if contradicts and self._contradicts is None:
             self._contradicts = sited, attitude_now
-        if isinstance(pose, Refusal):
+        if isinstance(pose, Rejection):
             refused = Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
             others = _alternatives(pose, here, axes)
             return replace(refused, alternatives=others, suspects=pose.suspects)
@@ -280,7 +280,7 @@ def _turned(failed: FailedBar | None, turn: NDArray[np.float64]) -> FailedBar | 
     return replace(failed, off_m=turn @ failed.off_m, covariance_m2=turn @ failed.covariance_m2 @ turn.T)
 
 
-def _alternatives(refusal: Refusal, here: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:
+def _alternatives(refusal: Rejection, here: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:
     """The poses that a refusal leaves open, on earth."""
     turn = axes.turn_from(here)
     found = []

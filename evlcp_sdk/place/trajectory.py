@@ -15,9 +15,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.carried import Carried, carried, imu_sigmas
-from evlcp_sdk.place.chances import chi_square
+from evlcp_sdk.place.dead_reckoning import Reckoned, imu_sigmas, reckon
 from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.scene.swing import Swing
 from evlcp_sdk.values import Fix
 
@@ -479,7 +479,7 @@ def _motion(
     return np.append(mean, np.zeros(biases)), move, wide + new @ new.T, tuple(causes), way.turn_rad
 
 
-def _way(point: TrajectoryPoint, swing: Swing, own: slice | None, spec: ErrorModel) -> tuple[Carried, int]:
+def _way(point: TrajectoryPoint, swing: Swing, own: slice | None, spec: ErrorModel) -> tuple[Reckoned, int]:
     """Position and velocity as a swing carries them, and how many biases it has."""
     biases = len(imu_sigmas(swing, spec))
     imu = np.zeros(biases) if own is None else point.mean[own][:biases]
@@ -489,7 +489,7 @@ def _way(point: TrajectoryPoint, swing: Swing, own: slice | None, spec: ErrorMod
         swing = replace(swing, push_m_s2=None)
         imu = imu[: len(imu_sigmas(swing, spec))]
     sigma = math.radians(point.heading_sigma_deg)
-    way = carried(swing, point.mean[3:_MOTION], math.radians(heading), sigma, imu, spec)
+    way = reckon(swing, point.mean[3:_MOTION], math.radians(heading), sigma, imu, spec)
     unused = np.zeros((_MOTION, biases - way.by_imu.shape[1]))
     return replace(way, by_imu=np.concatenate([way.by_imu, unused], 1)), biases
 

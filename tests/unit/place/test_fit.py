@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.fit import fit_pose
-from evlcp_sdk.place.judgement import Judged, _doubted, _solve, _test, judged
+from evlcp_sdk.place.fit_assessment import AssessedPose, _doubted, _solve, _test, assess_fit
 from evlcp_sdk.place.model import FOCAL_UNIT, Fit, linearize, move
 from evlcp_sdk.place.observations import (
     BarView,
@@ -258,8 +258,8 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     p, position, rotation = problem(np.random.default_rng(12), bars, noise=1.0)
     fit = fit_pose(p, Fit.at(p, position, rotation))
     assert fit.settled
-    found, equations = judged(p, fit), linearize(p, fit, SPEC.huber_sigmas)
-    assert isinstance(found, Judged)
+    found, equations = assess_fit(p, fit), linearize(p, fit, SPEC.huber_sigmas)
+    assert isinstance(found, AssessedPose)
     assert equations is not None
     pose, keep = found.pose, p.unknowns
     spread = np.zeros((14 + 9 * bars, 14 + 9 * bars))
@@ -285,8 +285,8 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
     p, position, rotation = problem(np.random.default_rng(12), 3, noise=1.0)
     p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=0.0))
     fit = fit_pose(p, Fit.at(p, position, rotation))
-    found, solution = judged(p, fit), _solve(p, fit)
-    assert isinstance(found, Judged)
+    found, solution = assess_fit(p, fit), _solve(p, fit)
+    assert isinstance(found, AssessedPose)
     assert solution is not None
     risk = stats.chi2.isf(SPEC.risk, 1)
     for b in range(3):

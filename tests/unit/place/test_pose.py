@@ -13,11 +13,11 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.failed import failed_bar
-from evlcp_sdk.place.judgement import Pose
+from evlcp_sdk.place.fault_estimate import estimate_fault
+from evlcp_sdk.place.fit_assessment import Pose
 from evlcp_sdk.place.observations import BarView, Problem, project_bars
 from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
-from evlcp_sdk.place.refusals import REFUSALS, Refusal
+from evlcp_sdk.place.rejections import REJECTION_REASONS, Rejection
 from evlcp_sdk.place.starts import three_point_poses
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -58,7 +58,7 @@ def views(
     return seen
 
 
-def solved(found: Pose | Refusal) -> Pose:
+def solved(found: Pose | Rejection) -> Pose:
     assert isinstance(found, Pose), found
     return found
 
@@ -305,7 +305,7 @@ def test_every_error_that_is_stated_is_in_the_covariance(
     while len(squares) < 120:
         seen, told, sigma = drawn(rng, places, known, survey, focal, across=0.5)
         found = solve_pose(seen, CAMERA, told, None, sigma)
-        if isinstance(found, Refusal):
+        if isinstance(found, Rejection):
             # Two bars on gravity and a survey of 5 cm leave metres along an arc.
             assert found.kind in ("uncertain", "two-solutions"), found
             assert survey[0] > 0
@@ -328,7 +328,7 @@ def test_a_bar_that_disagrees_is_left_out_by_name(which: int, way: tuple[int, in
         seen, told, _ = drawn(rng, THREE, known, (0.0, 0.0, 0.0), 0.0)
         seen[which] = dataclasses.replace(seen[which], enu_m=seen[which].enu_m + 0.5 * np.array(way))
         found = solve_pose(seen, CAMERA, told)
-        if isinstance(found, Refusal):
+        if isinstance(found, Rejection):
             # A pair that stays cannot always tell which of three is wrong; it never says a place.
             assert found.kind == "misfit", found
             assert f"bar {which}" in found.detail or "not" in found.detail
@@ -348,7 +348,7 @@ def test_a_bar_that_is_left_out_stands_where_its_image_says() -> None:
         moved_m = rng.normal(0, 0.5, 3)
         seen[1] = dataclasses.replace(seen[1], enu_m=seen[1].enu_m - moved_m)
         found = solve_pose(seen, CAMERA, told)
-        if isinstance(found, Refusal) or found.excluded != ("bar 1",):
+        if isinstance(found, Rejection) or found.excluded != ("bar 1",):
             continue
         failed = found.failed
         assert failed is not None
@@ -373,7 +373,7 @@ def test_where_a_left_out_bar_stands_is_the_weighted_fit_of_its_points(across: f
     exact = dataclasses.replace(pose, covariance=np.zeros_like(pose.covariance))
     problem = Problem.of([seen[0], moved, seen[2]], CAMERA, told, spec, sigma)
     assert isinstance(problem, Problem)
-    found = failed_bar(problem, 1, exact, 99.0, 5)
+    found = estimate_fault(problem, 1, exact, 99.0, 5)
     way = moved.points_px[-1] - moved.points_px[0]
     size = float(np.linalg.norm(way))
     way = way / size
@@ -414,7 +414,7 @@ def test_two_bars_that_disagree_are_refused() -> None:
     seen[0] = dataclasses.replace(seen[0], enu_m=seen[0].enu_m + np.array([0.0, 0.0, 0.5]))
     found = solve_pose(seen, CAMERA, told)
     assert refused(found) == "misfit"
-    assert isinstance(found, Refusal)
+    assert isinstance(found, Rejection)
     assert "bar 0" in found.detail
     assert "bar 1" in found.detail
 
@@ -427,7 +427,7 @@ def test_a_focal_length_that_is_another_lens_is_found(said_mm: float) -> None:
         seen = views([bar(p) for p in places], np.zeros(3), UP.rotation(), rng)
         said = dataclasses.replace(CAMERA, focal_mm=said_mm)
         found = solve_pose(seen, said, known)
-        assert found.kind == "misfit" if isinstance(found, Refusal) else found.excluded
+        assert found.kind == "misfit" if isinstance(found, Rejection) else found.excluded
         assert fitting_focal_mm(seen, said, known) == pytest.approx(35.0, rel=0.04)
 
 
@@ -452,7 +452,7 @@ def test_two_sites_mixed_up_are_not_a_third_bar_at_fault() -> None:
     assert np.linalg.norm(behind.enu_m) > 80
     found = solve_pose(mixed, CAMERA, Attitude(5.0, 0.0, None, 0.1))
     assert refused(found) == "misfit"
-    assert isinstance(found, Refusal)
+    assert isinstance(found, Rejection)
     assert "bar 0 at the site of bar 1 and the reverse" in found.detail
 
 
@@ -475,7 +475,7 @@ def test_protection_levels_cover_what_no_test_finds() -> None:
         else:
             camera = dataclasses.replace(CAMERA, focal_mm=CAMERA.focal_mm * (1 + 0.01 * size))
         found = solve_pose(seen, camera, told)
-        if isinstance(found, Refusal) or math.isinf(found.hpl_m):
+        if isinstance(found, Rejection) or math.isinf(found.hpl_m):
             continue
         assert math.hypot(*found.enu_m[:2]) < found.hpl_m
         assert abs(found.enu_m[2]) < found.vpl_m
@@ -556,7 +556,7 @@ def test_false_alarms_are_as_rare_as_said() -> None:
     for _ in range(500):
         seen, told, sigma = drawn(rng, THREE, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), SURVEY, 0.002)
         found = solve_pose(seen, CAMERA, told, spec, sigma)
-        alarms += isinstance(found, Refusal) or bool(found.excluded)
+        alarms += isinstance(found, Rejection) or bool(found.excluded)
     # Tests of overlapping parts share alarms, and the total is counted by Huber: never more, and not none.
     assert 1 <= alarms <= stats.binom.isf(1e-3, 500, 0.02)
 
@@ -601,9 +601,9 @@ def test_a_lone_bar_and_a_poor_compass(gravity_sigma_deg: float) -> None:
     assert stats.chi2.isf(0.999, 180) < sum(squares) < stats.chi2.isf(0.001, 180)
 
 
-def refused(found: Pose | Refusal) -> str:
-    assert isinstance(found, Refusal), found
-    assert found.kind in REFUSALS
+def refused(found: Pose | Rejection) -> str:
+    assert isinstance(found, Rejection), found
+    assert found.kind in REJECTION_REASONS
     assert found.detail
     return found.kind
 
@@ -671,7 +671,7 @@ def test_both_poses_are_told_where_two_fit() -> None:
     seen = views(bars, np.zeros(3), UP.rotation(), rng, 1.0)
     found = solve_pose(seen, CAMERA, Attitude(5.0, 0.0, None, 0.1), POINT_ONLY)
     assert refused(found) == "two-solutions"
-    assert isinstance(found, Refusal)
+    assert isinstance(found, Rejection)
     likelihoods = [one.likelihood for one in found.candidates]
     assert likelihoods[0] == 1
     assert 1e-4 < likelihoods[1] < 1
@@ -706,7 +706,7 @@ def test_never_a_silent_wrong_position(seed: int, count: int, told: str) -> None
         error = found.enu_m - position
         assert error @ np.linalg.solve(found.covariance[:3, :3], error) < stats.chi2.isf(1e-7, 3)
     else:
-        assert found.kind in REFUSALS
+        assert found.kind in REJECTION_REASONS
 
 
 def test_a_pitch_of_the_wrong_sign_is_not_a_bar_at_fault() -> None:
@@ -719,7 +719,7 @@ def test_a_pitch_of_the_wrong_sign_is_not_a_bar_at_fault() -> None:
         bars = [bar(place, (rng.normal(0, 0.01), rng.normal(0, 0.01), 1)) for place in places]
         seen = views(bars, np.zeros(3), Attitude(pitch, 0.0, 0.0).rotation(), rng, 0.07)
         found = solve_pose(seen, CAMERA, Attitude(-pitch, 0.0, 0.0, 0.1, 0.1))
-        assert isinstance(found, Refusal)
+        assert isinstance(found, Rejection)
         assert found.kind == "misfit"
         suspects.append(found.suspects)
     assert sum("attitude" in some for some in suspects) >= 15

@@ -16,7 +16,7 @@ from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.positioner import BarKind, Positioner, _alternatives
-from evlcp_sdk.place.refusals import Candidate, Refusal
+from evlcp_sdk.place.rejections import Candidate, Rejection
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing
@@ -511,7 +511,7 @@ def test_poses_that_are_left_open_are_told_on_earth() -> None:
     here, axes = LocalAxes(35.2, 137.1, 60.0), LocalAxes(35.0, 137.0, 50.0)
     spread = np.diag([1.0, 4.0, 9.0])
     open_one = Candidate(np.array([5.0, 6.0, 7.0]), Attitude(1.0, 2.0, 30.0).rotation(), spread, 0.5)
-    (found,) = _alternatives(Refusal("two-solutions", "", (open_one,)), here, axes)
+    (found,) = _alternatives(Rejection("two-solutions", "", (open_one,)), here, axes)
     place = here.to_enu(found.latitude_deg, found.longitude_deg, found.height_m)
     np.testing.assert_allclose(place, [5, 6, 7], atol=1e-6)
     np.testing.assert_allclose(axes.to_geodetic(found.enu_m)[2], found.height_m, atol=1e-6)

@@ -3,12 +3,12 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.chances import chance_below, chi_square
-from evlcp_sdk.place.judgement import Pose
+from evlcp_sdk.place.fit_assessment import Pose
 from evlcp_sdk.place.observations import Problem, project_bars
+from evlcp_sdk.place.quantiles import chance_below, chi_square
 from evlcp_sdk.values import FailedBar
 
-__all__ = ["failed_bar"]
+__all__ = ["estimate_fault"]
 
 Floats = NDArray[np.float64]
 
@@ -19,7 +19,7 @@ _FREEDOM = 6
 """Of the test of a bar: three of its place, three of its attitude."""
 
 
-def failed_bar(problem: Problem, bar: int, pose: Pose, test: float, parts: int) -> FailedBar:
+def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: int) -> FailedBar:
     """Where a bar stands by its image, seen from a pose that does without it.
 
     Weighted least squares over its points, which share the shift of its image, for its place; its attitude

@@ -7,7 +7,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import stats
 
-from evlcp_sdk.place.carried import carried, imu_sigmas
+from evlcp_sdk.place.dead_reckoning import imu_sigmas, reckon
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import IMU, filter_fixes, smooth_trajectory
 from evlcp_sdk.scene.attitude import AttitudeLog
@@ -58,7 +58,7 @@ def stepped(
 @pytest.mark.parametrize("push", [False, True])
 def test_the_way_is_that_of_short_steps(push: bool) -> None:
     way, imu = swing(gyro=True, push=push), np.array([3.0, 1.0, -2.0, 0.5])[: 4 if push else 1]
-    found = carried(way, VELOCITY, 0.4, 0.0, imu, SPEC)
+    found = reckon(way, VELOCITY, 0.4, 0.0, imu, SPEC)
     exact = stepped(way, VELOCITY, 0.4, imu)
     start = np.append(np.zeros(3), VELOCITY)
     np.testing.assert_allclose(found.move @ start + found.added, exact, atol=2e-3)
@@ -75,8 +75,8 @@ def test_the_way_is_that_of_short_steps(push: bool) -> None:
 def test_headings_error_pushes_aside() -> None:
     way = swing(gyro=True, push=True)
     quiet = dataclasses.replace(SPEC, rate_white_deg_rts=0.0)
-    without = carried(way, VELOCITY, 0.4, 0.0, np.zeros(4), quiet).noise
-    found = carried(way, VELOCITY, 0.4, 0.01, np.zeros(4), quiet).noise - without
+    without = reckon(way, VELOCITY, 0.4, 0.0, np.zeros(4), quiet).noise
+    found = reckon(way, VELOCITY, 0.4, 0.01, np.zeros(4), quiet).noise - without
     slope = stepped(way, VELOCITY, 0.401, np.zeros(4)) - stepped(way, VELOCITY, 0.399, np.zeros(4))
     np.testing.assert_allclose(found, np.outer(slope, slope) * 25, atol=1e-4)
 
@@ -85,7 +85,7 @@ def test_headings_error_pushes_aside() -> None:
 def test_noise_is_that_of_kicks(push: bool) -> None:
     """White acceleration, and a gyroscope's random walk, kick by kick through what follows each."""
     way = swing(gyro=True, push=push)
-    found = carried(way, VELOCITY, 0.4, 0.0, np.zeros(4 if push else 1), SPEC).noise
+    found = reckon(way, VELOCITY, 0.4, 0.0, np.zeros(4 if push else 1), SPEC).noise
     t, kicks = way.t_s, 120
     noise, middles = np.zeros((6, 6)), (np.arange(kicks) + 0.5) * 3 / kicks
     grid = (np.arange(6000) + 0.5) * 3 / 6000

@@ -9,10 +9,10 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.learnt import Learnt, focal_share, learnt
+from evlcp_sdk.place.estimated_biases import EstimatedBias, estimate_biases, focal_share
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.pose import solve_pose
-from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.place.trajectory import IMU, TrajectoryPoint, filter_fixes
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -59,7 +59,7 @@ def drive(rng: np.random.Generator) -> tuple[list[Fix], dict[tuple[str, str], fl
                 points += rng.normal(0, 0.07, points.shape) + rng.normal(0, SPEC.shared_sigma_px, 2)
                 views.append(BarView(b, said, points, np.full(16, 0.0707), (SITE_M, 0.0, 0.0)))
         pose = solve_pose(views, CAMERA, attitude, SPEC, LENS)
-        if not isinstance(pose, Refusal):
+        if not isinstance(pose, Rejection):
             fixes.append(
                 dataclasses.replace(
                     Fix.refused(t * 1e6, pose.transmitters, "", ""),
@@ -82,7 +82,7 @@ def test_a_drive_past_bars_tells_their_errors_and_its_own() -> None:
     for _ in range(3):
         fixes, truth = drive(rng)
         last = filter_fixes(fixes, dataclasses.replace(SPEC, acceleration_m2_s3=0.01))[-1]
-        rows = learnt(states_of(last), CAMERA, LENS, said, sites, SPEC)
+        rows = estimate_biases(states_of(last), CAMERA, LENS, said, sites, SPEC)
         squares += [((row.correction - truth[row.part, row.what]) / row.sigma) ** 2 for row in rows]
         table = {(row.part, row.what): row for row in rows}
         for key in (("camera", "focal_mm"), ("attitude", "time_us"), ("attitude", "heading_deg")):
@@ -105,7 +105,7 @@ def test_what_a_drive_does_not_tell_keeps_its_sigma() -> None:
         standing={"camera": np.zeros((3, 7)), "attitude": np.zeros((3, 4)), "bar 3": np.zeros((3, 1))},
     )
     points = filter_fixes([dataclasses.replace(fix, t_us=t) for t in (0.0, 1e5, 2e5)], SPEC)
-    rows = learnt(states_of(points[-1]), CAMERA, LENS, Attitude(0, 0, 0, 0.2, 0.3), {}, SPEC)
+    rows = estimate_biases(states_of(points[-1]), CAMERA, LENS, Attitude(0, 0, 0, 0.2, 0.3), {}, SPEC)
     found = {(row.part, row.what): row for row in rows}
     # Nothing was stated of the clock, nor of the principal point, nor of the site.
     assert list(found) == [
@@ -122,8 +122,8 @@ def test_what_a_drive_does_not_tell_keeps_its_sigma() -> None:
 
 def test_biases_of_an_imu_are_taken_off() -> None:
     state = np.array([1.0, 0.0, -2.0, 0.5]), np.diag([0.25, 1.0, 0.04, 1.0])
-    rows = learnt({IMU: state, "gnss": state}, CAMERA, LENS, None, {}, SPEC)
-    assert rows[0] == Learnt(IMU, "rate_deg_s", -0.1, 0.05, 0.1)
+    rows = estimate_biases({IMU: state, "gnss": state}, CAMERA, LENS, None, {}, SPEC)
+    assert rows[0] == EstimatedBias(IMU, "rate_deg_s", -0.1, 0.05, 0.1)
     assert [row.what for row in rows[1:]] == ["push_right_m_s2", "push_forward_m_s2", "push_up_m_s2"]
     assert rows[2].correction == pytest.approx(0.1)
     assert [row.determined for row in rows] == [True, False, True, False]

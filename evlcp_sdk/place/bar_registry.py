@@ -8,11 +8,11 @@ import numpy as np
 
 from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.chances import chi_square
+from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, site_of_transmitter
 from evlcp_sdk.values import Packet
 
-__all__ = ["Whereabouts"]
+__all__ = ["BarRegistry"]
 
 _LENGTH_SHARE = 0.01
 """Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
@@ -44,7 +44,7 @@ class _Said:
     link: str = ""
 
 
-class Whereabouts:
+class BarRegistry:
     """Where the transmitters of a receiver stand.
 
     Args:
@@ -89,7 +89,7 @@ class Whereabouts:
 
     def contradicted_by(self, sites: Sequence[BarSite]) -> dict[int, str]:
         """How beacons contradict other sites than these here, by their ids."""
-        others = Whereabouts(sites, self._spec, self._alone)
+        others = BarRegistry(sites, self._spec, self._alone)
         others._said = self._said
         return {self.ids[number]: how for number, how in others.contradicted.items() if number in self.ids}
 

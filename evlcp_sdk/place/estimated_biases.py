@@ -13,7 +13,7 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite
 
-__all__ = ["Learnt", "focal_share", "learnt"]
+__all__ = ["EstimatedBias", "estimate_biases", "focal_share"]
 
 Floats = NDArray[np.float64]
 
@@ -22,7 +22,7 @@ _TOLD_SHARE = 0.9
 
 
 @dataclass(frozen=True)
-class Learnt:
+class EstimatedBias:
     """One standing error as a drive shows it.
 
     Attributes:
@@ -45,14 +45,14 @@ class Learnt:
         return self.sigma < _TOLD_SHARE * self.stated_sigma
 
 
-def learnt(
+def estimate_biases(
     states: Mapping[str, tuple[Floats, Floats]],
     camera: CameraModel,
     camera_sigma: CameraSigma,
     attitude: Attitude | None,
     sites: Mapping[int, BarSite],
     spec: ErrorModel,
-) -> list[Learnt]:
+) -> list[EstimatedBias]:
     """Standing states in their units; an error that was stated as none is left out.
 
     Args:
@@ -64,7 +64,7 @@ def learnt(
         sites: Where the transmitters stand, by number.
         spec: An IMU's sigmas.
     """
-    found: list[Learnt] = []
+    found: list[EstimatedBias] = []
     for part, (mean, covariance) in states.items():
         if part == "camera":
             root = camera_sigma.root(camera)
@@ -90,7 +90,7 @@ def learnt(
         for i, name in enumerate(names):
             if stated[i] > 0:
                 sigma = math.sqrt(max(float(spread[i, i]), 0.0))
-                found.append(Learnt(part, name, float(values[i]), sigma, float(stated[i])))
+                found.append(EstimatedBias(part, name, float(values[i]), sigma, float(stated[i])))
     return found
 
 

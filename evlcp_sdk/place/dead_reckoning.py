@@ -12,14 +12,14 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.swing import Swing
 
-__all__ = ["Carried", "carried", "imu_sigmas"]
+__all__ = ["Reckoned", "imu_sigmas", "reckon"]
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
-class Carried:
+class Reckoned:
     """What time makes of position, m, and velocity, m/s: east, north, up of each.
 
     Attributes:
@@ -45,14 +45,14 @@ def imu_sigmas(swing: Swing, spec: ErrorModel) -> Floats:
     return np.array(sigmas)
 
 
-def carried(
+def reckon(
     swing: Swing,
     velocity_m_s: Floats,
     heading_rad: float,
     heading_sigma_rad: float,
     imu: Floats,
     spec: ErrorModel,
-) -> Carried:
+) -> Reckoned:
     """Carry position and velocity over a time.
 
     Without a push the velocity turns as the camera does, driven by white acceleration; with one it changes by
@@ -119,7 +119,7 @@ def carried(
         by_imu[2, -1], by_imu[5, -1] = -(span**2) / 2 * sigmas[-1], -span * sigmas[-1]
         askew = flat[:, 0] * heading_sigma_rad
         noise[np.ix_(level_rows, level_rows)] += np.outer(askew, askew)
-    return Carried(move, added, noise, by_imu, float(angle[-1]))
+    return Reckoned(move, added, noise, by_imu, float(angle[-1]))
 
 
 def _nodes(t_s: Floats) -> tuple[Floats, Floats]:

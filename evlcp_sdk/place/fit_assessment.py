@@ -12,7 +12,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.chances import chi_square
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.model import (
     FAULT,
@@ -27,10 +26,11 @@ from evlcp_sdk.place.model import (
     skewed,
 )
 from evlcp_sdk.place.observations import Problem
-from evlcp_sdk.place.refusals import Refusal
+from evlcp_sdk.place.quantiles import chi_square
+from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.values import FailedBar
 
-__all__ = ["FOCAL", "Judged", "Pose", "covering", "judged", "misfits"]
+__all__ = ["FOCAL", "AssessedPose", "Pose", "assess_fit", "covering", "misfits"]
 
 Floats = NDArray[np.float64]
 
@@ -115,7 +115,7 @@ class Pose:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class AssessedPose:
     """A pose with what its tests say.
 
     Attributes:
@@ -202,23 +202,23 @@ def _inverted(matrix: Floats) -> Floats | None:
     return inverse
 
 
-def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
+def assess_fit(problem: Problem, fit: Fit) -> AssessedPose | Rejection:
     """The pose with its covariance and tests, or why it cannot be trusted."""
     spec, freedom = problem.spec, problem.freedom
     solution = _solve(problem, fit)
     if solution is None:
-        return Refusal("not-determined", "the equations are singular")
+        return Rejection("not-determined", "the equations are singular")
     if (end_on := _end_on(problem, fit)) is not None:
         return end_on
     size, axes = np.linalg.eigh(solution.spread[:3, :3])
     wide = math.sqrt(max(size[-1], 0.0))
     if wide > spec.max_sigma_m:
-        return Refusal("uncertain", f"by {wide:.1f} m, more than {spec.max_sigma_m:g} m")
+        return Rejection("uncertain", f"by {wide:.1f} m, more than {spec.max_sigma_m:g} m")
     bent, slopes = _bend(problem, fit, solution, size, axes)
     amiss = misfits(problem, fit)
     # A fit of what does not fit need not be at the least cost.
     if bent > _MOST_BEND and not amiss:
-        return Refusal("uncertain", f"by {wide:.2f} m along a curve: an ellipse would mislead")
+        return Rejection("uncertain", f"by {wide:.2f} m along a curve: an ellipse would mislead")
     levels, tests, worst = _test_parts(problem, solution)
     doubt = f"the points miss the sites by {math.sqrt(fit.cost / freedom):.1f} sigmas (rms)" if amiss else ""
     moves = _moves_by_errors(problem, solution)
@@ -240,10 +240,10 @@ def judged(problem: Problem, fit: Fit) -> Judged | Refusal:
         standing_slope=_named(problem, *slopes),
         hidden_m=levels.hidden_m,
     )
-    return Judged(pose, worst or doubt, tests)
+    return AssessedPose(pose, worst or doubt, tests)
 
 
-def _end_on(problem: Problem, fit: Fit) -> Refusal | None:
+def _end_on(problem: Problem, fit: Fit) -> Rejection | None:
     """A lone bar that points along the line of sight."""
     if len(problem.transmitters) > 1:
         return None
@@ -253,7 +253,7 @@ def _end_on(problem: Problem, fit: Fit) -> Refusal | None:
     sine = math.sqrt(max(1 - cosine**2, 0.0))
     if sine >= math.sin(math.radians(problem.spec.min_view_deg)):
         return None
-    return Refusal("end-on", f"the bar is seen {math.degrees(math.asin(sine)):.0f} degrees from its axis")
+    return Rejection("end-on", f"the bar is seen {math.degrees(math.asin(sine)):.0f} degrees from its axis")
 
 
 Moves = tuple[Floats, Floats, Floats]

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CONTRADICTIONS", "REFUSALS", "Candidate", "Refusal"]
+__all__ = ["CONTRADICTIONS", "REJECTION_REASONS", "Candidate", "Rejection"]
 
-REFUSALS = {
+REJECTION_REASONS = {
     "no-site": "no bar in view stands at a known place",
     "no-facing": "the clusters are not in line, and no site says where its LEDs face",
     "site-contradicted": "the bars' own beacons say other places or lengths than their sites",
@@ -45,11 +45,11 @@ class Candidate:
 
 
 @dataclass(frozen=True)
-class Refusal:
+class Rejection:
     """Why there is no position.
 
     Attributes:
-        kind: One of `REFUSALS`.
+        kind: One of `REJECTION_REASONS`.
         detail: The same in words, with the figures of this case.
         candidates: Of `two-solutions`, the poses that fit, the likeliest first.
         suspects: Of `misfit`, the parts of which one, if it were left out, would explain it.
