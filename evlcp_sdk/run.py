@@ -41,8 +41,8 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.diagnosis.diagnose import Diagnosis
     from evlcp_sdk.live.budget import Budget
-    from evlcp_sdk.live.outlet import Outlet
     from evlcp_sdk.live.pictures import PictureSlot
+    from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.place.bar_registry import BarRegistry
     from evlcp_sdk.place.calibration import Calibrated, CalibrationView
     from evlcp_sdk.place.navigator import PositionPlan
@@ -317,7 +317,7 @@ def live(
     clock_zero: ClockZero = None,
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
-    outlet: Outlet | None = None,
+    publisher: Publisher | None = None,
     pictures: PictureSlot | None = None,
     budget: Budget | None = None,
     warm: bool = True,
@@ -339,7 +339,7 @@ def live(
             known.
         sinks: Output formats beside the default ones, by name.
         lines: Takes a line of JSON for each frame, message and fix as it comes; None for nobody.
-        outlet: Where listeners subscribe; None for nobody. It is closed at the end.
+        publisher: Where listeners subscribe; None for nobody. It is closed at the end.
         pictures: Where pictures of events are drawn when they are asked for; None for none.
         budget: When what is left out.
         warm: Load all kernels before the first event, and before a source that does not wait is opened:
@@ -355,12 +355,12 @@ def live(
         PluginError: A plugin's code fails.
     """
     from evlcp_sdk.live.loop import LiveLoop
-    from evlcp_sdk.live.outlet import Outlet
+    from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.live.warm import warm_up
 
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
-    outlet = Outlet() if outlet is None else outlet
+    publisher = Publisher() if publisher is None else publisher
     url = str(source.path if isinstance(source, EventSource) else source)
     try:
         # A recording waits for its reader, and what is wrong with its name is said at once.
@@ -383,13 +383,13 @@ def live(
             ) as writer:
                 receiver = Receiver(links, registry.hook, **known, on_frame=lambda frame: loop.frame(frame))
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
-                loop = LiveLoop(opened, receiver, links, outlet, pictures, budget, pulses=pulses)
+                loop = LiveLoop(opened, receiver, links, publisher, pictures, budget, pulses=pulses)
                 run, given = loop.run(stopped), (_say_nothing, stopped, loop.summary)
                 table = _run(opened, url, receiver, writer, run, loop.close, *given)
-        outlet.publish("end", float(table["recording"]["last_us"] or 0), table)
+        publisher.publish("end", float(table["recording"]["last_us"] or 0), table)
         return table
     finally:
-        outlet.close()
+        publisher.close()
         if pictures is not None:
             pictures.close()
 

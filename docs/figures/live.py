@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from evlcp_sdk.link.several import load_links, named_links
-from evlcp_sdk.live import Budget, Outlet
+from evlcp_sdk.live import Budget, Publisher
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.run import live
@@ -36,13 +36,13 @@ def main() -> None:
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from tests.unit.study.browser import Browser
 
-    links, outlet, sites = load_links(None), Outlet(), load_sites(given.sites)
+    links, publisher, sites = load_links(None), Publisher(), load_sites(given.sites)
     attitude = AttitudeLog.read(given.attitude)
     serving = Serving(view=True)
     over = threading.Event()
     with (
         TemporaryDirectory() as folder,
-        Services(serving, outlet, named_links(links), name=given.recording.name, sites=sites) as services,
+        Services(serving, publisher, named_links(links), name=given.recording.name, sites=sites) as services,
         Browser(Path(folder)) as browser,
     ):
         assert services.view is not None
@@ -59,13 +59,13 @@ def main() -> None:
             kwargs={
                 "plan": PositionPlan(sites),
                 "attitude": attitude,
-                "outlet": outlet,
+                "publisher": publisher,
                 "pictures": services.pictures,
                 "budget": Budget(waiting_ms=1000, most_ms=10_000),
                 "stopped": over.is_set,
             },
         )
-        mine = outlet.subscribe({"status"}, most=10)
+        mine = publisher.subscribe({"status"}, most=10)
         runner.start()
         first_us = None
         while not mine.ended:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.cli._receiving import LinePrinter
     from evlcp_sdk.live.loop import LiveStatus
-    from evlcp_sdk.live.outlet import Outlet
+    from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.live.services import Services, Serving
 
 __all__ = ["live"]
@@ -174,7 +174,7 @@ def live(
     from evlcp_sdk.io.reconnect import ReconnectingSource
     from evlcp_sdk.link.several import named_links
     from evlcp_sdk.live.budget import Budget
-    from evlcp_sdk.live.outlet import Outlet
+    from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.live.services import Services
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
@@ -187,12 +187,12 @@ def live(
     clock = camera.clock()
     chosen = serving.chosen(out, positions=plan is not None)
     sinks = formats.names(registry, out, positions=plan is not None)
-    attitude, outlet = camera.attitude(), Outlet()
+    attitude, publisher = camera.attitude(), Publisher()
     sites = plan.sites if plan is not None else ()
     services = Services(
-        chosen, outlet, named_links(links), name=Path(url).name, sites=sites, clock_zero=clock
+        chosen, publisher, named_links(links), name=Path(url).name, sites=sites, clock_zero=clock
     )
-    with stop_on_request() as stopped, services, _going_on(outlet, silent=lines is not None):
+    with stop_on_request() as stopped, services, _going_on(publisher, silent=lines is not None):
         _say_where(services)
         source = ReconnectingSource(partial(open_source, url, registry), stopped) if reconnect else url
         summary = run_live(
@@ -205,7 +205,7 @@ def live(
             clock_zero=clock,
             sinks=sinks,
             lines=lines,
-            outlet=outlet,
+            publisher=publisher,
             pictures=services.pictures,
             budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
             stopped=stopped.or_when(lambda: out is None and lines is not None and lines.gone),
@@ -236,7 +236,7 @@ def _print_summary(
 
 
 @contextmanager
-def _going_on(outlet: Outlet, *, silent: bool) -> Iterator[None]:
+def _going_on(publisher: Publisher, *, silent: bool) -> Iterator[None]:
     """A line on stderr that says how it goes, on a terminal only, and not between lines of JSON."""
     from rich.live import Live
 
@@ -244,7 +244,7 @@ def _going_on(outlet: Outlet, *, silent: bool) -> Iterator[None]:
     if silent or not err.is_interactive:
         yield
         return
-    mine = outlet.subscribe({"status"}, most=1)
+    mine = publisher.subscribe({"status"}, most=1)
 
     def draw() -> None:
         with Live(console=err, transient=True, auto_refresh=False) as shown:
@@ -257,7 +257,7 @@ def _going_on(outlet: Outlet, *, silent: bool) -> Iterator[None]:
     try:
         yield
     finally:
-        outlet.leave(mine)
+        publisher.leave(mine)
         thread.join()
 
 

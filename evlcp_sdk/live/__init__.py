@@ -1,16 +1,17 @@
 """Receiving in real time: a source read in slices, a budget of time, and results for whoever listens.
 
 ```
-source --reader (a thread)--> slices --LiveLoop--> receiver --> Outlet --> Subscription, Subscription, ...
+source --reader (a thread)--> slices --LiveLoop--> receiver --> Publisher --> Subscription, Subscription, ...
                                           +-> PictureSlot (a picture when one is asked for, the newest only)
 ```
 
 How a viewer, a server or a recorder joins, from threads of its own:
 
 ```
-outlet, pictures = Outlet(), PictureSlot()
-mine = outlet.subscribe({"frame", "message", "fix", "status"}, most=1000, wake=wake_my_loop)
-threading.Thread(target=run.live, args=("replay:REC.raw",), kwargs={"outlet": outlet, "pictures": pictures})
+publisher, pictures = Publisher(), PictureSlot()
+mine = publisher.subscribe({"frame", "message", "fix", "status"}, most=1000, wake=wake_my_loop)
+listeners = {"publisher": publisher, "pictures": pictures}
+threading.Thread(target=run.live, args=("replay:REC.raw",), kwargs=listeners)
 for news in mine.take(timeout_s=1.0):     # [] after the time-out; mine.ended once all is said
     news.kind, news.t_us, news.value, news.late_ms
 picture = pictures.take(timeout_s=0.5)    # asks for one, and waits for it; None after the time-out
@@ -36,8 +37,8 @@ What is published:
 from evlcp_sdk.live.budget import Budget, Shedder
 from evlcp_sdk.live.delays import DelayTally
 from evlcp_sdk.live.loop import LiveLoop, LiveStatus
-from evlcp_sdk.live.outlet import KINDS, News, Outlet, Subscription
 from evlcp_sdk.live.pictures import Picture, PictureSlot
+from evlcp_sdk.live.publisher import KINDS, News, Publisher, Subscription
 
 __all__ = [
     "KINDS",
@@ -46,9 +47,9 @@ __all__ = [
     "LiveLoop",
     "LiveStatus",
     "News",
-    "Outlet",
     "Picture",
     "PictureSlot",
+    "Publisher",
     "Shedder",
     "Subscription",
 ]

@@ -11,8 +11,8 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.live.budget import LEVELS, Budget, Shedder
 from evlcp_sdk.live.delays import DelayTally
-from evlcp_sdk.live.outlet import Outlet
 from evlcp_sdk.live.pictures import PictureSlot
+from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.reader import Reader, Slice
 from evlcp_sdk.place.navigator import Placed
 from evlcp_sdk.plugin.source import EventSource, Loss
@@ -88,7 +88,7 @@ class LiveLoop:
         source: What is read; not closed.
         receiver: What decodes it; it gives each frame to `frame`.
         links: What it decodes.
-        outlet: Where results go.
+        publisher: Where results go.
         pictures: Where pictures are drawn; None for none.
         budget: When what is shed.
         clock: Gives the time, s.
@@ -104,7 +104,7 @@ class LiveLoop:
         source: EventSource,
         receiver: Receiver,
         links: Sequence[Link],
-        outlet: Outlet,
+        publisher: Publisher,
         pictures: PictureSlot | None = None,
         budget: Budget | None = None,
         clock: Callable[[], float] = time.monotonic,
@@ -113,7 +113,7 @@ class LiveLoop:
         self._pulses = pulses
         self._source, self._receiver = source, receiver
         self._forms = {name: link.packet for name, link in named_links(links).items()}
-        self._outlet, self._pictures = outlet, pictures
+        self._publisher, self._pictures = publisher, pictures
         self._budget = Budget() if budget is None else budget
         self._clock = clock
         self._reader = Reader(source, clock)
@@ -184,7 +184,7 @@ class LiveLoop:
             for stage, part_s in zip(STAGES, (*parts_s, now - shone_s), strict=True):
                 self.delays[stage].add(part_s * 1e3)
                 self._recent[stage].add(part_s * 1e3)
-        self._outlet.publish("frame", frame.t_us, frame, late_ms)
+        self._publisher.publish("frame", frame.t_us, frame, late_ms)
 
     def _shone_s(self, t_us: float) -> float:
         """When a time of the camera's clock was, by our own clock, s."""
@@ -193,7 +193,7 @@ class LiveLoop:
 
     def placed(self, placed: Placed) -> None:
         """Tell listeners of a fix."""
-        self._outlet.publish("fix", placed.fix.t_us, placed)
+        self._publisher.publish("fix", placed.fix.t_us, placed)
 
     def summary(self) -> dict[str, Any]:
         """Delays by stage, what was shed, and for how long, as JSON values."""
@@ -258,15 +258,15 @@ class LiveLoop:
                 self._pulses.add(piece.triggers, came_s, max(float(column[-1]) for column in columns))
         self._events += len(piece.events)
         if len(piece.triggers):
-            self._outlet.publish("triggers", float(piece.triggers.t_us[0]), piece.triggers)
+            self._publisher.publish("triggers", float(piece.triggers.t_us[0]), piece.triggers)
         if len(piece.events):
-            self._outlet.publish("events", float(piece.events.t_us[0]), piece.events)
+            self._publisher.publish("events", float(piece.events.t_us[0]), piece.events)
 
     def _tell(self, packets: list[Packet]) -> None:
         for packet in packets:
-            self._outlet.publish("packet", packet.t_us, packet)
+            self._publisher.publish("packet", packet.t_us, packet)
             for message in packet.messages:
-                self._outlet.publish("message", packet.t_us, message, self._end_to_end_ms(message))
+                self._publisher.publish("message", packet.t_us, message, self._end_to_end_ms(message))
 
     def _end_to_end_ms(self, message: ReceivedMessage) -> float | None:
         """How long after the time that it says a message `time` is read, ms; None for others, or at the end.
@@ -291,8 +291,8 @@ class LiveLoop:
         since_s = at_s - self._status_s
         if since_s < _STATUS_EVERY_S and not now:
             return
-        if self._outlet.wanted("status"):
-            self._outlet.publish("status", self._last_us, self._status(at_s, since_s))
+        if self._publisher.wanted("status"):
+            self._publisher.publish("status", self._last_us, self._status(at_s, since_s))
         self._status_s, self._status_events = at_s, self._events
         self._recent = {stage: DelayTally() for stage in self.delays}
 

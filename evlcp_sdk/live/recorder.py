@@ -9,7 +9,7 @@ from typing import Any, Final
 from evlcp_sdk.errors import EvlcpError, StreamError
 from evlcp_sdk.io.open import open_writer
 from evlcp_sdk.io.writers import EventWriter
-from evlcp_sdk.live.outlet import Outlet, Subscription
+from evlcp_sdk.live.publisher import Publisher, Subscription
 from evlcp_sdk.values import Events, Triggers
 
 __all__ = ["Recorder"]
@@ -26,14 +26,14 @@ class Recorder:
     """Writes events and triggers to a RAW file in a thread of its own, from `start` to `stop`.
 
     Args:
-        outlet: Where they come from.
+        publisher: Where they come from.
         folder: Where files go, named by the time of their start; made if need be.
         width: Columns of the sensor.
         height: Its rows.
     """
 
-    def __init__(self, outlet: Outlet, folder: Path, width: int, height: int) -> None:
-        self._outlet, self._folder = outlet, folder
+    def __init__(self, publisher: Publisher, folder: Path, width: int, height: int) -> None:
+        self._publisher, self._folder = publisher, folder
         self._size = width, height
         self._mine: Subscription | None = None
         self._thread: threading.Thread | None = None
@@ -58,7 +58,7 @@ class Recorder:
             return
         self._path = self._folder / f"live-{datetime.now(UTC):%Y%m%dT%H%M%S.%fZ}.raw"
         self._events, self._fault = 0, ""
-        self._mine = self._outlet.subscribe({"events", "triggers"}, most=_MOST_WAITING)
+        self._mine = self._publisher.subscribe({"events", "triggers"}, most=_MOST_WAITING)
         self._thread = threading.Thread(
             target=self._write, args=(self._path, self._mine), name="evlcp-recorder", daemon=True
         )
@@ -67,7 +67,7 @@ class Recorder:
     def stop(self, timeout_s: float = 30.0) -> None:
         """End the file: all that has come is in it."""
         if self._mine is not None and self._thread is not None:
-            self._outlet.leave(self._mine)
+            self._publisher.leave(self._mine)
             self._thread.join(timeout_s)
 
     def _write(self, path: Path, mine: Subscription) -> None:
@@ -80,7 +80,7 @@ class Recorder:
         except OSError as fault:
             self._fault = f"{path.parent}: cannot be made: {fault.strerror}"
         finally:
-            self._outlet.leave(mine)
+            self._publisher.leave(mine)
 
     def _fill(self, writer: EventWriter, mine: Subscription) -> None:
         """Write what comes; what is written stays where no more can be."""

@@ -9,7 +9,7 @@ from evlcp_sdk.errors import OutputError
 from evlcp_sdk.io.evt3 import EVT3
 from evlcp_sdk.io.patience import pieces_until
 from evlcp_sdk.io.raw import RawEncoder, format_header
-from evlcp_sdk.live.outlet import Outlet, Subscription
+from evlcp_sdk.live.publisher import Publisher, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.signals import Stopped
 
@@ -47,7 +47,7 @@ class Sender:
         self, source: EventSource, tcp: tuple[str, int] | None = None, unix: Path | None = None
     ) -> None:
         self._source = source
-        self._outlet = Outlet()
+        self._publisher = Publisher()
         self._threads: list[threading.Thread] = []
         self._listening: list[socket.socket] = []
         self._first = threading.Event()
@@ -89,11 +89,11 @@ class Sender:
         try:
             for events, triggers in pieces_until(self._source, stopped):
                 self.counts["events"] += len(events)
-                self._outlet.publish("events", 0.0, (events, triggers))
+                self._publisher.publish("events", 0.0, (events, triggers))
                 if stopped():
                     break
         finally:
-            self._outlet.close()
+            self._publisher.close()
             self._over.set()
             for thread in self._threads:
                 thread.join(2 * _STALLED_S)
@@ -101,7 +101,7 @@ class Sender:
     def close(self) -> None:
         """Let all go."""
         self._over.set()
-        self._outlet.close()
+        self._publisher.close()
         for one in self._listening:
             one.close()
         if self._unix is not None and self._listening:
@@ -127,7 +127,7 @@ class Sender:
                 continue
             except OSError:
                 return
-            mine = self._outlet.subscribe({"events"}, most=_MOST_PIECES)
+            mine = self._publisher.subscribe({"events"}, most=_MOST_PIECES)
             self.counts["listeners"] += 1
             self._start(self._send, connection, mine)
             self._first.set()
@@ -146,5 +146,5 @@ class Sender:
             except OSError:
                 pass  # It has left, or takes nothing.
             finally:
-                self._outlet.leave(mine)
+                self._publisher.leave(mine)
                 self.counts["pieces_dropped"] += mine.dropped

@@ -8,12 +8,12 @@ from types import TracebackType
 from typing import Self
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.live.casts import Cast
-from evlcp_sdk.live.desk import Desk
-from evlcp_sdk.live.outlet import Outlet
+from evlcp_sdk.live.loop_thread import LoopThread
 from evlcp_sdk.live.pictures import PictureSlot
+from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.telling import Teller
+from evlcp_sdk.live.serializer import Serializer
+from evlcp_sdk.live.tcp_output import TcpOutput
 from evlcp_sdk.live.viewer import Viewer
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.spelling import counted
@@ -48,7 +48,7 @@ class Services:
 
     Args:
         serving: Which.
-        outlet: Where results come from.
+        publisher: Where results come from.
         links: The configurations by name, as `named_links` gives them.
         name: Name of the source.
         sites: Where the bars stand.
@@ -67,7 +67,7 @@ class Services:
     def __init__(
         self,
         serving: Serving,
-        outlet: Outlet,
+        publisher: Publisher,
         links: Mapping[str, Link],
         *,
         name: str,
@@ -76,15 +76,15 @@ class Services:
     ) -> None:
         self.pictures = PictureSlot() if serving.view else None
         self._recorder: Recorder | None = None
-        self._teller: Teller | None = None
+        self._serializer: Serializer | None = None
         self.view: Viewer | None = None
         if self.pictures is not None:
             if serving.record_to is not None:
                 camera = next(iter(links.values())).camera
-                self._recorder = Recorder(outlet, serving.record_to, camera.width, camera.height)
-            self._teller = Teller(outlet, self.pictures, links, sites)
+                self._recorder = Recorder(publisher, serving.record_to, camera.width, camera.height)
+            self._serializer = Serializer(publisher, self.pictures, links, sites)
             self.view = Viewer(
-                self._teller,
+                self._serializer,
                 links,
                 name=name,
                 sites=len(sites),
@@ -94,10 +94,10 @@ class Services:
             )
         ports = {False: serving.nmea_port, True: serving.gpsd_port}
         self.nmea, self.gpsd = (
-            None if port is None else Cast(outlet, gpsd=gpsd, port=port, clock_zero=clock_zero)
+            None if port is None else TcpOutput(publisher, gpsd=gpsd, port=port, clock_zero=clock_zero)
             for gpsd, port in ports.items()
         )
-        self._outlet = outlet
+        self._publisher = publisher
         self._stack = ExitStack()
 
     @property
@@ -109,21 +109,20 @@ class Services:
     @property
     def fault(self) -> str:
         """What the page could not show, and why; empty for nothing."""
-        if self._teller is None or not self._teller.untold:
+        if self._serializer is None or not self._serializer.untold:
             return ""
-        return (
-            f"{counted(self._teller.untold, 'message')} could not be shown on the page: {self._teller.fault}"
-        )
+        many = counted(self._serializer.untold, "message")
+        return f"{many} could not be shown on the page: {self._serializer.fault}"
 
     def __enter__(self) -> Self:
         servers = [one for one in (self.view, self.nmea, self.gpsd) if one is not None]
         with ExitStack() as stack:
             if servers:
-                desk = stack.enter_context(Desk())
+                loop_thread = stack.enter_context(LoopThread())
                 for server in servers:
-                    desk.call(server.start())
-                    stack.callback(_finish, desk, server)
-            stack.callback(self._outlet.close)
+                    loop_thread.call(server.start())
+                    stack.callback(_finish, loop_thread, server)
+            stack.callback(self._publisher.close)
             if self._recorder is not None:
                 stack.callback(self._recorder.stop)
             self._stack = stack.pop_all()
@@ -136,5 +135,5 @@ class Services:
         self._stack.__exit__(kind, value, trace)
 
 
-def _finish(desk: Desk, server: Viewer | Cast) -> None:
-    desk.call(server.finish())
+def _finish(loop_thread: LoopThread, server: Viewer | TcpOutput) -> None:
+    loop_thread.call(server.finish())

@@ -25,9 +25,9 @@ from markupsafe import Markup
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
-from evlcp_sdk.live.desk import cannot_listen, stop_listening
+from evlcp_sdk.live.loop_thread import cannot_listen, stop_listening
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.telling import MOST_WAITING, PICTURES_PER_S, Teller
+from evlcp_sdk.live.serializer import MOST_WAITING, PICTURES_PER_S, Serializer
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_hex
 from evlcp_sdk.report.pages import TEMPLATES, render_page
 
@@ -70,10 +70,10 @@ class _Browser:
 
 
 class Viewer:
-    """Serves the page and what it shows; runs in the loop of a `Desk`.
+    """Serves the page and what it shows; runs in the loop of a `LoopThread`.
 
     Args:
-        feed: What is shown.
+        serializer: What is shown.
         links: The configurations by name, as `named_links` gives them.
         name: Name of the source, for the title.
         sites: How many bars the map shows.
@@ -88,7 +88,7 @@ class Viewer:
 
     def __init__(
         self,
-        feed: Teller,
+        serializer: Serializer,
         links: Mapping[str, Link],
         *,
         name: str,
@@ -97,7 +97,7 @@ class Viewer:
         port: int = 0,
         recorder: Recorder | None = None,
     ) -> None:
-        self._feed, self._recorder = feed, recorder
+        self._serializer, self._recorder = serializer, recorder
         self._name, self._links, self._sites = name, links, sites
         self._host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
@@ -118,7 +118,7 @@ class Viewer:
     @property
     def dropped(self) -> int:
         """Results that browsers were not sent as they did not take them, or as there was no time, so far."""
-        return self._feed.dropped + self._left + sum(browser.dropped for browser in self._browsers)
+        return self._serializer.dropped + self._left + sum(browser.dropped for browser in self._browsers)
 
     async def start(self) -> None:
         """Listen.
@@ -144,22 +144,22 @@ class Viewer:
                 server_header=None,
             )
         except OSError as fault:
-            self._feed.leave()
+            self._serializer.leave()
             raise cannot_listen(self._host, self.port, fault) from fault
         self.port = next(iter(server.sockets)).getsockname()[1]
 
         async def pump() -> None:
             try:
-                while not self._feed.ended:
-                    await self._feed.turn()
-                    for kind, line in self._feed.take(frames=bool(self._browsers)):
+                while not self._serializer.ended:
+                    await self._serializer.turn()
+                    for kind, line in self._serializer.take(frames=bool(self._browsers)):
                         self._tell(kind, line)
                     self._send_all()
                 # The last words.
                 await asyncio.sleep(2 / PICTURES_PER_S)
                 self._send_all()
             finally:
-                self._feed.leave()
+                self._serializer.leave()
                 await stop_listening(server)
 
         self._pump = asyncio.create_task(pump())
@@ -309,8 +309,8 @@ class Viewer:
             return
         from websockets.asyncio.server import broadcast
 
-        shot = self._feed.shot()
-        self._feed.ask()
+        shot = self._serializer.shot()
+        self._serializer.ask()
         record = None if self._recorder is None else self._recorder.state
         end = f'"record": {json.dumps(record)}}}'
         for browser in ready:
@@ -320,7 +320,7 @@ class Viewer:
             told, data = '"picture": null, "bars": null', b""
             if shot is not None and new:
                 browser.picture, told, data = shot.number, shot.told, shot.png
-            dropped = browser.dropped + self._feed.dropped
+            dropped = browser.dropped + self._serializer.dropped
             text = f'{{"news": [{", ".join(browser.waiting)}], "dropped": {dropped}, {told}, {end}'.encode()
             browser.waiting.clear()
             browser.ready = False

@@ -16,11 +16,11 @@ from websockets.sync.client import connect
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import named_links
-from evlcp_sdk.live import Budget, Outlet
+from evlcp_sdk.live import Budget, Publisher
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.run import live, receive
 from evlcp_sdk.values import Frame
-from tests.unit.live.test_casts import port_of, tell
+from tests.unit.live.test_tcp_output import port_of, tell
 
 PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
 NOW = struct.pack("ii", 1, 0)
@@ -58,9 +58,9 @@ def sender(pieces: Iterable[bytes], end: Callable[[socket.socket], None]) -> Ite
 
 
 def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
-    outlet, over, lives = Outlet(), threading.Event(), {"nmea": 0, "gpsd": 0, "view": 0}
+    publisher, over, lives = Publisher(), threading.Event(), {"nmea": 0, "gpsd": 0, "view": 0}
     serving = Serving(view=True, nmea_port=0, gpsd_port=0)
-    with Services(serving, outlet, named_links(load_link()), name="x") as services:
+    with Services(serving, publisher, named_links(load_link()), name="x") as services:
         assert services.view is not None
         url = services.view.url.replace("http", "ws") + "live"
 
@@ -97,14 +97,14 @@ def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
 
         def fixes() -> None:
             while not over.wait(0.01):
-                tell(outlet, time.monotonic() * 1e6)
+                tell(publisher, time.monotonic() * 1e6)
 
         lived = [(client, "nmea"), (client, "gpsd"), (browser, "view")]
         threads = [threading.Thread(target=until_over, args=given) for given in lived]
         threads.append(threading.Thread(target=fixes))
         for thread in threads:
             thread.start()
-        mine = outlet.subscribe({"frame"}, most=100_000)
+        mine = publisher.subscribe({"frame"}, most=100_000)
 
         def pieces() -> Iterator[bytes]:
             """Yields the recording bit by bit: as long as any kind has died too seldom, it goes slowly."""
@@ -116,7 +116,7 @@ def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
                     time.sleep(0.01)
 
         try:
-            given: dict[str, Any] = {"outlet": outlet, "pictures": services.pictures, "budget": PATIENT}
+            given: dict[str, Any] = {"publisher": publisher, "pictures": services.pictures, "budget": PATIENT}
             with sender(pieces(), socket.socket.close) as source:
                 summary = live(source, **given, warm=False)
         finally:

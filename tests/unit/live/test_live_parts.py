@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.live import Budget, DelayTally, Outlet, PictureSlot, Shedder
+from evlcp_sdk.live import Budget, DelayTally, PictureSlot, Publisher, Shedder
 from evlcp_sdk.live.reader import ArrivalClock, Reader
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Region, Triggers
@@ -21,30 +21,30 @@ def events_at(t_us: list[int] | np.ndarray, seed: int = 0) -> Events:
 
 
 def test_each_listener_gets_its_kinds_and_its_queue() -> None:
-    outlet = Outlet()
+    publisher = Publisher()
     woken = []
-    frames = outlet.subscribe({"frame"}, most=3, wake=lambda: woken.append(1))
-    everything = outlet.subscribe()
+    frames = publisher.subscribe({"frame"}, most=3, wake=lambda: woken.append(1))
+    everything = publisher.subscribe()
     for number in range(5):
-        outlet.publish("frame", number, number, late_ms=0.5)
-        outlet.publish("status", number, number)
+        publisher.publish("frame", number, number, late_ms=0.5)
+        publisher.publish("status", number, number)
     assert [news.value for news in frames.take()] == [2, 3, 4]
     assert (frames.dropped, everything.dropped, len(woken)) == (2, 0, 5)
     assert [(news.kind, news.value) for news in everything.take()][:2] == [("frame", 0), ("status", 0)]
     assert frames.take(timeout_s=0) == []
-    outlet.leave(frames)
-    outlet.publish("frame", 9.0, 9)
+    publisher.leave(frames)
+    publisher.publish("frame", 9.0, 9)
     assert frames.ended
     assert not everything.ended
-    outlet.close()
+    publisher.close()
     assert [news.value for news in everything.take()] == [9]
     assert everything.ended
-    assert outlet.subscribe().ended
+    assert publisher.subscribe().ended
 
 
 def test_who_waits_is_woken_by_news_and_by_the_end() -> None:
-    outlet = Outlet()
-    mine = outlet.subscribe({"status"})
+    publisher = Publisher()
+    mine = publisher.subscribe({"status"})
     got: list[object] = []
 
     def listen() -> None:
@@ -53,8 +53,8 @@ def test_who_waits_is_woken_by_news_and_by_the_end() -> None:
 
     thread = threading.Thread(target=listen)
     thread.start()
-    outlet.publish("status", 0.0, "a")
-    outlet.close()
+    publisher.publish("status", 0.0, "a")
+    publisher.close()
     thread.join(5)
     assert not thread.is_alive()
     assert got == ["a"]

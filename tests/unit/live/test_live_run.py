@@ -20,7 +20,7 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.io import RawSource, ReplaySource, open_source, write_events
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.live import Budget, LiveStatus, Outlet, PictureSlot, Subscription
+from evlcp_sdk.live import Budget, LiveStatus, PictureSlot, Publisher, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import live, receive
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
@@ -54,13 +54,13 @@ def gathered(subscription: Subscription) -> dict[str, list[Any]]:
 def test_a_replay_gives_what_the_file_gives(
     demo_raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    outlet, pictures = Outlet(), PictureSlot()
+    publisher, pictures = Publisher(), PictureSlot()
     pictures.ask()
-    mine = outlet.subscribe(most=100_000)
+    mine = publisher.subscribe(most=100_000)
     summary = live(
         f"replay:{demo_raw}?speed=50",
         tmp_path / "out",
-        outlet=outlet,
+        publisher=publisher,
         pictures=pictures,
         budget=PATIENT,
         warm=False,
@@ -92,9 +92,9 @@ def test_a_replay_gives_what_the_file_gives(
 
 def test_frames_of_several_links_name_theirs(demo_raw: Path) -> None:
     links = [load_link(), load_link(overrides=["modulation.id=wh8"])]
-    outlet = Outlet()
-    mine = outlet.subscribe({"frame", "packet"}, most=100_000)
-    live(f"replay:{demo_raw}?speed=50", None, links, outlet=outlet, budget=PATIENT, warm=False)
+    publisher = Publisher()
+    mine = publisher.subscribe({"frame", "packet"}, most=100_000)
+    live(f"replay:{demo_raw}?speed=50", None, links, publisher=publisher, budget=PATIENT, warm=False)
     found = gathered(mine)
     packets = list(receive(demo_raw, links))
     assert [key(f) for f in found["frame"]] == [key(f) for packet in packets for f in packet.frames]
@@ -138,10 +138,10 @@ def test_a_time_that_is_sent_says_the_delay_from_end_to_end(tmp_path: Path) -> N
     symbols = compose(link, other={"time": float(said_s)}, repeat=3, sequence=1)
     write_events(tmp_path / "time.raw", ideal_events(link, IdealBar(symbols, start_us=start_us)), 1280, 720)
     zero = datetime.fromtimestamp(said_s, UTC) + timedelta(milliseconds=2, microseconds=-start_us)
-    outlet, told_s = Outlet(), []
-    mine = outlet.subscribe({"message"}, wake=lambda: told_s.append(time.monotonic()))
+    publisher, told_s = Publisher(), []
+    mine = publisher.subscribe({"message"}, wake=lambda: told_s.append(time.monotonic()))
     source = ReplaySource(open_source(tmp_path / "time.raw"))
-    summary = live(source, None, link, clock_zero=zero, outlet=outlet, budget=PATIENT, warm=False)
+    summary = live(source, None, link, clock_zero=zero, publisher=publisher, budget=PATIENT, warm=False)
     (news,) = mine.take()
     assert news.value.age_s == pytest.approx(2e-3, abs=5e-5)
     assert summary["live"]["delays"]["end_to_end"]["max_ms"] == round(news.late_ms, 3)
@@ -172,9 +172,11 @@ class Burst(EventSource):
 
 
 def test_what_there_is_no_time_for_is_left_out_and_counted(demo_raw: Path) -> None:
-    outlet = Outlet()
-    mine = outlet.subscribe({"events", "status"}, most=100_000)
-    summary = live(Burst(demo_raw), outlet=outlet, budget=Budget(waiting_ms=0.1, most_ms=0.4), warm=False)
+    publisher = Publisher()
+    mine = publisher.subscribe({"events", "status"}, most=100_000)
+    summary = live(
+        Burst(demo_raw), publisher=publisher, budget=Budget(waiting_ms=0.1, most_ms=0.4), warm=False
+    )
     with RawSource(demo_raw) as source:
         total = len(source.read()[0])
     assert sum(len(events) for events in gathered(mine)["events"]) == total
@@ -199,10 +201,10 @@ def test_distances_are_measured_of_every_nth_frame(demo_raw: Path) -> None:
 
 def test_it_ends_when_it_is_asked_to(demo_raw: Path) -> None:
     asked = threading.Event()
-    outlet = Outlet()
-    outlet.subscribe({"frame"}, wake=asked.set)
+    publisher = Publisher()
+    publisher.subscribe({"frame"}, wake=asked.set)
     summary = live(
-        f"replay:{demo_raw}?loop=1", outlet=outlet, budget=PATIENT, warm=False, stopped=asked.is_set
+        f"replay:{demo_raw}?loop=1", publisher=publisher, budget=PATIENT, warm=False, stopped=asked.is_set
     )
     assert summary["status"] == "interrupted"
     assert summary["counts"]["frames"] > 0
@@ -217,8 +219,8 @@ def test_a_damaged_recording_is_not_waited_for(demo_raw: Path, tmp_path: Path) -
     with RawSource(damaged) as source:
         t_us = source.read()[0].t_us
     assert t_us[-1] - t_us[0] > 60e6  # Its clock leaps by minutes.
-    mine = (outlet := Outlet()).subscribe(most=100_000)
-    summary = live(damaged, outlet=outlet, budget=PATIENT, warm=False)
+    mine = (publisher := Publisher()).subscribe(most=100_000)
+    summary = live(damaged, publisher=publisher, budget=PATIENT, warm=False)
     waited_us = t_us[-1] - t_us[0] - summary["recording"]["counts"]["silences_skipped_us"]
     assert 0 < waited_us < 10e6
     assert "pace" in [note["code"] for note in summary["notes"]]

@@ -25,7 +25,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import named_links
-from evlcp_sdk.live import Budget, Outlet
+from evlcp_sdk.live import Budget, Publisher
 from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.live.viewer import page
@@ -49,7 +49,7 @@ FRAMES = [frame for packet in packets(3) for frame in packet.frames]
 class Stage:
     """A run that a test makes up, and its view."""
 
-    outlet: Outlet
+    publisher: Publisher
     services: Services
 
     @property
@@ -78,7 +78,7 @@ class Stage:
 
     def frame(self, n: int) -> None:
         frame = FRAMES[n % len(FRAMES)]
-        self.outlet.publish("frame", frame.t_us, frame, 2.5)
+        self.publisher.publish("frame", frame.t_us, frame, 2.5)
 
     def picture(self, t_us: int) -> None:
         """A slice with one event, at column 5 of row 7, as the loop gives it."""
@@ -89,10 +89,10 @@ class Stage:
 
 @pytest.fixture
 def stage() -> Iterator[Stage]:
-    outlet = Outlet()
-    with Services(Serving(view=True), outlet, LINKS, name="a name", sites=(SITE,)) as services:
-        yield Stage(outlet, services)
-        outlet.close()
+    publisher = Publisher()
+    with Services(Serving(view=True), publisher, LINKS, name="a name", sites=(SITE,)) as services:
+        yield Stage(publisher, services)
+        publisher.close()
 
 
 def unpacked(bundle: str | bytes) -> tuple[dict[str, Any], bytes]:
@@ -195,12 +195,12 @@ def test_one_that_stalls_costs_the_others_nothing(stage: Stage) -> None:
 def test_what_was_before_is_told_to_who_comes_later(stage: Stage) -> None:
     axes = LocalAxes.of([SITE])
     fix = Fix.refused(5e3, (0,), "misfit", "why")
-    stage.outlet.publish("fix", fix.t_us, Placed(fix, None))
+    stage.publisher.publish("fix", fix.t_us, Placed(fix, None))
     enu_m, unit = np.array([3.0, -20.0, -1.0]), np.eye(3)
     where = [float(v) for v in axes.to_geodetic(enu_m)]
     given = Fix(6e3, *where, enu_m, unit, unit, 0.0, 0.0, 0.0, 1.0, (0,), verified=False)
     filtered = Place(6e3, *where, enu_m, unit, 1.0, 0.0, left_out=False, starts=True)
-    stage.outlet.publish("fix", given.t_us, Placed(given, filtered))
+    stage.publisher.publish("fix", given.t_us, Placed(given, filtered))
     time.sleep(0.2)
     with stage.connect() as link:
         link.recv(5)
@@ -223,21 +223,21 @@ class Failing(TextKind):
 
 
 def test_a_message_that_cannot_be_shown_is_counted_and_said() -> None:
-    outlet = Outlet()
-    with Services(Serving(view=True), outlet, LINKS, name="a name") as services:
-        stage = Stage(outlet, services)
+    publisher = Publisher()
+    with Services(Serving(view=True), publisher, LINKS, name="a name") as services:
+        stage = Stage(publisher, services)
         with stage.connect() as link:
             link.recv(5)
             for number, value in enumerate(("raises", math.nan, "read me")):
                 message = ReceivedMessage(
                     0, 0, 5.0, Message(2, 7, number, b"-"), Failing(), value, "unverified", ""
                 )
-                outlet.publish("message", 5.0, message)
+                publisher.publish("message", 5.0, message)
             lines: list[dict[str, Any]] = []
             until_s = time.monotonic() + 10
             while "message" not in [line["line"] for line in lines] and time.monotonic() < until_s:
                 lines += next_of(link)[0]["news"]
-        outlet.close()
+        publisher.close()
     assert [line["count"] for line in lines if line["line"] == "untold"] == [1, 2]
     assert "to_dict() fails: ZeroDivisionError: by nothing" in lines[0]["fault"]
     assert lines[-1]["text"] == "read me"
@@ -256,27 +256,27 @@ def test_browsers_only_look_on(stage: Stage) -> None:
 
 
 def test_a_recording_is_what_came(tmp_path: Path) -> None:
-    outlet = Outlet()
+    publisher = Publisher()
     folder = tmp_path / "not" / "made"
     serving = Serving(view=True, record_to=folder)
-    with Services(serving, outlet, LINKS, name="x") as services:
-        stage = Stage(outlet, services)
+    with Services(serving, publisher, LINKS, name="x") as services:
+        stage = Stage(publisher, services)
         with stage.connect() as link:
             link.recv(5)
-            publish(outlet, 1_000)
+            publish(publisher, 1_000)
             link.send('{"record": true}')
-            _until(lambda: outlet.wanted("events"))
-            publish(outlet, 2_000)
-            outlet.publish("triggers", 2_500, Triggers.of([2_500, 3_004], [0, 0], [1, 0]))
-            publish(outlet, 3_000)
+            _until(lambda: publisher.wanted("events"))
+            publish(publisher, 2_000)
+            publisher.publish("triggers", 2_500, Triggers.of([2_500, 3_004], [0, 0], [1, 0]))
+            publish(publisher, 3_000)
             link.send('{"record": false}')
-            _until(lambda: not outlet.wanted("events"))
-            publish(outlet, 4_000)
+            _until(lambda: not publisher.wanted("events"))
+            publish(publisher, 4_000)
             _until(lambda: any(folder.glob("live-*.raw")))
             stage.frame(0)
             assert next_of(link)[0]["record"]["events"] == 20
         (path,) = folder.iterdir()
-        outlet.close()
+        publisher.close()
     with open_source(path) as source:
         events, triggers = source.read()
     assert events.t_us.tolist() == [*range(2_000, 2_010), *range(3_000, 3_010)]
@@ -287,14 +287,14 @@ def test_a_recording_is_what_came(tmp_path: Path) -> None:
 def test_what_was_recorded_stays_where_a_recording_has_to_end(
     why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    outlet = Outlet()
-    recorder = Recorder(outlet, tmp_path, 1280, 720)
+    publisher = Publisher()
+    recorder = Recorder(publisher, tmp_path, 1280, 720)
     recorder.start()
-    publish(outlet, 2_000)
+    publish(publisher, 2_000)
     _until(lambda: recorder.state["events"] == 10)
     if why == "disk":
         monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=7_000_000))
-    publish(outlet, 3_000 if why == "disk" else 1_000)
+    publish(publisher, 3_000 if why == "disk" else 1_000)
     _until(lambda: not recorder.state["recording"])
     told = {"disk": "7 MB are left on the disk: expected 100", "clock": "event at 1000 us after 2009 us"}
     assert told[why] in recorder.state["fault"]
@@ -302,9 +302,9 @@ def test_what_was_recorded_stays_where_a_recording_has_to_end(
         assert len(source.read()[0]) == (20 if why == "disk" else 10)
 
 
-def publish(outlet: Outlet, t_us: int) -> None:
+def publish(publisher: Publisher, t_us: int) -> None:
     t = np.arange(t_us, t_us + 10)
-    outlet.publish("events", t_us, Events.of(t, t % 1280, t % 720, t % 2))
+    publisher.publish("events", t_us, Events.of(t, t % 1280, t % 720, t % 2))
 
 
 def _until(true: Callable[[], bool], most_s: float = 10.0) -> None:
@@ -320,7 +320,7 @@ def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
             ConfigError,
             match=rf"127.0.0.1:{stage.port}: .*expected an address of this machine and a port",
         ),
-        Services(Serving(view=True, port=stage.port), Outlet(), LINKS, name="x"),
+        Services(Serving(view=True, port=stage.port), Publisher(), LINKS, name="x"),
     ):
         pass
 
@@ -328,14 +328,14 @@ def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> None:
     """Two browsers and one that stalls: pictures change, numbers are those of frames.csv, links come back."""
-    outlet, summary = Outlet(), {}
+    publisher, summary = Publisher(), {}
     with (
-        Services(Serving(view=True), outlet, LINKS, name=demo_raw.name) as services,
+        Services(Serving(view=True), publisher, LINKS, name=demo_raw.name) as services,
         Browser(tmp_path / "a") as first,
         Browser(tmp_path / "b") as second,
-        Stage(outlet, services).connect(),  # which never says that it is ready
+        Stage(publisher, services).connect(),  # which never says that it is ready
     ):
-        stage = Stage(outlet, services)
+        stage = Stage(publisher, services)
         for browser, wide in ((first, 1280), (second, 390)):
             browser.dress(wide, dark=wide == 390)
             browser.open(stage.url)
@@ -347,7 +347,7 @@ def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> Non
                     f"replay:{demo_raw}?speed=0.05",
                     tmp_path / "out",
                     list(LINKS.values()),
-                    outlet=outlet,
+                    publisher=publisher,
                     pictures=services.pictures,
                     budget=Budget(waiting_ms=1e6, most_ms=1e7),
                 )

@@ -9,15 +9,15 @@ from typing import Any, Final
 from evlcp_sdk.errors import PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.loop import LiveStatus
-from evlcp_sdk.live.outlet import News, Outlet
 from evlcp_sdk.live.pictures import Picture, PictureSlot
+from evlcp_sdk.live.publisher import News, Publisher
 from evlcp_sdk.results.columns import frame_columns
 from evlcp_sdk.results.lines import fix_line, format_frame
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, ReceivedMessage
 
-__all__ = ["MOST_WAITING", "PICTURES_PER_S", "Shot", "Teller"]
+__all__ = ["MOST_WAITING", "PICTURES_PER_S", "Serializer", "Shot"]
 
 PICTURES_PER_S: Final = 25
 
@@ -45,11 +45,11 @@ class Shot:
     png: bytes
 
 
-class Teller:
-    """Says what a run finds, in the thread that asks.
+class Serializer:
+    """Writes what a run finds for browsers, in the thread that asks.
 
     Args:
-        outlet: Where results come from.
+        publisher: Where results come from.
         pictures: Where pictures come from.
         links: The configurations by name, as `named_links` gives them.
         sites: Where the bars stand, for the map.
@@ -63,12 +63,12 @@ class Teller:
 
     def __init__(
         self,
-        outlet: Outlet,
+        publisher: Publisher,
         pictures: PictureSlot,
         links: Mapping[str, Link],
         sites: Sequence[BarSite] = (),
     ) -> None:
-        self._outlet, self._pictures = outlet, pictures
+        self._publisher, self._pictures = publisher, pictures
         self._columns = frame_columns(filtered=False, links=len(links) > 1)
         self._sites = tuple(sites)
         self._sites_told = not sites
@@ -76,7 +76,7 @@ class Teller:
         self._shot: Shot | None = None
         self._turn_s = 0.0
         self.untold, self.fault = 0, ""
-        self._mine = outlet.subscribe(_KINDS, most=MOST_WAITING)
+        self._mine = publisher.subscribe(_KINDS, most=MOST_WAITING)
 
     @property
     def dropped(self) -> int:
@@ -100,7 +100,7 @@ class Teller:
 
     def leave(self) -> None:
         """Listen no more."""
-        self._outlet.leave(self._mine)
+        self._publisher.leave(self._mine)
 
     def take(self, *, frames: bool) -> list[tuple[str, str]]:
         """What has come since, oldest first: a kind of news, or `bars`, and what is said of it, JSON.

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 from evlcp_sdk.errors import StreamError
 
-__all__ = ["KINDS", "News", "Outlet", "Subscription"]
+__all__ = ["KINDS", "News", "Publisher", "Subscription"]
 
 KINDS: Final = ("frame", "packet", "message", "fix", "events", "triggers", "status", "end")
 """What is published; see `evlcp_sdk.live`."""
@@ -33,7 +33,7 @@ class News:
 
 
 class Subscription:
-    """A queue of news, the newest `most`; made by `Outlet.subscribe`.
+    """A queue of news, the newest `most`; made by `Publisher.subscribe`.
 
     Attributes:
         dropped: News that were pushed out of the queue by newer ones, so far.
@@ -88,13 +88,13 @@ class Subscription:
             self._wake()
 
 
-class Outlet:
+class Publisher:
     """Gives what a live run finds to its subscriptions; any thread may subscribe, at any time.
 
-    >>> outlet = Outlet()
-    >>> mine = outlet.subscribe({"status"}, most=2)
+    >>> publisher = Publisher()
+    >>> mine = publisher.subscribe({"status"}, most=2)
     >>> for number in range(3):
-    ...     outlet.publish("status", number, value=number)
+    ...     publisher.publish("status", number, value=number)
     >>> [news.value for news in mine.take()], mine.dropped
     ([1, 2], 1)
     """

@@ -8,13 +8,13 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from evlcp_sdk.live.desk import cannot_listen, stop_listening
-from evlcp_sdk.live.outlet import News, Outlet, Subscription
+from evlcp_sdk.live.loop_thread import cannot_listen, stop_listening
+from evlcp_sdk.live.publisher import News, Publisher, Subscription
 from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
 from evlcp_sdk.results.nmea import sentences
 from evlcp_sdk.utc import ClockZero, zero_at
 
-__all__ = ["Cast"]
+__all__ = ["TcpOutput"]
 
 _MOST_WAITING: Final = 1000
 """Fixes that wait for a client; the oldest go."""
@@ -48,14 +48,14 @@ class _Client:
         self.filled.set()
 
 
-class Cast:
-    """Serves positions over TCP; runs in the loop of a `Desk`.
+class TcpOutput:
+    """Serves positions over TCP; runs in the loop of a `LoopThread`.
 
     Where the UTC of the camera's clock is not known, the computer's clock says it, once: programs that read
     positions want a time.
 
     Args:
-        outlet: Where fixes come from.
+        publisher: Where fixes come from.
         gpsd: As gpsd's JSON, to clients that say `?WATCH`; or else NMEA, to whoever connects.
         host: Where to listen.
         port: The same; 0 for any that is free.
@@ -68,14 +68,14 @@ class Cast:
 
     def __init__(
         self,
-        outlet: Outlet,
+        publisher: Publisher,
         *,
         gpsd: bool,
         host: str = "127.0.0.1",
         port: int = 0,
         clock_zero: ClockZero = None,
     ) -> None:
-        self._outlet, self._gpsd = outlet, gpsd
+        self._publisher, self._gpsd = publisher, gpsd
         self._host, self.port = host, port
         self._zero = clock_zero
         self._clients: set[_Client] = set()
@@ -104,11 +104,11 @@ class Cast:
             if not loop.is_closed():
                 loop.call_soon_threadsafe(came.set)
 
-        mine = self._mine = self._outlet.subscribe({"fix", "status"}, most=_MOST_WAITING, wake=wake)
+        mine = self._mine = self._publisher.subscribe({"fix", "status"}, most=_MOST_WAITING, wake=wake)
         try:
             server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MOST_LINE)
         except OSError as fault:
-            self._outlet.leave(mine)
+            self._publisher.leave(mine)
             raise cannot_listen(self._host, self.port, fault) from fault
         self.port = server.sockets[0].getsockname()[1]
 
@@ -120,7 +120,7 @@ class Cast:
                     for news in mine.take(0):
                         self._tell(news)
             finally:
-                self._outlet.leave(mine)
+                self._publisher.leave(mine)
                 await stop_listening(server)
 
         self._pump = asyncio.create_task(pump())

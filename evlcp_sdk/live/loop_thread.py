@@ -9,7 +9,7 @@ from typing import Any, Protocol, Self, TypeVar
 
 from evlcp_sdk.errors import ConfigError
 
-__all__ = ["Desk", "Listening", "cannot_listen", "stop_listening"]
+__all__ = ["Listening", "LoopThread", "cannot_listen", "stop_listening"]
 
 _T = TypeVar("_T")
 
@@ -20,12 +20,12 @@ _QUIET_TURNS = 5
 """Turns of the loop without a task, in which connections are let go."""
 
 
-class Desk:
+class LoopThread:
     """An event loop in a thread of its own; a context manager, whose end cancels all that runs in it."""
 
     def __init__(self) -> None:
         self.loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._run, name="evlcp-desk", daemon=True)
+        self._thread = threading.Thread(target=self._run, name="evlcp-loop", daemon=True)
 
     def call(self, job: Coroutine[Any, Any, _T]) -> _T:
         """Run something in the loop; return what it returns, or raise what it raises."""
