@@ -18,7 +18,7 @@ __all__ = [
     "make",
     "native_library",
     "native_program",
-    "test_folder",
+    "tests_folder",
 ]
 
 FIRMWARE = Path(__file__).parent / "firmware"
@@ -122,11 +122,11 @@ def arm_image(board: str) -> Path:
     """
     _compiler("arm-none-eabi-gcc", "gcc-arm-none-eabi")
     if board == "mps2-an385":
-        return make("mps2", makefile=test_folder() / "firmware" / "c" / "Makefile") / f"{board}.elf"
+        return make("mps2", makefile=tests_folder() / "firmware" / "c" / "Makefile") / f"{board}.elf"
     return make("images" if board[-2:] in ("-1", "-2") else "stm32") / f"{board}.elf"
 
 
-def test_folder() -> Path:
+def tests_folder() -> Path:
     """The checkout's tests, where emulators of the part and QEMU's board stand.
 
     Raises:

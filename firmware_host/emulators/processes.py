@@ -158,7 +158,7 @@ def _model(name: str) -> list[str]:
     Raises:
         ToolchainError: This is no checkout.
     """
-    root = build.test_folder().parent
+    root = build.tests_folder().parent
     code = (
         f"import runpy, sys; sys.path.insert(0, {str(root)!r});"
         f" runpy.run_module('tests.models.{name}', run_name='__main__', alter_sys=True)"
