@@ -24,7 +24,7 @@ TRUE_WARNINGS = {"bracket-45m": ["clusters-hidden"], "rate-cap-3mev-50m": ["satu
 # Figures of benchmarks/road.toml that are not reached, a set a bar; a recording that is not here reaches all.
 def table(*args: str | Path) -> dict[str, Any]:
     """What the benchmark prints as JSON, by recording, of its first link; speed left out."""
-    command = [sys.executable, BENCHMARK, *args, "--rounds", "0", "--tiled", "0", "--json"]
+    command = [sys.executable, BENCHMARK, *args, "--rounds", "0", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     assert done.returncode in (0, 1), done.stderr
     links = json.loads(done.stdout)
