@@ -1,4 +1,4 @@
-"""Loops over the times of events, and Cholesky's root of a few unknowns, compiled."""
+"""Loops over grid cells and over the times of events, and Cholesky's root of a few unknowns, compiled."""
 
 from typing import Any
 
@@ -8,6 +8,44 @@ from numpy.typing import NDArray
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
+
+
+@njit
+def take_in(heard: Array, prior: Array, out: Array) -> None:
+    """Probability of each cluster in each cell by Bayes' rule, from its evidence and from the place alone.
+
+    All are (K, rows, columns). Without a cluster, the evidence is as likely as each with equal priors, and
+    not even a cell that fits a code in all its values is sure to show a cluster, nor a place.
+    """
+    clusters, rows, columns = prior.shape
+    # Flat, cells go side by side.
+    cells = rows * columns
+    heard_of = np.ascontiguousarray(heard).reshape(clusters, cells)
+    prior_of = np.ascontiguousarray(prior).reshape(clusters, cells)
+    out_of = out.reshape(clusters, cells)
+    place, share = np.zeros(cells), np.zeros(cells)
+    out[:] = 0
+    for k in range(clusters):
+        _add_to(place, prior_of[k])
+        _add_to(share, heard_of[k])
+    for j in range(cells):
+        if place[j] == 0:
+            continue
+        odds = clusters / max(1 - share[j], 1e-6)
+        unheard = 0.0 if share[j] > 0 else 1.0
+        total = max(1 - place[j], 1e-6)
+        for k in range(clusters):
+            if prior_of[k, j] != 0:
+                total += prior_of[k, j] * (heard_of[k, j] * odds + unheard)
+        for k in range(clusters):
+            if prior_of[k, j] != 0:
+                out_of[k, j] = prior_of[k, j] * (heard_of[k, j] * odds + unheard) / total
+
+
+@njit
+def _add_to(total: Array, part: Array) -> None:
+    for j in range(total.size):
+        total[j] += part[j]
 
 
 @njit

@@ -13,10 +13,16 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message
 from evlcp_sdk.air.kinds import MessageKind
 from evlcp_sdk.errors import ConfigError, StreamError
+from evlcp_sdk.late import Late
 
 if TYPE_CHECKING:
     import pandas
     import pyarrow
+
+if TYPE_CHECKING:
+    from evlcp_sdk import _kernels
+else:
+    _kernels = Late("evlcp_sdk._kernels")
 
 __all__ = [
     "Alternative",
@@ -266,17 +272,12 @@ class PresenceMap:
         What a cell shows tells how well it can be read, too; for a decoding that knows that by other means, a
         dim cell in its place counts in full.
         """
-        if self.prior is None:
+        prior = self.prior
+        if prior is None:
             return self
-        prior, heard = self.prior.astype(np.float64), self.probability.astype(np.float64)
-        share = heard.sum(0)
-        # Without a cluster, the evidence is as likely as each with equal priors; and not even a cell that
-        # fits a code in all its values is sure to show a cluster, nor a place.
-        odds = len(prior) / np.maximum(1 - share, 1e-6)
-        weight = prior * (heard * odds + ~(share > 0))
-        none = np.maximum(1 - prior.sum(0), 1e-6)
-        total = np.concatenate([none[None], weight]).sum(0)
-        return changed(self, probability=(weight / total).astype(self.probability.dtype))
+        probability = np.empty_like(self.probability)
+        _kernels.take_in(self.probability, prior, probability)
+        return changed(self, probability=probability)
 
     def __repr__(self) -> str:
         clusters, rows, columns = self.selected.shape
