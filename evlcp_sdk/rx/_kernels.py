@@ -1082,6 +1082,40 @@ def copy_near(pixels: Array, places: Array, unit: complex, along: float, across:
                     out[k, v, u] = pixels[k, v, u]
 
 
+@njit
+def mask(
+    presence: tuple[Array, Array, Array],
+    seen: Array,
+    place: tuple[Array, complex, float, int],
+    bins: int,
+    edge: float,
+    out: tuple[Array, Array, Array, Array],
+) -> None:
+    """Probability, choice and pixels with a layout's place taken in, and its prior, into zeros.
+
+    Of a line, whose width shows within `bins` px from its axis and is that at `edge` of its peak; of a
+    layout of squares where there are none. The place is the clusters', a direction, spacing and grid.
+    """
+    (likely, selected, pixels), (prior, probability, chosen, near) = presence, out
+    places, unit, spacing, grid = place
+    across = spacing
+    if bins:
+        hits, cells, profile = np.zeros(bins), np.zeros(bins), np.empty(bins)
+        across_profile(likely, seen, places, unit, spacing, grid, hits, cells)
+        wide = core_profile(hits, cells, edge, profile)
+        across = float(wide)
+        line_prior(places, unit, spacing, grid, profile[:wide], prior)
+    else:
+        block_prior(places, unit, spacing, grid, prior)
+    copy_near(pixels, places, unit, spacing, across, near)
+    clusters, rows, columns = prior.shape
+    for k in range(clusters):
+        for r in range(rows):
+            for c in range(columns):
+                if prior[k, r, c] > 0:
+                    probability[k, r, c], chosen[k, r, c] = likely[k, r, c], selected[k, r, c]
+
+
 _BEYOND_PX = 2.0
 """How far beyond its end a cluster's light counts, px: so far a lens and pixels spread it. Farther away is
 that of others, by which events between theirs make its code look present."""

@@ -214,21 +214,13 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
         unit *= layout.way
     spacing_px = abs(placement.scale) * layout.spacing_m
     places = placement.places(layout)
-    grid, likely = presence.grid_px, presence.probability
-    pixels, prior = np.zeros_like(presence.pixels), np.zeros_like(likely)
-    across_px = spacing_px
-    if layout.line:
-        bins = math.ceil(spacing_px + _WIDEST_PX)
-        hits, cells, profile = np.zeros(bins), np.zeros(bins), np.empty(bins)
-        _kernels.across_profile(likely, placement.seen, places, unit, spacing_px, grid, hits, cells)
-        wide = _kernels.core_profile(hits, cells, _EDGE, profile)
-        across_px = float(wide)
-        _kernels.line_prior(places, unit, spacing_px, grid, profile[:wide], prior)
-    else:
-        _kernels.block_prior(places, unit, spacing_px, grid, prior)
-    _kernels.copy_near(presence.pixels, places, unit, spacing_px, across_px, pixels)
-    inside = prior > 0
-    return PresenceMap(likely * inside, grid, presence.selected & inside, pixels, prior)
+    given = presence.probability, presence.selected, presence.pixels
+    prior, probability = np.zeros_like(given[0]), np.zeros_like(given[0])
+    selected, pixels = np.zeros_like(given[1]), np.zeros_like(given[2])
+    bins = math.ceil(spacing_px + _WIDEST_PX) if layout.line else 0
+    place, out = (places, unit, spacing_px, presence.grid_px), (prior, probability, selected, pixels)
+    _kernels.mask(given, placement.seen, place, bins, _EDGE, out)
+    return PresenceMap(probability, presence.grid_px, selected, pixels, prior)
 
 
 def lit(
