@@ -27,7 +27,7 @@ _LONG_S = 2.0
 class Compiling:
     """What compiling kernels, and loading those that are kept, has taken in this process.
 
-    It is said once, to the log, when it has taken long.
+    Compiling is said once, to the log, when it has taken long; loading is not.
 
     Attributes:
         processor_s: Processor time, s.
@@ -36,6 +36,7 @@ class Compiling:
 
     def __init__(self) -> None:
         self.processor_s = self.elapsed_s = 0.0
+        self._compiled_s = 0.0
         self._depth = 0
         self._is_said = False
 
@@ -49,6 +50,7 @@ class Compiling:
         @wraps(compile_)
         def watched(sig: Any) -> Any:
             begin = time.process_time(), time.perf_counter()
+            compiled = sum(kernel.stats.cache_misses.values())
             # Numba's many small objects would be looked through again and again: a seventh of the time.
             collects = gc.isenabled()
             gc.disable()
@@ -67,8 +69,11 @@ class Compiling:
                     gc.enable()
                 if not self._depth:
                     self.processor_s += time.process_time() - begin[0]
-                    self.elapsed_s += time.perf_counter() - begin[1]
-                    if self.elapsed_s > _LONG_S and not self._is_said:
+                    elapsed_s = time.perf_counter() - begin[1]
+                    self.elapsed_s += elapsed_s
+                    if sum(kernel.stats.cache_misses.values()) > compiled:
+                        self._compiled_s += elapsed_s
+                    if self._compiled_s > _LONG_S and not self._is_said:
                         self._is_said = True
                         logging.getLogger(__name__).info(
                             "compiling kernels, once on a machine; up to a minute in all"

@@ -33,8 +33,9 @@ def test_time_for_kernels_is_left_out() -> None:
     def compile_(_sig: object) -> None:
         busy(0.05)
 
-    inner = COMPILING.watched(SimpleNamespace(compile=compile_))
-    outer = COMPILING.watched(SimpleNamespace(compile=lambda sig: (busy(0.05), inner(sig))))
+    stats = SimpleNamespace(cache_misses={})
+    inner = COMPILING.watched(SimpleNamespace(compile=compile_, stats=stats))
+    outer = COMPILING.watched(SimpleNamespace(compile=lambda sig: (busy(0.05), inner(sig)), stats=stats))
     with watch.running():
         began_s = time.perf_counter()
         outer(None)
