@@ -3,6 +3,7 @@
 import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,15 +12,26 @@ import typer
 from evlcp_sdk.cli._common import LinkFiles, Overrides, complain, echo, loaded
 
 if TYPE_CHECKING:
-    from datetime import datetime
-
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.utc import PulseClock
 
-__all__ = ["CameraOptions", "FormatOptions", "LinePrinter", "LinkOptions", "json_lines_of"]
+__all__ = ["CameraOptions", "FormatOptions", "LinePrinter", "LinkOptions", "json_lines_of", "parse_utc"]
+
+
+def parse_utc(text: str) -> datetime:
+    """A time in ISO 8601, UTC unless it says otherwise."""
+    try:
+        time = datetime.fromisoformat(text)
+    except ValueError as fault:
+        raise typer.BadParameter(f"{text!r}: expected a time such as 2026-03-01T10:15:00Z") from fault
+    time = time if time.tzinfo is not None else time.replace(tzinfo=UTC)
+    # MCAP counts from 1970 on, and NMEA has two digits of the year.
+    if not datetime(1970, 1, 1, tzinfo=UTC) <= time < datetime(2200, 1, 1, tzinfo=UTC):
+        raise typer.BadParameter(f"{text!r}: expected 1970 to 2199")
+    return time
 
 
 @dataclass(frozen=True)
@@ -129,9 +141,10 @@ class CameraOptions:
         typer.Option("--time-sigma-us", min=0, help="Of the offset of the file's times from the camera's."),
     ] = 0.0
     clock_zero: Annotated[
-        str | None,
+        datetime | None,
         typer.Option(
             "--clock-zero",
+            parser=parse_utc,
             metavar="UTC",
             help="UTC of the camera clock's 0, for the age of signed beacons, NMEA and MCAP.",
         ),
@@ -180,8 +193,7 @@ class CameraOptions:
         """What says the UTC of a camera's clock: pulses of a recording, or its zero; None for nothing."""
         from evlcp_sdk.utc import PulseClock
 
-        zero = self.zero()
-        return zero if self.pps is None else PulseClock(self.pps, zero)
+        return self.clock_zero if self.pps is None else PulseClock(self.pps, self.clock_zero)
 
     def plan(self, links: "Sequence[Link]", *, mcap: bool = False) -> "PositionPlan | None":
         """What positions are computed from, of those of several links that allow it; None without sites."""
@@ -198,26 +210,8 @@ class CameraOptions:
         link = next(iter(placing_links(named_links(links)).values()))
         log = None
         if self.gnss is not None:
-            log = GnssLog.read(self.gnss, self.zero(), link.position.gnss_sigma_m)
+            log = GnssLog.read(self.gnss, self.clock_zero, link.position.gnss_sigma_m)
         return PositionPlan(load_sites(self.sites), log)
-
-    def zero(self) -> "datetime | None":
-        """UTC of the camera clock's 0; None if it is not given."""
-        from datetime import UTC, datetime
-
-        text = self.clock_zero
-        if text is None:
-            return None
-        try:
-            zero = datetime.fromisoformat(text)
-        except ValueError as fault:
-            expected = f"{text!r}: expected a time such as 2026-03-01T10:15:00Z"
-            raise typer.BadParameter(expected, param_hint="--clock-zero") from fault
-        zero = zero if zero.tzinfo is not None else zero.replace(tzinfo=UTC)
-        # MCAP counts from 1970 on, and NMEA has two digits of the year.
-        if not datetime(1970, 1, 1, tzinfo=UTC) <= zero < datetime(2200, 1, 1, tzinfo=UTC):
-            raise typer.BadParameter(f"{text!r}: expected 1970 to 2199", param_hint="--clock-zero")
-        return zero
 
 
 class LinePrinter:

@@ -28,8 +28,6 @@ from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
 if TYPE_CHECKING:
-    from datetime import datetime
-
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.plugin.registry import Registry
@@ -142,10 +140,8 @@ def receive(
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
         jobs = [_fitted(job, links[0], registry) for job in jobs]
     plan = camera.plan(links, mcap=formats.mcap)
-    decode = DecodeJob(
-        links, plan, camera.attitude(), camera.zero(), camera.pps,
-        formats.names(registry, out, positions=plan is not None), lines,
-    )  # fmt: skip
+    sinks = formats.names(registry, out, positions=plan is not None)
+    decode = DecodeJob(links, plan, camera.attitude(), camera, sinks, lines)
     here = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not here:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
@@ -267,15 +263,13 @@ class DecodeJob:
     links: tuple[Link, ...]
     plan: PositionPlan | None
     attitude: Attitude | AttitudeLog | None
-    clock_zero: datetime | None
-    pps: int | None
+    camera: CameraOptions
     sinks: tuple[str, ...]
     lines: LinePrinter | None
 
     def __call__(self, job: ReceiveJob, here: tuple[Registry, EndRequest] | None) -> dict[str, Any]:
         """The summary."""
         from evlcp_sdk.run import receive_to_folder, stop_on_request
-        from evlcp_sdk.utc import PulseClock
 
         decode = partial(
             receive_to_folder,
@@ -284,7 +278,7 @@ class DecodeJob:
             job.link or self.links,
             plan=self.plan,
             attitude=self.attitude,
-            clock_zero=self.clock_zero if self.pps is None else PulseClock(self.pps, self.clock_zero),
+            clock_zero=self.camera.clock(),
             sinks=self.sinks,
         )
         if here is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,7 +10,7 @@ import typer
 
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo
-from evlcp_sdk.cli._receiving import CameraOptions
+from evlcp_sdk.cli._receiving import CameraOptions, parse_utc
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
@@ -53,8 +54,10 @@ def survey(
         ),
     ] = None,
     clock_zero: Annotated[
-        str | None,
-        typer.Option("--clock-zero", metavar="UTC", help="UTC of the camera clock's 0, for NMEA."),
+        datetime | None,
+        typer.Option(
+            "--clock-zero", parser=parse_utc, metavar="UTC", help="UTC of the camera clock's 0, for NMEA."
+        ),
     ] = None,
     link_files: LinkFiles = None,
     overrides: Overrides = None,
