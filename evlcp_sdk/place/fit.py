@@ -131,6 +131,7 @@ def _solve(matrix: Floats, side: Floats, damping: float) -> Floats | None:
     scale = 1 / np.sqrt(np.maximum(np.diag(damped), 1e-300))
     scaled = damped * scale * scale[:, None]
     try:
+        # Says whether it is positive definite; NumPy solves nothing with it.
         np.linalg.cholesky(scaled)
     except np.linalg.LinAlgError:
         return None

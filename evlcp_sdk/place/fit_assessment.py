@@ -23,9 +23,8 @@ from evlcp_sdk.place.model import (
     Fit,
     linearize,
     move,
-    skewed,
 )
-from evlcp_sdk.place.observations import Problem
+from evlcp_sdk.place.observations import Problem, skewed
 from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.values import FailedBar

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.observations import Problem
+from evlcp_sdk.place.observations import Problem, skewed
 from evlcp_sdk.scene.camera import CameraModel
 
 __all__ = [
@@ -26,7 +26,6 @@ __all__ = [
     "Fit",
     "linearize",
     "move",
-    "skewed",
 ]
 
 Floats = NDArray[np.float64]
@@ -96,37 +95,6 @@ class Equations:
         return matrix, side
 
 
-@dataclass(frozen=True, eq=False)
-class _Known:
-    """What is the same of a problem wherever it is made linear: of each point, with the sigmas of its bar.
-
-    Attributes:
-        place: Sigma of its bar's place, m, float64 (n, 1).
-        turn: Of the turn, radians.
-        stretched: Its arm from its bar's centre by one sigma of the bar's length, m, float64 (n, 3).
-        arm: What a turn does to it, float64 (n, 3, 3).
-        root: A root of the covariance of its bar's shift in the image, px, float64 (n, 2, 2).
-        even: What makes its errors even in all directions, float64 (n, 2, 2).
-    """
-
-    place: Floats
-    turn: Floats
-    stretched: Floats
-    arm: Floats
-    root: Floats
-    even: Floats
-
-    @classmethod
-    def of(cls, problem: Problem) -> "_Known":
-        known: _Known | None = vars(problem).get("_known")
-        if known is None:
-            sigma, arm_m = problem.bar_sigma[problem.bar], problem.points[:, 3:6]
-            root, even = _symmetric(sigma[:, 3:6]), _symmetric(sigma[:, 6:9])
-            known = cls(sigma[:, :1], sigma[:, 1:2], arm_m * sigma[:, 2:3], skewed(arm_m), root, even)
-            vars(problem)["_known"] = known
-        return known
-
-
 def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
     """The problem at a point; None where a point is behind the camera.
 
@@ -135,7 +103,7 @@ def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
         at: The point.
         huber: Misses in sigmas beyond which a point weighs less.
     """
-    points, known, own = problem.points, _Known.of(problem), at.local[problem.bar]
+    points, known, own = problem.points, problem.known, at.local[problem.bar]
     offset = points[:, :3] - at.position + known.place * own[:, 3:6] + own[:, 2:3] * known.stretched
     offset += _by(known.turn * own[:, 6:9], known.arm)
     seen = offset @ at.rotation
@@ -202,25 +170,10 @@ def move(problem: Problem, at: Fit, step: Floats) -> Fit:
     )
 
 
-_LEVI_CIVITA = np.zeros((3, 9))
-for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
-    _LEVI_CIVITA[_i, 3 * _j + _k], _LEVI_CIVITA[_i, 3 * _k + _j] = -1.0, 1.0
-
-
-def skewed(vectors: Floats) -> Floats:
-    """Matrices of vectors v (n, 3), float64 (n, 3, 3): times w it is v x w, and w times it is w x v."""
-    return (vectors @ _LEVI_CIVITA).reshape(-1, 3, 3)
-
-
 def _by(vectors: Floats, matrices: Floats) -> Floats:
     """Vectors (n, k) times symmetric, or from the left, matrices (n, k, m)."""
     product: Floats = (vectors[:, None, :] @ matrices)[:, 0]
     return product
-
-
-def _symmetric(upper: Floats) -> Floats:
-    """Matrices of their upper halves (n, 3), float64 (n, 2, 2)."""
-    return upper[:, [0, 1, 1, 2]].reshape(-1, 2, 2)
 
 
 def _erring(camera: CameraModel, error: Floats) -> CameraModel:

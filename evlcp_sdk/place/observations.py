@@ -15,7 +15,16 @@ from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
-__all__ = ["EXACT_RAD", "BarView", "Problem", "between_of", "project_bars", "shared_sigmas"]
+__all__ = [
+    "EXACT_RAD",
+    "BarView",
+    "KnownSigmas",
+    "Problem",
+    "between_of",
+    "project_bars",
+    "shared_sigmas",
+    "skewed",
+]
 
 Floats = NDArray[np.float64]
 
@@ -25,6 +34,10 @@ triangle of 10 m at 50 m is seen to better than a pixel of 7000 px."""
 
 EXACT_RAD = 1e-7
 """Least sigma of an angle, so that exact knowledge stays solvable: 5 um at 50 m."""
+
+_LEVI_CIVITA = np.zeros((3, 9))
+for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+    _LEVI_CIVITA[_i, 3 * _j + _k], _LEVI_CIVITA[_i, 3 * _k + _j] = -1.0, 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -104,6 +117,32 @@ def project_bars(
     return camera.project(ahead), np.concatenate([-slope, turned], -1)
 
 
+def skewed(vectors: Floats) -> Floats:
+    """Matrices of vectors v (n, 3), float64 (n, 3, 3): times w it is v x w, and w times it is w x v."""
+    return (vectors @ _LEVI_CIVITA).reshape(-1, 3, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class KnownSigmas:
+    """What is the same of a problem wherever it is made linear: of each point, with the sigmas of its bar.
+
+    Attributes:
+        place: Sigma of its bar's place, m, float64 (n, 1).
+        turn: Of the turn, radians.
+        stretched: Its arm from its bar's centre by one sigma of the bar's length, m, float64 (n, 3).
+        arm: What a turn does to it, float64 (n, 3, 3).
+        root: A root of the covariance of its bar's shift in the image, px, float64 (n, 2, 2).
+        even: What makes its errors even in all directions, float64 (n, 2, 2).
+    """
+
+    place: Floats
+    turn: Floats
+    stretched: Floats
+    arm: Floats
+    root: Floats
+    even: Floats
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """All points in one array, all sigmas, and which unknowns there are.
@@ -154,6 +193,13 @@ class Problem:
         """Where each bar's points are."""
         ends = np.cumsum(np.bincount(self.bar, minlength=len(self.bar_sigma))).tolist()
         return [slice(first, end) for first, end in zip([0, *ends], ends, strict=False)]
+
+    @cached_property
+    def known(self) -> KnownSigmas:
+        """What is the same wherever it is made linear."""
+        sigma, arm_m = self.bar_sigma[self.bar], self.points[:, 3:6]
+        root, even = (sigma[:, k : k + 3][:, [0, 1, 1, 2]].reshape(-1, 2, 2) for k in (3, 6))
+        return KnownSigmas(sigma[:, :1], sigma[:, 1:2], arm_m * sigma[:, 2:3], skewed(arm_m), root, even)
 
     @classmethod
     def of(
