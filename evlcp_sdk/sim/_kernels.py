@@ -14,7 +14,7 @@ from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
 
-ON_FACTOR, OFF_FACTOR, U_BASE, T_BASE, REFERENCE, T_READY, T_LAST_OUT, LIGHT, FOLLOWER = range(9)
+ON_FACTOR, OFF_FACTOR, U_BASE, REFERENCE, T_READY, T_LAST_OUT, LIGHT, FOLLOWER = range(8)
 """Columns of a pixel's state: its thresholds as factors, the receptor, the comparator, the light on it, and
 the log signal behind the source follower, where that has a time constant."""
 
@@ -886,13 +886,13 @@ def _load(
 
 
 @njit
-def _keep(pixels: Array, end_us: float, block: int, store: tuple[Array, Array], batch: Batch) -> None:
+def _keep(pixels: Array, block: int, store: tuple[Array, Array], batch: Batch) -> None:
     """Put a batch's pixels back."""
     f = batch.f
     for i in range(pixels.size):
         s, c = store[0][pixels[i]], store[1][pixels[i]]
         s[ON_FACTOR], s[OFF_FACTOR] = f[_ON + i], f[_OFF + i]
-        s[U_BASE], s[T_BASE], s[REFERENCE] = f[_U + i], end_us, f[_REFERENCE + i]
+        s[U_BASE], s[REFERENCE] = f[_U + i], f[_REFERENCE + i]
         s[T_READY], s[T_LAST_OUT] = f[_READY + i], f[_LAST_OUT + i]
         s[LIGHT], s[FOLLOWER] = f[_NOW + i], f[_FOLLOWER + i]
         c[DRAW], c[ARMED], c[BLOCK] = batch.draw[i], int(f[_ARMED + i]), block + 2
@@ -1032,7 +1032,7 @@ def run_pixels(
         size = _load(pixels, store[2], block.number, state, batch, model), pixels.size
         of_batch = block.masks[j], block.strides[j]
         _run_batch(size, of_batch, block.end_us, world, room, batch, model, out)
-        _keep(pixels, block.end_us, block.number, state, batch)
+        _keep(pixels, block.number, state, batch)
     return last
 
 
@@ -1124,9 +1124,9 @@ def read_out(
     `times_us` are (when the words' times begin, what a row takes, until when). One row is served at a time,
     which takes all its requests along; the next is the next one below with a request, and after the last row
     the first. Of `limit` (events, window in us), more events in a window are dropped; 0 for none. `words` are
-    sorted; `memory` holds (time when
-    free, last row, number of the window, events in it) and is updated. Where `pending`, bool (rows, columns),
-    all False, has any room, a pixel sends nothing while a request of its waits.
+    sorted; `memory` holds (time when free, last row, number of the window, events in it) and is updated.
+    Where `pending`, bool (rows, columns), all False, has any room, a pixel sends nothing while a request of
+    its waits.
 
     Returns:
         (events written, events over the cap, requests of waiting pixels, requests left).

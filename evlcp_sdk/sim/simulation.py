@@ -369,7 +369,7 @@ class Simulation:
         self._darkest_texture = float(self._texture.min())
         self._ends_m = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
         size = scene.camera.width * scene.camera.height
-        self._state = np.zeros((size, 9))
+        self._state = np.zeros((size, 8))
         self._counters = np.zeros((size, 3), np.int64)
         rng = np.random.default_rng([scene.seed, 0x40])
         self._hot = rng.choice(size, rng.binomial(size, scene.sensor.hot_share), replace=False)
