@@ -298,9 +298,17 @@ def receive_to_folder(
         url = str(opened.path) if url == STDIN else url
         check_sensor(opened, url, links[0].camera)
         pulses = _pulses_of(clock_zero, opened, url)
-        known: dict[str, Any] = {"plan": plan, "attitude": attitude, "clock_zero": clock_zero}
-        known |= {"name": Path(url).name, "sinks": sinks, "lines": lines}
-        with ResultWriter(folder, links, registry, **known) as writer:
+        with ResultWriter(
+            folder,
+            links,
+            registry,
+            name=Path(url).name,
+            plan=plan,
+            attitude=attitude,
+            clock_zero=clock_zero,
+            sinks=sinks,
+            lines=lines,
+        ) as writer:
             receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
             pieces = ((events, receiver.feed(events)) for events in _events_of(opened, pulses, stopped))
             return _run(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
@@ -375,17 +383,32 @@ def live(
             check_sensor(opened, url, links[0].camera)
             if warm and waits:
                 warm_up(links, positions=plan is not None)
-            known: dict[str, Any] = {"attitude": attitude, "clock_zero": clock_zero}
-            kept = known | {"name": Path(url).name, "plan": plan, "sinks": sinks, "lines": lines}
             loop: LiveLoop
             with ResultWriter(
-                folder, links, registry, **kept, placed=lambda placed: loop.placed(placed)
+                folder,
+                links,
+                registry,
+                name=Path(url).name,
+                plan=plan,
+                attitude=attitude,
+                clock_zero=clock_zero,
+                sinks=sinks,
+                lines=lines,
+                placed=lambda placed: loop.placed(placed),
             ) as writer:
-                receiver = Receiver(links, registry.hook, **known, on_frame=lambda frame: loop.frame(frame))
+                receiver = Receiver(
+                    links,
+                    registry.hook,
+                    attitude=attitude,
+                    clock_zero=clock_zero,
+                    on_frame=lambda frame: loop.frame(frame),
+                )
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
                 loop = LiveLoop(opened, receiver, links, publisher, pictures, budget, pulses=pulses)
-                run, given = loop.run(stopped), (_say_nothing, stopped, loop.summary)
-                table = _run(opened, url, receiver, writer, run, loop.close, *given)
+                pieces = loop.run(stopped)
+                table = _run(
+                    opened, url, receiver, writer, pieces, loop.close, _say_nothing, stopped, loop.summary
+                )
         publisher.publish("end", float(table["recording"]["last_us"] or 0), table)
         return table
     finally:

@@ -80,7 +80,8 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
             presence.pixels, placement.seen, places, reach_px, heard, edges, line, points
         )
         unseen = np.isnan(points[:, 0])
-        if np.count_nonzero(unseen) > clusters - 3:
+        seen = clusters - int(np.count_nonzero(unseen))
+        if seen < 3:
             return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan
         ends, mean = np.where(unseen, np.nan, 0.0), points.copy()
         for axis, way in ways:
@@ -88,7 +89,6 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
                 mean, places, neighbours[axis], (unit * way, reach_px), (heard, edges, every), points, ends
             )
         squares = _kernels.squares_left(points, layout.at_m)
-        seen = sum(end == end for end in ends.tolist())
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)
         return points, variance**0.5 * (1 + (_OUTER - 1) * ends), flank_px
