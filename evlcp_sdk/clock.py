@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk._kernels")
 
-__all__ = ["LEAP_US", "CameraClock"]
-
 LEAP_US = 1_000_000
 """The longest pause that is believed at once: what was seen before a longer one is forgotten anyway."""
 

@@ -29,25 +29,6 @@ from evlcp_sdk.errors import ConfigError, InputError, OutputError
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-__all__ = [
-    "Outputs",
-    "check_columns",
-    "check_output",
-    "check_sha256",
-    "csv_number",
-    "defused",
-    "is_there",
-    "open_log",
-    "output_fault",
-    "read_csv",
-    "read_json",
-    "read_numbers",
-    "read_secret",
-    "read_whole",
-    "shipped",
-    "write_new",
-]
-
 _OTHERS = 0o077
 """Permissions that a private file does not give."""
 

@@ -10,15 +10,6 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.values import Fix
 
-__all__ = [
-    "characters",
-    "integrity",
-    "number_or_none",
-    "sigmas",
-    "symbol_list",
-    "text_or_empty",
-]
-
 
 def text_or_empty(value: float, digits: int) -> str:
     """A number with so many digits; empty for NaN and infinity."""

@@ -13,8 +13,6 @@ from typing import Any, TypeVar, overload
 
 import numba
 
-__all__ = ["COMPILING", "Compiling", "count_compiled", "count_imported", "find_cache_folder", "njit"]
-
 F = TypeVar("F", bound=Callable[..., Any])
 
 _ROOM_BYTES = 50_000_000

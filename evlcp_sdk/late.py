@@ -3,8 +3,6 @@
 from importlib import import_module
 from typing import Any
 
-__all__ = ["Late"]
-
 
 class Late:
     """Stands for a module; after the first use a name of it costs what a name of any module does.

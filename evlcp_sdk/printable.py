@@ -1,7 +1,5 @@
 """Text from outside on a terminal moves no cursor and sets no title; this imports nothing."""
 
-__all__ = ["printable"]
-
 _CONTROLS = {
     **{n: f"\\x{n:02x}" for n in (*range(0x20), *range(0x7F, 0xA0)) if chr(n) not in "\t\n"},
     # What turns the direction of a text, and so shows another one than it is.

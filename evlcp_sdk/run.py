@@ -30,7 +30,7 @@ from evlcp_sdk.results.summary import Status
 from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.signals import Stopped, stop_on_request
+from evlcp_sdk.signals import Stopped
 from evlcp_sdk.stopwatch import Stopwatch, times_real_time
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Frame, Packet
@@ -52,22 +52,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.survey import SurveyedBar
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.scene.sites import BarSite, LocalAxes
-
-__all__ = [
-    "Advance",
-    "Reception",
-    "Stopped",
-    "calibrate",
-    "convert",
-    "diagnose",
-    "film",
-    "live",
-    "receive",
-    "receive_to_folder",
-    "stop_on_request",
-    "survey",
-    "survey_on_the_way",
-]
 
 Advance = Callable[[int, int | None], None]
 """Called after each piece with the bytes that are done, and of how many if that is known."""

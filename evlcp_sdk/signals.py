@@ -6,8 +6,6 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from types import FrameType
 
-__all__ = ["ENDING", "EndRequest", "Stopped", "heard_by", "interrupt", "stop_on_request", "waiting"]
-
 ENDING = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 """All are answered in the same way."""
 

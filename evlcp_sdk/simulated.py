@@ -15,8 +15,6 @@ from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, resolve_scene, t
 from evlcp_sdk.sim.world import attitude_log, sites_said
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["SimulatedSource", "simulate"]
-
 Advance = Callable[[float], None]
 
 

@@ -14,17 +14,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import read_whole
 from evlcp_sdk.spelling import nearest
 
-__all__ = [
-    "SpecError",
-    "build",
-    "parse_toml",
-    "parse_value",
-    "read_toml",
-    "shown",
-    "spec_model",
-    "toml_value",
-]
-
 T = TypeVar("T")
 
 

@@ -3,8 +3,6 @@
 import difflib
 from collections.abc import Sequence
 
-__all__ = ["counted", "hinted", "nearest", "unhinted"]
-
 
 def counted(number: int, what: str) -> str:
     """A number of things, with thousands apart.

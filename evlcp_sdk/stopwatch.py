@@ -7,8 +7,6 @@ from contextlib import contextmanager
 
 from evlcp_sdk.kernels import COMPILING
 
-__all__ = ["Stopwatch", "times_real_time"]
-
 
 def times_real_time(recorded_s: float, processor_s: float) -> float:
     """Recorded time over the processor time of what was done with it; NaN where either is 0.

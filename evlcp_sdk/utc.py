@@ -6,8 +6,6 @@ from datetime import UTC, datetime, timedelta
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.values import Triggers
 
-__all__ = ["ClockZero", "PulseClock", "at_ns", "zero_at"]
-
 _EPOCH = datetime(1970, 1, 1, tzinfo=UTC)
 
 _MOST_OFF = 1e-3

@@ -17,8 +17,6 @@ from evlcp_sdk.scene.sites import load_sites
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.values import Events
 
-__all__ = ["STEPS", "Warmth", "warm_up"]
-
 STEPS = ("simulate", "receive", "positions", "formats")
 """What is done, in this order."""
 

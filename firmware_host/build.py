@@ -10,17 +10,6 @@ from pathlib import Path
 
 from firmware_host.errors import ToolchainError
 
-__all__ = [
-    "FIRMWARE",
-    "TARGETS",
-    "arm_image",
-    "build_folder",
-    "make",
-    "native_library",
-    "native_program",
-    "tests_folder",
-]
-
 FIRMWARE = Path(__file__).parent / "firmware"
 """The firmware's source tree."""
 

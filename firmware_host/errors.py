@@ -17,19 +17,6 @@ DatagramError                          bytes that are not a datagram of the prot
 
 from evlcp_sdk.errors import EvlcpError
 
-__all__ = [
-    "BoardError",
-    "BoardResetError",
-    "DatagramError",
-    "FleetError",
-    "IncompatibleError",
-    "LineError",
-    "NoBoardError",
-    "RefusedError",
-    "ToolchainError",
-    "VerifyError",
-]
-
 
 class DatagramError(ValueError):
     """Bytes that are not a datagram, or a payload of another length than its message's."""

@@ -12,8 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["ClusterFlicker", "check", "low_risk_percent", "no_effect_percent"]
-
 Floats = NDArray[np.floating[Any]]
 
 LIMIT_HZ = 3000.0

@@ -8,8 +8,6 @@ from typing import Self
 
 from evlcp_sdk.errors import InputError
 
-__all__ = ["FLASH_BYTES", "FLASH_START", "FlashImage"]
-
 FLASH_START = 0x0800_0000
 """Where an STM32's flash begins."""
 FLASH_BYTES = 1 << 20

@@ -38,8 +38,6 @@ from firmware_host.ports.transport import TraceTransport, Transport
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
-__all__ = ["RECEIVED", "RECORDING", "EmulatedLight", "Step", "light_of", "loop"]
-
 RECORDING = "loop.raw"
 """Name of the recording in the folder."""
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from evlcp_sdk.air.blocks import BlockError
 from evlcp_sdk.errors import ConfigError
 
-__all__ = ["BEACON_BYTES", "Beacon"]
-
 _FIXED = struct.Struct("<qqiHHI")
 
 BEACON_BYTES = _FIXED.size

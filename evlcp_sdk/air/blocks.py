@@ -8,20 +8,6 @@ from enum import IntEnum
 
 from evlcp_sdk.errors import ConfigError, EvlcpError
 
-__all__ = [
-    "DIGEST_BYTES",
-    "FORMAT_VERSION",
-    "HEADER_BYTES",
-    "MOST_MESSAGE_BYTES",
-    "Block",
-    "BlockError",
-    "Kind",
-    "Message",
-    "carried_bytes",
-    "joined",
-    "split",
-]
-
 FORMAT_VERSION = 1
 """Version of the block format."""
 

@@ -18,17 +18,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.errors import CodebookMismatchError, ConfigError
 
-__all__ = [
-    "AIR_INTERFACE",
-    "BARKER13",
-    "Codebook",
-    "are_pairs",
-    "chips_of_values",
-    "edges_of_chips",
-    "hadamard",
-    "word_of_chips",
-]
-
 AIR_INTERFACE = 1
 """Version of the built-in air interface: all codes are pair codes."""
 

@@ -8,8 +8,6 @@ pass; bits enter as they are, first bit first, and the register is sent as it is
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CRC24C", "CRC_BITS", "crc24"]
-
 CRC_BITS = 24
 """Bits of the check."""
 

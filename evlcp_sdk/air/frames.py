@@ -14,16 +14,6 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 
-__all__ = [
-    "PacketFormat",
-    "bits_of_symbols",
-    "chips_behind",
-    "info_words",
-    "packet_chips",
-    "pilot_words",
-    "symbols_of_bits",
-]
-
 
 @dataclass(frozen=True)
 class PacketFormat:

@@ -11,20 +11,6 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import BlockError, Kind
 from evlcp_sdk.errors import ConfigError
 
-__all__ = [
-    "BUILT_IN_KINDS",
-    "SIGNALS",
-    "BeaconKind",
-    "Countdown",
-    "CountdownKind",
-    "DataKind",
-    "MessageKind",
-    "SignatureKind",
-    "TextKind",
-    "TimeKind",
-    "kind_named",
-]
-
 _TIME = struct.Struct("<Q")
 _COUNTDOWN = struct.Struct("<BBI")
 _LAST_TIME_S = 253_402_300_800.0

@@ -22,17 +22,6 @@ from evlcp_sdk.files import read_secret, write_new
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
-__all__ = [
-    "KEY_NAME_BYTES",
-    "TrustedKey",
-    "TrustedKeys",
-    "make_key",
-    "public_key",
-    "read_key",
-    "sign",
-    "signed_bytes",
-]
-
 KEY_NAME_BYTES = 8
 """Bytes that name a public key in a signature: the first of its SHA-256."""
 

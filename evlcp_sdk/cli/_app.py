@@ -17,8 +17,6 @@ from evlcp_sdk.printable import printable
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
 
-__all__ = ["make_app", "run"]
-
 HELP = """Read data and distance from blinking LEDs with an event camera.
 
 [bold]evlcp loop[/] sends a text from end to end on this machine, emulated board and simulated camera;

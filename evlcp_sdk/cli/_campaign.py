@@ -4,12 +4,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from evlcp_sdk.cli._common import complain, console
+from evlcp_sdk.cli._common import console
+from evlcp_sdk.cli._complain import complain
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.collect import Progress
-
-__all__ = ["progress_bar", "show_faults"]
 
 _MOST_FAULTS = 5
 

@@ -6,8 +6,6 @@ from dataclasses import fields, is_dataclass
 from functools import wraps
 from typing import Any, get_type_hints
 
-__all__ = ["command"]
-
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """A function as a command for Typer: of each parameter that is a dataclass, every field is an option.

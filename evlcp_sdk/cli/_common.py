@@ -21,24 +21,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.run import Advance
     from evlcp_sdk.study.jobs import Executor
 
-__all__ = [
-    "Dask",
-    "Json",
-    "LinkFile",
-    "LinkFiles",
-    "Overrides",
-    "Workers",
-    "bytes_bar",
-    "complain",
-    "console",
-    "echo",
-    "hush",
-    "loaded",
-    "log_on_stderr",
-    "make_executor",
-    "shows_bars",
-]
-
 LinkFile = Annotated[
     str | None, typer.Option("-c", "--config", metavar="link.toml", help="The link; all defaults without it.")
 ]

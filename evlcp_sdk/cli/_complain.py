@@ -5,8 +5,6 @@ from contextlib import suppress
 
 from evlcp_sdk.printable import printable
 
-__all__ = ["complain"]
-
 
 def complain(text: str) -> None:
     """Print one line per fault on stderr; without a stderr, nothing."""

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFiles, Overrides, complain, echo, loaded
+from evlcp_sdk.cli._common import LinkFiles, Overrides, echo, loaded
+from evlcp_sdk.cli._complain import complain
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.utc import PulseClock
-
-__all__ = ["CameraOptions", "FormatOptions", "LinePrinter", "LinkOptions", "json_lines_of", "parse_utc"]
 
 
 def parse_utc(text: str) -> datetime:

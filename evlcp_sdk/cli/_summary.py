@@ -10,8 +10,6 @@ from evlcp_sdk.spelling import counted
 if TYPE_CHECKING:
     from rich.console import Console
 
-__all__ = ["delays_text", "show"]
-
 _MOST_SHOWN, _MOST_SAID = 8, 200
 """Messages that are shown, the newest, and characters of each."""
 

@@ -7,8 +7,6 @@ if TYPE_CHECKING:
     from rich.console import Console
     from rich.table import Table
 
-__all__ = ["print_table"]
-
 _Column = Sequence[tuple[str, bool]]
 
 _PIPE_WIDTH = 10_000

@@ -15,8 +15,6 @@ from evlcp_sdk.spelling import counted
 if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibrated
 
-__all__ = ["calibrate"]
-
 
 @command
 def calibrate(

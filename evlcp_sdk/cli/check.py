@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.testing import Verdict
 
-__all__ = ["check"]
-
 _STYLES = {"ok": "green", "failed": "bold red", "skipped": "dim", "excused": "yellow"}
 
 _WIDTH = 18

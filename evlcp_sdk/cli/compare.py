@@ -12,15 +12,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, complain, console, echo, make_executor
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo, make_executor
+from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.comparison import Comparison, Table
     from evlcp_sdk.study.variants import Variant
-
-__all__ = ["compare"]
 
 _SQLITE = b"SQLite format 3\0"
 

@@ -10,8 +10,6 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, echo
 
-__all__ = ["config"]
-
 
 class CodebookForm(StrEnum):
     """How `--codebook` prints the codes."""

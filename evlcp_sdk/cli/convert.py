@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Json, bytes_bar, complain, echo
+from evlcp_sdk.cli._common import Json, bytes_bar, echo
+from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.spelling import counted
-
-__all__ = ["convert"]
 
 
 @command
@@ -52,7 +51,7 @@ def convert(
     from evlcp_sdk.errors import InputError, UnpluggedError
     from evlcp_sdk.io.urls import sides
     from evlcp_sdk.run import convert as run_convert
-    from evlcp_sdk.run import stop_on_request
+    from evlcp_sdk.signals import stop_on_request
 
     given = None
     if size is not None:

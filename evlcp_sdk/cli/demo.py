@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Json, Workers, complain, console, echo
+from evlcp_sdk.cli._common import Json, Workers, console, echo
+from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
@@ -17,8 +18,6 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.study.summary import Summary
     from evlcp_sdk.values import Frame
-
-__all__ = ["demo", "demo_campaign", "demo_files"]
 
 DEMO_NAME = "night-50m-30kmh-cut"
 CAMPAIGN_NAME = "demo"

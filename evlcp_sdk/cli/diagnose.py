@@ -13,8 +13,6 @@ from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console,
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.diagnose import Diagnosis
 
-__all__ = ["diagnose"]
-
 
 @command
 def diagnose(

@@ -9,8 +9,6 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, echo
 
-__all__ = ["info"]
-
 
 @command
 def info(

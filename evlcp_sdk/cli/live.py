@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import complain, console, echo
+from evlcp_sdk.cli._common import console, echo
+from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._receiving import CameraOptions, FormatOptions, LinkOptions, json_lines_of
 from evlcp_sdk.cli._summary import delays_text, show
 
@@ -23,8 +24,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.live.loop import LiveStatus
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.live.services import Services, Serving
-
-__all__ = ["live"]
 
 _HERE = "127.0.0.1"
 
@@ -178,7 +177,7 @@ def live(
     from evlcp_sdk.live.services import Services
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
-    from evlcp_sdk.run import stop_on_request
+    from evlcp_sdk.signals import stop_on_request
 
     lines = json_lines_of(json_lines, [url], as_json=as_json)
     registry = Registry.load()

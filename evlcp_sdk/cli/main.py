@@ -11,8 +11,6 @@ import sys
 
 from evlcp_sdk.cli._complain import complain
 
-__all__ = ["main"]
-
 _FAILED = 1
 _INTERRUPTED = 130
 

@@ -10,8 +10,6 @@ from evlcp_sdk.cli._common import Json, echo
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
 
-__all__ = ["plugins", "table_of"]
-
 
 @command
 def plugins(as_json: Json = False) -> None:

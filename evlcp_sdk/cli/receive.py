@@ -13,16 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import (
-    Dask,
-    bytes_bar,
-    complain,
-    console,
-    echo,
-    hush,
-    make_executor,
-    shows_bars,
-)
+from evlcp_sdk.cli._common import Dask, bytes_bar, console, echo, hush, make_executor, shows_bars
+from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._receiving import CameraOptions, FormatOptions, LinePrinter, LinkOptions, json_lines_of
 from evlcp_sdk.cli._summary import show
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
@@ -34,8 +26,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.signals import EndRequest
     from evlcp_sdk.study.jobs import Executor, Outcome
-
-__all__ = ["receive"]
 
 
 class LinkMode(StrEnum):
@@ -164,7 +154,7 @@ def _run_jobs(
     Raises:
         InterruptedRunError: Whoever started it ended it.
     """
-    from evlcp_sdk.run import stop_on_request
+    from evlcp_sdk.signals import stop_on_request
 
     def pass_on() -> None:
         if registry is None:
@@ -269,7 +259,8 @@ class DecodeJob:
 
     def __call__(self, job: ReceiveJob, here: tuple[Registry, EndRequest] | None) -> dict[str, Any]:
         """The summary."""
-        from evlcp_sdk.run import receive_to_folder, stop_on_request
+        from evlcp_sdk.run import receive_to_folder
+        from evlcp_sdk.signals import stop_on_request
 
         decode = partial(
             receive_to_folder,

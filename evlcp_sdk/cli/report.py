@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.study.summary import Summary
     from evlcp_sdk.study.tally import Tally
 
-__all__ = ["report", "show_paper", "show_positions", "show_series"]
-
 
 @command
 def report(

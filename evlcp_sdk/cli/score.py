@@ -9,9 +9,8 @@ from typing import Annotated, Any
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Json, complain, console, echo
-
-__all__ = ["score"]
+from evlcp_sdk.cli._common import Json, console, echo
+from evlcp_sdk.cli._complain import complain
 
 
 @command

@@ -8,9 +8,7 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import complain
-
-__all__ = ["serve"]
+from evlcp_sdk.cli._complain import complain
 
 
 @command

@@ -13,8 +13,6 @@ from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, console, echo
 from evlcp_sdk.spelling import counted
 
-__all__ = ["simulate"]
-
 
 @command
 def simulate(

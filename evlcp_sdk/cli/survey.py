@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.place.survey import SurveyedBar
 
-__all__ = ["survey"]
-
 
 @command
 def survey(

@@ -11,8 +11,6 @@ from evlcp_sdk.cli._campaign import progress_bar, show_faults
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Dask, Json, Workers, console, echo, make_executor
 
-__all__ = ["sweep"]
-
 
 @command
 def sweep(

@@ -11,8 +11,6 @@ from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, echo
 from evlcp_sdk.spelling import counted
 
-__all__ = ["video"]
-
 
 @command
 def video(

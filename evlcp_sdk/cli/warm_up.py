@@ -5,8 +5,6 @@ from __future__ import annotations
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, console, echo
 
-__all__ = ["warm_up"]
-
 
 @command
 def warm_up(as_json: Json = False) -> None:

@@ -11,8 +11,6 @@ from evlcp_sdk.diagnosis.tallies import SURE, count_missing_codewords
 from evlcp_sdk.diagnosis.warnings import check_saturation
 from evlcp_sdk.spelling import counted
 
-__all__ = ["Check", "checks_of"]
-
 Verdict = Literal["pass", "doubt", "fail", "skip"]
 """Of a stage: passed; passed, but near its limit; failed; not reached."""
 

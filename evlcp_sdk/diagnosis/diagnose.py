@@ -21,8 +21,6 @@ from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events
 
-__all__ = ["Diagnosis", "diagnosis_of", "infer_link"]
-
 _RATE_SHARE = 0.005
 """How far a measured rate may be off: half of that is seen where rows are read late."""
 

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.light import LightSource
     from evlcp_sdk.diagnosis.probe import Trial
 
-__all__ = ["Diagnostic", "Facts", "has_rate", "other_codewords"]
-
 NEAR_RATE = 0.8
 """Share of its largest mean that a source has at the link's rate if that is its rate, or a multiple."""
 

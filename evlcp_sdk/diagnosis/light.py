@@ -20,8 +20,6 @@ from evlcp_sdk.diagnosis._kernels import BINS, COARSE, COARSE_US, FINE, FINE_US,
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.values import Events
 
-__all__ = ["LightSource", "LightSurvey", "comb"]
-
 Floats = NDArray[np.float64]
 
 _MOST_CELLS = 16_384

@@ -11,8 +11,6 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events
 
-__all__ = ["Trial", "better_links", "try_link"]
-
 FRAME_COUNTS = (1, 2, 4, 5, 6, 8, 10, 12, 16, 20, 24, 32, 40, 48, 64)
 """Frames per packet that are tried first, and then those beside the best: the share of frames accepted falls
 to both sides of the right number."""

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.values import Events
 
-__all__ = ["ReadoutTally"]
-
 _CAPPED_SHARE = 0.2
 """Share of milliseconds with the very same number of events, to half a percent, above which the readout is
 at its limit: chips, and the noise of their number, change it by more."""

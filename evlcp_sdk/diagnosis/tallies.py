@@ -22,15 +22,6 @@ if TYPE_CHECKING:
 else:
     rejections, trajectory = (Late(f"evlcp_sdk.place.{name}") for name in ("rejections", "trajectory"))
 
-__all__ = [
-    "MOST_MESSAGES",
-    "SURE",
-    "PositionTally",
-    "RunTally",
-    "TransmitterTally",
-    "count_missing_codewords",
-]
-
 _CELL_M = 0.01
 _FARTHEST_M = 1_000.0
 """Medians know no distance beyond: a hundred thousand cells are enough."""

@@ -17,8 +17,6 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import alike_links
 from evlcp_sdk.spelling import counted
 
-__all__ = ["check_alike", "check_saturation", "find_notes", "find_warnings"]
-
 Found = Iterator[Diagnostic]
 
 _MOST_IDS = 5

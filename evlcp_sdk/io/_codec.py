@@ -12,8 +12,6 @@ from evlcp_sdk.io import _words
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["Codec", "Columns", "Decoder"]
-
 MAX_SIDE = 2048
 """Columns and rows that 11 bits can address."""
 

@@ -69,8 +69,6 @@ from evlcp_sdk.io._words import (
 )
 from evlcp_sdk.kernels import njit
 
-__all__ = ["decode_evt2", "decode_evt3", "encode_evt2", "encode_evt3"]
-
 Column = NDArray[Any]
 EventColumns = tuple[Column, Column, Column, Column]
 """t (int64), x and y (uint16), p (uint8), of one length."""

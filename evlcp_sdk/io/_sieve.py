@@ -8,8 +8,6 @@ from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events
 
-__all__ = ["Sieve"]
-
 MEANINGS: Final = {
     "outside_sensor": ("dropped_off_sensor", "events outside the sensor; dropped"),
     "time_backward": ("dropped_time_backward", "events earlier than the one before; dropped"),

@@ -18,8 +18,6 @@ from evlcp_sdk.io.raw import RawSource, format_header
 from evlcp_sdk.io.urls import split_options
 from evlcp_sdk.plugin.source import Loss
 
-__all__ = ["BagSource", "EventPacket", "is_bag", "open_bag"]
-
 TYPES: Final = ("event_camera_msgs/msg/EventPacket", "event_camera_msgs/EventPacket")
 
 _MOST_HELD: Final = 256

@@ -17,8 +17,6 @@ from evlcp_sdk.io.urls import flag, positive, split_options
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.spelling import nearest
 
-__all__ = ["CameraSource", "open_camera"]
-
 _KINDS: Final = {"PROPHESEE_EVK4": "prophesee_evk4", "PROPHESEE_EVK3_HD": "prophesee_evk3_hd"}
 """Of the driver's names those that send EVT3, and the module that configures each."""
 

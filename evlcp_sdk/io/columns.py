@@ -19,8 +19,6 @@ from evlcp_sdk.io.writers import LAST_TIME_US
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["PIECE_ROWS", "WINDOW_US", "ColumnSource", "Piece", "piece_of"]
-
 PIECE_ROWS: Final = 1 << 16
 
 MOST_WAITING: Final = 1 << 20

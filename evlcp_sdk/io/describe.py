@@ -7,8 +7,6 @@ import numpy as np
 
 from evlcp_sdk.plugin.source import EventSource
 
-__all__ = ["RATE_WINDOW_US", "describe"]
-
 RATE_WINDOW_US = 10_000
 """The peak rate is the most events in a window of this length on a fixed grid."""
 

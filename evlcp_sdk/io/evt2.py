@@ -7,8 +7,6 @@ import numpy as np
 from evlcp_sdk.io import _words
 from evlcp_sdk.io._codec import Codec
 
-__all__ = ["EVT2"]
-
 EVT2: Final = Codec(
     name="EVT2",
     version="2.0",

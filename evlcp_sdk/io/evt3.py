@@ -7,8 +7,6 @@ import numpy as np
 from evlcp_sdk.io import _words
 from evlcp_sdk.io._codec import Codec
 
-__all__ = ["EVT3"]
-
 EVT3: Final = Codec(
     name="EVT3",
     version="3.0",

@@ -11,8 +11,6 @@ from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["FORMATS", "FaerySource"]
-
 FORMATS: Final = {".aedat4": "AEDAT4", ".aedat": "AEDAT4", ".dat": "DAT", ".es": "ES"}
 """The formats read this way, by the suffix of the file's name."""
 

@@ -10,18 +10,6 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.io.writers import LAST_TIME_US
 
-__all__ = [
-    "Fields",
-    "Polarities",
-    "RowError",
-    "TimeUnit",
-    "fields_of",
-    "fields_of_values",
-    "time_unit",
-    "unit_named",
-    "unit_of",
-]
-
 UNITS_US: Final = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 
 _UNITS: Final = {

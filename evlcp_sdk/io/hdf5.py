@@ -13,8 +13,6 @@ from evlcp_sdk.io.fields import Fields, fields_of, fields_of_values, unit_named
 from evlcp_sdk.io.tables import said
 from evlcp_sdk.io.urls import flag, split_options
 
-__all__ = ["Hdf5Source", "open_hdf5"]
-
 PLACES: Final = ("events", "raw_events", "CD/events")
 MAGIC: Final = b"\x89HDF\r\n\x1a\n"
 MATLAB: Final = b"MATLAB 7.3"

@@ -45,8 +45,6 @@ from evlcp_sdk.io.tables import (
 from evlcp_sdk.io.urls import flag, split_options
 from evlcp_sdk.values import Triggers
 
-__all__ = ["SUFFIXES", "ListSource", "is_list", "open_list"]
-
 PIECE_BYTES: Final = 1 << 20
 TRIGGER_ROWS: Final = 1 << 12
 LOOKED_AT: Final = 1 << 14

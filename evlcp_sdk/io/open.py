@@ -27,8 +27,6 @@ else:
     _late = ("bags", "camera", "hdf5", "lists", "ros")
     bags, camera, hdf5, lists, ros = (Late(f"evlcp_sdk.io.{name}") for name in _late)
 
-__all__ = ["STDIN", "is_recording", "open_source", "open_writer", "read_events", "write_events"]
-
 WRITABLE: Final = {".raw": "EVT3", ".mcap": "BAG", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
 
 STDIN: Final = "-"

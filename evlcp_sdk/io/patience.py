@@ -10,8 +10,6 @@ from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.signals import Stopped, waiting
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["open_until", "pieces_until"]
-
 
 def open_until(source: EventSource | str | Path, registry: Registry, stopped: Stopped) -> EventSource:
     """Open a source, or give one that is open; a request to stop ends the wait for a sender.

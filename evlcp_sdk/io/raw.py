@@ -21,8 +21,6 @@ from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["CODECS", "RawEncoder", "RawHeader", "RawSource", "RawWriter", "format_header", "parse_header"]
-
 CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 """The encodings that can be read and written, by name."""
 

@@ -9,8 +9,6 @@ from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.signals import Stopped
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["ReconnectingSource"]
-
 _EVERY_S: Final = 0.5
 """How often it is tried."""
 

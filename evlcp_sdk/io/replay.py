@@ -10,8 +10,6 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["LoopSource", "ReplaySource"]
-
 SEAM_US = 500_000
 """Dark time between a recording's end and its next pass: what was seen is forgotten, no clock leaps."""
 

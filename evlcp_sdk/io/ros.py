@@ -14,8 +14,6 @@ from evlcp_sdk.io.raw import RawEncoder, RawWriter
 from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["EVENT_PACKET", "EventBagWriter", "RosBag"]
-
 EVENT_PACKET: Final = "event_camera_msgs/msg/EventPacket"
 
 _DEFINITIONS: Final = {

@@ -4,8 +4,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.scene.camera import CameraModel
 
-__all__ = ["check_sensor"]
-
 
 def check_sensor(source: EventSource, url: object, camera: CameraModel) -> None:
     """Refuse a recording of another sensor than the camera has; one that does not say its size passes.

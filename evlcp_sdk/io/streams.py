@@ -12,8 +12,6 @@ from evlcp_sdk.io.raw import CODECS, RawSource, format_header
 from evlcp_sdk.io.urls import sides, split_options
 from evlcp_sdk.plugin.source import EventSource
 
-__all__ = ["SCHEMES", "SocketBytes", "StreamSource", "open_stream"]
-
 SCHEMES: Final = ("tcp", "udp", "unix")
 """Those that `open_stream` opens."""
 

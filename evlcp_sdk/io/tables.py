@@ -18,8 +18,6 @@ from evlcp_sdk.files import Outputs
 from evlcp_sdk.io.writers import LAST_TIME_US, EventWriter
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["CsvWriter", "NpzColumn", "NpzWriter", "npy_header", "said", "show"]
-
 COLUMNS: Final = ("t_us", "x", "y", "p")
 TRIGGER_COLUMNS: Final = ("trigger_t_us", "trigger_channel", "trigger_value")
 WIRE_TYPES: Final[dict[str, np.dtype[Any]]] = {

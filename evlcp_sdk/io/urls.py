@@ -8,8 +8,6 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._codec import MAX_SIDE
 from evlcp_sdk.spelling import nearest
 
-__all__ = ["flag", "positive", "sides", "split_options"]
-
 
 def split_options(url: str, kinds: Mapping[str, Callable[[str], Any]]) -> tuple[str, dict[str, Any]]:
     """Return what stands before the last `?` of a name, and the options behind it.

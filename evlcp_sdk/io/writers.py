@@ -12,8 +12,6 @@ from evlcp_sdk.errors import OutputError, StreamError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["LAST_TIME_US", "EventWriter"]
-
 LAST_TIME_US = 10**18 - 1
 """Latest time, and with a minus earliest, that a table holds: 18 digits, us."""
 

@@ -11,8 +11,6 @@ from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Code, Corrected
 
-__all__ = ["BlockCoder", "interleaver", "packet_bits"]
-
 _SEED = 2463534242
 """Seed of the interleaver's sequence, Marsaglia's own."""
 

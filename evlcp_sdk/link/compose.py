@@ -17,8 +17,6 @@ from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.scene.sites import BarSite
 
-__all__ = ["beacon_of_site", "compose", "each_packet", "messages_of", "packets_of", "utf8"]
-
 
 def compose(
     link: Link | Path | str | None = None,

@@ -40,8 +40,6 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.specs import SpecError, build, parse_value, read_toml, shown
 from evlcp_sdk.spelling import hinted, nearest
 
-__all__ = ["Link", "load_link", "resolve", "with_leds"]
-
 _SPECS: dict[str, type[Any]] = {
     "camera": CameraModel,
     "camera_sigma": CameraSigma,

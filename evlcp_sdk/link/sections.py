@@ -8,8 +8,6 @@ from pydantic import Field
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.air.signing import TrustedKey
 
-__all__ = ["AirSpec", "MessageSpec", "PositionSpec", "RegionSpec"]
-
 
 @dataclass(frozen=True)
 class AirSpec:

@@ -11,8 +11,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 
-__all__ = ["alike_links", "load_links", "named_links", "placing_links"]
-
 LinkLike = Link | Path | str | None
 
 

@@ -9,8 +9,6 @@ from evlcp_sdk.link.blocks import packet_bits
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.specs import shown
 
-__all__ = ["differences"]
-
 _MESSAGES_TRIED = 4
 
 

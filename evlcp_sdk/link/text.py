@@ -9,8 +9,6 @@ from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.bar import SHAPES, BarLayout
 from evlcp_sdk.specs import spec_model, toml_value
 
-__all__ = ["to_toml"]
-
 _UNITS = {
     "deg_s": "deg/s",
     "us": "us",

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["LEVELS", "Budget", "Shedder"]
-
 LEVELS: Final = (
     "all",
     "rows outside of regions are shed",

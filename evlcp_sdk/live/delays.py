@@ -4,8 +4,6 @@ import itertools
 import math
 from typing import Final
 
-__all__ = ["DelayTally"]
-
 _FINEST_MS: Final = 1e-3
 _CELLS_PER_E: Final = 50
 """Cells a factor of e: 2 % each."""

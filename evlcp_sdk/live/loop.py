@@ -21,8 +21,6 @@ from evlcp_sdk.signals import Stopped
 from evlcp_sdk.utc import PulseClock
 from evlcp_sdk.values import Events, Frame, Packet, ReceivedMessage, Region
 
-__all__ = ["STAGES", "LiveLoop", "LiveStatus"]
-
 STAGES: Final = ("gather", "queue", "compute", "total")
 """Of a frame's delay: from its last chip until the slice with which it could be decoded was there; until that
 was taken; until the frame was decoded; and all of these."""

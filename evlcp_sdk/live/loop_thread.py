@@ -9,8 +9,6 @@ from typing import Any, Protocol, Self, TypeVar
 
 from evlcp_sdk.errors import ConfigError
 
-__all__ = ["Listening", "LoopThread", "cannot_listen", "stop_listening"]
-
 _T = TypeVar("_T")
 
 _LEAVE_S = 2.0

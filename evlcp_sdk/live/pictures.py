@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["Picture", "PictureSlot"]
-
 _FORGET_EVERY = 16
 """Slices after which what is too old for a picture is forgotten: to look with each takes longer."""
 

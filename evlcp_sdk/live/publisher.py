@@ -8,8 +8,6 @@ from typing import Any, Final
 
 from evlcp_sdk.errors import StreamError
 
-__all__ = ["KINDS", "News", "Publisher", "Subscription"]
-
 KINDS: Final = ("frame", "packet", "message", "fix", "events", "triggers", "status", "end")
 """What is published; see `evlcp_sdk.live`."""
 

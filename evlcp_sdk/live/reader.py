@@ -10,8 +10,6 @@ from typing import Final
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["ArrivalClock", "Reader", "Slice"]
-
 _MOST_EVENTS: Final = 1 << 24
 """Events that wait at the most, half a second of the most that a camera gives: the oldest go."""
 

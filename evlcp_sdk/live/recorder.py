@@ -12,8 +12,6 @@ from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.live.publisher import Publisher, Subscription
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["Recorder"]
-
 _MOST_WAITING: Final = 4096
 """Pieces that wait for the disk, some seconds; the oldest go, counted."""
 

@@ -13,8 +13,6 @@ from evlcp_sdk.live.publisher import Publisher, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.signals import Stopped
 
-__all__ = ["Sender"]
-
 _MOST_PIECES: Final = 2000
 """Pieces that wait for one who takes them slowly: two seconds of a camera."""
 

@@ -17,8 +17,6 @@ from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, ReceivedMessage
 
-__all__ = ["MOST_WAITING", "PICTURES_PER_S", "Serializer", "Shot"]
-
 PICTURES_PER_S: Final = 25
 
 MOST_WAITING: Final = 4000

@@ -19,8 +19,6 @@ from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.utc import ClockZero
 
-__all__ = ["Services", "Serving"]
-
 
 @dataclass(frozen=True)
 class Serving:

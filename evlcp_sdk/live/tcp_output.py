@@ -14,8 +14,6 @@ from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
 from evlcp_sdk.results.nmea import sentences
 from evlcp_sdk.utc import ClockZero, zero_at
 
-__all__ = ["TcpOutput"]
-
 _MOST_WAITING: Final = 1000
 """Fixes that wait for a client; the oldest go."""
 _MOST_CLIENTS: Final = 32

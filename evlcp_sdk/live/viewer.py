@@ -35,8 +35,6 @@ if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
-__all__ = ["Viewer", "page"]
-
 _MOST_BROWSERS: Final = 16
 _FINISH_S: Final = 1.0
 _MOST_SAID: Final = 4096

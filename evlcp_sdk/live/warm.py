@@ -16,8 +16,6 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.values import Events
 
-__all__ = ["warm_up"]
-
 _WARM_US = 30_000
 """Of the recording that comes with the SDK: three packets, of which two are whole."""
 

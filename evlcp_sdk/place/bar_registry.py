@@ -12,8 +12,6 @@ from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, site_of_transmitter
 from evlcp_sdk.values import Packet
 
-__all__ = ["BarRegistry"]
-
 _LENGTH_SHARE = 0.01
 """Share by which a beacon's length may differ from its site's: a lone bar's distance is wrong by as much."""
 

@@ -11,8 +11,6 @@ from evlcp_sdk.place.points import unseen_px
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.values import Frame
 
-__all__ = ["BarPoint", "bar_point"]
-
 Floats = NDArray[np.float64]
 
 _STEPS = (1.0, 0.1, 0.1, 1e-4, 1e-4, 1e-6, 1e-6)

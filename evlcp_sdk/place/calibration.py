@@ -18,16 +18,6 @@ from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, between_of, project_bars, shared_sigmas
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
-__all__ = [
-    "PARAMETERS",
-    "Calibrated",
-    "CalibrationView",
-    "SeenView",
-    "SolvedViews",
-    "calibrate",
-    "solve_views",
-]
-
 Floats = NDArray[np.float64]
 
 PARAMETERS = CAMERA_PARAMETERS

@@ -12,8 +12,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.swing import Swing
 
-__all__ = ["Reckoned", "imu_sigmas", "reckon"]
-
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 

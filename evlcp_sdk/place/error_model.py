@@ -5,8 +5,6 @@ from typing import Self
 
 from evlcp_sdk.link.sections import PositionSpec
 
-__all__ = ["ErrorModel"]
-
 
 @dataclass(frozen=True)
 class ErrorModel(PositionSpec):

@@ -13,8 +13,6 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite
 
-__all__ = ["EstimatedBias", "estimate_biases", "focal_share"]
-
 Floats = NDArray[np.float64]
 
 _TOLD_SHARE = 0.9

@@ -8,8 +8,6 @@ from evlcp_sdk.place.observations import Problem, project_bars
 from evlcp_sdk.place.quantiles import chance_below, chi_square
 from evlcp_sdk.values import FailedBar
 
-__all__ = ["estimate_fault"]
-
 Floats = NDArray[np.float64]
 
 _STEPS = 4

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.model import SHARED, Equations, Fit, linearize, move
 from evlcp_sdk.place.observations import Problem
 
-__all__ = ["STEPS", "fit_pose"]
-
 Floats = NDArray[np.float64]
 
 STEPS = 50

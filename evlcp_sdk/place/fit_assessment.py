@@ -29,8 +29,6 @@ from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.values import FailedBar
 
-__all__ = ["FOCAL", "AssessedPose", "Pose", "assess_fit", "covering", "misfits"]
-
 Floats = NDArray[np.float64]
 
 FOCAL = "focal length"

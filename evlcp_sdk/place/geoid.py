@@ -14,8 +14,6 @@ from importlib.resources import files
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["geoid_m"]
-
 _ZERO_DM = 2000
 _STEP_DEG = 0.5
 

@@ -20,8 +20,6 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Fix
 
-__all__ = ["GnssLog", "attitude_of", "gnss_fix"]
-
 Floats = NDArray[np.float64]
 
 _SIGMAS = ("sigma_east_m", "sigma_north_m", "sigma_up_m")

@@ -16,18 +16,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.observations import Problem, skewed
 from evlcp_sdk.scene.camera import CameraModel
 
-__all__ = [
-    "FAULT",
-    "FOCAL_UNIT",
-    "LENS",
-    "LOCAL",
-    "SHARED",
-    "Equations",
-    "Fit",
-    "linearize",
-    "move",
-]
-
 Floats = NDArray[np.float64]
 
 FAULT, LENS, SHARED, LOCAL = 6, 7, 14, 9

@@ -27,8 +27,6 @@ from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.spelling import nearest
 from evlcp_sdk.values import Fix, Packet
 
-__all__ = ["Navigator", "Place", "Placed", "PositionPlan", "Settled"]
-
 Floats = NDArray[np.float64]
 
 _BLOCK = 1024

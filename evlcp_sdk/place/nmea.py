@@ -14,8 +14,6 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import csv_number, read_whole
 from evlcp_sdk.place.poses import PLACE
 
-__all__ = ["NmeaFix", "checksum", "read_nmea"]
-
 Floats = NDArray[np.float64]
 
 _HALF_DAY_S = 43_200

@@ -15,17 +15,6 @@ from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
-__all__ = [
-    "EXACT_RAD",
-    "BarView",
-    "KnownSigmas",
-    "Problem",
-    "between_of",
-    "project_bars",
-    "shared_sigmas",
-    "skewed",
-]
-
 Floats = NDArray[np.float64]
 
 _INLINE = 0.02

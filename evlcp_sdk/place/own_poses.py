@@ -12,8 +12,6 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Packet
 
-__all__ = ["OwnPoses"]
-
 _MOST = 12
 """Poses by which a bar is surveyed: of more, errors of the track are the same ones again."""
 

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.values import Frame
 
-__all__ = ["SeenPoints", "points_at", "unseen_px"]
-
 Floats = NDArray[np.float64]
 
 _STEEP = 0.9

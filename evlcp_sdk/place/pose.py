@@ -26,8 +26,6 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.values import FailedBar
 
-__all__ = ["fitting_focal_mm", "solve_pose"]
-
 _APART_SIGMAS = 6.0
 """Solutions nearer to each other, in sigmas of the position, are one."""
 

@@ -8,8 +8,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import check_columns, csv_number, read_csv
 from evlcp_sdk.scene.attitude import Attitude
 
-__all__ = ["PLACE", "KnownPose", "read_poses"]
-
 PLACE = {
     "latitude_deg": (-90.0, 90.0),
     "longitude_deg": (-180.0, 180.0),

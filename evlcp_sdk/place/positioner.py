@@ -21,8 +21,6 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Alternative, FailedBar, Fix, Frame, Packet
 
-__all__ = ["BarKind", "Positioner"]
-
 
 @dataclass(frozen=True)
 class BarKind:

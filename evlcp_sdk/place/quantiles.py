@@ -2,8 +2,6 @@
 
 from functools import lru_cache
 
-__all__ = ["chance_below", "chi_square"]
-
 
 @lru_cache(maxsize=4096)
 def chi_square(chance: float, freedom: int) -> float:

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["CONTRADICTIONS", "REJECTION_REASONS", "Candidate", "Rejection"]
-
 REJECTION_REASONS = {
     "no-site": "no bar in view stands at a known place",
     "no-facing": "the clusters are not in line, and no site says where its LEDs face",

@@ -11,8 +11,6 @@ from evlcp_sdk.place.model import Fit
 from evlcp_sdk.place.observations import Problem
 from evlcp_sdk.place.quantiles import chi_square
 
-__all__ = ["ODDS", "is_hopeless", "likely_starts", "three_point_poses"]
-
 Floats = NDArray[np.float64]
 
 ODDS = 18.4

@@ -18,8 +18,6 @@ from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 
-__all__ = ["SurveyedBar", "survey"]
-
 Floats = NDArray[np.float64]
 
 _PLACE_M, _TURN_RAD = 100.0, 0.5

@@ -21,17 +21,6 @@ from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.scene.swing import Swing
 from evlcp_sdk.values import Fix
 
-__all__ = [
-    "GNSS",
-    "IMU",
-    "SwingSource",
-    "TrajectoryPoint",
-    "filter_fixes",
-    "heading_at",
-    "smooth_trajectory",
-    "trajectory_step",
-]
-
 Floats = NDArray[np.float64]
 
 SwingSource = Callable[[float, float], Swing | None]

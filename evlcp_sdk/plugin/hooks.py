@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.air.kinds import MessageKind
     from evlcp_sdk.plugin.source import EventSource
 
-__all__ = ["ENTRY_POINT_GROUP", "Algorithm", "SinkRecord", "hookimpl", "hookspec"]
-
 ENTRY_POINT_GROUP = "evlcp"
 """Entry-point group, and pluggy project name."""
 

@@ -12,8 +12,6 @@ from evlcp_sdk.plugin.hooks import SinkRecord
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.spelling import nearest
 
-__all__ = ["SUMMARY", "InstalledSink", "choose_sinks", "installed_sinks", "message_kinds"]
-
 SUMMARY = "summary.json"
 """What every result has: no sink writes it."""
 

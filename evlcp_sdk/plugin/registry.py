@@ -24,8 +24,6 @@ from evlcp_sdk.plugin.hooks import ENTRY_POINT_GROUP, Algorithm
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.spelling import nearest
 
-__all__ = ["Broken", "Installed", "Registry"]
-
 
 @dataclass(frozen=True)
 class Installed:

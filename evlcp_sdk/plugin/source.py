@@ -11,8 +11,6 @@ from typing import Protocol, Self
 from evlcp_sdk.errors import EvlcpError, PluginError, StreamError
 from evlcp_sdk.values import Events, Triggers
 
-__all__ = ["DEFAULT_MAX_EVENTS", "EventSource", "Ledger", "Loss"]
-
 DEFAULT_MAX_EVENTS = 1 << 18
 """Events of a piece unless asked otherwise: under 4 MB, so that it is still in the cache when it is used, and
 four times what four bars give in a time step, as a step that lies in two pieces has to be put together."""

@@ -5,8 +5,6 @@ import colorsys
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["TRANSMITTER_COLOURS", "cluster_colours", "cluster_hex", "transmitter_colour"]
-
 TRANSMITTER_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9")
 """Okabe and Ito's colours, which colour-blind readers can distinguish, too."""
 

@@ -10,8 +10,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.diagnosis.diagnose import Diagnosis
 from evlcp_sdk.report.pages import render_page
 
-__all__ = ["page"]
-
 _MOST_SOURCES = 40
 
 _MARKS = {"pass": ("yes", "ok"), "doubt": ("no", "doubt"), "fail": ("no", "fails"), "skip": ("note", "-")}

@@ -29,19 +29,6 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Events, Fix, Frame, PresenceMap, Region
 
-__all__ = [
-    "FigureProbe",
-    "Figures",
-    "Thinned",
-    "draw_distance",
-    "draw_presence",
-    "draw_regions",
-    "draw_track",
-    "off_neighbours",
-    "plain",
-    "titled",
-]
-
 _INK = "#333333"
 _DPI = 150
 _MOST_ZOOMS = 3

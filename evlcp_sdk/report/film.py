@@ -23,19 +23,6 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Frame, Packet, Region
 
-__all__ = [
-    "FILM_KINDS",
-    "Film",
-    "FilmKind",
-    "Footage",
-    "check_film",
-    "draw_film",
-    "gather_footage",
-    "pictures_of",
-    "plan_film",
-    "save_film",
-]
-
 FilmKind = Literal["WEBP", "GIF", "MP4"]
 
 FILM_KINDS: Mapping[str, FilmKind] = {".webp": "WEBP", ".gif": "GIF", ".mp4": "MP4"}

@@ -12,8 +12,6 @@ from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import cluster_hex
 from evlcp_sdk.values import Frame, FrameView, PresenceMap
 
-__all__ = ["Motion", "MotionProbe", "cluster_map", "sent_chips"]
-
 _MARGIN_PX = 3
 _MOST_EVENTS = 4
 """Events of one polarity of a pixel in a chip; more look no brighter."""

@@ -26,8 +26,6 @@ from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Events, Frame, Packet
 
-__all__ = ["Report"]
-
 _MOST_TRANSMITTERS = 6
 _MOST_POINTS = 512
 _MOST_ROWS = 40

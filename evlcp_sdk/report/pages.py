@@ -14,8 +14,6 @@ from typing import Any
 from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
-__all__ = ["TEMPLATES", "render_page"]
-
 TEMPLATES = Environment(
     loader=PackageLoader("evlcp_sdk.report"),
     autoescape=True,

@@ -15,8 +15,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.report.pages import TEMPLATES
 
-__all__ = ["Plot", "ellipse", "enlarge_ellipses"]
-
 _SIDE = 2000
 """Steps of a chart's box in either direction."""
 

@@ -8,8 +8,6 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Fix
 
-__all__ = ["ALTERNATIVE_COLUMNS", "AlternativesCsv"]
-
 ALTERNATIVE_COLUMNS = (
     *("t_us", "number", "likelihood", *PLACE_COLUMNS),
     *("heading_deg", "pitch_deg", "roll_deg", "bars"),

@@ -11,16 +11,6 @@ from evlcp_sdk.values import Alternative, Fix, Frame
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import Place
 
-__all__ = [
-    "FILTERED_COLUMNS",
-    "FRAME_COLUMNS",
-    "LINK_COLUMN",
-    "PLACE_COLUMNS",
-    "frame_columns",
-    "frame_value",
-    "place_row",
-]
-
 FRAME_COLUMNS = (
     "transmitter",
     "packet",

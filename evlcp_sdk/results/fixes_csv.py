@@ -10,8 +10,6 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Fix
 
-__all__ = ["FIX_COLUMNS", "FixesCsv"]
-
 FIX_COLUMNS = (
     "t_us",
     *PLACE_COLUMNS,

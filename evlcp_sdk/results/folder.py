@@ -10,8 +10,6 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import Outputs, check_output, check_sha256, output_fault, read_json
 from evlcp_sdk.plugin.records import SUMMARY
 
-__all__ = ["ResultFolder", "check_result_file", "read_summary"]
-
 
 class ResultFolder:
     """Files in a hidden place of their own, which `finish` moves into the folder; a context manager.

@@ -9,8 +9,6 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Packet
 
-__all__ = ["FramesCsv"]
-
 
 class FramesCsv(Sink):
     """Writes `frames.csv`."""

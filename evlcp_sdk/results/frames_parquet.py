@@ -14,8 +14,6 @@ from evlcp_sdk.values import Packet
 if TYPE_CHECKING:
     import pyarrow
 
-__all__ = ["FramesParquet"]
-
 
 class FramesParquet(Sink):
     """Writes `frames.parquet`, one row group every `GROUP` frames."""

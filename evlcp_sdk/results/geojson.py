@@ -11,8 +11,6 @@ from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.trail import Trail
 from evlcp_sdk.values import Fix
 
-__all__ = ["GeoJson"]
-
 
 class GeoJson(Sink):
     """Writes `fixes.geojson`."""

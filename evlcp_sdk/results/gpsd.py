@@ -10,8 +10,6 @@ from evlcp_sdk.place.geoid import geoid_m
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.values import Fix
 
-__all__ = ["DEVICE", "VERSION", "answer", "sky", "tpv"]
-
 DEVICE: Final = "evlcp"
 """Name of the only device."""
 

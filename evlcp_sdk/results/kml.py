@@ -17,8 +17,6 @@ from evlcp_sdk.results.trail import Trail
 from evlcp_sdk.utc import zero_at
 from evlcp_sdk.values import Fix
 
-__all__ = ["Kml"]
-
 _HEAD = """<?xml version="1.0" encoding="UTF-8"?>
 <kml xmlns="http://www.opengis.net/kml/2.2"><Document><name>{name}</name>
 <Style id="fix"><IconStyle><color>ff30a0ff</color><scale>0.4</scale></IconStyle>\

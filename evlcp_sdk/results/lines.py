@@ -9,8 +9,6 @@ from evlcp_sdk.results.columns import FRAME_COLUMNS, frame_columns, frame_value
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.values import Fix, Frame, Packet
 
-__all__ = ["JsonLines", "fix_line", "format_frame"]
-
 
 class JsonLines:
     """Gives a line for each frame, message and fix as it comes; `line` in it says which it is.

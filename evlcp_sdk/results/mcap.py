@@ -25,8 +25,6 @@ from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.utc import at_ns
 from evlcp_sdk.values import Events, Fix, Packet, Region
 
-__all__ = ["Mcap"]
-
 FRAME_ID, CAMERA_ID = "enu", "camera"
 """Names of the local axes, and of the camera's: x right, y down, z forward."""
 

@@ -12,8 +12,6 @@ from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.utc import at_ns
 from evlcp_sdk.values import Fix
 
-__all__ = ["NavSat"]
-
 _NO_FIX, _FIX = -1, 0
 _UNKNOWN, _KNOWN = 0, 3
 """Of a covariance: whether it is known, in full."""

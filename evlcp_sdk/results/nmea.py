@@ -25,8 +25,6 @@ from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.utc import zero_at
 from evlcp_sdk.values import FailedBar, Fix
 
-__all__ = ["Nmea", "gbs", "gga", "gst", "rmc", "sentences", "txt"]
-
 _KNOTS_PER_M_S = 3600 / 1852
 
 

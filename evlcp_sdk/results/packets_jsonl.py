@@ -10,8 +10,6 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Packet, ReceivedMessage
 
-__all__ = ["PacketsJsonl", "message_line", "packet_line"]
-
 
 class PacketsJsonl(Sink):
     """Writes `packets.jsonl`."""

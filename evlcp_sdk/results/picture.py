@@ -8,8 +8,6 @@ import numpy as np
 
 from evlcp_sdk.values import Events
 
-__all__ = ["EventImage"]
-
 _PALETTE: Final = bytes([16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235])
 """Nothing, OFF, ON, both: the colours of the film and the report."""
 

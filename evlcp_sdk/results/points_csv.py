@@ -8,8 +8,6 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.values import Packet
 
-__all__ = ["POINT_COLUMNS", "PointsCsv"]
-
 _PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 POINT_COLUMNS = (

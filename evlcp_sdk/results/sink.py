@@ -14,8 +14,6 @@ from evlcp_sdk.values import Events, Fix, Packet
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan, Settled
 
-__all__ = ["Run", "Sink"]
-
 
 @dataclass(frozen=True, eq=False)
 class Run:

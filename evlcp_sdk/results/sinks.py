@@ -20,8 +20,6 @@ from evlcp_sdk.values import Events, Packet
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import Placed, Settled
 
-__all__ = ["Sinks", "load_sinks"]
-
 
 def load_sinks(chosen: Sequence[InstalledSink]) -> list[tuple[InstalledSink, type[Sink]]]:
     """Import the classes of sinks.

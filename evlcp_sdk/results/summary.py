@@ -13,8 +13,6 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
 from evlcp_sdk.results.folder import ResultFolder
 
-__all__ = ["Status", "messages_off", "summary_of", "write_summary"]
-
 Status = Literal["complete", "degraded", "interrupted", "failed"]
 """How a run ended: read to the end, the same with much of it dropped, stopped by the user, or stopped by
 input that cannot be read."""

@@ -8,8 +8,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.results.columns import frame_columns, frame_value
 from evlcp_sdk.values import Packet, arrow_table, pandas_frame
 
-__all__ = ["frames_table"]
-
 
 def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "pandas") -> Any:
     """The frames of packets as a table, a row per frame, with the columns of `frames.csv`, not rounded.

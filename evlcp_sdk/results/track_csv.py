@@ -9,8 +9,6 @@ from evlcp_sdk.results.columns import PLACE_COLUMNS, place_row
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 
-__all__ = ["TRACK_COLUMNS", "TrackCsv"]
-
 TRACK_COLUMNS = (
     "t_us",
     *PLACE_COLUMNS,

@@ -6,8 +6,6 @@ from itertools import pairwise
 
 from evlcp_sdk.place.navigator import Settled
 
-__all__ = ["Trail", "cut"]
-
 Line = list[list[float]]
 """Points [longitude in degrees, latitude in degrees, height in m]."""
 

@@ -30,8 +30,6 @@ from evlcp_sdk.values import Events, Packet
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import Navigator, Placed, PositionPlan
 
-__all__ = ["ResultWriter"]
-
 
 class ResultWriter:
     """Writes one recording's result into a folder; use as a context manager, end with `finish`.

@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["AlignedFrame", "FrameAligner", "Pilot", "polarity_sums"]
-
 _LEAST_CLUSTERS = 0.5
 """Share of the clusters that must be in their place in a frame: fewer may be another bar's."""
 

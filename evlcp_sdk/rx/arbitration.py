@@ -18,8 +18,6 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.followed import same_place
 from evlcp_sdk.values import Packet, Region, changed
 
-__all__ = ["ArbitratedPacket", "LinkArbiter", "explained_us"]
-
 _CLEARLY = 1.25
 """How many times more light one link explains than another before nothing else matters."""
 

@@ -11,8 +11,6 @@ from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
 
-__all__ = ["StreamContext"]
-
 
 @dataclass(frozen=True)
 class StreamContext:

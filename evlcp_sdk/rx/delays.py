@@ -21,8 +21,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["LONGEST_ROW_US", "RowDelay", "RowDelays"]
-
 _STEPS = 10
 """Steps of a chip in which the response of a block of rows is placed."""
 

@@ -20,8 +20,6 @@ from evlcp_sdk.rx.places import Places
 from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["DetectedRegions"]
-
 _BACKFILL_FRAMES = 2
 """Frames kept from before a region was found, where these are longer than the steps of the receiver's own
 tracker: a slow light is known after its first character. Not more, as they are looked for where the light is

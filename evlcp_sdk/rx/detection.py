@@ -25,8 +25,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["BACKFILL_STEPS", "MARGIN_PX", "RegionFollower"]
-
 MARGIN_PX = 5
 """Seam around a region: how far it may move in a step, 1.5 px/ms and more, and how far it is blurred."""
 

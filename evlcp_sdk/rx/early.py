@@ -5,8 +5,6 @@ from collections.abc import Callable
 
 from evlcp_sdk.values import Frame, Packet
 
-__all__ = ["EarlyFrames"]
-
 _MOST_TRANSMITTERS = 1024
 _MOST_FRAMES = 4096
 """Of a transmitter that wait for a judgement; of more, the oldest come with their packet or not at all."""

@@ -11,8 +11,6 @@ from evlcp_sdk.rx.limits import held_bytes
 from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["SAME_PX", "Followed", "Piece", "same_place"]
-
 SAME_PX = 5.0
 """How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
 

@@ -9,8 +9,6 @@ from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.values import Region
 
-__all__ = ["Framer"]
-
 
 class Framer(ABC):
     """The events of regions to frames, time step by time step.

@@ -26,8 +26,6 @@ from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Missed, Transmitter, Transmitters
 from evlcp_sdk.values import Frame, Region, SyncLock, changed
 
-__all__ = ["PacketFraming"]
-
 _TAIL_CHIPS = 0.5
 """A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
 

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.values import SyncLock
 
-__all__ = ["DueFrame", "PacketGrid"]
-
 
 @dataclass(frozen=True)
 class DueFrame:

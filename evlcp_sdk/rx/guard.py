@@ -20,8 +20,6 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.spelling import hinted
 from evlcp_sdk.values import Bend, PresenceMap, Range, SoftSymbols, SyncLock
 
-__all__ = ["Guard"]
-
 _FAR_PACKETS = 64
 """Packets between a lock and the time when it is found; the grid of its packets is counted from it."""
 

@@ -20,8 +20,6 @@ from evlcp_sdk.rx.trust import BeaconJudge, Standing, signed_text
 from evlcp_sdk.utc import ClockZero, zero_at
 from evlcp_sdk.values import Packet, ReceivedMessage, changed
 
-__all__ = ["MessageAssembler"]
-
 _LLR_POWER, _MOST_LLR = 0.5, 7.0
 """Power that sizes of LLRs are raised to, as decoders are surer within a burst than they are right, and the
 largest after that: no bit is surer than the sync it hangs on, which is wrong once in a thousand."""

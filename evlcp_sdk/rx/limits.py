@@ -11,8 +11,6 @@ from typing import Final
 
 from evlcp_sdk.values import Events
 
-__all__ = ["EVENT_BYTES", "LIMITS", "PIECE_BYTES", "Limits", "held_bytes"]
-
 EVENT_BYTES: Final = 13
 """Of an event: its time, column, row and polarity."""
 

@@ -21,8 +21,6 @@ from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.values import Frame, Packet, Region, changed
 
-__all__ = ["LinkReceiver"]
-
 
 class LinkReceiver:
     """Follows the regions of a stream by one link, receives and decodes what they send, reads its messages.

@@ -1,7 +1,5 @@
 """From when until when the light of each transmitter was there."""
 
-__all__ = ["LitTimes"]
-
 _MOST = 1024
 """Transmitters that are remembered: those seen last."""
 

@@ -13,8 +13,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["calibrate_llr", "still_lit"]
-
 _FRAME_WORTH = 6.0
 """LLRs of a cluster that those of all its frame are worth: light and shaking are much the same for all,
 while a panel or leaves stand behind some."""

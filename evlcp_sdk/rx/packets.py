@@ -2,8 +2,6 @@
 
 from evlcp_sdk.values import Frame, Packet, changed
 
-__all__ = ["PacketAssembler"]
-
 
 class PacketAssembler:
     """Collects a transmitter's frames until their packet is over.

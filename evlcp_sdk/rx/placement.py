@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["Layout", "Placement", "layout_of", "lit", "masked", "placements"]
-
 _LEAST_SPACING_PX = 1.0
 """A placement that puts neighbours into one pixel would fit anything."""
 

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["Places", "region_of"]
-
 _MOST_AHEAD_STEPS = 2
 """Steps beyond the measured centres for which a region goes straight on, before a shaking camera turns."""
 

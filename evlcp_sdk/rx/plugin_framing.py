@@ -22,8 +22,6 @@ from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.values import DecodedFrame, Frame, Range, Region, SyncLock
 
-__all__ = ["PluginFraming"]
-
 _COUNTED = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
 
 _NO_RANGE = Range(math.nan, math.nan, 0)

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["FindPoints", "points_finder"]
-
 FindPoints = Callable[
     [PresenceMap, Placement, NDArray[np.int16]], tuple[NDArray[np.float64], NDArray[np.float64], float]
 ]

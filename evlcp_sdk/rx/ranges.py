@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["RangeKeeper", "Ranges"]
-
 _MEMORY_S = 0.3
 """Distances that are looked back on: a bicycle's swerve or a brake changes the acceleration in no less."""
 

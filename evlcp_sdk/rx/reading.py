@@ -19,8 +19,6 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
 from evlcp_sdk.values import FrameView, Range, SoftSymbols
 
-__all__ = ["FrameReader", "ReadableFrame", "Reading"]
-
 _NO_RANGE = Range(math.nan, math.nan, 0)
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 

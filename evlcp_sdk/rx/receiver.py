@@ -20,8 +20,6 @@ from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Frame, Packet, Region
 
-__all__ = ["Receiver"]
-
 
 class Receiver:
     """Decodes a stream of events, whatever pieces it comes in.

@@ -23,16 +23,6 @@ from evlcp_sdk.rx.placement import Placement
 from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet, changed
 
-__all__ = [
-    "FOLLOWED_CHIPS",
-    "FrameDetection",
-    "ReflectionQueue",
-    "Reflections",
-    "brighter",
-    "originals",
-    "repeats",
-]
-
 FOLLOWED_CHIPS = 2.5
 """The last events of a frame come late, some later than its clock says: it is whole if its light goes on for
 two chips after those due. The stream ends with the latest event, which is later than its light by more than

@@ -36,8 +36,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["Rhythm", "select"]
-
 _MOST_SCORE = 40
 """Scores rise no further: what has blinked in rhythm for long is forgotten after so many rises off it."""
 

@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_sdk.rx._kernels")
 
-__all__ = ["Spread", "expected_lengths", "length_errors", "neighbours", "sharper"]
-
 Floats = NDArray[np.float64]
 
 _AXIS_PX = 0.8

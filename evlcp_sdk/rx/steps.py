@@ -29,8 +29,6 @@ from evlcp_sdk.values import (
     changed,
 )
 
-__all__ = ["Announcer", "Steps", "on_camera", "tracker_of"]
-
 
 def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
     """What a stage gives, with the times of the camera's clock."""

@@ -10,9 +10,6 @@ from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.values import Events
 
-__all__ = ["TimeStep", "Timeline"]
-
-
 _MOST_PIECES = 64
 """Pieces of a time step that wait to be put together, but for one more in `_WHOLE_EVENTS`: small ones take
 more memory than their events."""

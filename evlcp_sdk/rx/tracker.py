@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["RegionTracker"]
-
 Pair = tuple[float, float]
 
 

@@ -19,8 +19,6 @@ from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import Region, SyncLock
 
-__all__ = ["LOOKBACK_PACKETS", "Missed", "Transmitter", "Transmitters"]
-
 LOOKBACK_PACKETS = 2
 """Packets of events kept while there is no lock: one to find a preamble in, one to look back on."""
 

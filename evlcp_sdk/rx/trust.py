@@ -15,8 +15,6 @@ from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Trust
 
-__all__ = ["BeaconJudge", "Standing", "signed_text"]
-
 _MOST_VERIFIED = 4096
 """Transmitter ids whose last verified beacon is remembered; the one not received for longest makes way."""
 

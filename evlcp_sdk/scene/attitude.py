@@ -13,8 +13,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import check_columns, csv_number, read_csv
 from evlcp_sdk.scene.swing import Swing
 
-__all__ = ["Attitude", "AttitudeLog", "attitude_source"]
-
 _NEEDED = ("t_us", "pitch_deg", "roll_deg")
 _OPTIONAL = ("heading_deg", "gravity_sigma_deg", "heading_sigma_deg")
 _AXES = ("right", "down", "forward")

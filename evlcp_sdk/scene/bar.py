@@ -17,17 +17,6 @@ from evlcp_sdk.files import csv_number, read_csv
 from evlcp_sdk.specs import SpecError, build, shown
 from evlcp_sdk.spelling import nearest
 
-__all__ = [
-    "SHAPES",
-    "BarLayout",
-    "LedColumns",
-    "LedGrid",
-    "LedRing",
-    "LedTable",
-    "Shape",
-    "read_leds",
-]
-
 _MOST_LEDS = 1 << 16
 
 _MOST_M = 100.0

@@ -9,8 +9,6 @@ from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
 
-__all__ = ["CAMERA_PARAMETERS", "CameraModel", "CameraSigma"]
-
 CAMERA_PARAMETERS = ("focal_mm", "centre_x_px", "centre_y_px", "k1", "k2", "p1", "p2")
 """What a calibration estimates of a camera, in the order of covariances."""
 

@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel
 
-__all__ = ["BarSight", "foreshortening", "magnification_of", "sight_of"]
-
 Floats = NDArray[np.float64]
 
 _PLUMB_DEG = 0.1

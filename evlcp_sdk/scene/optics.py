@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 else:
     special = Late("scipy.special")
 
-__all__ = ["Blur", "airy_blur", "step"]
-
 Floats = NDArray[np.float64]
 
 CORE_SIGMA, FIRST_WING_SIGMA = 0.35, 0.8

@@ -19,9 +19,6 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.specs import SpecError, build, read_toml, toml_value
 from evlcp_sdk.spelling import nearest
 
-__all__ = ["BarSite", "LocalAxes", "load_sites", "resolve_sites", "site_of_transmitter", "to_toml"]
-
-
 _LEAST_UPRIGHT = 0.1
 """Sine of an axis' elevation below which it lies: LEDs then face level, whatever they are turned about it."""
 

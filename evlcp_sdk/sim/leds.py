@@ -9,8 +9,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing, LedTable
 from evlcp_sdk.sim.scene import MOST_SOURCES, BarSpec
 
-__all__ = ["LitStrip", "lit_strips"]
-
 _SAME_M = 1e-6
 """LEDs that stand in one line to the micrometre stand in one strip."""
 

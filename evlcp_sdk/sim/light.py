@@ -32,17 +32,6 @@ from evlcp_sdk.sim.scene import (
 )
 from evlcp_sdk.sim.world import bar_across, bar_axis, bar_towards, sites_of
 
-__all__ = [
-    "BarLight",
-    "LampLight",
-    "Pane",
-    "Source",
-    "StripLight",
-    "reflections_of",
-    "sources_of",
-    "wiper_switches",
-]
-
 Floats = NDArray[np.float64]
 
 _SINE_STEPS = 32

@@ -13,8 +13,6 @@ from evlcp_sdk.files import read_csv
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.scene import NEAREST_M, MotionSpec
 
-__all__ = ["CameraPath", "Strip", "Vibration", "pothole_angle_rad", "project"]
-
 Floats = NDArray[np.float64]
 
 _SINES = 128

@@ -14,8 +14,6 @@ from evlcp_sdk.scene.optics import Blur, airy_blur, step
 from evlcp_sdk.sim.leds import LitStrip
 from evlcp_sdk.sim.scene import BarSpec, LensSpec
 
-__all__ = ["blur_of", "blur_sigma_px", "led_light_w_m2", "step_table", "strip_table"]
-
 Floats = NDArray[np.float64]
 
 

@@ -19,8 +19,6 @@ from evlcp_sdk.sim.simulation import Simulation, scene_table
 from evlcp_sdk.sim.truth import Truth, link_table_of, truth_from_table
 from evlcp_sdk.sim.world import camera_on_earth, sites_of
 
-__all__ = ["scene_of_truth", "truth_of"]
-
 Floats = NDArray[np.float64]
 
 _OF_SENSOR = (

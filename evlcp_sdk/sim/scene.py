@@ -25,24 +25,6 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import SpecError, build, parse_toml, parse_value, read_toml
 from evlcp_sdk.spelling import nearest
 
-__all__ = [
-    "BackgroundSpec",
-    "BarSpec",
-    "LampSpec",
-    "LensSpec",
-    "MotionSpec",
-    "ReflectionSpec",
-    "Scene",
-    "SensorSpec",
-    "WiperSpec",
-    "WorldSpec",
-    "links_of",
-    "load_scene",
-    "preset_names",
-    "preset_text",
-    "resolve_scene",
-]
-
 MOST_PIXELS = 4096
 """Columns and rows of a sensor."""
 

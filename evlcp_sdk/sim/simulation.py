@@ -22,17 +22,6 @@ from evlcp_sdk.sim.optics import blur_of, step_table, strip_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
 from evlcp_sdk.values import Events
 
-__all__ = [
-    "ACTIVITY_FLOOR",
-    "MOTION_STEP_PX",
-    "Simulation",
-    "pixel_model",
-    "quantile_table",
-    "request_words",
-    "requests_room",
-    "simulate",
-]
-
 Floats = NDArray[np.float64]
 
 _Requests = tuple[Floats, NDArray[np.int32]]

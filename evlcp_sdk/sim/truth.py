@@ -15,8 +15,6 @@ from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite, resolve_sites
 
-__all__ = ["SentBar", "Truth", "read_truth", "truth_from_table", "truth_path"]
-
 Floats = NDArray[np.float64]
 
 _DARK_W_M2 = 1e-6

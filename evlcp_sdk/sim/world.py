@@ -19,18 +19,6 @@ from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
 
-__all__ = [
-    "attitude_log",
-    "bar_across",
-    "bar_axis",
-    "bar_towards",
-    "camera_on_earth",
-    "rendered",
-    "scene_to_enu",
-    "sites_of",
-    "sites_said",
-]
-
 Floats = NDArray[np.float64]
 
 

@@ -24,8 +24,6 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.values import FrameView, PresenceMap, Range
 
-__all__ = ["BarBound", "LayoutBound", "bar_bound", "frame_bound", "layout_bound"]
-
 Array = NDArray[np.float64]
 
 _NONE = Range(math.nan, math.nan, 0)

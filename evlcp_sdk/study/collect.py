@@ -9,8 +9,6 @@ from evlcp_sdk.study.plan import Job, Plan, StopRule
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics, Tally
 
-__all__ = ["Counted", "Progress", "RunJob", "collect", "progress_of"]
-
 RunJob = Callable[[Job], Sequence[tuple[str, Statistics]]]
 """Runs a job; gives the statistics of each of its tasks."""
 

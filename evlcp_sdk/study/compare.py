@@ -26,8 +26,6 @@ from evlcp_sdk.study.measure import statistics_of, without_truth
 from evlcp_sdk.study.variants import Variant
 from evlcp_sdk.values import Events, FrameView, Range
 
-__all__ = ["compare_recording", "comparison_of"]
-
 _WARM_PACKETS = 2
 """Packets that a variant decodes beforehand: one may be cut, so that a whole one loads every kernel."""
 

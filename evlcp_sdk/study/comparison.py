@@ -19,21 +19,6 @@ from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, Figure, measure
 from evlcp_sdk.study.summary import Series, Summary
 from evlcp_sdk.study.tally import Statistics, Tally
 
-__all__ = [
-    "BOUND_NAME",
-    "COLUMNS",
-    "MARK",
-    "STAGES",
-    "Column",
-    "Comparison",
-    "Measured",
-    "Row",
-    "Table",
-    "Times",
-    "of_campaign",
-    "total_of",
-]
-
 STAGES = ("separation", "decoding", "ranging")
 """The stages that every frame goes through, and whose time is measured."""
 

@@ -10,8 +10,6 @@ from evlcp_sdk.files import csv_number, read_csv
 from evlcp_sdk.results.folder import check_result_file, read_summary
 from evlcp_sdk.values import Frame, Packet
 
-__all__ = ["FrameRow", "frames_of", "read_frames", "row_of_frame"]
-
 
 @dataclass(frozen=True)
 class FrameRow:

@@ -15,14 +15,6 @@ from scipy import special
 
 from evlcp_sdk.study.tally import Tally
 
-__all__ = [
-    "FEWEST_RECORDINGS",
-    "INTERVALS",
-    "Figure",
-    "measure",
-    "ratio_interval",
-]
-
 FEWEST_RECORDINGS = 5
 """With fewer recordings than this there is no interval: what is known of the tails is guessed more than
 measured. At five, nine of ten intervals hold the true value where rates differ by a factor of e."""

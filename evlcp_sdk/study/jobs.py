@@ -24,8 +24,6 @@ if TYPE_CHECKING:
     from concurrent.futures import Future, ProcessPoolExecutor
     from multiprocessing.connection import Connection
 
-__all__ = ["DaskCluster", "Executor", "Fault", "Inline", "Outcome", "Processes", "stop_workers"]
-
 J = TypeVar("J")
 R = TypeVar("R")
 

@@ -18,8 +18,6 @@ from evlcp_sdk.rx.reflections import FOLLOWED_CHIPS
 from evlcp_sdk.sim.truth import SentBar, Truth
 from evlcp_sdk.study.frames import FrameRow
 
-__all__ = ["BarFrames", "Matched", "check_link", "find_start", "match", "nearest_bar", "sent_packets"]
-
 Floats = NDArray[np.float64]
 
 NEAREST_PX = 60.0

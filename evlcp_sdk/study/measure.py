@@ -18,15 +18,6 @@ from evlcp_sdk.study.match import NEAREST_PX, BarFrames, find_start, match, near
 from evlcp_sdk.study.tally import Statistics, Tally, in_nm, segment_of
 from evlcp_sdk.values import Frame, Packet
 
-__all__ = [
-    "bar_tallies",
-    "message_tallies",
-    "position_tallies",
-    "sites_seen",
-    "statistics_of",
-    "without_truth",
-]
-
 
 def bar_tallies(sent: BarFrames, pairs: Iterable[tuple[FrameRow, int]]) -> list[tuple[int, Tally]]:
     """Tallies of one bar, each with the start of its segment: one a sent frame, one a decoded."""

@@ -3,8 +3,6 @@
 from dataclasses import dataclass
 from typing import Literal
 
-__all__ = ["PAPER", "PAPER_NAME", "Measure", "Reference"]
-
 PAPER_NAME = "arXiv 2510.17203"
 
 Measure = Literal["ber", "rmse_m", "gross_share"]

@@ -21,19 +21,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.specs import SpecError, build, parse_value, read_toml, toml_value
 from evlcp_sdk.study.tally import Tally
 
-__all__ = [
-    "Case",
-    "Job",
-    "Plan",
-    "Point",
-    "StopRule",
-    "Task",
-    "digest_of",
-    "load_plan",
-    "make_plan",
-    "plan_from_dict",
-]
-
 
 @dataclass(frozen=True)
 class StopRule:

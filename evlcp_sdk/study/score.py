@@ -22,8 +22,6 @@ from evlcp_sdk.study.match import match
 from evlcp_sdk.study.measure import bar_tallies
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
-__all__ = ["links_of_result", "score_frames"]
-
 _FARTHEST_M = 200
 """Segments from here on are not written."""
 

@@ -19,8 +19,6 @@ from evlcp_sdk.files import check_output
 from evlcp_sdk.study.plan import Plan, plan_from_dict
 from evlcp_sdk.study.tally import Statistics
 
-__all__ = ["Store"]
-
 SCHEMA = 3
 
 _TABLES = """

@@ -20,8 +20,6 @@ from evlcp_sdk.study.plan import Plan
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
 
-__all__ = ["PaperComparison", "Series", "Summary", "Verdict", "beside_paper", "summarize", "verdict_of"]
-
 
 @dataclass(frozen=True)
 class Series:

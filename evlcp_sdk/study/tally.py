@@ -11,18 +11,6 @@ from pydantic import Field
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.specs import build
 
-__all__ = [
-    "BIN_M",
-    "HALF_METRE_M",
-    "POSITION_BIN_M",
-    "SEGMENT_M",
-    "SILENT_NEES",
-    "Statistics",
-    "Tally",
-    "in_nm",
-    "segment_of",
-]
-
 SEGMENT_M = 10
 """Length of the segments of distance that figures are given for, m."""
 

@@ -22,8 +22,6 @@ from evlcp_sdk.study.plan import Case, Job, Plan, digest_of, load_plan
 from evlcp_sdk.study.tally import Statistics
 from evlcp_sdk.values import Packet
 
-__all__ = ["environment_of", "plan_of", "run_job"]
-
 _PACKAGES = ("air", "link", "place", "plugin", "rx", "scene", "sim")
 _ON_AIR = ("air", "bar", "framing", "pilots", "modulation", "error-correction")
 """Sections of a link that say what a bar sends, and from where; those that its framing has."""

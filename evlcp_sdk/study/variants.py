@@ -11,8 +11,6 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import load_links, named_links
 from evlcp_sdk.plugin.registry import Registry
 
-__all__ = ["Variant", "load_variants"]
-
 _KEY = r"[\w-]+\s*\.\s*[\w-]+\s*(?:\.\s*[\w-]+\s*)?="
 _SETTING = re.compile(rf"{_KEY}.*", re.DOTALL)
 _AT_SETTING = re.compile(rf",(?=\s*{_KEY})")

@@ -10,8 +10,6 @@ from evlcp_sdk.testing.exercises import link_of
 from evlcp_sdk.testing.law import Subject, expect, law
 from evlcp_sdk.testing.views import ideal_frame, ideal_presence, ideal_sums
 
-__all__ = ["MODULATION", "PILOTS"]
-
 _COUNTS = (2, 4, 8, 16, 24, 32)
 _MOST_ALIKE = 0.25
 """Correlation of two pilots, normalised: 3 of 8 values differ, so that one seen wrong is put right."""

@@ -13,8 +13,6 @@ from evlcp_sdk.testing.exercises import compile_subject, expect_column, link_of
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, expect, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 
-__all__ = ["ERROR_CORRECTION"]
-
 _LENGTHS = (1, 31, 64, 100, 256, 333, 640, 1025, 1280)
 """Blocks on air: of the built-in profiles, powers of two, and lengths that are neither."""
 

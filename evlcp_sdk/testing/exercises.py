@@ -18,22 +18,6 @@ from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_frame, ideal_sums, ideal_view
 from evlcp_sdk.values import Events
 
-__all__ = [
-    "ONE_CLUSTER",
-    "Exercise",
-    "arguments_of",
-    "compile_subject",
-    "exercise_of",
-    "expect_column",
-    "feed_events",
-    "filters_of",
-    "link_of",
-    "link_of_one_cluster",
-    "recording_of",
-    "subject_of",
-    "symbols_of",
-]
-
 ONE_CLUSTER = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
 """A bar for what sends with one cluster only."""
 

@@ -17,8 +17,6 @@ from evlcp_sdk.testing.exercises import arguments_of, exercise_of
 from evlcp_sdk.testing.law import LawError, Subject, expect, expect_same, law
 from evlcp_sdk.testing.trees import map_arrays
 
-__all__ = ["DESCRIPTION", "FUNCTION", "RESULT"]
-
 _SAME = 1e-5
 """Tolerance where the order of a sum may change: single precision."""
 

@@ -17,8 +17,6 @@ from evlcp_sdk.testing.trees import map_arrays
 from evlcp_sdk.testing.views import GRID_PX, ideal_frame, ideal_presence, ideal_sums, ideal_view
 from evlcp_sdk.values import PresenceMap, Range, SoftSymbols
 
-__all__ = ["DECODING", "RANGING", "SEPARATION"]
-
 _SPACINGS_PX = (4, 6, 8, 10, 12, 14)
 """Spacings of clusters: 108 m to 31 m with the default bar and camera."""
 _EXACT = 1e-3

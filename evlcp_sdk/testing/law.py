@@ -10,20 +10,6 @@ from evlcp_sdk.testing.trees import difference
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
 
-__all__ = [
-    "InapplicableLawError",
-    "Law",
-    "LawError",
-    "Status",
-    "Subject",
-    "Verdict",
-    "compile_or_skip",
-    "expect",
-    "expect_same",
-    "judge",
-    "law",
-]
-
 Status = Literal["ok", "failed", "skipped", "excused"]
 """`excused`: fails, as the author declared it would, with a reason."""
 

@@ -8,8 +8,6 @@ from evlcp_sdk.testing.exercises import expect_column, link_of
 from evlcp_sdk.testing.law import Subject, compile_or_skip, expect, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 
-__all__ = ["LINK"]
-
 _PACKETS = 3
 _CLUSTER_PX = 8.0
 _NEAR = 0.05

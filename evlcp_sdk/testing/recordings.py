@@ -9,8 +9,6 @@ from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import Events
 
-__all__ = ["IdealBar", "ideal_events", "lamp_events", "merged", "noise_events", "random_symbols"]
-
 
 @dataclass(frozen=True, eq=False)
 class IdealBar:

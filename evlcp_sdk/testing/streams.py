@@ -22,8 +22,6 @@ from evlcp_sdk.testing.law import Subject, expect, expect_same, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.values import Events, Region, SyncLock
 
-__all__ = ["DETECTION", "FRAMING", "SYNCHRONIZATION", "TRACKING"]
-
 _PACKETS = 4
 _STEP_US = 1500
 _FLUSH_US = 100_000

@@ -15,9 +15,6 @@ from evlcp_sdk.testing.law import InapplicableLawError, Law, LawError, Subject, 
 from evlcp_sdk.testing.links import LINK
 from evlcp_sdk.testing.streams import DETECTION, FRAMING, SYNCHRONIZATION, TRACKING
 
-__all__ = ["check", "check_link", "conformance", "laws_of"]
-
-
 _EVERY = DESCRIPTION + FUNCTION + RESULT
 _LAWS: dict[str, tuple[Law, ...]] = {
     "detection": _EVERY + DETECTION,

@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["difference", "map_arrays"]
-
 
 def map_arrays(value: Any, change: Callable[[NDArray[Any]], NDArray[Any]]) -> Any:
     """The same structure with every array changed."""

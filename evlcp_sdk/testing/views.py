@@ -8,8 +8,6 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
-__all__ = ["GRID_PX", "ideal_frame", "ideal_presence", "ideal_soft", "ideal_sums", "ideal_view"]
-
 GRID_PX = 2
 """Side of a grid cell of an ideal presence map, px."""
 

@@ -17,21 +17,6 @@ from evlcp_sdk.link.resolve import Link
 from firmware_host.protocol.generated.requests import CLUSTERS, LEDS, ROW_BYTES, Format
 from firmware_host.protocol.rows import BOARD_LEDS, masks_of_clusters, rows_of_chips
 
-__all__ = [
-    "Bank",
-    "Composed",
-    "bank_of",
-    "check_link",
-    "limits",
-    "packet_content",
-    "queue_of",
-    "random_symbols",
-    "read_masks",
-    "rest_content",
-    "symbol_chips",
-    "word_limits",
-]
-
 WORD_CHIPS = 16
 """Chips of a pilot, and of an info segment, that the board composes."""
 

@@ -70,8 +70,6 @@ from firmware_host.protocol.generated.requests import (
 )
 from firmware_host.protocol.wire import WireMessage
 
-__all__ = ["Board", "Programmed", "Settings", "profile_number", "provision"]
-
 _BLOCK = 2048
 """Bytes of a bank whose CRC decides together whether they are there."""
 

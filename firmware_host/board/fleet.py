@@ -29,19 +29,6 @@ from firmware_host.errors import FleetError, IncompatibleError
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD, Watchdog
 
-__all__ = [
-    "Entry",
-    "Inventory",
-    "Result",
-    "board_of",
-    "program_fleet",
-    "raise_failures",
-    "read_entries",
-    "read_inventory",
-    "run_fleet",
-    "verify_fleet",
-]
-
 
 @dataclass(frozen=True)
 class Entry:

@@ -8,8 +8,6 @@ from evlcp_sdk.files import read_secret, write_new
 from firmware_host.protocol.generated.requests import KEY_BYTES
 from firmware_host.protocol.seal import key_name
 
-__all__ = ["make_board_key", "read_board_key"]
-
 _MOST_BYTES = 1024
 
 

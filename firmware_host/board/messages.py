@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.scene.sites import BarSite
     from firmware_host.board.stream import Stream
 
-__all__ = ["Content", "check_interval", "packet_s", "send_anew"]
-
 
 @dataclass(frozen=True)
 class Content:

@@ -11,8 +11,6 @@ from firmware_host.board.board import Board
 from firmware_host.errors import BoardError, LineError, NoBoardError
 from firmware_host.protocol.generated.requests import StatusReply, Watchdog
 
-__all__ = ["Back", "Gone", "Unheard", "watch"]
-
 _FIRST_PAUSE_S = 0.25
 _LONGEST_PAUSE_S = 5.0
 

@@ -29,8 +29,6 @@ from firmware_host.protocol.generated.requests import (
 from firmware_host.protocol.seal import Sealer, key_name
 from firmware_host.protocol.wire import WireMessage
 
-__all__ = ["Session", "refusal"]
-
 
 def _if_silent(port: str) -> str:
     """What to do where nobody answers on a port that could be opened."""

@@ -5,8 +5,6 @@ from pathlib import Path
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.sites import BarSite, load_sites
 
-__all__ = ["site_that_sends"]
-
 
 def site_that_sends(path: Path, transmitter_id: int | None, by: str) -> BarSite:
     """The bar of a file of sites that sends.

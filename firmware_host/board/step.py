@@ -7,8 +7,6 @@ from firmware_host.board.board import Board
 from firmware_host.errors import BoardError, LineError, RefusedError
 from firmware_host.protocol.generated.requests import Capability, State, Status
 
-__all__ = ["start_together", "wait_for_pulse"]
-
 _ROUNDS = 20
 
 

@@ -22,8 +22,6 @@ from firmware_host.protocol.generated.requests import (
     StopRequest,
 )
 
-__all__ = ["AHEAD", "Stream"]
-
 AHEAD = 4
 """Packets that wait on the board, the one that plays among them, unless the caller says otherwise."""
 

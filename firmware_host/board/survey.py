@@ -10,8 +10,6 @@ from firmware_host.ports.usb import SerialPort, UsbFilter, serial_ports
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import HelloReply
 
-__all__ = ["Found", "ask", "find", "survey"]
-
 _PROBE_TRIES = 2
 
 

@@ -18,8 +18,6 @@ from evlcp_sdk.link.shared import differences
 from evlcp_sdk.plugin.registry import Registry
 from firmware_host.errors import IncompatibleError
 
-__all__ = ["read_symbols", "symbols_of", "symbols_table"]
-
 ON_AIR = ("air", "bar", "framing", "pilots", "modulation")
 """Tables of a link that symbols and chips follow from; blocks follow from the error correction, too."""
 

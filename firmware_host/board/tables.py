@@ -15,8 +15,6 @@ from firmware_host.protocol.generated.requests import (
     Watchdog,
 )
 
-__all__ = ["about_table", "name_of", "names_of_bits", "status_table"]
-
 
 def about_table(about: HelloReply) -> dict[str, Any]:
     """What a board is and what it can, from its HELLO."""

@@ -33,8 +33,6 @@ from firmware_host.protocol.generated.requests import (
 )
 from firmware_host.protocol.wire import WireMessage
 
-__all__ = ["Package", "Updated", "confirm", "update", "update_status"]
-
 Progress = Callable[[int, int], None]
 
 _NO_UPDATE = (

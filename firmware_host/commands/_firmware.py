@@ -9,8 +9,6 @@ import typer
 from firmware_host.commands._json import AsJson, say
 from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board, progress_bar
 
-__all__ = ["FlashCommand", "Target", "build_images", "flash", "update"]
-
 
 class Target(StrEnum):
     """Boards that an image is built for."""

@@ -8,8 +8,6 @@ from typer.core import TyperCommand
 
 from evlcp_sdk.cli._common import echo
 
-__all__ = ["AsJson", "JsonCommand", "fault_table", "print_json", "say"]
-
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, also of what goes wrong.")]
 
 

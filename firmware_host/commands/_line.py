@@ -14,21 +14,6 @@ from firmware_host.commands._json import JsonCommand, print_json
 if TYPE_CHECKING:
     from firmware_host.board.board import Board
 
-__all__ = [
-    "LINE",
-    "BoardLine",
-    "KeepAlive",
-    "LineCommand",
-    "SurveyCommand",
-    "from_command_line",
-    "keep_alive",
-    "line_options",
-    "open_board",
-    "progress_bar",
-    "say_done",
-    "say_watchdog",
-]
-
 _BAUD = 1_000_000
 
 

@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from firmware_host.board.bank import Bank
 
-__all__ = ["RandomPackets", "Seed", "SymbolsFile", "bank", "symbols"]
-
 SymbolsFile = Annotated[
     Path | None,
     typer.Argument(metavar="SYMBOLS.json", help="Symbols \\[packet]\\[frame]\\[cluster], with their link."),

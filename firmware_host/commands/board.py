@@ -38,8 +38,6 @@ if TYPE_CHECKING:
     from firmware_host.board.monitor import Back, Gone, Unheard
     from firmware_host.protocol.generated.requests import StatusReply
 
-__all__ = ["app"]
-
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode="rich",

@@ -11,8 +11,6 @@ import typer
 
 from evlcp_sdk.cli._common import LinkFile, Overrides, console, echo
 
-__all__ = ["loop"]
-
 
 def loop(
     text: Annotated[str, typer.Option("--text", metavar="TEXT", help="What is sent.")] = "Road works",

@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from firmware_host.board.messages import Content
 
-__all__ = ["keygen", "message"]
-
 _MOST_NUMBER = 2**32 - 1
 
 

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from firmware_host.board.stream import Stream
 
-__all__ = ["Ahead", "said_of", "stream", "table_of"]
-
 _LOOK_S = 0.005
 _MOST_LINES = 64
 

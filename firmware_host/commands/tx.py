@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.link.resolve import Link
 
-__all__ = ["app"]
-
 app = typer.Typer(
     no_args_is_help=True, rich_markup_mode="rich", help="Make, show and check what goes on air."
 )

@@ -14,8 +14,6 @@ from evlcp_sdk.errors import InputError
 from firmware_host.protocol.generated.requests import CHIP_DARK, CHIP_TEST, ROW_BYTES
 from firmware_host.protocol.rows import BOARD_LEDS, chips_of_rows
 
-__all__ = ["RECORD", "LedRecord"]
-
 RECORD = np.dtype([("tick", "<u4"), ("chip", "<u4"), ("row", "u1", (ROW_BYTES,))])
 """One record."""
 

@@ -7,8 +7,6 @@ from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import NoBoardError
 from firmware_host.ports.transport import SocketTransport
 
-__all__ = ["check_free", "listener"]
-
 
 def check_free(listen: str) -> None:
     """Raise ConfigError if somebody answers where an emulator is to listen; a socket left behind may be."""

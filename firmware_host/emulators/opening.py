@@ -10,8 +10,6 @@ from firmware_host.emulators.processes import start_native, start_qemu
 from firmware_host.ports.transport import Transport, open_transport
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
-__all__ = ["open_port"]
-
 
 def open_port(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
     """Open a port, or start an emulator, by its name; see the module.

@@ -18,19 +18,6 @@ from firmware_host.errors import LineError, NoBoardError, ToolchainError
 from firmware_host.images import FLASH_BYTES
 from firmware_host.ports.transport import SocketTransport
 
-__all__ = [
-    "ProcessTransport",
-    "bound",
-    "native_command",
-    "qemu_command",
-    "rom_command",
-    "start_native",
-    "start_qemu",
-    "stm32_command",
-    "wait_for",
-]
-
-
 _DIES_WITH_PARENT = (
     "import ctypes, os, signal, sys;"
     " ctypes.CDLL(None).prctl(1, signal.SIGTERM);"  # PR_SET_PDEATHSIG, which holds over exec

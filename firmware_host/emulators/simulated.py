@@ -11,8 +11,6 @@ from firmware_host import build
 from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD, LEDS, ROW_BYTES
 
-__all__ = ["SimulatedBoard", "SimulatedLine", "UsbLine"]
-
 
 @cache
 def _library() -> ctypes.CDLL:

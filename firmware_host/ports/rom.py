@@ -9,8 +9,6 @@ from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyEr
 from firmware_host.images import FLASH_START, FlashImage
 from firmware_host.ports.transport import Transport
 
-__all__ = ["BAUD", "PRODUCT", "SECTORS", "RomLoader", "flash_image"]
-
 BAUD = 115_200
 """The fastest rate that the ROM takes for sure, bit/s."""
 PRODUCT = 0x413

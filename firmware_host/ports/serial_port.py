@@ -12,8 +12,6 @@ from typing import Any
 
 from firmware_host.errors import LineError, NoBoardError
 
-__all__ = ["SerialTransport", "holders"]
-
 _MISSING = {errno.ENOENT, errno.ENXIO, errno.ENODEV}
 _DENIED = {errno.EACCES, errno.EPERM}
 _TAKEN = {errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK}

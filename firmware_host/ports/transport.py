@@ -21,15 +21,6 @@ from firmware_host.ports.serial_port import SerialTransport
 from firmware_host.ports.usb import device_of
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
-__all__ = [
-    "ReplayTransport",
-    "SocketTransport",
-    "TraceTransport",
-    "Transport",
-    "on_network",
-    "open_transport",
-]
-
 _NETWORK = ("unix:", "tcp:", "socket://", "rfc2217://")
 
 

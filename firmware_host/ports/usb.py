@@ -6,8 +6,6 @@ from dataclasses import dataclass
 from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import NoBoardError
 
-__all__ = ["BRIDGES", "SerialPort", "UsbFilter", "device_of", "serial_ports"]
-
 BRIDGES = {
     "0403:6001": "FTDI FT232R",
     "0403:6010": "FTDI FT2232",

@@ -24,8 +24,6 @@ from firmware_host.protocol.generated.requests import (
 from firmware_host.protocol.seal import Sealer
 from firmware_host.protocol.wire import WireMessage
 
-__all__ = ["TRIES", "Client", "RequestOutcome", "Timing"]
-
 TRIES = 5
 """How often a request is sent before it is given up, unless the caller says otherwise."""
 

@@ -14,8 +14,6 @@ from cobs import cobs
 from firmware_host.errors import DatagramError
 from firmware_host.protocol.generated.requests import CRC_BYTES, HEADER_BYTES, MAX_PAYLOAD
 
-__all__ = ["MAX_WIRE_BYTES", "Counts", "Datagram", "DatagramDecoder"]
-
 _HEADER = struct.Struct("<BBHH")
 
 MAX_WIRE_BYTES = HEADER_BYTES + MAX_PAYLOAD + CRC_BYTES + 3 + 1

@@ -17,8 +17,6 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.link.resolve import resolve
 
-__all__ = ["Exchange", "Field", "codebook_of", "generated_files", "main", "render"]
-
 HERE = Path(__file__).parents[1]
 
 _SIZES = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i16": 2}

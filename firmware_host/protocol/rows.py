@@ -6,8 +6,6 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.errors import ConfigError
 from firmware_host.protocol.generated.requests import CLUSTERS, LEDS, ROW_BYTES
 
-__all__ = ["BOARD_LEDS", "chips_of_rows", "masks_of_clusters", "rows_of_chips"]
-
 BOARD_LEDS: NDArray[np.int64] = np.repeat(np.arange(CLUSTERS), LEDS // CLUSTERS)
 """The cluster of each LED where the board composes packets, int64 (96,)."""
 

@@ -17,8 +17,6 @@ from dataclasses import dataclass
 
 from firmware_host.protocol.generated.requests import KEY_NAME_BYTES, SEAL_BYTES, SEALED
 
-__all__ = ["Sealer", "key_name"]
-
 _HEAD = struct.Struct("<BBHI")
 
 

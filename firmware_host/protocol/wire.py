@@ -7,8 +7,6 @@ from typing import Any, ClassVar, Self
 
 from firmware_host.errors import DatagramError
 
-__all__ = ["WireMessage"]
-
 
 @cache
 def _packer(codes: str) -> struct.Struct:

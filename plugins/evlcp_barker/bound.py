@@ -15,8 +15,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_barker._kernels")
 
-__all__ = ["due_chips", "guard_chips", "least_correlation", "preamble_share"]
-
 _HALF = 0.5
 """Of the events of a preamble half agree with it and are its own, at the least: what is missing, other light
 in the region, its halo and its repeated events take up to the other half."""

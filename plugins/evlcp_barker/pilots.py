@@ -9,8 +9,6 @@ from evlcp_sdk.air.codebook import BARKER13, chips_of_values
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Pilots
 
-__all__ = ["Barker13Pilots"]
-
 
 @dataclass(frozen=True)
 class Barker13Pilots(Pilots):

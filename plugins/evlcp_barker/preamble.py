@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["PreambleTimes", "find_peaks", "time_preamble"]
-
 Floats = NDArray[np.float64]
 
 OUTSTANDS = 6.0

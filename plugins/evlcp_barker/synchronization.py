@@ -22,8 +22,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_barker._kernels")
 
-__all__ = ["BarkerSync"]
-
 _TIMING_SIGMA_US = 2.0
 """Least spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
 

@@ -10,8 +10,6 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, Range
 
-__all__ = ["NoRanging"]
-
 _NONE = Range(math.nan, math.nan, 0)
 
 

@@ -13,8 +13,6 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, Range
 
-__all__ = ["CentroidRanging"]
-
 _NONE = Range(float("nan"), float("nan"), 0)
 
 

@@ -9,8 +9,6 @@ from evlcp_sdk.air.crc import CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
 
-__all__ = ["NoCorrection"]
-
 
 @dataclass(frozen=True)
 class NoCorrection(ErrorCorrection):

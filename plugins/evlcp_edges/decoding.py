@@ -11,8 +11,6 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols
 
-__all__ = ["EdgeDecoding"]
-
 _SURE = 5.0
 """Log odds of a codeword from which its cluster teaches the others: one of 150 such is another."""
 

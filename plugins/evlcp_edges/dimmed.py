@@ -10,8 +10,6 @@ from pydantic import Field
 from evlcp_sdk.air.codebook import BARKER13, hadamard
 from evlcp_sdk.plugin.roles import Modulation, Pilots
 
-__all__ = ["DimmedPilots", "DimmedWh4x2", "dimmed_chips"]
-
 Slots = Annotated[
     int,
     Field(

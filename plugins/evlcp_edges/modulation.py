@@ -12,8 +12,6 @@ from evlcp_sdk.air.codebook import edges_of_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Modulation
 
-__all__ = ["Nrz", "Ppm"]
-
 
 @dataclass(frozen=True)
 class Ppm(Modulation):

@@ -19,8 +19,6 @@ if TYPE_CHECKING:
 else:
     ndimage = Late("scipy.ndimage")
 
-__all__ = ["EdgeSeparation", "cell_sums", "to_pixels"]
-
 
 @dataclass(frozen=True)
 class EdgeSeparation(Separation):

@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_joint._kernels")
 
-__all__ = ["JointScaleRanging"]
-
 _NONE = Range(float("nan"), float("nan"), 0)
 
 _STARTING_GAIN = 0.8

@@ -9,8 +9,6 @@ from pydantic import Field
 
 from evlcp_sdk.plugin.roles import Filter, Tracker, Tracking
 
-__all__ = ["KalmanTracking", "NoTracking"]
-
 
 @dataclass(frozen=True)
 class NoTracking(Tracking):

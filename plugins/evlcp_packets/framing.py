@@ -7,8 +7,6 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.plugin.roles import STEPS, Deframer, Framing
 
-__all__ = ["Packets"]
-
 
 @dataclass(frozen=True)
 class Packets(Framing):

@@ -12,8 +12,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_poc._kernels")
 
-__all__ = ["blob_band", "blob_size", "cut_maps", "full_band", "pair_shifts", "phase_only_correlation"]
-
 _NO_PHASE = 1e-5
 """Amplitude, in the largest of a spectrum, below which there is no phase: that of rounding."""
 

@@ -3,8 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["choose_pairs", "far_pairs", "robust_mean"]
-
 Floats = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Pairs = tuple[Indices, Indices, Floats]

@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_poc._kernels")
 
-__all__ = ["PocRanging", "cut_size"]
-
 _NONE = Range(float("nan"), float("nan"), 0)
 
 _RIM_PX = 0.2

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_polar._kernels")
 
-__all__ = ["Polar", "information_set", "list_nodes", "sent_bits", "transform"]
-
 _MOST_BITS = 1024
 """Longest codeword: what the reliability sequence is given for."""
 

@@ -1,7 +1,5 @@
 """How reliable the inputs of a polar code are: the sequence of 5G NR."""
 
-__all__ = ["RELIABILITY"]
-
 # fmt: off
 RELIABILITY = (
     0, 1, 2, 4, 8, 16, 32, 3, 5, 64, 9, 6, 17, 10, 18, 128, 12, 33, 65, 20, 256, 34, 24, 36, 7, 129, 66,

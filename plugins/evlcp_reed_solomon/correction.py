@@ -12,8 +12,6 @@ from evlcp_sdk.air.crc import CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
 
-__all__ = ["ReedSolomon"]
-
 _LONGEST = 255
 _CRC_BYTES = CRC_BITS // 8
 _SPARE = 8

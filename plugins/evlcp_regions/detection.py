@@ -11,8 +11,6 @@ from evlcp_sdk.plugin.roles import Detection, Detector
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["Rhythmic", "Whole"]
-
 
 @dataclass(frozen=True)
 class Rhythmic(Detection):

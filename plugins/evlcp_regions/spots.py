@@ -15,8 +15,6 @@ from evlcp_sdk.plugin.roles import Detection, Detector
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
-__all__ = ["Spots"]
-
 _CELL_PX, _FINE_PX = 32, 8
 """Cells in which new spots are looked for, and those in which known ones are."""
 

@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.kernels import njit
 
-__all__ = ["best_path", "bit_evidence", "character_scores"]
-
 Column = NDArray[Any]
 
 _NOTHING = 30.0

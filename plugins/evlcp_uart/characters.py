@@ -9,8 +9,6 @@ from numpy.typing import NDArray
 
 from evlcp_uart.light import BEFORE
 
-__all__ = ["BitOrder", "Characters", "Parity"]
-
 Parity = Literal["none", "even", "odd"]
 BitOrder = Literal["lowest", "highest"]
 

@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from evlcp_uart.characters import Characters
 from evlcp_uart.light import CONTEXTS, EARLY, LOG_GAINS, OUTLIER, TICKS, Light, guesses, log_sums
 
-__all__ = ["CLOCK_SHARE", "Character", "CharacterDecoder", "CharacterState"]
-
 _BLOCK = 32
 """Characters of a stretch that is decoded at once, if they follow one another."""
 

@@ -17,8 +17,6 @@ from evlcp_sdk.values import DecodedFrame, Events, SoftSymbols
 from evlcp_uart.characters import BitOrder, Characters, Parity
 from evlcp_uart.decoder import CLOCK_SHARE, Character, CharacterDecoder, CharacterState
 
-__all__ = ["Uart", "read_characters"]
-
 _PIECE = 1 << 16
 """Events that are taken at once from an array."""
 

@@ -7,8 +7,6 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-__all__ = ["BEFORE", "CONTEXTS", "EARLY", "GAINS", "OUTLIER", "TICKS", "Light", "guesses", "log_sums"]
-
 TICKS = 16
 """Ticks of a bit."""
 

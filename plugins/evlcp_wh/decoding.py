@@ -16,8 +16,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_wh._kernels")
 
-__all__ = ["WhTransform", "match_words"]
-
 _MIN_WEIGHT = 0.01
 """Presence probability below which a cell is passed over: it adds nothing that is seen, but takes time."""
 

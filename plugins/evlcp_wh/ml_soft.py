@@ -17,8 +17,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_wh._kernels")
 
-__all__ = ["INDEPENDENT_PIXELS", "MAX_EVENTS", "LearnedDecoder", "MlSoft"]
-
 MAX_EVENTS = 3
 """Polarity sums beyond this many events count as this many: more are too rare to learn."""
 

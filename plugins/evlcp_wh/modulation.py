@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.codebook import chips_of_values, hadamard
 from evlcp_sdk.plugin.roles import Modulation
 
-__all__ = ["Raw8", "Wh4x2", "Wh8"]
-
 
 def _signed_rows(order: int) -> NDArray[np.int8]:
     rows = hadamard(order)

@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_wh._kernels")
 
-__all__ = ["MotionFeedback", "find_path", "match_shifts", "take_back"]
-
 _UNSURE_LLR = 2.0
 """Log-likelihood ratio of a bit below which a bar that moved is sought farther: one such bit in eight is
 wrong."""

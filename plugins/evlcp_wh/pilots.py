@@ -8,8 +8,6 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.codebook import BARKER13, chips_of_values, hadamard
 from evlcp_sdk.plugin.roles import Pilots
 
-__all__ = ["WhPilots"]
-
 
 @dataclass(frozen=True)
 class WhPilots(Pilots):

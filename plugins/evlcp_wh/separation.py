@@ -18,8 +18,6 @@ if TYPE_CHECKING:
 else:
     _kernels = Late("evlcp_wh._kernels")
 
-__all__ = ["CellPosterior", "WhCorrelation"]
-
 _VALUE_ERROR = 0.1
 """Probability that a cell's value is seen wrong: of a cell half beside the bar, which is one of four."""
 

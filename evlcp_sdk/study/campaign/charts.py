@@ -19,8 +19,6 @@ from evlcp_sdk.study.paper import PAPER_NAME, Measure
 from evlcp_sdk.study.summary import Series, Summary, reference_marks
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
 
-__all__ = ["Chart", "Dot", "Line", "Mark", "charts_of", "decades", "draw", "save_charts"]
-
 DASHES = ("solid", "dash", "dot", "dashdot")
 SYMBOLS = ("circle", "diamond", "square", "cross")
 

@@ -21,8 +21,6 @@ from evlcp_sdk.study.plan import digest_of
 from evlcp_sdk.study.summary import AGREEMENT, PaperComparison, Series, Summary, beside_paper
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
-__all__ = ["POSITION_HEAD", "comparison_rows", "page", "position_rows", "title_of"]
-
 
 def page(summary: Summary) -> str:
     """The page's HTML.
