@@ -370,12 +370,6 @@ struct evlcp_write_request {
     uint32_t offset; /* First byte. */
 };
 
-static inline void evlcp_write_request_put(uint8_t *p, const struct evlcp_write_request *m)
-{
-    evlcp_put8(p + 0, m->bank);
-    evlcp_put32(p + 1, m->offset);
-}
-
 static inline void evlcp_write_request_get(const uint8_t *p, struct evlcp_write_request *m)
 {
     m->bank = evlcp_get8(p + 0);
@@ -397,13 +391,6 @@ static inline void evlcp_write_reply_put(uint8_t *p, const struct evlcp_write_re
     evlcp_put16(p + 5, m->count);
 }
 
-static inline void evlcp_write_reply_get(const uint8_t *p, struct evlcp_write_reply *m)
-{
-    m->bank = evlcp_get8(p + 0);
-    m->offset = evlcp_get32(p + 1);
-    m->count = evlcp_get16(p + 5);
-}
-
 #define EVLCP_READ_REQUEST_BYTES 7u
 /* Read from a bank. */
 struct evlcp_read_request {
@@ -411,13 +398,6 @@ struct evlcp_read_request {
     uint32_t offset; /* First byte. */
     uint16_t count; /* Bytes wanted. */
 };
-
-static inline void evlcp_read_request_put(uint8_t *p, const struct evlcp_read_request *m)
-{
-    evlcp_put8(p + 0, m->bank);
-    evlcp_put32(p + 1, m->offset);
-    evlcp_put16(p + 5, m->count);
-}
 
 static inline void evlcp_read_request_get(const uint8_t *p, struct evlcp_read_request *m)
 {
@@ -439,12 +419,6 @@ static inline void evlcp_read_reply_put(uint8_t *p, const struct evlcp_read_repl
     evlcp_put32(p + 1, m->offset);
 }
 
-static inline void evlcp_read_reply_get(const uint8_t *p, struct evlcp_read_reply *m)
-{
-    m->bank = evlcp_get8(p + 0);
-    m->offset = evlcp_get32(p + 1);
-}
-
 #define EVLCP_CRC_REQUEST_BYTES 9u
 /* CRC-32/ISO-HDLC of a bank's bytes. */
 struct evlcp_crc_request {
@@ -452,13 +426,6 @@ struct evlcp_crc_request {
     uint32_t offset; /* First byte. */
     uint32_t length; /* Bytes. */
 };
-
-static inline void evlcp_crc_request_put(uint8_t *p, const struct evlcp_crc_request *m)
-{
-    evlcp_put8(p + 0, m->bank);
-    evlcp_put32(p + 1, m->offset);
-    evlcp_put32(p + 5, m->length);
-}
 
 static inline void evlcp_crc_request_get(const uint8_t *p, struct evlcp_crc_request *m)
 {
@@ -476,11 +443,6 @@ struct evlcp_crc_reply {
 static inline void evlcp_crc_reply_put(uint8_t *p, const struct evlcp_crc_reply *m)
 {
     evlcp_put32(p + 0, m->crc);
-}
-
-static inline void evlcp_crc_reply_get(const uint8_t *p, struct evlcp_crc_reply *m)
-{
-    m->crc = evlcp_get32(p + 0);
 }
 
 #define EVLCP_COMMIT_REQUEST_BYTES 44u
@@ -538,13 +500,6 @@ struct evlcp_start_request {
     uint32_t at_clock; /* Without a pulse: begin when STATUS's clock stands here; 0: at once. */
 };
 
-static inline void evlcp_start_request_put(uint8_t *p, const struct evlcp_start_request *m)
-{
-    evlcp_put32(p + 0, m->at_pulse);
-    evlcp_put16(p + 4, m->pulse_hz);
-    evlcp_put32(p + 6, m->at_clock);
-}
-
 static inline void evlcp_start_request_get(const uint8_t *p, struct evlcp_start_request *m)
 {
     m->at_pulse = evlcp_get32(p + 0);
@@ -567,11 +522,6 @@ static inline void evlcp_start_request_get(const uint8_t *p, struct evlcp_start_
 struct evlcp_level_request {
     uint16_t level_ma; /* LED current, mA. */
 };
-
-static inline void evlcp_level_request_put(uint8_t *p, const struct evlcp_level_request *m)
-{
-    evlcp_put16(p + 0, m->level_ma);
-}
 
 static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_request *m)
 {
@@ -739,11 +689,6 @@ struct evlcp_save_request {
     uint8_t autostart; /* 1: recall and play after a reset. */
 };
 
-static inline void evlcp_save_request_put(uint8_t *p, const struct evlcp_save_request *m)
-{
-    evlcp_put8(p + 0, m->autostart);
-}
-
 static inline void evlcp_save_request_get(const uint8_t *p, struct evlcp_save_request *m)
 {
     m->autostart = evlcp_get8(p + 0);
@@ -762,12 +707,6 @@ static inline void evlcp_save_reply_put(uint8_t *p, const struct evlcp_save_repl
     evlcp_put32(p + 1, m->save_sequence);
 }
 
-static inline void evlcp_save_reply_get(const uint8_t *p, struct evlcp_save_reply *m)
-{
-    m->slot = evlcp_get8(p + 0);
-    m->save_sequence = evlcp_get32(p + 1);
-}
-
 #define EVLCP_RECALL_REQUEST_BYTES 0u
 
 #define EVLCP_RECALL_REPLY_BYTES 5u
@@ -781,12 +720,6 @@ static inline void evlcp_recall_reply_put(uint8_t *p, const struct evlcp_recall_
 {
     evlcp_put8(p + 0, m->slot);
     evlcp_put32(p + 1, m->save_sequence);
-}
-
-static inline void evlcp_recall_reply_get(const uint8_t *p, struct evlcp_recall_reply *m)
-{
-    m->slot = evlcp_get8(p + 0);
-    m->save_sequence = evlcp_get32(p + 1);
 }
 
 #define EVLCP_LED_TEST_REQUEST_BYTES 4u
@@ -821,13 +754,6 @@ struct evlcp_stream_request {
     uint8_t digest[32]; /* Digest of the codebook that packets are made with. */
 };
 
-static inline void evlcp_stream_request_put(uint8_t *p, const struct evlcp_stream_request *m)
-{
-    evlcp_put8(p + 0, m->bank);
-    evlcp_put8(p + 1, m->format);
-    evlcp_copy(p + 2, m->digest, 32u);
-}
-
 static inline void evlcp_stream_request_get(const uint8_t *p, struct evlcp_stream_request *m)
 {
     m->bank = evlcp_get8(p + 0);
@@ -846,11 +772,6 @@ static inline void evlcp_stream_reply_put(uint8_t *p, const struct evlcp_stream_
     evlcp_put16(p + 0, m->slots);
 }
 
-static inline void evlcp_stream_reply_get(const uint8_t *p, struct evlcp_stream_reply *m)
-{
-    m->slots = evlcp_get16(p + 0);
-}
-
 #define EVLCP_PUSH_REQUEST_BYTES 8u
 /* Put a piece of a packet into the queue, if it is the next and there is room; the reply says what is. */
 struct evlcp_push_request {
@@ -859,14 +780,6 @@ struct evlcp_push_request {
     uint16_t offset; /* First byte. */
     uint8_t last; /* 1: no further packet comes, dark after what is there; 0: playing goes on. */
 };
-
-static inline void evlcp_push_request_put(uint8_t *p, const struct evlcp_push_request *m)
-{
-    evlcp_put8(p + 0, m->bank);
-    evlcp_put32(p + 1, m->number);
-    evlcp_put16(p + 5, m->offset);
-    evlcp_put8(p + 7, m->last);
-}
 
 static inline void evlcp_push_request_get(const uint8_t *p, struct evlcp_push_request *m)
 {
@@ -893,24 +806,11 @@ static inline void evlcp_push_reply_put(uint8_t *p, const struct evlcp_push_repl
     evlcp_put32(p + 10, m->underruns);
 }
 
-static inline void evlcp_push_reply_get(const uint8_t *p, struct evlcp_push_reply *m)
-{
-    m->number = evlcp_get32(p + 0);
-    m->offset = evlcp_get16(p + 4);
-    m->begun = evlcp_get32(p + 6);
-    m->underruns = evlcp_get32(p + 10);
-}
-
 #define EVLCP_KEY_REQUEST_BYTES 16u
 /* Set the key that requests which change something are sealed with; SAVE keeps it. */
 struct evlcp_key_request {
     uint8_t key[16]; /* The key; zeros for none. */
 };
-
-static inline void evlcp_key_request_put(uint8_t *p, const struct evlcp_key_request *m)
-{
-    evlcp_copy(p + 0, m->key, 16u);
-}
 
 static inline void evlcp_key_request_get(const uint8_t *p, struct evlcp_key_request *m)
 {
@@ -969,16 +869,6 @@ static inline void evlcp_update_status_reply_put(uint8_t *p, const struct evlcp_
     evlcp_copy(p + 11, m->target, 16u);
 }
 
-static inline void evlcp_update_status_reply_get(const uint8_t *p, struct evlcp_update_status_reply *m)
-{
-    m->running = evlcp_get8(p + 0);
-    m->trial = evlcp_get8(p + 1);
-    m->next = evlcp_get8(p + 2);
-    m->capacity = evlcp_get32(p + 3);
-    m->sequence = evlcp_get32(p + 7);
-    evlcp_copy(m->target, p + 11, 16u);
-}
-
 #define EVLCP_UPDATE_BEGIN_REQUEST_BYTES 9u
 /* Erase the place of the next image; only while the LEDs are dark, and not on trial. */
 struct evlcp_update_begin_request {
@@ -986,13 +876,6 @@ struct evlcp_update_begin_request {
     uint32_t length; /* Its bytes. */
     uint32_t crc; /* Their CRC-32/ISO-HDLC. */
 };
-
-static inline void evlcp_update_begin_request_put(uint8_t *p, const struct evlcp_update_begin_request *m)
-{
-    evlcp_put8(p + 0, m->image);
-    evlcp_put32(p + 1, m->length);
-    evlcp_put32(p + 5, m->crc);
-}
 
 static inline void evlcp_update_begin_request_get(const uint8_t *p, struct evlcp_update_begin_request *m)
 {
@@ -1008,11 +891,6 @@ static inline void evlcp_update_begin_request_get(const uint8_t *p, struct evlcp
 struct evlcp_update_write_request {
     uint32_t offset; /* First byte, a multiple of four. */
 };
-
-static inline void evlcp_update_write_request_put(uint8_t *p, const struct evlcp_update_write_request *m)
-{
-    evlcp_put32(p + 0, m->offset);
-}
 
 static inline void evlcp_update_write_request_get(const uint8_t *p, struct evlcp_update_write_request *m)
 {
@@ -1032,12 +910,6 @@ static inline void evlcp_update_write_reply_put(uint8_t *p, const struct evlcp_u
     evlcp_put16(p + 4, m->count);
 }
 
-static inline void evlcp_update_write_reply_get(const uint8_t *p, struct evlcp_update_write_reply *m)
-{
-    m->offset = evlcp_get32(p + 0);
-    m->count = evlcp_get16(p + 4);
-}
-
 #define EVLCP_UPDATE_COMMIT_REQUEST_BYTES 0u
 
 #define EVLCP_UPDATE_COMMIT_REPLY_BYTES 4u
@@ -1049,11 +921,6 @@ struct evlcp_update_commit_reply {
 static inline void evlcp_update_commit_reply_put(uint8_t *p, const struct evlcp_update_commit_reply *m)
 {
     evlcp_put32(p + 0, m->sequence);
-}
-
-static inline void evlcp_update_commit_reply_get(const uint8_t *p, struct evlcp_update_commit_reply *m)
-{
-    m->sequence = evlcp_get32(p + 0);
 }
 
 #define EVLCP_UPDATE_RESTART_REQUEST_BYTES 0u
