@@ -9,28 +9,22 @@ _Static_assert(EVLCP_CLUSTERS == EVLCP_BOARD_CLUSTERS, "codebook and board have 
 
 void evlcp_banks_init(struct evlcp_banks *banks)
 {
-    for (uint32_t i = 0; i < EVLCP_BANKS; i++)
-        banks->plan[i].valid = banks->stream[i].on = false;
     atomic_store(&banks->active, EVLCP_NO_BANK);
     atomic_store(&banks->pending, EVLCP_NO_BANK);
-    banks->commits = 0u;
 }
 
 void evlcp_setup_init(struct evlcp_setup *setup, uint32_t tick_hz)
 {
-    setup->profile = EVLCP_PROFILE_WH4X2;
-    setup->preamble_chips = EVLCP_PREAMBLE_CHIPS;
-    setup->preamble = evlcp_preamble;
-    setup->frames = 10u;
-    setup->pilot_every = 1u;
-    setup->chip_rate_hz = 10000u;
-    setup->ticks_per_chip = tick_hz / setup->chip_rate_hz;
+    *setup = (struct evlcp_setup){.profile = EVLCP_PROFILE_WH4X2,
+                                  .preamble_chips = EVLCP_PREAMBLE_CHIPS,
+                                  .preamble = evlcp_preamble,
+                                  .frames = 10u,
+                                  .pilot_every = 1u,
+                                  .chip_rate_hz = 10000u,
+                                  .ticks_per_chip = tick_hz / 10000u};
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
         setup->pilots[k] = evlcp_pilots[k];
     evlcp_copy(setup->digest, evlcp_digest, 32u);
-    setup->hold = 0u;
-    setup->clusters = 0u;
-    setup->packet_chips = 0u;
 }
 
 static bool equal(const uint8_t *a, const uint8_t *b, uint32_t count)
@@ -63,68 +57,40 @@ bool evlcp_banks_held(const struct evlcp_banks *banks, uint8_t bank)
 static bool already(const struct evlcp_plan *plan, const struct evlcp_setup *setup,
                     const struct evlcp_commit_request *request)
 {
-    bool same = plan->preamble == setup->preamble && plan->preamble_chips == setup->preamble_chips;
-    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-        same = same && plan->pilots[k] == setup->pilots[k];
-    return same && plan->valid && plan->format == request->format && plan->packets == request->packets &&
+    return plan->valid && plan->format == request->format && plan->packets == request->packets &&
            plan->length == request->length && plan->crc == request->crc &&
-           equal(plan->digest, request->digest, 32u) && equal(setup->digest, request->digest, 32u) &&
-           plan->profile == setup->profile && plan->frames == setup->frames &&
-           plan->pilot_every == setup->pilot_every && plan->ticks_per_chip == setup->ticks_per_chip &&
-           plan->hold == setup->hold && plan->clusters == setup->clusters &&
-           plan->packet_chips == evlcp_setup_chips(setup);
-}
-
-uint32_t evlcp_setup_chips(const struct evlcp_setup *setup)
-{
-    return setup->hold != 0u ? setup->packet_chips * setup->hold
-                             : evlcp_packet_chips(setup->preamble_chips, setup->frames, setup->pilot_every);
+           equal((const uint8_t *)&plan->setup, (const uint8_t *)setup, sizeof *setup) &&
+           equal(setup->digest, request->digest, 32u);
 }
 
 /* How content of a format is laid out, and what of the setup it is played with. False: not together. */
 static bool plan_of(struct evlcp_plan *plan, const struct evlcp_setup *setup, uint8_t format)
 {
     bool chips = setup->hold != 0u;
-    if (chips ? setup->packet_chips == 0u || setup->packet_chips > EVLCP_BANK_BYTES
+    if (chips ? setup->chips == 0u || setup->chips > EVLCP_BANK_BYTES
               : setup->frames == 0u || setup->pilot_every == 0u)
         return false;
-    plan->format = format;
-    plan->packet_chips = evlcp_setup_chips(setup);
-    plan->hold = setup->hold;
-    plan->clusters = setup->clusters;
-    plan->table_bytes = 0u;
+    *plan = (struct evlcp_plan){.setup = *setup, .format = format, .packet_chips = evlcp_packet_chips(setup)};
     for (uint32_t i = 0; i < EVLCP_ROW_BYTES; i++)
         plan->lit[i] = 0xffu;
+    uint32_t packet = chips ? setup->chips : plan->packet_chips; /* in the bank */
     switch (format) {
     case EVLCP_FORMAT_WORDS:
-        if (chips)
-            return false;
         plan->packet_bytes = setup->frames * EVLCP_FRAME_BYTES;
-        break;
+        return !chips;
     case EVLCP_FORMAT_MASKS:
         plan->chip_bytes = EVLCP_ROW_BYTES;
-        plan->packet_bytes = (chips ? setup->packet_chips : plan->packet_chips) * EVLCP_ROW_BYTES;
         break;
     case EVLCP_FORMAT_CLUSTERS:
         if (!chips || setup->clusters == 0u || setup->clusters > EVLCP_LEDS)
             return false;
         plan->chip_bytes = (uint8_t)((setup->clusters + 7u) / 8u);
         plan->table_bytes = setup->clusters * EVLCP_ROW_BYTES;
-        plan->packet_bytes = setup->packet_chips * plan->chip_bytes;
         break;
     default:
         return false;
     }
-    plan->profile = setup->profile;
-    plan->preamble_chips = setup->preamble_chips;
-    plan->preamble = setup->preamble;
-    plan->frames = setup->frames;
-    plan->pilot_every = setup->pilot_every;
-    plan->chip_rate_hz = setup->chip_rate_hz;
-    plan->ticks_per_chip = setup->ticks_per_chip;
-    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-        plan->pilots[k] = setup->pilots[k];
-    evlcp_copy(plan->digest, setup->digest, 32u);
+    plan->packet_bytes = packet * plan->chip_bytes;
     return true;
 }
 
@@ -135,7 +101,7 @@ static bool read_table(struct evlcp_plan *plan, const uint8_t *content, uint32_t
         return true;
     for (uint32_t i = 0; i < EVLCP_ROW_BYTES; i++)
         plan->lit[i] = 0u;
-    for (uint32_t k = 0; k < plan->clusters; k++) {
+    for (uint32_t k = 0; k < plan->setup.clusters; k++) {
         for (uint32_t i = 0; i < EVLCP_ROW_BYTES; i++, content++) {
             if ((plan->lit[i] & *content) != 0u) {
                 *detail = k;
@@ -150,10 +116,8 @@ static bool read_table(struct evlcp_plan *plan, const uint8_t *content, uint32_t
 enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evlcp_setup *setup,
                                      const struct evlcp_stream_request *request, uint32_t *detail)
 {
-    if (request->bank >= EVLCP_BANKS) {
-        *detail = EVLCP_BANKS - 1u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (request->bank >= EVLCP_BANKS)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, EVLCP_BANKS - 1u);
     if (evlcp_banks_held(banks, request->bank))
         return EVLCP_STATUS_BUSY;
     struct evlcp_plan *plan = &banks->plan[request->bank];
@@ -165,28 +129,21 @@ enum evlcp_status evlcp_banks_stream(struct evlcp_banks *banks, const struct evl
         return EVLCP_STATUS_FOREIGN_CODEBOOK;
     /* One that plays, one that is put in meanwhile. */
     uint32_t room = EVLCP_BANK_BYTES - plan->table_bytes;
-    if (plan->packet_bytes > room / 2u) {
-        *detail = 0u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (plan->packet_bytes > room / 2u)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, 0u);
     if (!read_table(plan, banks->content[request->bank], detail))
         return EVLCP_STATUS_OUT_OF_RANGE;
     evlcp_stream_begin(stream, plan->packet_bytes, plan->table_bytes, room);
     plan->packets = (uint16_t)stream->slots;
-    plan->duty = 0u; /* not known before: the guard looks at what is sent */
-    plan->length = 0u;
-    plan->crc = 0u;
-    plan->valid = true;
+    plan->valid = true; /* its duty is not known before: the guard looks at what is sent */
     return EVLCP_STATUS_OK;
 }
 
 enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlcp_setup *setup,
                                     const struct evlcp_commit_request *request, uint32_t *detail)
 {
-    if (request->bank >= EVLCP_BANKS) {
-        *detail = EVLCP_BANKS - 1u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (request->bank >= EVLCP_BANKS)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, EVLCP_BANKS - 1u);
     struct evlcp_plan *plan = &banks->plan[request->bank];
     const uint8_t *content = banks->content[request->bank];
     if (evlcp_banks_held(banks, request->bank))
@@ -195,22 +152,16 @@ enum evlcp_status evlcp_banks_check(struct evlcp_banks *banks, const struct evlc
     if (request->packets == 0u || !plan_of(plan, setup, request->format))
         return EVLCP_STATUS_OUT_OF_RANGE;
     uint32_t most = (EVLCP_BANK_BYTES - plan->table_bytes) / plan->packet_bytes;
-    if (request->packets > most) {
-        *detail = most;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (request->packets > most)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, most);
     uint32_t length = plan->table_bytes + plan->packet_bytes * request->packets;
-    if (request->length != length) {
-        *detail = length;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (request->length != length)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, length);
     if (!equal(request->digest, setup->digest, 32u) || !evlcp_profile_digest_ok(setup->profile, setup->digest))
         return EVLCP_STATUS_FOREIGN_CODEBOOK;
     uint32_t crc = evlcp_crc32(0u, content, request->length);
-    if (crc != request->crc) {
-        *detail = crc;
-        return EVLCP_STATUS_BAD_CRC;
-    }
+    if (crc != request->crc)
+        return evlcp_refuse(EVLCP_STATUS_BAD_CRC, detail, crc);
     if (!read_table(plan, content, detail))
         return EVLCP_STATUS_OUT_OF_RANGE;
     plan->packets = request->packets;

@@ -14,23 +14,6 @@
 #define EVLCP_BANK_BYTES 40960u
 #endif
 
-/* What the next COMMIT plays with. */
-struct evlcp_setup {
-    uint8_t profile;
-    uint8_t preamble_chips;
-    uint8_t pilot_every;
-    uint16_t frames;
-    uint32_t preamble;
-    uint32_t chip_rate_hz;
-    uint32_t ticks_per_chip;
-    uint16_t pilots[EVLCP_BOARD_CLUSTERS];
-    uint8_t digest[32];
-    /* Of chips alone, which no codebook is needed for; `hold` is 0 otherwise. */
-    uint8_t hold;
-    uint8_t clusters;
-    uint32_t packet_chips; /* in the bank */
-};
-
 struct evlcp_banks {
     uint8_t content[EVLCP_BANKS][EVLCP_BANK_BYTES];
     struct evlcp_plan plan[EVLCP_BANKS];
@@ -47,9 +30,6 @@ void evlcp_banks_init(struct evlcp_banks *banks);
 
 /* Setup of the codebook the firmware was built with. */
 void evlcp_setup_init(struct evlcp_setup *setup, uint32_t tick_hz);
-
-/* Length of a packet in chips of the chip rate. */
-uint32_t evlcp_setup_chips(const struct evlcp_setup *setup);
 
 /* Whether a digest may stand for a profile: a built-in one has the firmware's own, a custom one any. */
 bool evlcp_profile_digest_ok(uint8_t profile, const uint8_t digest[32]);

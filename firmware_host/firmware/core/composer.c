@@ -3,23 +3,24 @@
 _Static_assert(EVLCP_BOARD_CLUSTERS == 16u && EVLCP_LEDS == 96u && EVLCP_ROW_BYTES == 12u,
                "the row tables are made for 16 clusters of 6 LEDs");
 
-uint32_t evlcp_packet_chips(uint8_t preamble_chips, uint16_t frames, uint8_t pilot_every)
+_Static_assert(sizeof(struct evlcp_setup) == 88u, "setups are compared byte by byte");
+
+uint32_t evlcp_packet_chips(const struct evlcp_setup *setup)
 {
-    uint32_t pilots = ((uint32_t)frames + pilot_every - 1u) / pilot_every;
-    return preamble_chips + (uint32_t)frames * (EVLCP_FRAME_CHIPS - EVLCP_PILOT_CHIPS) + pilots * EVLCP_PILOT_CHIPS;
+    if (setup->hold != 0u)
+        return setup->chips * setup->hold;
+    uint32_t pilots = ((uint32_t)setup->frames + setup->pilot_every - 1u) / setup->pilot_every;
+    return setup->preamble_chips + (uint32_t)setup->frames * (EVLCP_FRAME_CHIPS - EVLCP_PILOT_CHIPS) +
+           pilots * EVLCP_PILOT_CHIPS;
 }
 
 void evlcp_cursor_seek(struct evlcp_cursor *cursor, const struct evlcp_plan *plan, const uint8_t *content,
                        uint32_t packet)
 {
-    cursor->plan = plan;
-    cursor->content = content;
-    cursor->packet = packet;
-    cursor->chip = 0u;
-    cursor->in_frame = 0u;
-    cursor->to_pilot = 0u;
-    cursor->held = 0u;
-    cursor->at = content + plan->table_bytes + packet * plan->packet_bytes;
+    *cursor = (struct evlcp_cursor){.plan = plan,
+                                    .content = content,
+                                    .packet = packet,
+                                    .at = content + plan->table_bytes + packet * plan->packet_bytes};
 }
 
 void evlcp_row_of_mask(uint16_t mask, uint8_t row[EVLCP_ROW_BYTES])
@@ -42,7 +43,7 @@ static uint16_t frame_mask(const struct evlcp_cursor *c)
     if (c->in_frame < EVLCP_PILOT_CHIPS) {
         uint32_t shift = EVLCP_PILOT_CHIPS - 1u - c->in_frame;
         for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-            mask = mask << 1 | ((uint32_t)c->plan->pilots[k] >> shift & 1u);
+            mask = mask << 1 | ((uint32_t)c->plan->setup.pilots[k] >> shift & 1u);
     } else {
         uint32_t shift = EVLCP_FRAME_CHIPS - 1u - c->in_frame;
         for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
@@ -71,7 +72,7 @@ static void row_of_clusters(const struct evlcp_plan *plan, const uint8_t *masks,
     uint32_t a = 0u;
     uint32_t b = 0u;
     uint32_t c = 0u;
-    for (uint32_t left = plan->clusters; left != 0u; bits++) {
+    for (uint32_t left = plan->setup.clusters; left != 0u; bits++) {
         uint32_t here = left < 8u ? left : 8u;
         const uint8_t *mask = masks;
         /* No bit beyond the last cluster: there is no mask. */
@@ -99,18 +100,18 @@ bool evlcp_cursor_row(struct evlcp_cursor *cursor, uint8_t row[EVLCP_ROW_BYTES])
             evlcp_copy(row, cursor->at, EVLCP_ROW_BYTES);
         else
             row_of_clusters(plan, cursor->content, cursor->at, row);
-        if (++cursor->held >= plan->hold) {
+        if (++cursor->held >= plan->setup.hold) {
             cursor->held = 0u;
             cursor->at += plan->chip_bytes;
         }
-    } else if (cursor->chip < plan->preamble_chips) {
-        uint32_t on = plan->preamble >> (plan->preamble_chips - 1u - cursor->chip) & 1u;
+    } else if (cursor->chip < plan->setup.preamble_chips) {
+        uint32_t on = plan->setup.preamble >> (plan->setup.preamble_chips - 1u - cursor->chip) & 1u;
         evlcp_row_of_mask(on ? 0xffffu : 0u, row);
     } else {
         evlcp_row_of_mask(frame_mask(cursor), row);
         if (++cursor->in_frame == EVLCP_FRAME_CHIPS) {
             cursor->at += EVLCP_FRAME_BYTES;
-            cursor->to_pilot = (uint8_t)((cursor->to_pilot == 0u ? plan->pilot_every : cursor->to_pilot) - 1u);
+            cursor->to_pilot = (uint8_t)((cursor->to_pilot == 0u ? plan->setup.pilot_every : cursor->to_pilot) - 1u);
             cursor->in_frame = cursor->to_pilot == 0u ? 0u : EVLCP_PILOT_CHIPS;
         }
     }

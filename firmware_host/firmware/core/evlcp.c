@@ -11,6 +11,7 @@ static const uint8_t dark[EVLCP_ROW_BYTES];
 
 /* A request on its way through its handler. */
 struct exchange {
+    uint16_t sequence;
     const uint8_t *in;
     uint32_t in_length;
     uint8_t *out;
@@ -87,23 +88,32 @@ bool evlcp_light(struct evlcp *e, uint16_t level_ma, uint16_t level_limit_ma, ui
     return true;
 }
 
-/* Whether a bank that plays or would play allows for so large a share. */
-static bool bright_enough(const struct evlcp *e, uint8_t bank, uint32_t allowed)
+/* Whether a bank, if there is one, allows for so small a share. */
+static bool dim_enough(const struct evlcp *e, uint8_t bank, uint32_t allowed)
 {
     return bank == EVLCP_NO_BANK || e->banks.plan[bank].duty <= allowed;
 }
 
+/* What plays, or would with the next START, must not end in the dark. */
+static bool all_dim_enough(const struct evlcp *e, uint32_t allowed)
+{
+    return dim_enough(e, atomic_load(&e->banks.pending), allowed) &&
+           dim_enough(e, atomic_load(&e->banks.active), allowed);
+}
+
+static enum evlcp_status out_of_range(struct exchange *x, uint32_t nearest)
+{
+    return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, &x->detail, nearest);
+}
+
 /* ---- requests ---- */
 
-static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t sequence)
+static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_hello_request request;
-    struct evlcp_hello_reply reply = {0};
-    evlcp_hello_request_get(x->in, &request);
+    const struct evlcp_hello_request request = evlcp_hello_request_get(x->in);
     if (request.major != EVLCP_PROTOCOL_MAJOR) {
         static const uint8_t version[4] = {EVLCP_PROTOCOL_MAJOR, EVLCP_PROTOCOL_MINOR};
-        x->detail = evlcp_get32(version);
-        return EVLCP_STATUS_INCOMPATIBLE;
+        return evlcp_refuse(EVLCP_STATUS_INCOMPATIBLE, &x->detail, evlcp_get32(version));
     }
     if (e->session == EVLCP_NO_SESSION || request.nonce != e->nonce) {
         uint16_t session = (uint16_t)(request.nonce ^ request.nonce >> 16);
@@ -112,41 +122,42 @@ static enum evlcp_status on_hello(struct evlcp *e, struct exchange *x, uint16_t 
         e->session = session;
         e->nonce = request.nonce;
         e->control.known = false;
-        e->control.newest = sequence;
-        e->control.sequence = sequence;
-        evlcp_trust_session(&e->trust, sequence);
+        e->control.newest = x->sequence;
+        e->control.sequence = x->sequence;
+        evlcp_trust_session(&e->trust, x->sequence);
     }
-    reply.major = EVLCP_PROTOCOL_MAJOR;
-    reply.minor = EVLCP_PROTOCOL_MINOR;
-    reply.session = e->session;
-    reply.version_major = EVLCP_VERSION_MAJOR;
-    reply.version_minor = EVLCP_VERSION_MINOR;
-    reply.version_patch = EVLCP_VERSION_PATCH;
-    reply.window = EVLCP_WINDOW;
-    reply.max_payload = EVLCP_MAX_PAYLOAD;
-    reply.banks = EVLCP_BANKS;
-    reply.bank_bytes = EVLCP_BANK_BYTES;
-    reply.clusters = EVLCP_BOARD_CLUSTERS;
-    reply.leds = EVLCP_LEDS;
-    reply.tick_hz = e->info.tick_hz;
-    reply.chip_rate_max_hz = e->info.chip_rate_max_hz;
-    reply.level_max_ma = e->info.level_max_ma;
-    reply.mean_max_ma = e->info.mean_max_ma;
-    reply.burst_chips = e->info.burst_chips;
-    reply.capabilities = e->info.capabilities | EVLCP_CAPABILITY_STREAM;
+    const struct evlcp_hal_info *info = &e->info;
+    struct evlcp_hello_reply reply = {
+        .major = EVLCP_PROTOCOL_MAJOR,
+        .minor = EVLCP_PROTOCOL_MINOR,
+        .session = e->session,
+        .version_major = EVLCP_VERSION_MAJOR,
+        .version_minor = EVLCP_VERSION_MINOR,
+        .version_patch = EVLCP_VERSION_PATCH,
+        .window = EVLCP_WINDOW,
+        .max_payload = EVLCP_MAX_PAYLOAD,
+        .banks = EVLCP_BANKS,
+        .bank_bytes = EVLCP_BANK_BYTES,
+        .clusters = EVLCP_BOARD_CLUSTERS,
+        .leds = EVLCP_LEDS,
+        .tick_hz = info->tick_hz,
+        .chip_rate_max_hz = info->chip_rate_max_hz,
+        .level_max_ma = info->level_max_ma,
+        .mean_max_ma = info->mean_max_ma,
+        .burst_chips = info->burst_chips,
+        .capabilities = info->capabilities | EVLCP_CAPABILITY_STREAM,
+        .uptime_ms = hal_millis(),
+        .clock_hz = info->clock_hz,
+        .formats = 1u << EVLCP_FORMAT_WORDS | 1u << EVLCP_FORMAT_MASKS | 1u << EVLCP_FORMAT_CLUSTERS,
+        .chip_rate_min_hz = 1u + (info->tick_hz - 1u) / info->ticks_per_chip_max};
     if (e->trust.able) {
         reply.capabilities |= EVLCP_CAPABILITY_TRUST;
         evlcp_copy(reply.challenge, e->trust.challenge, sizeof reply.challenge);
         evlcp_trust_name(&e->trust, reply.key_name);
     }
-    evlcp_copy(reply.unique_id, e->info.unique_id, sizeof reply.unique_id);
-    evlcp_copy(reply.hal, e->info.name, sizeof reply.hal);
-    reply.clock_hz = e->info.clock_hz;
-    reply.formats = 1u << EVLCP_FORMAT_WORDS | 1u << EVLCP_FORMAT_MASKS | 1u << EVLCP_FORMAT_CLUSTERS;
-    reply.chip_rate_min_hz = 1u + (e->info.tick_hz - 1u) / e->info.ticks_per_chip_max;
-    reply.uptime_ms = hal_millis();
-    evlcp_hello_reply_put(x->out, &reply);
-    x->out_length = EVLCP_HELLO_REPLY_BYTES;
+    evlcp_copy(reply.unique_id, info->unique_id, sizeof reply.unique_id);
+    evlcp_copy(reply.hal, info->name, sizeof reply.hal);
+    x->out_length = evlcp_hello_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
@@ -171,39 +182,24 @@ static uint32_t nearest_chip_rate(const struct evlcp_hal_info *info, uint32_t ra
 
 static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_configure_request request;
-    evlcp_configure_request_get(x->in, &request);
-    if (!chip_rate_ok(&e->info, request.chip_rate_hz)) {
-        x->detail = nearest_chip_rate(&e->info, request.chip_rate_hz);
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    const struct evlcp_configure_request request = evlcp_configure_request_get(x->in);
+    if (!chip_rate_ok(&e->info, request.chip_rate_hz))
+        return out_of_range(x, nearest_chip_rate(&e->info, request.chip_rate_hz));
     uint32_t most = EVLCP_BANK_BYTES / EVLCP_FRAME_BYTES;
-    if (request.frames == 0u || request.frames > most) {
-        x->detail = request.frames == 0u ? 1u : most;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
-    if (request.pilot_every == 0u) {
-        x->detail = 1u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
-    if (request.profile > EVLCP_PROFILE_RAW8 && request.profile != EVLCP_PROFILE_CUSTOM) {
-        x->detail = EVLCP_PROFILE_CUSTOM;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
-    if (request.level_limit_ma > e->info.level_max_ma || request.duty_limit > 1000u) {
-        x->detail = request.duty_limit > 1000u ? 1000u : e->info.level_max_ma;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (request.frames == 0u || request.frames > most)
+        return out_of_range(x, request.frames == 0u ? 1u : most);
+    if (request.pilot_every == 0u)
+        return out_of_range(x, 1u);
+    if (request.profile > EVLCP_PROFILE_RAW8 && request.profile != EVLCP_PROFILE_CUSTOM)
+        return out_of_range(x, EVLCP_PROFILE_CUSTOM);
+    if (request.level_limit_ma > e->info.level_max_ma || request.duty_limit > 1000u)
+        return out_of_range(x, request.duty_limit > 1000u ? 1000u : e->info.level_max_ma);
     uint16_t limit = request.level_limit_ma != 0u ? request.level_limit_ma : e->level_limit_ma;
     uint16_t share = request.duty_limit != 0u ? request.duty_limit : e->duty_limit;
     uint16_t level_ma = e->level_ma < limit ? e->level_ma : limit;
-    /* What plays, or would with the next START, must not end in the dark. */
     uint32_t allowed = evlcp_allowed(e, level_ma, share);
-    if (request.duty_limit != 0u && (!bright_enough(e, atomic_load(&e->banks.pending), allowed) ||
-                                     !bright_enough(e, atomic_load(&e->banks.active), allowed))) {
-        x->detail = allowed;
-        return EVLCP_STATUS_TOO_BRIGHT;
-    }
+    if (request.duty_limit != 0u && !all_dim_enough(e, allowed))
+        return evlcp_refuse(EVLCP_STATUS_TOO_BRIGHT, &x->detail, allowed);
     if (!evlcp_light(e, level_ma, limit, share))
         return EVLCP_STATUS_HARDWARE_FAULT;
     e->setup.chip_rate_hz = request.chip_rate_hz;
@@ -213,20 +209,16 @@ static enum evlcp_status on_configure(struct evlcp *e, struct exchange *x)
     e->setup.pilot_every = request.pilot_every;
     const struct evlcp_configure_reply reply = {
         .ticks_per_chip = e->setup.ticks_per_chip,
-        .packet_chips = evlcp_setup_chips(&e->setup)};
-    evlcp_configure_reply_put(x->out, &reply);
-    x->out_length = EVLCP_CONFIGURE_REPLY_BYTES;
+        .packet_chips = evlcp_packet_chips(&e->setup)};
+    x->out_length = evlcp_configure_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_codebook(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_codebook_request request;
-    evlcp_codebook_request_get(x->in, &request);
-    if (request.preamble_chips == 0u || request.preamble_chips > 32u) {
-        x->detail = 32u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    const struct evlcp_codebook_request request = evlcp_codebook_request_get(x->in);
+    if (request.preamble_chips == 0u || request.preamble_chips > 32u)
+        return out_of_range(x, 32u);
     if (!evlcp_profile_digest_ok(e->setup.profile, request.digest))
         return EVLCP_STATUS_FOREIGN_CODEBOOK;
     if (e->setup.profile != EVLCP_PROFILE_CUSTOM) {
@@ -244,27 +236,22 @@ static enum evlcp_status on_codebook(struct evlcp *e, struct exchange *x)
         e->setup.pilots[k] = request.pilots[k];
     e->setup.hold = 0u;
     e->setup.clusters = 0u;
-    e->setup.packet_chips = 0u;
+    e->setup.chips = 0u;
     evlcp_copy(e->setup.digest, request.digest, sizeof e->setup.digest);
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_chips(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_chips_request request;
-    evlcp_chips_request_get(x->in, &request);
-    if (request.packet_chips == 0u || request.packet_chips > EVLCP_BANK_BYTES) {
-        x->detail = request.packet_chips == 0u ? 1u : EVLCP_BANK_BYTES;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
-    if (request.hold == 0u || request.clusters > EVLCP_LEDS) {
-        x->detail = request.hold == 0u ? 1u : EVLCP_LEDS;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    const struct evlcp_chips_request request = evlcp_chips_request_get(x->in);
+    if (request.packet_chips == 0u || request.packet_chips > EVLCP_BANK_BYTES)
+        return out_of_range(x, request.packet_chips == 0u ? 1u : EVLCP_BANK_BYTES);
+    if (request.hold == 0u || request.clusters > EVLCP_LEDS)
+        return out_of_range(x, request.hold == 0u ? 1u : EVLCP_LEDS);
     e->setup.profile = EVLCP_PROFILE_CUSTOM;
     e->setup.hold = request.hold;
     e->setup.clusters = request.clusters;
-    e->setup.packet_chips = request.packet_chips;
+    e->setup.chips = request.packet_chips;
     evlcp_copy(e->setup.digest, request.digest, sizeof e->setup.digest);
     return EVLCP_STATUS_OK;
 }
@@ -274,29 +261,23 @@ static enum evlcp_status on_write(struct evlcp *e, struct exchange *x)
     uint8_t bank = evlcp_get8(x->in);
     uint32_t offset = evlcp_get32(x->in + 1);
     uint32_t count = x->in_length - EVLCP_WRITE_REQUEST_BYTES;
-    if (!evlcp_banks_range_ok(bank, offset, count)) {
-        x->detail = EVLCP_BANK_BYTES;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (!evlcp_banks_range_ok(bank, offset, count))
+        return out_of_range(x, EVLCP_BANK_BYTES);
     if (evlcp_banks_held(&e->banks, bank))
         return EVLCP_STATUS_BUSY;
     e->banks.plan[bank].valid = false;
     evlcp_copy(e->banks.content[bank] + offset, x->in + EVLCP_WRITE_REQUEST_BYTES, count);
     const struct evlcp_write_reply reply = {.bank = bank, .offset = offset, .count = (uint16_t)count};
-    evlcp_write_reply_put(x->out, &reply);
-    x->out_length = EVLCP_WRITE_REPLY_BYTES;
+    x->out_length = evlcp_write_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
-static enum evlcp_status on_read(const struct evlcp *e, struct exchange *x)
+static enum evlcp_status on_read(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_read_request request;
-    evlcp_read_request_get(x->in, &request);
+    const struct evlcp_read_request request = evlcp_read_request_get(x->in);
     if (!evlcp_banks_range_ok(request.bank, request.offset, request.count) ||
-        request.count > EVLCP_MAX_PAYLOAD - EVLCP_READ_REPLY_BYTES) {
-        x->detail = EVLCP_MAX_PAYLOAD - EVLCP_READ_REPLY_BYTES;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+        request.count > EVLCP_MAX_PAYLOAD - EVLCP_READ_REPLY_BYTES)
+        return out_of_range(x, EVLCP_MAX_PAYLOAD - EVLCP_READ_REPLY_BYTES);
     x->out[0] = request.bank;
     evlcp_put32(x->out + 1, request.offset);
     evlcp_copy(x->out + EVLCP_READ_REPLY_BYTES, e->banks.content[request.bank] + request.offset, request.count);
@@ -304,25 +285,20 @@ static enum evlcp_status on_read(const struct evlcp *e, struct exchange *x)
     return EVLCP_STATUS_OK;
 }
 
-static enum evlcp_status on_crc(const struct evlcp *e, struct exchange *x)
+static enum evlcp_status on_crc(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_crc_request request;
-    evlcp_crc_request_get(x->in, &request);
-    if (!evlcp_banks_range_ok(request.bank, request.offset, request.length)) {
-        x->detail = EVLCP_BANK_BYTES;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    const struct evlcp_crc_request request = evlcp_crc_request_get(x->in);
+    if (!evlcp_banks_range_ok(request.bank, request.offset, request.length))
+        return out_of_range(x, EVLCP_BANK_BYTES);
     const struct evlcp_crc_reply reply = {
         .crc = evlcp_crc32(0u, e->banks.content[request.bank] + request.offset, request.length)};
-    evlcp_crc_reply_put(x->out, &reply);
-    x->out_length = EVLCP_CRC_REPLY_BYTES;
+    x->out_length = evlcp_crc_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_commit_request request;
-    evlcp_commit_request_get(x->in, &request);
+    const struct evlcp_commit_request request = evlcp_commit_request_get(x->in);
     uint8_t active = atomic_load(&e->banks.active);
     uint8_t pending = atomic_load(&e->banks.pending);
     bool held = request.bank < EVLCP_BANKS && evlcp_banks_held(&e->banks, request.bank);
@@ -330,55 +306,43 @@ static enum evlcp_status on_commit(struct evlcp *e, struct exchange *x)
     if (pending != EVLCP_NO_BANK && pending != request.bank)
         return EVLCP_STATUS_BUSY;
     /* The chip timer is not changed while it runs: a chip of another length would be torn. */
-    if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].ticks_per_chip) {
-        x->detail = e->banks.plan[active].chip_rate_hz;
-        return EVLCP_STATUS_BUSY;
-    }
+    if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].setup.ticks_per_chip)
+        return evlcp_refuse(EVLCP_STATUS_BUSY, &x->detail, e->banks.plan[active].setup.chip_rate_hz);
     enum evlcp_status status = evlcp_banks_check(&e->banks, &e->setup, &request, &x->detail);
     if (status != EVLCP_STATUS_OK)
         return status;
     uint32_t allowed = evlcp_allowed(e, e->level_ma, e->duty_limit);
-    if (!bright_enough(e, request.bank, allowed)) {
-        x->detail = allowed;
-        return EVLCP_STATUS_TOO_BRIGHT;
-    }
+    if (!dim_enough(e, request.bank, allowed))
+        return evlcp_refuse(EVLCP_STATUS_TOO_BRIGHT, &x->detail, allowed);
     if (!held)
         evlcp_activate(e, request.bank);
     const struct evlcp_commit_reply reply = {.commits = e->banks.commits};
-    evlcp_commit_reply_put(x->out, &reply);
-    x->out_length = EVLCP_COMMIT_REPLY_BYTES;
+    x->out_length = evlcp_commit_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_stream(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_stream_request request;
-    evlcp_stream_request_get(x->in, &request);
+    const struct evlcp_stream_request request = evlcp_stream_request_get(x->in);
     uint8_t active = atomic_load(&e->banks.active);
     if (atomic_load(&e->banks.pending) != EVLCP_NO_BANK)
         return EVLCP_STATUS_BUSY;
-    if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].ticks_per_chip) {
-        x->detail = e->banks.plan[active].chip_rate_hz;
-        return EVLCP_STATUS_BUSY;
-    }
+    if (running(e) && e->setup.ticks_per_chip != e->banks.plan[active].setup.ticks_per_chip)
+        return evlcp_refuse(EVLCP_STATUS_BUSY, &x->detail, e->banks.plan[active].setup.chip_rate_hz);
     enum evlcp_status status = evlcp_banks_stream(&e->banks, &e->setup, &request, &x->detail);
     if (status != EVLCP_STATUS_OK)
         return status;
     evlcp_activate(e, request.bank);
     const struct evlcp_stream_reply reply = {.slots = (uint16_t)e->banks.stream[request.bank].slots};
-    evlcp_stream_reply_put(x->out, &reply);
-    x->out_length = EVLCP_STREAM_REPLY_BYTES;
+    x->out_length = evlcp_stream_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_push(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_push_request request;
-    evlcp_push_request_get(x->in, &request);
-    if (request.bank >= EVLCP_BANKS) {
-        x->detail = EVLCP_BANKS - 1u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    const struct evlcp_push_request request = evlcp_push_request_get(x->in);
+    if (request.bank >= EVLCP_BANKS)
+        return out_of_range(x, EVLCP_BANKS - 1u);
     struct evlcp_stream *stream = &e->banks.stream[request.bank];
     if (!stream->on)
         return EVLCP_STATUS_NOTHING_COMMITTED;
@@ -393,8 +357,7 @@ static enum evlcp_status on_push(struct evlcp *e, struct exchange *x)
     /* The end holds once everything before it is there. */
     if (request.last == 1u && reply.offset == 0u && reply.number == request.number + (count != 0u ? 1u : 0u))
         atomic_store(&stream->ended, true);
-    evlcp_push_reply_put(x->out, &reply);
-    x->out_length = EVLCP_PUSH_REPLY_BYTES;
+    x->out_length = evlcp_push_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
@@ -421,9 +384,8 @@ static enum evlcp_status start(struct evlcp *e, uint32_t *detail)
 
 static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_start_request request;
+    const struct evlcp_start_request request = evlcp_start_request_get(x->in);
     struct evlcp_pulse pulse;
-    evlcp_start_request_get(x->in, &request);
     bool waits = request.at_pulse != 0u || request.at_clock != 0u;
     if (waits && (e->info.capabilities & EVLCP_CAPABILITY_PULSE) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
@@ -431,17 +393,13 @@ static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
         return EVLCP_STATUS_BUSY;
     if (request.at_pulse != 0u) {
         uint8_t bank = atomic_load(&e->banks.active);
-        uint32_t rate = bank != EVLCP_NO_BANK ? e->banks.plan[bank].chip_rate_hz : e->setup.chip_rate_hz;
+        uint32_t rate = bank != EVLCP_NO_BANK ? e->banks.plan[bank].setup.chip_rate_hz : e->setup.chip_rate_hz;
         (void)hal_pulse(&pulse);
         /* It takes two pulses to know how far they are apart, and one that comes. */
-        if ((int32_t)(request.at_pulse - pulse.count) < (pulse.between != 0u ? 1 : 3)) {
-            x->detail = pulse.count + 3u;
-            return EVLCP_STATUS_OUT_OF_RANGE;
-        }
-        if (request.pulse_hz == 0u || rate % request.pulse_hz != 0u) {
-            x->detail = 1u;
-            return EVLCP_STATUS_OUT_OF_RANGE;
-        }
+        if ((int32_t)(request.at_pulse - pulse.count) < (pulse.between != 0u ? 1 : 3))
+            return out_of_range(x, pulse.count + 3u);
+        if (request.pulse_hz == 0u || rate % request.pulse_hz != 0u)
+            return out_of_range(x, 1u);
     }
     enum evlcp_status status = start(e, &x->detail);
     if (status == EVLCP_STATUS_OK && waits)
@@ -454,20 +412,14 @@ static enum evlcp_status on_start(struct evlcp *e, struct exchange *x)
 
 static enum evlcp_status on_level(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_level_request request;
-    evlcp_level_request_get(x->in, &request);
+    const struct evlcp_level_request request = evlcp_level_request_get(x->in);
     if ((e->info.capabilities & EVLCP_CAPABILITY_LEVEL) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
-    if (request.level_ma > e->level_limit_ma) {
-        x->detail = e->level_limit_ma;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (request.level_ma > e->level_limit_ma)
+        return out_of_range(x, e->level_limit_ma);
     uint32_t allowed = evlcp_allowed(e, request.level_ma, e->duty_limit);
-    if (!bright_enough(e, atomic_load(&e->banks.pending), allowed) ||
-        !bright_enough(e, atomic_load(&e->banks.active), allowed)) {
-        x->detail = allowed;
-        return EVLCP_STATUS_TOO_BRIGHT;
-    }
+    if (!all_dim_enough(e, allowed))
+        return evlcp_refuse(EVLCP_STATUS_TOO_BRIGHT, &x->detail, allowed);
     test_end(e);
     return evlcp_light(e, request.level_ma, e->level_limit_ma, e->duty_limit) ? EVLCP_STATUS_OK
                                                                                : EVLCP_STATUS_HARDWARE_FAULT;
@@ -492,75 +444,65 @@ static uint8_t state(struct evlcp *e)
 
 static enum evlcp_status on_status(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_status_reply reply = {0};
-    reply.state = state(e);
-    reply.faults = faults(e);
-    /* Pending first, as in evlcp_banks_held. */
-    reply.pending_bank = atomic_load(&e->banks.pending);
+    struct evlcp_pulse pulse;
+    (void)hal_pulse(&pulse);
+    struct evlcp_status_reply reply = {
+        .state = state(e),
+        .faults = faults(e),
+        .pending_bank = atomic_load(&e->banks.pending), /* first, as in evlcp_banks_held */
+        .commits = e->banks.commits,
+        .packets_sent = atomic_load(&e->player.packets_sent),
+        .chips_sent = atomic_load(&e->player.chips_sent),
+        .lateness_ticks = atomic_load(&e->player.lateness),
+        .lateness_max_ticks = atomic_load(&e->player.lateness_max),
+        .crc_errors = e->link.crc_errors,
+        .framing_errors = e->link.framing_errors,
+        .overflow_errors = atomic_load(&e->link.overflow_errors),
+        .requests = e->requests,
+        .level_ma = e->level_ma,
+        .level_limit_ma = e->level_limit_ma,
+        .duty_limit = e->duty_limit,
+        .temperature_dc = e->health.temperature_dc,
+        .watchdog = e->watch.action,
+        .watchdog_ms = e->watch.timeout_ms,
+        .silence_ms = hal_millis() - e->watch.asked_ms,
+        .uptime_ms = hal_millis(),
+        .clock = hal_clock(),
+        .pulses = pulse.count,
+        .pulse_clocks = pulse.between};
     reply.active_bank = atomic_load(&e->banks.active);
-    evlcp_copy(reply.digest, e->setup.digest, sizeof reply.digest);
-    reply.chip_rate_hz = e->setup.chip_rate_hz;
-    reply.profile = e->setup.profile;
-    reply.frames = e->setup.frames;
-    reply.pilot_every = e->setup.pilot_every;
+    const struct evlcp_setup *setup = &e->setup;
     if (reply.active_bank != EVLCP_NO_BANK) {
         const struct evlcp_plan *plan = &e->banks.plan[reply.active_bank];
+        setup = &plan->setup;
         reply.format = plan->format;
-        reply.profile = plan->profile;
-        reply.frames = plan->frames;
-        reply.pilot_every = plan->pilot_every;
         reply.packets = plan->packets;
         reply.length = plan->length;
         reply.duty = plan->duty;
         reply.crc = plan->crc;
-        reply.chip_rate_hz = plan->chip_rate_hz;
         reply.packet_chips = plan->packet_chips;
-        reply.hold = plan->hold;
-        reply.clusters = plan->clusters;
-        evlcp_copy(reply.digest, plan->digest, sizeof reply.digest);
+        reply.hold = setup->hold;
+        reply.clusters = (uint8_t)setup->clusters;
         if (e->banks.stream[reply.active_bank].on)
             reply.underruns = atomic_load(&e->banks.stream[reply.active_bank].underruns);
     }
-    reply.commits = e->banks.commits;
-    reply.packets_sent = atomic_load(&e->player.packets_sent);
-    reply.chips_sent = atomic_load(&e->player.chips_sent);
-    reply.lateness_ticks = atomic_load(&e->player.lateness);
-    reply.lateness_max_ticks = atomic_load(&e->player.lateness_max);
-    reply.crc_errors = e->link.crc_errors;
-    reply.framing_errors = e->link.framing_errors;
-    reply.overflow_errors = atomic_load(&e->link.overflow_errors);
-    reply.requests = e->requests;
-    reply.level_ma = e->level_ma;
-    reply.level_limit_ma = e->level_limit_ma;
-    reply.duty_limit = e->duty_limit;
-    reply.temperature_dc = e->health.temperature_dc;
+    reply.profile = setup->profile;
+    reply.frames = setup->frames;
+    reply.pilot_every = setup->pilot_every;
+    reply.chip_rate_hz = setup->chip_rate_hz;
+    evlcp_copy(reply.digest, setup->digest, sizeof reply.digest);
     evlcp_copy(reply.open_leds, e->health.open_leds, sizeof reply.open_leds);
-    reply.watchdog = e->watch.action;
-    reply.watchdog_ms = e->watch.timeout_ms;
-    reply.silence_ms = hal_millis() - e->watch.asked_ms;
-    reply.uptime_ms = hal_millis();
-    struct evlcp_pulse pulse;
-    (void)hal_pulse(&pulse);
-    reply.clock = hal_clock();
-    reply.pulses = pulse.count;
-    reply.pulse_clocks = pulse.between;
-    evlcp_status_reply_put(x->out, &reply);
-    x->out_length = EVLCP_STATUS_REPLY_BYTES;
+    x->out_length = evlcp_status_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
 static enum evlcp_status on_watchdog(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_watchdog_request request;
-    evlcp_watchdog_request_get(x->in, &request);
-    if (request.action > EVLCP_WATCHDOG_DARK) {
-        x->detail = EVLCP_WATCHDOG_DARK;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
-    if (request.action != EVLCP_WATCHDOG_KEEP && request.timeout_ms < WATCHDOG_MIN_MS) {
-        x->detail = WATCHDOG_MIN_MS;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    const struct evlcp_watchdog_request request = evlcp_watchdog_request_get(x->in);
+    if (request.action > EVLCP_WATCHDOG_DARK)
+        return out_of_range(x, EVLCP_WATCHDOG_DARK);
+    if (request.action != EVLCP_WATCHDOG_KEEP && request.timeout_ms < WATCHDOG_MIN_MS)
+        return out_of_range(x, WATCHDOG_MIN_MS);
     e->watch.action = request.action;
     e->watch.timeout_ms = request.timeout_ms;
     return EVLCP_STATUS_OK;
@@ -570,14 +512,11 @@ static enum evlcp_status on_save(struct evlcp *e, struct exchange *x)
 {
     struct evlcp_save_reply reply = {0};
     uint8_t autostart = evlcp_get8(x->in);
-    if (autostart > 1u) {
-        x->detail = 1u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (autostart > 1u)
+        return out_of_range(x, 1u);
     enum evlcp_status status = evlcp_settings_save(e, autostart == 1u, &reply);
     if (status == EVLCP_STATUS_OK) {
-        evlcp_save_reply_put(x->out, &reply);
-        x->out_length = EVLCP_SAVE_REPLY_BYTES;
+        x->out_length = evlcp_save_reply_put(x->out, &reply);
     }
     return status;
 }
@@ -587,37 +526,27 @@ static enum evlcp_status on_recall(struct evlcp *e, struct exchange *x)
     struct evlcp_recall_reply reply = {0};
     enum evlcp_status status = evlcp_settings_recall(e, false, &reply);
     if (status == EVLCP_STATUS_OK) {
-        evlcp_recall_reply_put(x->out, &reply);
-        x->out_length = EVLCP_RECALL_REPLY_BYTES;
+        x->out_length = evlcp_recall_reply_put(x->out, &reply);
     }
     return status;
 }
 
 static enum evlcp_status on_led_test(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_led_test_request request;
-    evlcp_led_test_request_get(x->in, &request);
+    const struct evlcp_led_test_request request = evlcp_led_test_request_get(x->in);
     if (running(e) || atomic_load(&e->player.want_play))
         return EVLCP_STATUS_BUSY;
-    if (request.last >= EVLCP_LEDS || request.first > request.last) {
-        x->detail = EVLCP_LEDS - 1u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
-    if (request.dwell_ms == 0u) {
-        x->detail = 1u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (request.last >= EVLCP_LEDS || request.first > request.last)
+        return out_of_range(x, EVLCP_LEDS - 1u);
+    if (request.dwell_ms == 0u)
+        return out_of_range(x, 1u);
     hal_health(&e->health);
-    if ((e->health.faults & HOLDS_DARK) != 0u) {
-        x->detail = e->health.faults;
-        return EVLCP_STATUS_HARDWARE_FAULT;
-    }
+    if ((e->health.faults & HOLDS_DARK) != 0u)
+        return evlcp_refuse(EVLCP_STATUS_HARDWARE_FAULT, &x->detail, e->health.faults);
     /* A LED is on for as long as the host likes: with no more than the mean that it may have. */
     uint32_t most = (uint32_t)e->level_ma * evlcp_allowed(e, e->level_ma, e->duty_limit) / 1000u;
-    if (!hal_level((uint16_t)most)) {
-        x->detail = 0u;
-        return EVLCP_STATUS_HARDWARE_FAULT;
-    }
+    if (!hal_level((uint16_t)most))
+        return evlcp_refuse(EVLCP_STATUS_HARDWARE_FAULT, &x->detail, 0u);
     e->test.on = true;
     e->test.led = request.first;
     e->test.last = request.last;
@@ -642,8 +571,7 @@ static enum evlcp_status on_update_status(struct evlcp *e, struct exchange *x)
         return EVLCP_STATUS_NOT_SUPPORTED;
     evlcp_update_tell(&reply);
     evlcp_copy(reply.target, e->info.target, sizeof reply.target);
-    evlcp_update_status_reply_put(x->out, &reply);
-    x->out_length = EVLCP_UPDATE_STATUS_REPLY_BYTES;
+    x->out_length = evlcp_update_status_reply_put(x->out, &reply);
     return EVLCP_STATUS_OK;
 }
 
@@ -656,37 +584,45 @@ static enum evlcp_status on_update_write(struct evlcp *e, struct exchange *x)
         status = evlcp_update_write(&e->update, offset, x->in + EVLCP_UPDATE_WRITE_REQUEST_BYTES, count, &x->detail);
     if (status == EVLCP_STATUS_OK) {
         const struct evlcp_update_write_reply reply = {.offset = offset, .count = (uint16_t)count};
-        evlcp_update_write_reply_put(x->out, &reply);
-        x->out_length = EVLCP_UPDATE_WRITE_REPLY_BYTES;
+        x->out_length = evlcp_update_write_reply_put(x->out, &reply);
     }
     return status;
 }
 
-static enum evlcp_status on_update(struct evlcp *e, uint8_t type, struct exchange *x)
+static enum evlcp_status on_update_begin(struct evlcp *e, struct exchange *x)
 {
-    struct evlcp_update_begin_request begin;
+    const struct evlcp_update_begin_request request = evlcp_update_begin_request_get(x->in);
+    enum evlcp_status status = may_update(e);
+    return status == EVLCP_STATUS_OK ? evlcp_update_begin(&e->update, &request, &x->detail) : status;
+}
+
+static enum evlcp_status on_update_commit(struct evlcp *e, struct exchange *x)
+{
     struct evlcp_update_commit_reply reply = {0};
     enum evlcp_status status = may_update(e);
-    if (status != EVLCP_STATUS_OK)
-        return status;
-    switch (type) {
-    case EVLCP_TYPE_UPDATE_BEGIN:
-        evlcp_update_begin_request_get(x->in, &begin);
-        return evlcp_update_begin(&e->update, &begin, &x->detail);
-    case EVLCP_TYPE_UPDATE_COMMIT:
+    if (status == EVLCP_STATUS_OK)
         status = evlcp_update_commit(&e->update, &reply.sequence, &x->detail);
-        if (status == EVLCP_STATUS_OK) {
-            evlcp_update_commit_reply_put(x->out, &reply);
-            x->out_length = EVLCP_UPDATE_COMMIT_REPLY_BYTES;
-        }
-        return status;
-    case EVLCP_TYPE_UPDATE_RESTART:
+    if (status == EVLCP_STATUS_OK)
+        x->out_length = evlcp_update_commit_reply_put(x->out, &reply);
+    return status;
+}
+
+static enum evlcp_status on_update_restart(struct evlcp *e, struct exchange *x)
+{
+    (void)x;
+    enum evlcp_status status = may_update(e);
+    if (status == EVLCP_STATUS_OK) {
         e->update.restart = true;
         e->update.restart_ms = hal_millis();
-        return EVLCP_STATUS_OK;
-    default:
-        return evlcp_update_confirm();
     }
+    return status;
+}
+
+static enum evlcp_status on_update_confirm(struct evlcp *e, struct exchange *x)
+{
+    (void)x;
+    enum evlcp_status status = may_update(e);
+    return status == EVLCP_STATUS_OK ? evlcp_update_confirm() : status;
 }
 
 /* No packet is taken from now on, and none of a stream is left for another START. */
@@ -697,54 +633,33 @@ static void play_no_more(struct evlcp *e)
         evlcp_stream_end(&e->banks.stream[bank]);
 }
 
-static enum evlcp_status on_control(struct evlcp *e, uint8_t type, struct exchange *x)
+static enum evlcp_status on_key(struct evlcp *e, struct exchange *x)
 {
-    switch (type) {
-    case EVLCP_TYPE_UPDATE_BEGIN:
-    case EVLCP_TYPE_UPDATE_COMMIT:
-    case EVLCP_TYPE_UPDATE_RESTART:
-    case EVLCP_TYPE_UPDATE_CONFIRM:
-        return on_update(e, type, x);
-    case EVLCP_TYPE_CONFIGURE:
-        return on_configure(e, x);
-    case EVLCP_TYPE_CODEBOOK:
-        return on_codebook(e, x);
-    case EVLCP_TYPE_CHIPS:
-        return on_chips(e, x);
-    case EVLCP_TYPE_COMMIT:
-        return on_commit(e, x);
-    case EVLCP_TYPE_STREAM:
-        return on_stream(e, x);
-    case EVLCP_TYPE_KEY:
-        if (!e->trust.able)
-            return EVLCP_STATUS_NOT_SUPPORTED;
-        evlcp_trust_set(&e->trust, x->in);
-        return EVLCP_STATUS_OK;
-    case EVLCP_TYPE_START:
-        return on_start(e, x);
-    case EVLCP_TYPE_STOP:
-        play_no_more(e);
-        test_end(e);
-        return EVLCP_STATUS_OK;
-    case EVLCP_TYPE_BLANK:
-        play_no_more(e);
-        evlcp_player_blank(&e->player);
-        test_end(e);
-        return EVLCP_STATUS_OK;
-    case EVLCP_TYPE_LEVEL:
-        return on_level(e, x);
-    case EVLCP_TYPE_WATCHDOG:
-        return on_watchdog(e, x);
-    case EVLCP_TYPE_SAVE:
-        return on_save(e, x);
-    case EVLCP_TYPE_RECALL:
-        return on_recall(e, x);
-    default:
-        return on_led_test(e, x);
-    }
+    if (!e->trust.able)
+        return EVLCP_STATUS_NOT_SUPPORTED;
+    evlcp_trust_set(&e->trust, x->in);
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_stop(struct evlcp *e, struct exchange *x)
+{
+    (void)x;
+    play_no_more(e);
+    test_end(e);
+    return EVLCP_STATUS_OK;
+}
+
+static enum evlcp_status on_blank(struct evlcp *e, struct exchange *x)
+{
+    (void)x;
+    play_no_more(e);
+    evlcp_player_blank(&e->player);
+    test_end(e);
+    return EVLCP_STATUS_OK;
 }
 
 struct shape {
+    enum evlcp_status (*handle)(struct evlcp *e, struct exchange *x);
     uint8_t type;
     bool control;
     bool query;
@@ -753,7 +668,8 @@ struct shape {
     uint16_t bytes;
 };
 
-static const struct shape shapes[] = {EVLCP_SHAPES};
+#define SHAPE(name, ...) {on_##name, __VA_ARGS__},
+static const struct shape shapes[] = {EVLCP_REQUESTS(SHAPE)};
 
 static const struct shape *shape_of(uint8_t type)
 {
@@ -770,23 +686,22 @@ static bool after(uint16_t sequence, uint16_t than)
     return (int16_t)(uint16_t)(sequence - than) > 0;
 }
 
-static enum evlcp_status controlled(struct evlcp *e, const struct evlcp_datagram *d, struct exchange *x)
+/* Whether it is the latest control request again: that is answered again and not done again. */
+static bool repeated(const struct evlcp_control *c, const struct evlcp_datagram *d)
+{
+    return c->known && d->sequence == c->sequence && d->type == c->type;
+}
+
+static enum evlcp_status controlled(struct evlcp *e, const struct shape *shape, struct exchange *x)
 {
     struct evlcp_control *c = &e->control;
-    if (c->known && d->sequence == c->sequence && d->type == c->type) {
-        evlcp_copy(x->out, c->reply, c->length);
-        x->out_length = c->length;
-        x->detail = evlcp_get32(c->reply);
-        return (enum evlcp_status)c->status;
-    }
-    if (!after(d->sequence, c->sequence))
-        return EVLCP_STATUS_STALE;
-    enum evlcp_status status = on_control(e, d->type, x);
-    c->known = true;
-    c->type = d->type;
-    c->status = (uint8_t)status;
-    c->sequence = d->sequence;
-    c->length = x->out_length;
+    enum evlcp_status status = shape->handle(e, x);
+    *c = (struct evlcp_control){.known = true,
+                                .type = shape->type,
+                                .status = (uint8_t)status,
+                                .sequence = x->sequence,
+                                .newest = c->newest,
+                                .length = x->out_length};
     evlcp_copy(c->reply, x->out, x->out_length);
     if (status != EVLCP_STATUS_OK)
         evlcp_put32(c->reply, x->detail);
@@ -808,10 +723,8 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     const struct shape *shape = shape_of(d->type);
     if (shape == 0)
         return EVLCP_STATUS_UNKNOWN_TYPE;
-    if (d->length < shape->least || (d->length > shape->bytes && !shape->open_ended)) {
-        x->detail = shape->bytes;
-        return EVLCP_STATUS_BAD_LENGTH;
-    }
+    if (d->length < shape->least || (d->length > shape->bytes && !shape->open_ended))
+        return evlcp_refuse(EVLCP_STATUS_BAD_LENGTH, &x->detail, shape->bytes);
     /* Of an earlier minor version: what it does not have is zero. */
     uint8_t whole[EVLCP_REQUEST_MOST] = {0};
     if (d->length < shape->bytes) {
@@ -820,7 +733,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
         x->in_length = shape->bytes;
     }
     if (d->type == EVLCP_TYPE_HELLO) {
-        enum evlcp_status status = on_hello(e, x, d->sequence);
+        enum evlcp_status status = on_hello(e, x);
         if (status == EVLCP_STATUS_OK && trusted)
             heard(e);
         return status;
@@ -828,8 +741,7 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
     if (d->session != e->session || e->session == EVLCP_NO_SESSION)
         return EVLCP_STATUS_NO_SESSION;
     struct evlcp_control *c = &e->control;
-    /* What is answered again is not done again: a KEY, say, whose answer was lost. */
-    bool again = shape->control && c->known && d->sequence == c->sequence && d->type == c->type;
+    bool again = shape->control && repeated(c, d); /* a KEY, say, whose answer was lost */
     if (!trusted && !shape->query && !again)
         return EVLCP_STATUS_NEEDS_KEY;
     if (trusted) {
@@ -845,35 +757,27 @@ static enum evlcp_status dispatch(struct evlcp *e, const struct evlcp_datagram *
             c->known = false;
         }
     }
-    if (shape->control) {
+    if (shape->control)
         e->watch.acted = e->watch.acted && !trusted;
-        return controlled(e, d, x);
+    if (shape->control && repeated(c, d)) {
+        evlcp_copy(x->out, c->reply, c->length);
+        x->out_length = c->length;
+        x->detail = evlcp_get32(c->reply);
+        return (enum evlcp_status)c->status;
     }
-    switch (d->type) {
-    case EVLCP_TYPE_WRITE:
-        return after(d->sequence, c->sequence) ? on_write(e, x) : EVLCP_STATUS_STALE;
-    case EVLCP_TYPE_PUSH:
-        return after(d->sequence, c->sequence) ? on_push(e, x) : EVLCP_STATUS_STALE;
-    case EVLCP_TYPE_UPDATE_WRITE:
-        return after(d->sequence, c->sequence) ? on_update_write(e, x) : EVLCP_STATUS_STALE;
-    case EVLCP_TYPE_UPDATE_STATUS:
-        return on_update_status(e, x);
-    case EVLCP_TYPE_READ:
-        return on_read(e, x);
-    case EVLCP_TYPE_CRC:
-        return on_crc(e, x);
-    default: {
-        enum evlcp_status status = on_status(e, x);
-        if (trusted)
-            e->watch.asked_ms = e->watch.heard_ms; /* after, for the status tells how long it was */
-        return status;
-    }
-    }
+    if (!shape->query && !after(d->sequence, c->sequence))
+        return EVLCP_STATUS_STALE;
+    if (shape->control)
+        return controlled(e, shape, x);
+    enum evlcp_status status = shape->handle(e, x);
+    if (trusted && d->type == EVLCP_TYPE_STATUS)
+        e->watch.asked_ms = e->watch.heard_ms; /* after, for the status tells how long it was */
+    return status;
 }
 
 static void answer(struct evlcp *e, struct evlcp_datagram *d)
 {
-    struct exchange x = {.in = d->payload, .out = e->payload};
+    struct exchange x = {.sequence = d->sequence, .in = d->payload, .out = e->payload};
     bool sealed = false;
     /* Replies go to hosts; one that comes here was echoed by the line. */
     if ((d->type & EVLCP_REPLY_BIT) != 0u)
@@ -946,40 +850,17 @@ static void walk(struct evlcp *e, uint32_t now)
 void evlcp_init(struct evlcp *e)
 {
     /* The LEDs first: nothing may light them before a COMMIT. */
-    evlcp_player_init(&e->player);
+    hal_leds(dark, EVLCP_CHIP_DARK);
     hal_info(&e->info);
-    atomic_store(&e->link.head, 0u);
-    atomic_store(&e->link.tail, 0u);
-    atomic_store(&e->link.overflow_errors, 0u);
-    e->link.length = 0u;
-    e->link.left = 0u;
-    e->link.open = false;
-    e->link.broken = false;
-    e->link.full_block = true;
-    e->link.crc_errors = 0u;
-    e->link.framing_errors = 0u;
-    e->link.wire_length = 0u;
-    e->link.wire_sent = 0u;
     evlcp_banks_init(&e->banks);
     evlcp_setup_init(&e->setup, e->info.tick_hz);
-    e->watch = (struct evlcp_watch){
-        .action = EVLCP_WATCHDOG_KEEP, .heard_ms = hal_millis(), .asked_ms = hal_millis()};
-    e->test.on = false;
-    e->control = (struct evlcp_control){.known = false};
-    e->update = (struct evlcp_update){.open = false};
-    e->start = (struct evlcp_start){.waiting = false};
-    e->session = EVLCP_NO_SESSION;
-    e->nonce = 0u;
-    e->requests = 0u;
-    e->latched = 0u;
+    e->watch.heard_ms = e->watch.asked_ms = hal_millis();
     if (e->info.burst_chips > EVLCP_BURST_MOST)
         e->info.burst_chips = EVLCP_BURST_MOST;
     e->player.guard.burst = 1000u * e->info.burst_chips;
-    e->level_ma = 0u;
     (void)evlcp_light(e, e->info.level_default_ma, e->info.level_max_ma, 1000u);
     hal_health(&e->health);
     e->health_ms = hal_millis();
-    e->trust = (struct evlcp_trust){.able = false};
     evlcp_settings_key(e);
     struct evlcp_recall_reply recalled;
     uint32_t detail;
@@ -1022,7 +903,7 @@ static bool due(struct evlcp *e)
         when.at = pulse.at + (e->start.at_pulse - pulse.count) * pulse.between;
         when.pulse = e->start.at_pulse;
         when.pulse_hz = e->start.pulse_hz;
-        when.chip_rate_hz = e->banks.plan[atomic_load(&e->banks.active)].chip_rate_hz;
+        when.chip_rate_hz = e->banks.plan[atomic_load(&e->banks.active)].setup.chip_rate_hz;
     }
     if ((int32_t)(when.at - hal_clock()) > (int32_t)(e->info.clock_hz / 1000000u * EVLCP_START_LEAD_US))
         return false;

@@ -81,7 +81,7 @@ struct evlcp {
     uint8_t payload[EVLCP_MAX_PAYLOAD];
 };
 
-/* Begin: LEDs dark, no session; a flash slot saved with autostart is recalled and played. */
+/* Begin, in memory that is zero: LEDs dark, no session; a flash slot saved with autostart is recalled and played. */
 void evlcp_init(struct evlcp *e);
 
 /* Bytes came in. */

@@ -96,11 +96,12 @@ static uint32_t most_of_rows(const uint8_t *rows, uint32_t count, uint32_t bytes
 
 static uint32_t most_of_words(const struct evlcp_plan *plan, const uint8_t *words)
 {
-    uint32_t pilots = ((uint32_t)plan->frames + plan->pilot_every - 1u) / plan->pilot_every;
-    uint32_t frames = (uint32_t)plan->packets * plan->frames;
+    const struct evlcp_setup *setup = &plan->setup;
+    uint32_t pilots = ((uint32_t)setup->frames + setup->pilot_every - 1u) / setup->pilot_every;
+    uint32_t frames = (uint32_t)plan->packets * setup->frames;
     uint32_t most = 0u;
     for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++) {
-        uint32_t on = plan->packets * (ones(plan->preamble) + pilots * ones(plan->pilots[k]));
+        uint32_t on = plan->packets * (ones(setup->preamble) + pilots * ones(setup->pilots[k]));
         for (uint32_t f = 0; f < frames; f++)
             on += ones(evlcp_get16(words + f * EVLCP_FRAME_BYTES + 2u * k));
         most = on > most ? on : most;
@@ -110,7 +111,7 @@ static uint32_t most_of_words(const struct evlcp_plan *plan, const uint8_t *word
 
 uint16_t evlcp_guard_duty(const struct evlcp_plan *plan, const uint8_t *content)
 {
-    uint32_t chips = plan->packets * plan->packet_chips / (plan->hold != 0u ? plan->hold : 1u);
+    uint32_t chips = plan->packets * plan->packet_chips / (plan->setup.hold != 0u ? plan->setup.hold : 1u);
     uint32_t on = plan->format == EVLCP_FORMAT_WORDS
                       ? most_of_words(plan, content)
                       : most_of_rows(content + plan->table_bytes, chips, plan->chip_bytes);

@@ -4,26 +4,6 @@
 
 static const uint8_t dark[EVLCP_ROW_BYTES];
 
-void evlcp_player_init(struct evlcp_player *player)
-{
-    atomic_store(&player->want_play, false);
-    atomic_store(&player->want_idle, false);
-    atomic_store(&player->running, false);
-    atomic_store(&player->chip_lost, false);
-    atomic_store(&player->over_limit, false);
-    atomic_store(&player->packets_sent, 0u);
-    atomic_store(&player->chips_sent, 0u);
-    atomic_store(&player->lateness, 0u);
-    atomic_store(&player->lateness_max, 0u);
-    player->idle = false;
-    player->halt = false;
-    player->lit = dark;
-    player->idle_dark = 0u;
-    player->dark_ms = 0u;
-    player->guard = (struct evlcp_guard){.burst = 0u};
-    hal_leds(dark, EVLCP_CHIP_DARK);
-}
-
 /* Go to packet `next` of the active bank, or to what its stream has next. */
 static void seek(struct evlcp_player *player, struct evlcp_banks *banks, uint32_t next)
 {
@@ -93,7 +73,7 @@ void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
     const struct evlcp_plan *plan = &banks->plan[atomic_load(&banks->active)];
     player->chip = 0u;
     player->halt = false;
-    player->ticks_per_chip = plan->ticks_per_chip;
+    player->ticks_per_chip = plan->setup.ticks_per_chip;
     atomic_store(&player->chip_lost, false);
     atomic_store(&player->over_limit, false);
     atomic_store(&player->lateness, 0u);
@@ -101,13 +81,13 @@ void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks)
     uint32_t rested_ms = hal_millis() - player->dark_ms;
     if (rested_ms > 1000u)
         rested_ms = 1000u; /* longer than any burst */
-    evlcp_guard_rest(&player->guard, rested_ms * plan->chip_rate_hz / 1000u);
+    evlcp_guard_rest(&player->guard, rested_ms * plan->setup.chip_rate_hz / 1000u);
     seek(player, banks, 0u);
     if (player->halt)
         return; /* the end of a stream that has played */
     compose(player);
     atomic_store(&player->running, true);
-    hal_chips(plan->ticks_per_chip);
+    hal_chips(plan->setup.ticks_per_chip);
 }
 
 void evlcp_player_blank(struct evlcp_player *player)

@@ -35,8 +35,6 @@ struct evlcp_player {
     atomic_uint_least32_t lateness_max;
 };
 
-void evlcp_player_init(struct evlcp_player *player);
-
 /* Start with the active bank's first packet; must not run, and a bank must be active. */
 void evlcp_player_begin(struct evlcp_player *player, struct evlcp_banks *banks);
 

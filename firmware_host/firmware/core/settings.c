@@ -20,6 +20,7 @@ struct slot {
 
 static void put_header(const struct slot *s, uint8_t b[EVLCP_SLOT_HEADER_BYTES])
 {
+    const struct evlcp_setup *setup = &s->plan.setup;
     for (uint32_t i = 0; i < EVLCP_SLOT_HEADER_BYTES; i++)
         b[i] = 0u;
     evlcp_put32(b, MAGIC);
@@ -29,26 +30,26 @@ static void put_header(const struct slot *s, uint8_t b[EVLCP_SLOT_HEADER_BYTES])
     evlcp_put16(b + 10, s->level_ma);
     evlcp_put32(b + 12, s->watchdog_ms);
     b[16] = s->plan.format;
-    b[17] = s->plan.profile;
-    b[18] = s->plan.preamble_chips;
-    b[19] = s->plan.pilot_every;
+    b[17] = setup->profile;
+    b[18] = setup->preamble_chips;
+    b[19] = setup->pilot_every;
     /* Chips alone have neither frames nor preamble nor pilots, and a firmware that does not know them takes no packet
        without frames. */
-    bool chips = s->plan.hold != 0u;
-    evlcp_put16(b + 20, chips ? 0u : s->plan.frames);
+    bool chips = setup->hold != 0u;
+    evlcp_put16(b + 20, chips ? 0u : setup->frames);
     evlcp_put16(b + 22, s->plan.packets);
-    evlcp_put32(b + 24, chips ? s->plan.packet_chips / s->plan.hold : s->plan.preamble);
+    evlcp_put32(b + 24, chips ? setup->chips : setup->preamble);
     evlcp_put32(b + 28, s->plan.length);
     evlcp_put32(b + 32, s->plan.crc);
-    evlcp_put32(b + 36, s->plan.chip_rate_hz);
+    evlcp_put32(b + 36, setup->chip_rate_hz);
     if (chips) {
-        b[40] = s->plan.hold;
-        b[41] = s->plan.clusters;
+        b[40] = setup->hold;
+        b[41] = (uint8_t)setup->clusters;
     } else {
         for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-            evlcp_put16(b + 40 + 2u * k, s->plan.pilots[k]);
+            evlcp_put16(b + 40 + 2u * k, setup->pilots[k]);
     }
-    evlcp_copy(b + 72, s->plan.digest, 32u);
+    evlcp_copy(b + 72, setup->digest, 32u);
     evlcp_put16(b + 104, s->level_limit_ma);
     evlcp_put16(b + 106, s->duty_limit);
     evlcp_copy(b + 108, s->key, EVLCP_KEY_BYTES);
@@ -59,43 +60,49 @@ static void put_header(const struct slot *s, uint8_t b[EVLCP_SLOT_HEADER_BYTES])
 static bool get_header(struct evlcp *e, uint8_t index, struct slot *s)
 {
     uint8_t b[EVLCP_SLOT_HEADER_BYTES];
+    struct evlcp_setup *setup = &s->plan.setup;
     if (!hal_flash_read(index, 0u, b, sizeof b) || evlcp_get32(b) != MAGIC ||
         evlcp_get32(b + sizeof b - 4u) != evlcp_crc32(0u, b, sizeof b - 4u))
         return false;
-    s->sequence = evlcp_get32(b + 4);
-    s->autostart = b[8] != 0u;
-    s->watchdog = b[9];
-    s->level_ma = evlcp_get16(b + 10);
-    s->watchdog_ms = evlcp_get32(b + 12);
-    s->plan.valid = false;
+    *s = (struct slot){.sequence = evlcp_get32(b + 4),
+                       .autostart = b[8] != 0u,
+                       .watchdog = b[9],
+                       .level_ma = evlcp_get16(b + 10),
+                       .watchdog_ms = evlcp_get32(b + 12),
+                       .level_limit_ma = evlcp_get16(b + 104),
+                       .duty_limit = evlcp_get16(b + 106)};
     s->plan.format = b[16];
-    s->plan.profile = b[17];
-    s->plan.preamble_chips = b[18];
-    s->plan.pilot_every = b[19];
-    s->plan.frames = evlcp_get16(b + 20);
+    setup->profile = b[17];
+    setup->preamble_chips = b[18];
+    setup->pilot_every = b[19];
+    setup->frames = evlcp_get16(b + 20);
     s->plan.packets = evlcp_get16(b + 22);
-    s->plan.preamble = evlcp_get32(b + 24);
     s->plan.length = evlcp_get32(b + 28);
     s->plan.crc = evlcp_get32(b + 32);
-    s->plan.chip_rate_hz = evlcp_get32(b + 36);
-    bool chips = s->plan.frames == 0u;
-    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-        s->plan.pilots[k] = chips ? 0u : evlcp_get16(b + 40 + 2u * k);
-    s->plan.hold = chips ? b[40] : 0u;
-    s->plan.clusters = chips ? b[41] : 0u;
-    s->plan.packet_chips = chips ? s->plan.preamble : 0u; /* in the bank */
-    s->plan.preamble = chips ? 0u : s->plan.preamble;
-    evlcp_copy(s->plan.digest, b + 72, 32u);
-    s->level_limit_ma = evlcp_get16(b + 104);
-    s->duty_limit = evlcp_get16(b + 106);
+    setup->chip_rate_hz = evlcp_get32(b + 36);
+    if (setup->frames == 0u) {
+        setup->chips = evlcp_get32(b + 24);
+        setup->hold = b[40];
+        setup->clusters = b[41];
+    } else {
+        setup->preamble = evlcp_get32(b + 24);
+        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+            setup->pilots[k] = evlcp_get16(b + 40 + 2u * k);
+    }
+    evlcp_copy(setup->digest, b + 72, 32u);
     evlcp_copy(s->key, b + 108, EVLCP_KEY_BYTES);
-    return s->plan.chip_rate_hz != 0u && e->info.tick_hz % s->plan.chip_rate_hz == 0u &&
-           s->plan.length <= EVLCP_BANK_BYTES;
+    if (setup->chip_rate_hz == 0u || e->info.tick_hz % setup->chip_rate_hz != 0u)
+        return false;
+    setup->ticks_per_chip = e->info.tick_hz / setup->chip_rate_hz;
+    return s->plan.length <= EVLCP_BANK_BYTES;
 }
 
-static bool newer(uint32_t a, uint32_t b)
+/* Read both headers; the slot with the newest that is whole, 0 if there is none. */
+static uint8_t newest(struct evlcp *e, struct slot found[EVLCP_SLOTS], bool valid[EVLCP_SLOTS])
 {
-    return (int32_t)(a - b) > 0;
+    for (uint8_t i = 0; i < EVLCP_SLOTS; i++)
+        valid[i] = get_header(e, i, &found[i]);
+    return valid[1] && (!valid[0] || (int32_t)(found[1].sequence - found[0].sequence) > 0) ? 1u : 0u;
 }
 
 enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct evlcp_save_reply *reply)
@@ -111,17 +118,10 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
         return EVLCP_STATUS_BUSY;
     if (active == EVLCP_NO_BANK || e->banks.stream[active].on)
         return EVLCP_STATUS_NOTHING_COMMITTED;
-    for (uint8_t i = 0; i < EVLCP_SLOTS; i++)
-        valid[i] = get_header(e, i, &found[i]);
     /* Into the slot that is empty or older: the newest stays if the power fails meanwhile. */
-    uint8_t to = 0u;
-    uint32_t sequence = 1u;
-    if (valid[0] && (!valid[1] || newer(found[0].sequence, found[1].sequence))) {
-        to = 1u;
-        sequence = found[0].sequence + 1u;
-    } else if (valid[1]) {
-        sequence = found[1].sequence + 1u;
-    }
+    uint8_t last = newest(e, found, valid);
+    uint8_t to = valid[last] ? (uint8_t)(1u - last) : 0u;
+    uint32_t sequence = valid[last] ? found[last].sequence + 1u : 1u;
     struct slot slot = {.sequence = sequence,
                               .autostart = autostart,
                               .watchdog = e->watch.action,
@@ -159,29 +159,16 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot 
 {
     uint8_t bank = atomic_load(&e->banks.active) == 0u ? 1u : 0u;
     uint32_t detail = 0u;
-    struct evlcp_setup setup = {.profile = s->plan.profile,
-                                .preamble_chips = s->plan.preamble_chips,
-                                .pilot_every = s->plan.pilot_every,
-                                .frames = s->plan.frames,
-                                .preamble = s->plan.preamble,
-                                .hold = s->plan.hold,
-                                .clusters = s->plan.clusters,
-                                .packet_chips = s->plan.packet_chips,
-                                .chip_rate_hz = s->plan.chip_rate_hz,
-                                .ticks_per_chip = e->info.tick_hz / s->plan.chip_rate_hz};
     struct evlcp_commit_request request = {.bank = bank,
                                            .format = s->plan.format,
                                            .packets = s->plan.packets,
                                            .length = s->plan.length,
                                            .crc = s->plan.crc};
-    for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-        setup.pilots[k] = s->plan.pilots[k];
-    evlcp_copy(setup.digest, s->plan.digest, sizeof setup.digest);
-    evlcp_copy(request.digest, s->plan.digest, sizeof request.digest);
+    evlcp_copy(request.digest, s->plan.setup.digest, sizeof request.digest);
     e->banks.plan[bank].valid = false;
     if (!hal_flash_read(index, EVLCP_SLOT_HEADER_BYTES, e->banks.content[bank], s->plan.length))
         return EVLCP_STATUS_FLASH_FAULT;
-    enum evlcp_status status = evlcp_banks_check(&e->banks, &setup, &request, &detail);
+    enum evlcp_status status = evlcp_banks_check(&e->banks, &s->plan.setup, &request, &detail);
     if (status != EVLCP_STATUS_OK)
         return status;
     if (s->level_limit_ma > e->info.level_max_ma || s->level_ma > s->level_limit_ma || s->duty_limit > 1000u ||
@@ -189,7 +176,7 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot 
         return EVLCP_STATUS_HARDWARE_FAULT;
     if (e->banks.plan[bank].duty > evlcp_allowed(e, s->level_ma, e->duty_limit))
         return EVLCP_STATUS_TOO_BRIGHT;
-    e->setup = setup;
+    e->setup = s->plan.setup;
     e->watch.action = s->watchdog <= EVLCP_WATCHDOG_DARK ? s->watchdog : EVLCP_WATCHDOG_KEEP;
     e->watch.timeout_ms = s->watchdog_ms;
     evlcp_activate(e, bank);
@@ -204,9 +191,7 @@ enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, st
         return EVLCP_STATUS_NOT_SUPPORTED;
     if (atomic_load(&e->player.running) || atomic_load(&e->banks.pending) != EVLCP_NO_BANK || e->test.on)
         return EVLCP_STATUS_BUSY;
-    for (uint8_t i = 0; i < EVLCP_SLOTS; i++)
-        valid[i] = get_header(e, i, &found[i]);
-    uint8_t first = valid[1] && (!valid[0] || newer(found[1].sequence, found[0].sequence)) ? 1u : 0u;
+    uint8_t first = newest(e, found, valid);
     for (uint8_t turn = 0; turn < EVLCP_SLOTS; turn++) {
         uint8_t i = turn == 0u ? first : (uint8_t)(1u - first);
         if (!valid[i])
@@ -229,10 +214,8 @@ void evlcp_settings_key(struct evlcp *e)
     bool valid[EVLCP_SLOTS];
     if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
         return;
-    for (uint8_t i = 0; i < EVLCP_SLOTS; i++)
-        valid[i] = get_header(e, i, &found[i]);
     /* Not that of an older slot, whatever RECALL does: a key that was changed is not believed again. */
-    uint8_t newest = valid[1] && (!valid[0] || newer(found[1].sequence, found[0].sequence)) ? 1u : 0u;
-    if (valid[newest])
-        evlcp_trust_set(&e->trust, found[newest].key);
+    uint8_t last = newest(e, found, valid);
+    if (valid[last])
+        evlcp_trust_set(&e->trust, found[last].key);
 }

@@ -135,14 +135,10 @@ enum evlcp_status evlcp_update_begin(struct evlcp_update *u, const struct evlcp_
     uint8_t image = next_image(&newest);
     if (on_trial()) /* the image before it must stay until this one has proven itself */
         return EVLCP_STATUS_BUSY;
-    if (request->image != image + 1u) {
-        *detail = image + 1u;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
-    if (request->length == 0u || request->length > EVLCP_IMAGE_BYTES) {
-        *detail = EVLCP_IMAGE_BYTES;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (request->image != image + 1u)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, image + 1u);
+    if (request->length == 0u || request->length > EVLCP_IMAGE_BYTES)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, EVLCP_IMAGE_BYTES);
     u->open = hal_flash_erase((uint8_t)(EVLCP_IMAGE_SLOT + image));
     u->image = image;
     u->length = request->length;
@@ -155,10 +151,8 @@ enum evlcp_status evlcp_update_write(const struct evlcp_update *u, uint32_t offs
 {
     if (!u->open)
         return EVLCP_STATUS_NOTHING_COMMITTED;
-    if (offset % 4u != 0u || offset > u->length || count > u->length - offset) {
-        *detail = u->length;
-        return EVLCP_STATUS_OUT_OF_RANGE;
-    }
+    if (offset % 4u != 0u || offset > u->length || count > u->length - offset)
+        return evlcp_refuse(EVLCP_STATUS_OUT_OF_RANGE, detail, u->length);
     return hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + u->image), offset, bytes, count)
                ? EVLCP_STATUS_OK
                : EVLCP_STATUS_FLASH_FAULT;

@@ -133,6 +133,13 @@ enum evlcp_fault {
     EVLCP_FAULT_PULSE = 256, /* No pulse came, or none that fits: the board goes on by its own clock; until the next START. */
 };
 
+/* Refuse a request, with the number that goes with it. */
+static inline enum evlcp_status evlcp_refuse(enum evlcp_status status, uint32_t *detail, uint32_t number)
+{
+    *detail = number;
+    return status;
+}
+
 static inline void evlcp_copy(uint8_t *to, const uint8_t *from, uint32_t n)
 {
     for (uint32_t i = 0; i < n; i++)
@@ -179,18 +186,21 @@ struct evlcp_hello_request {
     uint32_t nonce; /* Random; the same nonce keeps the session. */
 };
 
-static inline void evlcp_hello_request_put(uint8_t *p, const struct evlcp_hello_request *m)
+static inline uint32_t evlcp_hello_request_put(uint8_t *p, const struct evlcp_hello_request *m)
 {
     evlcp_put8(p + 0, m->major);
     evlcp_put8(p + 1, m->minor);
     evlcp_put32(p + 2, m->nonce);
+    return 6u;
 }
 
-static inline void evlcp_hello_request_get(const uint8_t *p, struct evlcp_hello_request *m)
+static inline struct evlcp_hello_request evlcp_hello_request_get(const uint8_t *p)
 {
-    m->major = evlcp_get8(p + 0);
-    m->minor = evlcp_get8(p + 1);
-    m->nonce = evlcp_get32(p + 2);
+    struct evlcp_hello_request m = {0};
+    m.major = evlcp_get8(p + 0);
+    m.minor = evlcp_get8(p + 1);
+    m.nonce = evlcp_get32(p + 2);
+    return m;
 }
 
 #define EVLCP_HELLO_REPLY_BYTES 86u
@@ -224,7 +234,7 @@ struct evlcp_hello_reply {
     uint32_t chip_rate_min_hz; /* Slowest chip rate. */
 };
 
-static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_reply *m)
+static inline uint32_t evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_reply *m)
 {
     evlcp_put8(p + 0, m->major);
     evlcp_put8(p + 1, m->minor);
@@ -252,36 +262,39 @@ static inline void evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hello_re
     evlcp_copy(p + 76, m->key_name, 4u);
     evlcp_put16(p + 80, m->formats);
     evlcp_put32(p + 82, m->chip_rate_min_hz);
+    return 86u;
 }
 
-static inline void evlcp_hello_reply_get(const uint8_t *p, struct evlcp_hello_reply *m)
+static inline struct evlcp_hello_reply evlcp_hello_reply_get(const uint8_t *p)
 {
-    m->major = evlcp_get8(p + 0);
-    m->minor = evlcp_get8(p + 1);
-    m->session = evlcp_get16(p + 2);
-    m->version_major = evlcp_get8(p + 4);
-    m->version_minor = evlcp_get8(p + 5);
-    m->version_patch = evlcp_get8(p + 6);
-    m->window = evlcp_get8(p + 7);
-    m->max_payload = evlcp_get16(p + 8);
-    m->banks = evlcp_get8(p + 10);
-    m->bank_bytes = evlcp_get32(p + 11);
-    m->clusters = evlcp_get8(p + 15);
-    m->leds = evlcp_get16(p + 16);
-    m->tick_hz = evlcp_get32(p + 18);
-    m->chip_rate_max_hz = evlcp_get32(p + 22);
-    m->level_max_ma = evlcp_get16(p + 26);
-    m->mean_max_ma = evlcp_get16(p + 28);
-    m->burst_chips = evlcp_get16(p + 30);
-    m->capabilities = evlcp_get32(p + 32);
-    evlcp_copy(m->unique_id, p + 36, 12u);
-    m->uptime_ms = evlcp_get32(p + 48);
-    evlcp_copy(m->hal, p + 52, 12u);
-    m->clock_hz = evlcp_get32(p + 64);
-    evlcp_copy(m->challenge, p + 68, 8u);
-    evlcp_copy(m->key_name, p + 76, 4u);
-    m->formats = evlcp_get16(p + 80);
-    m->chip_rate_min_hz = evlcp_get32(p + 82);
+    struct evlcp_hello_reply m = {0};
+    m.major = evlcp_get8(p + 0);
+    m.minor = evlcp_get8(p + 1);
+    m.session = evlcp_get16(p + 2);
+    m.version_major = evlcp_get8(p + 4);
+    m.version_minor = evlcp_get8(p + 5);
+    m.version_patch = evlcp_get8(p + 6);
+    m.window = evlcp_get8(p + 7);
+    m.max_payload = evlcp_get16(p + 8);
+    m.banks = evlcp_get8(p + 10);
+    m.bank_bytes = evlcp_get32(p + 11);
+    m.clusters = evlcp_get8(p + 15);
+    m.leds = evlcp_get16(p + 16);
+    m.tick_hz = evlcp_get32(p + 18);
+    m.chip_rate_max_hz = evlcp_get32(p + 22);
+    m.level_max_ma = evlcp_get16(p + 26);
+    m.mean_max_ma = evlcp_get16(p + 28);
+    m.burst_chips = evlcp_get16(p + 30);
+    m.capabilities = evlcp_get32(p + 32);
+    evlcp_copy(m.unique_id, p + 36, 12u);
+    m.uptime_ms = evlcp_get32(p + 48);
+    evlcp_copy(m.hal, p + 52, 12u);
+    m.clock_hz = evlcp_get32(p + 64);
+    evlcp_copy(m.challenge, p + 68, 8u);
+    evlcp_copy(m.key_name, p + 76, 4u);
+    m.formats = evlcp_get16(p + 80);
+    m.chip_rate_min_hz = evlcp_get32(p + 82);
+    return m;
 }
 
 #define EVLCP_CONFIGURE_REQUEST_BYTES 12u
@@ -295,7 +308,7 @@ struct evlcp_configure_request {
     uint16_t duty_limit; /* Largest share of time that a LED is on from now on, permille; 0: as it is. */
 };
 
-static inline void evlcp_configure_request_put(uint8_t *p, const struct evlcp_configure_request *m)
+static inline uint32_t evlcp_configure_request_put(uint8_t *p, const struct evlcp_configure_request *m)
 {
     evlcp_put32(p + 0, m->chip_rate_hz);
     evlcp_put8(p + 4, m->profile);
@@ -303,16 +316,19 @@ static inline void evlcp_configure_request_put(uint8_t *p, const struct evlcp_co
     evlcp_put8(p + 7, m->pilot_every);
     evlcp_put16(p + 8, m->level_limit_ma);
     evlcp_put16(p + 10, m->duty_limit);
+    return 12u;
 }
 
-static inline void evlcp_configure_request_get(const uint8_t *p, struct evlcp_configure_request *m)
+static inline struct evlcp_configure_request evlcp_configure_request_get(const uint8_t *p)
 {
-    m->chip_rate_hz = evlcp_get32(p + 0);
-    m->profile = evlcp_get8(p + 4);
-    m->frames = evlcp_get16(p + 5);
-    m->pilot_every = evlcp_get8(p + 7);
-    m->level_limit_ma = evlcp_get16(p + 8);
-    m->duty_limit = evlcp_get16(p + 10);
+    struct evlcp_configure_request m = {0};
+    m.chip_rate_hz = evlcp_get32(p + 0);
+    m.profile = evlcp_get8(p + 4);
+    m.frames = evlcp_get16(p + 5);
+    m.pilot_every = evlcp_get8(p + 7);
+    m.level_limit_ma = evlcp_get16(p + 8);
+    m.duty_limit = evlcp_get16(p + 10);
+    return m;
 }
 
 #define EVLCP_CONFIGURE_REPLY_BYTES 8u
@@ -322,16 +338,19 @@ struct evlcp_configure_reply {
     uint32_t packet_chips; /* Length of a packet in chips. */
 };
 
-static inline void evlcp_configure_reply_put(uint8_t *p, const struct evlcp_configure_reply *m)
+static inline uint32_t evlcp_configure_reply_put(uint8_t *p, const struct evlcp_configure_reply *m)
 {
     evlcp_put32(p + 0, m->ticks_per_chip);
     evlcp_put32(p + 4, m->packet_chips);
+    return 8u;
 }
 
-static inline void evlcp_configure_reply_get(const uint8_t *p, struct evlcp_configure_reply *m)
+static inline struct evlcp_configure_reply evlcp_configure_reply_get(const uint8_t *p)
 {
-    m->ticks_per_chip = evlcp_get32(p + 0);
-    m->packet_chips = evlcp_get32(p + 4);
+    struct evlcp_configure_reply m = {0};
+    m.ticks_per_chip = evlcp_get32(p + 0);
+    m.packet_chips = evlcp_get32(p + 4);
+    return m;
 }
 
 #define EVLCP_CODEBOOK_REQUEST_BYTES 69u
@@ -343,22 +362,25 @@ struct evlcp_codebook_request {
     uint8_t digest[32]; /* SHA-256 of the codebook. */
 };
 
-static inline void evlcp_codebook_request_put(uint8_t *p, const struct evlcp_codebook_request *m)
+static inline uint32_t evlcp_codebook_request_put(uint8_t *p, const struct evlcp_codebook_request *m)
 {
     evlcp_put8(p + 0, m->preamble_chips);
     evlcp_put32(p + 1, m->preamble);
     for (uint32_t i = 0; i < 16u; i++)
         evlcp_put16(p + 5 + 2u * i, m->pilots[i]);
     evlcp_copy(p + 37, m->digest, 32u);
+    return 69u;
 }
 
-static inline void evlcp_codebook_request_get(const uint8_t *p, struct evlcp_codebook_request *m)
+static inline struct evlcp_codebook_request evlcp_codebook_request_get(const uint8_t *p)
 {
-    m->preamble_chips = evlcp_get8(p + 0);
-    m->preamble = evlcp_get32(p + 1);
+    struct evlcp_codebook_request m = {0};
+    m.preamble_chips = evlcp_get8(p + 0);
+    m.preamble = evlcp_get32(p + 1);
     for (uint32_t i = 0; i < 16u; i++)
-        m->pilots[i] = evlcp_get16(p + 5 + 2u * i);
-    evlcp_copy(m->digest, p + 37, 32u);
+        m.pilots[i] = evlcp_get16(p + 5 + 2u * i);
+    evlcp_copy(m.digest, p + 37, 32u);
+    return m;
 }
 
 #define EVLCP_CODEBOOK_REPLY_BYTES 0u
@@ -370,10 +392,12 @@ struct evlcp_write_request {
     uint32_t offset; /* First byte. */
 };
 
-static inline void evlcp_write_request_get(const uint8_t *p, struct evlcp_write_request *m)
+static inline struct evlcp_write_request evlcp_write_request_get(const uint8_t *p)
 {
-    m->bank = evlcp_get8(p + 0);
-    m->offset = evlcp_get32(p + 1);
+    struct evlcp_write_request m = {0};
+    m.bank = evlcp_get8(p + 0);
+    m.offset = evlcp_get32(p + 1);
+    return m;
 }
 
 #define EVLCP_WRITE_REPLY_BYTES 7u
@@ -384,11 +408,12 @@ struct evlcp_write_reply {
     uint16_t count; /* Bytes written. */
 };
 
-static inline void evlcp_write_reply_put(uint8_t *p, const struct evlcp_write_reply *m)
+static inline uint32_t evlcp_write_reply_put(uint8_t *p, const struct evlcp_write_reply *m)
 {
     evlcp_put8(p + 0, m->bank);
     evlcp_put32(p + 1, m->offset);
     evlcp_put16(p + 5, m->count);
+    return 7u;
 }
 
 #define EVLCP_READ_REQUEST_BYTES 7u
@@ -399,11 +424,13 @@ struct evlcp_read_request {
     uint16_t count; /* Bytes wanted. */
 };
 
-static inline void evlcp_read_request_get(const uint8_t *p, struct evlcp_read_request *m)
+static inline struct evlcp_read_request evlcp_read_request_get(const uint8_t *p)
 {
-    m->bank = evlcp_get8(p + 0);
-    m->offset = evlcp_get32(p + 1);
-    m->count = evlcp_get16(p + 5);
+    struct evlcp_read_request m = {0};
+    m.bank = evlcp_get8(p + 0);
+    m.offset = evlcp_get32(p + 1);
+    m.count = evlcp_get16(p + 5);
+    return m;
 }
 
 #define EVLCP_READ_REPLY_BYTES 5u
@@ -413,10 +440,11 @@ struct evlcp_read_reply {
     uint32_t offset; /* First byte. */
 };
 
-static inline void evlcp_read_reply_put(uint8_t *p, const struct evlcp_read_reply *m)
+static inline uint32_t evlcp_read_reply_put(uint8_t *p, const struct evlcp_read_reply *m)
 {
     evlcp_put8(p + 0, m->bank);
     evlcp_put32(p + 1, m->offset);
+    return 5u;
 }
 
 #define EVLCP_CRC_REQUEST_BYTES 9u
@@ -427,11 +455,13 @@ struct evlcp_crc_request {
     uint32_t length; /* Bytes. */
 };
 
-static inline void evlcp_crc_request_get(const uint8_t *p, struct evlcp_crc_request *m)
+static inline struct evlcp_crc_request evlcp_crc_request_get(const uint8_t *p)
 {
-    m->bank = evlcp_get8(p + 0);
-    m->offset = evlcp_get32(p + 1);
-    m->length = evlcp_get32(p + 5);
+    struct evlcp_crc_request m = {0};
+    m.bank = evlcp_get8(p + 0);
+    m.offset = evlcp_get32(p + 1);
+    m.length = evlcp_get32(p + 5);
+    return m;
 }
 
 #define EVLCP_CRC_REPLY_BYTES 4u
@@ -440,9 +470,10 @@ struct evlcp_crc_reply {
     uint32_t crc; /* CRC of the bytes. */
 };
 
-static inline void evlcp_crc_reply_put(uint8_t *p, const struct evlcp_crc_reply *m)
+static inline uint32_t evlcp_crc_reply_put(uint8_t *p, const struct evlcp_crc_reply *m)
 {
     evlcp_put32(p + 0, m->crc);
+    return 4u;
 }
 
 #define EVLCP_COMMIT_REQUEST_BYTES 44u
@@ -456,7 +487,7 @@ struct evlcp_commit_request {
     uint8_t digest[32]; /* Digest of the codebook the content was made with. */
 };
 
-static inline void evlcp_commit_request_put(uint8_t *p, const struct evlcp_commit_request *m)
+static inline uint32_t evlcp_commit_request_put(uint8_t *p, const struct evlcp_commit_request *m)
 {
     evlcp_put8(p + 0, m->bank);
     evlcp_put8(p + 1, m->format);
@@ -464,16 +495,19 @@ static inline void evlcp_commit_request_put(uint8_t *p, const struct evlcp_commi
     evlcp_put32(p + 4, m->length);
     evlcp_put32(p + 8, m->crc);
     evlcp_copy(p + 12, m->digest, 32u);
+    return 44u;
 }
 
-static inline void evlcp_commit_request_get(const uint8_t *p, struct evlcp_commit_request *m)
+static inline struct evlcp_commit_request evlcp_commit_request_get(const uint8_t *p)
 {
-    m->bank = evlcp_get8(p + 0);
-    m->format = evlcp_get8(p + 1);
-    m->packets = evlcp_get16(p + 2);
-    m->length = evlcp_get32(p + 4);
-    m->crc = evlcp_get32(p + 8);
-    evlcp_copy(m->digest, p + 12, 32u);
+    struct evlcp_commit_request m = {0};
+    m.bank = evlcp_get8(p + 0);
+    m.format = evlcp_get8(p + 1);
+    m.packets = evlcp_get16(p + 2);
+    m.length = evlcp_get32(p + 4);
+    m.crc = evlcp_get32(p + 8);
+    evlcp_copy(m.digest, p + 12, 32u);
+    return m;
 }
 
 #define EVLCP_COMMIT_REPLY_BYTES 4u
@@ -482,14 +516,17 @@ struct evlcp_commit_reply {
     uint32_t commits; /* Commits accepted since reset. */
 };
 
-static inline void evlcp_commit_reply_put(uint8_t *p, const struct evlcp_commit_reply *m)
+static inline uint32_t evlcp_commit_reply_put(uint8_t *p, const struct evlcp_commit_reply *m)
 {
     evlcp_put32(p + 0, m->commits);
+    return 4u;
 }
 
-static inline void evlcp_commit_reply_get(const uint8_t *p, struct evlcp_commit_reply *m)
+static inline struct evlcp_commit_reply evlcp_commit_reply_get(const uint8_t *p)
 {
-    m->commits = evlcp_get32(p + 0);
+    struct evlcp_commit_reply m = {0};
+    m.commits = evlcp_get32(p + 0);
+    return m;
 }
 
 #define EVLCP_START_REQUEST_BYTES 10u
@@ -500,11 +537,13 @@ struct evlcp_start_request {
     uint32_t at_clock; /* Without a pulse: begin when STATUS's clock stands here; 0: at once. */
 };
 
-static inline void evlcp_start_request_get(const uint8_t *p, struct evlcp_start_request *m)
+static inline struct evlcp_start_request evlcp_start_request_get(const uint8_t *p)
 {
-    m->at_pulse = evlcp_get32(p + 0);
-    m->pulse_hz = evlcp_get16(p + 4);
-    m->at_clock = evlcp_get32(p + 6);
+    struct evlcp_start_request m = {0};
+    m.at_pulse = evlcp_get32(p + 0);
+    m.pulse_hz = evlcp_get16(p + 4);
+    m.at_clock = evlcp_get32(p + 6);
+    return m;
 }
 
 #define EVLCP_START_REPLY_BYTES 0u
@@ -523,9 +562,11 @@ struct evlcp_level_request {
     uint16_t level_ma; /* LED current, mA. */
 };
 
-static inline void evlcp_level_request_get(const uint8_t *p, struct evlcp_level_request *m)
+static inline struct evlcp_level_request evlcp_level_request_get(const uint8_t *p)
 {
-    m->level_ma = evlcp_get16(p + 0);
+    struct evlcp_level_request m = {0};
+    m.level_ma = evlcp_get16(p + 0);
+    return m;
 }
 
 #define EVLCP_LEVEL_REPLY_BYTES 0u
@@ -576,7 +617,7 @@ struct evlcp_status_reply {
     uint8_t clusters; /* Clusters of the active bank's masks; 0 without these. */
 };
 
-static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_reply *m)
+static inline uint32_t evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_reply *m)
 {
     evlcp_put8(p + 0, m->state);
     evlcp_put16(p + 1, m->faults);
@@ -617,49 +658,52 @@ static inline void evlcp_status_reply_put(uint8_t *p, const struct evlcp_status_
     evlcp_put32(p + 143, m->packet_chips);
     evlcp_put8(p + 147, m->hold);
     evlcp_put8(p + 148, m->clusters);
+    return 149u;
 }
 
-static inline void evlcp_status_reply_get(const uint8_t *p, struct evlcp_status_reply *m)
+static inline struct evlcp_status_reply evlcp_status_reply_get(const uint8_t *p)
 {
-    m->state = evlcp_get8(p + 0);
-    m->faults = evlcp_get16(p + 1);
-    m->active_bank = evlcp_get8(p + 3);
-    m->pending_bank = evlcp_get8(p + 4);
-    m->format = evlcp_get8(p + 5);
-    m->profile = evlcp_get8(p + 6);
-    m->frames = evlcp_get16(p + 7);
-    m->pilot_every = evlcp_get8(p + 9);
-    m->packets = evlcp_get16(p + 10);
-    m->length = evlcp_get32(p + 12);
-    m->crc = evlcp_get32(p + 16);
-    m->chip_rate_hz = evlcp_get32(p + 20);
-    m->commits = evlcp_get32(p + 24);
-    m->packets_sent = evlcp_get32(p + 28);
-    m->chips_sent = evlcp_get32(p + 32);
-    m->lateness_ticks = evlcp_get32(p + 36);
-    m->lateness_max_ticks = evlcp_get32(p + 40);
-    m->crc_errors = evlcp_get32(p + 44);
-    m->framing_errors = evlcp_get32(p + 48);
-    m->overflow_errors = evlcp_get32(p + 52);
-    m->requests = evlcp_get32(p + 56);
-    m->level_ma = evlcp_get16(p + 60);
-    m->level_limit_ma = evlcp_get16(p + 62);
-    m->duty_limit = evlcp_get16(p + 64);
-    m->duty = evlcp_get16(p + 66);
-    m->temperature_dc = (int16_t)evlcp_get16(p + 68);
-    evlcp_copy(m->open_leds, p + 70, 12u);
-    m->watchdog = evlcp_get8(p + 82);
-    m->watchdog_ms = evlcp_get32(p + 83);
-    m->silence_ms = evlcp_get32(p + 87);
-    m->uptime_ms = evlcp_get32(p + 91);
-    evlcp_copy(m->digest, p + 95, 32u);
-    m->underruns = evlcp_get32(p + 127);
-    m->clock = evlcp_get32(p + 131);
-    m->pulses = evlcp_get32(p + 135);
-    m->pulse_clocks = evlcp_get32(p + 139);
-    m->packet_chips = evlcp_get32(p + 143);
-    m->hold = evlcp_get8(p + 147);
-    m->clusters = evlcp_get8(p + 148);
+    struct evlcp_status_reply m = {0};
+    m.state = evlcp_get8(p + 0);
+    m.faults = evlcp_get16(p + 1);
+    m.active_bank = evlcp_get8(p + 3);
+    m.pending_bank = evlcp_get8(p + 4);
+    m.format = evlcp_get8(p + 5);
+    m.profile = evlcp_get8(p + 6);
+    m.frames = evlcp_get16(p + 7);
+    m.pilot_every = evlcp_get8(p + 9);
+    m.packets = evlcp_get16(p + 10);
+    m.length = evlcp_get32(p + 12);
+    m.crc = evlcp_get32(p + 16);
+    m.chip_rate_hz = evlcp_get32(p + 20);
+    m.commits = evlcp_get32(p + 24);
+    m.packets_sent = evlcp_get32(p + 28);
+    m.chips_sent = evlcp_get32(p + 32);
+    m.lateness_ticks = evlcp_get32(p + 36);
+    m.lateness_max_ticks = evlcp_get32(p + 40);
+    m.crc_errors = evlcp_get32(p + 44);
+    m.framing_errors = evlcp_get32(p + 48);
+    m.overflow_errors = evlcp_get32(p + 52);
+    m.requests = evlcp_get32(p + 56);
+    m.level_ma = evlcp_get16(p + 60);
+    m.level_limit_ma = evlcp_get16(p + 62);
+    m.duty_limit = evlcp_get16(p + 64);
+    m.duty = evlcp_get16(p + 66);
+    m.temperature_dc = (int16_t)evlcp_get16(p + 68);
+    evlcp_copy(m.open_leds, p + 70, 12u);
+    m.watchdog = evlcp_get8(p + 82);
+    m.watchdog_ms = evlcp_get32(p + 83);
+    m.silence_ms = evlcp_get32(p + 87);
+    m.uptime_ms = evlcp_get32(p + 91);
+    evlcp_copy(m.digest, p + 95, 32u);
+    m.underruns = evlcp_get32(p + 127);
+    m.clock = evlcp_get32(p + 131);
+    m.pulses = evlcp_get32(p + 135);
+    m.pulse_clocks = evlcp_get32(p + 139);
+    m.packet_chips = evlcp_get32(p + 143);
+    m.hold = evlcp_get8(p + 147);
+    m.clusters = evlcp_get8(p + 148);
+    return m;
 }
 
 #define EVLCP_WATCHDOG_REQUEST_BYTES 5u
@@ -669,16 +713,19 @@ struct evlcp_watchdog_request {
     uint32_t timeout_ms; /* Silence before it acts, at least 100 ms. */
 };
 
-static inline void evlcp_watchdog_request_put(uint8_t *p, const struct evlcp_watchdog_request *m)
+static inline uint32_t evlcp_watchdog_request_put(uint8_t *p, const struct evlcp_watchdog_request *m)
 {
     evlcp_put8(p + 0, m->action);
     evlcp_put32(p + 1, m->timeout_ms);
+    return 5u;
 }
 
-static inline void evlcp_watchdog_request_get(const uint8_t *p, struct evlcp_watchdog_request *m)
+static inline struct evlcp_watchdog_request evlcp_watchdog_request_get(const uint8_t *p)
 {
-    m->action = evlcp_get8(p + 0);
-    m->timeout_ms = evlcp_get32(p + 1);
+    struct evlcp_watchdog_request m = {0};
+    m.action = evlcp_get8(p + 0);
+    m.timeout_ms = evlcp_get32(p + 1);
+    return m;
 }
 
 #define EVLCP_WATCHDOG_REPLY_BYTES 0u
@@ -689,9 +736,11 @@ struct evlcp_save_request {
     uint8_t autostart; /* 1: recall and play after a reset. */
 };
 
-static inline void evlcp_save_request_get(const uint8_t *p, struct evlcp_save_request *m)
+static inline struct evlcp_save_request evlcp_save_request_get(const uint8_t *p)
 {
-    m->autostart = evlcp_get8(p + 0);
+    struct evlcp_save_request m = {0};
+    m.autostart = evlcp_get8(p + 0);
+    return m;
 }
 
 #define EVLCP_SAVE_REPLY_BYTES 5u
@@ -701,10 +750,11 @@ struct evlcp_save_reply {
     uint32_t save_sequence; /* Its sequence number. */
 };
 
-static inline void evlcp_save_reply_put(uint8_t *p, const struct evlcp_save_reply *m)
+static inline uint32_t evlcp_save_reply_put(uint8_t *p, const struct evlcp_save_reply *m)
 {
     evlcp_put8(p + 0, m->slot);
     evlcp_put32(p + 1, m->save_sequence);
+    return 5u;
 }
 
 #define EVLCP_RECALL_REQUEST_BYTES 0u
@@ -716,10 +766,11 @@ struct evlcp_recall_reply {
     uint32_t save_sequence; /* Its sequence number. */
 };
 
-static inline void evlcp_recall_reply_put(uint8_t *p, const struct evlcp_recall_reply *m)
+static inline uint32_t evlcp_recall_reply_put(uint8_t *p, const struct evlcp_recall_reply *m)
 {
     evlcp_put8(p + 0, m->slot);
     evlcp_put32(p + 1, m->save_sequence);
+    return 5u;
 }
 
 #define EVLCP_LED_TEST_REQUEST_BYTES 4u
@@ -730,18 +781,21 @@ struct evlcp_led_test_request {
     uint16_t dwell_ms; /* Time a LED is on, at least 1 ms. */
 };
 
-static inline void evlcp_led_test_request_put(uint8_t *p, const struct evlcp_led_test_request *m)
+static inline uint32_t evlcp_led_test_request_put(uint8_t *p, const struct evlcp_led_test_request *m)
 {
     evlcp_put8(p + 0, m->first);
     evlcp_put8(p + 1, m->last);
     evlcp_put16(p + 2, m->dwell_ms);
+    return 4u;
 }
 
-static inline void evlcp_led_test_request_get(const uint8_t *p, struct evlcp_led_test_request *m)
+static inline struct evlcp_led_test_request evlcp_led_test_request_get(const uint8_t *p)
 {
-    m->first = evlcp_get8(p + 0);
-    m->last = evlcp_get8(p + 1);
-    m->dwell_ms = evlcp_get16(p + 2);
+    struct evlcp_led_test_request m = {0};
+    m.first = evlcp_get8(p + 0);
+    m.last = evlcp_get8(p + 1);
+    m.dwell_ms = evlcp_get16(p + 2);
+    return m;
 }
 
 #define EVLCP_LED_TEST_REPLY_BYTES 0u
@@ -754,11 +808,13 @@ struct evlcp_stream_request {
     uint8_t digest[32]; /* Digest of the codebook that packets are made with. */
 };
 
-static inline void evlcp_stream_request_get(const uint8_t *p, struct evlcp_stream_request *m)
+static inline struct evlcp_stream_request evlcp_stream_request_get(const uint8_t *p)
 {
-    m->bank = evlcp_get8(p + 0);
-    m->format = evlcp_get8(p + 1);
-    evlcp_copy(m->digest, p + 2, 32u);
+    struct evlcp_stream_request m = {0};
+    m.bank = evlcp_get8(p + 0);
+    m.format = evlcp_get8(p + 1);
+    evlcp_copy(m.digest, p + 2, 32u);
+    return m;
 }
 
 #define EVLCP_STREAM_REPLY_BYTES 2u
@@ -767,9 +823,10 @@ struct evlcp_stream_reply {
     uint16_t slots; /* Packets that the queue holds, the one that plays among them. */
 };
 
-static inline void evlcp_stream_reply_put(uint8_t *p, const struct evlcp_stream_reply *m)
+static inline uint32_t evlcp_stream_reply_put(uint8_t *p, const struct evlcp_stream_reply *m)
 {
     evlcp_put16(p + 0, m->slots);
+    return 2u;
 }
 
 #define EVLCP_PUSH_REQUEST_BYTES 8u
@@ -781,12 +838,14 @@ struct evlcp_push_request {
     uint8_t last; /* 1: no further packet comes, dark after what is there; 0: playing goes on. */
 };
 
-static inline void evlcp_push_request_get(const uint8_t *p, struct evlcp_push_request *m)
+static inline struct evlcp_push_request evlcp_push_request_get(const uint8_t *p)
 {
-    m->bank = evlcp_get8(p + 0);
-    m->number = evlcp_get32(p + 1);
-    m->offset = evlcp_get16(p + 5);
-    m->last = evlcp_get8(p + 7);
+    struct evlcp_push_request m = {0};
+    m.bank = evlcp_get8(p + 0);
+    m.number = evlcp_get32(p + 1);
+    m.offset = evlcp_get16(p + 5);
+    m.last = evlcp_get8(p + 7);
+    return m;
 }
 
 #define EVLCP_PUSH_REPLY_BYTES 14u
@@ -798,12 +857,13 @@ struct evlcp_push_reply {
     uint32_t underruns; /* How often the queue was empty before its end was announced. */
 };
 
-static inline void evlcp_push_reply_put(uint8_t *p, const struct evlcp_push_reply *m)
+static inline uint32_t evlcp_push_reply_put(uint8_t *p, const struct evlcp_push_reply *m)
 {
     evlcp_put32(p + 0, m->number);
     evlcp_put16(p + 4, m->offset);
     evlcp_put32(p + 6, m->begun);
     evlcp_put32(p + 10, m->underruns);
+    return 14u;
 }
 
 #define EVLCP_KEY_REQUEST_BYTES 16u
@@ -812,9 +872,11 @@ struct evlcp_key_request {
     uint8_t key[16]; /* The key; zeros for none. */
 };
 
-static inline void evlcp_key_request_get(const uint8_t *p, struct evlcp_key_request *m)
+static inline struct evlcp_key_request evlcp_key_request_get(const uint8_t *p)
 {
-    evlcp_copy(m->key, p + 0, 16u);
+    struct evlcp_key_request m = {0};
+    evlcp_copy(m.key, p + 0, 16u);
+    return m;
 }
 
 #define EVLCP_KEY_REPLY_BYTES 0u
@@ -828,20 +890,23 @@ struct evlcp_chips_request {
     uint8_t digest[32]; /* SHA-256 of what chips mean, which COMMIT repeats. */
 };
 
-static inline void evlcp_chips_request_put(uint8_t *p, const struct evlcp_chips_request *m)
+static inline uint32_t evlcp_chips_request_put(uint8_t *p, const struct evlcp_chips_request *m)
 {
     evlcp_put32(p + 0, m->packet_chips);
     evlcp_put8(p + 4, m->hold);
     evlcp_put8(p + 5, m->clusters);
     evlcp_copy(p + 6, m->digest, 32u);
+    return 38u;
 }
 
-static inline void evlcp_chips_request_get(const uint8_t *p, struct evlcp_chips_request *m)
+static inline struct evlcp_chips_request evlcp_chips_request_get(const uint8_t *p)
 {
-    m->packet_chips = evlcp_get32(p + 0);
-    m->hold = evlcp_get8(p + 4);
-    m->clusters = evlcp_get8(p + 5);
-    evlcp_copy(m->digest, p + 6, 32u);
+    struct evlcp_chips_request m = {0};
+    m.packet_chips = evlcp_get32(p + 0);
+    m.hold = evlcp_get8(p + 4);
+    m.clusters = evlcp_get8(p + 5);
+    evlcp_copy(m.digest, p + 6, 32u);
+    return m;
 }
 
 #define EVLCP_CHIPS_REPLY_BYTES 0u
@@ -859,7 +924,7 @@ struct evlcp_update_status_reply {
     uint8_t target[16]; /* What the board is, ASCII, zero-padded: part and crystal. */
 };
 
-static inline void evlcp_update_status_reply_put(uint8_t *p, const struct evlcp_update_status_reply *m)
+static inline uint32_t evlcp_update_status_reply_put(uint8_t *p, const struct evlcp_update_status_reply *m)
 {
     evlcp_put8(p + 0, m->running);
     evlcp_put8(p + 1, m->trial);
@@ -867,6 +932,7 @@ static inline void evlcp_update_status_reply_put(uint8_t *p, const struct evlcp_
     evlcp_put32(p + 3, m->capacity);
     evlcp_put32(p + 7, m->sequence);
     evlcp_copy(p + 11, m->target, 16u);
+    return 27u;
 }
 
 #define EVLCP_UPDATE_BEGIN_REQUEST_BYTES 9u
@@ -877,11 +943,13 @@ struct evlcp_update_begin_request {
     uint32_t crc; /* Their CRC-32/ISO-HDLC. */
 };
 
-static inline void evlcp_update_begin_request_get(const uint8_t *p, struct evlcp_update_begin_request *m)
+static inline struct evlcp_update_begin_request evlcp_update_begin_request_get(const uint8_t *p)
 {
-    m->image = evlcp_get8(p + 0);
-    m->length = evlcp_get32(p + 1);
-    m->crc = evlcp_get32(p + 5);
+    struct evlcp_update_begin_request m = {0};
+    m.image = evlcp_get8(p + 0);
+    m.length = evlcp_get32(p + 1);
+    m.crc = evlcp_get32(p + 5);
+    return m;
 }
 
 #define EVLCP_UPDATE_BEGIN_REPLY_BYTES 0u
@@ -892,9 +960,11 @@ struct evlcp_update_write_request {
     uint32_t offset; /* First byte, a multiple of four. */
 };
 
-static inline void evlcp_update_write_request_get(const uint8_t *p, struct evlcp_update_write_request *m)
+static inline struct evlcp_update_write_request evlcp_update_write_request_get(const uint8_t *p)
 {
-    m->offset = evlcp_get32(p + 0);
+    struct evlcp_update_write_request m = {0};
+    m.offset = evlcp_get32(p + 0);
+    return m;
 }
 
 #define EVLCP_UPDATE_WRITE_REPLY_BYTES 6u
@@ -904,10 +974,11 @@ struct evlcp_update_write_reply {
     uint16_t count; /* Bytes written. */
 };
 
-static inline void evlcp_update_write_reply_put(uint8_t *p, const struct evlcp_update_write_reply *m)
+static inline uint32_t evlcp_update_write_reply_put(uint8_t *p, const struct evlcp_update_write_reply *m)
 {
     evlcp_put32(p + 0, m->offset);
     evlcp_put16(p + 4, m->count);
+    return 6u;
 }
 
 #define EVLCP_UPDATE_COMMIT_REQUEST_BYTES 0u
@@ -918,9 +989,10 @@ struct evlcp_update_commit_reply {
     uint32_t sequence; /* Number of this update. */
 };
 
-static inline void evlcp_update_commit_reply_put(uint8_t *p, const struct evlcp_update_commit_reply *m)
+static inline uint32_t evlcp_update_commit_reply_put(uint8_t *p, const struct evlcp_update_commit_reply *m)
 {
     evlcp_put32(p + 0, m->sequence);
+    return 4u;
 }
 
 #define EVLCP_UPDATE_RESTART_REQUEST_BYTES 0u
@@ -933,34 +1005,34 @@ static inline void evlcp_update_commit_reply_put(uint8_t *p, const struct evlcp_
 
 #define EVLCP_REQUEST_MOST 69u /* longest request, data left out */
 
-/* Requests: type, whether control, whether a query, whether any length may follow, and the length,
+/* Requests: name, type, whether control, whether a query, whether any length may follow, and the length,
    that of the first minor version and today's; a shorter one goes on with zeros. */
-#define EVLCP_SHAPES \
-    {0x01u, false, false, true, 6u, 6u}, \
-    {0x02u, true, false, false, 12u, 12u}, \
-    {0x03u, true, false, false, 69u, 69u}, \
-    {0x04u, false, false, true, 5u, 5u}, \
-    {0x05u, false, true, false, 7u, 7u}, \
-    {0x06u, false, true, false, 9u, 9u}, \
-    {0x07u, true, false, false, 44u, 44u}, \
-    {0x08u, true, false, false, 0u, 10u}, \
-    {0x09u, true, false, false, 0u, 0u}, \
-    {0x0au, true, false, false, 0u, 0u}, \
-    {0x0bu, true, false, false, 2u, 2u}, \
-    {0x0cu, false, true, false, 0u, 0u}, \
-    {0x0du, true, false, false, 5u, 5u}, \
-    {0x0eu, true, false, false, 1u, 1u}, \
-    {0x0fu, true, false, false, 0u, 0u}, \
-    {0x10u, true, false, false, 4u, 4u}, \
-    {0x18u, true, false, false, 34u, 34u}, \
-    {0x19u, false, false, true, 8u, 8u}, \
-    {0x1au, true, false, false, 16u, 16u}, \
-    {0x1bu, true, false, false, 38u, 38u}, \
-    {0x20u, false, true, false, 0u, 0u}, \
-    {0x21u, true, false, false, 9u, 9u}, \
-    {0x22u, false, false, true, 4u, 4u}, \
-    {0x23u, true, false, false, 0u, 0u}, \
-    {0x24u, true, false, false, 0u, 0u}, \
-    {0x25u, true, false, false, 0u, 0u}
+#define EVLCP_REQUESTS(X) \
+    X(hello, 0x01u, false, false, true, 6u, 6u) \
+    X(configure, 0x02u, true, false, false, 12u, 12u) \
+    X(codebook, 0x03u, true, false, false, 69u, 69u) \
+    X(write, 0x04u, false, false, true, 5u, 5u) \
+    X(read, 0x05u, false, true, false, 7u, 7u) \
+    X(crc, 0x06u, false, true, false, 9u, 9u) \
+    X(commit, 0x07u, true, false, false, 44u, 44u) \
+    X(start, 0x08u, true, false, false, 0u, 10u) \
+    X(stop, 0x09u, true, false, false, 0u, 0u) \
+    X(blank, 0x0au, true, false, false, 0u, 0u) \
+    X(level, 0x0bu, true, false, false, 2u, 2u) \
+    X(status, 0x0cu, false, true, false, 0u, 0u) \
+    X(watchdog, 0x0du, true, false, false, 5u, 5u) \
+    X(save, 0x0eu, true, false, false, 1u, 1u) \
+    X(recall, 0x0fu, true, false, false, 0u, 0u) \
+    X(led_test, 0x10u, true, false, false, 4u, 4u) \
+    X(stream, 0x18u, true, false, false, 34u, 34u) \
+    X(push, 0x19u, false, false, true, 8u, 8u) \
+    X(key, 0x1au, true, false, false, 16u, 16u) \
+    X(chips, 0x1bu, true, false, false, 38u, 38u) \
+    X(update_status, 0x20u, false, true, false, 0u, 0u) \
+    X(update_begin, 0x21u, true, false, false, 9u, 9u) \
+    X(update_write, 0x22u, false, false, true, 4u, 4u) \
+    X(update_commit, 0x23u, true, false, false, 0u, 0u) \
+    X(update_restart, 0x24u, true, false, false, 0u, 0u) \
+    X(update_confirm, 0x25u, true, false, false, 0u, 0u)
 
 #endif

@@ -86,20 +86,16 @@ static void say_hello(struct host *h, uint32_t nonce)
 {
     uint8_t payload[EVLCP_HELLO_REQUEST_BYTES];
     const struct evlcp_hello_request request = {.major = EVLCP_PROTOCOL_MAJOR, .minor = EVLCP_PROTOCOL_MINOR, .nonce = nonce};
-    struct evlcp_hello_reply reply;
     evlcp_hello_request_put(payload, &request);
     EXPECT(exchange(h, EVLCP_TYPE_HELLO, ++h->sequence, EVLCP_NO_SESSION, payload, sizeof payload));
     EXPECT(h->status == EVLCP_STATUS_OK && h->length == EVLCP_HELLO_REPLY_BYTES);
-    evlcp_hello_reply_get(h->payload, &reply);
-    h->session = reply.session;
+    h->session = evlcp_hello_reply_get(h->payload).session;
 }
 
 static struct evlcp_status_reply ask_status(struct host *h)
 {
-    struct evlcp_status_reply reply = {0};
     EXPECT(ask(h, EVLCP_TYPE_STATUS, NULL, 0) == EVLCP_STATUS_OK);
-    evlcp_status_reply_get(h->payload, &reply);
-    return reply;
+    return evlcp_status_reply_get(h->payload);
 }
 
 /* Write `count` bytes of a pattern into a bank; returns their CRC. */
