@@ -7,17 +7,11 @@ long, so that no stage sees one and floating point is as fine late on a clock as
 
 from bisect import bisect_right
 from collections import deque
-from typing import TYPE_CHECKING
 
 import numpy as np
 
-from evlcp_sdk.late import Late
+from evlcp_sdk import _kernels
 from evlcp_sdk.values import Events
-
-if TYPE_CHECKING:
-    from evlcp_sdk import _kernels
-else:
-    _kernels = Late("evlcp_sdk._kernels")
 
 LEAP_US = 1_000_000
 """The longest pause that is believed at once: what was seen before a longer one is forgotten anyway."""

@@ -9,9 +9,8 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from functools import wraps
 from pathlib import Path
+from threading import RLock
 from typing import Any, TypeVar, overload
-
-import numba
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -84,6 +83,46 @@ COMPILING = Compiling()
 """Of this process."""
 
 
+class _Kernel:
+    """Stands in a module for a kernel, until one of them is called: only then Numba is imported.
+
+    All of that module are made then, as one may call another.
+    """
+
+    def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
+        self._function, self._options, self._made = function, options, None
+
+    def __call__(self, *args: Any) -> Any:
+        return self.made()(*args)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.made(), name)
+
+    def made(self) -> Any:
+        with _MAKING:
+            if self._made is None:
+                self._made = _compiled(self._function, self._options)
+                names = self._function.__globals__
+                names |= {n: one.made() for n, one in names.items() if isinstance(one, _Kernel)}
+        return self._made
+
+
+_MAKING = RLock()
+
+
+def _compiled(function: Callable[..., Any], options: dict[str, Any]) -> Any:
+    import numba
+
+    kernel = numba.njit(**options)(function)
+    # Numba finds no folder: RuntimeError.
+    with suppress(RuntimeError):
+        kernel.enable_caching()
+        if shutil.disk_usage(kernel.stats.cache_path).free < _ROOM_BYTES:
+            kernel = numba.njit(**options)(function)
+    kernel.compile = COMPILING.watched(kernel)
+    return kernel
+
+
 @overload
 def njit(function: F, /) -> F: ...
 
@@ -102,29 +141,19 @@ def njit(function: Any = None, /, **options: Any) -> Any:
         options: Others of `numba.njit`.
     """
     chosen: dict[str, Any] = {"nogil": True, "error_model": "numpy"} | options
-
-    def compile_(given: Callable[..., Any]) -> Any:
-        kernel = numba.njit(**chosen)(given)
-        # Numba finds no folder: RuntimeError.
-        with suppress(RuntimeError):
-            kernel.enable_caching()
-            if shutil.disk_usage(kernel.stats.cache_path).free < _ROOM_BYTES:
-                kernel = numba.njit(**chosen)(given)
-        kernel.compile = COMPILING.watched(kernel)
-        return kernel
-
-    return compile_ if function is None else compile_(function)
+    return (lambda given: _Kernel(given, chosen)) if function is None else _Kernel(function, chosen)
 
 
 def _all_kernels() -> Iterator[Any]:
-    """All that have been imported."""
+    """All of modules of which one has been called."""
     for name, module in list(sys.modules.items()):
         if name.endswith("_kernels"):
-            yield from (kernel for kernel in vars(module).values() if hasattr(kernel, "py_func"))
+            made = (one for one in list(vars(module).values()) if not isinstance(one, _Kernel))
+            yield from (one for one in made if hasattr(one, "py_func"))
 
 
 def count_imported() -> int:
-    """How many kernels this process has imported; most of them will be called."""
+    """How many kernels this process has made; most of them will be called."""
     return sum(1 for _ in _all_kernels())
 
 
@@ -134,5 +163,5 @@ def count_compiled() -> int:
 
 
 def find_cache_folder() -> Path | None:
-    """The folder of the kernels imported first; None where none can be written."""
+    """The folder of the kernels made first; None where none can be written."""
     return next((Path(k.stats.cache_path) for k in _all_kernels() if k.stats.cache_path is not None), None)

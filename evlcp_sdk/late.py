@@ -1,4 +1,4 @@
-"""Modules that are imported when something of them is used: those of kernels, as of numba, and SciPy."""
+"""Modules that are imported when something of them is used: formats, and SciPy."""
 
 from importlib import import_module
 from typing import Any

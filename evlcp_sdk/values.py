@@ -9,20 +9,15 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk import _kernels
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message
 from evlcp_sdk.air.kinds import MessageKind
 from evlcp_sdk.errors import ConfigError, StreamError
-from evlcp_sdk.late import Late
 
 if TYPE_CHECKING:
     import pandas
     import pyarrow
-
-if TYPE_CHECKING:
-    from evlcp_sdk import _kernels
-else:
-    _kernels = Late("evlcp_sdk._kernels")
 
 __all__ = [
     "Alternative",

@@ -3,26 +3,20 @@
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.detection import MARGIN_PX
 from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
 from evlcp_sdk.rx.rhythm import columns_of
 from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 _LEAST_CLUSTERS = 0.5
 """Share of the clusters that must be in their place in a frame: fewer may be another bar's."""

@@ -8,18 +8,12 @@ its rows wait for one another: 20 us from end to end at 50 m, 90 us at 16 m.
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.values import Events, SyncLock, changed
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 _STEPS = 10
 """Steps of a chip in which the response of a block of rows is placed."""

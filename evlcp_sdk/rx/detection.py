@@ -4,14 +4,14 @@ import math
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.followed import SAME_PX, Followed, Piece, same_place
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.places import Places, region_of
@@ -19,11 +19,6 @@ from evlcp_sdk.rx.rhythm import Rhythm, select
 from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 MARGIN_PX = 5
 """Seam around a region: how far it may move in a step, 1.5 px/ms and more, and how far it is blurred."""

@@ -1,17 +1,10 @@
 """How far a frame's symbols are believed: one measure for every decoding."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.values import PresenceMap, SoftSymbols
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 _FRAME_WORTH = 6.0
 """LLRs of a cluster that those of all its frame are worth: light and shaking are much the same for all,

@@ -2,18 +2,12 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.values import PresenceMap, changed
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 _LEAST_SPACING_PX = 1.0
 """A placement that puts neighbours into one pixel would fit anything."""

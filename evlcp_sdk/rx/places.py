@@ -1,18 +1,12 @@
 """Where a region was over time: columns of numbers, as each frame asks for them, and may move them all."""
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.values import Region
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 _MOST_AHEAD_STEPS = 2
 """Steps beyond the measured centres for which a region goes straight on, before a shaking camera turns."""

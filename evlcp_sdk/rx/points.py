@@ -2,19 +2,13 @@
 
 import math
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.placement import Layout, Placement
 from evlcp_sdk.values import PresenceMap
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 FindPoints = Callable[
     [PresenceMap, Placement, NDArray[np.int16]], tuple[NDArray[np.float64], NDArray[np.float64], float]

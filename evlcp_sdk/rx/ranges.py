@@ -2,19 +2,13 @@
 
 import math
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import Bend, Range
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 _MEMORY_S = 0.3
 """Distances that are looked back on: a bicycle's swerve or a brake changes the acceleration in no less."""

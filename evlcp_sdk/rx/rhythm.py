@@ -23,18 +23,12 @@ opened by rises only that come soon after the one before. One pass, four bytes a
 
 import math
 from itertools import pairwise
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.values import Events, plain
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx import _kernels
-else:
-    _kernels = Late("evlcp_sdk.rx._kernels")
 
 _MOST_SCORE = 40
 """Scores rise no further: what has blinked in rhythm for long is forgotten after so many rises off it."""
@@ -236,7 +230,7 @@ class Rhythm:
         self._row = (self._row + many) % height
 
 
-def columns_of(events: Events, first: int = 0) -> "_kernels.Columns":
+def columns_of(events: Events, first: int = 0) -> _kernels.Columns:
     """The columns of events from one on, as kernels take them."""
     return (
         plain(events.t_us[first:]),

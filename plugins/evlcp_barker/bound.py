@@ -1,19 +1,13 @@
 """From which correlation on events are a preamble: by what its codebook's codes make of a pixel's answers."""
 
 from functools import lru_cache
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_barker import _kernels
 from evlcp_sdk.air.codebook import Codebook, are_pairs, edges_of_chips
 from evlcp_sdk.air.frames import packet_chips
-from evlcp_sdk.late import Late
-
-if TYPE_CHECKING:
-    from evlcp_barker import _kernels
-else:
-    _kernels = Late("evlcp_barker._kernels")
 
 _HALF = 0.5
 """Of the events of a preamble half agree with it and are its own, at the least: what is missing, other light

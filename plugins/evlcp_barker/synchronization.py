@@ -2,25 +2,20 @@
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from evlcp_barker import _kernels
 from evlcp_barker.bound import due_chips, guard_chips, least_correlation
 from evlcp_barker.preamble import find_peaks, time_preamble
 from evlcp_sdk.air.codebook import Codebook, are_pairs
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Synchronization
 from evlcp_sdk.values import SyncLock, changed, plain
-
-if TYPE_CHECKING:
-    from evlcp_barker import _kernels
-else:
-    _kernels = Late("evlcp_barker._kernels")
 
 _TIMING_SIGMA_US = 2.0
 """Least spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""

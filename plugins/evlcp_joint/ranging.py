@@ -4,24 +4,19 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from evlcp_joint import _kernels
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Bend, FrameView, Range, changed, plain
-
-if TYPE_CHECKING:
-    from evlcp_joint import _kernels
-else:
-    _kernels = Late("evlcp_joint._kernels")
 
 _NONE = Range(float("nan"), float("nan"), 0)
 

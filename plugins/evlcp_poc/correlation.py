@@ -1,16 +1,9 @@
 """Shifts between images by phase-only correlation."""
 
-from typing import TYPE_CHECKING
-
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.late import Late
-
-if TYPE_CHECKING:
-    from evlcp_poc import _kernels
-else:
-    _kernels = Late("evlcp_poc._kernels")
+from evlcp_poc import _kernels
 
 _NO_PHASE = 1e-5
 """Amplitude, in the largest of a spectrum, below which there is no phase: that of rounding."""

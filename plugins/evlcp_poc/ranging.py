@@ -2,12 +2,13 @@
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from evlcp_poc import _kernels
 from evlcp_poc.correlation import (
     blob_band,
     cut_maps,
@@ -18,16 +19,10 @@ from evlcp_poc.correlation import (
 from evlcp_poc.pairs import choose_pairs, far_pairs, robust_mean
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, Range, plain
-
-if TYPE_CHECKING:
-    from evlcp_poc import _kernels
-else:
-    _kernels = Late("evlcp_poc._kernels")
 
 _NONE = Range(float("nan"), float("nan"), 0)
 

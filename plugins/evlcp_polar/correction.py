@@ -3,22 +3,17 @@
 from dataclasses import dataclass
 from functools import cached_property
 from math import ceil, floor, log
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from evlcp_polar import _kernels
 from evlcp_polar.sequence import RELIABILITY
 from evlcp_sdk.air.crc import CRC24C, CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
-
-if TYPE_CHECKING:
-    from evlcp_polar import _kernels
-else:
-    _kernels = Late("evlcp_polar._kernels")
 
 _MOST_BITS = 1024
 """Longest codeword: what the reliability sequence is given for."""

@@ -1,20 +1,15 @@
 """What the info segment of each cluster says."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
-
-if TYPE_CHECKING:
-    from evlcp_wh import _kernels
-else:
-    _kernels = Late("evlcp_wh._kernels")
+from evlcp_wh import _kernels
 
 _MIN_WEIGHT = 0.01
 """Presence probability below which a cell is passed over: it adds nothing that is seen, but takes time."""

@@ -1,21 +1,15 @@
 """What the info segment of each cluster says, by likelihoods learned from the pilots."""
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
+from evlcp_wh import _kernels
 from evlcp_wh.decoding import match_words
-
-if TYPE_CHECKING:
-    from evlcp_wh import _kernels
-else:
-    _kernels = Late("evlcp_wh._kernels")
 
 MAX_EVENTS = 3
 """Polarity sums beyond this many events count as this many: more are too rare to learn."""

@@ -2,23 +2,18 @@
 
 from dataclasses import dataclass, replace
 from math import inf
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
+from evlcp_wh import _kernels
 from evlcp_wh.ml_soft import INDEPENDENT_PIXELS, MAX_EVENTS, LearnedDecoder
 from evlcp_wh.separation import CellPosterior
-
-if TYPE_CHECKING:
-    from evlcp_wh import _kernels
-else:
-    _kernels = Late("evlcp_wh._kernels")
 
 _UNSURE_LLR = 2.0
 """Log-likelihood ratio of a bit below which a bar that moved is sought farther: one such bit in eight is

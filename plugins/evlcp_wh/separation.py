@@ -2,21 +2,16 @@
 
 from dataclasses import dataclass
 from math import log
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.roles import Separate, Separation
 from evlcp_sdk.values import PresenceMap, plain
-
-if TYPE_CHECKING:
-    from evlcp_wh import _kernels
-else:
-    _kernels = Late("evlcp_wh._kernels")
+from evlcp_wh import _kernels
 
 _VALUE_ERROR = 0.1
 """Probability that a cell's value is seen wrong: of a cell half beside the bar, which is one of four."""
