@@ -25,7 +25,8 @@ from firmware_host.board.bank import Bank, bank_of, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
-from firmware_host.emulators.processes import start_native, start_qemu
+from firmware_host.emulators.native import NativeBoard, NativeLine
+from firmware_host.emulators.processes import start_qemu
 from firmware_host.emulators.simulated import SimulatedBoard, UsbLine
 from firmware_host.errors import BoardError
 from firmware_host.images import FlashImage
@@ -47,7 +48,7 @@ def program() -> None:
     bank = Bank.of_symbols(random_symbols(64, 10, book, np.random.default_rng(0)), book)
     times_s = []
     for _ in range(5):
-        with Session(start_native(baud=BAUD), Timing(BAUD)) as session:
+        with Session(NativeLine(NativeBoard(baud=BAUD)), Timing(BAUD)) as session:
             began = time.perf_counter()
             provision(Board(session), bank, Settings())
             times_s.append(time.perf_counter() - began)

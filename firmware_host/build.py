@@ -81,16 +81,6 @@ def _compiler(name: str, package: str) -> None:
         raise ToolchainError(f"{name} is missing: apt-get install --no-install-recommends {package}")
 
 
-def native_program() -> Path:
-    """The board as a program for this machine.
-
-    Raises:
-        ToolchainError: No C compiler, or it fails.
-    """
-    _compiler(os.environ.get("CC", "cc"), "gcc libc6-dev make")
-    return make("native") / "evlcp-board"
-
-
 def native_library() -> Path:
     """The board as a shared library for this machine.
 

@@ -1,6 +1,7 @@
 """Images of a part's flash: from ELF, Intel HEX and binary files, and back."""
 
 import struct
+import tempfile
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,19 @@ FLASH_START = 0x0800_0000
 """Where an STM32's flash begins."""
 FLASH_BYTES = 1 << 20
 """What an STM32F405 has of it."""
+
+
+def check_flash_file(path: Path) -> None:
+    """Raise InputError unless an emulator can keep its flash in a file, which need not be there."""
+    try:
+        if not path.is_file() and path.exists():
+            raise InputError(f"{path}: not a file; expected the name of a flash file, there or new")
+        if path.is_file():
+            path.open("rb").close()
+        # SAVE puts a new file in the place of the old one
+        tempfile.TemporaryFile(dir=path.resolve().parent).close()
+    except OSError as fault:
+        raise InputError(f"{path}: the flash file cannot be used: {fault.strerror}") from fault
 
 
 @dataclass(frozen=True)

@@ -146,30 +146,6 @@ def chips_behind(codebook: Codebook, packet: PacketFormat, frame: int) -> NDArra
     return np.full(codebook.clusters, first.pop() if len(first) == 1 else -1, np.int8)
 
 
-def _words(chips: NDArray[np.uint8]) -> NDArray[np.uint16]:
-    if chips.shape[-1] != 16:
-        raise ConfigError(f"a driver-board word has 16 chips, these codes have {chips.shape[-1]}")
-    shifted = chips.astype(np.uint16) << np.arange(15, -1, -1, dtype=np.uint16)
-    words: NDArray[np.uint16] = shifted.sum(-1, dtype=np.uint16)
-    return words
-
-
-def pilot_words(codebook: Codebook) -> NDArray[np.uint16]:
-    """The pilots as driver-board words, uint16 (K,); most significant bit first on air."""
-    return _words(codebook.pilots)
-
-
-def info_words(symbols: ArrayLike, codebook: Codebook) -> NDArray[np.uint16]:
-    """Info segments as driver-board words: symbols (F, K) to uint16 (F, K).
-
-    Raises:
-        ConfigError: Symbols of another shape or outside the codebook, or codes of another length.
-    """
-    words = _words(codebook.codewords)
-    found: NDArray[np.uint16] = words[_checked(symbols, codebook)]
-    return found
-
-
 def bits_of_symbols(symbols: ArrayLike, bits_per_symbol: int) -> NDArray[np.uint8]:
     """Bits of symbols (F, K), frame by frame, cluster 0 first, most significant bit first.
 

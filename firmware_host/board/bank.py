@@ -1,7 +1,7 @@
 """What a driver board is sent: symbols or chips, as the content of a bank."""
 
 import zlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.air.codebook import Codebook, word_of_chips
-from evlcp_sdk.air.frames import PacketFormat, info_words, packet_chips, pilot_words
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_numbers
 from evlcp_sdk.link.resolve import Link
@@ -26,57 +26,39 @@ PREAMBLE_CHIPS = 32
 MOST_FRAMES = 65_535
 """Frames of a packet at most that the board composes."""
 
-MOST_RANDOM_FRAMES = 1_000_000
+MOST_RANDOM_FRAMES = 100_000
 """Random frames at most: minutes of light, far beyond any bank, and within memory."""
 
 MOST_CHIPS_A_SECOND = 1_000_000
 """Chips a second that no board takes more of; each says its own maximum, too."""
 
 Symbols = NDArray[np.int64]
-
-
-@dataclass(frozen=True, eq=False)
-class Composed:
-    """What the board puts packets together with.
-
-    Attributes:
-        codebook: Preamble and pilots, and what the words are of.
-        packet: Lengths of a packet's parts.
-    """
-
-    codebook: Codebook
-    packet: PacketFormat
+Chips = NDArray[np.uint8]
 
 
 @dataclass(frozen=True, eq=False)
 class Bank:
-    """Content of one bank.
+    """Packets of chips, as a bank of a board holds them.
 
     Attributes:
         format: Info words, the LEDs of each chip, or the clusters of each chip.
-        packets: Packets in it.
-        content: The bank's bytes; none if the link has more LEDs than any board.
-        digest: What its chips mean: digest of the codebook, 64 hex digits.
-        profile: The name of that.
-        chip_rate_hz: Chips per second.
-        packet_chips: Chips of a packet.
+        codebook: What the chips mean.
+        packet: Lengths of a packet's parts.
         led_clusters: The cluster of each LED, int64 (LEDs,).
-        composed: What the board puts packets together with; None if the bank has every chip.
-        word_limits: Why it could not.
+        composed: Whether the board knows the codebook, so that it can put packets together.
         rest: What its LEDs must do while nothing is sent, as the link's framing says.
+        chips: Whole packets, uint8 (chips, clusters or LEDs); none in the queue of a stream.
+        content: The bank's bytes; none if the link has more LEDs than any board.
     """
 
     format: Format
-    packets: int
-    content: bytes
-    digest: str
-    profile: str
-    chip_rate_hz: int
-    packet_chips: int
+    codebook: Codebook
+    packet: PacketFormat
     led_clusters: NDArray[np.int64]
-    composed: Composed | None = None
-    word_limits: tuple[str, ...] = ()
+    composed: bool
     rest: int | None = None
+    chips: Chips = field(default_factory=lambda: np.zeros((0, 1), np.uint8))
+    content: bytes = b""
 
     @classmethod
     def of_symbols(
@@ -97,11 +79,9 @@ class Bank:
         '5555'
         """
         s = _checked(symbols)
-        like = _like(codebook, PacketFormat.of(codebook, s.shape[1], chip_rate_hz, pilot_every), led_clusters)
-        if len(led_clusters) > LEDS:
-            return replace(like, packets=len(s))
-        packets = (packet_content(like, one, codebook, pilot_every) for one in s)
-        return replace(like, packets=len(s), content=like.content + b"".join(packets))
+        packet = PacketFormat.of(codebook, s.shape[1], chip_rate_hz, pilot_every)
+        like = _like(codebook, packet, led_clusters)
+        return like.holding(symbol_chips(s, codebook, pilot_every))
 
     @classmethod
     def of_chips(
@@ -123,30 +103,52 @@ class Bank:
                 f"array of shape {c.shape}, expected whole packets of {packet.packet_chips} chips"
                 f" ({packet.frames} frames)"
             )
-        packets = len(c) // packet.packet_chips
-        if len(led_clusters) > LEDS:
-            return replace(like, packets=packets)
-        if like.format == Format.CLUSTERS and c.shape[1] == codebook.clusters:
-            return replace(like, packets=packets, content=like.content + _bits_of_chips(c))
-        rows = rows_of_chips(c, led_clusters)
-        return replace(like, format=Format.MASKS, packets=packets, content=rows.tobytes())
+        by_cluster = like.format == Format.CLUSTERS and c.shape[1] == codebook.clusters
+        return replace(like, format=Format.CLUSTERS if by_cluster else Format.MASKS).holding(c)
+
+    def holding(self, chips: NDArray[Any]) -> "Bank":
+        """The same with other packets.
+
+        Raises:
+            ConfigError: The chips are not 0 and 1, or there are other columns.
+        """
+        if len(self.led_clusters) > LEDS:
+            return replace(self, chips=chips)
+        return replace(self, chips=chips, content=self.table + (self.encode(chips) if len(chips) else b""))
+
+    def encode(self, chips: NDArray[Any]) -> bytes:
+        """Whole packets as they stand in a bank; faults as of `holding`."""
+        if self.format == Format.MASKS:
+            return rows_of_chips(chips, self.led_clusters).tobytes()
+        if chips.dtype.kind not in "uib" or not np.isin(chips, (0, 1)).all():
+            raise ConfigError("chips: expected integers 0 and 1")
+        if self.format == Format.CLUSTERS:
+            return np.packbits(chips.astype(np.uint8), axis=1).tobytes()
+        packet = self.packet
+        ends = [packet.frame_start_chip(frame + 1) for frame in range(packet.frames)]
+        info = np.array([range(end - WORD_CHIPS, end) for end in ends])
+        segments = chips.reshape(-1, packet.packet_chips, self.clusters)[:, info].swapaxes(2, 3)
+        return np.packbits(segments, axis=3)[..., ::-1].tobytes()
 
     def chip_by_chip(self) -> "Bank":
         """The same with every chip in the bank, where the board would compose packets."""
-        if self.composed is None or self.format != Format.WORDS:
-            return replace(self, composed=None)
-        book, packet = self.composed.codebook, self.composed.packet
-        words = np.frombuffer(self.content, "<u2").astype(">u2").view(np.uint8)
-        info = np.unpackbits(words).reshape(self.packets, packet.frames, CLUSTERS, WORD_CHIPS)
-        preamble = np.repeat(book.preamble[:, None], CLUSTERS, axis=1)
-        parts = [masks_of_clusters(self.led_clusters).tobytes()]
-        for one in info:
-            parts.append(_bits_of_chips(preamble))
-            for frame, codes in enumerate(one):
-                if packet.has_pilot(frame):
-                    parts.append(_bits_of_chips(book.pilots.T))
-                parts.append(_bits_of_chips(codes.T))
-        return replace(self, format=Format.CLUSTERS, content=b"".join(parts), composed=None)
+        form = Format.CLUSTERS if self.format == Format.WORDS else self.format
+        return replace(self, format=form, composed=False).holding(self.chips)
+
+    @property
+    def packets(self) -> int:
+        """Packets in it."""
+        return len(self.chips) // self.packet.packet_chips
+
+    @property
+    def digest(self) -> str:
+        """What its chips mean: digest of the codebook, 64 hex digits."""
+        return self.codebook.digest
+
+    @property
+    def chip_rate_hz(self) -> int:
+        """Chips per second."""
+        return int(self.packet.chip_rate_hz)
 
     @property
     def clusters(self) -> int:
@@ -154,16 +156,16 @@ class Bank:
         return int(self.led_clusters.max()) + 1
 
     @property
-    def table_bytes(self) -> int:
-        """Bytes before the first packet: the masks of the clusters."""
-        return self.clusters * ROW_BYTES if self.format == Format.CLUSTERS else 0
+    def table(self) -> bytes:
+        """What stands before the first packet: the masks of the clusters."""
+        return masks_of_clusters(self.led_clusters).tobytes() if self.format == Format.CLUSTERS else b""
 
     @property
     def packet_bytes(self) -> int:
         """Bytes of a packet."""
-        if self.format == Format.WORDS and self.composed is not None:
-            return 2 * CLUSTERS * self.composed.packet.frames
-        return self.chip_bytes * self.packet_chips
+        if self.format == Format.WORDS:
+            return 2 * CLUSTERS * self.packet.frames
+        return self.chip_bytes * self.packet.packet_chips
 
     @property
     def chip_bytes(self) -> int:
@@ -173,30 +175,12 @@ class Bank:
     @cached_property
     def duty(self) -> int:
         """Share of time that it has a LED on, that of the brightest, permille, rounded up."""
-        chips = self.packets * self.packet_chips
-        if self.format == Format.WORDS and self.composed is not None:
-            book, packet = self.composed.codebook, self.composed.packet
-            words = np.frombuffer(self.content, "<u2").reshape(-1, CLUSTERS)
-            pilots = -(-packet.frames // packet.pilot_every)
-            own = pilots * np.bitwise_count(pilot_words(book)).astype(np.int64)
-            own += word_of_chips(book.preamble).bit_count()
-            on = int((np.bitwise_count(words).sum(0, dtype=np.int64) + self.packets * own).max())
-        else:
-            rows = np.frombuffer(self.content, np.uint8, offset=self.table_bytes).reshape(chips, -1)
-            on = int(np.unpackbits(rows, axis=1).sum(0, dtype=np.int64).max())
-        return -(-1000 * on // chips)
+        return -(-1000 * int(self.chips.sum(0, dtype=np.int64).max()) // len(self.chips))
 
     @cached_property
     def crc(self) -> int:
         """CRC-32/ISO-HDLC of the content."""
         return zlib.crc32(self.content)
-
-
-def _bits_of_chips(chips: NDArray[Any]) -> bytes:
-    """A bit a cluster, cluster 0 the most significant of each chip's first byte."""
-    if chips.dtype.kind not in "uib" or not np.isin(chips, (0, 1)).all():
-        raise ConfigError("chips: expected integers 0 and 1")
-    return np.packbits(chips.astype(np.uint8), axis=1).tobytes()
 
 
 def _like(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int64]) -> Bank:
@@ -209,49 +193,16 @@ def _like(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int
     clusters = int(led_clusters.max()) + 1
     if clusters != codebook.clusters:
         raise ConfigError(f"LEDs of {clusters} clusters, expected {codebook.clusters}, one for each pilot")
-    why = tuple(word_limits(codebook, packet, led_clusters))
-    composed = None if why else Composed(codebook, packet)
+    composed = not word_limits(codebook, packet, led_clusters)
     form = Format.WORDS if composed else Format.CLUSTERS if -(-clusters // 8) < ROW_BYTES else Format.MASKS
-    # more LEDs than a row has are refused by the board's own number
-    masks = form == Format.CLUSTERS and len(led_clusters) <= LEDS
-    return Bank(
-        form,
-        0,
-        masks_of_clusters(led_clusters).tobytes() if masks else b"",
-        codebook.digest,
-        codebook.profile,
-        int(packet.chip_rate_hz),
-        packet.packet_chips,
-        led_clusters,
-        composed,
-        why,
-    )
-
-
-def packet_content(like: Bank, symbols: ArrayLike, codebook: Codebook, pilot_every: int) -> bytes:
-    """One packet as it stands in a bank: symbols (frames, clusters).
-
-    Raises:
-        ConfigError: Symbols of another shape or outside the codebook.
-    """
-    if like.format == Format.WORDS:
-        return info_words(symbols, codebook).astype("<u2").tobytes()
-    chips = packet_chips(symbols, codebook, pilot_every)
-    if like.format == Format.CLUSTERS:
-        return _bits_of_chips(chips)
-    return rows_of_chips(chips, like.led_clusters).tobytes()
+    return Bank(form, codebook, packet, led_clusters, composed)
 
 
 def rest_content(like: Bank) -> bytes | None:
     """A packet during which nothing is sent, as it stands in a bank; None if any pattern may stand there."""
     if like.rest is None:
         return None
-    chips = np.full((like.packet_chips, like.clusters), like.rest, np.uint8)
-    return (
-        _bits_of_chips(chips)
-        if like.format == Format.CLUSTERS
-        else rows_of_chips(chips, like.led_clusters).tobytes()
-    )
+    return like.encode(np.full((like.packet.packet_chips, like.clusters), like.rest, np.uint8))
 
 
 def limits(packet: PacketFormat) -> list[str]:
@@ -307,7 +258,7 @@ def queue_of(link: Link) -> Bank:
     rest = link.algorithm("framing").rest()
     like = replace(_like(link.codebook, link.packet, link.bar.led_clusters()), rest=rest)
     # A board that composes packets has words for no pause.
-    return like if rest is None else like.chip_by_chip()
+    return like.holding(like.chips) if rest is None else like.chip_by_chip()
 
 
 def _refuse(faults: list[str]) -> None:

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from evlcp_sdk.air.codebook import word_of_chips
-from evlcp_sdk.air.frames import pilot_words
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, packet_content, queue_of, rest_content
+from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, queue_of, rest_content, word_limits
 from firmware_host.board.session import Session
 from firmware_host.board.stream import AHEAD, Stream
 from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
@@ -24,7 +24,6 @@ from firmware_host.protocol.generated.requests import (
     KEY_BYTES,
     LEDS,
     NO_BANK,
-    ROW_BYTES,
     BlankReply,
     BlankRequest,
     Capability,
@@ -275,14 +274,13 @@ class Board:
         """
         self._configure(bank)
         digest = bytes.fromhex(bank.digest)
-        if bank.composed is None:
+        if not bank.composed:
             clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
-            request = ChipsRequest(bank.packet_chips, self._hold(bank), clusters, digest)
+            request = ChipsRequest(bank.packet.packet_chips, self._hold(bank), clusters, digest)
             self.session.call(request, ChipsReply)
             return
-        book = bank.composed.codebook
-        pilots = tuple(int(w) for w in pilot_words(book))
-        preamble = (bank.composed.packet.preamble_chips, word_of_chips(book.preamble))
+        pilots = tuple(map(word_of_chips, bank.codebook.pilots))
+        preamble = (bank.packet.preamble_chips, word_of_chips(bank.codebook.preamble))
         self.session.call(CodebookRequest(*preamble, pilots, digest), CodebookReply)
 
     def _hold(self, bank: Bank) -> int:
@@ -291,7 +289,7 @@ class Board:
         More than one where the board has no chips as long as these.
         """
         about, rate = self.about, bank.chip_rate_hz
-        if bank.composed is None:
+        if not bank.composed:
             for hold in range(1, min(_MOST_HOLD, about.chip_rate_max_hz // rate) + 1):
                 if rate * hold >= about.chip_rate_min_hz and about.tick_hz % (rate * hold) == 0:
                     return hold
@@ -303,7 +301,7 @@ class Board:
         Chip by chip where it would compose packets, but has no chips as long as theirs and so shows each
         several times.
         """
-        slow = bank.composed is not None and bank.chip_rate_hz < self.about.chip_rate_min_hz
+        slow = bank.composed and bank.chip_rate_hz < self.about.chip_rate_min_hz
         return bank.chip_by_chip() if slow else bank
 
     def _configure(self, bank: Bank, level_limit_ma: int = 0, duty_limit: int = 0) -> None:
@@ -338,11 +336,11 @@ class Board:
         """Whether the active bank has packets of the same number and lengths."""
         if (status.format, status.packets, status.length) != (bank.format, bank.packets, len(bank.content)):
             return False
-        if bank.composed is not None:
+        if bank.composed:
             return not status.hold and (status.frames, status.pilot_every) == _frames(bank)
         clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
         hold = self._hold(bank)
-        expected = (hold * bank.packet_chips, hold, clusters)
+        expected = (hold * bank.packet.packet_chips, hold, clusters)
         return (status.packet_chips, status.hold, status.clusters) == expected
 
     def program(self, content: Bank, verify: bool = True, progress: Progress | None = None) -> Programmed:
@@ -435,9 +433,9 @@ class Board:
             packet, shape = np.asarray(symbols), (link.packet.frames, link.codebook.clusters)
             if packet.shape != shape:
                 raise ConfigError(f"symbols of shape {packet.shape}, expected {shape}: frames, clusters")
-            return packet_content(like, packet, link.codebook, link.packet.pilot_every)
+            return like.encode(packet_chips(packet, link.codebook, link.packet.pilot_every))
 
-        packet_s = like.packet_chips / like.chip_rate_hz
+        packet_s = like.packet.packet_chips / like.chip_rate_hz
         pulse_s = min(0.5, status.watchdog_ms / 3e3) if acts else 0.5
         stream = Stream(self.session, bank, content, packet_s, ahead, pulse_s, rest_content(like))
         if status.state != State.PLAYING:
@@ -468,7 +466,7 @@ class Board:
                 f"air.chip_rate_hz = {bank.chip_rate_hz}",
             )
         raise IncompatibleError(
-            f"{self.session.name}: plays {plays}, this payload's link has {comes} ({bank.profile});"
+            f"{self.session.name}: plays {plays}, this payload's link has {comes} ({bank.codebook.profile});"
             " give its link with -c or --set, or 'evlcp board program' to change it"
         )
 
@@ -490,7 +488,7 @@ class Board:
         self.check_same_air(bank, s)
         if not self._same_packets(bank, s):
             holds = f"{s.packet_chips // s.hold} chips" if s.hold else _in_frames(s.frames, s.pilot_every)
-            wanted = _in_frames(*_frames(bank)) if bank.composed else f"{bank.packet_chips} chips"
+            wanted = _in_frames(*_frames(bank)) if bank.composed else f"{bank.packet.packet_chips} chips"
             raise VerifyError(
                 f"{name}: holds {s.packets} packets of {holds}, {s.length} bytes; expected {bank.packets} of"
                 f" {wanted}, {len(bank.content)} bytes; {again}"
@@ -513,20 +511,20 @@ class Board:
         about, name, leds = self.about, self.session.name, len(bank.led_clusters)
         if leds > about.leds:
             raise ConfigError(f"a link of {leds} LEDs, {name} has {about.leds}: HELLO says so")
-        if bank.composed is not None and (about.leds, about.clusters) != (LEDS, CLUSTERS):
+        if bank.composed and (about.leds, about.clusters) != (LEDS, CLUSTERS):
             raise ConfigError(
                 f"packets of {CLUSTERS} clusters and {LEDS} LEDs, {name} has {about.clusters}"
                 f" and {about.leds}: HELLO says so"
             )
-        if bank.composed is None and not about.formats >> bank.format & 1:
-            reasons = "; ".join(bank.word_limits)
+        if not bank.composed and not about.formats >> bank.format & 1:
+            reasons = "; ".join(word_limits(bank.codebook, bank.packet, bank.led_clusters))
             raise IncompatibleError(
                 f"{name}: its firmware (protocol {about.major}.{about.minor}) plays packets that it composes"
                 f" alone, and this link has {reasons}; update the firmware"
             )
-        room = about.bank_bytes - bank.table_bytes
+        room = about.bank_bytes - len(bank.table)
         what = f"a bank of {name} has {about.bank_bytes}" + (
-            f", {bank.table_bytes} of them for the clusters" if bank.table_bytes else ""
+            f", {len(bank.table)} of them for the clusters" if len(bank.table) else ""
         )
         # a stream needs room for one that plays and one that comes
         queue = not bank.packets
@@ -724,8 +722,7 @@ def _packet_s(status: StatusReply) -> float:
 
 def _frames(bank: Bank) -> tuple[int, int]:
     """Frames of a packet, and from one pilot to the next; one each where the board composes none."""
-    composed = bank.composed
-    return (composed.packet.frames, composed.packet.pilot_every) if composed else (1, 1)
+    return (bank.packet.frames, bank.packet.pilot_every) if bank.composed else (1, 1)
 
 
 def _in_frames(frames: int, pilot_every: int) -> str:
@@ -734,22 +731,18 @@ def _in_frames(frames: int, pilot_every: int) -> str:
 
 def _length(bank: Bank) -> str:
     """How long a bank's packets are, for a person."""
-    if bank.composed is not None:
-        return f"{bank.composed.packet.frames} frames"
-    return f"{bank.packet_chips} chips"
+    return f"{bank.packet.frames} frames" if bank.composed else f"{bank.packet.packet_chips} chips"
 
 
 def _most(bank: Bank, room: int) -> str:
     """How long a bank's packets may be, for a person."""
-    if bank.composed is None:
+    if not bank.composed:
         return f"{room // bank.chip_bytes} chips"
-    packet = bank.composed.packet
 
     def size(frames: int) -> int:
-        chips = replace(packet, frames=frames).packet_chips
-        return 2 * CLUSTERS * frames if bank.format == Format.WORDS else ROW_BYTES * chips
+        return replace(bank, packet=replace(bank.packet, frames=frames)).packet_bytes
 
-    return f"{bisect_right(range(1, packet.frames + 1), room, key=size)} frames"
+    return f"{bisect_right(range(1, bank.packet.frames + 1), room, key=size)} frames"
 
 
 def _silent(done: int, total: int) -> None:
@@ -758,6 +751,6 @@ def _silent(done: int, total: int) -> None:
 
 def profile_number(bank: Bank) -> int:
     """The protocol's number of a bank's codebook; `custom` for one that the firmware was not built with."""
-    if bank.composed is None:
+    if not bank.composed:
         return Profile.CUSTOM
     return next((p for p, digest in DIGESTS.items() if digest == bank.digest), Profile.CUSTOM)

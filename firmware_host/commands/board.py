@@ -669,20 +669,13 @@ def emulate(
     For example: [bold]evlcp board emulate qemu --listen unix:/tmp/board --leds leds.bin[/]
     """
     import re
-    import signal
-    import subprocess
 
-    from evlcp_sdk.errors import ConfigError, InputError
+    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import check_output
-    from firmware_host.emulators.listening import check_free
-    from firmware_host.emulators.processes import (
-        native_command,
-        qemu_command,
-        rom_command,
-        stm32_command,
-        wait_for,
-    )
-    from firmware_host.errors import ToolchainError
+    from evlcp_sdk.signals import stop_on_request
+    from firmware_host.emulators import processes
+    from firmware_host.emulators.listening import HostLine, check_free
+    from firmware_host.emulators.native import NativeBoard, serve
 
     scheme, _, place = listen.partition(":")
     known = ("unix", "tcp", "pty") if emulator is Emulator.NATIVE else ("unix", "tcp")
@@ -695,19 +688,36 @@ def emulate(
     check_free(listen)
     if leds is not None:
         check_output(leds, regular=False)
+    if emulator is Emulator.NATIVE:
+        with contextlib.ExitStack() as stack:
+            board = stack.enter_context(contextlib.closing(NativeBoard(leds, flash, baud, unique_id)))
+            line = stack.enter_context(contextlib.closing(HostLine(listen, link)))
+            stopped = stack.enter_context(stop_on_request())
+            echo(f"listening on {line.place}")
+            serve(board, line, stopped)
+        return
     if emulator is Emulator.QEMU:
-        command = qemu_command(listen, leds)
+        command = processes.qemu_command(listen, leds)
     elif emulator is Emulator.ROM:
-        command = rom_command(listen, flash, leds)
-    elif emulator is Emulator.STM32:
-        command = stm32_command(listen, leds)
+        command = processes.rom_command(listen, flash, leds)
     else:
-        command = native_command(listen, leds, flash, link, baud, unique_id)
+        command = processes.stm32_command(listen, leds)
+    _run_in_foreground(emulator, command, listen)
+
+
+def _run_in_foreground(emulator: Emulator, command: list[str], listen: str) -> None:
+    """Run an emulator that ends with this command, however that comes."""
+    import signal
+    import subprocess
+
+    from evlcp_sdk.errors import InputError
+    from firmware_host.emulators.processes import wait_for
+    from firmware_host.errors import ToolchainError
+
     process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-    # The emulator ends with this command, however that comes.
     signal.signal(signal.SIGTERM, lambda *_: process.terminate())
     try:
-        if emulator is not Emulator.NATIVE and (line := wait_for(listen, process)) is not None:
+        if (line := wait_for(listen, process)) is not None:
             line.close()
             echo(f"listening on {listen}")
         code = process.wait()

@@ -1,11 +1,18 @@
-"""Where emulators listen: a place is free, or somebody answers there."""
+"""Where emulators listen for a host: a socket or a pseudo-terminal."""
 
+import os
+import select
 import socket
+import tty
 from pathlib import Path
 
 from evlcp_sdk.errors import ConfigError
-from firmware_host.errors import NoBoardError
+from firmware_host.errors import NoBoardError, ToolchainError
 from firmware_host.ports.transport import SocketTransport
+
+__all__ = ["HostLine", "check_free"]
+
+_MOST_BYTES = 2048
 
 
 def check_free(listen: str) -> None:
@@ -19,17 +26,114 @@ def check_free(listen: str) -> None:
     raise ConfigError(f"--listen {listen}: another program answers there; end it, or listen elsewhere")
 
 
-def listener(listen: str) -> socket.socket:
-    """Listen at `unix:PATH`, where a socket left behind is replaced, or `tcp:HOST:PORT`."""
-    scheme, _, place = listen.partition(":")
-    if scheme == "unix":
-        path = Path(place)
-        if path.is_socket():
-            path.unlink()
+class HostLine:
+    """The board's end of a line, for one host at a time; another one is hung up on.
+
+    Args:
+        listen: `unix:PATH`, where a socket left behind is replaced, `tcp:HOST:PORT`, or `pty`.
+        link: Name for the pseudo-terminal; a link of that name is replaced.
+
+    Attributes:
+        place: What hosts connect to.
+
+    Raises:
+        ToolchainError: One cannot listen there.
+    """
+
+    def __init__(self, listen: str, link: Path | None = None) -> None:
+        scheme, _, self.place = listen.partition(":")
+        self._server: socket.socket | None = None
+        self._host: int | None = None
+        self._others: list[int] = []
+        self._link: Path | None = link
+        self._out = b""
+        try:
+            if scheme == "pty":
+                self._open_terminal(link)
+            else:
+                self._server = self._listen(scheme)
+                self.place = listen
+        except OSError as fault:
+            raise ToolchainError(f"{listen}: no board can listen there: {fault.strerror}") from fault
+
+    def _listen(self, scheme: str) -> socket.socket:
+        if scheme == "tcp":
+            host, _, port = self.place.rpartition(":")
+            return socket.create_server((host, int(port)))
+        self._link = Path(self.place)
+        if self._link.is_socket():
+            self._link.unlink()
         server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        server.bind(place)
+        try:
+            server.bind(self.place)
+        except OSError:
+            server.close()
+            raise
         server.listen(1)
-    else:
-        host, _, port = place.rpartition(":")
-        server = socket.create_server((host, int(port)))
-    return server
+        return server
+
+    def _open_terminal(self, link: Path | None) -> None:
+        # The other end stays open, so that a host that leaves does not hang up the line.
+        self._host, end = os.openpty()
+        self._others = [end]
+        tty.setraw(end)
+        os.set_blocking(self._host, False)
+        self.place = os.ttyname(end)
+        if link is not None:
+            if link.is_symlink():
+                link.unlink()
+            link.symlink_to(self.place)
+            self.place = str(link)
+
+    def exchange(self, data: bytes, wait_s: float) -> bytes:
+        """Send to the host, if there is one, and give what it has sent, after at most `wait_s`."""
+        host = self._host
+        self._out = self._out + data if host is not None else b""
+        server = [] if self._server is None else [self._server.fileno()]
+        ends = [] if host is None else [host]
+        ready, free, _ = select.select(server + ends * (not self._out), ends * bool(self._out), [], wait_s)
+        if self._server is not None and self._server.fileno() in ready:
+            self._take_host(self._server)
+        try:
+            if host is not None and free:
+                self._out = self._out[os.write(host, self._out) :]
+            if host is not None and host in ready:
+                if found := os.read(host, _MOST_BYTES):
+                    return found
+                self._hang_up()
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._hang_up()
+        return b""
+
+    def _take_host(self, server: socket.socket) -> None:
+        if self._host is not None and _has_left(self._host):
+            return  # first all that it has sent is read
+        found, _ = server.accept()
+        if self._host is not None:
+            found.close()
+            return
+        found.setblocking(False)
+        self._host = found.detach()
+
+    def _hang_up(self) -> None:
+        if self._host is not None:
+            os.close(self._host)
+        self._host = None
+
+    def close(self) -> None:
+        """Listen no longer; the socket or the link is removed."""
+        self._hang_up()
+        for end in self._others:
+            os.close(end)
+        if self._server is not None:
+            self._server.close()
+        if self._link is not None:
+            self._link.unlink(missing_ok=True)
+
+
+def _has_left(host: int) -> bool:
+    poll = select.poll()
+    poll.register(host, select.POLLRDHUP)
+    return bool(poll.poll(0))

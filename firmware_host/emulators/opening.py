@@ -6,7 +6,8 @@ else is a port of `firmware_host.ports.transport`.
 
 from pathlib import Path
 
-from firmware_host.emulators.processes import start_native, start_qemu
+from firmware_host.emulators.native import NativeBoard, NativeLine
+from firmware_host.emulators.processes import start_qemu
 from firmware_host.ports.transport import Transport, open_transport
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
@@ -21,7 +22,7 @@ def open_port(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
     """
     scheme, _, rest = spec.partition(":")
     if scheme == "native":
-        return start_native(flash=Path(rest) if rest else None)
+        return NativeLine(NativeBoard(flash=Path(rest) if rest else None))
     if scheme == "qemu":
         return start_qemu()
     return open_transport(spec, baud)

@@ -1,4 +1,4 @@
-"""The board without a board: the native program, and the ARM image in QEMU."""
+"""Boards that run as programs of their own: the ARM image in QEMU, and models of the part."""
 
 import contextlib
 import importlib.util
@@ -15,7 +15,7 @@ from pathlib import Path
 from evlcp_sdk.errors import InputError
 from firmware_host import build
 from firmware_host.errors import LineError, NoBoardError, ToolchainError
-from firmware_host.images import FLASH_BYTES
+from firmware_host.images import FLASH_BYTES, check_flash_file
 from firmware_host.ports.transport import SocketTransport
 
 _DIES_WITH_PARENT = (
@@ -66,50 +66,6 @@ def _end(process: "subprocess.Popen[bytes]") -> None:
         process.wait()
     if process.stderr is not None:
         process.stderr.close()
-
-
-def native_command(
-    listen: str,
-    leds: Path | None = None,
-    flash: Path | None = None,
-    link: Path | None = None,
-    baud: int = 0,
-    unique_id: int = 0,
-) -> list[str]:
-    """Command line of the native board.
-
-    Args:
-        listen: `pty`, `unix:PATH`, `tcp:HOST:PORT` or `fd:N`.
-        leds: File for the LED records.
-        flash: File that keeps the flash slots.
-        link: Name to give the pseudo-terminal.
-        baud: Line rate to keep to, bit/s; 0 for as fast as it goes.
-        unique_id: The board's number, 64 bits.
-
-    Raises:
-        InputError: The flash file cannot be read, or not be replaced.
-        ToolchainError: It cannot be built.
-    """
-    if flash is not None:
-        _check_flash(flash)
-    command = [str(build.native_program()), "--listen", listen]
-    for name, value in (("--leds", leds), ("--flash", flash), ("--link", link)):
-        if value is not None:
-            command += [name, str(value)]
-    return [*command, "--baud", str(baud), "--id", str(unique_id)]
-
-
-def _check_flash(path: Path) -> None:
-    try:
-        if not path.is_file() and path.exists():
-            raise InputError(f"{path}: not a file; expected the name of a flash file, there or new")
-        if path.is_file():
-            path.open("rb").close()
-        folder = path.resolve().parent
-        # SAVE puts a new file in the place of the old one
-        tempfile.TemporaryFile(dir=folder).close()
-    except OSError as fault:
-        raise InputError(f"{path}: the flash file cannot be used: {fault.strerror}") from fault
 
 
 def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> list[str]:
@@ -183,7 +139,7 @@ def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None
         ToolchainError: The model is missing.
     """
     if flash is not None:
-        _check_flash(flash)
+        check_flash_file(flash)
         if flash.is_file() and flash.stat().st_size != FLASH_BYTES:
             raise InputError(
                 f"{flash}: {flash.stat().st_size} bytes, expected {FLASH_BYTES}, the flash of the part"
@@ -205,24 +161,6 @@ def wait_for(
             return SocketTransport.connect(listen)
         time.sleep(0.02)
     return None
-
-
-def start_native(
-    leds: Path | None = None, flash: Path | None = None, baud: int = 0, unique_id: int = 0
-) -> ProcessTransport:
-    """Start the native board and connect to it.
-
-    Raises:
-        InputError: The flash file cannot be used.
-        ToolchainError: It cannot be built.
-    """
-    ours, theirs = socket.socketpair()
-    with contextlib.ExitStack() as undo, theirs:
-        undo.enter_context(ours)
-        command = native_command(f"fd:{theirs.fileno()}", leds, flash, None, baud, unique_id)
-        process = subprocess.Popen(command, pass_fds=(theirs.fileno(),), stdin=subprocess.DEVNULL)
-        undo.pop_all()
-    return ProcessTransport("native:", ours, process)
 
 
 def start_qemu(leds: Path | None = None) -> ProcessTransport:

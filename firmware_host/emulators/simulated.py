@@ -35,6 +35,9 @@ def _library() -> ctypes.CDLL:
         ("set_pulse", None, [handle, ctypes.c_double, ctypes.c_double]),
         ("cut_power", None, [handle, ctypes.c_uint32]),
         ("image", None, [handle, ctypes.c_uint8, ctypes.c_char_p]),
+        ("flash_bytes", size, []),
+        ("flash", None, [handle, ctypes.c_char_p]),
+        ("set_flash", None, [handle, ctypes.c_char_p]),
     ):
         function = getattr(library, f"board_{name}")
         function.restype, function.argtypes = result, arguments
@@ -82,11 +85,25 @@ class SimulatedBoard:
         count = self._c.board_output(self._board, self._room, len(self._room))
         return ctypes.string_at(self._room, count)
 
-    def records(self) -> LedRecord:
-        """LED outputs since the last call."""
+    def take_records(self) -> NDArray[np.void]:
+        """LED outputs since the last call, an array of `RECORD`."""
         table = np.zeros(self._c.board_record_count(self._board), RECORD)
         self._c.board_take_records(self._board, table.ctypes.data)
-        return LedRecord.of_records(table)
+        return table
+
+    def records(self) -> LedRecord:
+        """LED outputs since the last call."""
+        return LedRecord.of_records(self.take_records())
+
+    def flash(self) -> bytes:
+        """The slots of SAVE."""
+        room = ctypes.create_string_buffer(self._c.board_flash_bytes())
+        self._c.board_flash(self._board, room)
+        return room.raw
+
+    def set_flash(self, content: bytes) -> None:
+        """Be a board that has these slots, and has just been reset."""
+        self._c.board_set_flash(self._board, content)
 
     def shown(self) -> NDArray[np.uint8]:
         """The LEDs now, uint8 (96,)."""

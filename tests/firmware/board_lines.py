@@ -1,6 +1,6 @@
 """Lines to a simulated board that go wrong, and what its LEDs may show all the same."""
 
-import subprocess
+import threading
 from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
@@ -12,7 +12,8 @@ from firmware_host.board.bank import symbol_chips
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
-from firmware_host.emulators.processes import bound, native_command
+from firmware_host.emulators.listening import HostLine
+from firmware_host.emulators.native import NativeBoard, serve
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol.client import Timing
 
@@ -24,19 +25,19 @@ class HostDiedError(Exception):
 
 
 class Native:
-    """The native board in the background, as `evlcp board emulate native` starts it; options are its own."""
+    """A native board in the background, as `evlcp board emulate native` runs it; options are its own."""
 
     def __init__(self, listen: str, **options: Any) -> None:
-        command = bound(native_command(listen, **options))
-        self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
-        assert self.process.stdout is not None
-        assert self.process.stdout.readline() == f"listening on {listen}\n"
+        self.board, self.line = NativeBoard(**options), HostLine(listen)
+        self.ended = threading.Event()
+        self.thread = threading.Thread(target=serve, args=(self.board, self.line, self.ended.is_set))
+        self.thread.start()
 
     def end(self) -> None:
-        self.process.terminate()
-        self.process.wait(10)
-        assert self.process.stdout is not None
-        self.process.stdout.close()
+        self.ended.set()
+        self.thread.join(10)
+        self.line.close()
+        self.board.close()
 
 
 class FatalLine(SimulatedLine):

@@ -20,12 +20,14 @@ import pytest
 from board_lines import Native, check_order, packet_sequence
 
 from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.errors import OutputError
 from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import RECORD, LedRecord
-from firmware_host.emulators.processes import bound, native_command, wait_for
+from firmware_host.emulators.processes import bound
 from firmware_host.errors import LineError
+from firmware_host.ports.transport import open_transport
 from tests.conftest import Run
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -439,22 +441,18 @@ def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path: Path, option: st
 
 def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
     flash, place = tmp_path / "flash.bin", f"unix:{tmp_path / 'board'}"
-    command = native_command(place, flash=flash)
     payload = Bank.of_symbols(random_symbols(1, 10, book, np.random.default_rng(0)), book)
 
     @contextlib.contextmanager
-    def started() -> "Iterator[tuple[subprocess.Popen[bytes], Board]]":
-        process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
+    def started() -> "Iterator[tuple[Emulated, Board]]":
+        emulated = Emulated("native", "--listen", place, "--flash", flash)
         try:
-            line = wait_for(place, process)
-            assert line is not None
-            with Session(line) as session:
-                yield process, Board(session)
+            with Session(open_transport(place)) as session:
+                yield emulated, Board(session)
         finally:
-            process.terminate()
-            process.wait(10)
+            emulated.end()
 
-    with started() as (process, board):
+    with started() as (emulated, board):
         board.program(payload)
         for number in range(1, 6):
             with flash.open("rb") as old:
@@ -464,11 +462,11 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
                 assert old.read() == before
             assert flash.read_bytes() != before
         saved = flash.read_bytes()
-        # The system ends the board in the middle of the next write.
-        resource.prlimit(process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
+        # The system takes no more in the middle of the next write.
+        resource.prlimit(emulated.process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
         with pytest.raises(LineError):
             board.save()
-        assert process.wait(10) == -signal.SIGXFSZ
+        assert emulated.process.wait(10) == OutputError.exit_code
     assert flash.read_bytes() == saved
     with started() as (_, board):
         assert board.recall().save_sequence == 5
@@ -496,14 +494,12 @@ def test_a_flash_file_that_cannot_be_used_is_told_at_once(evlcp, tmp_path: Path,
         assert done.err.count("\n") == 1
 
 
-def test_a_file_that_is_no_flash_is_left_alone(tmp_path: Path) -> None:
-    """In a process of its own: the board itself says so."""
+def test_a_file_that_is_no_flash_is_left_alone(evlcp, tmp_path: Path) -> None:
     path = tmp_path / "notes.bin"
-    command = [*EVLCP, "board", "emulate", "native", "--listen", f"unix:{tmp_path / 'b'}", "--flash", path]
     for size in (4, 100_000):
         path.write_bytes(bytes(size))
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
-        assert done.returncode == 3
-        assert f"{path}: not a flash file of" in done.stderr
-        assert done.stderr.count("\n") == 1
+        done = evlcp("board", "emulate", "native", "--listen", f"unix:{tmp_path / 'b'}", "--flash", path)
+        assert done.code == 3
+        assert f"{path}: not a flash file of" in done.err
+        assert done.err.count("\n") == 1
         assert path.read_bytes() == bytes(size)

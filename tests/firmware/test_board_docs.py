@@ -44,7 +44,7 @@ def test_inventory_is_valid(tmp_path: Path) -> None:
         ("T02", 20, 16),
         ("T03", 20, 4),
     ]
-    assert [bank.composed.packet.pilot_every for _, bank in boards] == [1, 4, 4]
+    assert [bank.packet.pilot_every for _, bank in boards] == [1, 4, 4]
 
 
 @pytest.mark.parametrize("block", blocks("python"))

@@ -2,16 +2,14 @@
 
 import json
 import socket
-import subprocess
 from collections.abc import Iterator
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
+from board_lines import Native
 
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board.fleet import read_inventory
-from firmware_host.emulators.processes import native_command
 from firmware_host.errors import IncompatibleError
 
 pytestmark = pytest.mark.usefixtures("compiler")
@@ -20,20 +18,11 @@ pytestmark = pytest.mark.usefixtures("compiler")
 @pytest.fixture
 def boards(tmp_path: Path) -> Iterator[list[str]]:
     """32 native boards on unix sockets."""
-    with ExitStack() as stack:
-        ports = []
-        for n in range(32):
-            port = f"unix:{tmp_path / f'b{n}'}"
-            process = subprocess.Popen(
-                native_command(port, unique_id=n), stdin=subprocess.DEVNULL, stdout=subprocess.PIPE
-            )
-            stack.callback(process.wait)
-            stack.callback(process.terminate)
-            assert process.stdout is not None
-            stack.callback(process.stdout.close)
-            assert process.stdout.readline().startswith(b"listening")
-            ports.append(port)
-        yield ports
+    ports = [f"unix:{tmp_path / f'b{n}'}" for n in range(32)]
+    emulated = [Native(port, unique_id=n) for n, port in enumerate(ports)]
+    yield ports
+    for board in emulated:
+        board.end()
 
 
 def inventory(path: Path, ports: list[str], extra: dict[int, str]) -> Path:
@@ -51,8 +40,8 @@ def test_a_boards_link(tmp_path: Path) -> None:
     extra = {1: "link = {air = {pilot_every = 4, frames_per_packet = 8}}\n", 2: 'link = "links/fast.toml"\n'}
     file = inventory(tmp_path / "three.toml", ["unix:/a", "unix:/b", "unix:/c"], extra)
     banks = [bank for _, bank in read_inventory(file).boards]
-    assert [b.composed.packet.pilot_every for b in banks] == [1, 4, 1]
-    assert [b.composed.packet.frames for b in banks] == [10, 8, 10]
+    assert [b.packet.pilot_every for b in banks] == [1, 4, 1]
+    assert [b.packet.frames for b in banks] == [10, 8, 10]
     assert [b.chip_rate_hz for b in banks] == [10_000, 10_000, 20_000]
     inventory(file, ["unix:/a"], {0: "link = {air = {pilot_every = 0}}\n"})
     with pytest.raises(ConfigError, match=r"board\[0\]: link: air\.pilot_every = 0"):
@@ -64,7 +53,7 @@ def test_a_link_for_all_boards(tmp_path: Path) -> None:
     file.write_text(
         file.read_text().replace("random = 16", 'random = 16\nlink = {modulation = {id = "wh8"}}')
     )
-    assert [bank.profile for _, bank in read_inventory(file).boards] == ["wh8", "wh4x2"]
+    assert [bank.codebook.profile for _, bank in read_inventory(file).boards] == ["wh8", "wh4x2"]
 
 
 def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
@@ -74,7 +63,7 @@ def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
     entry = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\npayload = "m.json"\n'
     file.write_text("[[board]]\n" + entry)
     ((_, bank),) = read_inventory(file).boards
-    assert (bank.profile, bank.chip_rate_hz) == ("wh8", 5000)
+    assert (bank.codebook.profile, bank.chip_rate_hz) == ("wh8", 5000)
     file.write_text("[[board]]\n" + entry + "link = {air = {chip_rate_hz = 5000.0}}\n")
     with pytest.raises(IncompatibleError, match=r"board\[0\]: .*modulation\.id: sent with .*wh8"):
         read_inventory(file)

@@ -172,7 +172,7 @@ def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
     loaded = symbol_chips(random_symbols(2, 10, book, np.random.default_rng(0)), book)
     np.save(path, loaded)
     payload = read_masks(path, load_link())
-    assert (payload.packets, payload.packet_chips, len(payload.content)) == (2, 346, 2 * 346 * 12)
+    assert (payload.packets, payload.packet.packet_chips, len(payload.content)) == (2, 346, 2 * 346 * 12)
 
 
 def test_codebook_packets_are_balanced_and_do_not_flicker(evlcp) -> None:
@@ -216,7 +216,7 @@ def test_pilots_in_some_frames_only(evlcp, tmp_path: Path, book: Codebook) -> No
     assert np.load(file).tolist() == expected.tolist()
     masks = read_masks(file, load_link(overrides=["air.frames_per_packet=6", "air.pilot_every=4"]))
     assert masks.packets == 2
-    assert masks.composed.packet.pilot_every == 4
+    assert masks.packet.pilot_every == 4
     rows = [line.split() for line in evlcp(*options, "--format", "table").out.splitlines()[1:]]
     assert {row[1] for row in rows if row[4] == "-"} == {"1", "2", "3", "5"}
     words = evlcp(*options, "--format", "hex").out.splitlines()

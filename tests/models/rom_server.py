@@ -6,11 +6,11 @@ What it is told to run then runs on the model of the part, at the same socket, w
 import argparse
 import contextlib
 import importlib.util
-import socket
 import sys
 from pathlib import Path
 
-from firmware_host.emulators.listening import listener
+from firmware_host.emulators.listening import HostLine
+from firmware_host.errors import ToolchainError
 from firmware_host.images import FLASH_START, FlashImage
 from tests.models.rom import RomEmulator
 
@@ -19,33 +19,27 @@ __all__ = ["main", "serve_rom"]
 _BOOT_US = 15_000
 
 
-def serve_rom(rom: RomEmulator, server: socket.socket, flash: Path | None = None) -> socket.socket:
-    """Let hosts talk to a ROM, one after the other, until one has it run something; that one's line.
+def serve_rom(rom: RomEmulator, line: HostLine, flash: Path | None = None) -> None:
+    """Let hosts talk to a ROM, one after the other, until one has it run something.
 
     Args:
         rom: The part.
-        server: Where hosts come.
-        flash: File that holds its flash whenever a host has left.
+        line: Where hosts come.
+        flash: File that holds its flash whenever it has changed.
     """
-    while True:
-        line, _ = server.accept()
-        while rom.started is None and (data := _received(line)):
-            line.sendall(rom.receive(data))
-        if flash is not None:
-            flash.write_bytes(rom.flash)
-        if rom.started is not None:
-            return line
-        line.close()
+    answer, held = b"", b""
+    while rom.started is None:
+        data = line.exchange(answer, 0.0 if answer else 0.2)
+        answer = rom.receive(data) if data else b""
+        if not data and flash is not None and rom.flash != held:
+            held = bytes(rom.flash)
+            flash.write_bytes(held)
+    line.exchange(answer, 0.0)
+    if flash is not None:
+        flash.write_bytes(rom.flash)
 
 
-def _received(line: socket.socket) -> bytes:
-    try:
-        return line.recv(4096)
-    except OSError:
-        return b""
-
-
-def _runs(flash: bytes, server: socket.socket, line: socket.socket, leds: Path | None) -> None:
+def _runs(flash: bytes, line: HostLine, leds: Path | None) -> None:
     """Run what was flashed, by a crystal of 8 MHz or else of 12."""
     from tests.models.stm32 import Stm32
     from tests.models.stm32_server import serve
@@ -59,7 +53,7 @@ def _runs(flash: bytes, server: socket.socket, line: socket.socket, leds: Path |
             wrong = fault
             continue
         with contextlib.ExitStack() as stack:
-            serve(chip, server, stack.enter_context(leds.open("wb")) if leds else None, line)
+            serve(chip, line, stack.enter_context(leds.open("wb")) if leds else None)
     sys.stderr.write(f"rom: what was flashed does not run on the model: {wrong}\n")
     raise SystemExit(1)
 
@@ -73,17 +67,17 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     try:
         held = options.flash.read_bytes() if options.flash and options.flash.exists() else None
-        server = listener(options.listen)
+        line = HostLine(options.listen)
         rom = RomEmulator(held)
-        line = serve_rom(rom, server, options.flash)
+        serve_rom(rom, line, options.flash)
         if importlib.util.find_spec("unicorn") is None:
             sys.stderr.write("rom: told to run; 'pip install unicorn' for the model that does\n")
             return
-        _runs(bytes(rom.flash), server, line, options.leds)
+        _runs(bytes(rom.flash), line, options.leds)
     except KeyboardInterrupt:
         pass
-    except OSError as fault:
-        sys.stderr.write(f"rom: {fault.filename or options.listen}: {fault.strerror}\n")
+    except (OSError, ToolchainError) as fault:
+        sys.stderr.write(f"rom: {fault}\n")
         raise SystemExit(1) from None
 
 

@@ -5,15 +5,14 @@ holds each row that the latches took while the outputs were on, and the time, in
 """
 
 import argparse
-import selectors
-import socket
 import struct
 import sys
 import time
 from pathlib import Path
 from typing import BinaryIO
 
-from firmware_host.emulators.listening import listener
+from firmware_host.emulators.listening import HostLine
+from firmware_host.errors import ToolchainError
 from firmware_host.protocol.generated.requests import CHIP_DARK, LEDS
 from tests.models.stm32 import UNIT_HZ, Shown, Stm32
 
@@ -38,51 +37,24 @@ def records(log: list[Shown], chip: int = 0) -> tuple[bytes, int]:
     return b"".join(out), chip
 
 
-def serve(
-    chip: Stm32, server: socket.socket, leds: BinaryIO | None = None, line: socket.socket | None = None
-) -> None:
-    """Run a model for hosts at a socket, one at a time, until it is ended; `line` is the first one's."""
+def serve(chip: Stm32, line: HostLine, leds: BinaryIO | None = None) -> None:
+    """Run a model for hosts, one at a time, until it is ended."""
     begun, number = time.monotonic(), 0
-    with selectors.DefaultSelector() as selector:
-        selector.register(server, selectors.EVENT_READ)
-        if line is not None:
-            selector.register(line, selectors.EVENT_READ)
-        while True:
-            chip.run(_STEP_US)
-            ahead = chip.now / UNIT_HZ - (time.monotonic() - begun)
-            if ahead < 0:
-                begun -= ahead  # what was lost is not caught up with
-            for key, _ in selector.select(max(0.0, ahead)):
-                if key.fileobj is server:
-                    found, _ = server.accept()
-                    if line is not None:
-                        found.close()  # a board has one host
-                        continue
-                    line = found
-                    selector.register(line, selectors.EVENT_READ)
-                elif line is not None:
-                    try:
-                        data = line.recv(4096)
-                    except OSError:
-                        data = b""
-                    if data:
-                        chip.usart.arrive(data)
-                    else:
-                        selector.unregister(line)
-                        line.close()
-                        line = None
-            if chip.usart.to_host:
-                data = bytes(chip.usart.to_host)
-                chip.usart.to_host.clear()
-                if line is not None:
-                    line.sendall(data)
-            if len(chip.drivers.log) > 1:
-                # the last one is what the drivers compare the next with
-                done, chip.drivers.log[:] = chip.drivers.log[:-1], chip.drivers.log[-1:]
-                packed, number = records(done, number)
-                if leds is not None:
-                    leds.write(packed)
-                    leds.flush()
+    while True:
+        chip.run(_STEP_US)
+        ahead = chip.now / UNIT_HZ - (time.monotonic() - begun)
+        if ahead < 0:
+            begun -= ahead  # what was lost is not caught up with
+        sent = bytes(chip.usart.to_host)
+        chip.usart.to_host.clear()
+        chip.usart.arrive(line.exchange(sent, max(0.0, ahead)))
+        if len(chip.drivers.log) > 1:
+            # the last one is what the drivers compare the next with
+            done, chip.drivers.log[:] = chip.drivers.log[:-1], chip.drivers.log[-1:]
+            packed, number = records(done, number)
+            if leds is not None:
+                leds.write(packed)
+                leds.flush()
 
 
 def main(arguments: list[str] | None = None) -> None:
@@ -94,11 +66,11 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     leds = options.leds.open("wb") if options.leds else None
     try:
-        serve(Stm32(options.image), listener(options.listen), leds)
+        serve(Stm32(options.image), HostLine(options.listen), leds)
     except KeyboardInterrupt:
         pass
-    except OSError as fault:
-        sys.stderr.write(f"stm32: {options.listen}: {fault.strerror}\n")
+    except ToolchainError as fault:
+        sys.stderr.write(f"stm32: {fault}\n")
         raise SystemExit(1) from None
 
 

@@ -11,14 +11,12 @@ from evlcp_edges.modulation import Nrz, Ppm
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.pilots import WhPilots
 
-from evlcp_sdk.air.codebook import Codebook, chips_of_values, hadamard
+from evlcp_sdk.air.codebook import Codebook, chips_of_values, hadamard, word_of_chips
 from evlcp_sdk.air.frames import (
     PacketFormat,
     bits_of_symbols,
     chips_behind,
-    info_words,
     packet_chips,
-    pilot_words,
     symbols_of_bits,
 )
 from evlcp_sdk.errors import CodebookMismatchError, ConfigError
@@ -36,10 +34,8 @@ def book_of(profile: str) -> Codebook:
 @pytest.mark.parametrize("profile", PROFILES)
 def test_words_are_the_vectors(profile: str) -> None:
     book = book_of(profile)
-    assert [f"{w:04x}" for w in pilot_words(book)] == VECTORS["pilot_words"]
-    n = len(book.codewords)
-    words = info_words(np.arange(n).repeat(16).reshape(n, 16), book)[:, 0]
-    assert [f"{w:04x}" for w in words] == VECTORS["info_words"][profile]
+    assert [f"{word_of_chips(code):04x}" for code in book.pilots] == VECTORS["pilot_words"]
+    assert [f"{word_of_chips(code):04x}" for code in book.codewords] == VECTORS["info_words"][profile]
     assert "".join(map(str, book.preamble)) == VECTORS["preamble_chips"]
     assert book.preamble.tolist() == chips_of_values(VECTORS["barker13"]).tolist()
     assert book.to_dict()["preamble"] == VECTORS["barker13"]

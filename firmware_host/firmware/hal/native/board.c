@@ -100,7 +100,7 @@ uint32_t hal_millis(void)
 
 uint32_t hal_send(const uint8_t *bytes, uint32_t count)
 {
-    size_t room = self->output_room > self->output_length ? self->output_room - self->output_length : 0u;
+    size_t room = sizeof self->output - self->output_length;
     if (count > room)
         count = (uint32_t)room;
     memcpy(self->output + self->output_length, bytes, count);
@@ -200,7 +200,6 @@ void native_init(struct native *board)
     memset(board, 0, sizeof *board);
     memset(board->flash, 0xff, sizeof board->flash);
     memset(board->images, 0xff, sizeof board->images);
-    board->output_room = sizeof board->output;
     board->health.temperature_dc = 250;
     native_reset(board);
 }

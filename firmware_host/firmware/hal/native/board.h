@@ -1,5 +1,5 @@
-/* The driver board in a process: HAL over memory and a virtual tick counter. Time moves only in
-   native_run, so a test decides when chips fall due; main.c lets it follow the clock. */
+/* The driver board in a process: HAL over memory and a virtual tick counter. Time moves only in native_run, so
+   the caller decides when chips fall due. */
 #ifndef EVLCP_NATIVE_BOARD_H
 #define EVLCP_NATIVE_BOARD_H
 
@@ -40,7 +40,6 @@ struct native {
     uint32_t power_left; /* words and erases of the flash until then; 0: for ever */
     uint8_t output[1u << 16]; /* sent, not yet collected */
     size_t output_length;
-    size_t output_room; /* bytes the line takes now; at most the buffer */
     uint8_t shown[EVLCP_ROW_BYTES];
     /* LED records: u32 tick, u32 chip, row; little-endian. */
     void (*record)(void *context, const uint8_t record[NATIVE_RECORD_BYTES]);

@@ -1,4 +1,4 @@
-/* The board as a shared library, for tests in virtual time. */
+/* The board as a shared library; its time is what the caller lets pass. */
 #include <stdlib.h>
 #include <string.h>
 
@@ -10,25 +10,6 @@ struct library {
     size_t count;
     size_t room;
 };
-
-struct library *board_new(const uint8_t unique_id[12]);
-void board_free(struct library *l);
-void board_reset(struct library *l);
-void board_run_us(struct library *l, uint64_t us);
-void board_input(struct library *l, const uint8_t *bytes, size_t count);
-size_t board_output(struct library *l, uint8_t *bytes, size_t room);
-size_t board_record_count(const struct library *l);
-void board_take_records(struct library *l, uint8_t *bytes);
-void board_set_health(struct library *l, int16_t temperature_dc, uint8_t faults, uint8_t open_led);
-void board_set_late(struct library *l, uint32_t ticks);
-void board_set_failures(struct library *l, uint8_t level, uint8_t flash);
-void board_flip_flash(struct library *l, uint8_t slot, uint32_t offset);
-void board_shown(const struct library *l, uint8_t row[EVLCP_ROW_BYTES]);
-uint16_t board_level(const struct library *l);
-uint8_t board_running(const struct library *l);
-void board_cut_power(struct library *l, uint32_t left);
-void board_set_pulse(struct library *l, double period, double next);
-void board_image(const struct library *l, uint8_t image, uint8_t *bytes);
 
 static void keep(void *context, const uint8_t record[NATIVE_RECORD_BYTES])
 {
@@ -153,4 +134,21 @@ void board_set_pulse(struct library *l, double period, double next)
 {
     l->board.pulse_period = period;
     l->board.pulse_next = next;
+}
+
+size_t board_flash_bytes(void)
+{
+    return sizeof((struct native *)0)->flash;
+}
+
+void board_flash(const struct library *l, uint8_t *bytes)
+{
+    memcpy(bytes, l->board.flash, sizeof l->board.flash);
+}
+
+/* The flash of another board, and a reset. */
+void board_set_flash(struct library *l, const uint8_t *bytes)
+{
+    memcpy(l->board.flash, bytes, sizeof l->board.flash);
+    native_reset(&l->board);
 }

@@ -1,0 +1,149 @@
+"""The native board: the firmware compiled for this machine, whose chips fall due by the clock."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.files import Outputs, output_fault
+from firmware_host.emulators.listening import HostLine
+from firmware_host.emulators.simulated import SimulatedBoard
+from firmware_host.images import check_flash_file
+
+__all__ = ["NativeBoard", "NativeLine", "serve"]
+
+_PIECE = 2048
+"""Bytes that the board receives at once: half of what it has room for."""
+
+_STEP_S = 0.005
+
+
+@dataclass
+class _Rated:
+    """One direction of a line; room that is not used is lost, as on a line."""
+
+    baud: int
+    waiting: bytes = b""
+    room: float = 0.0
+    at_s: float = field(default_factory=time.monotonic)
+
+    def pass_on(self, data: bytes) -> bytes:
+        """What has passed the line by now."""
+        self.waiting += data
+        now_s = time.monotonic()
+        self.room += (now_s - self.at_s) * self.baud / 10
+        self.at_s = now_s
+        count = min(len(self.waiting), int(self.room)) if self.baud else len(self.waiting)
+        self.room -= count
+        passed, self.waiting = self.waiting[:count], self.waiting[count:]
+        if not self.waiting:
+            self.room = min(self.room, 2.0)
+        return passed
+
+
+class NativeBoard:
+    """A board of its own time, which follows the clock whenever something is exchanged with it.
+
+    Args:
+        leds: File for the LED records.
+        flash: File that keeps what SAVE writes, new or there.
+        baud: Line rate to keep to, bit/s; 0 for as fast as it goes.
+        unique_id: The board's number, 64 bits.
+
+    Raises:
+        InputError: The flash file cannot be used.
+        OutputError: A file cannot be written; so does `exchange`.
+        ToolchainError: The board cannot be built.
+    """
+
+    def __init__(
+        self, leds: Path | None = None, flash: Path | None = None, baud: int = 0, unique_id: int = 0
+    ) -> None:
+        self._device = SimulatedBoard(bytes(4) + unique_id.to_bytes(8, "big"))
+        self._held = self._device.flash()
+        self._flash = None if flash is None else flash.resolve()
+        if flash is not None:
+            check_flash_file(flash)
+            if flash.is_file():
+                self._held = flash.read_bytes()
+                if len(self._held) != len(self._device.flash()):
+                    raise InputError(f"{flash}: not a flash file of {len(self._device.flash())} bytes")
+                self._device.set_flash(self._held)
+            self._store()  # a place that takes no SAVE is known now
+        try:
+            self._leds = None if leds is None else leds.open("wb", buffering=0)
+        except OSError as fault:
+            raise output_fault(leds or "", fault) from fault
+        self._to_board, self._to_host = _Rated(baud), _Rated(baud)
+        self._begun_s = time.monotonic()
+        self.wait_s = _STEP_S / 10 if baud else _STEP_S
+
+    def exchange(self, data: bytes) -> bytes:
+        """Let time pass until now, give the board what a host has sent, and take what it sends."""
+        self._device.run(int((time.monotonic() - self._begun_s) * 1e6) - self._device.now_us)
+        data = self._to_board.pass_on(data)
+        for at in range(0, len(data), _PIECE):
+            self._device.receive(data[at : at + _PIECE])
+            self._device.run(0)
+        # Before the answer to a SAVE goes out, the slots are in the file.
+        if self._flash is not None and (held := self._device.flash()) != self._held:
+            self._held = held
+            self._store()
+        records = self._device.take_records()
+        if self._leds is not None:
+            try:
+                self._leds.write(records.tobytes())
+            except OSError as fault:
+                raise output_fault(self._leds.name, fault) from fault
+        return self._to_host.pass_on(self._device.sent())
+
+    def close(self) -> None:
+        """Switch it off: its files are whole."""
+        if self._leds is not None:
+            self._leds.close()
+
+    def _store(self) -> None:
+        """A new file takes the place of the old one when it is whole; a link stays one."""
+        if self._flash is not None:
+            with Outputs() as outputs:
+                outputs.open_binary(self._flash).write(self._held)
+                outputs.commit()
+
+
+class NativeLine:
+    """A native board in this process, as a `Transport`; it ends with the line."""
+
+    def __init__(self, board: NativeBoard, name: str = "native:") -> None:
+        self.name = name
+        self._board = board
+        self._came = b""
+
+    def now(self) -> float:
+        """Monotonic time, s."""
+        return time.monotonic()
+
+    def read(self, timeout_s: float) -> bytes:
+        """See `Transport.read`."""
+        end = self.now() + timeout_s
+        while True:
+            data, self._came = self._came + self._board.exchange(b""), b""
+            left = end - self.now()
+            if data or left <= 0:
+                return data
+            time.sleep(min(left, 0.001))
+
+    def write(self, data: bytes) -> None:
+        """See `Transport.write`."""
+        self._came += self._board.exchange(data)
+
+    def close(self) -> None:
+        """The board ends."""
+        self._board.close()
+
+
+def serve(board: NativeBoard, line: HostLine, stopped: Callable[[], bool]) -> None:
+    """Let hosts talk to a board, one at a time, until it is stopped."""
+    data = b""
+    while not stopped():
+        data = line.exchange(board.exchange(data), board.wait_s)
