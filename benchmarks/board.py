@@ -32,7 +32,7 @@ from firmware_host.errors import BoardError
 from firmware_host.images import FlashImage
 from firmware_host.ports.rom import RomLoader, flash_image
 from firmware_host.protocol.client import RequestOutcome, Timing
-from firmware_host.protocol.generated.requests import CommitReply, CommitRequest, StatusReply, StatusRequest
+from firmware_host.protocol.generated.requests import CommitRequest, StatusReply, StatusRequest
 from firmware_host.protocol.wire import WireMessage
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -111,7 +111,7 @@ def stm32() -> None:
         board.fill(0, bank.content)
         sizes = (bank.format, bank.packets, len(bank.content), bank.crc)
         began = chip.now
-        board.session.call(CommitRequest(0, *sizes, bytes.fromhex(bank.digest)), CommitReply)
+        board.session.call(CommitRequest(0, *sizes, bytes.fromhex(bank.digest)))
         commit_ms = (chip.now - began) / US / 1e3
         board.start()
         chip.run(10_000)

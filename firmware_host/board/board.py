@@ -24,26 +24,17 @@ from firmware_host.protocol.generated.requests import (
     KEY_BYTES,
     LEDS,
     NO_BANK,
-    BlankReply,
     BlankRequest,
     Capability,
-    ChipsReply,
     ChipsRequest,
-    CodebookReply,
     CodebookRequest,
-    CommitReply,
     CommitRequest,
-    ConfigureReply,
     ConfigureRequest,
-    CrcReply,
     CrcRequest,
     Format,
     HelloReply,
-    KeyReply,
     KeyRequest,
-    LedTestReply,
     LedTestRequest,
-    LevelReply,
     LevelRequest,
     Profile,
     ReadReply,
@@ -52,22 +43,17 @@ from firmware_host.protocol.generated.requests import (
     RecallRequest,
     SaveReply,
     SaveRequest,
-    StartReply,
     StartRequest,
     State,
     Status,
     StatusReply,
     StatusRequest,
-    StopReply,
     StopRequest,
-    StreamReply,
     StreamRequest,
     Watchdog,
-    WatchdogReply,
     WatchdogRequest,
     WriteRequest,
 )
-from firmware_host.protocol.wire import WireMessage
 
 _BLOCK = 2048
 """Bytes of a bank whose CRC decides together whether they are there."""
@@ -157,7 +143,7 @@ class Board:
 
     def status(self) -> StatusReply:
         """What the board does."""
-        return self.session.call(StatusRequest(), StatusReply)
+        return self.session.call(StatusRequest())
 
     def start(self, at_pulse: int = 0, pulse_hz: int = 1, at_clock: int = 0) -> None:
         """Play the active bank: now, at a pulse and in step with them from then on, or at a clock.
@@ -167,15 +153,15 @@ class Board:
             pulse_hz: Pulses a second.
             at_clock: The clock, as STATUS tells it; 0: none.
         """
-        self.session.call(StartRequest(at_pulse, pulse_hz if at_pulse else 0, at_clock), StartReply)
+        self.session.call(StartRequest(at_pulse, pulse_hz if at_pulse else 0, at_clock))
 
     def stop(self) -> None:
         """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
-        self.session.call(StopRequest(), StopReply)
+        self.session.call(StopRequest())
 
     def blank(self) -> None:
         """Dark at once."""
-        self.session.call(BlankRequest(), BlankReply)
+        self.session.call(BlankRequest())
 
     def level(self, level_ma: int) -> None:
         """Set the LED current, mA.
@@ -183,23 +169,23 @@ class Board:
         Raises:
             RefusedError: It is above the board's maximum.
         """
-        self.session.call(LevelRequest(level_ma), LevelReply)
+        self.session.call(LevelRequest(level_ma))
 
     def watchdog(self, action: Watchdog, timeout_ms: int) -> None:
         """What to do when the host is silent for `timeout_ms`."""
-        self.session.call(WatchdogRequest(action, timeout_ms), WatchdogReply)
+        self.session.call(WatchdogRequest(action, timeout_ms))
 
     def save(self, autostart: bool = False) -> SaveReply:
         """Save active bank and settings to flash."""
-        return self.session.call(SaveRequest(int(autostart)), SaveReply)
+        return self.session.call(SaveRequest(int(autostart)))
 
     def recall(self) -> RecallReply:
         """Commit what was saved."""
-        return self.session.call(RecallRequest(), RecallReply)
+        return self.session.call(RecallRequest())
 
     def test_leds(self, first: int, last: int, dwell_ms: int) -> None:
         """Walk over LEDs one by one."""
-        self.session.call(LedTestRequest(first, last, dwell_ms), LedTestReply)
+        self.session.call(LedTestRequest(first, last, dwell_ms))
 
     def set_key(self, key: bytes | None) -> None:
         """Set the board's key, or take it away; a new session begins, and SAVE keeps it.
@@ -210,23 +196,22 @@ class Board:
         """
         if not self.about.capabilities & Capability.TRUST:
             raise IncompatibleError(f"{self.session.name}: cannot have a key; see 'evlcp board hello'")
-        self.session.call(KeyRequest(key or bytes(KEY_BYTES)), KeyReply)
+        self.session.call(KeyRequest(key or bytes(KEY_BYTES)))
         self.session.key = key
         self.about = self.session.renew()
 
     def crc(self, bank: int, offset: int, length: int) -> int:
         """CRC-32 of a bank's bytes."""
-        return self.session.call(CrcRequest(bank, offset, length), CrcReply).crc
+        return self.session.call(CrcRequest(bank, offset, length)).crc
 
     def read(self, bank: int, offset: int, length: int) -> bytes:
         """A bank's bytes."""
         most = self.about.max_payload - ReadReply.fixed_bytes()
         found: dict[int, bytes] = {}
 
-        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+        def handle(request: ReadRequest, outcome: RequestOutcome) -> None:
             reply = self.session.checked(request, outcome)
-            if isinstance(reply, ReadReply):
-                found[reply.offset] = reply.data
+            found[reply.offset] = reply.data
 
         pieces = [(at, min(most, offset + length - at)) for at in range(offset, offset + length, most)]
         self.session.run((ReadRequest(bank, at, n) for at, n in pieces), handle)
@@ -277,11 +262,11 @@ class Board:
         if not bank.composed:
             clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
             request = ChipsRequest(bank.packet.packet_chips, self._hold(bank), clusters, digest)
-            self.session.call(request, ChipsReply)
+            self.session.call(request)
             return
         pilots = tuple(map(word_of_chips, bank.codebook.pilots))
         preamble = (bank.packet.preamble_chips, word_of_chips(bank.codebook.preamble))
-        self.session.call(CodebookRequest(*preamble, pilots, digest), CodebookReply)
+        self.session.call(CodebookRequest(*preamble, pilots, digest))
 
     def _hold(self, bank: Bank) -> int:
         """How many chips of the board's chip rate a chip of the bank lasts.
@@ -309,7 +294,7 @@ class Board:
         frames, every = _frames(bank)
         configure = ConfigureRequest(rate, profile_number(bank), frames, every, level_limit_ma, duty_limit)
         try:
-            self.session.call(configure, ConfigureReply)
+            self.session.call(configure)
         except RefusedError as fault:
             # the chip rate is what the board looks at first
             wrong = not about.chip_rate_min_hz <= rate <= about.chip_rate_max_hz or about.tick_hz % rate
@@ -375,7 +360,7 @@ class Board:
             )
         digest = bytes.fromhex(content.digest)
         commit = CommitRequest(bank, content.format, content.packets, total, content.crc, digest)
-        self.session.call(commit, CommitReply)
+        self.session.call(commit)
         status = self._settled()
         if verify and not self.holds(content, status):
             raise VerifyError(
@@ -422,7 +407,7 @@ class Board:
         if like.content:
             self.fill(bank, like.content)
         request = StreamRequest(bank, like.format, bytes.fromhex(like.digest))
-        slots = self.session.call(request, StreamReply).slots
+        slots = self.session.call(request).slots
         if ahead >= slots:
             raise ConfigError(
                 f"ahead = {ahead}, {self.session.name} holds {slots - 1} packets of this length"
@@ -565,9 +550,7 @@ class Board:
                     end = at + state["piece"]
                 yield WriteRequest(bank, at, content[at:end])
 
-        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
-            if not isinstance(request, WriteRequest):
-                return
+        def handle(request: WriteRequest, outcome: RequestOutcome) -> None:
             n = len(request.data)
             if outcome.status is None and n > _LEAST:
                 state["piece"] = max(_LEAST, min(state["piece"], n // 2))
@@ -585,12 +568,10 @@ class Board:
         """Blocks (offset, bytes) of a bank that are not `content`."""
         missing: list[tuple[int, int]] = []
 
-        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
-            reply = self.session.checked(request, outcome)
-            if isinstance(request, CrcRequest) and isinstance(reply, CrcReply):
-                end = request.offset + request.length
-                if zlib.crc32(content[request.offset : end]) != reply.crc:
-                    missing.append((request.offset, request.length))
+        def handle(request: CrcRequest, outcome: RequestOutcome) -> None:
+            crc = self.session.checked(request, outcome).crc
+            if zlib.crc32(content[request.offset : request.offset + request.length]) != crc:
+                missing.append((request.offset, request.length))
 
         blocks = [(at, min(_BLOCK, len(content) - at)) for at in range(0, len(content), _BLOCK)]
         self.session.run((CrcRequest(bank, at, n) for at, n in blocks), handle)

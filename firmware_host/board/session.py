@@ -2,7 +2,7 @@
 
 import random
 from collections.abc import Callable, Iterable
-from typing import TypeVar
+from typing import Any, TypeVar, cast
 
 from firmware_host.errors import (
     BoardError,
@@ -27,7 +27,7 @@ from firmware_host.protocol.generated.requests import (
     Type,
 )
 from firmware_host.protocol.seal import Sealer, key_name
-from firmware_host.protocol.wire import WireMessage
+from firmware_host.protocol.wire import WireMessage, WireRequest
 
 
 def _if_silent(port: str) -> str:
@@ -38,6 +38,7 @@ def _if_silent(port: str) -> str:
 
 
 Reply = TypeVar("Reply", bound=WireMessage)
+Request = TypeVar("Request", bound=WireRequest[Any])
 
 _ADVICE = {
     Status.UNKNOWN_TYPE: "the firmware does not know it; update the firmware",
@@ -195,7 +196,7 @@ class Session:
         self.client.sealer = known if same else Sealer(self.key, about.challenge, start)
         self.max_payload = about.max_payload - SEAL_BYTES
 
-    def call(self, request: WireMessage, reply: type[Reply]) -> Reply:
+    def call(self, request: WireRequest[Reply]) -> Reply:
         """One request and its answer.
 
         Raises:
@@ -204,12 +205,9 @@ class Session:
         """
         found: list[RequestOutcome] = []
         self.run([request], lambda _, outcome: found.append(outcome))
-        answer = self.checked(request, found[0])
-        if not isinstance(answer, reply):
-            raise LineError(f"{self.name}: {type(answer).__name__} came, expected {reply.__name__}")
-        return answer
+        return self.checked(request, found[0])
 
-    def _check_known(self, request: WireMessage) -> None:
+    def _check_known(self, request: WireRequest[Any]) -> None:
         """Raise IncompatibleError if the board's protocol is too old for a request."""
         later = request.later(self.client.minor)
         if later is None:
@@ -220,7 +218,7 @@ class Session:
             f" {MAJOR}.{MINOR}; update the firmware"
         )
 
-    def checked(self, request: WireMessage, outcome: RequestOutcome) -> WireMessage:
+    def checked(self, request: WireRequest[Reply], outcome: RequestOutcome) -> Reply:
         """The answer of an outcome.
 
         Raises:
@@ -233,11 +231,9 @@ class Session:
             )
         if outcome.reply is None:
             raise refusal(self.name, request.TYPE, outcome.status, outcome.detail)
-        return outcome.reply
+        return cast(Reply, outcome.reply)
 
-    def run(
-        self, requests: Iterable[WireMessage], handle: Callable[[WireMessage, RequestOutcome], None]
-    ) -> None:
+    def run(self, requests: Iterable[Request], handle: Callable[[Request, RequestOutcome], None]) -> None:
         """Send requests, as many at once as the board takes; `handle` gets each with its outcome.
 
         `requests` may be a generator that goes on while outcomes come in. What `handle` raises ends the run.
@@ -246,7 +242,7 @@ class Session:
             LineError: The line went away.
         """
         source = iter(requests)
-        sent: dict[int, WireMessage] = {}
+        sent: dict[int, Request] = {}
         more = True
         try:
             while True:

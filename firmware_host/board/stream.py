@@ -13,12 +13,9 @@ from firmware_host.board.session import Session
 from firmware_host.errors import BoardError, LineError
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.generated.requests import (
-    PushReply,
     PushRequest,
     State,
-    StatusReply,
     StatusRequest,
-    StopReply,
     StopRequest,
 )
 
@@ -226,13 +223,13 @@ class Stream:
         self._pieces.clear()
         self._flight.clear()
         self._session.client.forget()
-        self._session.call(StopRequest(), StopReply)
+        self._session.call(StopRequest())
         self._until_dark(self.packet_s)
 
     def _until_dark(self, soon_s: float) -> None:
         line = self._session.transport
         end = line.now() + soon_s + _DARK_S
-        while self._session.call(StatusRequest(), StatusReply).state not in (State.DARK, State.FAULT):
+        while self._session.call(StatusRequest()).state not in (State.DARK, State.FAULT):
             if line.now() > end:
                 raise LineError(f"{self._session.name}: still lit; try 'evlcp board blank'")
             line.read(min(0.005, self._pulse_s))
@@ -283,8 +280,6 @@ class Stream:
     def _take(self, outcome: RequestOutcome) -> None:
         piece, request = self._flight.pop(outcome.token)
         reply = self._session.checked(request, outcome)
-        if not isinstance(reply, PushReply):
-            raise LineError(f"{self._session.name}: {type(reply).__name__} came, expected PushReply")
         now = self._session.transport.now()
         self._position = max(self._position, (reply.number, reply.offset))
         if reply.begun > self.begun:

@@ -19,19 +19,14 @@ from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.generated.requests import (
     Capability,
     Status,
-    UpdateBeginReply,
     UpdateBeginRequest,
-    UpdateCommitReply,
     UpdateCommitRequest,
-    UpdateConfirmReply,
     UpdateConfirmRequest,
-    UpdateRestartReply,
     UpdateRestartRequest,
     UpdateStatusReply,
     UpdateStatusRequest,
     UpdateWriteRequest,
 )
-from firmware_host.protocol.wire import WireMessage
 
 Progress = Callable[[int, int], None]
 
@@ -134,12 +129,12 @@ def update_status(board: Board) -> UpdateStatusReply:
             f"{board.session.name}: takes no updates over its line; 'evlcp board flash' instead",
             Status.NOT_SUPPORTED,
         )
-    return board.session.call(UpdateStatusRequest(), UpdateStatusReply)
+    return board.session.call(UpdateStatusRequest())
 
 
 def confirm(board: Board) -> None:
     """Keep the image that runs on trial."""
-    board.session.call(UpdateConfirmRequest(), UpdateConfirmReply)
+    board.session.call(UpdateConfirmRequest())
 
 
 def update(
@@ -180,7 +175,7 @@ def update(
             f"{session.name}: {len(data)} bytes of firmware, an image may have {before.capacity}",
             Status.OUT_OF_RANGE,
         )
-    session.call(UpdateBeginRequest(before.next, len(data), zlib.crc32(data)), UpdateBeginReply)
+    session.call(UpdateBeginRequest(before.next, len(data), zlib.crc32(data)))
     advance = progress or (lambda _done, _total: None)
     piece = (board.session.max_payload - UpdateWriteRequest.fixed_bytes()) // 4 * 4
     done = 0
@@ -189,15 +184,15 @@ def update(
         for at in range(0, len(data), piece):
             yield UpdateWriteRequest(at, data[at : at + piece])
 
-    def handle(request: WireMessage, outcome: RequestOutcome) -> None:
+    def handle(request: UpdateWriteRequest, outcome: RequestOutcome) -> None:
         nonlocal done
         session.checked(request, outcome)
-        done += len(request.data) if isinstance(request, UpdateWriteRequest) else 0
+        done += len(request.data)
         advance(done, len(data))
 
     try:
         session.run(requests(), handle)
-        sequence = session.call(UpdateCommitRequest(), UpdateCommitReply).sequence
+        sequence = session.call(UpdateCommitRequest()).sequence
     except LineError as fault:
         raise type(fault)(
             f"{fault}; it begins anew, and the board keeps the firmware that it runs"
@@ -220,7 +215,7 @@ def _restart(board: Board, wait_s: float) -> None:
     """Restart the board, and say HELLO until it answers; one that has been reset has taken fewer requests."""
     session, line = board.session, board.session.transport
     taken = board.status().requests
-    session.call(UpdateRestartRequest(), UpdateRestartReply)
+    session.call(UpdateRestartRequest())
     begin = line.now()
     # a slow one gets longer
     end = begin + wait_s + 20 * session.client.latency_s

@@ -7,6 +7,7 @@ and come back before its deadline.
 import random
 from collections import deque
 from dataclasses import dataclass, field
+from typing import Any
 
 from firmware_host.errors import DatagramError
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
@@ -22,7 +23,7 @@ from firmware_host.protocol.generated.requests import (
     Status,
 )
 from firmware_host.protocol.seal import Sealer
-from firmware_host.protocol.wire import WireMessage
+from firmware_host.protocol.wire import WireMessage, WireRequest
 
 TRIES = 5
 """How often a request is sent before it is given up, unless the caller says otherwise."""
@@ -178,7 +179,7 @@ class Client:
             self._spread_s += (abs(late_s - self._mean_s) - self._spread_s) / 4
             self._mean_s += (late_s - self._mean_s) / 8
 
-    def submit(self, request: WireMessage, session: int | None = None) -> int:
+    def submit(self, request: WireRequest[Any], session: int | None = None) -> int:
         """Queue a request; returns the token its outcome will carry."""
         sequence = (self.first + self._tokens) & 0xFFFF
         chosen = self.session if session is None else session
@@ -188,7 +189,7 @@ class Client:
             status = SEALED
         wire = Datagram(request.TYPE, status, sequence, chosen, payload).encode()
         reply = REPLIES[request.TYPE]
-        longest = MAX_PAYLOAD if reply.LAYOUT.endswith("*") else max(4, reply.fixed_bytes())
+        longest = MAX_PAYLOAD if reply.takes_more() else max(4, reply.fixed_bytes())
         self._tokens += 1
         self._queue.append(_Waiting(token, request.TYPE, wire, longest + HEADER_BYTES + CRC_BYTES + 4))
         return token

@@ -19,8 +19,8 @@ from evlcp_sdk.link.resolve import resolve
 
 HERE = Path(__file__).parents[1]
 
-_SIZES = {"u8": 1, "u16": 2, "u32": 4, "u64": 8, "i16": 2}
-_CODES = {"u8": "B", "u16": "H", "u32": "I", "u64": "Q", "i16": "h"}
+_SIZES = {"u8": 1, "u16": 2, "u32": 4, "i16": 2}
+_CODES = {"u8": "B", "u16": "H", "u32": "I", "i16": "h"}
 
 
 @dataclass(frozen=True)
@@ -29,7 +29,7 @@ class Field:
 
     Attributes:
         name: Its name.
-        base: Type of an element: u8, u16, u32, u64, i16 or bytes.
+        base: Type of an element: u8, u16, u32, i16 or bytes.
         count: Elements; 0 for the rest of the payload.
         doc: Meaning.
         since: Minor version that brought it.
@@ -59,13 +59,6 @@ class Field:
         return _SIZES.get(self.base, 1) * self.count
 
     @property
-    def layout(self) -> str:
-        """Its code in `WireMessage.LAYOUT`."""
-        if self.base == "bytes":
-            return f"{self.count}s" if self.count else "*"
-        return f"{self.count if self.count > 1 else ''}{_CODES[self.base]}"
-
-    @property
     def bits(self) -> int:
         """Of an element."""
         return 8 * _SIZES[self.base]
@@ -78,25 +71,23 @@ class Field:
         )
 
     @property
-    def since_text(self) -> str:
-        """Its entry in `WireMessage.FIELD_SINCE`."""
-        return f'"{self.name}": {self.since}'
-
-    @property
     def python_type(self) -> str:
-        """Annotation."""
+        """Annotation, with its `struct` code."""
         if self.base == "bytes":
-            return "bytes"
-        return "int" if self.count == 1 else "tuple[int, ...]"
+            return f'Annotated[bytes, "{self.count}s"]' if self.count else "Rest"
+        if self.count == 1:
+            return self.base.upper()
+        return f'Annotated[tuple[int, ...], "{self.count}{_CODES[self.base]}"]'
 
     @property
     def python_default(self) -> str:
         """What stands for it where it is not known; empty if it always is."""
         if not self.since:
             return ""
+        absent = "0" if self.count == 1 else f"(0,) * {self.count}"
         if self.base == "bytes":
-            return f" = bytes({self.count})"
-        return " = 0" if self.count == 1 else f" = (0,) * {self.count}"
+            absent = f"bytes({self.count})"
+        return f' = field(default={absent}, metadata={{"since": {self.since}}})'
 
 
 @dataclass(frozen=True)
@@ -174,6 +165,10 @@ def _camel(name: str) -> str:
     return _CLASSES.get(name) or "".join(part.capitalize() for part in name.split("_"))
 
 
+def _reply_class(message: Exchange) -> str:
+    return f"{_camel(message.name)}Reply" if message.reply else "EmptyReply"
+
+
 def _with_offsets(fields: Sequence[Field]) -> list[tuple[Field, int]]:
     return list(zip(fields, accumulate((f.size for f in fields), initial=0), strict=False))
 
@@ -201,6 +196,7 @@ _TEMPLATES = Environment(
 )
 _TEMPLATES.filters |= {
     "camel": _camel,
+    "reply_class": _reply_class,
     "with_offsets": _with_offsets,
     "fields_table": _fields_table,
     "numbers_table": _numbers_table,
@@ -215,21 +211,11 @@ def render(template: str, definition: dict[str, Any]) -> str:
     """
     messages = [Exchange.parse(table) for table in definition["message"]]
     numbers = [(key.upper(), definition[part][key]) for part, keys in _NUMBERS.items() for key in keys]
-    constants = [
-        "MAJOR",
-        "MINOR",
-        "REPLIES",
-        *(n for n, _ in numbers),
-        *map(str.upper, definition["constants"]),
-    ]
-    classes = ["Type", *map(_camel, definition["enums"])]
-    classes += [f"{_camel(m.name)}{kind}" for m in messages for kind in ("Request", "Reply")]
     return _TEMPLATES.get_template(f"{template}.j2").render(
         definition,
         messages=messages,
         numbers=numbers,
         host_in_c=_HOST_IN_C,
-        exported=sorted(constants) + sorted(classes),
         digests={profile: codebook_of(profile).digest for profile in profiles_of(definition)},
     )
 

@@ -2,61 +2,72 @@
 
 import dataclasses
 import struct
-from functools import cache
-from typing import Any, ClassVar, Self
+from functools import cache, cached_property
+from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar, get_type_hints
 
 from firmware_host.errors import DatagramError
 
+__all__ = ["I16", "U8", "U16", "U32", "Rest", "WireMessage", "WireRequest"]
+
+U8 = Annotated[int, "B"]
+U16 = Annotated[int, "H"]
+U32 = Annotated[int, "I"]
+I16 = Annotated[int, "h"]
+Rest = Annotated[bytes, "*"]
+"""Bytes to the end of the payload; a last field."""
+
+Reply = TypeVar("Reply", bound="WireMessage")
+
+
+@dataclasses.dataclass(frozen=True)
+class _Layout:
+    """How the fields that a minor version knows stand in a payload: their `struct` codes."""
+
+    codes: dict[str, str]
+
+    @cached_property
+    def rest(self) -> str | None:
+        """The field that takes the rest."""
+        return next((name for name, code in self.codes.items() if code == "*"), None)
+
+    @cached_property
+    def head(self) -> struct.Struct:
+        """What stands before the rest."""
+        return struct.Struct("<" + " ".join(code for code in self.codes.values() if code != "*"))
+
 
 @cache
-def _packer(codes: str) -> struct.Struct:
-    return struct.Struct("<" + codes)
+def _read_layout(message: Any, minor: int | None) -> _Layout:
+    hints = get_type_hints(message, include_extras=True)
+    known = (f for f in _fields(message) if minor is None or f.metadata.get("since", 0) <= minor)
+    return _Layout({field.name: hints[field.name].__metadata__[0] for field in known})
 
 
-def _count(code: str) -> int:
-    """How many values a field takes: an array several, bytes one."""
-    return 1 if code.endswith("s") else int(code[:-1] or 1)
+def _layout(message: Any, minor: int | None = None) -> _Layout:
+    """What of a message a minor version knows; without one, all."""
+    return _read_layout(message, minor)
+
+
+def _fields(message: Any) -> tuple[dataclasses.Field[Any], ...]:
+    return dataclasses.fields(message)
 
 
 class WireMessage:
     """Base of a message's payload; subclasses are frozen dataclasses made from `protocol.toml`.
 
-    Attributes:
-        TYPE: Type byte of the request the payload belongs to.
-        LAYOUT: The `struct` code of each field, apart by blanks; `*` is the rest.
-        SINCE: Minor version of the protocol that brought the message.
-        FIELD_SINCE: The same of fields that came after the message; they are its last.
+    The annotation of a field has its `struct` code; one that a minor version of the protocol has brought has
+    that as `since` in its metadata, and stands last.
     """
-
-    TYPE: ClassVar[int]
-    LAYOUT: ClassVar[str]
-    SINCE: ClassVar[int] = 0
-    FIELD_SINCE: ClassVar[dict[str, int]] = {}
 
     @classmethod
     def fixed_bytes(cls) -> int:
         """Length without a trailing field of any length, bytes."""
-        return _packer(cls.LAYOUT.rstrip("*")).size
+        return _layout(cls).head.size
 
     @classmethod
-    def _lengths(cls) -> list[int]:
-        """Lengths of the payload in each minor version that changed it, bytes."""
-        codes = cls.LAYOUT.rstrip("*").split()
-        later = list(cls.FIELD_SINCE.values())
-        return [
-            _packer(" ".join(codes[: len(codes) - sum(since > minor for since in later)])).size
-            for minor in sorted({0, *later})
-        ]
-
-    def later(self, minor: int) -> str | None:
-        """What of this message a board of an earlier minor version could not know; None if nothing."""
-        if minor < self.SINCE:
-            return "it"
-        for field in dataclasses.fields(self):  # type: ignore[arg-type]
-            since = self.FIELD_SINCE.get(field.name, 0)
-            if since > minor and getattr(self, field.name) != field.default:
-                return field.name
-        return None
+    def takes_more(cls) -> bool:
+        """Whether it ends with a field of any length."""
+        return _layout(cls).rest is not None
 
     def pack(self, minor: int | None = None) -> bytes:
         """The payload as bytes, for a board of a minor version, or as long as it is.
@@ -64,26 +75,21 @@ class WireMessage:
         Raises:
             DatagramError: A value does not fit its field.
         """
+        layout = _layout(type(self), minor)
         values: list[Any] = []
-        rest = b""
-        later = self.FIELD_SINCE.values() if minor is not None else ()
-        codes = self.LAYOUT.split()
-        codes = codes[: len(codes) - sum(since > (minor or 0) for since in later)]
-        for code, field in zip(codes, dataclasses.fields(self), strict=False):  # type: ignore[arg-type]
-            value = getattr(self, field.name)
-            if code == "*":
-                rest = value
-            elif _count(code) > 1:
+        for name, code in layout.codes.items():
+            value = getattr(self, name)
+            if isinstance(value, tuple):
                 values += value
-            else:
+            elif code != "*":
                 if isinstance(value, bytes) and len(value) != struct.calcsize(code):
-                    raise DatagramError(f"{type(self).__name__}.{field.name}: {len(value)} bytes")
+                    raise DatagramError(f"{type(self).__name__}.{name}: {len(value)} bytes")
                 values.append(value)
         try:
-            head = _packer(" ".join(codes).rstrip("*")).pack(*values)
+            head = layout.head.pack(*values)
         except struct.error as fault:
             raise DatagramError(f"{type(self).__name__}: {fault}") from fault
-        return head + rest
+        return head + (getattr(self, layout.rest) if layout.rest else b"")
 
     @classmethod
     def unpack(cls, data: bytes) -> Self:
@@ -92,18 +98,43 @@ class WireMessage:
         Raises:
             DatagramError: The length is no minor version's.
         """
-        size = cls.fixed_bytes()
+        layout, size = _layout(cls), cls.fixed_bytes()
         if len(data) < size:
-            if len(data) not in cls._lengths():
+            minors = {f.metadata.get("since", 0) - 1 for f in _fields(cls)}
+            if len(data) not in {_layout(cls, max(0, minor)).head.size for minor in minors}:
                 raise DatagramError(f"{cls.__name__}: {len(data)} bytes, expected {size}")
             data += bytes(size - len(data))
-        flat = iter(_packer(cls.LAYOUT.rstrip("*")).unpack(data[:size]))
+        flat = list(layout.head.unpack(data[:size]))
         values: list[Any] = []
-        for code in cls.LAYOUT.split():
+        for code in layout.codes.values():
             if code == "*":
                 values.append(bytes(data[size:]))
-            elif (count := _count(code)) > 1:
-                values.append(tuple(next(flat) for _ in range(count)))
+            elif code[:-1] and code[-1] != "s":
+                count = int(code[:-1])
+                values.append(tuple(flat[:count]))
+                del flat[:count]
             else:
-                values.append(next(flat))
+                values.append(flat.pop(0))
         return cls(*values)
+
+
+class WireRequest(WireMessage, Generic[Reply]):
+    """Base of a request, of the reply that it has.
+
+    Attributes:
+        TYPE: Its type byte.
+        SINCE: Minor version of the protocol that brought it.
+    """
+
+    TYPE: ClassVar[int]
+    SINCE: ClassVar[int] = 0
+
+    def later(self, minor: int) -> str | None:
+        """What of this request a board of an earlier minor version could not know; None if nothing."""
+        if minor < self.SINCE:
+            return "it"
+        for field in _fields(self):
+            later = field.metadata.get("since", 0) > minor
+            if later and getattr(self, field.name) != field.default:
+                return field.name
+        return None

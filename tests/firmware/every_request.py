@@ -41,15 +41,15 @@ def every_request(board: Board, bank: Bank, update: bytes) -> list[str]:
         say((fault.status, fault.detail))
     spare = 1 - board.status().active_bank
     digest = bytes.fromhex(bank.digest)
-    slots = call(r.StreamRequest(spare, r.Format.WORDS, digest), r.StreamReply).slots
+    slots = call(r.StreamRequest(spare, r.Format.WORDS, digest)).slots
     say(slots)
-    push = call(r.PushRequest(spare, 0, 0, 0, bank.content[:64]), r.PushReply)
+    push = call(r.PushRequest(spare, 0, 0, 0, bank.content[:64]))
     say((push.number, push.offset, push.begun))
-    state = call(r.UpdateStatusRequest(), r.UpdateStatusReply)
+    state = call(r.UpdateStatusRequest())
     say((state.running, state.next, state.target.rstrip(b"\0").decode()))
-    call(r.UpdateBeginRequest(state.next, len(update), zlib.crc32(update)), r.UpdateBeginReply)
-    say(call(r.UpdateWriteRequest(0, update), r.UpdateWriteReply).count)
-    say(call(r.UpdateCommitRequest(), r.UpdateCommitReply).sequence)
-    call(r.UpdateConfirmRequest(), r.UpdateConfirmReply)
-    call(r.UpdateRestartRequest(), r.UpdateRestartReply)
+    call(r.UpdateBeginRequest(state.next, len(update), zlib.crc32(update)))
+    say(call(r.UpdateWriteRequest(0, update)).count)
+    say(call(r.UpdateCommitRequest()).sequence)
+    call(r.UpdateConfirmRequest())
+    call(r.UpdateRestartRequest())
     return told

@@ -23,11 +23,9 @@ from firmware_host.protocol.generated.requests import (
     BoardFault,
     Capability,
     Format,
-    PushReply,
     PushRequest,
     State,
     Status,
-    StreamReply,
     StreamRequest,
     Watchdog,
 )
@@ -129,10 +127,10 @@ def test_an_empty_queue_is_named_and_shows_the_idle_pattern() -> None:
 
 def board_of_status(stream: Stream) -> object:
     """STATUS in between; nothing of the stream is under way then."""
-    from firmware_host.protocol.generated.requests import StatusReply, StatusRequest
+    from firmware_host.protocol.generated.requests import StatusRequest
 
     assert not stream._flight
-    return stream._session.call(StatusRequest(), StatusReply)
+    return stream._session.call(StatusRequest())
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -272,7 +270,7 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
     like = queue_of(link)
     board.prepare(like)
     request = StreamRequest(0, Format.WORDS, bytes.fromhex(link.codebook.digest))
-    slots = board.session.call(request, StreamReply).slots
+    slots = board.session.call(request).slots
     assert slots == 4
     board.start()
     model = Queue(slots, 10_240)
@@ -288,7 +286,7 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
         count = min(count, left) if data.draw(st.booleans()) else count
         payload = bytes([data.draw(st.integers(0, 255))]) * count
         last = data.draw(st.integers(0, 20)) == 0
-        reply = board.session.call(PushRequest(0, number, offset, int(last), payload), PushReply)
+        reply = board.session.call(PushRequest(0, number, offset, int(last), payload))
         # the model knows when packets begin only from the board; they never go back
         assert begun <= reply.begun <= len(model.packets)
         begun = reply.begun
@@ -306,14 +304,12 @@ def test_masks_may_be_streamed_too() -> None:
     like = queue_of(LINK)
     board.prepare(like)
     digest = bytes.fromhex(LINK.codebook.digest)
-    assert board.session.call(StreamRequest(1, Format.MASKS, digest), StreamReply).slots == 40960 // (
-        346 * 12
-    )
+    assert board.session.call(StreamRequest(1, Format.MASKS, digest)).slots == 40960 // (346 * 12)
     rows = np.random.default_rng(0).integers(0, 2, (346, 96), dtype=np.uint8)
     content = np.packbits(rows, axis=1).tobytes()
     for at in range(0, len(content), 480):
         piece = content[at : at + 480]
-        board.session.call(PushRequest(1, 0, at, int(at + 480 >= len(content)), piece), PushReply)
+        board.session.call(PushRequest(1, 0, at, int(at + 480 >= len(content)), piece))
     board.start()
     device.run(60_000)
     shown = device.records().played().chips(None)
@@ -321,7 +317,7 @@ def test_masks_may_be_streamed_too() -> None:
     assert board.status().state == State.DARK
     for bank, status in ((0, Status.NOTHING_COMMITTED), (2, Status.OUT_OF_RANGE)):
         with pytest.raises(RefusedError) as told:
-            board.session.call(PushRequest(bank, 0, 0, 0, b"x"), PushReply)
+            board.session.call(PushRequest(bank, 0, 0, 0, b"x"))
         assert told.value.status == status
 
 

@@ -92,7 +92,7 @@ provision(board, bank, Settings(level_ma=7))
 status = board.status()
 assert board.holds(bank, status) and status.level_ma == 7 and status.later_numbers == (0, 0)
 try:
-    board.session.call(r.ConfigureRequest(10000, 0, 10, 1, 0, 0, later_wish=5), r.ConfigureReply)
+    board.session.call(r.ConfigureRequest(10000, 0, 10, 1, 0, 0, later_wish=5))
 except IncompatibleError as fault:
     print(fault)
 """

@@ -298,7 +298,7 @@ static inline struct evlcp_hello_reply evlcp_hello_reply_get(const uint8_t *p)
 }
 
 #define EVLCP_CONFIGURE_REQUEST_BYTES 12u
-/* Set what the next COMMIT plays with, playing goes on as it was; and limits of light, that hold at once. */
+/* Set what the next COMMIT plays with, not what plays; and limits of light, which hold at once. */
 struct evlcp_configure_request {
     uint32_t chip_rate_hz; /* Chips per second; must divide the tick rate; not changed while playing. */
     uint8_t profile; /* Info-segment profile. */

@@ -1,94 +1,10 @@
 """Messages of the driver board; `python -m firmware_host.protocol.generate` writes this file."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
-from firmware_host.protocol.wire import WireMessage
-
-__all__ = [
-    "CHALLENGE_BYTES",
-    "CHIP_DARK",
-    "CHIP_TEST",
-    "CLUSTERS",
-    "CRC_BYTES",
-    "DEFAULT_BAUD",
-    "HEADER_BYTES",
-    "KEY_BYTES",
-    "KEY_NAME_BYTES",
-    "LEDS",
-    "MAJOR",
-    "MAX_PAYLOAD",
-    "MINOR",
-    "NO_BANK",
-    "NO_SESSION",
-    "REPLIES",
-    "REPLY_BIT",
-    "ROW_BYTES",
-    "SEALED",
-    "SEAL_BYTES",
-    "WINDOW",
-    "BlankReply",
-    "BlankRequest",
-    "BoardFault",
-    "Capability",
-    "ChipsReply",
-    "ChipsRequest",
-    "CodebookReply",
-    "CodebookRequest",
-    "CommitReply",
-    "CommitRequest",
-    "ConfigureReply",
-    "ConfigureRequest",
-    "CrcReply",
-    "CrcRequest",
-    "Format",
-    "HelloReply",
-    "HelloRequest",
-    "KeyReply",
-    "KeyRequest",
-    "LedTestReply",
-    "LedTestRequest",
-    "LevelReply",
-    "LevelRequest",
-    "Profile",
-    "PushReply",
-    "PushRequest",
-    "ReadReply",
-    "ReadRequest",
-    "RecallReply",
-    "RecallRequest",
-    "SaveReply",
-    "SaveRequest",
-    "StartReply",
-    "StartRequest",
-    "State",
-    "Status",
-    "StatusReply",
-    "StatusRequest",
-    "StopReply",
-    "StopRequest",
-    "StreamReply",
-    "StreamRequest",
-    "Type",
-    "UpdateBeginReply",
-    "UpdateBeginRequest",
-    "UpdateCommitReply",
-    "UpdateCommitRequest",
-    "UpdateConfirmReply",
-    "UpdateConfirmRequest",
-    "UpdateRestartReply",
-    "UpdateRestartRequest",
-    "UpdateStatusReply",
-    "UpdateStatusRequest",
-    "UpdateWriteReply",
-    "UpdateWriteRequest",
-    "Watchdog",
-    "WatchdogReply",
-    "WatchdogRequest",
-    "WriteReply",
-    "WriteRequest",
-]
+from firmware_host.protocol.wire import I16, U8, U16, U32, Rest, WireMessage, WireRequest
 
 MAJOR = 2
 """Version of the protocol: of another major one no message is understood."""
@@ -295,895 +211,602 @@ class BoardFault(IntFlag):
 
 
 @dataclass(frozen=True, slots=True)
-class HelloRequest(WireMessage):
-    """Open a session and learn the board. Its first two fields never change between versions.
-
-    Attributes:
-        major: The host's protocol; another major version is INCOMPATIBLE.
-        minor: The host's protocol.
-        nonce: Random; the same nonce keeps the session.
-    """
-
-    TYPE: ClassVar[int] = 0x01
-    LAYOUT: ClassVar[str] = "B B I"
-
-    major: int
-    minor: int
-    nonce: int
+class EmptyReply(WireMessage):
+    """What the board answers where there is nothing to say."""
 
 
 @dataclass(frozen=True, slots=True)
 class HelloReply(WireMessage):
-    """What the board answers to HELLO.
+    """What the board answers to HELLO."""
 
-    Attributes:
-        major: The board's protocol.
-        minor: The board's protocol: what came later it does not know.
-        session: Goes into the header of every further request.
-        version_major: Firmware version.
-        version_minor: Firmware version.
-        version_patch: Firmware version.
-        window: Requests the host may have under way.
-        max_payload: Largest payload, bytes.
-        banks: Number of banks.
-        bank_bytes: Size of a bank, bytes.
-        clusters: Clusters.
-        leds: LEDs.
-        tick_hz: Rate of the tick counter that times the chips.
-        chip_rate_max_hz: Fastest chip rate.
-        level_max_ma: Largest LED current, mA.
-        mean_max_ma: Largest mean of a LED's current, mA.
-        burst_chips: Chips that a LED may be on beyond its share of any stretch of chips.
-        capabilities: Capability bits.
-        unique_id: The part's own number.
-        uptime_ms: Time since reset; smaller than before means a reset.
-        hal: Name of the hardware layer, ASCII, zero-padded.
-        clock_hz: Rate of STATUS's clock, nominal.
-        challenge: Drawn for the session: seals are over it.
-        key_name: First bytes of the SHA-256 of the board's key; zeros without one.
-        formats: What a bank may hold, 1 << format; 0: words and masks, in packets of a codebook.
-        chip_rate_min_hz: Slowest chip rate.
-    """
-
-    TYPE: ClassVar[int] = 0x01
-    LAYOUT: ClassVar[str] = "B B H B B B B H B I B H I I H H H I 12s I 12s I 8s 4s H I"
-    FIELD_SINCE: ClassVar[dict[str, int]] = {
-        "clock_hz": 1,
-        "challenge": 1,
-        "key_name": 1,
-        "formats": 2,
-        "chip_rate_min_hz": 2,
-    }
-
-    major: int
-    minor: int
-    session: int
-    version_major: int
-    version_minor: int
-    version_patch: int
-    window: int
-    max_payload: int
-    banks: int
-    bank_bytes: int
-    clusters: int
-    leds: int
-    tick_hz: int
-    chip_rate_max_hz: int
-    level_max_ma: int
-    mean_max_ma: int
-    burst_chips: int
-    capabilities: int
-    unique_id: bytes
-    uptime_ms: int
-    hal: bytes
-    clock_hz: int = 0
-    challenge: bytes = bytes(8)
-    key_name: bytes = bytes(4)
-    formats: int = 0
-    chip_rate_min_hz: int = 0
+    major: U8
+    """The board's protocol."""
+    minor: U8
+    """The board's protocol: what came later it does not know."""
+    session: U16
+    """Goes into the header of every further request."""
+    version_major: U8
+    """Firmware version."""
+    version_minor: U8
+    """Firmware version."""
+    version_patch: U8
+    """Firmware version."""
+    window: U8
+    """Requests the host may have under way."""
+    max_payload: U16
+    """Largest payload, bytes."""
+    banks: U8
+    """Number of banks."""
+    bank_bytes: U32
+    """Size of a bank, bytes."""
+    clusters: U8
+    """Clusters."""
+    leds: U16
+    """LEDs."""
+    tick_hz: U32
+    """Rate of the tick counter that times the chips."""
+    chip_rate_max_hz: U32
+    """Fastest chip rate."""
+    level_max_ma: U16
+    """Largest LED current, mA."""
+    mean_max_ma: U16
+    """Largest mean of a LED's current, mA."""
+    burst_chips: U16
+    """Chips that a LED may be on beyond its share of any stretch of chips."""
+    capabilities: U32
+    """Capability bits."""
+    unique_id: Annotated[bytes, "12s"]
+    """The part's own number."""
+    uptime_ms: U32
+    """Time since reset; smaller than before means a reset."""
+    hal: Annotated[bytes, "12s"]
+    """Name of the hardware layer, ASCII, zero-padded."""
+    clock_hz: U32 = field(default=0, metadata={"since": 1})
+    """Rate of STATUS's clock, nominal."""
+    challenge: Annotated[bytes, "8s"] = field(default=bytes(8), metadata={"since": 1})
+    """Drawn for the session: seals are over it."""
+    key_name: Annotated[bytes, "4s"] = field(default=bytes(4), metadata={"since": 1})
+    """First bytes of the SHA-256 of the board's key; zeros without one."""
+    formats: U16 = field(default=0, metadata={"since": 2})
+    """What a bank may hold, 1 << format; 0: words and masks, in packets of a codebook."""
+    chip_rate_min_hz: U32 = field(default=0, metadata={"since": 2})
+    """Slowest chip rate."""
 
 
 @dataclass(frozen=True, slots=True)
-class ConfigureRequest(WireMessage):
-    """Set what the next COMMIT plays with, playing goes on as it was; and limits of light, that hold at once.
+class HelloRequest(WireRequest[HelloReply]):
+    """Open a session and learn the board. Its first two fields never change between versions."""
 
-    Attributes:
-        chip_rate_hz: Chips per second; must divide the tick rate; not changed while playing.
-        profile: Info-segment profile.
-        frames: Frames per packet.
-        pilot_every: Frames from one pilot to the next; 1: every frame has one.
-        level_limit_ma: Largest LED current from now on, mA; 0: as it is.
-        duty_limit: Largest share of time that a LED is on from now on, permille; 0: as it is.
-    """
-
-    TYPE: ClassVar[int] = 0x02
-    LAYOUT: ClassVar[str] = "I B H B H H"
-
-    chip_rate_hz: int
-    profile: int
-    frames: int
-    pilot_every: int
-    level_limit_ma: int
-    duty_limit: int
+    TYPE: ClassVar[int] = 0x01
+    major: U8
+    """The host's protocol; another major version is INCOMPATIBLE."""
+    minor: U8
+    """The host's protocol."""
+    nonce: U32
+    """Random; the same nonce keeps the session."""
 
 
 @dataclass(frozen=True, slots=True)
 class ConfigureReply(WireMessage):
-    """What the board answers to CONFIGURE.
+    """What the board answers to CONFIGURE."""
 
-    Attributes:
-        ticks_per_chip: Length of a chip in ticks.
-        packet_chips: Length of a packet in chips.
-    """
+    ticks_per_chip: U32
+    """Length of a chip in ticks."""
+    packet_chips: U32
+    """Length of a packet in chips."""
+
+
+@dataclass(frozen=True, slots=True)
+class ConfigureRequest(WireRequest[ConfigureReply]):
+    """Set what the next COMMIT plays with, not what plays; and limits of light, which hold at once."""
 
     TYPE: ClassVar[int] = 0x02
-    LAYOUT: ClassVar[str] = "I I"
-
-    ticks_per_chip: int
-    packet_chips: int
+    chip_rate_hz: U32
+    """Chips per second; must divide the tick rate; not changed while playing."""
+    profile: U8
+    """Info-segment profile."""
+    frames: U16
+    """Frames per packet."""
+    pilot_every: U8
+    """Frames from one pilot to the next; 1: every frame has one."""
+    level_limit_ma: U16
+    """Largest LED current from now on, mA; 0: as it is."""
+    duty_limit: U16
+    """Largest share of time that a LED is on from now on, permille; 0: as it is."""
 
 
 @dataclass(frozen=True, slots=True)
-class CodebookRequest(WireMessage):
-    """Set preamble and pilots for the next COMMIT; those of a built-in profile must be the firmware's own.
-
-    Attributes:
-        preamble_chips: Chips of the preamble, at most 32.
-        preamble: Preamble, first chip on air the most significant of preamble_chips bits.
-        pilots: Pilot words, first chip on air the most significant bit.
-        digest: SHA-256 of the codebook.
-    """
+class CodebookRequest(WireRequest[EmptyReply]):
+    """Set preamble and pilots for the next COMMIT; those of a built-in profile must be the firmware's own."""
 
     TYPE: ClassVar[int] = 0x03
-    LAYOUT: ClassVar[str] = "B I 16H 32s"
-
-    preamble_chips: int
-    preamble: int
-    pilots: tuple[int, ...]
-    digest: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class CodebookReply(WireMessage):
-    """What the board answers to CODEBOOK."""
-
-    TYPE: ClassVar[int] = 0x03
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class WriteRequest(WireMessage):
-    """Write into a spare bank; voids what was committed in it.
-
-    Attributes:
-        bank: Bank.
-        offset: First byte.
-        data: Content.
-    """
-
-    TYPE: ClassVar[int] = 0x04
-    LAYOUT: ClassVar[str] = "B I *"
-
-    bank: int
-    offset: int
-    data: bytes
+    preamble_chips: U8
+    """Chips of the preamble, at most 32."""
+    preamble: U32
+    """Preamble, first chip on air the most significant of preamble_chips bits."""
+    pilots: Annotated[tuple[int, ...], "16H"]
+    """Pilot words, first chip on air the most significant bit."""
+    digest: Annotated[bytes, "32s"]
+    """SHA-256 of the codebook."""
 
 
 @dataclass(frozen=True, slots=True)
 class WriteReply(WireMessage):
-    """What the board answers to WRITE.
+    """What the board answers to WRITE."""
 
-    Attributes:
-        bank: Bank.
-        offset: First byte.
-        count: Bytes written.
-    """
-
-    TYPE: ClassVar[int] = 0x04
-    LAYOUT: ClassVar[str] = "B I H"
-
-    bank: int
-    offset: int
-    count: int
+    bank: U8
+    """Bank."""
+    offset: U32
+    """First byte."""
+    count: U16
+    """Bytes written."""
 
 
 @dataclass(frozen=True, slots=True)
-class ReadRequest(WireMessage):
-    """Read from a bank.
+class WriteRequest(WireRequest[WriteReply]):
+    """Write into a spare bank; voids what was committed in it."""
 
-    Attributes:
-        bank: Bank.
-        offset: First byte.
-        count: Bytes wanted.
-    """
-
-    TYPE: ClassVar[int] = 0x05
-    LAYOUT: ClassVar[str] = "B I H"
-
-    bank: int
-    offset: int
-    count: int
+    TYPE: ClassVar[int] = 0x04
+    bank: U8
+    """Bank."""
+    offset: U32
+    """First byte."""
+    data: Rest
+    """Content."""
 
 
 @dataclass(frozen=True, slots=True)
 class ReadReply(WireMessage):
-    """What the board answers to READ.
+    """What the board answers to READ."""
 
-    Attributes:
-        bank: Bank.
-        offset: First byte.
-        data: Content.
-    """
-
-    TYPE: ClassVar[int] = 0x05
-    LAYOUT: ClassVar[str] = "B I *"
-
-    bank: int
-    offset: int
-    data: bytes
+    bank: U8
+    """Bank."""
+    offset: U32
+    """First byte."""
+    data: Rest
+    """Content."""
 
 
 @dataclass(frozen=True, slots=True)
-class CrcRequest(WireMessage):
-    """CRC-32/ISO-HDLC of a bank's bytes.
+class ReadRequest(WireRequest[ReadReply]):
+    """Read from a bank."""
 
-    Attributes:
-        bank: Bank.
-        offset: First byte.
-        length: Bytes.
-    """
-
-    TYPE: ClassVar[int] = 0x06
-    LAYOUT: ClassVar[str] = "B I I"
-
-    bank: int
-    offset: int
-    length: int
+    TYPE: ClassVar[int] = 0x05
+    bank: U8
+    """Bank."""
+    offset: U32
+    """First byte."""
+    count: U16
+    """Bytes wanted."""
 
 
 @dataclass(frozen=True, slots=True)
 class CrcReply(WireMessage):
-    """What the board answers to CRC.
+    """What the board answers to CRC."""
 
-    Attributes:
-        crc: CRC of the bytes.
-    """
-
-    TYPE: ClassVar[int] = 0x06
-    LAYOUT: ClassVar[str] = "I"
-
-    crc: int
+    crc: U32
+    """CRC of the bytes."""
 
 
 @dataclass(frozen=True, slots=True)
-class CommitRequest(WireMessage):
-    """Check a bank; play it from the next packet boundary, or, if the check fails, go on with the old one.
+class CrcRequest(WireRequest[CrcReply]):
+    """CRC-32/ISO-HDLC of a bank's bytes."""
 
-    Attributes:
-        bank: Bank.
-        format: What the bank holds.
-        packets: Packets in the bank.
-        length: Bytes in the bank.
-        crc: CRC-32 of those bytes.
-        digest: Digest of the codebook the content was made with.
-    """
-
-    TYPE: ClassVar[int] = 0x07
-    LAYOUT: ClassVar[str] = "B B H I I 32s"
-
-    bank: int
-    format: int
-    packets: int
-    length: int
-    crc: int
-    digest: bytes
+    TYPE: ClassVar[int] = 0x06
+    bank: U8
+    """Bank."""
+    offset: U32
+    """First byte."""
+    length: U32
+    """Bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class CommitReply(WireMessage):
-    """What the board answers to COMMIT.
+    """What the board answers to COMMIT."""
 
-    Attributes:
-        commits: Commits accepted since reset.
-    """
+    commits: U32
+    """Commits accepted since reset."""
+
+
+@dataclass(frozen=True, slots=True)
+class CommitRequest(WireRequest[CommitReply]):
+    """Check a bank; play it from the next packet boundary, or, if the check fails, go on with the old one."""
 
     TYPE: ClassVar[int] = 0x07
-    LAYOUT: ClassVar[str] = "I"
-
-    commits: int
+    bank: U8
+    """Bank."""
+    format: U8
+    """What the bank holds."""
+    packets: U16
+    """Packets in the bank."""
+    length: U32
+    """Bytes in the bank."""
+    crc: U32
+    """CRC-32 of those bytes."""
+    digest: Annotated[bytes, "32s"]
+    """Digest of the codebook the content was made with."""
 
 
 @dataclass(frozen=True, slots=True)
-class StartRequest(WireMessage):
-    """Play the active bank from its first packet; nothing happens if it plays.
-
-    Attributes:
-        at_pulse: Begin at this pulse, as STATUS counts them, and keep in step; 0: not.
-        pulse_hz: Pulses a second; must divide the chip rate.
-        at_clock: Without a pulse: begin when STATUS's clock stands here; 0: at once.
-    """
+class StartRequest(WireRequest[EmptyReply]):
+    """Play the active bank from its first packet; nothing happens if it plays."""
 
     TYPE: ClassVar[int] = 0x08
-    LAYOUT: ClassVar[str] = "I H I"
-    FIELD_SINCE: ClassVar[dict[str, int]] = {"at_pulse": 1, "pulse_hz": 1, "at_clock": 1}
-
-    at_pulse: int = 0
-    pulse_hz: int = 0
-    at_clock: int = 0
-
-
-@dataclass(frozen=True, slots=True)
-class StartReply(WireMessage):
-    """What the board answers to START."""
-
-    TYPE: ClassVar[int] = 0x08
-    LAYOUT: ClassVar[str] = ""
+    at_pulse: U32 = field(default=0, metadata={"since": 1})
+    """Begin at this pulse, as STATUS counts them, and keep in step; 0: not."""
+    pulse_hz: U16 = field(default=0, metadata={"since": 1})
+    """Pulses a second; must divide the chip rate."""
+    at_clock: U32 = field(default=0, metadata={"since": 1})
+    """Without a pulse: begin when STATUS's clock stands here; 0: at once."""
 
 
 @dataclass(frozen=True, slots=True)
-class StopRequest(WireMessage):
+class StopRequest(WireRequest[EmptyReply]):
     """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
 
     TYPE: ClassVar[int] = 0x09
-    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
-class StopReply(WireMessage):
-    """What the board answers to STOP."""
-
-    TYPE: ClassVar[int] = 0x09
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class BlankRequest(WireMessage):
+class BlankRequest(WireRequest[EmptyReply]):
     """Dark at once, within the packet."""
 
     TYPE: ClassVar[int] = 0x0A
-    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
-class BlankReply(WireMessage):
-    """What the board answers to BLANK."""
-
-    TYPE: ClassVar[int] = 0x0A
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class LevelRequest(WireMessage):
-    """Set the LED current; refused above its limit, or if what is committed were too bright.
-
-    Attributes:
-        level_ma: LED current, mA.
-    """
+class LevelRequest(WireRequest[EmptyReply]):
+    """Set the LED current; refused above its limit, or if what is committed were too bright."""
 
     TYPE: ClassVar[int] = 0x0B
-    LAYOUT: ClassVar[str] = "H"
-
-    level_ma: int
-
-
-@dataclass(frozen=True, slots=True)
-class LevelReply(WireMessage):
-    """What the board answers to LEVEL."""
-
-    TYPE: ClassVar[int] = 0x0B
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class StatusRequest(WireMessage):
-    """What the board does, and what went wrong since reset."""
-
-    TYPE: ClassVar[int] = 0x0C
-    LAYOUT: ClassVar[str] = ""
+    level_ma: U16
+    """LED current, mA."""
 
 
 @dataclass(frozen=True, slots=True)
 class StatusReply(WireMessage):
-    """What the board answers to STATUS.
+    """What the board answers to STATUS."""
 
-    Attributes:
-        state: State.
-        faults: Fault bits.
-        active_bank: Bank that plays or would play, or no_bank.
-        pending_bank: Bank waiting for the packet boundary, or no_bank.
-        format: Format of the active bank.
-        profile: Profile of the active bank.
-        frames: Frames per packet of the active bank.
-        pilot_every: Frames from one of its pilots to the next.
-        packets: Packets in the active bank.
-        length: Bytes in the active bank.
-        crc: CRC-32 of the active bank.
-        chip_rate_hz: Chips per second, as configured.
-        commits: Commits accepted since reset.
-        packets_sent: Packets played to their end since reset.
-        chips_sent: Chips since reset.
-        lateness_ticks: Delay of the latest chip.
-        lateness_max_ticks: Largest delay since START.
-        crc_errors: Datagrams with a wrong CRC.
-        framing_errors: Datagrams too short, too long or no COBS.
-        overflow_errors: Bytes lost because the receive buffer was full.
-        requests: Good datagrams received.
-        level_ma: LED current, mA.
-        level_limit_ma: Largest LED current that LEVEL takes, mA.
-        duty_limit: Largest share of time that a LED may be on, permille; with a large LED current less.
-        duty: Share of time that the active bank has a LED on, that of the brightest, permille.
-        temperature_dc: Driver temperature, 0.1 degree C.
-        open_leds: A bit a LED: open.
-        watchdog: Watchdog action.
-        watchdog_ms: Watchdog time-out.
-        silence_ms: Time since the request before this one, HELLO left out.
-        uptime_ms: Time since reset.
-        digest: Digest of the active bank's codebook, or of the one set.
-        underruns: How often the active bank's stream was empty before its end was announced.
-        clock: The board's clock, which counts freely and wraps.
-        pulses: Pulses of the pulse input since reset.
-        pulse_clocks: Clocks from the pulse before to the latest; 0: unknown.
-        packet_chips: Length of a packet of the active bank, in chips of the chip rate.
-        hold: How many of these a chip of the bank lasts; 0: the bank is of a codebook.
-        clusters: Clusters of the active bank's masks; 0 without these.
-    """
+    state: U8
+    """State."""
+    faults: U16
+    """Fault bits."""
+    active_bank: U8
+    """Bank that plays or would play, or no_bank."""
+    pending_bank: U8
+    """Bank waiting for the packet boundary, or no_bank."""
+    format: U8
+    """Format of the active bank."""
+    profile: U8
+    """Profile of the active bank."""
+    frames: U16
+    """Frames per packet of the active bank."""
+    pilot_every: U8
+    """Frames from one of its pilots to the next."""
+    packets: U16
+    """Packets in the active bank."""
+    length: U32
+    """Bytes in the active bank."""
+    crc: U32
+    """CRC-32 of the active bank."""
+    chip_rate_hz: U32
+    """Chips per second, as configured."""
+    commits: U32
+    """Commits accepted since reset."""
+    packets_sent: U32
+    """Packets played to their end since reset."""
+    chips_sent: U32
+    """Chips since reset."""
+    lateness_ticks: U32
+    """Delay of the latest chip."""
+    lateness_max_ticks: U32
+    """Largest delay since START."""
+    crc_errors: U32
+    """Datagrams with a wrong CRC."""
+    framing_errors: U32
+    """Datagrams too short, too long or no COBS."""
+    overflow_errors: U32
+    """Bytes lost because the receive buffer was full."""
+    requests: U32
+    """Good datagrams received."""
+    level_ma: U16
+    """LED current, mA."""
+    level_limit_ma: U16
+    """Largest LED current that LEVEL takes, mA."""
+    duty_limit: U16
+    """Largest share of time that a LED may be on, permille; with a large LED current less."""
+    duty: U16
+    """Share of time that the active bank has a LED on, that of the brightest, permille."""
+    temperature_dc: I16
+    """Driver temperature, 0.1 degree C."""
+    open_leds: Annotated[bytes, "12s"]
+    """A bit a LED: open."""
+    watchdog: U8
+    """Watchdog action."""
+    watchdog_ms: U32
+    """Watchdog time-out."""
+    silence_ms: U32
+    """Time since the request before this one, HELLO left out."""
+    uptime_ms: U32
+    """Time since reset."""
+    digest: Annotated[bytes, "32s"]
+    """Digest of the active bank's codebook, or of the one set."""
+    underruns: U32
+    """How often the active bank's stream was empty before its end was announced."""
+    clock: U32 = field(default=0, metadata={"since": 1})
+    """The board's clock, which counts freely and wraps."""
+    pulses: U32 = field(default=0, metadata={"since": 1})
+    """Pulses of the pulse input since reset."""
+    pulse_clocks: U32 = field(default=0, metadata={"since": 1})
+    """Clocks from the pulse before to the latest; 0: unknown."""
+    packet_chips: U32 = field(default=0, metadata={"since": 2})
+    """Length of a packet of the active bank, in chips of the chip rate."""
+    hold: U8 = field(default=0, metadata={"since": 2})
+    """How many of these a chip of the bank lasts; 0: the bank is of a codebook."""
+    clusters: U8 = field(default=0, metadata={"since": 2})
+    """Clusters of the active bank's masks; 0 without these."""
+
+
+@dataclass(frozen=True, slots=True)
+class StatusRequest(WireRequest[StatusReply]):
+    """What the board does, and what went wrong since reset."""
 
     TYPE: ClassVar[int] = 0x0C
-    LAYOUT: ClassVar[str] = (
-        "B H B B B B H B H I I I I I I I I I I I I H H H H h 12s B I I I 32s I I I I I B B"
-    )
-    FIELD_SINCE: ClassVar[dict[str, int]] = {
-        "clock": 1,
-        "pulses": 1,
-        "pulse_clocks": 1,
-        "packet_chips": 2,
-        "hold": 2,
-        "clusters": 2,
-    }
-
-    state: int
-    faults: int
-    active_bank: int
-    pending_bank: int
-    format: int
-    profile: int
-    frames: int
-    pilot_every: int
-    packets: int
-    length: int
-    crc: int
-    chip_rate_hz: int
-    commits: int
-    packets_sent: int
-    chips_sent: int
-    lateness_ticks: int
-    lateness_max_ticks: int
-    crc_errors: int
-    framing_errors: int
-    overflow_errors: int
-    requests: int
-    level_ma: int
-    level_limit_ma: int
-    duty_limit: int
-    duty: int
-    temperature_dc: int
-    open_leds: bytes
-    watchdog: int
-    watchdog_ms: int
-    silence_ms: int
-    uptime_ms: int
-    digest: bytes
-    underruns: int
-    clock: int = 0
-    pulses: int = 0
-    pulse_clocks: int = 0
-    packet_chips: int = 0
-    hold: int = 0
-    clusters: int = 0
 
 
 @dataclass(frozen=True, slots=True)
-class WatchdogRequest(WireMessage):
-    """What to do when the host falls silent.
-
-    Attributes:
-        action: Watchdog action.
-        timeout_ms: Silence before it acts, at least 100 ms.
-    """
+class WatchdogRequest(WireRequest[EmptyReply]):
+    """What to do when the host falls silent."""
 
     TYPE: ClassVar[int] = 0x0D
-    LAYOUT: ClassVar[str] = "B I"
-
-    action: int
-    timeout_ms: int
-
-
-@dataclass(frozen=True, slots=True)
-class WatchdogReply(WireMessage):
-    """What the board answers to WATCHDOG."""
-
-    TYPE: ClassVar[int] = 0x0D
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class SaveRequest(WireMessage):
-    """Save active bank and settings to the older of two flash slots; only while the LEDs are dark.
-
-    Attributes:
-        autostart: 1: recall and play after a reset.
-    """
-
-    TYPE: ClassVar[int] = 0x0E
-    LAYOUT: ClassVar[str] = "B"
-
-    autostart: int
+    action: U8
+    """Watchdog action."""
+    timeout_ms: U32
+    """Silence before it acts, at least 100 ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class SaveReply(WireMessage):
-    """What the board answers to SAVE.
+    """What the board answers to SAVE."""
 
-    Attributes:
-        slot: Slot written.
-        save_sequence: Its sequence number.
-    """
-
-    TYPE: ClassVar[int] = 0x0E
-    LAYOUT: ClassVar[str] = "B I"
-
-    slot: int
-    save_sequence: int
+    slot: U8
+    """Slot written."""
+    save_sequence: U32
+    """Its sequence number."""
 
 
 @dataclass(frozen=True, slots=True)
-class RecallRequest(WireMessage):
-    """Commit what the newest valid flash slot holds; only while the LEDs are dark."""
+class SaveRequest(WireRequest[SaveReply]):
+    """Save active bank and settings to the older of two flash slots; only while the LEDs are dark."""
 
-    TYPE: ClassVar[int] = 0x0F
-    LAYOUT: ClassVar[str] = ""
+    TYPE: ClassVar[int] = 0x0E
+    autostart: U8
+    """1: recall and play after a reset."""
 
 
 @dataclass(frozen=True, slots=True)
 class RecallReply(WireMessage):
-    """What the board answers to RECALL.
+    """What the board answers to RECALL."""
 
-    Attributes:
-        slot: Slot read.
-        save_sequence: Its sequence number.
-    """
+    slot: U8
+    """Slot read."""
+    save_sequence: U32
+    """Its sequence number."""
+
+
+@dataclass(frozen=True, slots=True)
+class RecallRequest(WireRequest[RecallReply]):
+    """Commit what the newest valid flash slot holds; only while the LEDs are dark."""
 
     TYPE: ClassVar[int] = 0x0F
-    LAYOUT: ClassVar[str] = "B I"
-
-    slot: int
-    save_sequence: int
 
 
 @dataclass(frozen=True, slots=True)
-class LedTestRequest(WireMessage):
-    """Walk over LEDs one by one, at their mean current at most; not while playing. STOP or BLANK ends it.
-
-    Attributes:
-        first: First LED.
-        last: Last LED.
-        dwell_ms: Time a LED is on, at least 1 ms.
-    """
+class LedTestRequest(WireRequest[EmptyReply]):
+    """Walk over LEDs one by one, at their mean current at most; not while playing. STOP or BLANK ends it."""
 
     TYPE: ClassVar[int] = 0x10
-    LAYOUT: ClassVar[str] = "B B H"
-
-    first: int
-    last: int
-    dwell_ms: int
-
-
-@dataclass(frozen=True, slots=True)
-class LedTestReply(WireMessage):
-    """What the board answers to LED_TEST."""
-
-    TYPE: ClassVar[int] = 0x10
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class StreamRequest(WireMessage):
-    """Make a spare bank an empty queue of packets and play from it; idle pattern while it is empty.
-
-    Attributes:
-        bank: Bank.
-        format: What a packet holds.
-        digest: Digest of the codebook that packets are made with.
-    """
-
-    TYPE: ClassVar[int] = 0x18
-    LAYOUT: ClassVar[str] = "B B 32s"
-
-    bank: int
-    format: int
-    digest: bytes
+    first: U8
+    """First LED."""
+    last: U8
+    """Last LED."""
+    dwell_ms: U16
+    """Time a LED is on, at least 1 ms."""
 
 
 @dataclass(frozen=True, slots=True)
 class StreamReply(WireMessage):
-    """What the board answers to STREAM.
+    """What the board answers to STREAM."""
 
-    Attributes:
-        slots: Packets that the queue holds, the one that plays among them.
-    """
-
-    TYPE: ClassVar[int] = 0x18
-    LAYOUT: ClassVar[str] = "H"
-
-    slots: int
+    slots: U16
+    """Packets that the queue holds, the one that plays among them."""
 
 
 @dataclass(frozen=True, slots=True)
-class PushRequest(WireMessage):
-    """Put a piece of a packet into the queue, if it is the next and there is room; the reply says what is.
+class StreamRequest(WireRequest[StreamReply]):
+    """Make a spare bank an empty queue of packets and play from it; idle pattern while it is empty."""
 
-    Attributes:
-        bank: Bank.
-        number: Number of the packet, from 0 on.
-        offset: First byte.
-        last: 1: no further packet comes, dark after what is there; 0: playing goes on.
-        data: Content.
-    """
-
-    TYPE: ClassVar[int] = 0x19
-    LAYOUT: ClassVar[str] = "B I H B *"
-
-    bank: int
-    number: int
-    offset: int
-    last: int
-    data: bytes
+    TYPE: ClassVar[int] = 0x18
+    bank: U8
+    """Bank."""
+    format: U8
+    """What a packet holds."""
+    digest: Annotated[bytes, "32s"]
+    """Digest of the codebook that packets are made with."""
 
 
 @dataclass(frozen=True, slots=True)
 class PushReply(WireMessage):
-    """What the board answers to PUSH.
+    """What the board answers to PUSH."""
 
-    Attributes:
-        number: Number of the packet that is next: those before it are there.
-        offset: Bytes of it that are there.
-        begun: Packets that have begun to play.
-        underruns: How often the queue was empty before its end was announced.
-    """
+    number: U32
+    """Number of the packet that is next: those before it are there."""
+    offset: U16
+    """Bytes of it that are there."""
+    begun: U32
+    """Packets that have begun to play."""
+    underruns: U32
+    """How often the queue was empty before its end was announced."""
+
+
+@dataclass(frozen=True, slots=True)
+class PushRequest(WireRequest[PushReply]):
+    """Put a piece of a packet into the queue, if it is the next and there is room; the reply says what is."""
 
     TYPE: ClassVar[int] = 0x19
-    LAYOUT: ClassVar[str] = "I H I I"
-
-    number: int
-    offset: int
-    begun: int
-    underruns: int
+    bank: U8
+    """Bank."""
+    number: U32
+    """Number of the packet, from 0 on."""
+    offset: U16
+    """First byte."""
+    last: U8
+    """1: no further packet comes, dark after what is there; 0: playing goes on."""
+    data: Rest
+    """Content."""
 
 
 @dataclass(frozen=True, slots=True)
-class KeyRequest(WireMessage):
-    """Set the key that requests which change something are sealed with; SAVE keeps it.
-
-    Attributes:
-        key: The key; zeros for none.
-    """
+class KeyRequest(WireRequest[EmptyReply]):
+    """Set the key that requests which change something are sealed with; SAVE keeps it."""
 
     TYPE: ClassVar[int] = 0x1A
-    LAYOUT: ClassVar[str] = "16s"
     SINCE: ClassVar[int] = 1
-
-    key: bytes
+    key: Annotated[bytes, "16s"]
+    """The key; zeros for none."""
 
 
 @dataclass(frozen=True, slots=True)
-class KeyReply(WireMessage):
-    """What the board answers to KEY."""
-
-    TYPE: ClassVar[int] = 0x1A
-    LAYOUT: ClassVar[str] = ""
-    SINCE: ClassVar[int] = 1
-
-
-@dataclass(frozen=True, slots=True)
-class ChipsRequest(WireMessage):
-    """Set packets of chips alone for the next COMMIT or STREAM, in place of a codebook.
-
-    Attributes:
-        packet_chips: Chips of a packet in the bank.
-        hold: How many chips of the chip rate each of them lasts, from 1 on.
-        clusters: Clusters of the format CLUSTERS; 0: MASKS only.
-        digest: SHA-256 of what chips mean, which COMMIT repeats.
-    """
+class ChipsRequest(WireRequest[EmptyReply]):
+    """Set packets of chips alone for the next COMMIT or STREAM, in place of a codebook."""
 
     TYPE: ClassVar[int] = 0x1B
-    LAYOUT: ClassVar[str] = "I B B 32s"
     SINCE: ClassVar[int] = 2
-
-    packet_chips: int
-    hold: int
-    clusters: int
-    digest: bytes
-
-
-@dataclass(frozen=True, slots=True)
-class ChipsReply(WireMessage):
-    """What the board answers to CHIPS."""
-
-    TYPE: ClassVar[int] = 0x1B
-    LAYOUT: ClassVar[str] = ""
-    SINCE: ClassVar[int] = 2
-
-
-@dataclass(frozen=True, slots=True)
-class UpdateStatusRequest(WireMessage):
-    """Which image of the firmware runs, and where another one would go."""
-
-    TYPE: ClassVar[int] = 0x20
-    LAYOUT: ClassVar[str] = ""
+    packet_chips: U32
+    """Chips of a packet in the bank."""
+    hold: U8
+    """How many chips of the chip rate each of them lasts, from 1 on."""
+    clusters: U8
+    """Clusters of the format CLUSTERS; 0: MASKS only."""
+    digest: Annotated[bytes, "32s"]
+    """SHA-256 of what chips mean, which COMMIT repeats."""
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateStatusReply(WireMessage):
-    """What the board answers to UPDATE_STATUS.
+    """What the board answers to UPDATE_STATUS."""
 
-    Attributes:
-        running: Image that runs: 0 the one that was flashed, 1 or 2 one that came by an update.
-        trial: 1: it runs on trial, and is left at the third reset unless it is confirmed.
-        next: Image that an update takes the place of.
-        capacity: Largest image, bytes.
-        sequence: Number of the newest update, 0 if there was none.
-        target: What the board is, ASCII, zero-padded: part and crystal.
-    """
+    running: U8
+    """Image that runs: 0 the one that was flashed, 1 or 2 one that came by an update."""
+    trial: U8
+    """1: it runs on trial, and is left at the third reset unless it is confirmed."""
+    next: U8
+    """Image that an update takes the place of."""
+    capacity: U32
+    """Largest image, bytes."""
+    sequence: U32
+    """Number of the newest update, 0 if there was none."""
+    target: Annotated[bytes, "16s"]
+    """What the board is, ASCII, zero-padded: part and crystal."""
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateStatusRequest(WireRequest[UpdateStatusReply]):
+    """Which image of the firmware runs, and where another one would go."""
 
     TYPE: ClassVar[int] = 0x20
-    LAYOUT: ClassVar[str] = "B B B I I 16s"
-
-    running: int
-    trial: int
-    next: int
-    capacity: int
-    sequence: int
-    target: bytes
 
 
 @dataclass(frozen=True, slots=True)
-class UpdateBeginRequest(WireMessage):
-    """Erase the place of the next image; only while the LEDs are dark, and not on trial.
-
-    Attributes:
-        image: Image, as UPDATE_STATUS says.
-        length: Its bytes.
-        crc: Their CRC-32/ISO-HDLC.
-    """
+class UpdateBeginRequest(WireRequest[EmptyReply]):
+    """Erase the place of the next image; only while the LEDs are dark, and not on trial."""
 
     TYPE: ClassVar[int] = 0x21
-    LAYOUT: ClassVar[str] = "B I I"
-
-    image: int
-    length: int
-    crc: int
-
-
-@dataclass(frozen=True, slots=True)
-class UpdateBeginReply(WireMessage):
-    """What the board answers to UPDATE_BEGIN."""
-
-    TYPE: ClassVar[int] = 0x21
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class UpdateWriteRequest(WireMessage):
-    """Write into the place that was erased.
-
-    Attributes:
-        offset: First byte, a multiple of four.
-        data: Content.
-    """
-
-    TYPE: ClassVar[int] = 0x22
-    LAYOUT: ClassVar[str] = "I *"
-
-    offset: int
-    data: bytes
+    image: U8
+    """Image, as UPDATE_STATUS says."""
+    length: U32
+    """Its bytes."""
+    crc: U32
+    """Their CRC-32/ISO-HDLC."""
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateWriteReply(WireMessage):
-    """What the board answers to UPDATE_WRITE.
+    """What the board answers to UPDATE_WRITE."""
 
-    Attributes:
-        offset: First byte.
-        count: Bytes written.
-    """
-
-    TYPE: ClassVar[int] = 0x22
-    LAYOUT: ClassVar[str] = "I H"
-
-    offset: int
-    count: int
+    offset: U32
+    """First byte."""
+    count: U16
+    """Bytes written."""
 
 
 @dataclass(frozen=True, slots=True)
-class UpdateCommitRequest(WireMessage):
-    """Check the CRC of what was written; it runs on trial from the next reset on."""
+class UpdateWriteRequest(WireRequest[UpdateWriteReply]):
+    """Write into the place that was erased."""
 
-    TYPE: ClassVar[int] = 0x23
-    LAYOUT: ClassVar[str] = ""
+    TYPE: ClassVar[int] = 0x22
+    offset: U32
+    """First byte, a multiple of four."""
+    data: Rest
+    """Content."""
 
 
 @dataclass(frozen=True, slots=True)
 class UpdateCommitReply(WireMessage):
-    """What the board answers to UPDATE_COMMIT.
+    """What the board answers to UPDATE_COMMIT."""
 
-    Attributes:
-        sequence: Number of this update.
-    """
-
-    TYPE: ClassVar[int] = 0x23
-    LAYOUT: ClassVar[str] = "I"
-
-    sequence: int
+    sequence: U32
+    """Number of this update."""
 
 
 @dataclass(frozen=True, slots=True)
-class UpdateRestartRequest(WireMessage):
+class UpdateCommitRequest(WireRequest[UpdateCommitReply]):
+    """Check the CRC of what was written; it runs on trial from the next reset on."""
+
+    TYPE: ClassVar[int] = 0x23
+
+
+@dataclass(frozen=True, slots=True)
+class UpdateRestartRequest(WireRequest[EmptyReply]):
     """Reset, a little after the answer; only while the LEDs are dark."""
 
     TYPE: ClassVar[int] = 0x24
-    LAYOUT: ClassVar[str] = ""
 
 
 @dataclass(frozen=True, slots=True)
-class UpdateRestartReply(WireMessage):
-    """What the board answers to UPDATE_RESTART."""
-
-    TYPE: ClassVar[int] = 0x24
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class UpdateConfirmRequest(WireMessage):
+class UpdateConfirmRequest(WireRequest[EmptyReply]):
     """Keep the image that runs: the trial is over; only while the LEDs are dark."""
 
     TYPE: ClassVar[int] = 0x25
-    LAYOUT: ClassVar[str] = ""
-
-
-@dataclass(frozen=True, slots=True)
-class UpdateConfirmReply(WireMessage):
-    """What the board answers to UPDATE_CONFIRM."""
-
-    TYPE: ClassVar[int] = 0x25
-    LAYOUT: ClassVar[str] = ""
 
 
 REPLIES: dict[int, type[WireMessage]] = {
     0x01: HelloReply,
     0x02: ConfigureReply,
-    0x03: CodebookReply,
+    0x03: EmptyReply,
     0x04: WriteReply,
     0x05: ReadReply,
     0x06: CrcReply,
     0x07: CommitReply,
-    0x08: StartReply,
-    0x09: StopReply,
-    0x0A: BlankReply,
-    0x0B: LevelReply,
+    0x08: EmptyReply,
+    0x09: EmptyReply,
+    0x0A: EmptyReply,
+    0x0B: EmptyReply,
     0x0C: StatusReply,
-    0x0D: WatchdogReply,
+    0x0D: EmptyReply,
     0x0E: SaveReply,
     0x0F: RecallReply,
-    0x10: LedTestReply,
+    0x10: EmptyReply,
     0x18: StreamReply,
     0x19: PushReply,
-    0x1A: KeyReply,
-    0x1B: ChipsReply,
+    0x1A: EmptyReply,
+    0x1B: EmptyReply,
     0x20: UpdateStatusReply,
-    0x21: UpdateBeginReply,
+    0x21: EmptyReply,
     0x22: UpdateWriteReply,
     0x23: UpdateCommitReply,
-    0x24: UpdateRestartReply,
-    0x25: UpdateConfirmReply,
+    0x24: EmptyReply,
+    0x25: EmptyReply,
 }
 """The reply of each request type."""
