@@ -1,10 +1,12 @@
 """Where a command's symbols and their link come from: a file, or random ones with a seed."""
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli._common import LinkFile, Overrides
 from evlcp_sdk.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -14,82 +16,85 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from firmware_host.board.bank import Bank
 
-SymbolsFile = Annotated[
-    Path | None,
-    typer.Argument(metavar="SYMBOLS.json", help="Symbols \\[packet]\\[frame]\\[cluster], with their link."),
-]
-RandomPackets = Annotated[
-    int | None, typer.Option("--random", metavar="N", help="N packets of random symbols.")
-]
-Seed = Annotated[int, typer.Option(help="Seed of --random.", min=0)]
+__all__ = ["BankOptions", "SymbolOptions"]
 
 
-def _given(link_file: str | None, overrides: list[str] | None) -> "Link | None":
-    """The link that -c and --set name; None if neither is given."""
-    if link_file is None and not overrides:
-        return None
-    from evlcp_sdk.link.resolve import load_link
+@dataclass(frozen=True)
+class SymbolOptions:
+    """Symbols, and the link that they are sent with."""
 
-    return load_link(link_file, overrides or [])
+    symbols: Annotated[
+        Path | None,
+        typer.Argument(
+            metavar="SYMBOLS.json", help="Symbols \\[packet]\\[frame]\\[cluster], with their link."
+        ),
+    ] = None
+    random: Annotated[
+        int | None, typer.Option("--random", metavar="N", help="N packets of random symbols.")
+    ] = None
+    seed: Annotated[int, typer.Option(help="Seed of --random.", min=0)] = 0
+    link_file: LinkFile = None
+    overrides: Overrides = None
 
+    def given_link(self) -> "Link | None":
+        """The link that -c and --set name; None if neither is given."""
+        from evlcp_sdk.link.resolve import load_link
 
-def _default() -> "Link":
-    from evlcp_sdk.link.resolve import load_link
+        if self.link_file is None and not self.overrides:
+            return None
+        return load_link(self.link_file, self.overrides or [])
 
-    return load_link()
+    def load(self) -> "tuple[NDArray[np.int64], Link]":
+        """Symbols (packets, frames, clusters) of the file, or random ones, and the link they are sent with.
 
+        Raises:
+            ConfigError: Neither is given, or both, or the link is wrong.
+            IncompatibleError: The file was made with another link.
+            InputError: The file is wrong.
+        """
+        import numpy as np
 
-def symbols(
-    path: Path | None, random: int | None, seed: int, link_file: str | None, overrides: list[str] | None
-) -> "tuple[NDArray[np.int64], Link]":
-    """Symbols (packets, frames, clusters) of a file, or `random` packets, and the link they are sent with.
-
-    Raises:
-        ConfigError: Neither is given, or both, or the link is wrong.
-        IncompatibleError: The file was made with another link.
-        InputError: The file is wrong.
-    """
-    if (path is None) == (random is None):
-        raise ConfigError("give symbols as SYMBOLS.json or with --random N, one of the two")
-    link = _given(link_file, overrides)
-    if path is not None:
+        from evlcp_sdk.link.resolve import load_link
+        from firmware_host.board.bank import MOST_RANDOM_FRAMES, random_symbols
         from firmware_host.board.symbols import read_symbols
 
-        return read_symbols(path, link)
-    import numpy as np
+        if (self.symbols is None) == (self.random is None):
+            raise ConfigError("give symbols as SYMBOLS.json or with --random N, one of the two")
+        link = self.given_link()
+        if self.symbols is not None:
+            return read_symbols(self.symbols, link)
+        link = link or load_link()
+        frames, packets = link.packet.frames, self.random or 0
+        if not 0 < packets * frames <= MOST_RANDOM_FRAMES:
+            raise ConfigError(
+                f"--random {packets}, air.frames_per_packet = {frames}: expected at least 1 packet,"
+                f" at most {MOST_RANDOM_FRAMES} frames in all"
+            )
+        return random_symbols(packets, frames, link.codebook, np.random.default_rng(self.seed)), link
 
-    from firmware_host.board.bank import MOST_RANDOM_FRAMES, random_symbols
 
-    link = link or _default()
-    frames = link.packet.frames
-    if random is None or not (random >= 1 and random * frames <= MOST_RANDOM_FRAMES):
-        raise ConfigError(
-            f"--random {random}, air.frames_per_packet = {frames}: expected at least 1 packet,"
-            f" at most {MOST_RANDOM_FRAMES} frames in all"
-        )
-    return random_symbols(random, frames, link.codebook, np.random.default_rng(seed)), link
+@dataclass(frozen=True)
+class BankOptions(SymbolOptions):
+    """What a board is to play: symbols, or chips."""
 
+    masks: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.npy", help="Chips instead: uint8, a column per LED or cluster."),
+    ] = None
 
-def bank(
-    path: Path | None,
-    random: int | None,
-    masks: Path | None,
-    seed: int,
-    link_file: str | None,
-    overrides: list[str] | None,
-) -> "Bank":
-    """The content of a bank, of symbols or of chip masks.
+    def bank(self) -> "Bank":
+        """The content of a bank.
 
-    Raises:
-        ConfigError: Not one of them is given, the link is wrong, or a board cannot play it.
-        IncompatibleError: The file was made with another link.
-        InputError: The file is wrong.
-    """
-    from firmware_host.board.bank import bank_of, read_masks
+        Raises:
+            ConfigError: Not one of them is given, the link is wrong, or a board cannot play it.
+            IncompatibleError: The file was made with another link.
+            InputError: A file is wrong.
+        """
+        from evlcp_sdk.link.resolve import load_link
+        from firmware_host.board.bank import bank_of, read_masks
 
-    if masks is None:
-        return bank_of(*symbols(path, random, seed, link_file, overrides))
-    if path is not None or random is not None:
-        raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
-    link = _given(link_file, overrides) or _default()
-    return read_masks(masks, link)
+        if self.masks is None:
+            return bank_of(*self.load())
+        if self.symbols is not None or self.random is not None:
+            raise ConfigError("--masks, --random and SYMBOLS.json: give one of them")
+        return read_masks(self.masks, self.given_link() or load_link())

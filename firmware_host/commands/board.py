@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo
-from firmware_host.commands import _firmware, _source
+from firmware_host.commands import _firmware
 from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_json, say
 from firmware_host.commands._line import (
     LINE,
@@ -27,14 +28,14 @@ from firmware_host.commands._line import (
     say_done,
     say_watchdog,
 )
-from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
+from firmware_host.commands._source import BankOptions
 from firmware_host.commands.stream import stream
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from firmware_host.board.board import Board
-    from firmware_host.board.fleet import Entry, Result, Work
+    from firmware_host.board.fleet import Entry, Result
     from firmware_host.board.monitor import Back, Gone, Unheard
     from firmware_host.protocol.generated.requests import StatusReply
 
@@ -52,12 +53,6 @@ app.callback()(line_options)
 app.command("build", cls=JsonCommand)(_firmware.build_images)
 app.command(cls=_firmware.FlashCommand)(_firmware.flash)
 app.command(cls=LineCommand)(_firmware.update)
-
-Masks = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE.npy", help="Chips instead: uint8, a column per LED or cluster."),
-]
-
 
 InventoryFile = Annotated[
     Path | None, typer.Option("--inventory", metavar="FILE.toml", help="All boards of an inventory at once.")
@@ -163,14 +158,11 @@ def hello(
 
 
 @app.command(cls=LineCommand)
+@command
 def program(
+    *,
     context: typer.Context,
-    symbols: SymbolsFile = None,
-    random: RandomPackets = None,
-    masks: Masks = None,
-    seed: Seed = 0,
-    link_file: LinkFile = None,
-    overrides: Overrides = None,
+    payload: BankOptions,
     inventory: Annotated[
         Path | None, typer.Option(metavar="FILE.toml", help="Program all boards of an inventory at once.")
     ] = None,
@@ -203,7 +195,7 @@ def program(
     from firmware_host.protocol.generated.requests import Watchdog
 
     action = None if watchdog is None else Watchdog[watchdog.name]
-    bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
+    bank = payload.bank()
     settings = Settings(level, action, watchdog_ms, start, level_limit, duty_limit)
     with open_board(context) as board:
         with progress_bar("programming") as progress:
@@ -241,12 +233,28 @@ def _report(as_json: bool) -> Callable[[Result], None]:
     return report
 
 
-def _on_fleet(context: typer.Context, path: Path, as_json: bool, work: Work, *allowed: str) -> None:
-    """Do something with all boards of an inventory; ends with the exit code of the first that fails."""
+def _each(
+    context: typer.Context,
+    inventory: Path | None,
+    as_json: bool,
+    work: Callable[[Board], tuple[str, dict[str, Any]]],
+    *allowed: str,
+) -> None:
+    """Do something with a board, or with all of an inventory, and say what.
+
+    With an inventory it ends with the exit code of the first that fails, and `allowed` options may be given.
+    """
+    if inventory is None:
+        with open_board(context) as board:
+            said, table = work(board)
+        say(said, table, as_json)
+        return
     from firmware_host.board.fleet import raise_failures, read_entries, run_fleet
 
     _beside_inventory(context, *allowed)
-    raise_failures(path, run_fleet(read_entries(path), path.parent, work, _report(as_json)))
+    entries = read_entries(inventory)
+    report = _report(as_json)
+    raise_failures(inventory, run_fleet(entries, inventory.parent, lambda _, board: work(board), report))
 
 
 def _program_fleet(path: Path, verify: bool, stay: bool, as_json: bool) -> None:
@@ -260,14 +268,11 @@ def _program_fleet(path: Path, verify: bool, stay: bool, as_json: bool) -> None:
 
 
 @app.command(cls=LineCommand)
+@command
 def send(
+    *,
     context: typer.Context,
-    symbols: SymbolsFile = None,
-    random: RandomPackets = None,
-    masks: Masks = None,
-    seed: Seed = 0,
-    link_file: LinkFile = None,
-    overrides: Overrides = None,
+    payload: BankOptions,
     verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
     as_json: AsJson = False,
 ) -> None:
@@ -278,7 +283,7 @@ def send(
     from firmware_host.errors import RefusedError
     from firmware_host.protocol.generated.requests import NO_BANK, Status
 
-    bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
+    bank = payload.bank()
     with open_board(context) as board, progress_bar("sending") as progress:
         status = board.status()
         if status.active_bank == NO_BANK:
@@ -380,20 +385,15 @@ def _start_together(
 
 
 def _simple(
-    context: typer.Context, inventory: Path | None, as_json: bool, work: Callable[[Board], Any], state: str
+    context: typer.Context, inventory: Path | None, as_json: bool, ask: Callable[[Board], Any], state: str
 ) -> None:
     """A request or two, after which a board, or all of an inventory, is in a state."""
-    if inventory is None:
-        with open_board(context) as board:
-            work(board)
-        say("", {"state": state}, as_json)
-        return
 
-    def on_board(_: Entry, board: Board) -> tuple[str, dict[str, Any]]:
-        work(board)
-        return state, {"state": state}
+    def work(board: Board) -> tuple[str, dict[str, Any]]:
+        ask(board)
+        return state if inventory else "", {"state": state}
 
-    _on_fleet(context, inventory, as_json, on_board)
+    _each(context, inventory, as_json, work)
 
 
 @app.command(cls=LineCommand)
@@ -443,12 +443,12 @@ def status(
             _show(status_table(board.status()), as_json)
         return
 
-    def work(_: Entry, board: Board) -> tuple[str, dict[str, Any]]:
+    def work(board: Board) -> tuple[str, dict[str, Any]]:
         found = status_table(board.status())
         faults = f", faults {', '.join(found['faults'])}" if found["faults"] else ""
         return f"{found['state']}, {found['packets_sent']} packets sent{faults}", {"status": found}
 
-    _on_fleet(context, inventory, as_json, work)
+    _each(context, inventory, as_json, work)
 
 
 @app.command(cls=LineCommand)
@@ -563,14 +563,11 @@ def _print_seen(seen: StatusReply | Gone | Back | Unheard, which: dict[str, Any]
 
 
 @app.command(cls=LineCommand)
+@command
 def verify(
+    *,
     context: typer.Context,
-    symbols: SymbolsFile = None,
-    random: RandomPackets = None,
-    masks: Masks = None,
-    seed: Seed = 0,
-    link_file: LinkFile = None,
-    overrides: Overrides = None,
+    payload: BankOptions,
     inventory: InventoryFile = None,
     as_json: AsJson = False,
 ) -> None:
@@ -584,7 +581,7 @@ def verify(
         _beside_inventory(context)
         raise_failures(inventory, verify_fleet(read_inventory(inventory), _report(as_json)))
         return
-    bank = _source.bank(symbols, random, masks, seed, link_file, overrides)
+    bank = payload.bank()
     with open_board(context) as board:
         number = board.verify(bank)
     table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
@@ -623,17 +620,12 @@ def save(
     For example: [bold]evlcp board --port /dev/ttyUSB0 save --autostart[/]
     """
 
-    def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
+    def work(board: Board) -> tuple[str, dict[str, Any]]:
         reply = board.save(autostart)
         table = {"slot": reply.slot, "save_sequence": reply.save_sequence, "autostart": autostart}
         return f"saved in slot {reply.slot}, number {reply.save_sequence}", table
 
-    if inventory is not None:
-        _on_fleet(context, inventory, as_json, work, "autostart")
-        return
-    with open_board(context) as board:
-        said, table = work(None, board)
-    say(said, table, as_json)
+    _each(context, inventory, as_json, work, "autostart")
 
 
 @app.command(cls=LineCommand)

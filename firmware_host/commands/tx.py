@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFile, Overrides, echo
-from firmware_host.commands import _source
+from evlcp_sdk.cli._command import command
+from evlcp_sdk.cli._common import echo
 from firmware_host.commands._json import AsJson, JsonCommand, print_json
-from firmware_host.commands._source import RandomPackets, Seed, SymbolsFile
+from firmware_host.commands._source import SymbolOptions
 from firmware_host.commands.message import keygen, message
 
 if TYPE_CHECKING:
@@ -37,12 +37,10 @@ class Form(StrEnum):
 
 
 @app.command()
+@command
 def frames(
-    symbols: SymbolsFile = None,
-    random: RandomPackets = None,
-    seed: Seed = 0,
-    link_file: LinkFile = None,
-    overrides: Overrides = None,
+    *,
+    sent: SymbolOptions,
     form: Annotated[Form, typer.Option("--format", help="How the words are printed.")] = Form.TABLE,
     chips: Annotated[
         Path | None,
@@ -55,7 +53,7 @@ def frames(
 
     For example: [bold]evlcp tx frames --random 2 --seed 1 --chips chips.npy[/]
     """
-    table, link = _source.symbols(symbols, random, seed, link_file, overrides)
+    table, link = sent.load()
     if chips is not None:
         from evlcp_sdk.files import Outputs
         from firmware_host.board.bank import symbol_chips
@@ -140,12 +138,10 @@ _FORMS = {Form.TABLE: _table, Form.HEX: _hex, Form.C: _c, Form.JSON: _json}
 
 
 @app.command(cls=JsonCommand)
+@command
 def check(
-    symbols: SymbolsFile = None,
-    random: RandomPackets = None,
-    seed: Seed = 0,
-    link_file: LinkFile = None,
-    overrides: Overrides = None,
+    *,
+    sent: SymbolOptions,
     as_json: AsJson = False,
 ) -> None:
     """Check balance and flicker: on-share, longest run, lines below 3 kHz against IEEE Std 1789-2015.
@@ -157,9 +153,9 @@ def check(
     from firmware_host.board.bank import symbol_chips
     from firmware_host.flicker import check as measure
 
-    sent, link = _source.symbols(symbols, random, seed, link_file, overrides)
+    symbols, link = sent.load()
     chip_rate = link.packet.chip_rate_hz
-    rows = measure(symbol_chips(sent, link.codebook, link.packet.pilot_every), chip_rate)
+    rows = measure(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chip_rate)
     if as_json:
         print_json({"chip_rate_hz": chip_rate, "clusters": [r.to_dict() for r in rows]})
     else:
