@@ -1,12 +1,18 @@
 """What the tests of the transmitter share: codebook, tools that may be missing, boards."""
 
+import os
 import shutil
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.link.resolve import load_link
+from firmware_host import build
+
+SANITIZED = "EVLCP_TEST_LIBRARY"
+"""Names a library of the firmware, for tests that run in another process."""
 
 INSTALL = "sh firmware_host/firmware/install-toolchain.sh installs it (as root)"
 
@@ -21,6 +27,13 @@ def tool(*names: str) -> None:
 @pytest.fixture(scope="session")
 def book() -> Codebook:
     return load_link().codebook
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _library() -> None:
+    """The firmware under sanitizers, where the environment names it."""
+    if path := os.environ.get(SANITIZED):
+        build.native_library = lambda: Path(path)
 
 
 @pytest.fixture(scope="session")

@@ -19,7 +19,6 @@ from firmware_host import build
 from firmware_host.board.bank import Bank, bank_of, random_symbols, symbol_chips
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
-from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import IncompatibleError, RefusedError
 from firmware_host.protocol.client import Timing
@@ -136,23 +135,6 @@ def test_the_image_on_the_model_of_the_part(needs: Callable[..., None]) -> None:
     chip.run(300)
     assert chip.drivers.dark
     assert board.status().faults == BoardFault.CHIP_LOST
-
-
-def test_in_qemu(needs: Callable[..., None], tmp_path: Path) -> None:
-    needs("qemu-system-arm", "arm-none-eabi-gcc")
-    from firmware_host.emulators.processes import start_qemu
-
-    leds = tmp_path / "leds.bin"
-    with Session(start_qemu(leds)) as session:
-        board = Board(session)
-        provision(board, a_bank(), Settings())
-        while board.status().chips_sent < 250:
-            pass
-        board.stop()
-        board.wait_dark()
-    rows = LedRecord.read(leds).played().chips(None)
-    assert len(rows) >= 250
-    assert (rows == np.resize(EXPECTED, rows.shape)).all()
 
 
 @given(st.data())
