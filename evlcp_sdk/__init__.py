@@ -12,264 +12,142 @@ for packet in evlcp.receive("REC.raw"):
 TYPE_CHECKING = False  # typing itself would take longer to import than all that follows
 
 if TYPE_CHECKING:
-    from evlcp_sdk.air.beacons import Beacon
-    from evlcp_sdk.air.blocks import BlockError, Message
-    from evlcp_sdk.air.codebook import Codebook
-    from evlcp_sdk.air.frames import PacketFormat
-    from evlcp_sdk.air.kinds import MessageKind
+    from evlcp_sdk.air.beacons import Beacon as Beacon
+    from evlcp_sdk.air.blocks import BlockError as BlockError, Message as Message
+    from evlcp_sdk.air.codebook import Codebook as Codebook
+    from evlcp_sdk.air.frames import PacketFormat as PacketFormat
+    from evlcp_sdk.air.kinds import MessageKind as MessageKind
     from evlcp_sdk.errors import (
-        CodebookMismatchError,
-        ConfigError,
-        EvlcpError,
-        InputError,
-        InterruptedRunError,
-        OutputError,
-        PluginError,
-        PluginWarning,
-        RawFormatError,
-        StreamError,
-        UnknownAlgorithmError,
-        UnpluggedError,
+        CodebookMismatchError as CodebookMismatchError,
+        ConfigError as ConfigError,
+        EvlcpError as EvlcpError,
+        InputError as InputError,
+        InterruptedRunError as InterruptedRunError,
+        OutputError as OutputError,
+        PluginError as PluginError,
+        PluginWarning as PluginWarning,
+        RawFormatError as RawFormatError,
+        StreamError as StreamError,
+        UnknownAlgorithmError as UnknownAlgorithmError,
+        UnpluggedError as UnpluggedError,
     )
-    from evlcp_sdk.io.open import open_source as open
-    from evlcp_sdk.io.open import read_events, write_events
-    from evlcp_sdk.io.replay import ReplaySource
-    from evlcp_sdk.link.compose import compose
-    from evlcp_sdk.link.resolve import Link, load_link
-    from evlcp_sdk.place.gnss import GnssLog
-    from evlcp_sdk.place.navigator import Place, PositionPlan, Settled
-    from evlcp_sdk.plugin.hooks import Algorithm, SinkRecord, hookimpl
-    from evlcp_sdk.plugin.registry import Registry
+    from evlcp_sdk.io.open import open_source, read_events as read_events, write_events as write_events
+    from evlcp_sdk.io.replay import ReplaySource as ReplaySource
+    from evlcp_sdk.link.compose import compose as compose
+    from evlcp_sdk.link.resolve import Link as Link, load_link as load_link
+    from evlcp_sdk.place.gnss import GnssLog as GnssLog
+    from evlcp_sdk.place.navigator import Place as Place, PositionPlan as PositionPlan, Settled as Settled
+    from evlcp_sdk.plugin.hooks import Algorithm as Algorithm, SinkRecord as SinkRecord, hookimpl as hookimpl
+    from evlcp_sdk.plugin.registry import Registry as Registry
     from evlcp_sdk.plugin.roles import (
-        Code,
-        Corrected,
-        Decode,
-        Decoding,
-        Deframer,
-        Detection,
-        Detector,
-        ErrorCorrection,
-        Filter,
-        Framing,
-        Measure,
-        Modulation,
-        Pilots,
-        Ranging,
-        Separate,
-        Separation,
-        Synchronization,
-        Synchronizer,
-        Tracker,
-        Tracking,
+        Code as Code,
+        Corrected as Corrected,
+        Decode as Decode,
+        Decoding as Decoding,
+        Deframer as Deframer,
+        Detection as Detection,
+        Detector as Detector,
+        ErrorCorrection as ErrorCorrection,
+        Filter as Filter,
+        Framing as Framing,
+        Measure as Measure,
+        Modulation as Modulation,
+        Pilots as Pilots,
+        Ranging as Ranging,
+        Separate as Separate,
+        Separation as Separation,
+        Synchronization as Synchronization,
+        Synchronizer as Synchronizer,
+        Tracker as Tracker,
+        Tracking as Tracking,
     )
-    from evlcp_sdk.plugin.source import EventSource, Loss
-    from evlcp_sdk.results.folder import ResultFolder
-    from evlcp_sdk.results.sink import Run, Sink
-    from evlcp_sdk.results.tables import frames_table
-    from evlcp_sdk.run import Reception, diagnose, receive, receive_to_folder
-    from evlcp_sdk.rx.receiver import Receiver
-    from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
-    from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing, LedTable
-    from evlcp_sdk.scene.camera import CameraModel
-    from evlcp_sdk.scene.sites import BarSite, load_sites
-    from evlcp_sdk.simulated import SimulatedSource, simulate
+    from evlcp_sdk.plugin.source import EventSource as EventSource, Loss as Loss
+    from evlcp_sdk.results.folder import ResultFolder as ResultFolder
+    from evlcp_sdk.results.sink import Run as Run, Sink as Sink
+    from evlcp_sdk.results.tables import frames_table as frames_table
+    from evlcp_sdk.run import (
+        Reception as Reception,
+        diagnose as diagnose,
+        receive as receive,
+        receive_to_folder as receive_to_folder,
+    )
+    from evlcp_sdk.rx.receiver import Receiver as Receiver
+    from evlcp_sdk.scene.attitude import Attitude as Attitude, AttitudeLog as AttitudeLog
+    from evlcp_sdk.scene.bar import (
+        BarLayout as BarLayout,
+        LedColumns as LedColumns,
+        LedGrid as LedGrid,
+        LedRing as LedRing,
+        LedTable as LedTable,
+    )
+    from evlcp_sdk.scene.camera import CameraModel as CameraModel
+    from evlcp_sdk.scene.sites import BarSite as BarSite, load_sites as load_sites
+    from evlcp_sdk.simulated import SimulatedSource as SimulatedSource, simulate as simulate
     from evlcp_sdk.values import (
-        Alternative,
-        Bend,
-        DecodedFrame,
-        Events,
-        FailedBar,
-        Fix,
-        Frame,
-        FrameView,
-        Packet,
-        PresenceMap,
-        Range,
-        ReceivedMessage,
-        Region,
-        SoftSymbols,
-        SyncLock,
-        Triggers,
+        Alternative as Alternative,
+        Bend as Bend,
+        DecodedFrame as DecodedFrame,
+        Events as Events,
+        FailedBar as FailedBar,
+        Fix as Fix,
+        Frame as Frame,
+        FrameView as FrameView,
+        Packet as Packet,
+        PresenceMap as PresenceMap,
+        Range as Range,
+        ReceivedMessage as ReceivedMessage,
+        Region as Region,
+        SoftSymbols as SoftSymbols,
+        SyncLock as SyncLock,
+        Triggers as Triggers,
     )
 
-__all__ = [
-    "Algorithm",
-    "Alternative",
-    "Attitude",
-    "AttitudeLog",
-    "BarLayout",
-    "BarSite",
-    "Beacon",
-    "Bend",
-    "BlockError",
-    "CameraModel",
-    "Code",
-    "Codebook",
-    "CodebookMismatchError",
-    "ConfigError",
-    "Corrected",
-    "Decode",
-    "DecodedFrame",
-    "Decoding",
-    "Deframer",
-    "Detection",
-    "Detector",
-    "ErrorCorrection",
-    "EventSource",
-    "Events",
-    "EvlcpError",
-    "FailedBar",
-    "Filter",
-    "Fix",
-    "Frame",
-    "FrameView",
-    "Framing",
-    "GnssLog",
-    "InputError",
-    "InterruptedRunError",
-    "LedColumns",
-    "LedGrid",
-    "LedRing",
-    "LedTable",
-    "Link",
-    "Loss",
-    "Measure",
-    "Message",
-    "MessageKind",
-    "Modulation",
-    "OutputError",
-    "Packet",
-    "PacketFormat",
-    "Pilots",
-    "Place",
-    "PluginError",
-    "PluginWarning",
-    "PositionPlan",
-    "PresenceMap",
-    "Range",
-    "Ranging",
-    "RawFormatError",
-    "ReceivedMessage",
-    "Receiver",
-    "Reception",
-    "Region",
-    "Registry",
-    "ReplaySource",
-    "ResultFolder",
-    "Run",
-    "Separate",
-    "Separation",
-    "Settled",
-    "SimulatedSource",
-    "Sink",
-    "SinkRecord",
-    "SoftSymbols",
-    "StreamError",
-    "SyncLock",
-    "Synchronization",
-    "Synchronizer",
-    "Tracker",
-    "Tracking",
-    "Triggers",
-    "UnknownAlgorithmError",
-    "UnpluggedError",
-    "compose",
-    "diagnose",
-    "frames_table",
-    "hookimpl",
-    "load_link",
-    "load_sites",
-    "open",
-    "read_events",
-    "receive",
-    "receive_to_folder",
-    "simulate",
-    "write_events",
-]
+    open = open_source
 
 _HOMES = {
-    "air.beacons": ("Beacon",),
-    "air.blocks": ("BlockError", "Message"),
-    "air.codebook": ("Codebook",),
-    "air.frames": ("PacketFormat",),
-    "air.kinds": ("MessageKind",),
+    "air.beacons": "Beacon",
+    "air.blocks": "BlockError Message",
+    "air.codebook": "Codebook",
+    "air.frames": "PacketFormat",
+    "air.kinds": "MessageKind",
     "errors": (
-        "CodebookMismatchError",
-        "ConfigError",
-        "EvlcpError",
-        "InputError",
-        "InterruptedRunError",
-        "OutputError",
-        "PluginError",
-        "PluginWarning",
-        "RawFormatError",
-        "StreamError",
-        "UnknownAlgorithmError",
-        "UnpluggedError",
+        "CodebookMismatchError ConfigError EvlcpError InputError InterruptedRunError OutputError "
+        "PluginError PluginWarning RawFormatError StreamError UnknownAlgorithmError UnpluggedError"
     ),
-    "io.open": ("open_source", "read_events", "write_events"),
-    "io.replay": ("ReplaySource",),
-    "link.compose": ("compose",),
-    "link.resolve": ("Link", "load_link"),
-    "place.gnss": ("GnssLog",),
-    "place.navigator": ("Place", "PositionPlan", "Settled"),
-    "plugin.hooks": ("Algorithm", "SinkRecord", "hookimpl"),
-    "plugin.registry": ("Registry",),
-    "plugin.source": ("EventSource", "Loss"),
+    "io.open": "open_source read_events write_events",
+    "io.replay": "ReplaySource",
+    "link.compose": "compose",
+    "link.resolve": "Link load_link",
+    "place.gnss": "GnssLog",
+    "place.navigator": "Place PositionPlan Settled",
+    "plugin.hooks": "Algorithm SinkRecord hookimpl",
+    "plugin.registry": "Registry",
+    "plugin.source": "EventSource Loss",
     "plugin.roles": (
-        "Code",
-        "Corrected",
-        "Decode",
-        "Decoding",
-        "Deframer",
-        "Detection",
-        "Detector",
-        "ErrorCorrection",
-        "Filter",
-        "Framing",
-        "Measure",
-        "Modulation",
-        "Pilots",
-        "Ranging",
-        "Separate",
-        "Separation",
-        "Synchronization",
-        "Synchronizer",
-        "Tracker",
-        "Tracking",
+        "Code Corrected Decode Decoding Deframer Detection Detector ErrorCorrection Filter Framing "
+        "Measure Modulation Pilots Ranging Separate Separation Synchronization Synchronizer Tracker "
+        "Tracking"
     ),
-    "results.folder": ("ResultFolder",),
-    "results.sink": ("Run", "Sink"),
-    "results.tables": ("frames_table",),
-    "run": ("Reception", "diagnose", "receive", "receive_to_folder"),
-    "rx.receiver": ("Receiver",),
-    "scene.attitude": ("Attitude", "AttitudeLog"),
-    "scene.bar": ("BarLayout", "LedColumns", "LedGrid", "LedRing", "LedTable"),
-    "scene.camera": ("CameraModel",),
-    "scene.sites": ("BarSite", "load_sites"),
-    "simulated": ("SimulatedSource", "simulate"),
+    "results.folder": "ResultFolder",
+    "results.sink": "Run Sink",
+    "results.tables": "frames_table",
+    "run": "Reception diagnose receive receive_to_folder",
+    "rx.receiver": "Receiver",
+    "scene.attitude": "Attitude AttitudeLog",
+    "scene.bar": "BarLayout LedColumns LedGrid LedRing LedTable",
+    "scene.camera": "CameraModel",
+    "scene.sites": "BarSite load_sites",
+    "simulated": "SimulatedSource simulate",
     "values": (
-        "Alternative",
-        "Bend",
-        "Events",
-        "FailedBar",
-        "Fix",
-        "Frame",
-        "FrameView",
-        "DecodedFrame",
-        "Packet",
-        "PresenceMap",
-        "Range",
-        "ReceivedMessage",
-        "Region",
-        "SoftSymbols",
-        "SyncLock",
-        "Triggers",
+        "Alternative Bend Events FailedBar Fix Frame FrameView DecodedFrame Packet PresenceMap Range "
+        "ReceivedMessage Region SoftSymbols SyncLock Triggers"
     ),
 }
 """Where each name lives; it is imported when it is first used, so that the package itself takes no time."""
 
 _RENAMED = {"open": "open_source"}
+
+__all__ = sorted({*" ".join(_HOMES.values()).split(), *_RENAMED} - {*_RENAMED.values()})
 
 
 if not TYPE_CHECKING:  # or else a misspelt name would pass for one that is found here
@@ -280,7 +158,7 @@ if not TYPE_CHECKING:  # or else a misspelt name would pass for one that is foun
 
             wanted = _RENAMED.get(name, name)
             for module, names in _HOMES.items():
-                if wanted in names:
+                if wanted in names.split():
                     found = globals()[name] = getattr(import_module(f"{__name__}.{module}"), wanted)
                     return found
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -29,12 +29,12 @@ def progress_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
     from rich.progress import (
         BarColumn,
         MofNCompleteColumn,
+        Progress as Bar,
         ProgressColumn,
         Task,
         TextColumn,
         TimeRemainingColumn,
     )
-    from rich.progress import Progress as Bar
     from rich.text import Text
 
     from evlcp_sdk.kernels import count_compiled, count_imported

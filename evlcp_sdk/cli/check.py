@@ -119,8 +119,7 @@ def _check_one(
     from evlcp_sdk.errors import ConfigError, PluginError
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.spelling import unhinted
-    from evlcp_sdk.testing import check as hold
-    from evlcp_sdk.testing import laws_of
+    from evlcp_sdk.testing import check as hold, laws_of
 
     laws_of(role)
     registry = Registry.load()

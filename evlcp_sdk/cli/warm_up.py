@@ -21,8 +21,7 @@ def warm_up(as_json: Json = False) -> None:
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
     from evlcp_sdk.spelling import counted
-    from evlcp_sdk.warming import STEPS
-    from evlcp_sdk.warming import warm_up as warm
+    from evlcp_sdk.warming import STEPS, warm_up as warm
 
     err = console(stderr=True)
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())

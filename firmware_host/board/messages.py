@@ -6,8 +6,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
-from time import gmtime, strftime
-from time import time as clock_s
+from time import gmtime, strftime, time as clock_s
 from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.air.blocks import Message

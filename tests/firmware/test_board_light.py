@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from board_lines import board_on
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook

@@ -8,8 +8,7 @@ from typing import get_type_hints
 
 import pytest
 from cobs import cobs
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from firmware_host.errors import DatagramError
 from firmware_host.protocol import generate

@@ -5,8 +5,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 from board_lines import NoisyLine
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import packet_chips

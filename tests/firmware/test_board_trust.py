@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from board_lines import Native, NoisyLine
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.link.resolve import load_link
 from firmware_host.board.bank import bank_of, random_symbols

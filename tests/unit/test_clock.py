@@ -4,10 +4,8 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from clock_twins import clock as twin
-from clock_twins import ordered
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from clock_twins import clock as twin, ordered
+from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk import _kernels
 from evlcp_sdk.clock import LEAP_US, CameraClock

@@ -6,8 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from evlcp_sdk.air.beacons import BEACON_BYTES, Beacon
 from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, joined, split

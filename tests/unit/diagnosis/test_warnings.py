@@ -6,8 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from evlcp_sdk.diagnosis.facts import Facts, other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 from evt_twins import TWINS
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.io import RawSource, RawWriter, open_source, read_events, write_events

@@ -9,8 +9,7 @@ import zipfile
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.errors import InputError, StreamError
 from evlcp_sdk.io import open_source, open_writer, read_events, write_events

@@ -1,8 +1,7 @@
 """Heights of the geoid, beside those that the model's makers publish to test programs with."""
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from evlcp_sdk.place.geoid import geoid_m
 

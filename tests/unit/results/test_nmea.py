@@ -4,8 +4,7 @@ from datetime import UTC, datetime, timedelta
 
 import pynmea2
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from evlcp_sdk.place.nmea import checksum
 from evlcp_sdk.results.nmea import gga, rmc

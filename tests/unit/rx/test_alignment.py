@@ -6,8 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 import rx_twins as twins
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.rx.alignment import polarity_sums

@@ -4,8 +4,7 @@ import math
 from itertools import takewhile
 
 import pytest
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.grid import DueFrame, PacketGrid

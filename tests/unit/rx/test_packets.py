@@ -4,8 +4,7 @@ from itertools import chain, pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.values import Frame, Range, SoftSymbols

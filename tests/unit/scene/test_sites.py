@@ -5,8 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, load_sites, resolve_sites, site_of_transmitter

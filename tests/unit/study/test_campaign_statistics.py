@@ -5,8 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.study.tally import Statistics, Tally, segment_of
