@@ -27,13 +27,14 @@ from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.native import NativeBoard, NativeLine
 from firmware_host.emulators.processes import start_qemu
-from firmware_host.emulators.simulated import SimulatedBoard, UsbLine
+from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardError
 from firmware_host.images import FlashImage
 from firmware_host.ports.rom import RomLoader, flash_image
 from firmware_host.protocol.client import RequestOutcome, Timing
 from firmware_host.protocol.generated.requests import CommitRequest, StatusReply, StatusRequest
 from firmware_host.protocol.wire import WireMessage
+from tests.models.usb import UsbLine
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 

@@ -6,7 +6,7 @@ Mod% = f / 30 for 90 Hz to 3 kHz and 0.01 f below 90 Hz; low risk (practice 1) u
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -45,16 +45,8 @@ class ClusterFlicker:
 
     def to_dict(self) -> dict[str, Any]:
         """As plain values; what is infinite is None, as JSON has no number for it."""
-        return {
-            "cluster": self.cluster,
-            "on_share": self.on_share,
-            "longest_run": self.longest_run,
-            "line_hz": self.line_hz,
-            "line_percent": self.line_percent,
-            "limit_percent": self.limit_percent if math.isfinite(self.limit_percent) else None,
-            "low_risk": self.low_risk,
-            "no_effect": self.no_effect,
-        }
+        limit = self.limit_percent if math.isfinite(self.limit_percent) else None
+        return asdict(self) | {"limit_percent": limit}
 
 
 def no_effect_percent(frequency_hz: Floats) -> Floats:

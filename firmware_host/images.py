@@ -72,22 +72,6 @@ class FlashImage:
             content[at - first : at - first + len(piece)] = piece
         return cls(first, bytes(content))
 
-    def hex_text(self) -> str:
-        """As Intel HEX, 16 bytes a record."""
-        out, high = [], -1
-        for at in range(0, len(self.data), 16):
-            address = self.address + at
-            if address >> 16 != high:
-                high = address >> 16
-                out.append(_record(0, 4, high.to_bytes(2, "big")))
-            out.append(_record(address & 0xFFFF, 0, self.data[at : at + 16]))
-        return "\n".join([*out, _record(0, 1, b""), ""])
-
-
-def _record(address: int, kind: int, data: bytes) -> str:
-    body = bytes([len(data), address >> 8, address & 0xFF, kind]) + data
-    return f":{(body + bytes([-sum(body) & 0xFF])).hex().upper()}"
-
 
 def _hex_pieces(path: Path, data: bytes) -> Iterator[tuple[int, bytes]]:
     base, ended = 0, False

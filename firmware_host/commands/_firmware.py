@@ -45,8 +45,8 @@ def build_images(
     package = Package.built(target).to_json()
     contents = {
         ".elf": elf.read_bytes(),
-        ".hex": image.hex_text().encode(),
-        ".bin": image.data,
+        ".hex": elf.with_suffix(".hex").read_bytes(),
+        ".bin": elf.with_suffix(".bin").read_bytes(),
         ".update.json": package.encode(),
     }
     paths = [output / f"{target}{suffix}" for suffix in contents]

@@ -1,7 +1,6 @@
 """The firmware in this process, in virtual time: for tests of hosts, links and chip streams."""
 
 import ctypes
-from collections import deque
 from functools import cache
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 
 from firmware_host import build
 from firmware_host.emulators.led_record import RECORD, LedRecord
-from firmware_host.protocol.generated.requests import DEFAULT_BAUD, LEDS, ROW_BYTES
+from firmware_host.protocol.generated.requests import LEDS, ROW_BYTES
 
 
 @cache
@@ -28,7 +27,6 @@ def _library() -> ctypes.CDLL:
         ("set_health", None, [handle, ctypes.c_int16, ctypes.c_uint8, ctypes.c_uint8]),
         ("set_late", None, [handle, ctypes.c_uint32]),
         ("set_failures", None, [handle, ctypes.c_uint8, ctypes.c_uint8]),
-        ("flip_flash", None, [handle, ctypes.c_uint8, ctypes.c_uint32]),
         ("shown", None, [handle, ctypes.c_char_p]),
         ("level", ctypes.c_uint16, [handle]),
         ("running", ctypes.c_uint8, [handle]),
@@ -145,10 +143,6 @@ class SimulatedBoard:
         """Hardware that does not follow."""
         self._c.board_set_failures(self._board, level, flash)
 
-    def flip_flash(self, slot: int, offset: int) -> None:
-        """Flip a bit of a flash slot."""
-        self._c.board_flip_flash(self._board, slot, offset)
-
 
 class SimulatedLine:
     """A line to a simulated board, as a `Transport`; its clock is the board's.
@@ -192,57 +186,3 @@ class SimulatedLine:
 
     def close(self) -> None:
         """Nothing to let go."""
-
-
-class UsbLine(SimulatedLine):
-    """A line of a certain rate behind a USB bridge, which hands what it receives on late.
-
-    Args:
-        board: The board.
-        latency_s: Time that a bridge keeps what the board sends, s; its latency timer.
-        baud: Line rate, bit/s; a byte takes ten bits.
-        frame_s: Time that USB keeps what the host sends, s; a full-speed frame.
-        name: What to call it in messages.
-    """
-
-    def __init__(
-        self,
-        board: SimulatedBoard,
-        latency_s: float,
-        baud: int = DEFAULT_BAUD,
-        frame_s: float = 0.0,
-        name: str = "simulated USB:",
-    ) -> None:
-        super().__init__(board, name, step_us=20)
-        self._byte_us = 10e6 / baud
-        self._latency_us = latency_s * 1e6
-        self._frame_us = frame_s * 1e6
-        self._out: deque[tuple[float, bytes]] = deque()
-        self._in: deque[tuple[float, bytes]] = deque()
-        self._out_free_us = 0.0
-        self._in_free_us = 0.0
-
-    def write(self, data: bytes) -> None:
-        """Bytes to the board, one after the other at the line's rate."""
-        at = max(self.board.now_us + self._frame_us, self._out_free_us)
-        for byte in data:
-            at += self._byte_us
-            self._out.append((at, bytes([byte])))
-        self._out_free_us = at
-
-    def read(self, timeout_s: float) -> bytes:
-        """Bytes from the board, once they have come over the line and the bridge lets go of them."""
-        end = self.board.now_us + max(self.step_us, int(timeout_s * 1e6))
-        while True:
-            while self._out and self._out[0][0] <= self.board.now_us:
-                self.board.receive(self._out.popleft()[1])
-            sent = self.board.sent()
-            if sent:
-                self._in_free_us = max(self.board.now_us, self._in_free_us) + len(sent) * self._byte_us
-                self._in.append((self._in_free_us + self._latency_us, sent))
-            found = b""
-            while self._in and self._in[0][0] <= self.board.now_us:
-                found += self._in.popleft()[1]
-            if found or self.board.now_us >= end:
-                return found
-            self.board.run(self.step_us)

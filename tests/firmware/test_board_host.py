@@ -17,12 +17,13 @@ from evlcp_sdk.air.codebook import Codebook
 from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine, UsbLine
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import NoBoardError, RefusedError, VerifyError
 from firmware_host.ports.transport import SocketTransport
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import BoardFault, State, Status, Watchdog
 from tests.conftest import Run
+from tests.models.usb import UsbLine
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

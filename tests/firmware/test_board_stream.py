@@ -15,7 +15,7 @@ from firmware_host.board.bank import bank_of, queue_of, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine, UsbLine
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError, VerifyError
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import (
@@ -28,6 +28,7 @@ from firmware_host.protocol.generated.requests import (
     StreamRequest,
     Watchdog,
 )
+from tests.models.usb import UsbLine
 
 pytestmark = pytest.mark.usefixtures("compiler")
 

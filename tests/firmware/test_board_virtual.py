@@ -429,7 +429,9 @@ def test_save_survives_reset_and_damage(device: SimulatedBoard, book: Codebook) 
     status = board.status()
     assert board.holds(Bank.of_symbols(second, book), status)
     assert (status.level_ma, status.watchdog, status.watchdog_ms) == (33, Watchdog.IDLE, 700)
-    device.flip_flash(1, 200)
+    held = bytearray(device.flash())
+    held[len(held) // 2 + 200] ^= 0x10
+    device.set_flash(bytes(held))
     device.reset()
     board = board_on(SimulatedLine(device))
     assert board.recall().slot == 0

@@ -96,11 +96,6 @@ void board_set_failures(struct library *l, uint8_t level, uint8_t flash)
     l->board.flash_fails = flash != 0u;
 }
 
-void board_flip_flash(struct library *l, uint8_t slot, uint32_t offset)
-{
-    l->board.flash[slot][offset] ^= 0x10u;
-}
-
 void board_shown(const struct library *l, uint8_t row[EVLCP_ROW_BYTES])
 {
     memcpy(row, l->board.shown, EVLCP_ROW_BYTES);

@@ -1,0 +1,62 @@
+"""A board behind a USB bridge."""
+
+from collections import deque
+
+from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.protocol.generated.requests import DEFAULT_BAUD
+
+__all__ = ["UsbLine"]
+
+
+class UsbLine(SimulatedLine):
+    """A line of a certain rate behind a USB bridge, which hands what it receives on late.
+
+    Args:
+        board: The board.
+        latency_s: Time that a bridge keeps what the board sends, s; its latency timer.
+        baud: Line rate, bit/s; a byte takes ten bits.
+        frame_s: Time that USB keeps what the host sends, s; a full-speed frame.
+        name: What to call it in messages.
+    """
+
+    def __init__(
+        self,
+        board: SimulatedBoard,
+        latency_s: float,
+        baud: int = DEFAULT_BAUD,
+        frame_s: float = 0.0,
+        name: str = "simulated USB:",
+    ) -> None:
+        super().__init__(board, name, step_us=20)
+        self._byte_us = 10e6 / baud
+        self._latency_us = latency_s * 1e6
+        self._frame_us = frame_s * 1e6
+        self._out: deque[tuple[float, bytes]] = deque()
+        self._in: deque[tuple[float, bytes]] = deque()
+        self._out_free_us = 0.0
+        self._in_free_us = 0.0
+
+    def write(self, data: bytes) -> None:
+        """Bytes to the board, one after the other at the line's rate."""
+        at = max(self.board.now_us + self._frame_us, self._out_free_us)
+        for byte in data:
+            at += self._byte_us
+            self._out.append((at, bytes([byte])))
+        self._out_free_us = at
+
+    def read(self, timeout_s: float) -> bytes:
+        """Bytes from the board, once they have come over the line and the bridge lets go of them."""
+        end = self.board.now_us + max(self.step_us, int(timeout_s * 1e6))
+        while True:
+            while self._out and self._out[0][0] <= self.board.now_us:
+                self.board.receive(self._out.popleft()[1])
+            sent = self.board.sent()
+            if sent:
+                self._in_free_us = max(self.board.now_us, self._in_free_us) + len(sent) * self._byte_us
+                self._in.append((self._in_free_us + self._latency_us, sent))
+            found = b""
+            while self._in and self._in[0][0] <= self.board.now_us:
+                found += self._in.popleft()[1]
+            if found or self.board.now_us >= end:
+                return found
+            self.board.run(self.step_us)
