@@ -14,9 +14,6 @@ _T = TypeVar("_T")
 _LEAVE_S = 2.0
 """How long the end of a run waits for the servers: what a client has not taken by then is left."""
 
-_QUIET_TURNS = 5
-"""Turns of the loop without a task, in which connections are let go."""
-
 
 class LoopThread:
     """An event loop in a thread of its own; a context manager, whose end cancels all that runs in it."""
@@ -30,12 +27,8 @@ class LoopThread:
         return asyncio.run_coroutine_threadsafe(job, self.loop).result()
 
     def _run(self) -> None:
-        asyncio.set_event_loop(self.loop)
-        self.loop.run_forever()
-        self.loop.run_until_complete(_gone(self.loop))
-        self.loop.run_until_complete(self.loop.shutdown_asyncgens())
-        self.loop.run_until_complete(self.loop.shutdown_default_executor())
-        self.loop.close()
+        with asyncio.Runner(loop_factory=lambda: self.loop) as runner:
+            runner.get_loop().run_forever()
 
     def __enter__(self) -> Self:
         self._thread.start()
@@ -69,32 +62,13 @@ def cannot_listen(host: str, port: int, fault: OSError) -> ConfigError:
 
 
 async def stop_listening(server: Listening) -> None:
-    """Close a server. Who is just connecting is let in first: asyncio would forget that connection, open."""
+    """Close a server. Who is just connecting is let in first: asyncio would forget that connection, open.
+
+    Such a one's task has begun by then, and closes its connection when it is cancelled.
+    """
     loop = asyncio.get_running_loop()
     for one in server.sockets:
         loop.remove_reader(one.fileno())
-    for _ in range(2):
+    for _ in range(5):
         await asyncio.sleep(0)
     server.close()
-
-
-async def _gone(loop: asyncio.AbstractEventLoop) -> None:
-    """Cancel all that runs, and let it end, a moment at the most."""
-    until_s = loop.time() + _LEAVE_S / 2
-    seen: set[asyncio.Task[Any]] = set()
-    told: set[asyncio.Task[Any]] = set()
-    quiet = 0
-    while quiet < _QUIET_TURNS and loop.time() < until_s:
-        # Who has just connected has a task that must begin, or else nothing closes its connection.
-        running = asyncio.all_tasks(loop) - {asyncio.current_task()}
-        for task in (running & seen) - told:
-            task.cancel()
-            told.add(task)
-        seen = running
-        quiet = 0 if running else quiet + 1
-        await asyncio.sleep(0 if quiet or running - told else 1e-3)
-    # A client that takes nothing more keeps its connection open; asyncio has no public list of them.
-    for transport in list(getattr(loop, "_transports", {}).values()):
-        transport.abort()
-    for _ in range(_QUIET_TURNS):
-        await asyncio.sleep(0)
