@@ -55,9 +55,22 @@ class LinkOptions:
 
 
 @dataclass(frozen=True)
-class FormatOptions:
-    """Formats beside the usual ones."""
+class ResultOptions:
+    """Where results go, and formats beside the usual ones."""
 
+    out: Annotated[
+        Path | None,
+        typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be."),
+    ] = None
+    json_lines: Annotated[
+        str | None,
+        typer.Option(
+            "--json-lines",
+            metavar="-",
+            help="Frames, messages and fixes as lines of JSON on stdout as they come; OUT may be left out.",
+        ),
+    ] = None
+    as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False
     figures: Annotated[
         bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
     ] = False
@@ -71,7 +84,22 @@ class FormatOptions:
         typer.Option("--sink", metavar="NAME", help="Also write this format; may be repeated."),
     ] = None
 
-    def names(self, registry: "Registry", out: Path | None, *, positions: bool) -> tuple[str, ...]:
+    def lines(self, recordings: Sequence[str]) -> "LinePrinter | None":
+        """What prints lines as they come; None where nobody asked."""
+        from evlcp_sdk.io.open import STDIN
+
+        if self.json_lines is None:
+            return None
+        for wrong, why in (
+            (self.json_lines != STDIN, f"{self.json_lines}: expected -, standard output"),
+            (self.as_json, "end with the summary: give one of --json and --json-lines"),
+            (len(recordings) > 1, "are those of one recording"),
+        ):
+            if wrong:
+                raise typer.BadParameter(why, param_hint="--json-lines")
+        return LinePrinter()
+
+    def names(self, registry: "Registry", *, positions: bool) -> tuple[str, ...]:
         """Names of what is asked for, those with an option of their own first; all can be loaded."""
         from evlcp_sdk.plugin.records import choose_sinks
         from evlcp_sdk.results.sinks import load_sinks
@@ -79,7 +107,7 @@ class FormatOptions:
         short = [name for name in ("figures", "report", "parquet", "mcap") if getattr(self, name)]
         asked = tuple(dict.fromkeys([*short, *(self.sinks or [])]))
         load_sinks(choose_sinks(registry, asked, positions=positions))
-        if asked and out is None:
+        if asked and self.out is None:
             raise typer.BadParameter(
                 f"{', '.join(asked)} goes into a folder: give -o OUT", param_hint="--out"
             )
@@ -232,19 +260,3 @@ class LinePrinter:
             self.gone = True
             # Or else the interpreter tries once more as it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-
-
-def json_lines_of(where: str | None, recordings: Sequence[str], *, as_json: bool) -> LinePrinter | None:
-    """What prints lines as they come; None where nobody asked."""
-    from evlcp_sdk.io.open import STDIN
-
-    if where is None:
-        return None
-    for wrong, why in (
-        (where != STDIN, f"{where}: expected -, standard output"),
-        (as_json, "end with the summary: give one of --json and --json-lines"),
-        (len(recordings) > 1, "are those of one recording"),
-    ):
-        if wrong:
-            raise typer.BadParameter(why, param_hint="--json-lines")
-    return LinePrinter()

@@ -1,17 +1,35 @@
 """How a summary is printed."""
 
+import json
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evlcp_sdk.cli._common import console
+from evlcp_sdk.cli._common import console, echo
+from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from evlcp_sdk.cli._receiving import LinePrinter
+
 _MOST_SHOWN, _MOST_SAID = 8, 200
 """Messages that are shown, the newest, and characters of each."""
+
+
+def print_end(
+    summary: dict[str, Any], folder: Path | None, lines: "LinePrinter | None", *, as_json: bool
+) -> None:
+    """Say how a recording ended: as the last line of JSON, and to read on stderr; or on stdout."""
+    if lines is not None:
+        lines(json.dumps({"line": "summary"} | summary))
+    if as_json:
+        echo(json.dumps(summary))
+    elif lines is None or not lines.gone or folder is not None:
+        show(summary, folder, stderr=lines is not None)
+    if summary["status"] in ("failed", "degraded"):
+        complain(summary["error"])
 
 
 def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) -> None:

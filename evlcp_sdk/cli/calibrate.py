@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
 from evlcp_sdk.spelling import counted
 
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibrated
 
 
-@command
 def calibrate(
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings of bars at known sites.")

@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFile, console, echo
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ _WIDTH = 18
 """Of a law's name, where laws are shown as they are judged: the longest is `codewords-distinct`."""
 
 
-@command
 def check(
     role: Annotated[
         str | None, typer.Argument(metavar="[ROLE", help="What the algorithm does, e.g. ranging.")

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo, make_executor
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._tables import print_table
@@ -32,7 +31,6 @@ class CompareJob:
     here: bool
 
 
-@command
 def compare(
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings, or the RESULTS of one evlcp sweep.")

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, echo
 
 
@@ -18,7 +17,6 @@ class CodebookForm(StrEnum):
     C = "c"
 
 
-@command
 def config(
     link_file: LinkFile = None,
     overrides: Overrides = None,

@@ -7,13 +7,11 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, bytes_bar, echo
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.spelling import counted
 
 
-@command
 def convert(
     url: Annotated[
         str, typer.Argument(metavar="SOURCE", help="A recording, a stream, a camera, or what a plugin opens.")

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, Workers, console, echo
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -42,7 +41,6 @@ def demo_campaign() -> Path:
     return shipped("campaigns", f"{CAMPAIGN_NAME}.toml")
 
 
-@command
 def demo(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="OUT", help="Folder of the result.")] = Path(
         "demo-out"

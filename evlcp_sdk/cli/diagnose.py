@@ -7,14 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, echo
 
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.diagnose import Diagnosis
 
 
-@command
 def diagnose(
     recording: Annotated[str, typer.Argument(metavar="REC", help="A recording.")],
     out: Annotated[

@@ -6,11 +6,9 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, echo
 
 
-@command
 def info(
     recording: Annotated[str, typer.Argument(metavar="REC", help="A recording; - for standard input.")],
     as_json: Json = False,

@@ -7,20 +7,19 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import console, echo
+from evlcp_sdk.cli._common import console
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.cli._receiving import CameraOptions, FormatOptions, LinkOptions, json_lines_of
-from evlcp_sdk.cli._summary import delays_text, show
+from evlcp_sdk.cli._receiving import CameraOptions, LinkOptions, ResultOptions
+from evlcp_sdk.cli._summary import delays_text, print_end
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from evlcp_sdk.cli._receiving import LinePrinter
     from evlcp_sdk.live.loop import LiveStatus
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.live.services import Services, Serving
@@ -105,23 +104,8 @@ def live(
             " what a plugin can open; a recording is replayed at its own pace.",
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", metavar="OUT", help="Also write a result, as receive does, into a folder."
-        ),
-    ] = None,
     link: LinkOptions,
-    json_lines: Annotated[
-        str | None,
-        typer.Option(
-            "--json-lines",
-            metavar="-",
-            help="Frames, messages and fixes as lines of JSON on stdout as they come.",
-        ),
-    ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="The summary as one line of JSON.")] = False,
-    formats: FormatOptions,
+    result: ResultOptions,
     camera: CameraOptions,
     reconnect: Annotated[
         bool,
@@ -179,13 +163,13 @@ def live(
     from evlcp_sdk.run import live as run_live
     from evlcp_sdk.signals import stop_on_request
 
-    lines = json_lines_of(json_lines, [url], as_json=as_json)
+    out, lines = result.out, result.lines([url])
     registry = Registry.load()
     links = link.load(registry)
-    plan = camera.plan(links, mcap=formats.mcap)
+    plan = camera.plan(links, mcap=result.mcap)
     clock = camera.clock()
     chosen = serving.chosen(out, positions=plan is not None)
-    sinks = formats.names(registry, out, positions=plan is not None)
+    sinks = result.names(registry, positions=plan is not None)
     attitude, publisher = camera.attitude(), Publisher()
     sites = plan.sites if plan is not None else ()
     services = Services(
@@ -211,27 +195,11 @@ def live(
         )
         if services.fault:
             complain(services.fault)
-        _print_summary(summary, out, lines, as_json=as_json)
+        print_end(summary, out, lines, as_json=result.as_json)
         if stopped() and out is not None:
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")
     fault = UnpluggedError if summary["live"]["unplugged"] else InputError
     raise typer.Exit(fault.exit_code if summary["status"] == "failed" else 0)
-
-
-def _print_summary(
-    summary: dict[str, Any], out: Path | None, lines: LinePrinter | None, *, as_json: bool
-) -> None:
-    """Say how it ended, where that was asked for."""
-    import json
-
-    if lines is not None:
-        lines(json.dumps({"line": "summary"} | summary))
-    elif as_json:
-        echo(json.dumps(summary))
-    else:
-        show(summary, out, stderr=False)
-    if summary["status"] in ("failed", "degraded"):
-        complain(summary["error"])
 
 
 @contextmanager

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, echo
 
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
 
 
-@command
 def plugins(as_json: Json = False) -> None:
     """List the roles with what they do, the installed algorithms of each, and broken plugins.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass, replace
@@ -15,8 +16,8 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Dask, bytes_bar, console, echo, hush, make_executor, shows_bars
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.cli._receiving import CameraOptions, FormatOptions, LinePrinter, LinkOptions, json_lines_of
-from evlcp_sdk.cli._summary import show
+from evlcp_sdk.cli._receiving import CameraOptions, LinePrinter, LinkOptions, ResultOptions
+from evlcp_sdk.cli._summary import print_end
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
 if TYPE_CHECKING:
@@ -53,10 +54,6 @@ def receive(
             metavar="REC...", help="Recordings, or what a plugin can open; - for RAW on standard input."
         ),
     ],
-    out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be."),
-    ] = None,
     link: LinkOptions,
     link_mode: Annotated[
         LinkMode,
@@ -66,16 +63,7 @@ def receive(
         ),
     ] = LinkMode.GIVEN,
     strict: Annotated[bool, typer.Option("--strict", help="End with 1 where there are warnings.")] = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False,
-    json_lines: Annotated[
-        str | None,
-        typer.Option(
-            "--json-lines",
-            metavar="-",
-            help="Frames, messages and fixes as lines of JSON on stdout as they come; OUT may be left out.",
-        ),
-    ] = None,
-    formats: FormatOptions,
+    result: ResultOptions,
     workers: Annotated[
         int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
     ] = 0,
@@ -121,34 +109,32 @@ def receive(
     """
     from evlcp_sdk.plugin.registry import Registry
 
-    lines = json_lines_of(json_lines, recordings, as_json=as_json)
-    jobs = _jobs(recordings, out, lines)
+    lines = result.lines(recordings)
+    jobs = _jobs(recordings, result.out, lines)
     registry = Registry.load()
     links = link.load(registry)
     if link_mode is LinkMode.AUTO:
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
         jobs = [_fitted(job, links[0], registry) for job in jobs]
-    plan = camera.plan(links, mcap=formats.mcap)
-    sinks = formats.names(registry, out, positions=plan is not None)
+    plan = camera.plan(links, mcap=result.mcap)
+    sinks = result.names(registry, positions=plan is not None)
     decode = DecodeJob(links, plan, camera.attitude(), camera, sinks, lines)
     here = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not here:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
     executor = make_executor(0 if here else workers or None, dask)
-    printer = SummaryPrinter(lines, as_json)
-    _run_jobs(jobs, decode, executor, printer, registry if here else None, out)
-    raise typer.Exit(printer.worst or DEGRADED * printer.degraded or int(strict and printer.warned))
+    outcomes = _run_jobs(jobs, decode, executor, registry if here else None, result)
+    raise typer.Exit(_exit_code(outcomes, strict=strict))
 
 
 def _run_jobs(
     jobs: Sequence[ReceiveJob],
     decode: DecodeJob,
     executor: Executor,
-    printer: SummaryPrinter,
     registry: Registry | None,
-    out: Path | None,
-) -> None:
+    result: ResultOptions,
+) -> list[Outcome[ReceiveJob, dict[str, Any]]]:
     """Decode all, here if a registry is given, else in workers; print how each ended.
 
     Raises:
@@ -162,6 +148,7 @@ def _run_jobs(
 
             stop_workers()
 
+    outcomes: list[Outcome[ReceiveJob, dict[str, Any]]] = []
     with (
         stop_on_request(pass_on) as stopped,
         _recordings_bar(len(jobs) if registry is None else 0) as count,
@@ -170,60 +157,35 @@ def _run_jobs(
         run = partial(decode, here=None if registry is None else (registry, stopped))
         for outcome in stack.enter_context(closing(executor.run(run, _until(stopped, jobs)))):
             count()
-            printer.show(outcome)
+            outcomes.append(outcome)
+            if outcome.value is None:
+                _print_failure(outcome, as_json=result.as_json)
+            else:
+                print_end(outcome.value, outcome.job.folder, decode.lines, as_json=result.as_json)
         if stopped():
-            folder = printer.interrupted[0] if len(printer.interrupted) == 1 else out
+            ended = [one.job.folder for one in outcomes if one.value and one.value["status"] == "interrupted"]
+            folder = ended[0] if len(ended) == 1 else result.out
             where = "was printed" if folder is None else f"is in {folder}"
             raise InterruptedRunError(f"interrupted; what was decoded until then {where}")
+    return outcomes
 
 
-class SummaryPrinter:
-    """Prints how each recording ended.
+def _print_failure(outcome: Outcome[ReceiveJob, dict[str, Any]], *, as_json: bool) -> None:
+    message = outcome.fault.message if outcome.fault else "no result"
+    complain(message)
+    if as_json:
+        echo(json.dumps({"status": "failed", "error": message, "recording": {"path": outcome.job.url}}))
 
-    Args:
-        lines: Takes summaries as lines of JSON; None for nobody.
-        as_json: Each is one line of JSON on stdout.
 
-    Attributes:
-        worst: Exit code of the worst failure; 0 for none.
-        degraded: More of a recording was dropped than may be.
-        warned: A recording has warnings.
-        interrupted: Folders of those that were ended early.
-    """
-
-    def __init__(self, lines: LinePrinter | None, as_json: bool) -> None:
-        self._lines, self._as_json = lines, as_json
-        self.worst, self.degraded, self.warned = 0, False, False
-        self.interrupted: list[Path | None] = []
-
-    def show(self, outcome: Outcome[ReceiveJob, dict[str, Any]]) -> None:
-        """Print one."""
-        import json
-
-        job, summary, fault, lines = outcome.job, outcome.value, outcome.fault, self._lines
-        if summary is None:
-            message = fault.message if fault else "no result"
-            complain(message)
-            self.worst = max(self.worst, fault.exit_code if fault else 1)
-            if self._as_json:
-                failed = {"status": "failed", "error": message, "recording": {"path": job.url}}
-                echo(json.dumps(failed))
-            return
-        if lines is not None:
-            lines(json.dumps({"line": "summary"} | summary))
-        if self._as_json:
-            echo(json.dumps(summary))
-        elif lines is None or not lines.gone or job.folder is not None:
-            show(summary, job.folder, stderr=lines is not None)
-        status = summary["status"]
-        if status in ("failed", "degraded"):
-            complain(summary["error"])
-        if status == "failed":
-            self.worst = max(self.worst, InputError.exit_code)
-        if status == "interrupted":
-            self.interrupted.append(job.folder)
-        self.degraded |= status == "degraded"
-        self.warned |= bool(summary["warnings"])
+def _exit_code(outcomes: Sequence[Outcome[ReceiveJob, dict[str, Any]]], *, strict: bool) -> int:
+    """That of the worst failure; else of a recording of which too much was dropped, or of a warning."""
+    failures = [one.fault.exit_code for one in outcomes if one.fault is not None]
+    summaries = [one.value for one in outcomes if one.value is not None]
+    statuses = [summary["status"] for summary in summaries]
+    if "failed" in statuses:
+        failures.append(InputError.exit_code)
+    warned = any(summary["warnings"] for summary in summaries)
+    return max(failures, default=0) or DEGRADED * ("degraded" in statuses) or int(strict and warned)
 
 
 def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:

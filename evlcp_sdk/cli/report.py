@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, console, echo
 from evlcp_sdk.cli._tables import print_table
 
@@ -16,7 +15,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.study.tally import Tally
 
 
-@command
 def report(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="What evlcp sweep wrote.")],
     out: Annotated[

@@ -8,12 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, console, echo
 from evlcp_sdk.cli._complain import complain
 
 
-@command
 def score(
     folder: Annotated[Path, typer.Argument(metavar="OUT", help="What `evlcp receive -o OUT` wrote.")],
     truth_file: Annotated[Path, typer.Argument(metavar="REC.truth.json", help="The recording's truth.")],

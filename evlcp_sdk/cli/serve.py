@@ -7,11 +7,9 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._complain import complain
 
 
-@command
 def serve(
     url: Annotated[
         str, typer.Argument(metavar="URL", help="A recording, which is sent at its own pace, or a camera.")

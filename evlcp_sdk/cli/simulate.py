@@ -9,12 +9,10 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, console, echo
 from evlcp_sdk.spelling import counted
 
 
-@command
 def simulate(
     scene_file: Annotated[
         str | None, typer.Argument(metavar="[scene.toml]", help="The scene; or use --preset.")

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo
 from evlcp_sdk.cli._receiving import CameraOptions, parse_utc
 from evlcp_sdk.spelling import counted
@@ -19,7 +18,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.survey import SurveyedBar
 
 
-@command
 def survey(
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings of bars that send their ids.")

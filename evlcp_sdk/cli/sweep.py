@@ -8,11 +8,9 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli._campaign import progress_bar, show_faults
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Dask, Json, Workers, console, echo, make_executor
 
 
-@command
 def sweep(
     campaign: Annotated[Path, typer.Argument(metavar="CAMPAIGN.toml", help="The campaign.")],
     out: Annotated[

@@ -7,12 +7,10 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, echo
 from evlcp_sdk.spelling import counted
 
 
-@command
 def video(
     recording: Annotated[
         str, typer.Argument(metavar="REC", help="A recording, or what a plugin can open twice.")

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, console, echo
 
 
-@command
 def warm_up(as_json: Json = False) -> None:
     """Compile the kernels now, so that no later command waits for them.
 
