@@ -18,7 +18,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.air.frames import PacketFormat as PacketFormat
     from evlcp_sdk.air.kinds import MessageKind as MessageKind
     from evlcp_sdk.errors import (
-        CodebookMismatchError as CodebookMismatchError,
         ConfigError as ConfigError,
         EvlcpError as EvlcpError,
         InputError as InputError,
@@ -110,10 +109,7 @@ _HOMES = {
     "air.codebook": "Codebook",
     "air.frames": "PacketFormat",
     "air.kinds": "MessageKind",
-    "errors": (
-        "CodebookMismatchError ConfigError EvlcpError InputError InterruptedRunError OutputError "
-        "PluginError PluginWarning RawFormatError StreamError UnknownAlgorithmError UnpluggedError"
-    ),
+    "errors": ("PluginError PluginWarning RawFormatError StreamError UnknownAlgorithmError UnpluggedError"),
     "io.open": "open_source read_events write_events",
     "io.replay": "ReplaySource",
     "link.compose": "compose",

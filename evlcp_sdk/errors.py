@@ -3,8 +3,7 @@
 ```
 EvlcpError                     1   anything the SDK raises on purpose
 ├── ConfigError                2   a configuration value; names its path, the value, what was expected
-│   ├── UnknownAlgorithmError  2   no algorithm of that role and id; suggests the nearest
-│   └── CodebookMismatchError  2   two ends that do not share one codebook
+│   └── UnknownAlgorithmError  2   no algorithm of that role and id; suggests the nearest
 ├── PluginError                2   a plugin whose algorithm cannot be used or fails, or two of one (role, id)
 ├── OutputError                1   a file or folder that cannot be written
 ├── InputError                 3   a file or stream that cannot be read
@@ -23,7 +22,6 @@ from pathlib import Path
 from typing import ClassVar
 
 __all__ = [
-    "CodebookMismatchError",
     "ConfigError",
     "EvlcpError",
     "InputError",
@@ -52,10 +50,6 @@ class ConfigError(EvlcpError):
 
 class UnknownAlgorithmError(ConfigError):
     """No algorithm with that role and id is installed."""
-
-
-class CodebookMismatchError(ConfigError):
-    """Transmitter and receiver do not share one codebook."""
 
 
 class PluginError(EvlcpError):

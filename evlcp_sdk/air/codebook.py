@@ -10,13 +10,12 @@ import json
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
-from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.errors import CodebookMismatchError, ConfigError
+from evlcp_sdk.errors import ConfigError
 
 AIR_INTERFACE = 1
 """Version of the built-in air interface: all codes are pair codes."""
@@ -325,35 +324,6 @@ class Codebook:
         """The codebook as JSON text, with its digest."""
         return json.dumps(self.to_dict() | {"digest": self.digest})
 
-    @classmethod
-    def from_json(cls, text: str, source: Path | str = "codebook") -> Self:
-        """Read what `to_json` wrote.
-
-        Raises:
-            ConfigError: The text is not JSON, or a key is missing.
-            CodebookMismatchError: The air interface is another one, or the digest does not fit the codes.
-        """
-        try:
-            table = json.loads(text)
-            version = table["air_interface"]
-            if version not in (AIR_INTERFACE, _OF_CHIPS):
-                raise CodebookMismatchError(
-                    f"{source}: air_interface {version}, expected {AIR_INTERFACE} or {_OF_CHIPS}"
-                )
-            profile, *codes = (table[name] for name in ("profile", "preamble", "pilots", "codewords"))
-            if version == AIR_INTERFACE:
-                book = cls.of_values(profile, *codes)
-            else:
-                book = cls(profile, _chips(codes[0]), *(np.array([*map(_chips, c)]) for c in codes[1:]))
-            digest = table["digest"]
-        except (ValueError, TypeError, OverflowError, RecursionError) as fault:
-            raise ConfigError(f"{source}: not a codebook: {fault}") from fault
-        except KeyError as fault:
-            raise ConfigError(f"{source}: not a codebook: key {fault} is missing") from fault
-        if digest != book.digest:
-            raise CodebookMismatchError(f"{source}: digest {digest}, but its codes have {book.digest}")
-        return book
-
     def to_c(self) -> str:
         """The codebook as a C11 header: chip words, most significant bit first on air.
 
@@ -402,9 +372,3 @@ def _values(chips: Chips) -> Values:
 
 def _text(chips: Chips) -> str:
     return "".join(map(str, chips.tolist()))
-
-
-def _chips(text: Any) -> Chips:
-    if not isinstance(text, str) or set(text) - {"0", "1"}:
-        raise ValueError(f"{text!r:.40}: expected a string of chips, 0 and 1")
-    return np.array([*map(int, text)], np.uint8)

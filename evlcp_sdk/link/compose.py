@@ -135,12 +135,7 @@ def each_packet(
 ) -> Iterator[NDArray[np.int64]]:
     """The same one by one, int64 (frames, clusters), each made when it is taken."""
     blocks = [block for one in messages for block in split(one, coder.digest, coder.block_bytes)]
-
-    def made() -> Iterator[NDArray[np.int64]]:
-        for block in blocks:
-            yield from [coder.symbols(block.pack(coder.block_bytes))] * repeat
-
-    return made()
+    return (packet for block in blocks for packet in [coder.symbols(block.pack(coder.block_bytes))] * repeat)
 
 
 def beacon_of_site(site: BarSite, user: bytes = b"") -> Beacon:

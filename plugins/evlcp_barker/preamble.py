@@ -1,7 +1,5 @@
 """Where preambles are in a correlation, and when: by tables of all lags and of all that is left out."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,34 +26,17 @@ def find_peaks(rho: Floats, first: int, guard: int, squares: Floats, least: floa
     return found
 
 
-@dataclass(frozen=True)
-class PreambleTimes:
-    """Times of a preamble, in steps, and their variances by the jackknife.
-
-    Attributes:
-        on: Where positive events fit best; NaN where none do.
-        off: Where negative ones do.
-        onset: Where positive ones first reach half of their most, over what comes all the time.
-        on_noise: Variance of `on`.
-        off_noise: Of `off`.
-        onset_noise: Of `onset`.
-    """
-
-    on: float
-    off: float
-    onset: float
-    on_noise: float
-    off_noise: float
-    onset_noise: float
-
-
 def time_preamble(
     counts: Floats, lag: int, chips: Floats, steps: int, pair: int, rising: NDArray[np.int64]
-) -> PreambleTimes:
+) -> tuple[list[float], list[float]]:
     """Times of a preamble found at a lag in counts of OFF and ON, float64 (2, bins), `steps` a chip.
 
     `pair` chips, a pair of pair codes, are left out together to see how sure the first two are; the third is
     by the chips that are `rising`.
+
+    Returns:
+        Where positive events fit best, and negative ones, NaN where none do; and where positive ones first
+        reach half of their most, over what comes all the time; in steps. Their variances by the jackknife.
     """
     first, last = max(lag - steps, 0), min(lag + steps + 1, counts.shape[1] - steps * len(chips) + 1)
     running = np.zeros((2, last - first + steps * len(chips)))
@@ -70,7 +51,7 @@ def time_preamble(
     at = lag + steps * rising[:, None] + np.arange(-steps, steps)
     response = counts[1, np.clip(at, 0, counts.shape[1] - 1)]
     onset, onset_noise = _jackknife(_onsets(_without_each(response)))
-    return PreambleTimes(first + on, first + off, lag - steps + onset, on_noise, off_noise, onset_noise)
+    return [first + on, first + off, lag - steps + onset], [on_noise, off_noise, onset_noise]
 
 
 def _without_each(parts: Floats) -> Floats:

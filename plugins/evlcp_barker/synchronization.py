@@ -1,7 +1,7 @@
 """Packet timing by sliding correlation with the preamble."""
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import numpy as np
@@ -226,13 +226,12 @@ class BarkerSynchronizer:
 
     def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Preamble:
         """Times of one preamble, for positive and negative events apart, us."""
-        times = time_preamble(counts, lag, self._chips, _STEPS, self._pair, self._rising)
-        if math.isnan(times.on):
-            times = replace(times, on=times.off, on_noise=times.off_noise)
-        at = [(first_bin + v) * self._bin_us for v in (times.on, times.off, times.onset)]
-        noises = (times.on_noise, times.off_noise, times.onset_noise)
-        sigmas = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in noises]
-        return _Preamble(at[0], at[1], at[2], quality, *sigmas)
+        times, variances = time_preamble(counts, lag, self._chips, _STEPS, self._pair, self._rising)
+        if math.isnan(times[0]):
+            times[0], variances[0] = times[1], variances[1]
+        at = [(first_bin + v) * self._bin_us for v in times]
+        noises = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in variances]
+        return _Preamble(*at, quality, *noises)
 
     def _accept(
         self, clock: _Clock | None, stray: _Preamble | None, found: _Preamble

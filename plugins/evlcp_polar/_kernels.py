@@ -15,18 +15,6 @@ FROZEN, REPEATED, FREE = 0, 1, 2
 
 
 @njit
-def crc_holds(bits: Array, polynomial: int) -> bool:
-    """Whether a message followed by its 24 check bits leaves nothing over."""
-    register = 0xFFFFFF
-    for i in range(len(bits)):
-        feedback = (register >> 23) ^ bits[i]
-        register = (register << 1) & 0xFFFFFF
-        if feedback:
-            register ^= polynomial
-    return register == 0
-
-
-@njit
 def discrepancy_limit(weight: Array, log_share: float) -> float:
     """Largest total of flipped weights that is not an accident; negative if any total may be one.
 

@@ -11,7 +11,7 @@ from pydantic import Field
 
 from evlcp_polar import _kernels
 from evlcp_polar.sequence import RELIABILITY
-from evlcp_sdk.air.crc import CRC24C, CRC_BITS, crc24
+from evlcp_sdk.air.crc import CRC_BITS, crc24
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Code, Corrected, ErrorCorrection
 
@@ -250,7 +250,7 @@ class _PolarCode:
             found = _kernels.list_decode(mother, self.nodes, size, most, codewords, metric)
             for path in np.argsort(metric[:found], kind="stable"):
                 inputs = self._inputs(codewords[path])
-                if metric[path] <= limit and _kernels.crc_holds(inputs, CRC24C):
+                if metric[path] <= limit and not crc24(inputs).any():
                     return self._corrected(llr, codewords[path], inputs, ok=True)
                 if metric[path] < least:
                     guess, least = codewords[path], metric[path]

@@ -132,15 +132,6 @@ class Light:
         after_idle = float(np.clip(np.log(length / share), 10.0, 12.0))
         return after_idle, float(np.clip(-np.log(1 - share), 0.1, 3.0)) if many else 1.0
 
-    def log_likelihoods(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Log-likelihood of windows, float64 (..., 2, TICKS), by context and gain, float64 (..., C, J)."""
-        flat = windows.reshape(*windows.shape[:-2], -1)
-        alike = np.einsum("...k,ck->...c", flat, self.share * self.logs.reshape(CONTEXTS, -1))
-        events = flat.sum(-1)
-        found: NDArray[np.float64] = (events[..., None] * (self.share * LOG_GAINS))[..., None, :] - self.means
-        found += alike[..., None]
-        return found
-
     def of_context(
         self, windows: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:

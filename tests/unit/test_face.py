@@ -18,7 +18,7 @@ FACE = Path(evlcp.__file__)
 
 FACE_NAMES = """
     Algorithm Alternative Attitude AttitudeLog BarLayout BarSite Beacon Bend BlockError CameraModel Code
-    Codebook CodebookMismatchError ConfigError Corrected Decode Decoding Deframer Detection Detector
+    Codebook ConfigError Corrected Decode Decoding Deframer Detection Detector
     ErrorCorrection EventSource Events EvlcpError FailedBar Filter Fix Frame FrameView Framing GnssLog
     DecodedFrame InputError InterruptedRunError LedColumns LedGrid LedRing LedTable Link Loss Measure Message
     MessageKind Modulation OutputError Packet PacketFormat Pilots Place PluginError PluginWarning

@@ -123,12 +123,6 @@ def test_a_time_and_a_countdown() -> None:
         CountdownKind().unpack(bytes([1, 6, 0, 0, 0, 0]))
 
 
-def test_a_countdown_is_received() -> None:
-    message = Message(Kind.COUNTDOWN, 3, 9, CountdownKind().pack(Countdown("green", "amber", 4.5)))
-    found, _ = heard([message], load_link())
-    assert [(m.kind.name, m.value) for m in found] == [("countdown", Countdown("green", "amber", 4.5))]
-
-
 def bring(number: Any, name: Any, shown: Mapping[str, Any] | None = None) -> tuple[object, MessageKind]:
     class Other(wind.Wind):
         def to_dict(self, value: Any) -> Mapping[str, Any]:

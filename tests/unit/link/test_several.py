@@ -5,11 +5,7 @@ from pathlib import Path
 import pytest
 
 from evlcp_sdk.cli._receiving import LinkOptions
-from evlcp_sdk.diagnosis.facts import Facts
-from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import find_warnings
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import alike_links, load_links, named_links
 from evlcp_sdk.plugin.registry import Registry
 
@@ -64,24 +60,6 @@ def test_links_whose_characters_the_other_reads_are_named(
     (tmp_path / "bar.toml").write_text("")
     links = named_links(load_links([tmp_path / f"{name}.toml" for name in ("bar", "lamp", "other")]))
     assert alike_links(links) == [("lamp", "other")] * alike
-
-
-def test_two_kinds_of_odd_and_even_parity_are_told_apart(tmp_path: Path) -> None:
-    for parity in ("odd", "even"):
-        text = ONE_LED + TOLD.format(rate=3125.0) + f"data_bits = 7\nparity = '{parity}'"
-        (tmp_path / f"{parity}.toml").write_text(text)
-    assert not alike_links(named_links(load_links([tmp_path / "odd.toml", tmp_path / "even.toml"])))
-
-
-def test_links_alike_are_warned_of_before_anything_is_read(tmp_path: Path) -> None:
-    lamp = load_link(None, ["bar.rows=1", "bar.columns=1", "bar.cluster_rows=1", "framing.id=uart"])
-    off = load_link(
-        None, ["bar.rows=1", "bar.columns=1", "bar.cluster_rows=1", "framing.id=uart", "framing.idle=off"]
-    )
-    parts = {name: Facts(link, RunTally({}), {}) for name, link in (("lamp", lamp), ("off", off))}
-    (told,) = find_warnings(Facts(lamp, RunTally({}), {}, parts=parts))
-    assert told.code == "alike-links"
-    assert "'lamp' and 'off'" in told.text
 
 
 def test_links_alike_are_said_on_stderr_before_anything_is_read(

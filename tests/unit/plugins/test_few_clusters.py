@@ -75,25 +75,6 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str
     assert found.distance_m == pytest.approx(true_m, rel=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("layout", "said"),
-    [
-        (
-            "1 clusters",
-            "needs an even column of three clusters or more; .* of one cluster: use 'none' for this layout$",
-        ),
-        ("2 clusters", "needs .* or more; use 'none' for this layout$"),
-        ("ring", "needs .* or more; use 'poc' for this layout$"),
-        ("two lamps", "needs .* or more; use 'poc' for this layout$"),
-        ("one row of two", "needs .* or more; use 'none' for this layout$"),
-    ],
-)
-def test_joint_scale_says_what_works_instead(layout: str, said: str) -> None:
-    link = link_with(layout, "ranging.id=joint-scale")
-    with pytest.raises(ConfigError, match=said):
-        link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
-
-
 @pytest.mark.parametrize("layout", ["2 clusters", "3 clusters", "one row of two"])
 def test_poc_compares_no_clusters_whose_edges_differ(layout: str) -> None:
     link = link_with(layout, "ranging.id=poc")

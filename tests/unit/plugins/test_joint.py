@@ -521,51 +521,51 @@ def test_how_dim_negative_values_are(spacing: float) -> None:
     assert _kernels.measure_dim(-np.abs(sums), pilots, seen, place) == 1.0
 
 
-def fit_of(codes, known, dim, values, start):
+KNOWN = np.ones((K + 1, 16), np.bool_)
+KNOWN[[0, K]] = False
+
+
+def random_codes(rng):
+    return np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1)
+
+
+def fit_of(codes, dim, values, spacing):
     """The fit of a frame's values, of boundaries .45 px wide without tails, and where they lie off it."""
-    motion, fit = np.stack([np.zeros(16), (np.arange(16) + 0.5) / 16 - 0.5]), start.copy()
+    motion = np.stack([np.zeros(16), (np.arange(16) + 0.5) / 16 - 0.5])
+    fit = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
     fitted, by_boundary, scores, normal = _kernels.fit_bar(
-        codes, known, motion, values, profile(1.0), np.array([0.45, dim]), 6, fit
+        codes, KNOWN, motion, values, profile(1.0), np.array([0.45, dim]), 6, fit
     )
     assert fitted
     assert _kernels.assess_fit(by_boundary, scores, normal)[0] > 0
     return fit, by_boundary[:, 1:-1]
 
 
+def values_of(codes, places, rows):
+    """Of each row, about boundaries at these places, .45 px wide: float64 (values, rows)."""
+    share = norm.cdf((np.arange(rows)[:, None] - places) / 0.45)
+    return (codes[0] + share @ np.diff(codes, axis=0)).T
+
+
 @pytest.mark.parametrize("dim", [0.05, 0.5, 2.0])
 def test_boundaries_stay_where_one_sign_is_missed(dim: float) -> None:
     """Pilots, and symbols, say more steps of one sign at some boundaries."""
-    rng = np.random.default_rng(3)
-    symbols = rng.integers(0, 64, K)
-    codes = np.concatenate([PILOTS, WORDS[symbols]], axis=1).astype(np.float64)
-    spacing, rows = 8.6, 150
-    at = np.arange(rows) - (rows - 1) / 2
-    share = norm.cdf((at[:, None] - spacing * (np.arange(1, K) - K / 2)) / 0.45)
-    values = 0.6 * (codes[0] + share @ np.diff(codes, axis=0)).T
+    codes, spacing = random_codes(np.random.default_rng(3)), 8.6
+    values = 0.6 * values_of(codes, 74.5 + spacing * (np.arange(1, K) - K / 2), 150)
     values *= np.where(values < 0, dim, 1)
-    known = np.ones((K + 1, 16), np.bool_)
-    known[[0, K]] = False
-    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    fit, _ = fit_of(codes, known, dim, values, start)
+    fit, _ = fit_of(codes, dim, values, spacing)
     assert fit[0] == pytest.approx(spacing, rel=2e-5)
 
 
 def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
     """Steps up lie 0.08 px lower than steps down, and what repeats a value looks smaller by 0.05 px."""
-    rng = np.random.default_rng(7)
-    codes = np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1).astype(np.float64)
-    spacing, rows = 8.6, 150
-    at, boundaries = np.arange(rows) - (rows - 1) / 2, spacing * (np.arange(1, K) - K / 2)
-    values = np.empty((16, rows))
+    codes, spacing = random_codes(np.random.default_rng(7)), 8.6
+    boundaries, values = 74.5 + spacing * (np.arange(1, K) - K / 2), np.empty((16, 150))
     for i in range(16):
         again = codes[:, i] == codes[:, i - 1] if i else np.zeros(K)
         shift = 0.04 * np.sign(np.diff(codes[:, i])) + 0.05 * np.diff(again.astype(float))
-        share = norm.cdf((at[:, None] - boundaries - shift) / 0.45)
-        values[i] = 0.6 * (codes[0, i] + share @ np.diff(codes[:, i]))
-    known = np.ones((K + 1, 16), np.bool_)
-    known[[0, K]] = False
-    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    fit, (off, weight, _) = fit_of(codes, known, 1.0, values, start)
+        values[i] = 0.6 * values_of(codes[:, i : i + 1], boundaries + shift, 150)[0]
+    fit, (off, weight, _) = fit_of(codes, 1.0, values, spacing)
     assert fit[0] == pytest.approx(spacing, rel=2e-5)
     # The prior takes up to a tenth of them.
     assert_allclose(fit[5:], [0.04, 0.05], rtol=0.12)
@@ -575,17 +575,10 @@ def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
 
 def test_a_wave_of_the_pixels_shows_in_the_boundaries() -> None:
     """Boundaries seem off by 0.02 px times the sine of their place on the pixels."""
-    rng, rows, spacing = np.random.default_rng(8), 150, 8 + 1 / 15
-    codes = np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1).astype(np.float64)
-    known = np.ones((K + 1, 16), np.bool_)
-    known[[0, K]] = False
-    at, b = np.arange(rows), np.arange(1, K) - K / 2
-    places = (rows - 1) / 2 + 0.2 + spacing * b
+    codes, spacing, b = random_codes(np.random.default_rng(8)), 8 + 1 / 15, np.arange(1, K) - K / 2
+    places = 74.7 + spacing * b
     seem = places + 0.02 * np.sin(2 * np.pi * places)
-    share = norm.cdf((at[:, None] - seem) / 0.45)
-    values = 0.6 * (codes[0] + share @ np.diff(codes, axis=0)).T
-    start = np.array([1.001 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    fit, (off, weight, wave) = fit_of(codes, known, 1.0, values, start)
+    fit, (off, weight, wave) = fit_of(codes, 1.0, 0.6 * values_of(codes, seem, 150), spacing)
     assert_allclose(wave, np.sin(2 * np.pi * places), atol=0.2)
     # What a straight line through the wave does not take up is left, and that it takes up is the spacing's.
     terms = np.stack([np.ones(K - 1), b], 1)
@@ -603,15 +596,9 @@ def noisy_fit(distance_m: float, noise: float, seed: int) -> tuple[float, np.nda
     codes = np.concatenate([PILOTS, WORDS[symbols]], axis=1)
     spacing = LINK.camera.focal_px * 0.06 / distance_m
     rows = 2 * int(spacing * 8 + 4)
-    at = np.arange(rows) - (rows - 1) / 2
-    share = norm.cdf((at[:, None] - spacing * (np.arange(1, K) - K / 2)) / 0.45)
-    ideal = 0.8 * (codes[0] + share @ np.diff(codes, axis=0)).T
-    values = ideal + rng.normal(0, noise / np.sqrt(5), ideal.shape)
-    start = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    known = np.ones((K + 1, 16), np.bool_)
-    known[[0, K]] = False
+    ideal = 0.8 * values_of(codes, (rows - 1) / 2 + spacing * (np.arange(1, K) - K / 2), rows)
     # With the profile of the bound: a normal distribution.
-    fit, _ = fit_of(codes, known, 1.0, values, start)
+    fit, _ = fit_of(codes, 1.0, ideal + rng.normal(0, noise / np.sqrt(5), ideal.shape), spacing)
     return LINK.camera.focal_px * 0.06 / fit[0], symbols
 
 

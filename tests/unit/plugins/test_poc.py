@@ -39,16 +39,6 @@ def fit_peak(samples, size, band):
     return shifts[0]
 
 
-@pytest.mark.parametrize(("size", "samples"), [(8, 1), (21, 2), (24, 2), (40, 8)])
-@pytest.mark.parametrize("gain", [1e-3, 1.0, 40.0])
-def test_an_exact_peak_is_fitted_exactly(size, samples, gain):
-    band = size - 1 + size % 2
-    for shift in np.linspace(-0.7, 0.7, 29):
-        kernel, _ = twins.dirichlet(np.arange(-samples, samples + 1) - shift, size, band)
-        # The last step is below 1e-3 px, and what it leaves its square.
-        assert fit_peak(gain * kernel, size, band) == pytest.approx(shift, abs=1e-6)
-
-
 @pytest.mark.parametrize("seed", range(10))
 def test_a_noisy_peak_is_fitted_by_least_squares(seed):
     rng = np.random.default_rng(seed)
@@ -267,17 +257,6 @@ def test_distance_of_ideal_images(bar, blob, tolerance, tilt_deg, band):
 
 
 # What is left out
-
-
-@pytest.mark.parametrize("dark", [[1], [4, 9], [1, 2, 3, 12, 13, 14]])
-def test_dark_clusters_cost_only_their_pairs(dark):
-    maps = image_of(BAR, 50)
-    maps[dark] = 0
-    found = measured(maps, drop_extremes=0, outlier_iqr=1e6, min_pairs=1)
-    lit = [k for k in range(1, 15) if k not in dark]
-    longest = max(lit) - min(lit)
-    assert found.pairs == sum(j - i >= longest / 2 for i in lit for j in lit)
-    assert found.distance_m == pytest.approx(50, rel=1e-3)
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from itertools import product
 import numpy as np
 import pytest
 from evlcp_polar import _kernels
-from evlcp_polar.correction import Polar, information_set, list_nodes, sent_bits
+from evlcp_polar.correction import Polar, list_nodes
 from evlcp_polar.sequence import RELIABILITY
 from numpy.testing import assert_allclose, assert_array_equal
 from numpy.typing import NDArray
@@ -84,25 +84,6 @@ def test_the_sequence_is_in_order() -> None:
                     against += bool(place[i] > place[i ^ (3 << (b - 1))])
     assert moved == 2304
     assert against == 20
-
-
-@pytest.mark.parametrize(
-    ("length", "rate"), [(64, 0.5), (256, 0.5), (960, 0.5), (100, 0.4), (333, 0.3), (40, 0.9)]
-)
-def test_encoding_by_the_matrix(length: int, rate: float) -> None:
-    code = Polar(rate=rate).compile(length)
-    rng = np.random.default_rng(0)
-    message = rng.integers(0, 2, code.message_bits).astype(np.uint8)
-    k = code.message_bits + 24
-    n = 1 << (length - 1).bit_length()
-    inputs = np.zeros(n, np.uint8)
-    inputs[information_set(length, k)] = [*message, *crc24(message)]
-    codeword = inputs @ matrix(n) % 2
-    sent = sent_bits(length, k)
-    assert len(set(sent.tolist())) == length
-    assert_array_equal(code.encode(message), codeword[sent])
-    if k / length > 7 / 16:
-        assert not np.delete(codeword, sent).any(), "a bit that is not sent is 0: shortened"
 
 
 def by_the_standard(message: Bits, length: int) -> Bits:
@@ -218,35 +199,6 @@ def test_list_decoding_against_its_twin(n: int, k: int, size: int) -> None:
                 codewords, metric = decoded(llr, nodes, size)
                 assert_allclose(metric, [m for m, _ in wanted], rtol=1e-4, atol=1e-5)
                 assert_array_equal(codewords, [c for _, c in wanted])
-
-
-def test_nodes_cover_all_inputs_once() -> None:
-    rng = np.random.default_rng(0)
-    sets = [best_inputs(256, 128), information_set(960, 480), rng.random(128) < 0.5, np.ones(32, bool)]
-    for information in sets:
-        at = 0
-        for first, stage, kind in list_nodes(information):
-            inside = information[first : first + (1 << stage)]
-            assert first == at
-            assert first % (1 << stage) == 0
-            expected = {0: 0, 1: 1, 2: len(inside)}[int(kind)]
-            assert inside.sum() == expected
-            assert kind != 1 or inside[-1]
-            at += len(inside)
-        assert at == len(information)
-
-
-@pytest.mark.parametrize("size", [1, 8, 32])
-def test_nodes_decided_at_once_change_nothing(size: int) -> None:
-    rng = np.random.default_rng(size)
-    for length, mean in ((256, 0.0), (256, 0.8), (960, 0.7)):
-        information = information_set(length, length // 2)
-        for _ in range(5):
-            llr = rng.normal(mean, 1.0, len(information)).astype(np.float32)
-            codewords, metric = decoded(llr, list_nodes(information), size)
-            others, same = decoded(llr, single_nodes(information), size)
-            assert_allclose(metric, same, rtol=1e-4)
-            assert_array_equal(codewords, others)
 
 
 def test_a_limit_only_drops_what_exceeds_it() -> None:

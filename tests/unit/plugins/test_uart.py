@@ -373,13 +373,13 @@ def test_light_is_learned_as_it_is() -> None:
     mean = np.apply_along_axis(np.convolve, 2, wide, np.convolve(bar, bar), "valid")
     gains = light.gains / light.gains.sum(1, keepdims=True) @ GAINS
     np.testing.assert_allclose(light.rates * gains[:, None, None], mean, atol=0.05, rtol=0.12)
-    said = light.log_likelihoods(windows[:5])
+    found, _, _ = light.of_context(windows[:5])
     shares = light.gains + 12 * np.array([0.02, 0.12, 0.2, 0.4, 0.2, 0.06])
-    for k, context, j in itertools.product(range(5), range(CONTEXTS), range(len(GAINS))):
-        rate = GAINS[j] * light.rates[context]
-        poisson = float((windows[k] * np.log(rate) - rate).sum())
-        gain = math.log(shares[context, j] / shares[context].sum())
-        assert said[k, context, j] == pytest.approx(light.share * poisson + gain)
+    rates = GAINS[:, None, None] * light.rates[:, None]
+    for window, likely in zip(windows[:5], found, strict=True):
+        poisson = (window * np.log(rates) - rates).sum((2, 3))
+        over = np.log(shares / shares.sum(1, keepdims=True)) + light.share * poisson
+        np.testing.assert_allclose(likely, np.logaddexp.reduce(over, 1))
     assert light.explained(windows, known) > light.explained(windows, np.roll(known, 1, 1))
 
 
@@ -448,24 +448,26 @@ def test_a_text_comes_through_the_receiver_in_any_pieces() -> None:
     assert [repr(p) for p in again] == [repr(p) for p in packets]
 
 
-def test_a_list_without_places_is_received_by_the_command(tmp_path: Path) -> None:
-    from evlcp_sdk.io.open import open_source
-
-    rng = np.random.default_rng(9)
-    sent = rng.integers(32, 127, 60)
-    events = seen(rng, levels_of(sent, 7, "even", 2), 1e6 / 504, late_us=(200.0, 500.0), noise_hz=50.0)
-    rows = "".join(
-        f"{t * 1e-6:.6f},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True)
-    )
-    (tmp_path / "list.csv").write_text("t,p\n" + rows)
-    with open_source(tmp_path / "list.csv") as source:
-        packets, _ = _received(_link(chip_rate_hz=504.0, frames_per_packet=20), source.read()[0], 1 << 16)
-    assert [int(f.soft.symbols[0]) for p in packets for f in p.frames] == sent.tolist()
-
-
 def test_a_bar_of_clusters_is_refused() -> None:
     with pytest.raises(ConfigError, match="framing 'uart': a bar of 16 clusters, expected one"):
         resolve({"framing": {"id": "uart"}})
+
+
+def received(
+    evlcp: Callable[..., Any], folder: Path, events: Events, query: str = "", **framing: Any
+) -> tuple[str, dict[str, Any]]:
+    """What `receive` prints of a list of times and polarities, and its summary."""
+    rows = "".join(f"{t},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True))
+    (folder / "list.csv").write_text("t,p\n" + rows)
+    settings = {"bar.rows": 6, "detection.id": "whole", "framing.id": "uart", "air.chip_rate_hz": 3125.0}
+    settings |= {"air.frames_per_packet": 40} | {f"framing.{key}": value for key, value in framing.items()}
+    given = [part for key, value in settings.items() for part in ("--set", f"{key}={value}")]
+    run = evlcp("receive", f"list:{folder}/list.csv{query}", "-o", f"{folder}/out", *given)
+    assert run.code == 0
+    return run.out, json.loads((folder / "out" / "summary.json").read_text())
+
+
+SEVEN_EVEN = {"data_bits": 7, "parity": "even", "stop_bits": 2}
 
 
 def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
@@ -476,30 +478,14 @@ def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) 
         [[0, *(b := [int(c) for c in f"{code:07b}"]), sum(b) % 2, 1, 1] for code in codes.tolist()]
     ).tolist()
     events = seen(np.random.default_rng(2), levels, 320.0)
-    rows = "".join(f"{t},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True))
-    (tmp_path / "list.csv").write_text(rows)
-    link = "\n".join(
-        [
-            "[bar]\nrows = 6\ncolumns = 1\ncluster_rows = 6\ncluster_columns = 1",
-            "[air]\nchip_rate_hz = 3125.0\nframes_per_packet = 50",
-            '[framing]\nid = "uart"\ndata_bits = 7\nparity = "even"\nstop_bits = 2\nfirst_bit = "highest"',
-            '[detection]\nid = "whole"',
-        ]
-    )
-    (tmp_path / "uart.toml").write_text(link)
-    command = ["receive", f"{tmp_path}/list.csv", "-c", f"{tmp_path}/uart.toml", "-o", f"{tmp_path}/out"]
-    run = evlcp(*command)
-    assert run.code == 0
-    assert "text of 0: 'Rough winds do shake" in run.out
+    printed, summary = received(evlcp, tmp_path, events, first_bit="highest", **SEVEN_EVEN)
+    assert "text of 0: 'Rough winds do shake" in printed
     lines = [json.loads(line) for line in (tmp_path / "out" / "packets.jsonl").read_text().splitlines()]
     # Of the last packet only the first characters were sent.
     assert "".join(line["text"] for line in lines).rstrip("\ufffd") == text
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert [one["text"] for one in summary["transmitters"]] == [text]
     assert summary["warnings"] == []
-    (tmp_path / "uart.toml").write_text(link.replace("highest", "lowest"))
-    assert evlcp(*command).code == 0
-    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    _, summary = received(evlcp, tmp_path, events, **SEVEN_EVEN)
     assert [one["code"] for one in summary["warnings"]] == ["bit-order"]
 
 
@@ -544,32 +530,13 @@ def test_text_that_fits_both_ways_is_read_as_the_link_says() -> None:
     assert [c.value for c in found] == sent.tolist()
 
 
-def _write_list(path: Path, events: Events) -> None:
-    rows = "".join(f"{t},{p}\n" for t, p in zip(events.t_us.tolist(), events.p.tolist(), strict=True))
-    path.write_text("t,p\n" + rows)
-
-
 def test_what_a_list_has_wrong_is_said(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
     """Polarities that are turned, or of one kind alone; and what the list did not say."""
     sent = np.random.default_rng(4).integers(0, 128, 120)
     events = seen(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
-    (tmp_path / "uart.toml").write_text(
-        "\n".join(
-            [
-                "[bar]\nrows = 6\ncolumns = 1\ncluster_rows = 6\ncluster_columns = 1",
-                "[air]\nchip_rate_hz = 3125.0\nframes_per_packet = 40",
-                '[framing]\nid = "uart"\ndata_bits = 7\nparity = "even"\nstop_bits = 2',
-                '[detection]\nid = "whole"',
-            ]
-        )
-    )
 
     def told(kept: Events, query: str = "") -> dict[str, Any]:
-        _write_list(tmp_path / "list.csv", kept)
-        url = f"list:{tmp_path}/list.csv{query}"
-        assert evlcp("receive", url, "-c", f"{tmp_path}/uart.toml", "-o", f"{tmp_path}/out").code == 0
-        summary: dict[str, Any] = json.loads((tmp_path / "out" / "summary.json").read_text())
-        return summary
+        return received(evlcp, tmp_path, kept, query, **SEVEN_EVEN)[1]
 
     turned = Events.of(events.t_us, events.x, events.y, 1 - events.p)
     inverted = told(turned)
@@ -590,20 +557,10 @@ def test_a_lamp_that_reads_as_one_character_is_said(tmp_path: Path, evlcp: Calla
         "lamp": [1, *[0, 0, 0, 0, 0, 1, 1, 1, 1, 1] * 120],
         "text": levels_of(np.frombuffer(b"to be or not" * 10, np.uint8), 8, "none", 1),
     }
-    for name, levels in lists.items():
-        _write_list(tmp_path / "list.csv", seen(np.random.default_rng(3), levels, 320.0))
-        command = ["receive", f"{tmp_path}/list.csv", "-o", f"{tmp_path}/{name}", "--set", "framing.id=uart"]
-        for key, value in {
-            "framing.data_bits": 8,
-            "framing.parity": "none",
-            "framing.stop_bits": 1,
-            "detection.id": "whole",
-            "air.chip_rate_hz": 3125.0,
-            "bar.rows": 6,
-        }.items():
-            command += ["--set", f"{key}={value}"]
-        assert evlcp(*command).code == 0
-    said = {name: json.loads((tmp_path / name / "summary.json").read_text())["warnings"] for name in lists}
+    said = {
+        name: received(evlcp, tmp_path, seen(np.random.default_rng(3), levels, 320.0))[1]["warnings"]
+        for name, levels in lists.items()
+    }
     (lamp,) = (one for one in said["lamp"] if one["code"] == "one-character")
     assert "characters are 0xf0: a lamp that blinks once in a character's time" in lamp["text"]
     assert said["text"] == []

@@ -9,7 +9,7 @@ from evlcp_wh import _kernels, ml_soft
 from evlcp_wh.decoding import WhTransform, match_words
 from evlcp_wh.ml_soft import INDEPENDENT_PIXELS, LearnedDecoder, MlSoft
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
-from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts, take_back
+from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts
 from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from numpy.testing import assert_allclose, assert_array_equal
@@ -126,13 +126,6 @@ def pairs_of(sums, most):
     return pairs
 
 
-@pytest.mark.parametrize("most", [1, 3])
-def test_pairs_of_sums(most):
-    sums = random_sums(np.random.default_rng(most), (6, 5, 4))
-    first, second = np.clip(sums.astype(int), -most, most).reshape(3, 2, 20).swapaxes(0, 1) + most
-    assert_array_equal(pairs_of(sums, most), first * (2 * most + 1) + second)
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("grid", "most"), [(2, 1), (3, 2)])
 @pytest.mark.parametrize("prior", [0.5, 1.0])
@@ -190,13 +183,6 @@ def test_the_smooth_path_is_the_best_of_all(seed, step_cost, place_cost):
     path = np.empty((4, 2), np.int64)
     _kernels.smooth_path(np.moveaxis(scores, 0, -1), step_cost, place_cost, path)
     assert_array_equal(path, twins.best_path(scores, step_cost, place_cost))
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_motion_taken_back(seed):
-    rng = np.random.default_rng(seed)
-    sums, path = random_sums(rng, (8, 9, 5)), rng.integers(-6, 7, (4, 2))
-    assert_array_equal(take_back(sums, path), twins.take_back(sums, path))
 
 
 # Separation
