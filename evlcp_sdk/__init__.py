@@ -109,7 +109,10 @@ _HOMES = {
     "air.codebook": "Codebook",
     "air.frames": "PacketFormat",
     "air.kinds": "MessageKind",
-    "errors": ("PluginError PluginWarning RawFormatError StreamError UnknownAlgorithmError UnpluggedError"),
+    "errors": (
+        "ConfigError EvlcpError InputError InterruptedRunError OutputError "
+        "PluginError PluginWarning RawFormatError StreamError UnknownAlgorithmError UnpluggedError"
+    ),
     "io.open": "open_source read_events write_events",
     "io.replay": "ReplaySource",
     "link.compose": "compose",
