@@ -113,9 +113,9 @@ $(VENV)/.pip: | $(BIN)/python
 
 # Most modules are never imported: Python compiles a module when it is, and keeps that.
 $(VENV)/.installed: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q --no-compile -e '.[report]'
+	$(BIN)/python -m pip install -q --no-compile -e .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q --no-compile -e '.[faery,parquet,pandas,cluster,report,mcap,live,sign,mp4,camera,ros,hdf5,docs,notebook]' --group dev
+	$(BIN)/python -m pip install -q --no-compile -e '.[faery,parquet,pandas,cluster,mcap,live,sign,mp4,camera,ros,hdf5,docs,notebook]' --group dev
 	@touch $@ $(VENV)/.installed

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from evlcp_sdk.cli._common import Json, Workers, console, echo
-from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
@@ -67,13 +66,12 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     import json
     from contextlib import suppress
     from dataclasses import replace
-    from importlib.util import find_spec
 
     from evlcp_sdk.cli._campaign import progress_bar, show_faults
     from evlcp_sdk.cli._common import make_executor
-    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import Outputs, output_fault
-    from evlcp_sdk.study.campaign.charts import charts_of, save_charts
+    from evlcp_sdk.report.drawing import save_plots
+    from evlcp_sdk.study.campaign.charts import charts_of
     from evlcp_sdk.study.campaign.report import page
     from evlcp_sdk.study.collect import collect
     from evlcp_sdk.study.store import Store
@@ -83,8 +81,6 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     plan = plan_of(demo_campaign())
     if not as_json:
         console().print(f"simulating and receiving {len(plan.jobs)} stretches of a drive ...", style="dim")
-        if find_spec("plotly") is None:
-            complain("report.html will be left out: it needs the extra: pip install 'evlcp-sdk[report]'")
     try:
         out.mkdir(parents=True, exist_ok=True)
     except OSError as fault:
@@ -104,18 +100,14 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     if progress.faults:
         raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
     with Outputs() as outputs:
-        save_charts(charts_of(summary), summary.name, out, outputs)
-        try:
-            outputs.write_text(page(summary), out / "report.html")
-            written = f"{out}/report.html, ber.png, rmse.png and more, {results}"
-        except ConfigError as fault:
-            written = f"{out}/ber.png, rmse.png and more, {results}; {fault}"
+        save_plots(charts_of(summary), summary.name, out, outputs)
+        outputs.write_text(page(summary), out / "report.html")
         outputs.commit()
     if as_json:
         echo(json.dumps(summary.to_dict()))
         return
     show_drive(summary)
-    console().print(f"written: {written}", style="dim")
+    console().print(f"written: {out}/report.html, ber.png, rmse.png and more, {results}", style="dim")
 
 
 def show_drive(summary: Summary) -> None:

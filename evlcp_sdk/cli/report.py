@@ -19,9 +19,7 @@ def report(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="What evlcp sweep wrote.")],
     out: Annotated[
         Path | None,
-        typer.Option(
-            "-o", "--out", metavar="REPORT.html", help="The page; needs the extra report.", show_default=False
-        ),
+        typer.Option("-o", "--out", metavar="REPORT.html", help="The page.", show_default=False),
     ] = None,
     figures: Annotated[
         Path | None,
@@ -46,7 +44,8 @@ def report(
     import json
 
     from evlcp_sdk.files import Outputs
-    from evlcp_sdk.study.campaign.charts import charts_of, save_charts
+    from evlcp_sdk.report.drawing import save_plots
+    from evlcp_sdk.study.campaign.charts import charts_of
     from evlcp_sdk.study.campaign.report import page
     from evlcp_sdk.study.store import Store
     from evlcp_sdk.study.summary import summarize
@@ -58,7 +57,7 @@ def report(
     folder = figures or (out.parent / f"{out.stem}-figures" if out is not None else None)
     with Outputs() as outputs:
         if folder is not None:
-            save_charts(charts_of(summary), summary.name, folder, outputs)
+            save_plots(charts_of(summary), summary.name, folder, outputs)
         if out is not None:
             outputs.write_text(page(summary), out)
         outputs.commit()

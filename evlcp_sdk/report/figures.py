@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_colours, transmitter_colour
+from evlcp_sdk.report.drawing import INK_COLOUR, plain, titled
 from evlcp_sdk.report.plots import ellipse, enlarge_ellipses
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -29,7 +30,6 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Events, Fix, Frame, PresenceMap, Region
 
-_INK = "#333333"
 _DPI = 150
 _MOST_ZOOMS = 3
 _MOST_ELLIPSES = 40
@@ -212,12 +212,12 @@ def draw_track(track: Iterable[Settled], bars_enu_m: Mapping[int, NDArray[np.flo
             close.add_patch(Polygon(line, closed=True, fc=_ELLIPSE, ec="#8fb4cc", lw=0.8, alpha=0.7))
         close.plot([], [], "o", ms=9, mfc=_ELLIPSE, mec="#8fb4cc", label=said)
         for axis in (plan, close):
-            axis.plot(fixed[:, 0], fixed[:, 1], ".", ms=5, color=_INK, label="fix", zorder=3)
+            axis.plot(fixed[:, 0], fixed[:, 1], ".", ms=5, color=INK_COLOUR, label="fix", zorder=3)
         for way, colour, label in ((live, "#56b4e9", "filtered"), (smooth, "#d55e00", "smoothed")):
             for axis in (plan, close):
                 axis.plot(way[:, 0], way[:, 1], "-", lw=1.2, color=colour, label=label)
             height.plot(t_s, way[:, 2], "-", lw=1.4, color=colour)
-        height.plot(t_s, fixed[:, 2], ".", ms=3, color=_INK)
+        height.plot(t_s, fixed[:, 2], ".", ms=3, color=INK_COLOUR)
         _draw_integrity(spread, protected, [point.fix for point in points])
         close.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(1.0, 0.5))
     for axis in (plan, close):
@@ -230,7 +230,7 @@ def draw_track(track: Iterable[Settled], bars_enu_m: Mapping[int, NDArray[np.flo
     protected.set(ylabel="protection, m", xlabel="camera clock, s", ylim=(0, None))
     for axis in (plan, close, height, spread, protected):
         plain(axis)
-    figure.suptitle(f"{title}: {counted(len(points), 'position')} shown", fontsize=11, color=_INK)
+    figure.suptitle(f"{title}: {counted(len(points), 'position')} shown", fontsize=11, color=INK_COLOUR)
     return figure
 
 
@@ -262,7 +262,7 @@ def _draw_integrity(spread: Axes, protected: Axes, fixes: Sequence[Fix]) -> None
     for name, style in (("hpl_m", "-"), ("vpl_m", ":")):
         level = np.array([getattr(fix, name) for fix in fixes])
         shown = np.where(np.isfinite(level), level, np.nan)
-        protected.plot(t_s, shown, style, lw=1.4, color=_INK, label=_LEVELS[name])
+        protected.plot(t_s, shown, style, lw=1.4, color=INK_COLOUR, label=_LEVELS[name])
     alarmed = [fix.t_us * 1e-6 for fix in fixes if fix.excluded]
     protected.plot(alarmed, np.zeros(len(alarmed)), "x", ms=5, color="#d55e00", label="a part left out")
     for axis in (spread, protected):
@@ -327,12 +327,12 @@ def draw_presence(probe: FigureProbe, title: str) -> Figure:
     shown = [probe.clearest[n] for n in sorted(probe.clearest)[:_MOST_ZOOMS]]
     figure = Figure(figsize=(6.4 * len(shown), 7.4), layout="constrained")
     text = fill(_PRESENCE.format(size=shown[0].presence.grid_px), 92 * len(shown))
-    figure.supxlabel(text, x=0.02, ha="left", fontsize=9, color=_INK)
+    figure.supxlabel(text, x=0.02, ha="left", fontsize=9, color=INK_COLOUR)
     parts = figure.subfigures(1, len(shown), squeeze=False)[0]
     for part, best in zip(parts, shown, strict=True):
         number = best.frame.transmitter
         _draw_one_presence(part, best, _who(number, probe.echo_of[number]))
-    figure.suptitle(f"{title}: which pixels show which cluster", fontsize=11, color=_INK)
+    figure.suptitle(f"{title}: which pixels show which cluster", fontsize=11, color=INK_COLOUR)
     return figure
 
 
@@ -389,7 +389,7 @@ def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
     titled(profile, "rows")
     # Over the whole part: beside a reflection's number there is no room for the frame's above the rows alone.
     part.suptitle(
-        f"{who}, packet {frame.packet}, frame {frame.frame}", x=0.02, ha="left", fontsize=10, color=_INK
+        f"{who}, packet {frame.packet}, frame {frame.frame}", x=0.02, ha="left", fontsize=10, color=INK_COLOUR
     )
 
 
@@ -427,7 +427,7 @@ def draw_distance(probe: FigureProbe, title: str) -> Figure:
     last.set(ylabel="quality", xlabel="time since the first event, s", ylim=(0, 1.1))
     for axis in axes:
         plain(axis)
-    figure.suptitle(f"{title}: distance along the optical axis", fontsize=11, color=_INK)
+    figure.suptitle(f"{title}: distance along the optical axis", fontsize=11, color=INK_COLOUR)
     return figure
 
 
@@ -483,16 +483,3 @@ def _bounds(path: Iterable[Region]) -> tuple[float, float, float, float]:
 def _who(transmitter: int, echo_of: int | None) -> str:
     """A transmitter, and of which it is a reflection."""
     return f"transmitter {transmitter}" + ("" if echo_of is None else f" (reflection of {echo_of})")
-
-
-def titled(axis: Axes, text: str) -> None:
-    """Write a heading in the style of the house: on the left, small."""
-    axis.set_title(text, loc="left", fontsize=10, color=_INK)
-
-
-def plain(axis: Axes) -> None:
-    """Draw axes in the style of the house: no frame, a pale grid below what is drawn."""
-    for side in ("top", "right"):
-        axis.spines[side].set_visible(False)
-    axis.grid(color="#e6e6e6", lw=0.8)
-    axis.set_axisbelow(True)

@@ -20,7 +20,7 @@ from evlcp_sdk.report.colours import transmitter_colour
 from evlcp_sdk.report.figures import Thinned
 from evlcp_sdk.report.motion import MotionProbe
 from evlcp_sdk.report.pages import render_page
-from evlcp_sdk.report.plots import Plot, ellipse, enlarge_ellipses
+from evlcp_sdk.report.plots import INK, SCRIPT, Plot, ellipse, enlarge_ellipses
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.spelling import counted
@@ -127,8 +127,8 @@ class Report(Sink):
         page = render_page(
             "recording.html",
             f"{self.run.name}: report",
-            [files("evlcp_sdk.report").joinpath("report.js").read_text(encoding="utf-8")],
-            {"report": {"plots": {plot.id: plot.labels for plot in plots}, "motions": motions}},
+            [SCRIPT, files("evlcp_sdk.report").joinpath("report.js").read_text(encoding="utf-8")],
+            {"plots": {plot.id: plot.labels for plot in plots}, "report": {"motions": motions}},
             name=self.run.name,
             summary=summary,
             figures=self._headline(summary),
@@ -213,11 +213,12 @@ class Report(Sink):
             known = np.isfinite(depth)
             distance = Plot(f"distance-{number}", self._axis, "distance, m")
             distances.append(distance)
-            distance.band(t[known], (depth - sigma)[known], (depth + sigma)[known], colour)
-            distance.dots(t, depth, colour, f"{who}, with one sigma", labels)
+            name = f"{who}, with one sigma"
+            distance.dots(t, depth, colour, name, labels)
+            distance.band(t[known], (depth - sigma)[known], (depth + sigma)[known], colour, name)
             filtered = [math.nan if f.filtered is None else f.filtered.distance_m for f in frames]
             if np.isfinite(filtered).any():
-                distance.line(t, filtered, colour)
+                distance.line(t, filtered, colour, f"{who}, filtered")
             quality.dots(t, [frame.soft.quality for frame in frames], colour, who, labels)
             places = np.array([(frame.x_px, frame.y_px) for frame in frames])
             image.dots(places[:, 0], places[:, 1], colour, who, labels)
@@ -266,7 +267,7 @@ class Report(Sink):
             who = f"bar {number}"
             east, north, up = enu.tolist()
             place = f"{who}\neast {east:z.3f} m\nnorth {north:z.3f} m\nup {up:z.3f} m"
-            plan.dots([east], [north], "var(--ink)", "bar", [place])
+            plan.dots([east], [north], INK, "bar", [place])
             plan.name(east, north, who)
         return [plot for plot in (plan, close, height, spread) if not plot.empty]
 

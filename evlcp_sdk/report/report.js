@@ -1,35 +1,6 @@
 "use strict";
 const held = JSON.parse(document.getElementById("report").textContent);
 
-// Charts: the value nearest to the pointer.
-for (const [id, told] of Object.entries(held.plots)) {
-  const area = document.querySelector(`#${id} .area`);
-  const tip = document.createElement("div"), at = document.createElement("div");
-  tip.className = "tip"; at.className = "at";
-  tip.hidden = at.hidden = true;
-  area.append(at, tip);
-  const hide = () => { tip.hidden = at.hidden = true; };
-  const show = (event) => {
-    const box = area.getBoundingClientRect();
-    const x = event.clientX - box.left, y = event.clientY - box.top;
-    let best = null, least = 40 * 40;
-    for (const one of told) {
-      const dx = one[0] / 1000 * box.width - x, dy = one[1] / 1000 * box.height - y;
-      if (dx * dx + dy * dy < least) { least = dx * dx + dy * dy; best = one; }
-    }
-    if (best === null) { hide(); return; }
-    const left = best[0] / 1000 * box.width, top = best[1] / 1000 * box.height;
-    tip.textContent = best[2];
-    tip.hidden = at.hidden = false;
-    at.style.left = `${left}px`; at.style.top = `${top}px`;
-    tip.style.left = `${Math.max(0, Math.min(left + 12, box.width - tip.offsetWidth))}px`;
-    tip.style.top = `${top > tip.offsetHeight + 12 ? top - tip.offsetHeight - 10 : top + 12}px`;
-  };
-  area.addEventListener("pointermove", show);
-  area.addEventListener("pointerdown", show);
-  area.addEventListener("pointerleave", hide);
-}
-
 // The bar in slow motion: its events, its clusters, and what each of them sends.
 const motion = document.getElementById("motion");
 if (motion) {

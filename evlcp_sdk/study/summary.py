@@ -15,7 +15,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.study.collect import Counted
 from evlcp_sdk.study.intervals import Figure, measure
-from evlcp_sdk.study.paper import PAPER, Measure, Reference
+from evlcp_sdk.study.paper import PAPER, Reference
 from evlcp_sdk.study.plan import Plan
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
@@ -285,8 +285,3 @@ def _worst(series: Series, reference: Reference) -> tuple[Figure, tuple[int, int
         if ours.count and (not worst.count or ours.value > worst.value):
             worst, at = ours, (begin, begin + SEGMENT_M)
     return worst, at
-
-
-def reference_marks(kind: Measure) -> list[Reference]:
-    """The paper's figures of one measure."""
-    return [reference for reference in PAPER if reference.measure == kind]

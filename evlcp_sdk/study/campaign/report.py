@@ -1,20 +1,16 @@
-"""One self-contained page of a campaign: charts that answer the pointer, tables, configuration, digests.
-
-Needs the extra `report`. The page holds everything it shows, the charting library included, and asks no
-network for anything.
-"""
+"""One self-contained page of a campaign: charts that answer the pointer, tables, configuration, digests."""
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
-from markupsafe import Markup, escape
+from markupsafe import Markup
 
-from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.report.pages import render_page
+from evlcp_sdk.report.plots import SCRIPT
 from evlcp_sdk.spelling import counted
-from evlcp_sdk.study.campaign.charts import Chart, charts_of, decades
+from evlcp_sdk.study.campaign.charts import charts_of
 from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
 from evlcp_sdk.study.paper import PAPER_NAME
 from evlcp_sdk.study.plan import digest_of
@@ -23,26 +19,20 @@ from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
 
 def page(summary: Summary) -> str:
-    """The page's HTML.
-
-    Raises:
-        ConfigError: The extra is not installed.
-    """
-    try:
-        from plotly.offline import get_plotlyjs
-    except ImportError as fault:
-        raise ConfigError("a report needs the extra: pip install 'evlcp-sdk[report]'") from fault
+    """The page's HTML."""
     charts, beside = charts_of(summary), beside_paper(summary.series)
+    # Labels are known once a chart is drawn.
+    drawn = [(chart, chart.markup()) for chart in charts]
     rule = summary.plan.rule
     return render_page(
         "campaign.html",
         title_of(summary),
-        (get_plotlyjs(), _SCRIPT),
-        {_DATA: {chart.id: _plotly(chart) for chart in charts}},
+        [SCRIPT],
+        {"plots": {chart.id: chart.labels for chart in charts}},
         summary=summary,
         about=_about(summary),
         figures=_headlines(summary, beside),
-        charts=[(chart, _keys(chart)) for chart in charts],
+        charts=drawn,
         beside=_paper_rows(beside),
         paper=PAPER_NAME,
         agreement=AGREEMENT,
@@ -131,128 +121,6 @@ def _headlines(summary: Summary, beside: Sequence[PaperComparison]) -> list[tupl
 
 
 _SAID = {"better": "better", "agrees": "agree", "worse": "worse"}
-
-_SWATCHES = {
-    "circle": '<circle cx="17" cy="6" r="4"/>',
-    "diamond": '<path d="M17 1l5 5-5 5-5-5z"/>',
-    "square": '<path d="M13 2h8v8h-8z"/>',
-    "cross": '<path d="M15 2h4v2h2v4h-2v2h-4v-2h-2v-4h2z"/>',
-}
-_DASHES = {"solid": "none", "dash": "8 4", "dot": "2 3", "dashdot": "8 3 2 3"}
-
-
-def _keys(chart: Chart) -> Iterator[tuple[Sequence[int], str, float, str, str, str]]:
-    """What each line is, below the chart: each shows or hides its own, whose numbers it has."""
-    for number, line in enumerate(chart.lines):
-        symbol = "" if chart.steps else _SWATCHES[line.symbol]
-        yield [number], line.colour, 1.6, _DASHES[line.dash], Markup(symbol), line.name
-    marks: dict[str, list[int]] = {}
-    for number, mark in enumerate(chart.marks, len(chart.lines)):
-        marks.setdefault(mark.name, []).append(number)
-    for name, numbers in marks.items():
-        mark = chart.marks[numbers[0] - len(chart.lines)]
-        yield numbers, "inherit", 3, "8 4" if mark.clusters == 2 else "none", "", name
-
-
-_DATA = "charts"
-_SCRIPT = f"""
-const charts = JSON.parse(document.getElementById("{_DATA}").textContent);
-// The library would offer to upload a chart.
-const config = {{displaylogo: false, responsive: true, showSendToCloud: false, plotlyServerURL: ""}};
-const dark = matchMedia("(prefers-color-scheme: dark)");
-const colour = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-const look = c => {{
-  const [ink, line, dim] = ["--ink", "--line", "--dim"].map(colour);
-  const axis = a => ({{[a + ".gridcolor"]: line, [a + ".linecolor"]: dim, [a + ".tickcolor"]: dim,
-    ...(c.layout[a].minor ? {{[a + ".minor.gridcolor"]: line}} : {{}})}});
-  return {{"font.color": ink, "modebar.color": dim, "modebar.activecolor": ink,
-    "modebar.bgcolor": "rgba(0,0,0,0)", ...axis("xaxis"), ...axis("yaxis")}};
-}};
-const dressed = (id, c) => Plotly.relayout(id, look(c)).then(
-  () => c.ink.length && Plotly.restyle(id, {{"line.color": colour("--ink")}}, c.ink));
-for (const [id, c] of Object.entries(charts))
-  Plotly.newPlot(id, c.data, c.layout, config).then(() => dressed(id, c));
-dark.addEventListener("change", () => Object.entries(charts).forEach(([id, c]) => dressed(id, c)));
-for (const key of document.querySelectorAll(".key")) key.addEventListener("click", event => {{
-  const button = event.target.closest("button");
-  if (!button) return;
-  const shown = button.getAttribute("aria-pressed") !== "true";
-  button.setAttribute("aria-pressed", shown);
-  Plotly.restyle(key.dataset.chart, {{visible: shown}}, button.dataset.lines.split(" ").map(Number));
-}});
-"""
-"""Colours are those of the page: a browser says which scheme holds, and when it changes."""
-
-
-def _plotly(chart: Chart) -> dict[str, Any]:
-    """What the library draws; it takes texts for HTML of its own kind, so ours are escaped."""
-    data: list[dict[str, Any]] = []
-    for line in chart.lines:
-        trace: dict[str, Any] = {
-            "type": "scatter",
-            "name": str(escape(line.name)),
-            "x": [round(d.x, 6) for d in line.dots],
-            "y": [d.y for d in line.dots],
-            "text": [d.text for d in line.dots],
-            "hovertemplate": "%{text}<extra></extra>",
-            "line": {"color": line.colour, "dash": line.dash, "width": 1.6},
-        }
-        if chart.steps:
-            trace |= {"mode": "lines", "line": trace["line"] | {"shape": "hvh"}}
-        else:
-            trace |= {
-                "mode": "lines+markers",
-                "marker": {
-                    "size": 8,
-                    "symbol": ["triangle-down-open" if d.limit else line.symbol for d in line.dots],
-                },
-                "error_y": {
-                    "type": "data",
-                    "symmetric": False,
-                    "array": [0 if d.limit else d.high - d.y for d in line.dots],
-                    "arrayminus": [0 if d.limit else d.y - d.low for d in line.dots],
-                    "thickness": 1.2,
-                    "width": 3,
-                },
-            }
-        data.append(trace)
-    for mark in chart.marks:
-        middle = (mark.x0 + mark.x1) / 2
-        said = f"{mark.name}<br>{mark.x0:g} to {mark.x1:g} m: {'at most ' if mark.bound else ''}{mark.y:g}"
-        data.append(
-            {
-                "type": "scatter",
-                "mode": "lines",
-                "name": mark.name,
-                "x": [mark.x0, middle, mark.x1],
-                "y": [mark.y] * 3,
-                "text": [said] * 3,
-                "hovertemplate": "%{text}<extra></extra>",
-                "line": {
-                    "width": 2 if mark.bound else 4,
-                    "dash": "dash" if mark.clusters == 2 else "solid",
-                },
-            }
-        )
-    axis = {"zeroline": False, "ticks": "outside", "automargin": True}
-    y_axis = axis | {"title": {"text": chart.y_label, "standoff": 8}}
-    if chart.log_y:
-        y_axis |= {"type": "log", "minor": {"showgrid": True, "griddash": "dot"}}
-        narrow = decades(chart) < 2
-        y_axis |= {"dtick": "D2", "tickformat": "~g"} if narrow else {"dtick": 1, "exponentformat": "power"}
-    else:
-        y_axis |= {"rangemode": "tozero"}
-    layout = {
-        "margin": {"l": 10, "r": 10, "t": 34, "b": 10},
-        "paper_bgcolor": "rgba(0,0,0,0)",
-        "plot_bgcolor": "rgba(0,0,0,0)",
-        "hovermode": "closest",
-        "showlegend": False,
-        "xaxis": axis | {"title": {"text": chart.x_label, "standoff": 8}},
-        "yaxis": y_axis,
-    }
-    first = len(chart.lines)
-    return {"data": data, "layout": layout, "ink": list(range(first, first + len(chart.marks)))}
 
 
 def _paper_rows(comparisons: Sequence[PaperComparison]) -> list[list[str]]:

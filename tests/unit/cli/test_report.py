@@ -2,16 +2,15 @@
 
 import json
 import re
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from evlcp_sdk.cli.report import as_markdown
-from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import Outputs
-from evlcp_sdk.study.campaign.charts import charts_of, save_charts
+from evlcp_sdk.report.drawing import save_plots
+from evlcp_sdk.study.campaign.charts import charts_of
 from evlcp_sdk.study.campaign.report import POSITION_HEAD, page, position_rows
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
@@ -111,7 +110,7 @@ def test_json_has_every_figure(summary: Summary) -> None:
 
 def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> None:
     with Outputs() as outputs:
-        written = save_charts(charts_of(summary), summary.name, tmp_path / "figures", outputs)
+        written = save_plots(charts_of(summary), summary.name, tmp_path / "figures", outputs)
         assert not any(path.exists() for path in written)
         outputs.commit()
     assert [p.name for p in written] == [f"{c}.{kind}" for c in CHARTS for kind in ("png", "svg")]
@@ -119,14 +118,7 @@ def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> No
         assert path.read_bytes().startswith((b"\x89PNG", b"<?xml"))
 
 
-def test_without_plotly(summary: Summary, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "plotly.offline", None)
-    with pytest.raises(ConfigError, match="pip install 'evlcp-sdk\\[report\\]'"):
-        page(summary)
-
-
 def test_the_page_tells_everything(summary: Summary) -> None:
-    pytest.importorskip("plotly", reason="the extra report is not installed")
     text = page(summary)
     assert summary.digest in text
     assert "<h1>two methods &lt;/script&gt;: bit errors and distance errors, 30 to 80 m</h1>" in text
@@ -151,39 +143,39 @@ def test_the_page_tells_everything(summary: Summary) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) -> None:
-    pytest.importorskip("plotly", reason="the extra report is not installed")
     (tmp_path / "report.html").write_text(page(summary), encoding="utf-8")
     with Browser(tmp_path / "profile") as browser:
         browser.open(tmp_path / "report.html")
         drawn = browser.value(
-            "Object.fromEntries([...document.querySelectorAll('.chart')].map(e =>"
-            " [e.id, e.querySelectorAll('.scatterlayer .trace').length]))"
+            "Object.fromEntries([...document.querySelectorAll('.plot')].map(e =>"
+            " [e.id, e.querySelectorAll('.legend button').length]))"
         )
         assert set(drawn) == set(CHARTS)
         assert drawn["histogram"] == 4
         assert drawn["rmse"] > 4, "the paper's figures are missing"
         assert browser.value("document.querySelectorAll('table tr').length") > 20
-        offers = browser.value("[...document.querySelectorAll('.modebar-btn')].map(b => b.dataset.title)")
-        assert offers
-        assert not [title for title in offers if "loud" in title], "the page offers an upload"
         for chart in CHARTS:
             told = hovered(browser, chart)
             assert "km/h" in told, f"{chart}: nothing is told where the pointer is"
         for width in (1280, 390):
             for dark in (False, True):
                 browser.dress(width, dark=dark)
-                seen = {chart: browser.value(f"({SEEN})('{chart}')") for chart in CHARTS}
-                for chart, one in seen.items():
-                    assert one["paper"] == "rgba(0, 0, 0, 0)", chart
-                    assert one["plot"] > 0.7 * one["room"], f"{chart}: little left of {width} px"
-                    assert one["room"] <= width - 20, f"{chart}: wider than {width} px"
-                    assert one["key"] >= one["bottom"], f"{chart}: the legend is not below"
-                    assert (one["ink"] > 128) is dark, f"{chart}: not for this scheme"
+                for chart in CHARTS:
+                    area = f"document.querySelector('#{chart} .area')"
+                    room = browser.value(f"{area}.clientWidth")
+                    assert 0.7 * width - 200 < room <= width - 20, f"{chart}: of {width} px"
+                    ink = browser.value(f"getComputedStyle({area}.querySelector('.x')).color")
+                    assert (int(re.findall(r"\d+", ink)[0]) > 128) is dark, f"{chart}: not for this scheme"
                 assert browser.value("document.documentElement.scrollWidth") <= width
-        drawn_lines = "document.querySelectorAll('#rmse .scatterlayer .trace').length"
+        drawn_lines = (
+            "[...document.querySelectorAll('#rmse .area path')].filter(e => e.checkVisibility()).length"
+        )
         before = browser.value(drawn_lines)
-        browser.value("document.querySelector('.key[data-chart=rmse] button').click()")
-        assert browser.value(drawn_lines) == before - 1
+        browser.value("document.querySelector('#rmse button').click()")
+        assert browser.value(drawn_lines) < before
+        assert browser.value("document.querySelectorAll('#rmse button[aria-pressed=false]').length") == 1
+        browser.value("document.querySelector('#rmse button').click()")
+        assert browser.value(drawn_lines) == before
         asked = [
             m["params"]["request"]["url"]
             for m in browser.heard
@@ -228,38 +220,20 @@ def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_pa
     assert "| right | 2 of 2 | 0 | 100.0% |" in as_markdown(found)
 
 
-SEEN = """async id => {
-  const e = document.getElementById(id), frame = () => new Promise(requestAnimationFrame);
-  let before = "";
-  for (let i = 0; i < 90; i++) {
-    await frame();
-    const now = JSON.stringify([e._fullLayout.width, e._fullLayout.font.color, e.clientWidth]);
-    if (i > 10 && now === before && e._fullLayout.width === e.clientWidth) break;
-    before = now;
-  }
-  const r = e.getBoundingClientRect(), text = e.querySelector(".xtick text");
-  return {room: r.width, bottom: Math.round(r.bottom), plot: e._fullLayout._size.w,
-    paper: getComputedStyle(e.querySelector(".main-svg")).backgroundColor,
-    key: Math.round(document.querySelector(`.key[data-chart=${id}]`).getBoundingClientRect().top),
-    ink: Number(getComputedStyle(text).fill.match(/\\d+/)[0])};
-}"""
-"""How a chart stands once it has settled."""
-
-
 def hovered(browser: Browser, chart: str) -> str:
-    """What a chart tells when the pointer is on the first dot of its first line."""
+    """What a chart tells when the pointer is on a dot of its first line."""
     place: dict[str, Any] = browser.value(
-        f"(() => {{ const e = document.getElementById('{chart}'); e.scrollIntoView({{block: 'center'}});"
-        " const l = e._fullLayout, r = e.getBoundingClientRect();"
-        " const t = e.data[0], i = Math.floor(t.x.length / 2);"
-        " return {x: r.left + l.xaxis._offset + l.xaxis.c2p(t.x[i]),"
-        " y: r.top + l.yaxis._offset + l.yaxis.c2p(t.y[i])} })()"
+        f"(() => {{ const e = document.querySelector('#{chart} .area');"
+        " e.scrollIntoView({block: 'center'});"
+        f" const r = e.getBoundingClientRect(), t = plots['{chart}'].find(one => one[3] === 0);"
+        " return {x: r.left + t[0] / 1000 * r.width, y: r.top + Math.min(t[1] / 1000, 0.98) * r.height} })()"
     )
     browser.point_at(place["x"], place["y"])
+    tip = f"document.querySelector('#{chart} .tip')"
     return str(
         browser.value(
-            "new Promise(done => { const until = Date.now() + 3000; const look = () => {"
-            f" const h = document.querySelector('#{chart} .hoverlayer .hovertext');"
-            " h || Date.now() > until ? done(h ? h.textContent : '') : setTimeout(look, 30) }; look() })"
+            "new Promise(done => { const until = Date.now() + 1000; const look = () => {"
+            f" !{tip}.hidden || Date.now() > until ? done({tip}.hidden ? '' : {tip}.textContent)"
+            " : setTimeout(look, 30) }; look() })"
         )
     )

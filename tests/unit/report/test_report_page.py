@@ -52,8 +52,8 @@ def result(demo_raw: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def held(page: str) -> dict[str, Any]:
     """What the page's script reads."""
-    found: dict[str, Any] = json.loads(Elements(page).scripts[0])
-    return found
+    plots, report = map(json.loads, Elements(page).scripts[:2])
+    return {"plots": plots} | report
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
@@ -74,15 +74,15 @@ def test_numbers_are_those_of_the_files(result: Path) -> None:
         told = [float(one) for one in values[1].split(" ± ")]
         assert told == pytest.approx([float(row["distance_m"]), float(row["distance_sigma_m"])], abs=0.0051)
     told = held(page)["plots"]
-    for row, (_, _, text) in zip(rows, told["distance-0"], strict=True):
+    for row, (_, _, text, _) in zip(rows, told["distance-0"], strict=True):
         assert f"{row['distance_m']} ± {row['distance_sigma_m']} m" in text
         assert f"quality {row['quality']}" in text
         assert f"packet {row['packet']}, frame {row['frame']}," in text
     # Dots stand where their times are, to a thousandth of the chart.
-    x = np.array([x for x, _, _ in told["quality"]])
+    x = np.array([x for x, *_ in told["quality"]])
     t_us = np.array([float(row["t_us"]) for row in rows])
     assert x == pytest.approx(np.polyval(np.polyfit(t_us, x, 1), t_us), abs=1.1)
-    y = np.array([y for _, y, _ in told["distance-0"]])
+    y = np.array([y for _, y, *_ in told["distance-0"]])
     distance_m = np.array([float(row["distance_m"]) for row in rows])
     slope, above = np.polyfit(distance_m, y, 1)
     assert slope < 0
@@ -175,7 +175,7 @@ def test_what_others_wrote_stays_text(tmp_path: Path) -> None:
         folder.finish()
     page = Elements((tmp_path / "report.html").read_text())
     assert not [tag for tag, _ in page.tags if tag in ("img", "iframe")]
-    assert len(page.scripts) == 2
+    assert len(page.scripts) == 4
     assert page.text.count(HOSTILE) == 9
     assert "100 between the first and the last ones are left out" in page.text
 
@@ -189,7 +189,7 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
     with (tmp_path / "fixes.csv").open(newline="") as file:
         fixes = list(csv.DictReader(file))
     assert summary["positions"]["fixes"] == len(fixes) == len(told["track"]) == len(told["map"]) - 1
-    for fix, (_, _, text) in zip(fixes, told["track"], strict=True):
+    for fix, (_, _, text, _) in zip(fixes, told["track"], strict=True):
         east, north, up = (float(value) for value in re.findall(r"± (\S+) m", text))
         for shown, axis in ((east, "east"), (north, "north"), (up, "up")):
             assert shown == pytest.approx(float(fix[f"sigma_{axis}_m"]), rel=0.051)
@@ -282,7 +282,7 @@ def hovered(browser: Browser, chart: str, number: int) -> str:
     place = browser.value(
         f"(() => {{ const e = document.querySelector('#{chart} .area');"
         " e.scrollIntoView({block: 'center'});"
-        f" const r = e.getBoundingClientRect(), t = held.plots['{chart}'][{number}];"
+        f" const r = e.getBoundingClientRect(), t = plots['{chart}'][{number}];"
         " return {x: r.left + t[0] / 1000 * r.width, y: r.top + t[1] / 1000 * r.height} })()"
     )
     browser.point_at(place["x"], place["y"])

@@ -1,0 +1,101 @@
+"""Charts drawn by Matplotlib, in the style of the house: for papers, and for figures beside a result."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+
+from evlcp_sdk.files import Outputs, output_fault
+from evlcp_sdk.report.plots import INK, WIDTHS_PX, Plot, Shape
+
+INK_COLOUR = "#333333"
+
+
+def titled(axis: Axes, text: str) -> None:
+    """Write a heading: on the left, small."""
+    axis.set_title(text, loc="left", fontsize=10, color=INK_COLOUR, parse_math=False)
+
+
+def plain(axis: Axes) -> None:
+    """Draw axes without a frame, a pale grid below what is drawn."""
+    for side in ("top", "right"):
+        axis.spines[side].set_visible(False)
+    axis.grid(color="#e6e6e6", lw=0.8)
+    axis.set_axisbelow(True)
+
+
+def draw_plot(plot: Plot, title: str) -> Figure:
+    """Draw a chart, its names below, where no line runs."""
+    figure = Figure(figsize=(8, 5), layout="constrained")
+    axis = figure.subplots()
+    for shape in plot.shapes:
+        _draw_shape(axis, shape)
+    for x, y, text in plot.names:
+        axis.annotate(
+            text, (x, y), xytext=(0, 3), textcoords="offset points", fontsize=8,
+            color=INK_COLOUR, path_effects=[withStroke(linewidth=3, foreground="white")],
+        )  # fmt: skip
+    if plot.log_y:
+        axis.set_yscale("log")
+        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
+        axis.yaxis.set_minor_formatter(NullFormatter())
+    if plot.from_zero:
+        axis.set_ylim(bottom=0)
+    axis.set(xlabel=plot.x_name, ylabel=plot.y_name)
+    titled(axis, f"{title}: {plot.title}")
+    plain(axis)
+    if plot.legend:
+        handles = [_draw_shape(axis, shape, legend=True) for shape in plot.legend.values()]
+        # A column is as wide as the longest name.
+        columns = max(1, min(len(plot.legend), 110 // (8 + max(map(len, plot.legend)))))
+        legend = figure.legend(
+            handles, [*plot.legend], loc="outside lower left", frameon=False, fontsize=8, ncols=columns
+        )
+        for entry in legend.get_texts():
+            entry.set_parse_math(False)
+    return figure
+
+
+def _draw_shape(axis: Axes, shape: Shape, *, legend: bool = False) -> Any:
+    colour = INK_COLOUR if shape.colour == INK else shape.colour
+    x, y = ((), ()) if legend else shape.points.T
+    if shape.kind == "band":
+        return axis.fill(x, y, color=colour, alpha=0.25, lw=0)[0]
+    width = WIDTHS_PX[shape.kind]
+    if shape.kind in ("dots", "hole"):
+        colour = "white" if shape.kind == "hole" else colour
+        return axis.plot(x, y, "o", ms=width, mec="none", mfc=colour, zorder=4)[0]
+    style = (0, tuple(shape.dash)) if shape.dash else "-"
+    return axis.plot(x, y, ls=style, lw=0.75 * width, color=colour, zorder=3)[0]
+
+
+def save_plots(plots: Sequence[Plot], title: str, folder: Path, outputs: Outputs) -> list[Path]:
+    """Draw charts as PNG and SVG, named by their id.
+
+    Args:
+        plots: What is drawn.
+        title: Above each.
+        folder: Where they go; made if need be.
+        outputs: The files that they come into place with.
+
+    Raises:
+        OutputError: A file cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as fault:
+        raise output_fault(folder, fault) from fault
+    written = []
+    for plot in plots:
+        figure = draw_plot(plot, title)
+        for kind in ("png", "svg"):
+            path = folder / f"{plot.id}.{kind}"
+            with outputs.told(path):
+                figure.savefig(outputs.path(path), format=kind, dpi=150)
+            written.append(path)
+    return written

@@ -1,0 +1,39 @@
+"use strict";
+// Charts: the value nearest to the pointer, and lines that are shown or hidden by their names.
+const plots = JSON.parse(document.getElementById("plots").textContent);
+for (const [id, labels] of Object.entries(plots)) {
+  const plot = document.getElementById(id), area = plot.querySelector(".area"), hidden = new Set();
+  const tip = document.createElement("div"), at = document.createElement("div");
+  tip.className = "tip"; at.className = "at";
+  tip.hidden = at.hidden = true;
+  area.append(at, tip);
+  const hide = () => { tip.hidden = at.hidden = true; };
+  const show = (event) => {
+    const box = area.getBoundingClientRect();
+    const x = event.clientX - box.left, y = event.clientY - box.top;
+    let best = null, least = 40 * 40;
+    for (const one of labels) {
+      const dx = one[0] / 1000 * box.width - x, dy = one[1] / 1000 * box.height - y;
+      const away = dx * dx + dy * dy;
+      if (away < least && !hidden.has(one[3])) { least = away; best = one; }
+    }
+    if (best === null) { hide(); return; }
+    const left = best[0] / 1000 * box.width, top = best[1] / 1000 * box.height;
+    tip.textContent = best[2];
+    tip.hidden = at.hidden = false;
+    at.style.left = `${left}px`; at.style.top = `${top}px`;
+    tip.style.left = `${Math.max(0, Math.min(left + 12, box.width - tip.offsetWidth))}px`;
+    tip.style.top = `${top > tip.offsetHeight + 12 ? top - tip.offsetHeight - 10 : top + 12}px`;
+  };
+  area.addEventListener("pointermove", show);
+  area.addEventListener("pointerdown", show);
+  area.addEventListener("pointerleave", hide);
+  for (const button of plot.querySelectorAll(".legend button")) button.addEventListener("click", () => {
+    const line = Number(button.dataset.line), shown = hidden.delete(line);
+    if (!shown) hidden.add(line);
+    button.setAttribute("aria-pressed", shown);
+    for (const path of plot.querySelectorAll(`[data-line="${line}"]:not(button)`)) {
+      path.style.display = shown ? "" : "none";
+    }
+  });
+}
