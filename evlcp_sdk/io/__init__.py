@@ -1,20 +1,18 @@
-"""Recordings and cameras in and out: EVT2 and EVT3 RAW files, tables, and other formats through `faery`."""
+"""Recordings and cameras in and out: EVT2 and EVT3 RAW files, tables and streams; plugins bring others."""
 
-from evlcp_sdk.io.faery import FaerySource
 from evlcp_sdk.io.open import open_source, open_writer, read_events, write_events
 from evlcp_sdk.io.raw import RawHeader, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import StreamSource
 from evlcp_sdk.io.tables import CsvWriter, NpzWriter
-from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.source import DEFAULT_MAX_EVENTS, EventSource, Loss
+from evlcp_sdk.plugin.writer import EventWriter
 
 __all__ = [
     "DEFAULT_MAX_EVENTS",
     "CsvWriter",
     "EventSource",
     "EventWriter",
-    "FaerySource",
     "LoopSource",
     "Loss",
     "NpzWriter",

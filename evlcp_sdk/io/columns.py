@@ -1,10 +1,13 @@
 """Columns of times, polarities and places, as any table has them, to events: units, wraps, order."""
 
 import itertools
+import lzma
 import math
+import zipfile
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -14,9 +17,8 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.io.fields import Polarities, RowError, TimeUnit, time_unit
-from evlcp_sdk.io.tables import DAMAGE, said
-from evlcp_sdk.io.writers import LAST_TIME_US
 from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.plugin.writer import LAST_TIME_US
 from evlcp_sdk.values import Events, Triggers
 
 PIECE_ROWS: Final = 1 << 16
@@ -38,8 +40,55 @@ _COUNTERS: Final = ((0, 1 << 32, 1 << 26), (-(1 << 31), 1 << 31, 1 << 26), (0, 1
 For 32 bits of microseconds that is 67 s; for 24, which are full after 17 s, 131 ms.
 """
 
-Piece = tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None, Callable[[int], int]]
-"""Times, polarities, places (n, 2) or None, and in which line or row of the file the k-th of them stands."""
+DAMAGE: Final = (
+    *(OSError, EOFError, ValueError, RuntimeError, zlib.error, lzma.LZMAError, zipfile.BadZipFile),
+)
+"""What reading a damaged file raises; RuntimeError: a ZIP file's member is encrypted."""
+
+
+@dataclass(frozen=True)
+class Piece:
+    """Some rows of a table.
+
+    Attributes:
+        times: Their times, int64 or float64 (n,).
+        polarities: Numbers or words (n,).
+        places: x and y (n, 2); None where there are none.
+        number: In which line or row of the file the k-th of them stands.
+        done: How much of the file is read behind them, bytes.
+        cut: Rows at the end that are left out, as they are not whole.
+    """
+
+    times: NDArray[Any]
+    polarities: NDArray[Any]
+    places: NDArray[Any] | None
+    number: Callable[[int], int]
+    done: int
+    cut: int = 0
+
+
+@dataclass(frozen=True)
+class EventTable:
+    """What a file of columns holds.
+
+    Attributes:
+        format: Its name.
+        pieces: Its rows.
+        unit: The unit that the name of the times says; None where it says none.
+        where: What rows are called: `line` or `row`.
+        size: Columns and rows of the sensor, or None.
+        triggers: External ones, by time, where it has some.
+        window_us: How much earlier than those before a row may be to be sorted in, us; beyond that the
+            camera's clock has leapt, or it is dropped.
+    """
+
+    format: str
+    pieces: Iterator[Piece]
+    unit: str | None = None
+    where: str = "row"
+    size: tuple[int | None, int | None] = (None, None)
+    triggers: Iterator[Triggers] | None = None
+    window_us: float = math.inf
 
 
 class ColumnSource(EventSource):
@@ -51,54 +100,51 @@ class ColumnSource(EventSource):
 
     Args:
         path: The file.
-        format: Its name.
-        pieces: What it holds.
-        stack: Closes it.
-        where: What rows are called: `line` or `row`.
-        named: The unit that the file says; None where it says none.
+        read: Opens it on a stack that closes it.
         unit: The unit that the caller says, whatever the file does.
         inverted: The larger polarity is OFF.
-        triggers: External ones, by time, of a table that has some.
-        size: Columns and rows of the sensor, or None.
-        window_us: How much earlier than those before a row may be to be sorted in, us; beyond that the
-            camera's clock has leapt, or it is dropped.
 
     Raises:
-        InputError: The first piece cannot be read.
+        InputError: It cannot be opened, or its first piece not be read.
     """
 
     def __init__(
         self,
-        path: Path,
-        format: str,
-        pieces: Iterator[Piece],
-        stack: ExitStack,
+        path: Path | str,
+        read: Callable[[Path, ExitStack], EventTable],
         *,
-        where: str = "row",
-        named: Callable[[], str | None] = lambda: None,
         unit: str | None = None,
         inverted: bool = False,
-        triggers: Iterator[Triggers] | None = None,
-        size: tuple[int | None, int | None] = (None, None),
-        window_us: float = math.inf,
     ) -> None:
-        self._stack, self._pieces = stack, pieces
+        self.path = Path(path)
+        with ExitStack() as stack:
+            try:
+                table = read(self.path, stack)
+                size_bytes = self.path.stat().st_size
+            except DAMAGE as error:
+                raise self._damaged(error) from error
+            self._begin(table, size_bytes, unit, inverted)
+            self._stack = stack.pop_all()
+
+    def _begin(self, table: EventTable, size_bytes: int, unit: str | None, inverted: bool) -> None:
+        """Read the first piece, and see in which unit its times are."""
+        self._pieces, self._position, self._end = table.pieces, 0, size_bytes
         self._counts = {"rows_out_of_order": 0, "rows_cut": 0, "times_gone_round": 0}
-        self._where, self._inverted, self._window_us = where, inverted, window_us
+        where, self._inverted, self._window_us = table.where, inverted, table.window_us
+        self._where = where
         self._dropped = Loss(0, 0, where, "rows whose time, polarity or place is no number; dropped")
         self._position = 0
-        self.path, self.size_bytes = path, path.stat().st_size
         first = self._next_piece()
-        times = np.empty(0, np.int64) if first is None else _unwrap(first[0], None, 0)[0]
+        times = np.empty(0, np.int64) if first is None else _unwrap(first.times, None, 0)[0]
         if first is not None:
-            self._pieces = itertools.chain((first,), pieces)
-        share = min(self._position / max(self.size_bytes, 1), 1.0)
-        placed = first is not None and first[2] is not None
-        self._unit = TimeUnit(unit, "as told") if unit else time_unit(times, named(), share, placed=placed)
+            self._pieces = itertools.chain((first,), table.pieces)
+        share = min(self._position / max(size_bytes, 1), 1.0)
+        placed = first is not None and first.places is not None
+        self._unit = TimeUnit(unit, "as told") if unit else time_unit(times, table.unit, share, placed=placed)
         self._polarities = Polarities()
-        self._sieve = Sieve(where, *size)
+        self._sieve = Sieve(where, *table.size)
         self._waiting: list[Events] = []
-        self._row = first[3](0) if first is not None and len(times) else 1
+        self._row = first.number(0) if first is not None and len(times) else 1
         self._wrong: InputError | None = None
         self._fault: InputError | None = None
         self._closed: InputError | None = None
@@ -106,7 +152,7 @@ class ColumnSource(EventSource):
         self._before: int | None = None
         self._gone_round = 0
         self._open = True
-        self._merged = _with_triggers(iter(self._take_events, None), triggers or iter(()))
+        self._merged = _with_triggers(iter(self._take_events, None), table.triggers or iter(()))
         header = {
             "pixels": "as its columns x and y say" if placed else "none given: x = y = 0",
             "time": f"in {self._unit.name}, {self._unit.why}",
@@ -114,7 +160,7 @@ class ColumnSource(EventSource):
         self.step_us = _step_us(self._unit, times)
         if self.step_us >= _COARSE_US:
             header["step"] = f"times are rounded to {_in_words(self.step_us)}"
-        super().__init__(path, format, *size, header, self.size_bytes)
+        super().__init__(self.path, table.format, *table.size, header, size_bytes)
         self.guessed = "; ".join(filter(None, (self._unit.guess, header.get("step"))))
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
@@ -161,20 +207,28 @@ class ColumnSource(EventSource):
                 return None
         return given
 
+    def _damaged(self, error: Exception) -> InputError:
+        what = error.strerror if isinstance(error, OSError) else None
+        return InputError(f"{self.path}: {what or f'damaged or closed file: {one_line(error)}'}")
+
     def _next_piece(self) -> Piece | None:
         try:
-            return next(self._pieces, None)
-        except (*DAMAGE, zlib.error) as error:
-            raise InputError(f"{self.path}: damaged or closed file: {said(error)}") from error
+            piece = next(self._pieces, None)
+        except DAMAGE as error:
+            raise InputError(f"{self.path}: damaged or closed file: {one_line(error)}") from error
+        self._position = self._end if piece is None else piece.done
+        return piece
 
     def _next(self) -> Events | None:
         """The events of the next piece, in its order; None at the end."""
         if self._wrong is not None:
             raise self._wrong
-        piece = self._next_piece()
-        if piece is None:
+        found = self._next_piece()
+        if found is None:
             return None
-        times, values, places, number = self._numbers_of(piece)
+        self._counts["rows_cut"] += found.cut
+        piece = self._numbers_of(found)
+        times = piece.times
         before = self._before
         self._before = int(times[-1]) if len(times) and math.isfinite(times[-1]) else before
         rows, good = len(times), False
@@ -184,13 +238,13 @@ class ColumnSource(EventSource):
         self._counts["times_gone_round"] += max(turns, 0)
         while not good:
             try:
-                t_us, p = self._unit.us(times[:rows]), self._polarities.of(values[:rows])
-                x, y = _places(None if places is None else places[:rows], rows)
+                t_us, p = self._unit.us(times[:rows]), self._polarities.of(piece.polarities[:rows])
+                x, y = _places(None if piece.places is None else piece.places[:rows], rows)
                 good = True
             except RowError as error:
                 # What stands before it is given.
                 rows = error.row
-                self._wrong = InputError(f"{self.path}: {self._where} {number(rows)}: {error}")
+                self._wrong = InputError(f"{self.path}: {self._where} {piece.number(rows)}: {error}")
         if len(t_us):
             start_us = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
             latest = np.maximum.accumulate(np.concatenate([[start_us], t_us]))
@@ -200,25 +254,22 @@ class ColumnSource(EventSource):
 
     def _numbers_of(self, piece: Piece) -> Piece:
         """A piece without the rows in which something is no number; they are counted."""
-        times, values, places, number = piece
-        good = np.ones(len(times), bool)
-        for column in (times, values, *(() if places is None else places.T)):
+        good = np.ones(len(piece.times), bool)
+        for column in (piece.times, piece.polarities, *(() if piece.places is None else piece.places.T)):
             if column.dtype.kind == "f":
                 good &= np.isfinite(column)
             elif column.dtype.kind in "US":
-                good &= ~np.isin(
-                    np.char.lower(column), (b"nan", b"") if column.dtype.kind == "S" else ("nan", "")
-                )
+                good &= ~np.isin(np.char.lower(column), np.array(["nan", ""]).astype(column.dtype.kind))
         if good.all():
             return piece
         kept = np.flatnonzero(good)
-        lost, first = len(good) - len(kept), number(int((~good).argmax()))
-        self._dropped = self._dropped.more(lost, first)
-        return (
-            times[kept],
-            values[kept],
-            None if places is None else places[kept],
-            lambda row: number(int(kept[row])),
+        self._dropped = self._dropped.more(len(good) - len(kept), piece.number(int((~good).argmax())))
+        return replace(
+            piece,
+            times=piece.times[kept],
+            polarities=piece.polarities[kept],
+            places=None if piece.places is None else piece.places[kept],
+            number=lambda row: piece.number(int(kept[row])),
         )
 
     @property
@@ -264,16 +315,6 @@ def _with_triggers(
     while ahead is not None:
         yield Events.empty(), ahead
         ahead = next(triggers, None)
-
-
-def piece_of(columns: list[NDArray[Any]], row: int) -> Piece:
-    """A piece of times, polarities and perhaps places, each (n,), of rows from `row` on."""
-    times = columns[0]
-    if times.dtype.kind == "u" and times.size and times.max() > np.iinfo(np.int64).max:
-        times = times.astype(np.float64)
-    elif times.dtype.kind != "f":
-        times = times.astype(np.int64)
-    return times, columns[1], np.stack(columns[2:], 1) if len(columns) > 2 else None, row.__add__
 
 
 def _unwrap(times: NDArray[Any], before: int | None, gone_round: int) -> tuple[NDArray[Any], int, int]:
@@ -356,3 +397,9 @@ def _places(places: NDArray[Any] | None, n: int) -> tuple[NDArray[np.uint16], ND
         raise RowError(row, f"place {places[wrong][0]}, expected whole numbers from 0 to {_PLACES - 1}")
     found = whole.astype(np.uint16)
     return np.ascontiguousarray(found[:, 0]), np.ascontiguousarray(found[:, 1])
+
+
+def one_line(error: Exception) -> str:
+    """What an error says, in one line."""
+    text = " ".join(str(error).split()) or type(error).__name__
+    return text if len(text) <= 200 else f"{text[:200]}..."

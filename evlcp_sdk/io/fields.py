@@ -1,5 +1,6 @@
 """What the columns of somebody's list of events mean: names, units of time, words for polarities."""
 
+import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,7 +9,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.io.writers import LAST_TIME_US
+from evlcp_sdk.plugin.writer import LAST_TIME_US
 
 UNITS_US: Final = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 
@@ -439,7 +440,7 @@ def _line_of(t_us: NDArray[Any], unit: str) -> tuple[float, str, float] | None:
     since_us = t_us - t_us[0]
     high_hz = min(_BLINKS_HZ[1], 1e6 / (16 * float(steps.min())))
     low_hz = max(_BLINKS_HZ[0], 8e6 / float(since_us[-1]))
-    if high_hz < 1.5 * low_hz:
+    if not 1.5 * low_hz <= high_hz or not math.isfinite(float(since_us[-1]) / float(steps.min())):
         return None
     # Whole steps: others would beat with them.
     bin_us = float(steps.min()) * max(int(1e6 / (4 * high_hz) / float(steps.min())), 1)

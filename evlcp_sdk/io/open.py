@@ -2,48 +2,49 @@
 
 import io
 import re
+from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 from urllib.parse import unquote
 
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
 from evlcp_sdk.files import Outputs, is_there
-from evlcp_sdk.io.faery import FORMATS, FaerySource
 from evlcp_sdk.io.raw import CODECS, RawSource, RawWriter
 from evlcp_sdk.io.replay import LoopSource, ReplaySource
 from evlcp_sdk.io.streams import SCHEMES, open_stream
 from evlcp_sdk.io.tables import CsvWriter, NpzWriter
 from evlcp_sdk.io.urls import flag, positive, split_options
-from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.late import Late
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers
 
 if TYPE_CHECKING:
-    from evlcp_sdk.io import bags, camera, hdf5, lists, ros
+    from evlcp_sdk.io import camera, lists
 else:
     # What most runs do not read.
-    _late = ("bags", "camera", "hdf5", "lists", "ros")
-    bags, camera, hdf5, lists, ros = (Late(f"evlcp_sdk.io.{name}") for name in _late)
+    camera, lists = (Late(f"evlcp_sdk.io.{name}") for name in ("camera", "lists"))
 
-WRITABLE: Final = {".raw": "EVT3", ".mcap": "BAG", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
+WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
 
 STDIN: Final = "-"
 """What is opened as standard input."""
 
-_RECORDED: Final = ("file", "replay", "bag", "hdf5", "list")
-OWN: Final = (*_RECORDED, "camera", *SCHEMES)
-"""Schemes that are opened without a plugin."""
-
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
+
+
+def _scheme_of(url: str) -> str:
+    """What stands before the `:` of a name that is no file's; empty for none."""
+    found = _SCHEME.match(url)
+    return "" if found is None or is_there(url) else found[1].lower()
 
 
 def is_recording(url: Path | str) -> bool:
     """Whether a name is that of a recording, by what stands before its `:`."""
-    scheme = _SCHEME.match(str(url))
-    recorded = scheme is not None and scheme[1].lower() in _RECORDED
-    return str(url) != STDIN and (scheme is None or is_there(url) or recorded)
+    scheme, path = _scheme_of(str(url)), str(url).partition(":")[2].partition("?")[0]
+    return str(url) != STDIN and (not scheme or scheme in ("file", "replay", "list") or is_there(path))
 
 
 def open_source(url: Path | str, registry: Registry | None = None) -> EventSource:
@@ -64,35 +65,35 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
         InputError: It cannot be opened or is not of a known format, or nobody knows its scheme.
     """
     registry = Registry.load() if registry is None else registry
-    source = _ask_plugins(str(url), registry)
+    name = str(url)
+    if _scheme_of(name) == "file":
+        name = unquote(name.partition(":")[2].removeprefix("//"))
+    source = _ask_plugins(name, registry)
     if source is not None:
         return source
-    if str(url) == STDIN:
+    if name == STDIN:
         return _open_stdin()
-    scheme = _SCHEME.match(str(url))
-    if scheme is None or is_there(url):
-        return _open_file(url)
-    if scheme[1].lower() == "file":
-        return _open_file(unquote(str(url)[len(scheme[0]) :].removeprefix("//")))
-    if scheme[1].lower() == "replay":
-        return _open_replay(str(url), registry)
-    if scheme[1].lower() == "bag":
-        return bags.open_bag(str(url))
-    if scheme[1].lower() == "hdf5":
-        return hdf5.open_hdf5(str(url))
-    if scheme[1].lower() == "list":
-        return lists.open_list(str(url))
-    if scheme[1].lower() == "camera":
-        return camera.open_camera(str(url))
-    if scheme[1].lower() in SCHEMES:
-        return open_stream(str(url))
+    scheme = _scheme_of(name)
+    if not scheme:
+        return _open_file(name)
+    if scheme == "replay":
+        return _open_replay(name, registry)
+    if scheme in _SCHEMES:
+        return _SCHEMES[scheme](name)
     asked = sorted(registry.plugins("evlcp_open_events"))
     broken = "".join(f"; {plugin}" for plugin in registry.broken)
     raise InputError(
-        f"{url}: scheme '{scheme[1]}', expected {', '.join(f'{one}:' for one in OWN)}"
+        f"{url}: scheme '{scheme}', expected {', '.join(f'{one}:' for one in ('file', 'replay', *_SCHEMES))}"
         " or one that a plugin opens"
         f" (asked: {', '.join(asked) or 'no plugin that opens sources is installed'}){broken}"
     )
+
+
+_SCHEMES: Final[dict[str, Callable[[str], EventSource]]] = {
+    "list": lambda url: lists.open_list(url),
+    "camera": lambda url: camera.open_camera(url),
+    **dict.fromkeys(SCHEMES, open_stream),
+}
 
 
 def _ask_plugins(url: str, registry: Registry) -> EventSource | None:
@@ -149,42 +150,21 @@ def _open_replay(url: str, registry: Registry) -> EventSource:
     return ReplaySource(again, options.get("speed", 1.0))
 
 
-def _open_file(path: Path | str) -> EventSource:
-    target = Path(path)
-    if target.suffix.lower() in FORMATS:
-        return FaerySource(path)
-    if target.is_dir() and bags.is_bag(target, b""):
-        return bags.open_bag(target)
+def _open_file(name: str) -> EventSource:
+    """Open a RAW file, or a list of events where the content or the name says so."""
+    path = Path(name)
+    suffix = _suffix(path)
     try:
-        special = target.exists() and not target.is_file() and not target.is_dir()
-        start = b"% " if special else _first_bytes(target)
+        with path.open("rb") if path.is_file() else nullcontext() as file:
+            start = b"" if file is None else file.read(4)
+        is_raw = start.startswith(b"% ") and (suffix == ".raw" or suffix not in lists.SUFFIXES)
+        zipped = start.startswith((b"PK\x03\x04", b"\x1f\x8b"))
+        named = suffix in (".csv", ".csv.gz", ".npz")
+        if not is_raw and (zipped or named or (start and lists.is_list(path))):
+            return lists.read_list(path)
     except OSError as error:
-        raise InputError(f"{path}: {error.strerror}") from error
-    return _open_kind(path, target, start, special=special)
-
-
-def _open_kind(path: Path | str, target: Path, start: bytes, *, special: bool) -> EventSource:
-    """Open a file by its first bytes and its name; `special` are pipes and the like."""
-    suffix = _suffix(target)
-    if start.startswith(b"% ") and suffix == ".raw":
-        return RawSource(path)
-    if bags.is_bag(target, start):
-        return bags.open_bag(target)
-    if start.startswith((hdf5.MAGIC, hdf5.MATLAB)):
-        return hdf5.Hdf5Source(path)
-    if start.startswith(b"% ") and suffix not in lists.SUFFIXES:
-        return RawSource(path)
-    if start.startswith(b"PK\x03\x04") or suffix == ".npz":
-        return lists.ListSource(path)
-    is_table = start.startswith(b"\x1f\x8b") or suffix in (".csv", ".csv.gz")
-    if is_table or (start and not special and lists.is_list(target)):
-        return lists.ListSource(path)
-    return RawSource(path)  # which says what is wrong
-
-
-def _first_bytes(path: Path) -> bytes:
-    with path.open("rb") as file:
-        return file.read(16)
+        raise InputError(f"{name}: {error.strerror}") from error
+    return RawSource(name)  # which says what is wrong
 
 
 def _suffix(path: Path) -> str:
@@ -223,20 +203,24 @@ def open_writer(
         OutputError: The file cannot be written.
         StreamError: The format is unknown, or width and height are missing for RAW or a bag.
     """
-    name = (format or WRITABLE.get(_suffix(Path(path)), "")).upper()
+    suffix = _suffix(Path(path))
+    name = (format or WRITABLE.get(suffix, "")).upper()
     if name == "NPZ":
         return NpzWriter(path, width, height, outputs)
     if name == "CSV":
         return CsvWriter(path, width, height, outputs)
-    if name != "BAG" and name not in CODECS:
-        found = f"format {format!r}" if format else f"suffix {_suffix(Path(path))!r}"
+    if name not in CODECS:
+        given = {"path": Path(path), "width": width, "height": height, "format": format or ""}
+        writer: EventWriter | None = Registry.load().hook.evlcp_open_writer(**given, outputs=outputs)
+        if writer is not None:
+            return writer
+        found = f"format {format!r}" if format else f"suffix {suffix!r}"
         raise StreamError(
-            f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, BAG, NPZ, CSV"
+            f"{path}: {found}, expected {', '.join(WRITABLE)} or format EVT2, EVT3, NPZ, CSV, or one that a"
+            " plugin writes, as .mcap"
         )
     if width is None or height is None:
         raise StreamError(f"{path}: sensor of {width}x{height}, expected a width and a height for {name}")
-    if name == "BAG":
-        return ros.EventBagWriter(path, width, height, outputs)
     return RawWriter(path, width, height, CODECS[name], outputs)
 
 

@@ -17,8 +17,8 @@ from evlcp_sdk.io import _words
 from evlcp_sdk.io._codec import MAX_SIDE, Codec, Columns, Decoder
 from evlcp_sdk.io.evt2 import EVT2
 from evlcp_sdk.io.evt3 import EVT3
-from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers
 
 CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}

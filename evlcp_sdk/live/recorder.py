@@ -8,8 +8,8 @@ from typing import Any, Final
 
 from evlcp_sdk.errors import EvlcpError, StreamError
 from evlcp_sdk.io.open import open_writer
-from evlcp_sdk.io.writers import EventWriter
 from evlcp_sdk.live.publisher import Publisher, Subscription
+from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers
 
 _MOST_WAITING: Final = 4096

@@ -11,10 +11,14 @@ from typing import TYPE_CHECKING, Any
 import pluggy
 
 if TYPE_CHECKING:
+    from pathlib import Path
+
     import typer
 
     from evlcp_sdk.air.kinds import MessageKind
+    from evlcp_sdk.files import Outputs
     from evlcp_sdk.plugin.source import EventSource
+    from evlcp_sdk.plugin.writer import EventWriter
 
 ENTRY_POINT_GROUP = "evlcp"
 """Entry-point group, and pluggy project name."""
@@ -87,6 +91,21 @@ def evlcp_open_events(url: str) -> "EventSource | None":
     """Open `url` as an event source, or return None to leave it to others.
 
     Asked before the built-in readers, so that a package can bring a camera or a file format.
+    """
+
+
+@hookspec(firstresult=True)
+def evlcp_open_writer(
+    path: "Path", width: int | None, height: int | None, format: str, outputs: "Outputs | None"
+) -> "EventWriter | None":
+    """Create a recording to write in a format that the SDK does not know, or return None to leave it.
+
+    Args:
+        path: The file.
+        width: Columns of the sensor, or None.
+        height: Its rows, or None.
+        format: The format's name where one is asked for, whatever the file's; empty: as its suffix says.
+        outputs: As of `evlcp_sdk.io.open_writer`.
     """
 
 

@@ -10,12 +10,6 @@ _OF_FRAMES = (
     ("frames", "results.frames_csv:FramesCsv", "frames.csv", "a row per frame"),
     ("packets", "results.packets_jsonl:PacketsJsonl", "packets.jsonl", "a line per packet or message"),
     (
-        "parquet",
-        "results.frames_parquet:FramesParquet",
-        "frames.parquet",
-        "frames.csv's rows with their types",
-    ),
-    (
         "points",
         "results.points_csv:PointsCsv",
         "points.csv",
@@ -31,9 +25,6 @@ _OF_POSITIONS = (
     ("track", "results.track_csv:TrackCsv", "track.csv", "positions smoothed and filtered"),
     ("geojson", "results.geojson:GeoJson", "fixes.geojson", "positions, bars and track for a map"),
     ("nmea", "results.nmea:Nmea", "fixes.nmea", "positions as NMEA-0183"),
-    ("kml", "results.kml:Kml", "fixes.kml", "positions, bars and track for Google Earth"),
-    ("navsat", "results.navsat:NavSat", "navsat.mcap", "positions as a bag of ROS 2"),
-    ("mcap", "results.mcap:Mcap", "fixes.mcap", "positions for Foxglove"),
 )
 _PAGES = (
     (
@@ -50,13 +41,6 @@ _PAGES = (
 _DEFAULT = ("frames", "packets", "fixes", "track", "geojson", "nmea")
 """Those that are written without being asked for."""
 
-_NEEDS = {
-    "parquet": (("pyarrow",), "evlcp-sdk[parquet]"),
-    "navsat": (("mcap", "rosbags"), "evlcp-sdk[ros]"),
-    "mcap": (("mcap", "mcap_protobuf", "foxglove_schemas_protobuf"), "evlcp-sdk[mcap]"),
-}
-"""Modules that a format needs, and the extra that brings them."""
-
 
 @hookimpl
 def evlcp_sinks() -> Iterator[SinkRecord]:
@@ -64,7 +48,4 @@ def evlcp_sinks() -> Iterator[SinkRecord]:
     for rows in (_OF_FRAMES, _OF_POSITIONS, _PAGES):
         for name, target, files, summary in rows:
             default, positions = name in _DEFAULT, rows is _OF_POSITIONS
-            needs = _NEEDS.get(name, ((), ""))
-            yield SinkRecord(
-                name, f"evlcp_sdk.{target}", (*files.split(),), summary, default, positions, *needs
-            )
+            yield SinkRecord(name, f"evlcp_sdk.{target}", (*files.split(),), summary, default, positions)

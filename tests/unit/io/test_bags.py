@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from evlcp_formats.bags import _of_cdr
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import open_source, open_writer, read_events
-from evlcp_sdk.io.bags import _of_cdr
 from evlcp_sdk.values import Events, Triggers
 from tests.conftest import ROOT
 
@@ -281,7 +281,11 @@ def test_a_command_that_converts_says_what_is_wrong(
     done = evlcp("convert", demo_raw, "-o", tmp_path / "a.npz")
     assert (done.code, done.out) == (0, f"{tmp_path / 'a.npz'}: 764,142 events, 0 triggers\n")
     for arguments, code, told in (
-        ([demo_raw, "-o", tmp_path / "a.txt"], 1, "suffix '.txt', expected .raw, .mcap,"),
+        (
+            [demo_raw, "-o", tmp_path / "a.txt"],
+            1,
+            "suffix '.txt', expected .raw, .npz, .csv, .csv.gz or format EVT2",
+        ),
         ([tmp_path / "a.npz", "-o", tmp_path / "a.raw"], 0, ""),
         ([tmp_path / "a.npz", "-o", tmp_path / "a.raw", "--size", "9"], 2, "'9': expected WIDTHxHEIGHT"),
         ([tmp_path / "none.raw", "-o", tmp_path / "a.raw"], 3, "none.raw: No such file"),
@@ -345,7 +349,7 @@ def test_hdf5_tables_without_names(order: str, on_its_side: bool, tmp_path: Path
     with h5py.File(tmp_path / "b.h5", "w") as file:
         file["events"] = np.arange(40.0).reshape(10, 4)
     for name, told in (
-        (str(tmp_path / "b.h5"), "without names: expected to be told what its columns are"),
+        (str(tmp_path / "b.h5"), "say which columns they are, as by hdf5:PATH?columns=txyp"),
         (f"hdf5:{tmp_path / 'a.h5'}?columns=txy", "columns = 'txy': expected the letters t, x, y and p"),
     ):
         with pytest.raises(InputError, match=re.escape(told)):

@@ -148,7 +148,7 @@ BAD_NPZ = {
         "'t_us': 9{30}, .*expected one length",
     ),
     "a pickle": (npz_headed(header("'|O'")), "array t_us: found object"),
-    "no NPY in it": (npz_of_text(), "found the arrays t_us, expected t and p"),
+    "no NPY in it": (npz_of_text(), "array t_us: EOF"),
 }
 
 

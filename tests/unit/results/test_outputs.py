@@ -241,7 +241,7 @@ def test_parquet_imports_no_pandas() -> None:
     pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
     code = (
         "import sys, math, pyarrow\n"
-        "from evlcp_sdk.results.frames_parquet import _array\n"
+        "from evlcp_formats.parquet import _array\n"
         "real, rows = pyarrow.float64(), pyarrow.list_(pyarrow.int64())\n"
         "print(_array([1.5, math.nan, None, 2], real).to_pylist())\n"
         "print(_array([[1, None], [], [3]], rows).to_pylist(), 'pandas' in sys.modules)\n"

@@ -16,6 +16,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pynmea2
 import pytest
+from evlcp_formats.foxglove import FRAME_ID
 from PIL import Image
 
 from evlcp_sdk.files import STAGE_PREFIX
@@ -34,7 +35,6 @@ from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.fixes_csv import FixesCsv
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import GeoJson
-from evlcp_sdk.results.mcap import FRAME_ID
 from evlcp_sdk.results.nmea import Nmea
 from evlcp_sdk.results.points_csv import PointsCsv
 from evlcp_sdk.results.sink import Run

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from evlcp_sdk.io.ros import RosBag
+from evlcp_formats.ros import RosBag
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink

@@ -11,7 +11,7 @@ from evlcp_sdk.files import Outputs
 from evlcp_sdk.io._codec import MAX_SIDE
 from evlcp_sdk.io.evt3 import EVT3
 from evlcp_sdk.io.raw import RawEncoder, RawWriter
-from evlcp_sdk.io.writers import EventWriter
+from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers
 
 EVENT_PACKET: Final = "event_camera_msgs/msg/EventPacket"

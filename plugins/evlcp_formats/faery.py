@@ -11,8 +11,7 @@ from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-FORMATS: Final = {".aedat4": "AEDAT4", ".aedat": "AEDAT4", ".dat": "DAT", ".es": "ES"}
-"""The formats read this way, by the suffix of the file's name."""
+_FORMATS: Final = {".aedat4": "AEDAT4", ".aedat": "AEDAT4", ".dat": "DAT", ".es": "ES"}
 
 UNKNOWN_SIZE = (0xFFFF, 0xFFFF)
 
@@ -31,7 +30,7 @@ class FaerySource(EventSource):
 
     def __init__(self, path: Path | str) -> None:
         target = Path(path)
-        name = FORMATS[target.suffix.lower()]
+        name = _FORMATS[target.suffix.lower()]
         if not target.is_file():
             raise InputError(f"{path}: {'not a file' if target.exists() else 'No such file or directory'}")
         try:

@@ -50,20 +50,13 @@ class EventPacket:
     data: memoryview
 
 
-def is_bag(path: Path, start: bytes) -> bool:
-    """Whether a file, by its first bytes, or a folder is a bag."""
-    return (path.is_dir() and (path / "metadata.yaml").is_file()) or start.startswith(tuple(_MAGICS))
-
-
-def open_bag(url: Path | str) -> "BagSource":
+def open_bag(url: str) -> "BagSource":
     """Open `bag:PATH`, or `bag:PATH?topic=NAME`: a file of any kind, or a folder of ROS 2.
 
     Raises:
         InputError: It is no bag, has no such topic, or other words than EVT3; or the extra `ros` is needed.
     """
-    named, options = (
-        split_options(str(url), {"topic": str}) if str(url).startswith("bag:") else (str(url), {})
-    )
+    named, options = split_options(url, {"topic": str}) if url.startswith("bag:") else (url, {})
     return BagSource(named.removeprefix("bag:"), options.get("topic"))
 
 

@@ -1,0 +1,303 @@
+"""Columns of arrays: those of NPZ and NPY files here, and what other files of arrays share with them."""
+
+import math
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import IO, Any, Final, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io.columns import DAMAGE, PIECE_ROWS, WINDOW_US, EventTable, Piece, one_line
+from evlcp_sdk.io.fields import Fields, fields_of, fields_of_values
+from evlcp_sdk.io.tables import COLUMNS, LAST_VALUES, TRIGGER_COLUMNS, WIRE_TYPES
+from evlcp_sdk.values import Triggers
+
+_LOOKED_AT: Final = 1 << 14
+"""Rows at the start from which columns are recognized."""
+
+_TRIGGER_ROWS: Final = 1 << 12
+_MOST_COLUMNS: Final = 8
+
+
+class Array(Protocol):
+    """Values (n,), or a table's (n, k), that are read from front to back, perhaps more than once."""
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Rows, and columns of a table."""
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """Type of its values."""
+
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]:
+        """The values of some rows."""
+
+
+@dataclass(frozen=True)
+class ArrayColumn:
+    """An array, or a part of a table.
+
+    Attributes:
+        name: Of the array, for messages.
+        array: The array.
+        part: Name or number of the part; None for all of the array.
+    """
+
+    name: str
+    array: Array
+    part: str | int | None = None
+
+    @property
+    def kind(self) -> str:
+        """Of its type, as NumPy's; empty where it is no column."""
+        dtype, shape = self.array.dtype, self.array.shape
+        if len(shape) != (2 if isinstance(self.part, int) else 1):
+            return ""
+        return dtype[self.part].kind if isinstance(self.part, str) else dtype.kind
+
+    def of(self, block: NDArray[Any]) -> NDArray[Any]:
+        """Its values in a block of the array's rows."""
+        if self.part is None:
+            return block
+        return block[self.part] if isinstance(self.part, str) else block[:, self.part]
+
+
+def upright(array: NDArray[Any]) -> NDArray[Any]:
+    """An array (n,) of one in a single column or row, a table (n, k) of one on its side."""
+    if array.ndim != 2 or 1 in array.shape:
+        return array.ravel() if array.ndim == 2 else array
+    return array if array.shape[0] >= array.shape[1] else array.T
+
+
+def choose_columns(
+    path: Path,
+    names: Sequence[str],
+    array: Callable[[str], Array],
+    fields: Fields | None,
+    hint: str = "list:PATH?columns=t,p",
+) -> tuple[list[ArrayColumn], Fields]:
+    """Time, polarity and, where there are any, x and y: of arrays by name, or of a table among them.
+
+    Args:
+        path: The file, for messages.
+        names: Of its arrays.
+        array: Gives one of them.
+        fields: Which column is what; None: as the names say, or else the first rows.
+        hint: How to say which it is, for messages.
+
+    Raises:
+        InputError: There are no such columns, or they are no numbers, or of other lengths.
+    """
+    found = fields or fields_of(names)
+    if found is None and len(names) == 2:
+        found = _fields_of([ArrayColumn(name, array(name)) for name in names])
+    if found is None or max(found.which) >= len(names):
+        columns, found = _choose_table(path, names, array, fields, hint)
+    else:
+        columns = [ArrayColumn(names[k], array(names[k])) for k in found.which]
+    if any(column.array.shape == () for column in columns[2:]):
+        # Where the pixels are, not a place of each event.
+        found, columns = replace(found, places=None), columns[:2]
+    for column, kinds in zip(columns, ("iuf", "iubfUS", "iuf", "iuf"), strict=False):
+        if column.kind not in kinds or not column.kind:
+            what = f"{column.array.dtype} {column.array.shape}"
+            raise InputError(f"{path}: array {column.name}: found {what}, expected numbers (n,)")
+    _check_lengths(path, columns)
+    return columns, found
+
+
+def _choose_table(
+    path: Path, names: Sequence[str], array: Callable[[str], Array], fields: Fields | None, hint: str
+) -> tuple[list[ArrayColumn], Fields]:
+    """The columns of the first table in which they are recognized, one of a short name before others."""
+    for name in sorted(names, key=len):
+        try:
+            table = array(name)
+        except InputError:
+            if len(names) == 1:
+                raise
+            continue
+        parts: Sequence[str | int] = table.dtype.names or ()
+        if len(table.shape) == 2 and 1 < table.shape[1] <= _MOST_COLUMNS:
+            parts = range(table.shape[1])
+        columns = [ArrayColumn(name, table, part) for part in parts]
+        found = fields or (fields_of(table.dtype.names) if table.dtype.names else None) or _fields_of(columns)
+        if found is not None and max(found.which) < len(columns):
+            return [columns[k] for k in found.which], found
+    raise InputError(
+        f"{path}: found the arrays {', '.join(sorted(names)) or 'none'}, expected t and p or a table"
+        f" of them (or say which columns they are, as by {hint})"
+    )
+
+
+def _fields_of(columns: list[ArrayColumn]) -> Fields | None:
+    """Which of some columns is what, by the first rows."""
+    if not columns or not all(column.kind and column.kind in "iubfUS" for column in columns):
+        return None
+    return fields_of_values([column.of(column.array[:_LOOKED_AT]) for column in columns])
+
+
+def _check_lengths(path: Path, columns: list[ArrayColumn]) -> None:
+    lengths = {column.name: column.array.shape[0] if column.array.shape else 1 for column in columns}
+    if len(set(lengths.values())) > 1:
+        raise InputError(f"{path}: found arrays of the lengths {lengths}, expected one length")
+
+
+def pieces_of(columns: list[ArrayColumn], size_bytes: int) -> Iterator[Piece]:
+    """The rows of columns, an array that has several of them read once.
+
+    Args:
+        columns: Time, polarity and perhaps x and y.
+        size_bytes: Of the file.
+    """
+    rows = columns[0].array.shape[0]
+    arrays = {id(column.array): column.array for column in columns}
+    for first in range(0, rows, PIECE_ROWS):
+        part = slice(first, min(first + PIECE_ROWS, rows))
+        blocks = {key: array[part] for key, array in arrays.items()}
+        times, polarities, *places = (column.of(blocks[id(column.array)]) for column in columns)
+        if times.dtype.kind == "u" and times.max() > np.iinfo(np.int64).max:
+            times = times.astype(np.float64)
+        elif times.dtype.kind != "f":
+            times = times.astype(np.int64)
+        done = round(size_bytes * part.stop / rows)
+        yield Piece(times, polarities, np.stack(places, 1) if places else None, (first + 1).__add__, done)
+
+
+class Stored:
+    """An array in NumPy's format; a table whose columns lie one behind another is read at once.
+
+    Args:
+        name: What faults call it.
+        opened: Opens it from its start.
+
+    Raises:
+        InputError: It is none.
+    """
+
+    def __init__(self, name: str, opened: Callable[[], IO[bytes]]) -> None:
+        self._name, self._opened = name, opened
+        shape, on_end, self.dtype = self._open()
+        self.shape = (shape[0] * shape[1],) if len(shape) == 2 and 1 in shape else shape
+        if self.dtype.hasobject or min(shape, default=0) < 0:
+            raise InputError(f"{name}: found {self.dtype} {shape}, expected numbers (n,)")
+        self._whole: NDArray[Any] | None = None
+        if len(self.shape) == 2 and (on_end or shape[0] < shape[1]):
+            order: Literal["F", "C"] = "F" if on_end else "C"
+            data = self._file.read()
+            if len(data) > math.prod(shape) * self.dtype.itemsize:
+                raise InputError(f"{name}: found {len(data)} bytes, expected {self.dtype} {shape}")
+            values = self._values(data, math.prod(shape))
+            self._whole = upright(values.reshape(shape, order=order))
+            self.shape = self._whole.shape
+        self._rows = self.shape[0] if self.shape else 1
+
+    def _open(self) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+        """Open it, and read its shape, whether its columns lie on end, and its type."""
+        try:
+            self._file, self._row = self._opened(), 0
+            version = np.lib.format.read_magic(self._file)
+            read = np.lib.format.read_array_header_1_0
+            return (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(self._file)
+        except Exception as error:
+            # NumPy evaluates the header as a piece of Python, which may fail in any way.
+            raise InputError(f"{self._name}: {one_line(error)}") from error
+
+    def _values(self, data: bytes, many: int) -> NDArray[Any]:
+        size = many * self.dtype.itemsize
+        if len(data) < size:
+            found = (self._row if len(self.shape) < 2 else 0) + len(data) // self.dtype.itemsize
+            raise InputError(f"{self._name}: found {found} values, expected {math.prod(self.shape)}")
+        return np.frombuffer(data[:size], self.dtype)
+
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]:
+        """The values of some rows: the first ones, or those behind the last ones.
+
+        Raises:
+            InputError: The array ends too early.
+        """
+        first, last, _ = rows.indices(self._rows)
+        if self._whole is not None:
+            return self._whole[first:last]
+        if first != self._row:
+            self._open()
+        width = self.shape[1] if len(self.shape) == 2 else 1
+        many = (last - first) * width
+        values = self._values(self._file.read(many * self.dtype.itemsize), many)
+        self._row = last
+        return values.reshape(-1, width) if len(self.shape) == 2 else values
+
+
+def read_npy(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
+    """A table in an NPY file, of records, (n, k) or (k, n)."""
+    array = Stored(str(path), lambda: stack.enter_context(path.open("rb")))
+    columns, found = choose_columns(path, [path.name], lambda _: array, fields)
+    return EventTable("NPY", pieces_of(columns, path.stat().st_size), found.unit)
+
+
+def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
+    """Arrays of an NPZ file, or a table in one; in our own names with triggers and the sensor's size."""
+    try:
+        archive = stack.enter_context(zipfile.ZipFile(path))
+    except (zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError) as error:
+        raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
+    names = [member.removesuffix(".npy") for member in archive.namelist()]
+
+    def array(name: str) -> Stored:
+        return Stored(f"{path}: array {name}", lambda: stack.enter_context(archive.open(f"{name}.npy")))
+
+    columns, found = choose_columns(path, names, array, fields)
+    pieces = pieces_of(columns, path.stat().st_size)
+    if fields is not None or not set(COLUMNS) <= set(names):
+        return EventTable("NPZ", pieces, found.unit)
+    size = [_one(path, name, array(name)) if name in names else None for name in ("width", "height")]
+    triggers: list[ArrayColumn] = []
+    if "trigger_t_us" in names:
+        for name in TRIGGER_COLUMNS:
+            if name not in names:
+                raise InputError(f"{path}: found the arrays {', '.join(sorted(names))}, expected {name} too")
+            triggers.append(ArrayColumn(name, array(name)))
+    _check_lengths(path, triggers)
+    given = _triggers(path, triggers) if triggers else None
+    return EventTable("NPZ", pieces, found.unit, size=(size[0], size[1]), triggers=given, window_us=WINDOW_US)
+
+
+def _triggers(path: Path, columns: list[ArrayColumn]) -> Iterator[Triggers]:
+    for first in range(0, columns[0].array.shape[0], _TRIGGER_ROWS):
+        part = slice(first, first + _TRIGGER_ROWS)
+        try:
+            yield Triggers(*(_bounded(path, c.name, c.array[part], first) for c in columns))
+        except DAMAGE as error:
+            raise InputError(f"{path}: damaged triggers: {one_line(error)}") from error
+
+
+def _bounded(path: Path, name: str, values: NDArray[Any], row: int) -> NDArray[Any]:
+    """Values of a column of ours, from a row on, in its type.
+
+    Raises:
+        InputError: One is no integer, or has no place in the column.
+    """
+    last = LAST_VALUES.get(name, 0xFFFF)
+    first = -last if name == "trigger_t_us" else 0
+    if values.dtype.kind not in "iub":
+        raise InputError(f"{path}: array {name}: found {values.dtype}, expected integers")
+    wrong = (values < first) | (values > last)
+    if wrong.any():
+        k = int(wrong.argmax())
+        raise InputError(
+            f"{path}: array {name}: row {row + k + 1}: found {values[k]}, expected {first} to {last}"
+        )
+    return values.astype(WIRE_TYPES.get(name, np.dtype(np.int64)))
+
+
+def _one(path: Path, name: str, array: Stored) -> int:
+    """The only value of an array."""
+    if array.shape not in ((), (1,)):
+        raise InputError(f"{path}: array {name}: found {array.shape} values, expected one")
+    return int(_bounded(path, name, array[:1], 0)[0])

@@ -1,0 +1,124 @@
+"""The formats that few use: bags, HDF5, MAT, AEDAT4, DAT, ES; Parquet, KML, MCAP."""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from evlcp_sdk.errors import InputError, StreamError
+from evlcp_sdk.files import is_there
+from evlcp_sdk.plugin.hooks import SinkRecord, hookimpl
+
+if TYPE_CHECKING:
+    from evlcp_sdk.files import Outputs
+    from evlcp_sdk.plugin.source import EventSource
+    from evlcp_sdk.plugin.writer import EventWriter
+
+__all__ = ["evlcp_open_events", "evlcp_open_writer", "evlcp_sinks"]
+
+_STARTS = {
+    b"#ROSBAG V2.0": "bag",
+    b"SQLite format 3": "bag",
+    b"\x89MCAP0\r\n": "bag",
+    b"\x89HDF\r\n\x1a\n": "hdf5",
+    # In which HDF5 begins later.
+    b"MATLAB 7.3": "hdf5",
+    b"MATLAB ": "mat",
+}
+_SUFFIXES = {".aedat4": "faery", ".aedat": "faery", ".dat": "faery", ".es": "faery", ".mat": "mat"}
+
+
+@hookimpl
+def evlcp_open_events(url: str) -> "EventSource | None":
+    """Open a file of one of these formats, by its first bytes or its suffix; or as `bag:` and the like."""
+    scheme, _, rest = url.partition(":")
+    if is_there(url) or scheme not in ("bag", "hdf5", "list"):
+        return _open(url, _format_of(url))
+    if scheme != "list":
+        return _open(url, scheme)
+    path = rest.rpartition("?")[0] or rest
+    found = _format_of(path)
+    if found == "hdf5":
+        raise InputError(f"{path}: a file of MATLAB 7.3 or HDF5, expected to be named hdf5:{path}")
+    return _open(url, found) if found == "mat" else None
+
+
+def _open(url: str, found: str) -> "EventSource | None":
+    if found == "bag":
+        from evlcp_formats.bags import open_bag
+
+        return open_bag(url)
+    if found == "hdf5":
+        from evlcp_formats.hdf5 import open_hdf5
+
+        return open_hdf5(url)
+    if found == "mat":
+        from evlcp_formats.matlab import open_mat
+
+        return open_mat(url)
+    if found == "faery":
+        from evlcp_formats.faery import FaerySource
+
+        return FaerySource(url)
+    return None
+
+
+def _format_of(name: str) -> str:
+    """The format of a file, by its suffix or its first bytes, or of a folder; empty for another."""
+    path = Path(name)
+    if path.suffix.lower() in _SUFFIXES and _SUFFIXES[path.suffix.lower()] == "faery":
+        return "faery"
+    try:
+        if path.is_dir():
+            return "bag" if (path / "metadata.yaml").is_file() else ""
+        if not path.is_file():
+            return ""
+        with path.open("rb") as file:
+            start = file.read(16)
+    except OSError:
+        return ""
+    by_start = next((found for magic, found in _STARTS.items() if start.startswith(magic)), "")
+    return by_start or _SUFFIXES.get(path.suffix.lower(), "")
+
+
+@hookimpl
+def evlcp_open_writer(
+    path: Path, width: int | None, height: int | None, format: str, outputs: "Outputs | None"
+) -> "EventWriter | None":
+    """Write a bag of ROS 2: format BAG, or `.mcap`."""
+    if (format or path.suffix).upper() not in ("BAG", ".MCAP"):
+        return None
+    if width is None or height is None:
+        raise StreamError(f"{path}: sensor of {width}x{height}, expected a width and a height for BAG")
+    from evlcp_formats.ros import EventBagWriter
+
+    return EventBagWriter(path, width, height, outputs)
+
+
+@hookimpl
+def evlcp_sinks() -> Iterator[SinkRecord]:
+    """Results as Parquet, for Google Earth, ROS 2 and Foxglove."""
+    yield SinkRecord(
+        *("parquet", "evlcp_formats.parquet:FramesParquet", ("frames.parquet",)),
+        summary="frames.csv's rows with their types",
+        packages=("pyarrow",),
+        extra="evlcp-sdk[parquet]",
+    )
+    yield SinkRecord(
+        *("kml", "evlcp_formats.kml:Kml", ("fixes.kml",)),
+        summary="positions, bars and track for Google Earth",
+        positions=True,
+    )
+    yield SinkRecord(
+        *("navsat", "evlcp_formats.navsat:NavSat", ("navsat.mcap",)),
+        summary="positions as a bag of ROS 2",
+        positions=True,
+        packages=("mcap", "rosbags"),
+        extra="evlcp-sdk[ros]",
+    )
+    yield SinkRecord(
+        *("mcap", "evlcp_formats.foxglove:Mcap", ("fixes.mcap",)),
+        summary="positions for Foxglove",
+        positions=True,
+        packages=("mcap", "mcap_protobuf", "foxglove_schemas_protobuf"),
+        extra="evlcp-sdk[mcap]",
+    )

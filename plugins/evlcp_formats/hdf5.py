@@ -1,0 +1,182 @@
+"""HDF5 files, those of MATLAB 7.3 among them: columns in a group, records, or a table without names."""
+
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io.arrays import ArrayColumn, choose_columns, pieces_of
+from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, one_line
+from evlcp_sdk.io.fields import Fields, fields_of, unit_named
+from evlcp_sdk.io.urls import flag, split_options
+
+_PLACES: Final = ("events", "raw_events", "CD/events")
+_ECF: Final = 36559
+"""Number of the filter of Prophesee's codec, which no package with a permissive licence reads."""
+
+_MOST_CHUNK_BYTES: Final = 1 << 26
+"""Of what is unpacked at once; libraries choose a thousandth of it."""
+
+_MOST_RATIO: Final = 1100
+"""How much a byte of a file can hold: the limit of deflate is 1032."""
+
+
+def open_hdf5(url: str) -> ColumnSource:
+    """Open `hdf5:PATH`, with `?columns=txyp`, `unit=ms`, and `swapped=1` where x is the row.
+
+    Raises:
+        InputError: `h5py` is not installed, the file has no such layout, is damaged, or compressed by ECF, or
+            an option is wrong.
+    """
+    name, options = url, dict[str, Any]()
+    if url.startswith("hdf5:"):
+        name, options = split_options(url, {"columns": _order, "unit": unit_named, "swapped": flag})
+        name = name.removeprefix("hdf5:")
+
+    def opened(path: Path, stack: ExitStack) -> EventTable:
+        return _read(path, stack, options.get("columns"), options.get("swapped", False))
+
+    return ColumnSource(name, opened, unit=options.get("unit"))
+
+
+def _order(text: str) -> str:
+    if sorted(text) != sorted("txyp"):
+        raise ValueError("the letters t, x, y and p in the order of the table's columns, such as txyp")
+    return text
+
+
+def _read(path: Path, stack: ExitStack, order: str | None, swapped: bool) -> EventTable:
+    """Records or a group of columns by `h5py`, under one of `_PLACES`, or the only ones.
+
+    External storage, links to other files and virtual data sets are refused.
+    """
+    try:
+        import h5py
+    except ImportError as fault:
+        raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[hdf5]'") from fault
+    try:
+        file = stack.enter_context(h5py.File(path, "r"))
+        columns, found = _columns_of(path, file, order)
+        size = [file.attrs.get(name) for name in ("width", "height")]
+        width, height = (int(side) if side is not None else None for side in size)
+    except InputError:
+        raise
+    except Exception as fault:
+        # A damaged file makes h5py fail in any way.
+        raise InputError(f"{path}: found no HDF5 file, or a damaged one ({one_line(fault)})") from fault
+    if swapped:
+        columns[2:] = columns[:1:-1]
+    pieces = pieces_of(columns, path.stat().st_size)
+    return EventTable("HDF5", pieces, found.unit, size=(width, height), window_us=WINDOW_US)
+
+
+class _DataSet:
+    """A data set, upright where it lies on its side, as those of MATLAB do."""
+
+    def __init__(self, path: Path, dataset: Any) -> None:
+        _check(path, dataset)
+        self._path, self._dataset = path, dataset
+        self.dtype: np.dtype[Any] = dataset.dtype
+        shape = dataset.shape
+        self._on_its_side = len(shape) == 2 and shape[0] < shape[1]
+        shape = shape[::-1] if self._on_its_side else shape
+        self.shape = shape[:1] if shape[1:] == (1,) else shape
+
+    def __getitem__(self, rows: slice, /) -> NDArray[Any]:
+        """The values of some rows."""
+        try:
+            block = np.asarray(self._dataset[:, rows].T if self._on_its_side else self._dataset[rows])
+        except Exception as fault:
+            raise InputError(f"{self._path}: row {rows.start + 1}: damaged: {one_line(fault)}") from fault
+        return block.ravel() if len(self.shape) == 1 else block
+
+
+def _columns_of(path: Path, file: Any, order: str | None) -> tuple[list[ArrayColumn], Fields]:
+    """Time, polarity and, if there are any, x and y."""
+    import h5py
+
+    at, node = _place_of(path, file)
+    is_group = isinstance(node, h5py.Group)
+    names = [name for name in node if _is_own(node, name)] if is_group else list(node.dtype.names or ())
+    if order is not None and names:
+        raise InputError(
+            f"{path}: {at} has {', '.join(names)}: columns = {order!r} is for tables without names"
+        )
+    if (names or is_group) and fields_of(names) is None:
+        raise InputError(f"{path}: {at} has {', '.join(names) or 'no fields'}, expected x, y, p and t")
+    if is_group:
+        return choose_columns(path, names, lambda name: _DataSet(path, node[name]), None)
+    fields = None
+    if order is not None:
+        fields = Fields(order.index("t"), order.index("p"), (order.index("x"), order.index("y")))
+    return choose_columns(path, [at], lambda _: _DataSet(path, node), fields, "hdf5:PATH?columns=txyp")
+
+
+def _place_of(path: Path, file: Any) -> tuple[str, Any]:
+    """Where the columns are: in one of `_PLACES`, or at the top, as in files of MATLAB."""
+    import h5py
+
+    for place in _PLACES:
+        node = file
+        for part in place.split("/"):
+            inside = isinstance(node, h5py.Group) and part in node
+            if inside and not _is_own(node, part):
+                raise InputError(f"{path}: /{place} is a link, expected it in the file itself")
+            node = node[part] if inside else None
+        if node is not None:
+            return f"/{place}", node
+    own = [name for name in file if _is_own(file, name)]
+    if fields_of(own) is not None:
+        return "/", file
+    tables = [name for name in own if isinstance(file[name], h5py.Dataset)]
+    if len(tables) == 1:
+        return f"/{tables[0]}", file[tables[0]]
+    raise InputError(
+        f"{path}: found {', '.join(sorted(file)) or 'nothing'},"
+        f" expected /{' or /'.join(_PLACES)} with x, y, p and t"
+    )
+
+
+def _is_own(group: Any, name: str) -> bool:
+    """Whether it lies in the file itself, not behind a link to another."""
+    import h5py
+
+    return isinstance(group.get(name, getlink=True), h5py.HardLink)
+
+
+def _check(path: Path, dataset: Any) -> None:
+    """Refuse what is not in the file, or would take more room or time than a file of its size may.
+
+    Raises:
+        InputError: Which it is.
+    """
+    import h5py
+
+    is_column = (
+        isinstance(dataset, h5py.Dataset) and dataset.shape is not None and 1 <= len(dataset.shape) <= 2
+    )
+    if not is_column:
+        raise InputError(f"{path}: found {dataset.name}, expected a column of numbers")
+    if dataset.is_virtual or dataset.external:
+        raise InputError(f"{path}: {dataset.name} is stored in another file, expected it in this one")
+    plist = dataset.id.get_create_plist()
+    filters = [plist.get_filter(n)[0] for n in range(plist.get_nfilters())]
+    if _ECF in filters:
+        raise InputError(
+            f"{path}: {dataset.name} is compressed by ECF, Prophesee's own codec, which is not read here:"
+            " convert it to RAW by metavision_file_to_raw, or write it without compression"
+        )
+    width = dataset.dtype.itemsize
+    if dataset.chunks is not None and int(np.prod(dataset.chunks)) * width > _MOST_CHUNK_BYTES:
+        raise InputError(
+            f"{path}: {dataset.name} has chunks of {int(np.prod(dataset.chunks)) * width / 1e6:.0f} MB,"
+            f" expected at most {_MOST_CHUNK_BYTES / 1e6:.0f}: h5repack makes them smaller"
+        )
+    if int(np.prod(dataset.shape)) * width > _MOST_RATIO * path.stat().st_size:
+        raise InputError(
+            f"{path}: {dataset.name} is said to have {int(np.prod(dataset.shape))} values,"
+            f" more than {path.stat().st_size} bytes can hold"
+        )

@@ -1,0 +1,61 @@
+"""Files of MATLAB up to version 7: arrays by their names, or a table, those inside of structures too."""
+
+import math
+from collections.abc import Mapping
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.io.arrays import choose_columns, pieces_of, upright
+from evlcp_sdk.io.columns import ColumnSource, EventTable, one_line
+from evlcp_sdk.io.fields import Fields
+from evlcp_sdk.io.lists import open_list, read_list
+
+_VALUE_BYTES: Final = 8
+_MOST_BYTES: Final = 300_000_000
+
+
+def open_mat(url: str) -> ColumnSource:
+    """Open a file, or `list:PATH` with options."""
+    return open_list(url, _read) if url.startswith("list:") else read_list(url, _read)
+
+
+def _read(path: Path, _: ExitStack, fields: Fields | None) -> EventTable:
+    """The list of events in a file."""
+    arrays = _arrays(path)
+    columns, found = choose_columns(path, list(arrays), arrays.__getitem__, fields)
+    return EventTable("MAT", pieces_of(columns, path.stat().st_size), found.unit)
+
+
+def _arrays(path: Path) -> dict[str, NDArray[Any]]:
+    from scipy.io import loadmat, whosmat
+
+    try:
+        declared = sum(math.prod(map(int, shape)) for _, shape, _ in whosmat(path)) * _VALUE_BYTES
+        if declared > _MOST_BYTES:
+            raise InputError(
+                f"{path}: holds {declared / 1e6:.0f} MB, expected at most {_MOST_BYTES / 1e6:.0f},"
+                " as they are read at once: save them as HDF5 (-v7.3)"
+            )
+        found = loadmat(path, simplify_cells=True)
+    except InputError:
+        raise
+    except Exception as error:
+        # A damaged file makes SciPy fail in any way.
+        raise InputError(f"{path}: found no MAT file, expected one ({one_line(error)})") from error
+
+    arrays: dict[str, NDArray[Any]] = {}
+
+    def collect(inside: Mapping[str, Any]) -> None:
+        for name, value in inside.items():
+            if isinstance(value, Mapping):
+                collect(value)
+            elif not name.startswith("__") and isinstance(value, np.ndarray) and value.dtype.kind in "biufU":
+                arrays.setdefault(name, upright(value))
+
+    collect(found)
+    return arrays
