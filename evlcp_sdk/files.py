@@ -18,7 +18,7 @@ import re
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import TracebackType
@@ -461,13 +461,15 @@ def _words(name: str) -> list[str]:
 _MOST = 1e18
 """Size of the largest number of a CSV file: microseconds since 1970 are 1e15."""
 
+ANY_NUMBER = (-math.inf, math.inf)
+
 
 def csv_number(
     path: Path | str,
     line: int,
     name: str,
     text: str | None,
-    within: tuple[float, float] = (-math.inf, math.inf),
+    within: tuple[float, float] = ANY_NUMBER,
 ) -> float:
     """A number of a CSV file that was read.
 
@@ -485,6 +487,55 @@ def csv_number(
     if not low <= value <= high:
         raise ConfigError(f"{path}: line {line}: {name} = {text!r:.40}: expected {low:g} to {high:g}")
     return value
+
+
+def read_table(
+    path: Path | str,
+    needed: Mapping[str, tuple[float, float]],
+    optional: Mapping[str, tuple[float, float]],
+    rising: str = "",
+) -> tuple[list[int], dict[str, "NDArray[Any]"]]:
+    """The line of each row of a CSV file, and its columns of numbers, float64 (n,) each, n >= 1.
+
+    Args:
+        path: The file.
+        needed: Columns that it must have, and between what their numbers are.
+        optional: Those that it may have.
+        rising: The column whose numbers must rise from line to line, as times do.
+
+    Raises:
+        InputError: The file cannot be read, or is not CSV.
+        ConfigError: A column is missing, there is no row, or a number is none, out of range or does not rise.
+    """
+    import numpy as np
+
+    names, rows = read_csv(path)
+    check_columns(path, names, tuple(needed), tuple(optional))
+    if not rows:
+        raise ConfigError(f"{path}: expected one line of values or more")
+    table = {
+        name: np.array([csv_number(path, line, name, row[name], within) for line, row in rows])
+        for name, within in {**needed, **optional}.items()
+        if name in names
+    }
+    lines = [line for line, _ in rows]
+    if rising:
+        check_rising(path, lines, rising, table[rising])
+    return lines, table
+
+
+def check_rising(path: Path | str, lines: Sequence[int], name: str, values: "NDArray[Any]") -> None:
+    """Check that the numbers of a column rise from line to line.
+
+    Raises:
+        ConfigError: One does not.
+    """
+    for i in range(1, len(values)):
+        if values[i] <= values[i - 1]:
+            raise ConfigError(
+                f"{path}: line {lines[i]}: {name} = {values[i]:.16g}: expected more than the line before,"
+                f" {values[i - 1]:.16g}: rising {name}"
+            )
 
 
 def is_there(path: Path | str) -> bool:

@@ -15,8 +15,6 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-import numpy as np
-
 from evlcp_sdk.errors import ConfigError, InputError, PluginError, UnpluggedError
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
@@ -47,7 +45,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.calibration import Calibrated, CalibrationView
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.place.observations import BarView
-    from evlcp_sdk.place.points import SeenPoints
     from evlcp_sdk.place.poses import KnownPose
     from evlcp_sdk.place.survey import SurveyedBar
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
@@ -741,7 +738,6 @@ def _views(
 ) -> list[CalibrationView]:
     """What a recording shows at the times of known poses."""
     from evlcp_sdk.place.bar_registry import BarRegistry
-    from evlcp_sdk.place.observations import BarView
 
     who = BarRegistry(sites, link.position)
     seen, _ = _seen_at(url, poses, {"": link}, registry, who, source)
@@ -754,7 +750,7 @@ def _views(
             if number in stands_at:
                 site = stands_at[number]
                 enu = site.layout_positions_m(link.bar, axes)
-                bars.append(BarView.of(site.transmitter_id, enu, found, site.survey))
+                bars.append(replace(found, transmitter=site.transmitter_id, enu_m=enu, survey=site.survey))
         views.append(_view(pose, bars, axes))
     return views
 
@@ -778,7 +774,7 @@ def _seen_at(
     registry: Registry,
     who: BarRegistry,
     source: str,
-) -> tuple[list[dict[int, SeenPoints]], dict[int, str]]:
+) -> tuple[list[dict[int, BarView]], dict[int, str]]:
     """What `points_at` gives of each transmitter at the times of known poses; the link of each.
 
     Raises:
@@ -810,14 +806,14 @@ def _seen_at(
                     abs(one.points_t_us - pose.t_us) <= period_us for pose in poses
                 ):
                     kept.append(one)
-    found: list[dict[int, SeenPoints]] = []
+    found: list[dict[int, BarView]] = []
     for pose in poses:
         found.append({})
         for number, seen in frames.items():
             name = link_of[number]
             link = placing[name]
             errors = ErrorModel.of(link.position)
-            points = points_at(seen, pose.t_us, periods[name], link.bar.cluster_positions_m(), errors)
+            points = points_at(number, seen, pose.t_us, periods[name], link.bar.cluster_positions_m(), errors)
             if points is not None:
                 found[-1][number] = points
     times = [pose.t_us for pose in poses]
@@ -855,7 +851,6 @@ def survey(
     """
     from evlcp_sdk.place.bar_registry import BarRegistry
     from evlcp_sdk.place.error_model import ErrorModel
-    from evlcp_sdk.place.observations import BarView
     from evlcp_sdk.place.survey import survey as survey_bars
     from evlcp_sdk.scene.sites import LocalAxes
 
@@ -886,7 +881,7 @@ def survey(
                     raise ConfigError(
                         f"{url}: id {number} is sent by '{sends[number]}' and '{by}': give one link at a time"
                     )
-                bars.append(BarView.of(number, np.empty((0, 3)), found))
+                bars.append(replace(found, transmitter=number))
             views.append(_view(pose, bars, axes))
     long_m = {number: placing[by].bar.length_m for number, by in sends.items()}
     surveyed = survey_bars(views, axes, long_m, like.camera, like.camera_sigma, ErrorModel.of(like.position))
@@ -960,8 +955,8 @@ def _own_poses(
     with receive(url, links, registry=registry, attitude=attitude) as packets:
         for packet in packets:
             own.take(packet)
-            taken = navigator.positioner.stands_at | taken
-    poses, ids = own.close(), navigator.positioner.ids
+            taken = navigator.positioner.bars.stands_at | taken
+    poses, ids = own.close(), navigator.positioner.bars.ids
     wrong = [n for n, site in taken.items() if ids.get(n, site.transmitter_id) != site.transmitter_id]
     if not wrong:
         return poses, list(taken.values()), own.told

@@ -362,13 +362,13 @@ class PositionTally:
             "gnss_apart_m": None if navigator.apart_m is None else navigator.apart_m.round(3).tolist(),
             "frames_late": positioner.counts["frames_late"],
             "beacons_forged": positioner.counts["beacons_forged"],
-            "sites_contradicted": {str(n): how for n, how in positioner.contradicted.items()},
+            "sites_contradicted": {str(n): how for n, how in positioner.bars.contradicted.items()},
             "learnt": [_learnt_row(one) for one in navigator.estimated_biases()],
             "origin": asdict(axes) if axes is not None else None,
-            "bars_exact": [n for n, s in positioner.stands_at.items() if s.position_sigma_m is None],
-            "heard": {str(n): one for n, one in sorted(positioner.ids.items())},
-            "sites_unseen": [site.transmitter_id for site in positioner.unseen],
-            "bars": {str(n): s.transmitter_id for n, s in positioner.stands_at.items()},
+            "bars_exact": [n for n, s in positioner.bars.stands_at.items() if s.position_sigma_m is None],
+            "heard": {str(n): one for n, one in sorted(positioner.bars.ids.items())},
+            "sites_unseen": [site.transmitter_id for site in positioner.bars.unseen],
+            "bars": {str(n): s.transmitter_id for n, s in positioner.bars.stands_at.items()},
         }
 
 

@@ -4,14 +4,13 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import datetime
-from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import check_columns, csv_number, read_csv
+from evlcp_sdk.files import ANY_NUMBER, check_rising, read_table
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.nmea import read_nmea
 from evlcp_sdk.place.poses import PLACE
@@ -71,23 +70,15 @@ class GnssLog:
             return cls._of_nmea(path, clock_zero, usual_sigma_m)
         if Path(path).suffix.lower() == ".pos":
             raise ConfigError(f"{path}: a solution of RTKLIB: expected its NMEA (rnx2rtkp -n), or a CSV file")
-        names, rows = read_csv(path)
-        check_columns(path, names, ("t_us", *PLACE, *_SIGMAS), tuple(_CROSSED))
-        if not rows:
-            raise ConfigError(f"{path}: expected one line of values or more")
-        t_us, place = np.empty(len(rows)), np.empty((len(rows), 3))
-        spread = np.empty((len(rows), 3, 3))
-        for i, (line, row) in enumerate(rows):
-            value = partial(csv_number, path, line)
-            t_us[i] = value("t_us", row["t_us"])
-            _check_rising(path, line, t_us[: i + 1])
-            place[i] = [value(name, row[name], within) for name, within in PLACE.items()]
-            spread[i] = np.diag([value(name, row[name], _SIGMA_M) ** 2 for name in _SIGMAS])
-            for name, (a, b) in _CROSSED.items():
-                if name in names:
-                    spread[i, a, b] = spread[i, b, a] = value(name, row[name])
-            _check_covariance(f"{path}: line {line}", spread[i])
-        return cls(t_us, place, spread)
+        needed = {"t_us": ANY_NUMBER, **PLACE, **dict.fromkeys(_SIGMAS, _SIGMA_M)}
+        lines, table = read_table(path, needed, dict.fromkeys(_CROSSED, ANY_NUMBER), rising="t_us")
+        spread = np.eye(3) * np.stack([table[name] for name in _SIGMAS], 1)[:, None] ** 2
+        for name, (a, b) in _CROSSED.items():
+            if name in table:
+                spread[:, a, b] = spread[:, b, a] = table[name]
+        for line, one in zip(lines, spread, strict=True):
+            _check_covariance(f"{path}: line {line}", one)
+        return cls(table["t_us"], np.stack([table[name] for name in PLACE], 1), spread)
 
     @classmethod
     def _of_nmea(cls, path: Path | str, zero: datetime | None, usual_sigma_m: float) -> "GnssLog":
@@ -100,8 +91,7 @@ class GnssLog:
         if not found:
             raise ConfigError(f"{path}: expected a GGA with a fix or more")
         t_us = np.array([(fix.utc - zero).total_seconds() * 1e6 for fix in found])
-        for i, fix in enumerate(found):
-            _check_rising(path, fix.line, t_us[: i + 1])
+        check_rising(path, [fix.line for fix in found], "t_us", t_us)
         return cls(
             t_us, np.array([fix.place for fix in found]), np.array([fix.covariance_m2 for fix in found])
         )
@@ -130,15 +120,6 @@ def _check_covariance(where: str, spread: Floats) -> None:
     if not np.linalg.eigvalsh(spread / sigma / sigma[:, None])[0] > 3 * np.finfo(float).eps:
         said = ", ".join(f"{name} = {spread[at]:g}" for name, at in _CROSSED.items())
         raise ConfigError(f"{where}: {said}: expected a covariance, which these are not together")
-
-
-def _check_rising(path: Path | str, line: int, t_us: Floats) -> None:
-    """Whether the last of some times is later than the one before."""
-    if len(t_us) > 1 and not t_us[-1] > t_us[-2]:
-        raise ConfigError(
-            f"{path}: line {line}: t_us = {t_us[-1]:.16g}: expected more than the line before,"
-            f" {t_us[-2]:.16g}: rising t_us"
-        )
 
 
 def gnss_fix(

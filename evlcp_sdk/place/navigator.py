@@ -248,7 +248,7 @@ class Navigator:
 
     def estimated_biases(self) -> list[EstimatedBias]:
         """What the drive says so far of standing errors: of the camera, the attitude, the IMU, the sites."""
-        link, sites = self._link, self.positioner.stands_at
+        link, sites = self._link, self.positioner.bars.stands_at
         return estimate_biases(
             self._standing, link.camera, link.camera_sigma, self._attitude, sites, self._spec
         )
@@ -260,7 +260,7 @@ class Navigator:
             return {}
         return {
             number: axes.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
-            for number, site in self.positioner.stands_at.items()
+            for number, site in self.positioner.bars.stands_at.items()
         }
 
     def _placed(self, fix: Fix) -> Placed:

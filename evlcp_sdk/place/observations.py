@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.points import SeenPoints
 from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -59,28 +58,6 @@ class BarView:
     between: float = 1.0
     early_px: float = 0.0
     across: float = 1.0
-
-    @classmethod
-    def of(
-        cls,
-        transmitter: int,
-        enu_m: Floats,
-        seen: SeenPoints,
-        survey: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    ) -> "BarView":
-        """A bar by its points as they are seen."""
-        return cls(
-            transmitter,
-            enu_m,
-            seen.points_px,
-            seen.sigma_px,
-            survey,
-            seen.pixel_px,
-            seen.shift_px,
-            seen.between,
-            seen.early_px,
-            seen.across,
-        )
 
 
 def project_bars(
@@ -146,8 +123,7 @@ class Problem:
         bar_sigma: Of each bar: its survey, a root of the covariance of its image's shift, px, and what makes
             errors of points even in all directions, float64 (bars, 9): see `_sigmas_of`.
         transmitters: Number of each bar.
-        lens: Focal length, px, principal point, px, k1, k2, p1, p2, k3, float64 (8,).
-        lens_root: A lower root of the covariance of the first seven, float64 (7, 7).
+        lens_root: A lower root of the covariance of the camera's `CAMERA_PARAMETERS`, float64 (7, 7).
         level: The camera's axes as columns in ENU by the attitude, north where no heading is known, float64
             (3, 3).
         felt: Up in the camera's axes by that, float64 (3,).
@@ -166,7 +142,6 @@ class Problem:
     bar: NDArray[np.int64]
     bar_sigma: Floats
     transmitters: tuple[int, ...]
-    lens: Floats
     lens_root: Floats
     level: Floats
     felt: Floats
@@ -234,9 +209,6 @@ class Problem:
             bar=bar,
             bar_sigma=np.array(sigmas),
             transmitters=tuple(kept),
-            lens=np.array(
-                [camera.focal_px, *camera.centre_px, camera.k1, camera.k2, camera.p1, camera.p2, camera.k3]
-            ),
             lens_root=sigma.root(camera) if known else np.zeros((7, 7)),
             free=free,
             shaken_rad=shaken_rad,

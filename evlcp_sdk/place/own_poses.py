@@ -68,7 +68,7 @@ class OwnPoses:
     def told(self) -> str:
         """How many positions and new bars there were, in one line."""
         refused = "".join(f", {count} refused ({why})" for why, count in self._refused.most_common())
-        ids = self._navigator.positioner.ids
+        ids = self._navigator.positioner.bars.ids
         new = ", ".join(str(ids.get(number, "without an id")) for number in self._new()) or "none"
         return f"{counted(self._given, 'position')}{refused}; new bars: {new}"
 
@@ -103,7 +103,7 @@ class OwnPoses:
 
     def _new(self) -> list[int]:
         """Transmitters that stand at no known site."""
-        known = self._navigator.positioner.stands_at
+        known = self._navigator.positioner.bars.stands_at
         return [number for number in self._spans if number not in known]
 
     def _in_view(self, number: int, t_us: float) -> bool:

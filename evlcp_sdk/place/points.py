@@ -2,12 +2,12 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.values import Frame
 
 Floats = NDArray[np.float64]
@@ -43,29 +43,6 @@ _SAME = 1e-6
 """Share of a layout's extent below which its clusters are in a line, or in a plane."""
 
 
-class SeenPoints(NamedTuple):
-    """A bar's image points.
-
-    Attributes:
-        points_px: Column and row of each cluster, px, float64 (K, 2); NaN where it is not seen.
-        sigma_px: Their standard deviations along the bar, px, float64 (K,).
-        pixel_px: The part of these that stands: where in a pixel a point is, and in a moving image, when.
-        shift_px: What all share across the bar besides, px: where in a pixel its thin image is.
-        between: What is not known of how the image moved between frames, in that of an instant midway between
-            two of frames that follow one another evenly.
-        early_px: What all share in any direction besides, px: as the image moves, it is seen early or late.
-        across: Their standard deviations across the bar, in those along it.
-    """
-
-    points_px: Floats
-    sigma_px: Floats
-    pixel_px: float
-    shift_px: float = 0.0
-    between: float = 1.0
-    early_px: float = 0.0
-    across: float = 1.0
-
-
 def unseen_px(flank_px: float) -> float:
     """What the middle of a thin line is off, rms, as it does not show where in a pixel it is, px.
 
@@ -93,8 +70,13 @@ def _interpolation(t: Floats) -> Floats:
 
 
 def points_at(
-    frames: Sequence[Frame], t_us: float, period_us: float, layout_m: Floats, spec: ErrorModel
-) -> SeenPoints | None:
+    transmitter: int,
+    frames: Sequence[Frame],
+    t_us: float,
+    period_us: float,
+    layout_m: Floats,
+    spec: ErrorModel,
+) -> BarView | None:
     """A bar's image points at a time between its frames.
 
     The shape is a straight line in time through all frames within half a period, the place is interpolated
@@ -106,6 +88,7 @@ def points_at(
     as all points share it; so is by how much a moving image is seen early or late.
 
     Args:
+        transmitter: Its number.
         frames: With points, in order of time.
         t_us: Camera clock, us.
         period_us: Frames within half of it, before and after, count, us.
@@ -113,7 +96,7 @@ def points_at(
         spec: Least number of points, the error within pixels, and that in time.
 
     Returns:
-        The points; None where the bar is not seen before and after.
+        The points, of a bar that stands nowhere yet; None where it is not seen before and after.
     """
     near = [
         f
@@ -164,7 +147,17 @@ def points_at(
         off_px2, many = _off(found, layout_m)
         shown = math.sqrt((_PIXEL_WORTH * pixel_px**2 + _ALIKE * off_px2) / (_PIXEL_WORTH + many))
         across = max(math.hypot(max(aside * usual, shown), early_px) / along, _LEAST if many else 1.0)
-    return SeenPoints(found, sigma, pixel_px, shift_px, between, early_px, across)
+    return BarView(
+        transmitter,
+        np.empty((0, 3)),
+        found,
+        sigma,
+        pixel_px=pixel_px,
+        shift_px=shift_px,
+        between=between,
+        early_px=early_px,
+        across=across,
+    )
 
 
 def _off(points: Floats, layout_m: Floats) -> tuple[float, int]:

@@ -63,6 +63,10 @@ class Positioner:
         attitude_at: What is known of the camera's attitude at a time, us; None for nothing.
         spec: Bounds and weights; None for the defaults.
         camera_sigma: How precisely the camera is known; None: exactly.
+
+    Attributes:
+        axes: The local axes; None before anything is known of a place.
+        bars: Where the transmitters stand.
     """
 
     def __init__(
@@ -83,7 +87,7 @@ class Positioner:
         self._spec = ErrorModel() if spec is None else spec
         self._links: dict[int, str] = {}
         only = next(iter(self._kinds.values())).link if len(self._kinds) == 1 else ""
-        self._bars = BarRegistry(sites, self._spec, only)
+        self.bars = BarRegistry(sites, self._spec, only)
         self._frames: dict[int, list[Frame]] = {}
         self._next: int | None = None
         self._contradicts: tuple[list[BarView], Attitude | None] | None = None
@@ -92,27 +96,7 @@ class Positioner:
     @property
     def counts(self) -> dict[str, int]:
         """Fixes given and refused, frames that came too late for theirs, forged beacons."""
-        return self._counts | {"beacons_forged": self._bars.forged}
-
-    @property
-    def stands_at(self) -> dict[int, BarSite]:
-        """Where the transmitters stand of which that is known."""
-        return self._bars.stands_at
-
-    @property
-    def ids(self) -> dict[int, int]:
-        """Ids of the transmitters that said theirs."""
-        return self._bars.ids
-
-    @property
-    def unseen(self) -> tuple[BarSite, ...]:
-        """The sites that no transmitter was received of."""
-        return self._bars.unseen
-
-    @property
-    def contradicted(self) -> dict[int, str]:
-        """Transmitters that are left out as their beacons contradict their sites, and how."""
-        return self._bars.contradicted
+        return self._counts | {"beacons_forged": self.bars.forged}
 
     def fitting_focal_mm(self) -> float:
         """The focal length with which the first views that contradict one another fit, mm; NaN for none."""
@@ -127,7 +111,7 @@ class Positioner:
         for packet in packets:
             if packet.link not in self._kinds:
                 continue
-            self._bars.hear(packet)
+            self.bars.hear(packet)
             if packet.echo_of is None:
                 self._take(packet)
             else:
@@ -167,7 +151,7 @@ class Positioner:
         """A transmitter without a site, with what is known of it."""
         if said is None:
             return f"{number} (no id heard)"
-        other = self._bars.of_another_link(number)
+        other = self.bars.of_another_link(number)
         return f"{number} (id {said}" + (f", whose site is of link '{other}')" if other else ")")
 
     def _until(self, limit: float) -> list[Fix]:
@@ -194,11 +178,11 @@ class Positioner:
         here: LocalAxes | None = None
         for number, frames in sorted(self._frames.items()):
             kind = self._kinds[self._links[number]]
-            points = points_at(frames, t_us, kind.packet_us, kind.bar.cluster_positions_m(), self._spec)
-            if points is None:
+            view = points_at(number, frames, t_us, kind.packet_us, kind.bar.cluster_positions_m(), self._spec)
+            if view is None:
                 continue
             views.append(number)
-            site = self._bars.site(number)
+            site = self.bars.site(number)
             if site is None:
                 continue
             if self.axes is None:
@@ -210,16 +194,16 @@ class Positioner:
                 unplaced.append(str(fault))
                 continue
             here = LocalAxes.of([site]) if here is None else here
-            sited.append(BarView.of(number, enu, points, site.survey))
+            sited.append(replace(view, enu_m=enu, survey=site.survey))
         if not views:
             return None
         if here is None and unplaced:
             return Fix.refused(t_us, tuple(views), "no-facing", "; ".join(unplaced))
         if here is None or self.axes is None:
-            how = [text for number in views if (text := self._bars.contradiction(number))]
+            how = [text for number in views if (text := self.bars.contradiction(number))]
             if how:
                 return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
-            ids = self._bars.ids
+            ids = self.bars.ids
             which = ", ".join(self._named(n, ids.get(n)) for n in views)
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
         return self._solved(t_us, views, sited, here, self.axes)
@@ -237,7 +221,7 @@ class Positioner:
             refused = Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
             others = _alternatives(pose, here, axes)
             return replace(refused, alternatives=others, suspects=pose.suspects)
-        verified = all(self._bars.verified(n) for n in pose.transmitters)
+        verified = all(self.bars.verified(n) for n in pose.transmitters)
         attitude = Attitude.of_rotation(pose.rotation)
         latitude, longitude, height = (float(v) for v in here.to_geodetic(pose.enu_m))
         turn = axes.turn_from(here)

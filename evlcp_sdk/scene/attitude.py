@@ -10,11 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import check_columns, csv_number, read_csv
+from evlcp_sdk.files import ANY_NUMBER, read_table
 from evlcp_sdk.scene.swing import Swing
 
-_NEEDED = ("t_us", "pitch_deg", "roll_deg")
-_OPTIONAL = ("heading_deg", "gravity_sigma_deg", "heading_sigma_deg")
 _AXES = ("right", "down", "forward")
 _RATES = tuple(f"rate_{axis}_deg_s" for axis in _AXES)
 _FORCES = tuple(f"force_{axis}_m_s2" for axis in _AXES)
@@ -24,6 +22,14 @@ _GRAVITY_M_S2 = 9.80665
 
 _MOST_MEASURED = 1e5
 """Rate, degrees/s, or force, m/s2, of more than any sensor's."""
+
+_NEEDED = {"t_us": ANY_NUMBER, "pitch_deg": (-90.0, 90.0), "roll_deg": ANY_NUMBER}
+_OPTIONAL = {
+    "heading_deg": ANY_NUMBER,
+    **dict.fromkeys(("gravity_sigma_deg", "heading_sigma_deg"), (0.0, math.inf)),
+    **dict.fromkeys(_RATES + _FORCES, (-_MOST_MEASURED, _MOST_MEASURED)),
+}
+"""Columns, and between what their values are."""
 
 _GAP = 10.0
 """How many times as long as usual (the median) two lines lie apart where lines between them are lost: clocks
@@ -150,21 +156,16 @@ class AttitudeLog:
                 do, or by another measure.
         """
         usual = Attitude() if usual is None else usual
-        names, rows = read_csv(path)
-        lines = [line for line, _ in rows]
-        check_columns(path, names, _NEEDED, _OPTIONAL + _RATES + _FORCES)
+        _, table = read_table(path, _NEEDED, _OPTIONAL, rising="t_us")
         for axes in (_RATES, _FORCES):
-            absent = [name for name in axes if name not in names]
+            absent = [name for name in axes if name not in table]
             if 0 < len(absent) < len(axes):
                 raise ConfigError(f"{path}: line 1: no column {absent[0]} (columns: {', '.join(axes)})")
-        if _FORCES[0] in names and _RATES[0] not in names:
+        if _FORCES[0] in table and _RATES[0] not in table:
             raise ConfigError(f"{path}: line 1: no column {_RATES[0]}: forces need the rates, too")
-        table: dict[str, NDArray[np.float64]] = {}
-        for name in _NEEDED + _OPTIONAL + _RATES + _FORCES:
-            if name in names:
-                table[name] = np.array([csv_number(path, line, name, row[name]) for line, row in rows])
         t_us = table["t_us"]
-        _check_values(path, lines, table)
+        if len(t_us) < 2:
+            raise ConfigError(f"{path}: expected two lines or more with rising t_us")
         log = cls(
             t_us,
             table["pitch_deg"],
@@ -325,24 +326,3 @@ class AttitudeLog:
 def attitude_source(attitude: Attitude | AttitudeLog | None) -> Callable[[float], Attitude | None]:
     """The attitude at a time, us; None where nothing is known."""
     return attitude.at if isinstance(attitude, AttitudeLog) else lambda _t_us: attitude
-
-
-def _check_values(path: Path | str, lines: list[int], table: dict[str, NDArray[np.float64]]) -> None:
-    """Refuse times that do not rise, and values out of range."""
-    t_us = table["t_us"]
-    if len(t_us) < 2:
-        raise ConfigError(f"{path}: expected two lines or more with rising t_us")
-    if (np.diff(t_us) <= 0).any():
-        i = int(np.argmax(np.diff(t_us) <= 0)) + 1
-        raise ConfigError(
-            f"{path}: line {lines[i]}: t_us = {t_us[i]:.16g}: expected more than the line before,"
-            f" {t_us[i - 1]:.16g}: rising t_us"
-        )
-    most = dict.fromkeys(_RATES + _FORCES, _MOST_MEASURED) | {"pitch_deg": 90.0}
-    for name, values in table.items():
-        wrong, expected = np.abs(values) > most.get(name, math.inf), f"at most {most.get(name, math.inf):g}"
-        if name.endswith("_sigma_deg"):
-            wrong, expected = values < 0, "0 or more"
-        if wrong.any():
-            i = int(np.flatnonzero(wrong)[0])
-            raise ConfigError(f"{path}: line {lines[i]}: {name} = {values[i]:g}: expected {expected}")

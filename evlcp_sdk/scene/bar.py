@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import csv_number, read_csv
+from evlcp_sdk.files import read_table
 from evlcp_sdk.specs import SpecError, build, shown
 from evlcp_sdk.spelling import nearest
 
@@ -379,29 +379,17 @@ def read_leds(path: Path | str) -> list[list[float | int]]:
         InputError: The file cannot be read, or is not CSV.
         ConfigError: A column is missing, a value is not what it should be, or there are more than 65536 LEDs.
     """
-    columns, rows = read_csv(path)
-    for name in ("x_m", "y_m", "cluster"):
-        if name not in columns:
-            raise ConfigError(
-                f"{path}: line 1: no column {name}, expected x_m, y_m, cluster and, if needed, z_m"
-            )
-    if len(rows) > _MOST_LEDS:
-        raise ConfigError(f"{path}: line {rows[_MOST_LEDS][0]}: expected at most {_MOST_LEDS} LEDs")
-    if not rows:
-        raise ConfigError(f"{path}: line 2: expected an LED a line")
-    found: list[list[float | int]] = []
-    for line, row in rows:
-        place = [
-            csv_number(path, line, name, row[name], (-_MOST_M, _MOST_M)) if name in row else 0.0
-            for name in ("x_m", "y_m", "z_m")
-        ]
-        cluster = csv_number(path, line, "cluster", row["cluster"], (0, _MOST_LEDS - 1))
+    within = (-_MOST_M, _MOST_M)
+    needed = {"x_m": within, "y_m": within, "cluster": (0, _MOST_LEDS - 1)}
+    lines, table = read_table(path, needed, {"z_m": within})
+    if len(lines) > _MOST_LEDS:
+        raise ConfigError(f"{path}: line {lines[_MOST_LEDS]}: expected at most {_MOST_LEDS} LEDs")
+    for line, cluster in zip(lines, table["cluster"].tolist(), strict=True):
         if cluster != int(cluster):
-            raise ConfigError(
-                f"{path}: line {line}: cluster = {row['cluster']!r:.40}: expected a whole number"
-            )
-        found.append([*place, int(cluster)])
-    return found
+            raise ConfigError(f"{path}: line {line}: cluster = {cluster:g}: expected a whole number")
+    x, y, cluster = table["x_m"], table["y_m"], table["cluster"].astype(int)
+    z = table.get("z_m", np.zeros(len(x)))
+    return [list(row) for row in zip(x.tolist(), y.tolist(), z.tolist(), cluster.tolist(), strict=True)]
 
 
 def _expect_number(leds: int, said: str) -> None:

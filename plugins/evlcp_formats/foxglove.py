@@ -193,7 +193,7 @@ class Mcap(Sink):
 
         assert self.run.navigator is not None
         positioner = self.run.navigator.positioner
-        axes, bars = positioner.axes, dict(positioner.stands_at)
+        axes, bars = positioner.axes, dict(positioner.bars.stands_at)
         if axes is None or bars == self._bars:
             return
         message = SceneUpdate()

@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.points import SeenPoints, points_at, unseen_px
+from evlcp_sdk.place.observations import BarView
+from evlcp_sdk.place.points import points_at, unseen_px
 from evlcp_sdk.values import Frame, Range, SoftSymbols
 
 SPEC = ErrorModel(pixel_sigma_px=0.08)
@@ -49,7 +50,7 @@ def trials(
         pixel = np.einsum("ij,jkl->ikl", root, rng.normal(0, pixel_px, (9, 16, 2)))
         points = BAR_PX + course + pixel + rng.normal(0, white_px, (9, 16, 2))
         points[:, :, 0] += 60.0 * LEVER * rng.normal(0, lean, 9)[:, None]
-        found = points_at(frames(points, stated_px), 0.0, 36_000.0, LINE_M, SPEC)
+        found = points_at(7, frames(points, stated_px), 0.0, 36_000.0, LINE_M, SPEC)
         assert found is not None
         error = found[0] - BAR_PX
         errors.append(error - error.mean(0))
@@ -108,7 +109,7 @@ def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None
     errors, said = [], []
     for _ in range(300):
         points = BAR_PX + rng.normal(0, [across_px, 0.06], (9, 16, 2))
-        found = points_at(frames(points, 0.06), 0.0, 36_000.0, LINE_M, EXACT)
+        found = points_at(7, frames(points, 0.06), 0.0, 36_000.0, LINE_M, EXACT)
         assert found is not None
         error = found.points_px - BAR_PX
         errors.append((error - error.mean(0)).T)
@@ -119,13 +120,13 @@ def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None
     assert 1.0 < said_px2[1] / there[1] < 1.5
 
 
-def seen_as(layout_m: NDArray[np.float64], noise_px: float, seed: int) -> SeenPoints:
+def seen_as(layout_m: NDArray[np.float64], noise_px: float, seed: int) -> BarView:
     """A layout some 50 m ahead, turned and leaning, with errors that all frames share."""
     rng = np.random.default_rng(seed)
     turned = layout_m @ Rotation.from_euler("xyz", [25.0, 20.0, 10.0], degrees=True).as_matrix().T
     image = 640.0 + 7000.0 * turned[:, :2] / (50.0 + turned[:, 2:])
     points = image + rng.normal(0, noise_px, image.shape)
-    found = points_at(frames(np.repeat(points[None], 9, 0), 0.06), 0.0, 36_000.0, layout_m, EXACT)
+    found = points_at(7, frames(np.repeat(points[None], 9, 0), 0.06), 0.0, 36_000.0, layout_m, EXACT)
     assert found is not None
     return found
 
@@ -155,13 +156,13 @@ def test_too_few_clusters_show_nothing_of_their_errors() -> None:
     few = replace(EXACT, min_points=2)
     seen = [replace(frame, points_px=frame.points_px[:4], points_sigma_px=frame.points_sigma_px[:4])
             for frame in frames(np.repeat(BAR_PX[None], 9, 0), 0.1)]  # fmt: skip
-    found = points_at(seen, 0.0, 36_000.0, LINE_M[:4], few)
+    found = points_at(7, seen, 0.0, 36_000.0, LINE_M[:4], few)
     assert found is not None
     assert found.across == 1.0
 
 
 def test_points_without_an_error_are_not_exact_across() -> None:
-    found = points_at(frames(np.repeat(BAR_PX[None], 9, 0), 0.1), 0.0, 36_000.0, LINE_M, EXACT)
+    found = points_at(7, frames(np.repeat(BAR_PX[None], 9, 0), 0.1), 0.0, 36_000.0, LINE_M, EXACT)
     assert found is not None
     assert found.across == pytest.approx(0.1)
 
@@ -184,10 +185,10 @@ def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
 def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: float, most: float) -> None:
     points = BAR_PX + T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
     seen = [replace(frame, points_flank_px=0.6) for frame in frames(points, 0.1)]
-    found = points_at(seen, 0.0, 36_000.0, LINE_M, SPEC)
+    found = points_at(7, seen, 0.0, 36_000.0, LINE_M, SPEC)
     assert found is not None
     assert least - 1e-9 <= found.shift_px / unseen_px(0.6) <= most + 1e-9
-    unknown = points_at(frames(points, 0.1), 0.0, 36_000.0, LINE_M, SPEC)
+    unknown = points_at(7, frames(points, 0.1), 0.0, 36_000.0, LINE_M, SPEC)
     assert unknown is not None
     assert unknown.shift_px == 0.0
 
@@ -195,7 +196,7 @@ def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: fl
 def test_a_moving_image_is_seen_early_or_late_by_its_speed() -> None:
     for px_per_ms in (0.0, 2.0, 6.0):
         points = BAR_PX + T_US[:, None, None] / 1000.0 * np.array([0.6, -0.8]) * px_per_ms
-        found = points_at(frames(points, 0.1), 0.0, 36_000.0, LINE_M, replace(SPEC, early_sigma_us=15.0))
+        found = points_at(7, frames(points, 0.1), 0.0, 36_000.0, LINE_M, replace(SPEC, early_sigma_us=15.0))
         assert found is not None
         assert found.early_px == pytest.approx(0.015 * px_per_ms, abs=1e-12)
 
@@ -209,7 +210,7 @@ def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> Non
             replace(frame, points_t_us=t, points_px=at)
             for frame, t, at in zip(frames(points, 0.1), t_us.tolist(), points, strict=True)
         ]
-        found = points_at(seen, 0.0, 40_000.0, LINE_M, SPEC)
+        found = points_at(7, seen, 0.0, 40_000.0, LINE_M, SPEC)
         assert found is not None
         midway = 1e-16 * 0.5625 * 3600.0**4
         off = abs(found.points_px[:, 0].mean() - 300.0)

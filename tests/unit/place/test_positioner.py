@@ -241,7 +241,7 @@ def test_a_mirror_image_is_no_bar(known_from: int) -> None:
     assert_right(late)
     assert {f.transmitters for f in late} == {(0,)}
     assert [repr(f) for f in late] == [repr(f) for f in want[-len(late) :]]
-    assert set(both.stands_at) == {0}
+    assert set(both.bars.stands_at) == {0}
 
 
 def test_dark_clusters_and_a_gap_in_time() -> None:
@@ -350,13 +350,13 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
     )
     right = positioner([LEFT, RIGHT], gravity)
     assert_right(right.feed(stream) + right.close())
-    assert right.contradicted == {}
+    assert right.bars.contradicted == {}
     wrong = positioner(swapped, gravity)
     fixes = wrong.feed(stream) + wrong.close()
     assert {f.refusal for f in fixes} == {"site-contradicted"}
     assert "transmitter 0 says that it is 7.2 m from the site of its id" in fixes[0].detail
-    assert wrong.stands_at == {}
-    assert set(wrong.contradicted) == {0, 1}
+    assert wrong.bars.stands_at == {}
+    assert set(wrong.bars.contradicted) == {0, 1}
     # Whoever knows better than the beacons says so; nothing in the image could.
     alone = positioner(swapped, gravity, beacons="none")
     assert not any(f.refusal for f in alone.feed(stream) + alone.close())
