@@ -1,7 +1,7 @@
 """Where a bar is in the camera's axes, by one frame: for whoever needs no place on earth."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +12,6 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.values import Frame
 
 Floats = NDArray[np.float64]
-
-_STEPS = (1.0, 0.1, 0.1, 1e-4, 1e-4, 1e-6, 1e-6)
-"""Changes of the camera's parameters that slopes are taken over; the focal length in px."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,36 +63,15 @@ def bar_point(
             math.hypot(spec.shared_along_px, grown),
         ),
     )
-    across = depth * np.linalg.inv(camera.distort_slope(sight)) * shift
+    inverse = depth * np.linalg.inv(camera.distort_slope(sight))
     standing = np.zeros((3, 8))
     if sigma is not None and sigma.known:
-        standing[:, :7] = _slopes(frame, depth, camera) @ sigma.root(camera)
+        standing[:2, :7] = -inverse @ camera.parameter_slope(sight)
+        # A bar of so many pixels is the farther, the longer the lens.
+        standing[:, 0] += along * depth / camera.focal_px
+        standing[:, :7] = standing[:, :7] @ sigma.root(camera)
     standing[:, 7] = along * depth * spec.stretch_share
     new = np.zeros((3, 3))
     new[:, 0] = along * frame.range.sigma_m
-    new[:2, 1:] = across
+    new[:2, 1:] = inverse * shift
     return BarPoint(along * depth, new @ new.T + standing @ standing.T, standing)
-
-
-def _slopes(frame: Frame, depth_m: float, camera: CameraModel) -> Floats:
-    """How the point moves by each parameter of the camera, its focal length in px: float64 (3, 7)."""
-    pixel, f = np.array([frame.x_px, frame.y_px]), camera.focal_px
-
-    def point(parameters: Floats) -> Floats:
-        focal, x, y, k1, k2, p1, p2 = parameters.tolist()
-        changed = replace(
-            camera,
-            focal_mm=camera.focal_mm * focal / f,
-            centre_x_px=x,
-            centre_y_px=y,
-            k1=k1,
-            k2=k2,
-            p1=p1,
-            p2=p2,
-        )
-        # A bar of so many pixels is the farther, the longer the lens.
-        return np.asarray(np.append(changed.undistort(pixel), 1.0) * depth_m * focal / f)
-
-    here = np.array([f, *camera.centre_px, camera.k1, camera.k2, camera.p1, camera.p2])
-    steps = np.diag(_STEPS)
-    return np.stack([(point(here + s) - point(here - s)) / (2 * s.sum()) for s in steps], 1)

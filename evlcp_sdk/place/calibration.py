@@ -288,28 +288,18 @@ def _turned(offset_m: Floats, points_px: Floats, camera: CameraModel) -> Floats:
     return np.asarray(left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right)
 
 
-def _slopes(camera: CameraModel, direction: Floats, points_px: Floats, names: Sequence[str]) -> Floats:
-    """Derivatives of image points by the camera's parameters, float64 (n, 2, len(names))."""
-    u, v = direction.T
-    r2, f, zero, one = u * u + v * v, camera.focal_px, np.zeros(len(u)), np.ones(len(u))
-    away = (points_px - camera.centre_px) / camera.focal_mm
-    by: dict[str, tuple[Floats, Floats]] = {
-        "focal_mm": (away[:, 0], away[:, 1]),
-        "centre_x_px": (one, zero),
-        "centre_y_px": (zero, one),
-        "k1": (f * u * r2, f * v * r2),
-        "k2": (f * u * r2**2, f * v * r2**2),
-        "p1": (f * 2 * u * v, f * (r2 + 2 * v * v)),
-        "p2": (f * (r2 + 2 * u * u), f * 2 * u * v),
-    }
-    return np.stack([np.stack(by[name], -1) for name in names], -1)
+def _slopes(camera: CameraModel, direction: Floats) -> Floats:
+    """Derivatives of image points by the camera's parameters, its focal length in mm, float64 (n, 2, 7)."""
+    slope = camera.parameter_slope(direction)
+    slope[:, :, 0] *= camera.focal_px / camera.focal_mm
+    return slope
 
 
 def _at_corner(camera: CameraModel, name: str) -> float:
     """How far the image's farthest corner moves by a parameter's unit, px."""
     corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     direction = (corners - camera.centre_px) / camera.focal_px
-    moved = _slopes(camera, direction, corners, [name])[:, :, 0]
+    moved = _slopes(camera, direction)[:, :, PARAMETERS.index(name)]
     return float(np.linalg.norm(moved, axis=1).max())
 
 
@@ -420,7 +410,7 @@ class _Model:
             place[mine] += x[column + 7] * view.bend_px[mine]
         seen = (stands - position) @ rotation
         block = np.zeros((len(place), 2, len(x)))
-        block[:, :, : len(PARAMETERS)] = _slopes(now, seen[:, :2] / seen[:, 2:], place, PARAMETERS)
+        block[:, :, : len(PARAMETERS)] = _slopes(now, seen[:, :2] / seen[:, 2:])
         block[:, :, at : at + 3] = slope[:, :, :3]
         block[:, :, at + 3 : at + 6] = slope[:, :, 3:] @ _turn_slope(turn)
         if self.common is not None:

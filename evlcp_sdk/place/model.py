@@ -112,7 +112,7 @@ def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
     by_focal = (expected - camera.centre_px) * (FOCAL_UNIT * problem.camera.focal_px / camera.focal_px)
     rows[:, :, FAULT] = _by(by_focal, white)
     if problem.free[LENS:].any():
-        rows[:, :, LENS:SHARED] = white @ (_by_lens(camera, direction, expected) @ problem.lens_root)
+        rows[:, :, LENS:SHARED] = white @ (camera.parameter_slope(direction) @ problem.lens_root)
     local = np.concatenate(
         [
             white @ known.root,
@@ -183,20 +183,6 @@ def _by_point(slope: Floats, direction: Floats, ahead: Floats, rotation: Floats)
     """What a move of a point does to its image, by what its direction does, float64 (n, 2, 3), in ENU."""
     by = slope / ahead[:, None, None]
     return np.concatenate([by, -by @ direction[:, :, None]], -1) @ rotation.T
-
-
-def _by_lens(camera: CameraModel, direction: Floats, expected: Floats) -> Floats:
-    """What the camera's seven parameters do to points, px, float64 (n, 2, 7)."""
-    u, v, f = direction[:, 0], direction[:, 1], camera.focal_px
-    r2 = u * u + v * v
-    out = np.zeros((len(u), 2, 7))
-    out[:, :, 0] = (expected - camera.centre_px) / f
-    out[:, 0, 1] = out[:, 1, 2] = 1.0
-    out[:, :, 3] = f * direction * r2[:, None]
-    out[:, :, 4] = out[:, :, 3] * r2[:, None]
-    out[:, 0, 5] = out[:, 1, 6] = 2 * f * u * v
-    out[:, 1, 5], out[:, 0, 6] = f * (r2 + 2 * v * v), f * (r2 + 2 * u * u)
-    return out
 
 
 def _attitude(problem: Problem, rotation: Floats, unknowns: int) -> tuple[Floats, Floats]:

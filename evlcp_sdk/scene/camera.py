@@ -109,6 +109,19 @@ class CameraModel:
         turned[..., 2] = -direction / z[..., None]
         return self.distort_slope(direction) @ turned
 
+    def parameter_slope(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Derivatives of `distort` by `CAMERA_PARAMETERS`, the focal length in px: float64 (..., 2, 7)."""
+        u, v, f = direction[..., 0], direction[..., 1], self.focal_px
+        r2 = u * u + v * v
+        slope = np.zeros((*direction.shape, len(CAMERA_PARAMETERS)))
+        slope[..., 0] = (self.distort(direction) - self.centre_px) / f
+        slope[..., 0, 1] = slope[..., 1, 2] = 1.0
+        slope[..., 3] = f * direction * r2[..., None]
+        slope[..., 4] = slope[..., 3] * r2[..., None]
+        slope[..., 0, 5] = slope[..., 1, 6] = 2 * f * u * v
+        slope[..., 1, 5], slope[..., 0, 6] = f * (r2 + 2 * v * v), f * (r2 + 2 * u * u)
+        return slope
+
     def undistort(self, points_px: NDArray[np.float64]) -> NDArray[np.float64]:
         """Directions (x / z, y / z) that are seen at (column, row), px: the inverse of `distort`.
 

@@ -14,7 +14,6 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.place.calibration import (
     PARAMETERS,
     CalibrationView,
-    _slopes,
     _turn_slope,
     calibrate,
 )
@@ -164,19 +163,6 @@ def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
         ConfigError, match=r"centre_y_px = [\d.-]+ would fit the views, 360 is configured and 26 "
     ):
         calibrate([dataclasses.replace(view, rotation=level) for view in seen], camera)
-
-
-def test_slopes_are_the_numerical_ones() -> None:
-    rng = np.random.default_rng(1)
-    direction = rng.uniform(-0.5, 0.5, (5, 2))
-    values = np.array([getattr(TRUE, name) for name in PARAMETERS])
-
-    def image(x: NDArray[np.float64]) -> NDArray[np.float64]:
-        camera = dataclasses.replace(TRUE, **dict(zip(PARAMETERS, x.tolist(), strict=True)))
-        return camera.distort(direction).ravel()
-
-    found = _slopes(TRUE, direction, TRUE.distort(direction), PARAMETERS).reshape(10, -1)
-    np.testing.assert_allclose(found, approx_fprime(values, image, 1e-6), rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("turn", [np.array([0.2, -0.3, 0.1]), np.full(3, 1e-9)])

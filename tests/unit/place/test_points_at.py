@@ -52,10 +52,10 @@ def trials(
         points[:, :, 0] += 60.0 * LEVER * rng.normal(0, lean, 9)[:, None]
         found = points_at(7, frames(points, stated_px), 0.0, 36_000.0, LINE_M, SPEC)
         assert found is not None
-        error = found[0] - BAR_PX
+        error = found.points_px - BAR_PX
         errors.append(error - error.mean(0))
-        sigmas.append(found[1])
-        pixels.append(found[2])
+        sigmas.append(found.sigma_px)
+        pixels.append(found.pixel_px)
         across.append(found.across)
     return np.array(errors), np.array(sigmas), np.array(pixels), np.array(across)
 

@@ -1,12 +1,15 @@
 """The camera model against closed forms and numerical inverses."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from numpy.typing import NDArray
 from scipy.optimize import approx_fprime, root
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.scene.camera import CameraModel, CameraSigma
+from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
 BENT = CameraModel(
     focal_mm=4.0, centre_x_px=650.5, centre_y_px=340.25, k1=-0.21, k2=0.06, p1=1.1e-3, p2=-7e-4, k3=-0.004
@@ -82,6 +85,15 @@ def test_slopes_are_the_numerical_ones(x: float, y: float, z: float) -> None:
     np.testing.assert_allclose(
         BENT.distort_slope(direction), approx_fprime(direction, BENT.distort, 1e-7), atol=2e-3
     )
+
+    def image(values: NDArray[np.float64]) -> NDArray[np.float64]:
+        other = dict(zip(CAMERA_PARAMETERS, values.tolist(), strict=True))
+        other["focal_mm"] *= BENT.pitch_um / 1e3
+        return dataclasses.replace(BENT, **other).distort(direction)
+
+    here = np.array([BENT.focal_px, *(getattr(BENT, name) for name in CAMERA_PARAMETERS[1:])])
+    slope = approx_fprime(here, image, 1e-6)
+    np.testing.assert_allclose(BENT.parameter_slope(direction), slope, rtol=1e-4, atol=1e-3)
 
 
 def test_sigmas_and_correlations_make_the_covariance() -> None:
