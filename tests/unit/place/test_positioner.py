@@ -415,7 +415,10 @@ def test_an_attitude_file(tmp_path: Path) -> None:
         ("t_us,pitch_deg,roll_deg\n0,1,2\n0,1,2\n", r"line 3: t_us = 0: expected more than .* rising t_us"),
         ("t_us,pitch_deg,roll_deg\n0,1,2\n\n5,1,2\n3,1,2\n", r"line 5: t_us = 3: expected more than .* 5"),
         ("t_us,pitch_deg,roll_deg\n\n0,1,2\n1,x,2\n", r"line 4: pitch_deg = 'x': expected a number"),
-        ("t_us,pitch_deg,roll_deg,gravity_sigma_deg\n0,1,2,1\n1,1,2,-1\n", r"line 3: gravity_sigma_deg = -1"),
+        (
+            "t_us,pitch_deg,roll_deg,gravity_sigma_deg\n0,1,2,1\n1,1,2,-1\n",
+            r"line 3: gravity_sigma_deg = '-1'",
+        ),
         ("t_us,pitch_deg,roll_deg\n0,1\n1,1,2\n", r"line 2: 2 fields, expected 3, as line 1 has"),
     ],
 )

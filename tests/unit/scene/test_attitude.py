@@ -122,8 +122,6 @@ IMU += "force_right_m_s2,force_down_m_s2,force_forward_m_s2"
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("t_us,pitch_deg,roll_deg\n0,0,0\n1000,0,0,7\n", "line 3: 4 fields, expected 3, as line 1 has"),
-        ("t_us,pitch_deg,roll_deg\n0,0\n1000,0,0\n", "line 2: 2 fields, expected 3, as line 1 has"),
         ("t_us,pitch_deg,roll_deg\n0,0,0\n1000,95,0\n", "line 3: pitch_deg = '95': expected -90 to 90"),
         (
             f"{IMU}\n0,0,0,0,0,0,0,9.8,0\n9,0,0,0,0,0,0,9.8,0\n",
