@@ -57,23 +57,18 @@ def column(clusters: int, leds: int) -> Settings:
 
 PANEL = {"rows": 16, "columns": 16, "led_pitch_m": 0.02, "cluster_rows": 4, "cluster_columns": 4}
 LAMP = {"bar.rows": 6, "bar.columns": 1, "bar.cluster_rows": 6, "bar.cluster_columns": 1}
-TWO_COLUMNS = {"rows": 24, "columns": 2, "led_pitch_m": 0.04, "cluster_rows": 3}
 
 LINKS: dict[str, Settings] = {
-    "5 kchip/s": {"air.chip_rate_hz": 5000.0},
     "20 kchip/s": {"air.chip_rate_hz": 20_000.0},
-    "4 clusters": column(4, 6),
     "32 clusters": column(32, 3),
     "a panel": {f"bar.{key}": value for key, value in PANEL.items()},
-    "two columns": {f"bar.{key}": value for key, value in TWO_COLUMNS.items()},
-    "barker13": {"pilots.id": "barker13"},
-    "few pilots": {"air.pilot_every": 4, "air.frames_per_packet": 20},
-    "a stranger's modulation": {"modulation.id": "four"},
+    "few pilots of barker13": {"pilots.id": "barker13", "air.pilot_every": 4, "air.frames_per_packet": 20},
+    "a stranger's modulation of 4 clusters": {**column(4, 6), "modulation.id": "four"},
     "no pair code": {"modulation.id": "nrz"},
     "a quarter of the light": {"modulation.id": "wh4x2-dimmed", "pilots.id": "wh-dimmed"},
     "characters": {**LAMP, "framing.id": "uart", "framing.parity": "even"},
 }
-DURATIONS_S = {"5 kchip/s": 0.12, "20 kchip/s": 0.06, "a panel": 0.07, "a quarter of the light": 0.13}
+DURATIONS_S = {"20 kchip/s": 0.06, "a panel": 0.07, "a quarter of the light": 0.13}
 DISTANCE_M, DURATION_S, SEED = 40.0, 0.09, 2
 
 

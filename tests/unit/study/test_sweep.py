@@ -23,7 +23,7 @@ Evlcp = Callable[..., Any]
 CAMPAIGN = """
 [campaign]
 name = "short"
-seeds = 2
+seeds = 1
 
 [scene]
 base = "drive-30kmh"
@@ -49,15 +49,15 @@ def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) ->
     results = tmp_path / "r.sqlite"
     dry = evlcp("sweep", campaign, "-o", results, "--dry-run")
     assert dry.code == 0
-    assert "short: 0 of 8 tasks" in dry.out
+    assert "short: 0 of 4 tasks" in dry.out
     assert not results.exists()
     done = evlcp("sweep", campaign, "-o", results, "--workers", "2")
     assert (done.code, done.err) == (0, "")
-    assert "short: 8 of 8 tasks, 4 of 4 points" in done.out
+    assert "short: 4 of 4 tasks, 4 of 4 points" in done.out
     with Store(results) as store:
         found = store.results()
     plan = plan_of(campaign)
-    for outcome in Inline().run(run_job, plan.jobs[:2]):
+    for outcome in Inline().run(run_job, plan.jobs[:1]):
         assert outcome.value is not None
         for task, statistics in outcome.value:
             assert found[task] == statistics, "another process found something else"
@@ -68,7 +68,7 @@ def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) ->
         assert statistics.unmatched == 0
     again = evlcp("sweep", campaign, "-o", results, "--json")
     table = json.loads(again.out)
-    assert (table["done"], table["tasks"], table["failed"]) == (8, 8, 0)
+    assert (table["done"], table["tasks"], table["failed"]) == (4, 4, 0)
 
     shown = evlcp("report", results)
     assert shown.code == 0
@@ -177,7 +177,7 @@ def test_a_road_is_swept_in_steps_by_the_default_link_and_the_papers() -> None:
 
 
 def test_the_demo(evlcp: Evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    short = demo_campaign().read_text().replace("seeds = 5", "seeds = 1").replace("s = 0.3", "s = 0.1")
+    short = demo_campaign().read_text().replace("seeds = 5", "seeds = 1").replace("s = 0.3", "s = 0.07")
     (tmp_path / "short.toml").write_text(short)
     monkeypatch.setattr("evlcp_sdk.cli.demo.demo_campaign", lambda: tmp_path / "short.toml")
     done = evlcp("demo", "-o", tmp_path / "out")
