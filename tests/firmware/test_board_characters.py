@@ -16,7 +16,6 @@ from firmware_host import build
 from firmware_host.board.bank import bank_of, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
-from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.client import Timing
@@ -74,27 +73,14 @@ def packet_of(kind: str) -> tuple[Link, NDArray[np.int64], NDArray[np.uint8]]:
     return link, np.array([[byte] for byte in text]), np.repeat(np.array(chips, np.uint8)[:, None], 6, axis=1)
 
 
-def on_the_host(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.uint8]:
+def on_the_host(link: Link, symbols: NDArray[np.int64]) -> NDArray[np.uint8]:
     device = SimulatedBoard()
     provision(board_on(SimulatedLine(device)), bank_of(symbols[None], link), Settings())
     device.run(100_000)
     return device.records().played().chips(None)
 
 
-def in_qemu(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.uint8]:
-    from firmware_host.emulators.processes import start_qemu
-
-    with Session(start_qemu(folder / "leds.bin")) as session:
-        board = Board(session)
-        provision(board, bank_of(symbols[None], link), Settings())
-        while board.status().chips_sent < 300:
-            pass
-        board.stop()
-        board.wait_dark()
-    return LedRecord.read(folder / "leds.bin").played().chips(None)
-
-
-def on_the_model(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArray[np.uint8]:
+def on_the_model(link: Link, symbols: NDArray[np.int64]) -> NDArray[np.uint8]:
     """The image as it is flashed; rows as they are latched, from START on."""
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     from tests.models.stm32 import ModelLine, Stm32
@@ -111,18 +97,16 @@ def on_the_model(link: Link, symbols: NDArray[np.int64], folder: Path) -> NDArra
     return np.array([[int(bit) for bit in f"{row:096b}"] for row in rows[1:]], np.uint8)
 
 
-BOARDS = {"native": on_the_host, "qemu": in_qemu, "stm32": on_the_model}
+BOARDS = {"native": on_the_host, "stm32": on_the_model}
 
 
 @pytest.mark.parametrize("kind", ["7E2", "8O1, turned", "4-PPM"])
 @pytest.mark.parametrize("board", BOARDS)
-def test_every_board_plays_the_chips_of_the_link(
-    board: str, kind: str, needs: Callable[..., None], tmp_path: Path
-) -> None:
+def test_every_board_plays_the_chips_of_the_link(board: str, kind: str, needs: Callable[..., None]) -> None:
     if board != "native":
-        needs("cc", "make", "arm-none-eabi-gcc", *(["qemu-system-arm"] if board == "qemu" else []))
+        needs("cc", "make", "arm-none-eabi-gcc")
     link, symbols, told = packet_of(kind)
-    rows = BOARDS[board](link, symbols, tmp_path)
+    rows = BOARDS[board](link, symbols)
     leds = told.shape[1]
     assert len(rows) > len(told), "more than a packet"
     assert not rows[:, leds:].any()

@@ -4,7 +4,6 @@ import contextlib
 import json
 import os
 import pty
-import random
 import resource
 import signal
 import socket
@@ -17,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import Native, check_order, packet_sequence
+from board_lines import Native
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import OutputError
@@ -316,38 +315,6 @@ def test_ports_are_asked(native: str, tmp_path: Path) -> None:
     second.end()
     os.close(silent)
     os.close(other)
-
-
-def test_host_processes_killed(native: str, tmp_path: Path, book: Codebook, evlcp) -> None:
-    payloads = {"0": random_symbols(2, 10, book, np.random.default_rng(0))}
-    assert evlcp("board", "program", "--random", 2, "--seed", 0, "--port", native).code == 0
-    draw = random.Random(5)
-    killed, whole_s = 0, 0.0
-    for n in range(1, 10):
-        payloads[str(n)] = random_symbols(100, 10, book, np.random.default_rng(n))
-        command = [*EVLCP, "board", "program", "--random", "100", "--seed", str(n), "--port", native]
-        begin_s = time.monotonic()
-        process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        if n == 1:
-            # One may end, and says how long that takes here.
-            assert process.wait() == 0
-            whole_s = time.monotonic() - begin_s
-            continue
-        time.sleep(draw.uniform(0.4, 1.0) * whole_s)
-        process.kill()
-        if process.wait() == -signal.SIGKILL:
-            killed += 1
-        else:
-            # It was done: the machine has become quicker.
-            whole_s *= 0.7
-    assert killed
-    last = evlcp("board", "program", "--random", 2, "--seed", 0, "--port", native)
-    assert last.code == 0, last.err
-    evlcp("board", "stop", "--port", native)
-    played = LedRecord.read(tmp_path / "leds.bin").played()
-    assert (np.diff(played.ticks) == 1000).all()
-    sequence = packet_sequence(played, payloads, book)
-    assert check_order(sequence, {n: len(s) for n, s in payloads.items()})[0] == "0"
 
 
 def test_board_that_hangs_up_is_told(tmp_path: Path) -> None:

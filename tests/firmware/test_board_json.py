@@ -1,8 +1,6 @@
 """`--json` of every command, faults too; inventories for more than programming; a monitor that reconnects."""
 
 import json
-import signal
-import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,15 +8,13 @@ from typing import Any
 import pytest
 import typer
 from board_lines import Native
-from test_board_cli import EVLCP
 
 from firmware_host.board.board import Board
 from firmware_host.board.monitor import Back, Gone, watch
 from firmware_host.board.session import Session
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import LineError, NoBoardError
-from firmware_host.ports.transport import SocketTransport
-from firmware_host.protocol.generated.requests import State, StatusReply
+from firmware_host.protocol.generated.requests import StatusReply
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -245,29 +241,3 @@ def test_a_monitor_finds_its_board_again() -> None:
     assert opens == 4
     with pytest.raises(NoBoardError):
         list(watch(lambda: (_ for _ in ()).throw(NoBoardError("off")), 0.01, count=1))  # type: ignore[arg-type]
-
-
-def test_monitor_survives_a_board_that_restarts(tmp_path: Path) -> None:
-    port = f"unix:{tmp_path / 'b'}"
-    emulated = Native(port)
-    command = [*EVLCP, "board", "monitor", "--interval", "0.05", "--json", "--port", port]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stderr is not None
-    assert json.loads(process.stdout.readline())["state"] == "dark"
-    emulated.end()
-    lines = iter(process.stdout.readline, "")
-    gone = next(row for row in map(json.loads, lines) if "error" in row)
-    assert gone["error"]["exit_code"] in (4, 6)
-    emulated = Native(port)
-    back = next(row for row in map(json.loads, lines) if "back_after_s" in row)
-    assert back["back_after_s"] > 0.0
-    assert json.loads(next(lines))["state"] == "dark"
-    process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 0
-    assert "it is looked for" in process.stderr.read()
-    process.stdout.close()
-    process.stderr.close()
-    with Session(SocketTransport.connect(port)) as session:
-        assert Board(session).status().state == State.DARK
-    emulated.end()

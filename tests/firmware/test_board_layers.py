@@ -1,10 +1,10 @@
 """The layers of the transmitter's host tool, read from the imports."""
 
-import ast
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+from tests.unit.test_layers import imports_of
 
 ROOT = Path(__file__).parents[2]
 HOST = ROOT / "firmware_host"
@@ -30,19 +30,6 @@ def layer_of(module: str) -> int:
         if first in names.split():
             return level
     raise AssertionError(f"firmware_host.{module}: put it in a layer")
-
-
-def imports_of(path: Path) -> Iterator[str]:
-    """Every module that a file imports, also inside functions and for typing alone."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{path}: relative import"
-            for alias in node.names:
-                inner = ROOT / f"{node.module}.{alias.name}".replace(".", "/")
-                whole = inner.is_dir() or inner.with_suffix(".py").exists()
-                yield f"{node.module}.{alias.name}" if whole else str(node.module)
 
 
 def own_imports(module: str) -> set[str]:

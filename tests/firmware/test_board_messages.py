@@ -279,36 +279,3 @@ def test_a_board_plays_it(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
     found = messages_of(symbols_of(np.load(chips), link), link)
     assert found[Kind.TEXT].text == "Tempo 30 " * 20
     assert Beacon.unpack(found[Kind.BEACON].payload).height_m == 52.4
-
-
-@pytest.mark.usefixtures("compiler")
-def test_a_board_is_programmed_with_the_files_own_link(evlcp: Evlcp, tmp_path: Path) -> None:
-    port, leds, chips = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "c.npy"
-    settings = (
-        "modulation.id=wh8",
-        "air.chip_rate_hz=5000.0",
-        "air.frames_per_packet=12",
-        "air.pilot_every=3",
-    )
-    options = [part for setting in settings for part in ("--set", setting)]
-    for text in ("one", "two"):
-        assert evlcp("tx", "message", "--text", text, "-o", tmp_path / f"{text}.json", *options).code == 0
-    emulated = Native(port, leds=leds)
-    board = ("board", "--port", port)
-    assert evlcp(*board, "program", tmp_path / "one.json").code == 0
-    status = json.loads(evlcp(*board, "status", "--json").out)
-    assert (status["profile"], status["chip_rate_hz"]) == ("wh8", 5000)
-    assert (status["frames"], status["pilot_every"]) == (12, 3)
-    assert evlcp(*board, "verify", tmp_path / "one.json", *options).code == 0
-    assert evlcp(*board, "verify", tmp_path / "two.json").code == 7
-    assert evlcp(*board, "send", tmp_path / "two.json").code == 0
-    time.sleep(0.5)
-    assert evlcp(*board, "stop").code == 0
-    emulated.end()
-    assert evlcp("board", "leds", leds, "--chips", chips).code == 0
-    link = load_link(overrides=settings)
-    packets = symbols_of(np.load(chips), link)
-    texts = [messages_of(packet[None], link)[Kind.TEXT].text for packet in packets]
-    assert texts[0] == "one"
-    assert texts[-1] == "two"
-    assert texts == sorted(texts)

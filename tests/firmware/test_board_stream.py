@@ -133,7 +133,7 @@ def board_of_status(stream: Stream) -> object:
     return stream._session.call(StatusRequest())
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_noisy_line_loses_and_doubles_nothing(seed: int) -> None:
     device = SimulatedBoard()
     line = NoisyLine(device, 0.0, 0.0, 0.0, seed)

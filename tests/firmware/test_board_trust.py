@@ -291,7 +291,7 @@ def test_a_key_is_kept_and_changed() -> None:
     assert device.level_ma() == 34
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_a_noisy_line_with_a_key(seed: int) -> None:
     device = SimulatedBoard()
     line = NoisyLine(device, 5e-4, 0.02, 0.03, seed)
