@@ -92,7 +92,7 @@ def native_library() -> Path:
 
 
 def arm_image(board: str) -> Path:
-    """The ARM image of a board: `stm32f405`, `stm32f405-12mhz` or `stm32f405-netduinoplus2`.
+    """The ARM image of a board: `stm32f405` or `stm32f405-12mhz`.
 
     With `-1` or `-2` one for the two places of updates; in a checkout also QEMU's `mps2-an385`.
 

@@ -272,9 +272,7 @@ void hal_info(struct evlcp_hal_info *info)
                                     .name = "stm32f405",
                                     .target = EVLCP_TARGET,
                                     .clock_hz = CORE_HZ / 2u};
-#ifndef EVLCP_NETDUINOPLUS2
     evlcp_copy(info->unique_id, (const uint8_t *)UNIQUE_ID, sizeof info->unique_id);
-#endif
 }
 
 static void outputs_off(void)
@@ -812,19 +810,12 @@ static void receive_handler(void)
 
 static bool ready(const volatile uint32_t *where, uint32_t mask, uint32_t value)
 {
-#ifdef EVLCP_NETDUINOPLUS2
-    (void)where;
-    (void)mask;
-    (void)value;
-    return true;
-#else
     for (uint32_t n = 0; n < WAIT_LOOPS; n++) {
         if ((*where & mask) == value)
             return true;
         IWDG_KR = IWDG_FEED; /* an update starts with it running, and a dead crystal is waited for longer */
     }
     return false;
-#endif
 }
 
 /* Crystal -> 1 MHz -> PLL -> 168 MHz; buses at 42 and 84 MHz. False: still on the 16 MHz RC oscillator. */
