@@ -151,9 +151,6 @@ def codebook_of(profile: str) -> Codebook:
 _CLASSES = {"fault": "BoardFault"}
 """Classes whose name is not that of their definition, which the SDK has for something else."""
 
-_HOST_IN_C = ("hello", "configure", "codebook", "commit", "status", "watchdog", "led_test", "chips")
-"""Messages that the firmware's tests in C send and read as a host does; a board needs its own side alone."""
-
 _NUMBERS = {
     "protocol": ("header_bytes", "crc_bytes", "max_payload", "window", "default_baud"),
     "geometry": ("clusters", "leds", "row_bytes"),
@@ -215,7 +212,7 @@ def render(template: str, definition: dict[str, Any]) -> str:
         definition,
         messages=messages,
         numbers=numbers,
-        host_in_c=_HOST_IN_C,
+        stored=[(t["name"], t["doc"], [Field.parse(f) for f in t["fields"]]) for t in definition["stored"]],
         digests={profile: codebook_of(profile).digest for profile in profiles_of(definition)},
     )
 

@@ -17,8 +17,7 @@
 #endif
 
 #define EVLCP_SLOTS 2u
-#define EVLCP_SLOT_HEADER_BYTES 128u
-#define EVLCP_SLOT_BYTES (EVLCP_SLOT_HEADER_BYTES + EVLCP_BANK_BYTES)
+#define EVLCP_SLOT_BYTES (EVLCP_SAVED_BYTES + EVLCP_BANK_BYTES)
 
 struct evlcp_watch {
     uint8_t action;

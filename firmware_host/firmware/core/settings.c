@@ -5,112 +5,31 @@
 #define MAGIC 0x45564c33u
 #define CHUNK 256u
 
-/* A slot's header as it stands in the flash. */
-struct slot {
-    uint32_t sequence;
-    bool autostart;
-    uint8_t watchdog;
-    uint16_t level_ma;
-    uint32_t watchdog_ms;
-    uint16_t level_limit_ma;
-    uint16_t duty_limit;
-    uint8_t key[EVLCP_KEY_BYTES];
-    struct evlcp_plan plan;
-};
-
-static void put_header(const struct slot *s, uint8_t b[EVLCP_SLOT_HEADER_BYTES])
-{
-    const struct evlcp_setup *setup = &s->plan.setup;
-    for (uint32_t i = 0; i < EVLCP_SLOT_HEADER_BYTES; i++)
-        b[i] = 0u;
-    evlcp_put32(b, MAGIC);
-    evlcp_put32(b + 4, s->sequence);
-    b[8] = s->autostart ? 1u : 0u;
-    b[9] = s->watchdog;
-    evlcp_put16(b + 10, s->level_ma);
-    evlcp_put32(b + 12, s->watchdog_ms);
-    b[16] = s->plan.format;
-    b[17] = setup->profile;
-    b[18] = setup->preamble_chips;
-    b[19] = setup->pilot_every;
-    /* Chips alone have neither frames nor preamble nor pilots, and a firmware that does not know them takes no packet
-       without frames. */
-    bool chips = setup->hold != 0u;
-    evlcp_put16(b + 20, chips ? 0u : setup->frames);
-    evlcp_put16(b + 22, s->plan.packets);
-    evlcp_put32(b + 24, chips ? setup->chips : setup->preamble);
-    evlcp_put32(b + 28, s->plan.length);
-    evlcp_put32(b + 32, s->plan.crc);
-    evlcp_put32(b + 36, setup->chip_rate_hz);
-    if (chips) {
-        b[40] = setup->hold;
-        b[41] = (uint8_t)setup->clusters;
-    } else {
-        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-            evlcp_put16(b + 40 + 2u * k, setup->pilots[k]);
-    }
-    evlcp_copy(b + 72, setup->digest, 32u);
-    evlcp_put16(b + 104, s->level_limit_ma);
-    evlcp_put16(b + 106, s->duty_limit);
-    evlcp_copy(b + 108, s->key, EVLCP_KEY_BYTES);
-    evlcp_put32(b + EVLCP_SLOT_HEADER_BYTES - 4u, evlcp_crc32(0u, b, EVLCP_SLOT_HEADER_BYTES - 4u));
-}
-
 /* False if the slot is empty, torn, or of a board with another tick rate. */
-static bool get_header(struct evlcp *e, uint8_t index, struct slot *s)
+static bool get_slot(struct evlcp *e, uint8_t index, struct evlcp_saved *s)
 {
-    uint8_t b[EVLCP_SLOT_HEADER_BYTES];
-    struct evlcp_setup *setup = &s->plan.setup;
-    if (!hal_flash_read(index, 0u, b, sizeof b) || evlcp_get32(b) != MAGIC ||
-        evlcp_get32(b + sizeof b - 4u) != evlcp_crc32(0u, b, sizeof b - 4u))
+    uint8_t b[EVLCP_SAVED_BYTES];
+    if (!hal_flash_read(index, 0u, b, sizeof b))
         return false;
-    *s = (struct slot){.sequence = evlcp_get32(b + 4),
-                       .autostart = b[8] != 0u,
-                       .watchdog = b[9],
-                       .level_ma = evlcp_get16(b + 10),
-                       .watchdog_ms = evlcp_get32(b + 12),
-                       .level_limit_ma = evlcp_get16(b + 104),
-                       .duty_limit = evlcp_get16(b + 106)};
-    s->plan.format = b[16];
-    setup->profile = b[17];
-    setup->preamble_chips = b[18];
-    setup->pilot_every = b[19];
-    setup->frames = evlcp_get16(b + 20);
-    s->plan.packets = evlcp_get16(b + 22);
-    s->plan.length = evlcp_get32(b + 28);
-    s->plan.crc = evlcp_get32(b + 32);
-    setup->chip_rate_hz = evlcp_get32(b + 36);
-    if (setup->frames == 0u) {
-        setup->chips = evlcp_get32(b + 24);
-        setup->hold = b[40];
-        setup->clusters = b[41];
-    } else {
-        setup->preamble = evlcp_get32(b + 24);
-        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
-            setup->pilots[k] = evlcp_get16(b + 40 + 2u * k);
-    }
-    evlcp_copy(setup->digest, b + 72, 32u);
-    evlcp_copy(s->key, b + 108, EVLCP_KEY_BYTES);
-    if (setup->chip_rate_hz == 0u || e->info.tick_hz % setup->chip_rate_hz != 0u)
-        return false;
-    setup->ticks_per_chip = e->info.tick_hz / setup->chip_rate_hz;
-    return s->plan.length <= EVLCP_BANK_BYTES;
+    *s = evlcp_saved_get(b);
+    return s->magic == MAGIC && s->check == evlcp_crc32(0u, b, sizeof b - 4u) && s->chip_rate_hz != 0u &&
+           e->info.tick_hz % s->chip_rate_hz == 0u && s->length <= EVLCP_BANK_BYTES;
 }
 
 /* Read both headers; the slot with the newest that is whole, 0 if there is none. */
-static uint8_t newest(struct evlcp *e, struct slot found[EVLCP_SLOTS], bool valid[EVLCP_SLOTS])
+static uint8_t newest(struct evlcp *e, struct evlcp_saved found[EVLCP_SLOTS], bool valid[EVLCP_SLOTS])
 {
     for (uint8_t i = 0; i < EVLCP_SLOTS; i++)
-        valid[i] = get_header(e, i, &found[i]);
+        valid[i] = get_slot(e, i, &found[i]);
     return valid[1] && (!valid[0] || (int32_t)(found[1].sequence - found[0].sequence) > 0) ? 1u : 0u;
 }
 
 enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct evlcp_save_reply *reply)
 {
     uint8_t active = atomic_load(&e->banks.active);
-    struct slot found[EVLCP_SLOTS];
+    struct evlcp_saved found[EVLCP_SLOTS];
     bool valid[EVLCP_SLOTS];
-    uint8_t header[EVLCP_SLOT_HEADER_BYTES];
+    uint8_t header[EVLCP_SAVED_BYTES];
     if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
     /* Erasing stops the processor on single-bank parts: chips would come late, a LED test would stand still. */
@@ -122,32 +41,55 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
     uint8_t last = newest(e, found, valid);
     uint8_t to = valid[last] ? (uint8_t)(1u - last) : 0u;
     uint32_t sequence = valid[last] ? found[last].sequence + 1u : 1u;
-    struct slot slot = {.sequence = sequence,
-                              .autostart = autostart,
+    const struct evlcp_plan *plan = &e->banks.plan[active];
+    const struct evlcp_setup *setup = &plan->setup;
+    struct evlcp_saved slot = {.magic = MAGIC,
+                              .sequence = sequence,
+                              .autostart = autostart ? 1u : 0u,
                               .watchdog = e->watch.action,
                               .level_ma = e->level_ma,
                               .watchdog_ms = e->watch.timeout_ms,
+                              .format = plan->format,
+                              .profile = setup->profile,
+                              .preamble_chips = setup->preamble_chips,
+                              .pilot_every = setup->pilot_every,
+                              .packets = plan->packets,
+                              .length = plan->length,
+                              .crc = plan->crc,
+                              .chip_rate_hz = setup->chip_rate_hz,
                               .level_limit_ma = e->level_limit_ma,
-                              .duty_limit = e->duty_limit,
-                              .plan = e->banks.plan[active]};
-    evlcp_copy(slot.key, e->trust.key, EVLCP_KEY_BYTES);
-    put_header(&slot, header);
+                              .duty_limit = e->duty_limit};
+    /* Chips alone have neither frames nor preamble nor pilots, and a firmware that does not know them takes no packet
+       without frames. */
+    if (setup->hold != 0u) {
+        slot.preamble = setup->chips;
+        slot.pilots[0] = (uint16_t)(setup->hold | setup->clusters << 8);
+    } else {
+        slot.frames = setup->frames;
+        slot.preamble = setup->preamble;
+        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+            slot.pilots[k] = setup->pilots[k];
+    }
+    evlcp_copy(slot.digest, setup->digest, sizeof slot.digest);
+    evlcp_copy(slot.key, e->trust.key, sizeof slot.key);
+    (void)evlcp_saved_put(header, &slot);
+    evlcp_put32(header + sizeof header - 4u, evlcp_crc32(0u, header, sizeof header - 4u));
     /* The header goes last: until it is complete the slot is empty. */
     if (!hal_flash_erase(to) ||
-        !hal_flash_write(to, EVLCP_SLOT_HEADER_BYTES, e->banks.content[active], slot.plan.length) ||
+        !hal_flash_write(to, EVLCP_SAVED_BYTES, e->banks.content[active], slot.length) ||
         !hal_flash_write(to, 0u, header, sizeof header))
         return EVLCP_STATUS_FLASH_FAULT;
     /* Read back what the flash took. */
     uint32_t crc = 0u;
-    for (uint32_t at = 0; at < slot.plan.length; at += CHUNK) {
+    for (uint32_t at = 0; at < slot.length; at += CHUNK) {
         uint8_t bytes[CHUNK];
-        uint32_t count = slot.plan.length - at < CHUNK ? slot.plan.length - at : CHUNK;
-        if (!hal_flash_read(to, EVLCP_SLOT_HEADER_BYTES + at, bytes, count))
+        uint32_t count = slot.length - at < CHUNK ? slot.length - at : CHUNK;
+        if (!hal_flash_read(to, EVLCP_SAVED_BYTES + at, bytes, count))
             return EVLCP_STATUS_FLASH_FAULT;
         crc = evlcp_crc32(crc, bytes, count);
     }
-    struct slot back;
-    if (crc != slot.plan.crc || !get_header(e, to, &back) || back.sequence != sequence)
+    struct evlcp_saved back;
+    if (crc != slot.crc || !get_slot(e, to, &back) || back.sequence != sequence)
         return EVLCP_STATUS_FLASH_FAULT;
     reply->slot = to;
     reply->save_sequence = sequence;
@@ -155,20 +97,33 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
 }
 
 /* Load one slot into the spare bank and commit it. */
-static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot *s)
+static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct evlcp_saved *s)
 {
     uint8_t bank = atomic_load(&e->banks.active) == 0u ? 1u : 0u;
     uint32_t detail = 0u;
-    struct evlcp_commit_request request = {.bank = bank,
-                                           .format = s->plan.format,
-                                           .packets = s->plan.packets,
-                                           .length = s->plan.length,
-                                           .crc = s->plan.crc};
-    evlcp_copy(request.digest, s->plan.setup.digest, sizeof request.digest);
+    struct evlcp_setup setup = {.chip_rate_hz = s->chip_rate_hz,
+                                .ticks_per_chip = e->info.tick_hz / s->chip_rate_hz,
+                                .frames = s->frames,
+                                .profile = s->profile,
+                                .preamble_chips = s->preamble_chips,
+                                .pilot_every = s->pilot_every};
+    struct evlcp_commit_request request = {
+        .bank = bank, .format = s->format, .packets = s->packets, .length = s->length, .crc = s->crc};
+    if (s->frames == 0u) {
+        setup.chips = s->preamble;
+        setup.hold = (uint8_t)s->pilots[0];
+        setup.clusters = s->pilots[0] >> 8;
+    } else {
+        setup.preamble = s->preamble;
+        for (uint32_t k = 0; k < EVLCP_BOARD_CLUSTERS; k++)
+            setup.pilots[k] = s->pilots[k];
+    }
+    evlcp_copy(setup.digest, s->digest, sizeof setup.digest);
+    evlcp_copy(request.digest, s->digest, sizeof request.digest);
     e->banks.plan[bank].valid = false;
-    if (!hal_flash_read(index, EVLCP_SLOT_HEADER_BYTES, e->banks.content[bank], s->plan.length))
+    if (!hal_flash_read(index, EVLCP_SAVED_BYTES, e->banks.content[bank], s->length))
         return EVLCP_STATUS_FLASH_FAULT;
-    enum evlcp_status status = evlcp_banks_check(&e->banks, &s->plan.setup, &request, &detail);
+    enum evlcp_status status = evlcp_banks_check(&e->banks, &setup, &request, &detail);
     if (status != EVLCP_STATUS_OK)
         return status;
     if (s->level_limit_ma > e->info.level_max_ma || s->level_ma > s->level_limit_ma || s->duty_limit > 1000u ||
@@ -176,7 +131,7 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot 
         return EVLCP_STATUS_HARDWARE_FAULT;
     if (e->banks.plan[bank].duty > evlcp_allowed(e, s->level_ma, e->duty_limit))
         return EVLCP_STATUS_TOO_BRIGHT;
-    e->setup = s->plan.setup;
+    e->setup = setup;
     e->watch.action = s->watchdog <= EVLCP_WATCHDOG_DARK ? s->watchdog : EVLCP_WATCHDOG_KEEP;
     e->watch.timeout_ms = s->watchdog_ms;
     evlcp_activate(e, bank);
@@ -185,7 +140,7 @@ static enum evlcp_status load(struct evlcp *e, uint8_t index, const struct slot 
 
 enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, struct evlcp_recall_reply *reply)
 {
-    struct slot found[EVLCP_SLOTS];
+    struct evlcp_saved found[EVLCP_SLOTS];
     bool valid[EVLCP_SLOTS];
     if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
         return EVLCP_STATUS_NOT_SUPPORTED;
@@ -210,7 +165,7 @@ enum evlcp_status evlcp_settings_recall(struct evlcp *e, bool only_autostart, st
 
 void evlcp_settings_key(struct evlcp *e)
 {
-    struct slot found[EVLCP_SLOTS];
+    struct evlcp_saved found[EVLCP_SLOTS];
     bool valid[EVLCP_SLOTS];
     if ((e->info.capabilities & EVLCP_CAPABILITY_FLASH) == 0u)
         return;

@@ -7,17 +7,10 @@
 #define CHUNK 256u
 #define ERASED 0xffffffffu
 
-/* Behind an image: magic, sequence, length, CRC, CRC of these; then words that are programmed to zero. */
+/* Behind an image: its seal, then words that are programmed to zero. */
 #define SEAL_AT EVLCP_IMAGE_BYTES
-#define SEAL_BYTES 20u
 #define TRIES_AT (SEAL_AT + 32u)
 #define CONFIRMED_AT (SEAL_AT + 48u)
-
-struct seal {
-    uint32_t sequence;
-    uint32_t length;
-    uint32_t crc;
-};
 
 static uint32_t word(uint8_t image, uint32_t offset)
 {
@@ -45,17 +38,15 @@ static bool crc_of(uint8_t image, uint32_t length, uint32_t *crc)
 }
 
 /* Whether a whole image stands in a place. */
-static bool sealed(uint8_t image, struct seal *seal)
+static bool sealed(uint8_t image, struct evlcp_image_seal *seal)
 {
-    uint8_t b[SEAL_BYTES];
+    uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
     uint32_t crc;
-    if (!hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), SEAL_AT, b, sizeof b) || evlcp_get32(b) != MAGIC ||
-        evlcp_get32(b + 16) != evlcp_crc32(0u, b, 16u))
+    if (!hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), SEAL_AT, b, sizeof b))
         return false;
-    seal->sequence = evlcp_get32(b + 4);
-    seal->length = evlcp_get32(b + 8);
-    seal->crc = evlcp_get32(b + 12);
-    return seal->length <= EVLCP_IMAGE_BYTES && crc_of(image, seal->length, &crc) && crc == seal->crc;
+    *seal = evlcp_image_seal_get(b);
+    return seal->magic == MAGIC && seal->check == evlcp_crc32(0u, b, sizeof b - 4u) &&
+           seal->length <= EVLCP_IMAGE_BYTES && crc_of(image, seal->length, &crc) && crc == seal->crc;
 }
 
 static bool newer(uint32_t a, uint32_t b)
@@ -69,14 +60,14 @@ static bool confirmed(uint8_t image)
 }
 
 /* A place that holds an image which runs, or would run. */
-static bool worth(uint8_t image, struct seal *seal)
+static bool worth(uint8_t image, struct evlcp_image_seal *seal)
 {
     return sealed(image, seal) && (confirmed(image) || word(image, TRIES_AT + 4u * (EVLCP_TRIES - 1u)) == ERASED);
 }
 
 uint8_t evlcp_update_pick(void)
 {
-    struct seal seals[EVLCP_IMAGES];
+    struct evlcp_image_seal seals[EVLCP_IMAGES];
     bool valid[EVLCP_IMAGES];
     for (uint8_t i = 0; i < EVLCP_IMAGES; i++)
         valid[i] = worth(i, &seals[i]);
@@ -100,7 +91,7 @@ uint8_t evlcp_update_pick(void)
 /* The place that an update goes to: not the one that runs, else one that is empty, else the older. */
 static uint8_t next_image(uint32_t *newest)
 {
-    struct seal seals[EVLCP_IMAGES];
+    struct evlcp_image_seal seals[EVLCP_IMAGES];
     bool valid[EVLCP_IMAGES];
     uint8_t running = hal_running();
     *newest = 0u;
@@ -160,8 +151,7 @@ enum evlcp_status evlcp_update_write(const struct evlcp_update *u, uint32_t offs
 
 enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence, uint32_t *detail)
 {
-    uint8_t b[SEAL_BYTES];
-    struct seal seal;
+    uint8_t b[EVLCP_IMAGE_SEAL_BYTES];
     if (!u->open)
         return EVLCP_STATUS_NOTHING_COMMITTED;
     if (!crc_of(u->image, u->length, detail))
@@ -171,11 +161,9 @@ enum evlcp_status evlcp_update_commit(struct evlcp_update *u, uint32_t *sequence
     (void)next_image(sequence);
     *sequence += 1u;
     u->open = false;
-    evlcp_put32(b, MAGIC);
-    evlcp_put32(b + 4, *sequence);
-    evlcp_put32(b + 8, u->length);
-    evlcp_put32(b + 12, u->crc);
-    evlcp_put32(b + 16, evlcp_crc32(0u, b, 16u));
+    struct evlcp_image_seal seal = {.magic = MAGIC, .sequence = *sequence, .length = u->length, .crc = u->crc};
+    (void)evlcp_image_seal_put(b, &seal);
+    evlcp_put32(b + sizeof b - 4u, evlcp_crc32(0u, b, sizeof b - 4u));
     if (!hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + u->image), SEAL_AT, b, sizeof b) || !sealed(u->image, &seal))
         return EVLCP_STATUS_FLASH_FAULT;
     return EVLCP_STATUS_OK;

@@ -186,14 +186,6 @@ struct evlcp_hello_request {
     uint32_t nonce; /* Random; the same nonce keeps the session. */
 };
 
-static inline uint32_t evlcp_hello_request_put(uint8_t *p, const struct evlcp_hello_request *m)
-{
-    evlcp_put8(p + 0, m->major);
-    evlcp_put8(p + 1, m->minor);
-    evlcp_put32(p + 2, m->nonce);
-    return 6u;
-}
-
 static inline struct evlcp_hello_request evlcp_hello_request_get(const uint8_t *p)
 {
     struct evlcp_hello_request m = {0};
@@ -265,38 +257,6 @@ static inline uint32_t evlcp_hello_reply_put(uint8_t *p, const struct evlcp_hell
     return 86u;
 }
 
-static inline struct evlcp_hello_reply evlcp_hello_reply_get(const uint8_t *p)
-{
-    struct evlcp_hello_reply m = {0};
-    m.major = evlcp_get8(p + 0);
-    m.minor = evlcp_get8(p + 1);
-    m.session = evlcp_get16(p + 2);
-    m.version_major = evlcp_get8(p + 4);
-    m.version_minor = evlcp_get8(p + 5);
-    m.version_patch = evlcp_get8(p + 6);
-    m.window = evlcp_get8(p + 7);
-    m.max_payload = evlcp_get16(p + 8);
-    m.banks = evlcp_get8(p + 10);
-    m.bank_bytes = evlcp_get32(p + 11);
-    m.clusters = evlcp_get8(p + 15);
-    m.leds = evlcp_get16(p + 16);
-    m.tick_hz = evlcp_get32(p + 18);
-    m.chip_rate_max_hz = evlcp_get32(p + 22);
-    m.level_max_ma = evlcp_get16(p + 26);
-    m.mean_max_ma = evlcp_get16(p + 28);
-    m.burst_chips = evlcp_get16(p + 30);
-    m.capabilities = evlcp_get32(p + 32);
-    evlcp_copy(m.unique_id, p + 36, 12u);
-    m.uptime_ms = evlcp_get32(p + 48);
-    evlcp_copy(m.hal, p + 52, 12u);
-    m.clock_hz = evlcp_get32(p + 64);
-    evlcp_copy(m.challenge, p + 68, 8u);
-    evlcp_copy(m.key_name, p + 76, 4u);
-    m.formats = evlcp_get16(p + 80);
-    m.chip_rate_min_hz = evlcp_get32(p + 82);
-    return m;
-}
-
 #define EVLCP_CONFIGURE_REQUEST_BYTES 12u
 /* Set what the next COMMIT plays with, not what plays; and limits of light, which hold at once. */
 struct evlcp_configure_request {
@@ -307,17 +267,6 @@ struct evlcp_configure_request {
     uint16_t level_limit_ma; /* Largest LED current from now on, mA; 0: as it is. */
     uint16_t duty_limit; /* Largest share of time that a LED is on from now on, permille; 0: as it is. */
 };
-
-static inline uint32_t evlcp_configure_request_put(uint8_t *p, const struct evlcp_configure_request *m)
-{
-    evlcp_put32(p + 0, m->chip_rate_hz);
-    evlcp_put8(p + 4, m->profile);
-    evlcp_put16(p + 5, m->frames);
-    evlcp_put8(p + 7, m->pilot_every);
-    evlcp_put16(p + 8, m->level_limit_ma);
-    evlcp_put16(p + 10, m->duty_limit);
-    return 12u;
-}
 
 static inline struct evlcp_configure_request evlcp_configure_request_get(const uint8_t *p)
 {
@@ -345,14 +294,6 @@ static inline uint32_t evlcp_configure_reply_put(uint8_t *p, const struct evlcp_
     return 8u;
 }
 
-static inline struct evlcp_configure_reply evlcp_configure_reply_get(const uint8_t *p)
-{
-    struct evlcp_configure_reply m = {0};
-    m.ticks_per_chip = evlcp_get32(p + 0);
-    m.packet_chips = evlcp_get32(p + 4);
-    return m;
-}
-
 #define EVLCP_CODEBOOK_REQUEST_BYTES 69u
 /* Set preamble and pilots for the next COMMIT; those of a built-in profile must be the firmware's own. */
 struct evlcp_codebook_request {
@@ -361,16 +302,6 @@ struct evlcp_codebook_request {
     uint16_t pilots[16]; /* Pilot words, first chip on air the most significant bit. */
     uint8_t digest[32]; /* SHA-256 of the codebook. */
 };
-
-static inline uint32_t evlcp_codebook_request_put(uint8_t *p, const struct evlcp_codebook_request *m)
-{
-    evlcp_put8(p + 0, m->preamble_chips);
-    evlcp_put32(p + 1, m->preamble);
-    for (uint32_t i = 0; i < 16u; i++)
-        evlcp_put16(p + 5 + 2u * i, m->pilots[i]);
-    evlcp_copy(p + 37, m->digest, 32u);
-    return 69u;
-}
 
 static inline struct evlcp_codebook_request evlcp_codebook_request_get(const uint8_t *p)
 {
@@ -487,17 +418,6 @@ struct evlcp_commit_request {
     uint8_t digest[32]; /* Digest of the codebook the content was made with. */
 };
 
-static inline uint32_t evlcp_commit_request_put(uint8_t *p, const struct evlcp_commit_request *m)
-{
-    evlcp_put8(p + 0, m->bank);
-    evlcp_put8(p + 1, m->format);
-    evlcp_put16(p + 2, m->packets);
-    evlcp_put32(p + 4, m->length);
-    evlcp_put32(p + 8, m->crc);
-    evlcp_copy(p + 12, m->digest, 32u);
-    return 44u;
-}
-
 static inline struct evlcp_commit_request evlcp_commit_request_get(const uint8_t *p)
 {
     struct evlcp_commit_request m = {0};
@@ -520,13 +440,6 @@ static inline uint32_t evlcp_commit_reply_put(uint8_t *p, const struct evlcp_com
 {
     evlcp_put32(p + 0, m->commits);
     return 4u;
-}
-
-static inline struct evlcp_commit_reply evlcp_commit_reply_get(const uint8_t *p)
-{
-    struct evlcp_commit_reply m = {0};
-    m.commits = evlcp_get32(p + 0);
-    return m;
 }
 
 #define EVLCP_START_REQUEST_BYTES 10u
@@ -661,64 +574,12 @@ static inline uint32_t evlcp_status_reply_put(uint8_t *p, const struct evlcp_sta
     return 149u;
 }
 
-static inline struct evlcp_status_reply evlcp_status_reply_get(const uint8_t *p)
-{
-    struct evlcp_status_reply m = {0};
-    m.state = evlcp_get8(p + 0);
-    m.faults = evlcp_get16(p + 1);
-    m.active_bank = evlcp_get8(p + 3);
-    m.pending_bank = evlcp_get8(p + 4);
-    m.format = evlcp_get8(p + 5);
-    m.profile = evlcp_get8(p + 6);
-    m.frames = evlcp_get16(p + 7);
-    m.pilot_every = evlcp_get8(p + 9);
-    m.packets = evlcp_get16(p + 10);
-    m.length = evlcp_get32(p + 12);
-    m.crc = evlcp_get32(p + 16);
-    m.chip_rate_hz = evlcp_get32(p + 20);
-    m.commits = evlcp_get32(p + 24);
-    m.packets_sent = evlcp_get32(p + 28);
-    m.chips_sent = evlcp_get32(p + 32);
-    m.lateness_ticks = evlcp_get32(p + 36);
-    m.lateness_max_ticks = evlcp_get32(p + 40);
-    m.crc_errors = evlcp_get32(p + 44);
-    m.framing_errors = evlcp_get32(p + 48);
-    m.overflow_errors = evlcp_get32(p + 52);
-    m.requests = evlcp_get32(p + 56);
-    m.level_ma = evlcp_get16(p + 60);
-    m.level_limit_ma = evlcp_get16(p + 62);
-    m.duty_limit = evlcp_get16(p + 64);
-    m.duty = evlcp_get16(p + 66);
-    m.temperature_dc = (int16_t)evlcp_get16(p + 68);
-    evlcp_copy(m.open_leds, p + 70, 12u);
-    m.watchdog = evlcp_get8(p + 82);
-    m.watchdog_ms = evlcp_get32(p + 83);
-    m.silence_ms = evlcp_get32(p + 87);
-    m.uptime_ms = evlcp_get32(p + 91);
-    evlcp_copy(m.digest, p + 95, 32u);
-    m.underruns = evlcp_get32(p + 127);
-    m.clock = evlcp_get32(p + 131);
-    m.pulses = evlcp_get32(p + 135);
-    m.pulse_clocks = evlcp_get32(p + 139);
-    m.packet_chips = evlcp_get32(p + 143);
-    m.hold = evlcp_get8(p + 147);
-    m.clusters = evlcp_get8(p + 148);
-    return m;
-}
-
 #define EVLCP_WATCHDOG_REQUEST_BYTES 5u
 /* What to do when the host falls silent. */
 struct evlcp_watchdog_request {
     uint8_t action; /* Watchdog action. */
     uint32_t timeout_ms; /* Silence before it acts, at least 100 ms. */
 };
-
-static inline uint32_t evlcp_watchdog_request_put(uint8_t *p, const struct evlcp_watchdog_request *m)
-{
-    evlcp_put8(p + 0, m->action);
-    evlcp_put32(p + 1, m->timeout_ms);
-    return 5u;
-}
 
 static inline struct evlcp_watchdog_request evlcp_watchdog_request_get(const uint8_t *p)
 {
@@ -780,14 +641,6 @@ struct evlcp_led_test_request {
     uint8_t last; /* Last LED. */
     uint16_t dwell_ms; /* Time a LED is on, at least 1 ms. */
 };
-
-static inline uint32_t evlcp_led_test_request_put(uint8_t *p, const struct evlcp_led_test_request *m)
-{
-    evlcp_put8(p + 0, m->first);
-    evlcp_put8(p + 1, m->last);
-    evlcp_put16(p + 2, m->dwell_ms);
-    return 4u;
-}
 
 static inline struct evlcp_led_test_request evlcp_led_test_request_get(const uint8_t *p)
 {
@@ -889,15 +742,6 @@ struct evlcp_chips_request {
     uint8_t clusters; /* Clusters of the format CLUSTERS; 0: MASKS only. */
     uint8_t digest[32]; /* SHA-256 of what chips mean, which COMMIT repeats. */
 };
-
-static inline uint32_t evlcp_chips_request_put(uint8_t *p, const struct evlcp_chips_request *m)
-{
-    evlcp_put32(p + 0, m->packet_chips);
-    evlcp_put8(p + 4, m->hold);
-    evlcp_put8(p + 5, m->clusters);
-    evlcp_copy(p + 6, m->digest, 32u);
-    return 38u;
-}
 
 static inline struct evlcp_chips_request evlcp_chips_request_get(const uint8_t *p)
 {
@@ -1002,6 +846,121 @@ static inline uint32_t evlcp_update_commit_reply_put(uint8_t *p, const struct ev
 #define EVLCP_UPDATE_CONFIRM_REQUEST_BYTES 0u
 
 #define EVLCP_UPDATE_CONFIRM_REPLY_BYTES 0u
+
+#define EVLCP_SAVED_BYTES 128u
+/* What SAVE writes before a bank's content. Packets of chips alone have no frames; then see `preamble`, `pilots`. */
+struct evlcp_saved {
+    uint32_t magic; /* Names this layout. */
+    uint32_t sequence; /* The newest slot has the highest. */
+    uint8_t autostart; /* 1: recalled and played after a reset. */
+    uint8_t watchdog; /* Watchdog action. */
+    uint16_t level_ma; /* LED current. */
+    uint32_t watchdog_ms; /* Watchdog time-out. */
+    uint8_t format; /* Of the content. */
+    uint8_t profile; /* Info-segment profile. */
+    uint8_t preamble_chips; /* Chips of the preamble. */
+    uint8_t pilot_every; /* Frames from one pilot to the next. */
+    uint16_t frames; /* Per packet; 0: chips alone. */
+    uint16_t packets; /* In the content. */
+    uint32_t preamble; /* Preamble, or chips of a packet in the bank. */
+    uint32_t length; /* Bytes of the content. */
+    uint32_t crc; /* Of the content. */
+    uint32_t chip_rate_hz; /* Chips per second. */
+    uint16_t pilots[16]; /* Pilot words, or in the first: hold | clusters << 8. */
+    uint8_t digest[32]; /* Of the codebook, or of what chips mean. */
+    uint16_t level_limit_ma; /* Largest LED current. */
+    uint16_t duty_limit; /* Largest share of time, permille. */
+    uint8_t key[16]; /* The board's key; zeros for none. */
+    uint32_t check; /* CRC-32 of the above. */
+};
+
+static inline uint32_t evlcp_saved_put(uint8_t *p, const struct evlcp_saved *m)
+{
+    evlcp_put32(p + 0, m->magic);
+    evlcp_put32(p + 4, m->sequence);
+    evlcp_put8(p + 8, m->autostart);
+    evlcp_put8(p + 9, m->watchdog);
+    evlcp_put16(p + 10, m->level_ma);
+    evlcp_put32(p + 12, m->watchdog_ms);
+    evlcp_put8(p + 16, m->format);
+    evlcp_put8(p + 17, m->profile);
+    evlcp_put8(p + 18, m->preamble_chips);
+    evlcp_put8(p + 19, m->pilot_every);
+    evlcp_put16(p + 20, m->frames);
+    evlcp_put16(p + 22, m->packets);
+    evlcp_put32(p + 24, m->preamble);
+    evlcp_put32(p + 28, m->length);
+    evlcp_put32(p + 32, m->crc);
+    evlcp_put32(p + 36, m->chip_rate_hz);
+    for (uint32_t i = 0; i < 16u; i++)
+        evlcp_put16(p + 40 + 2u * i, m->pilots[i]);
+    evlcp_copy(p + 72, m->digest, 32u);
+    evlcp_put16(p + 104, m->level_limit_ma);
+    evlcp_put16(p + 106, m->duty_limit);
+    evlcp_copy(p + 108, m->key, 16u);
+    evlcp_put32(p + 124, m->check);
+    return 128u;
+}
+
+static inline struct evlcp_saved evlcp_saved_get(const uint8_t *p)
+{
+    struct evlcp_saved m = {0};
+    m.magic = evlcp_get32(p + 0);
+    m.sequence = evlcp_get32(p + 4);
+    m.autostart = evlcp_get8(p + 8);
+    m.watchdog = evlcp_get8(p + 9);
+    m.level_ma = evlcp_get16(p + 10);
+    m.watchdog_ms = evlcp_get32(p + 12);
+    m.format = evlcp_get8(p + 16);
+    m.profile = evlcp_get8(p + 17);
+    m.preamble_chips = evlcp_get8(p + 18);
+    m.pilot_every = evlcp_get8(p + 19);
+    m.frames = evlcp_get16(p + 20);
+    m.packets = evlcp_get16(p + 22);
+    m.preamble = evlcp_get32(p + 24);
+    m.length = evlcp_get32(p + 28);
+    m.crc = evlcp_get32(p + 32);
+    m.chip_rate_hz = evlcp_get32(p + 36);
+    for (uint32_t i = 0; i < 16u; i++)
+        m.pilots[i] = evlcp_get16(p + 40 + 2u * i);
+    evlcp_copy(m.digest, p + 72, 32u);
+    m.level_limit_ma = evlcp_get16(p + 104);
+    m.duty_limit = evlcp_get16(p + 106);
+    evlcp_copy(m.key, p + 108, 16u);
+    m.check = evlcp_get32(p + 124);
+    return m;
+}
+
+#define EVLCP_IMAGE_SEAL_BYTES 20u
+/* What stands behind an image that came by an update. */
+struct evlcp_image_seal {
+    uint32_t magic; /* Names this layout. */
+    uint32_t sequence; /* Number of the update. */
+    uint32_t length; /* Bytes of the image. */
+    uint32_t crc; /* Of the image. */
+    uint32_t check; /* CRC-32 of the above. */
+};
+
+static inline uint32_t evlcp_image_seal_put(uint8_t *p, const struct evlcp_image_seal *m)
+{
+    evlcp_put32(p + 0, m->magic);
+    evlcp_put32(p + 4, m->sequence);
+    evlcp_put32(p + 8, m->length);
+    evlcp_put32(p + 12, m->crc);
+    evlcp_put32(p + 16, m->check);
+    return 20u;
+}
+
+static inline struct evlcp_image_seal evlcp_image_seal_get(const uint8_t *p)
+{
+    struct evlcp_image_seal m = {0};
+    m.magic = evlcp_get32(p + 0);
+    m.sequence = evlcp_get32(p + 4);
+    m.length = evlcp_get32(p + 8);
+    m.crc = evlcp_get32(p + 12);
+    m.check = evlcp_get32(p + 16);
+    return m;
+}
 
 #define EVLCP_REQUEST_MOST 69u /* longest request, data left out */
 

@@ -30,9 +30,7 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
     native_init(&board);
     if (size == 0u)
         return 0;
-    uint8_t hello[EVLCP_HELLO_REQUEST_BYTES];
-    const struct evlcp_hello_request request = {.major = EVLCP_PROTOCOL_MAJOR, .minor = EVLCP_PROTOCOL_MINOR, .nonce = 1u};
-    evlcp_hello_request_put(hello, &request);
+    const uint8_t hello[EVLCP_HELLO_REQUEST_BYTES] = {EVLCP_PROTOCOL_MAJOR, EVLCP_PROTOCOL_MINOR, 1u};
     send_datagram(&board, 0u, EVLCP_NO_SESSION, EVLCP_TYPE_HELLO, hello, sizeof hello);
     if ((data[0] & 1u) == 0u) {
         for (size_t at = 1; at < size; at += 512u) {
