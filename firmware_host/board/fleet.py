@@ -3,7 +3,7 @@
 import contextlib
 import json
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from dataclasses import dataclass
 from pathlib import Path
@@ -118,11 +118,13 @@ class Inventory:
 
     Attributes:
         path: The file.
-        boards: Entry and bank of each board.
+        entries: The boards.
+        banks: What each plays, by its id.
     """
 
     path: Path
-    boards: tuple[tuple[Entry, Bank], ...]
+    entries: tuple[Entry, ...]
+    banks: Mapping[str, Bank]
 
 
 @dataclass(frozen=True)
@@ -173,8 +175,9 @@ def read_inventory(path: Path) -> Inventory:
         InputError: A payload or a key cannot be read.
         IncompatibleError: A payload was made with another link.
     """
-    links = _Links(path)
-    return Inventory(path, tuple((e, _bank(path, i, e, links)) for i, e in enumerate(read_entries(path))))
+    entries, links = read_entries(path), _Links(path)
+    banks = {entry.id: _bank(path, n, entry, links) for n, entry in enumerate(entries)}
+    return Inventory(path, entries, banks)
 
 
 def read_entries(path: Path) -> tuple[Entry, ...]:
@@ -309,36 +312,46 @@ Work = Callable[[Entry, Board], tuple[str, dict[str, Any]]]
 """What is done with a board; what it did, for a person and as plain values."""
 
 
-def run_fleet(
-    entries: Sequence[Entry], folder: Path, work: Work, report: Report | None = None
-) -> list[Result]:
-    """Do something with all boards of an inventory in a folder; one that fails does not hold up the others.
+def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) -> None:
+    """Do something with all boards of an inventory; one that fails does not hold up the others.
 
-    Returns:
-        The results in the order of the entries.
+    Args:
+        path: The inventory.
+        entries: Its boards.
+        work: What is done.
+        report: Called with each result as it comes.
+
+    Raises:
+        FleetError: A board failed; it has the exit code of the first of them.
     """
 
     def one(entry: Entry) -> Result:
         start = time.monotonic()
         said, table, failed = "", dict[str, Any](), None
         try:
-            with board_of(entry, folder) as board:
+            with board_of(entry, path.parent) as board:
                 said, table = work(entry, board)
         except EvlcpError as fault:
             failed = fault
         return Result(entry, said, table, failed, time.monotonic() - start)
 
-    results: dict[str, Result] = {}
+    faults: dict[str, EvlcpError] = {}
     with ThreadPoolExecutor(min(64, len(entries))) as pool:
         for future in as_completed([pool.submit(one, entry) for entry in entries]):
             result = future.result()
-            results[result.entry.id] = result
-            if report:
-                report(result)
-    return [results[entry.id] for entry in entries]
+            if result.fault is not None:
+                faults[result.entry.id] = result.fault
+            report(result)
+    failed = [entry.id for entry in entries if entry.id in faults]
+    if failed:
+        raise FleetError(
+            f"{path}: {len(failed)} of {len(entries)} boards failed"
+            f" ({', '.join(failed)}); the others are done; run it again for the rest",
+            faults[failed[0]].exit_code,
+        )
 
 
-def program_fleet(inventory: Inventory, verify: bool = True, report: Report | None = None) -> list[Result]:
+def program_fleet(inventory: Inventory, verify: bool, report: Report) -> None:
     """Program all boards at once.
 
     Args:
@@ -346,43 +359,17 @@ def program_fleet(inventory: Inventory, verify: bool = True, report: Report | No
         verify: Whether to compare what each board holds.
         report: Called with each result as it comes.
 
-    Returns:
-        The results in the inventory's order.
+    Raises:
+        FleetError: See `run_fleet`.
     """
-    banks = {entry.id: bank for entry, bank in inventory.boards}
 
     def work(entry: Entry, board: Board) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()
-        done = provision(board, banks[entry.id], entry.settings, verify)
+        done = provision(board, inventory.banks[entry.id], entry.settings, verify)
         table = {"written_bytes": done.written, "swapped": done.swapped}
         if not done.swapped:
             return f"was there already ({done.length} bytes)", table
         elapsed = time.monotonic() - start
         return f"programmed {done.written} of {done.length} bytes in {elapsed:.2f} s", table
 
-    return run_fleet([entry for entry, _ in inventory.boards], inventory.path.parent, work, report)
-
-
-def verify_fleet(inventory: Inventory, report: Report | None = None) -> list[Result]:
-    """Compare what all boards hold with what the inventory says; results in its order."""
-    banks = {entry.id: bank for entry, bank in inventory.boards}
-
-    def work(entry: Entry, board: Board) -> tuple[str, dict[str, Any]]:
-        bank = banks[entry.id]
-        number = board.verify(bank)
-        table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
-        return f"same: {len(bank.content)} bytes in bank {number}, CRC {bank.crc:08x}", table
-
-    return run_fleet([entry for entry, _ in inventory.boards], inventory.path.parent, work, report)
-
-
-def raise_failures(path: Path, results: list[Result]) -> None:
-    """Raise FleetError, with the exit code of the first failure, if any board failed."""
-    failed = [r for r in results if r.fault is not None]
-    if failed and failed[0].fault is not None:
-        raise FleetError(
-            f"{path}: {len(failed)} of {len(results)} boards failed"
-            f" ({', '.join(r.entry.id for r in failed)}); the others are done;"
-            " run it again for the rest",
-            failed[0].fault.exit_code,
-        )
+    run_fleet(inventory.path, inventory.entries, work, report)

@@ -32,8 +32,9 @@ from firmware_host.commands._source import BankOptions
 from firmware_host.commands.stream import stream
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Callable, Sequence
 
+    from firmware_host.board.bank import Bank
     from firmware_host.board.board import Board
     from firmware_host.board.fleet import Entry, Result
     from firmware_host.board.monitor import Back, Gone, Unheard
@@ -249,22 +250,19 @@ def _each(
             said, table = work(board)
         say(said, table, as_json)
         return
-    from firmware_host.board.fleet import raise_failures, read_entries, run_fleet
+    from firmware_host.board.fleet import read_entries, run_fleet
 
     _beside_inventory(context, *allowed)
-    entries = read_entries(inventory)
-    report = _report(as_json)
-    raise_failures(inventory, run_fleet(entries, inventory.parent, lambda _, board: work(board), report))
+    run_fleet(inventory, read_entries(inventory), lambda _, board: work(board), _report(as_json))
 
 
 def _program_fleet(path: Path, verify: bool, stay: bool, as_json: bool) -> None:
-    from firmware_host.board.fleet import program_fleet, raise_failures, read_inventory
+    from firmware_host.board.fleet import program_fleet, read_inventory
 
     inventory = read_inventory(path)
-    raise_failures(path, program_fleet(inventory, verify, _report(as_json)))
+    program_fleet(inventory, verify, _report(as_json))
     if stay:
-        entries = [entry for entry, _ in inventory.boards]
-        _watch_fleet(path, entries, 1.0, None, True, as_json, quiet=True)
+        _watch_fleet(path, inventory.entries, 1.0, None, True, as_json, quiet=True)
 
 
 @app.command(cls=LineCommand)
@@ -470,8 +468,7 @@ def monitor(
         from firmware_host.board.fleet import read_entries
 
         _beside_inventory(context, "interval", "count", "reconnect")
-        entries = list(read_entries(inventory))
-        _watch_fleet(inventory, entries, interval, count, reconnect, as_json)
+        _watch_fleet(inventory, read_entries(inventory), interval, count, reconnect, as_json)
         return
     line: BoardLine = context.obj
     # Where no port is named the one that is found now is meant, whatever comes later.
@@ -483,7 +480,7 @@ def monitor(
 
 def _watch_fleet(
     path: Path,
-    entries: list[Entry],
+    entries: Sequence[Entry],
     interval: float,
     count: int | None,
     reconnect: bool,
@@ -575,17 +572,26 @@ def verify(
 
     For example: [bold]evlcp board --port /dev/ttyUSB0 verify SYMBOLS.json[/]
     """
+
+    def compare(bank: Bank, board: Board) -> tuple[str, dict[str, Any]]:
+        number = board.verify(bank)
+        table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
+        return f"same: {len(bank.content)} bytes in bank {number}, CRC {bank.crc:08x}", table
+
     if inventory is not None:
-        from firmware_host.board.fleet import raise_failures, read_inventory, verify_fleet
+        from firmware_host.board.fleet import read_inventory, run_fleet
 
         _beside_inventory(context)
-        raise_failures(inventory, verify_fleet(read_inventory(inventory), _report(as_json)))
+        found = read_inventory(inventory)
+        report = _report(as_json)
+        run_fleet(
+            inventory, found.entries, lambda entry, board: compare(found.banks[entry.id], board), report
+        )
         return
     bank = payload.bank()
     with open_board(context) as board:
-        number = board.verify(bank)
-    table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
-    say(f"same: {len(bank.content)} bytes in bank {number}, CRC {bank.crc:08x}", table, as_json)
+        said, table = compare(bank, board)
+    say(said, table, as_json)
 
 
 @app.command("test-leds", cls=LineCommand)

@@ -17,7 +17,7 @@ SECTORS = (*[16 << 10] * 4, 64 << 10, *[128 << 10] * 7)
 """Sizes of the flash's sectors, bytes."""
 
 _ACK, _NACK, _SYNC = 0x79, 0x1F, 0x7F
-_GET, _GET_ID, _READ, _GO, _WRITE, _ERASE = 0x00, 0x02, 0x11, 0x21, 0x31, 0x44
+_GET_ID, _READ, _GO, _WRITE, _ERASE = 0x02, 0x11, 0x21, 0x31, 0x44
 _PIECE = 256
 _OPTIONS = 0x1FFF_C000
 _BROWN_OUT = 0x0C
@@ -137,17 +137,6 @@ class RomLoader:
             return found
 
         return int.from_bytes(self._command(_GET_ID, work, "GET ID"), "big")
-
-    def version(self) -> int:
-        """Version of the protocol, two hex digits."""
-
-        def work() -> bytes:
-            count = self._bytes(1)[0] + 1
-            found = self._bytes(count)
-            self._acknowledged()
-            return found
-
-        return self._command(_GET, work, "GET")[0]
 
     def read(self, address: int, count: int) -> bytes:
         """Up to 256 bytes."""

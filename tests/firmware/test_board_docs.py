@@ -37,14 +37,14 @@ def test_inventory_is_valid(tmp_path: Path) -> None:
     )
     make_key(tmp_path / "private.pem")
     (tmp_path / "tunnel.toml").write_text(blocks("toml")[0])
-    boards = read_inventory(tmp_path / "tunnel.toml").boards
+    found = read_inventory(tmp_path / "tunnel.toml")
     # beacon, signature (two packets) and text
-    assert [(e.id, e.level_ma, b.packets) for e, b in boards] == [
+    assert [(e.id, e.level_ma, found.banks[e.id].packets) for e in found.entries] == [
         ("T01", 20, 1),
         ("T02", 20, 16),
         ("T03", 20, 4),
     ]
-    assert [bank.packet.pilot_every for _, bank in boards] == [1, 4, 4]
+    assert [bank.packet.pilot_every for bank in found.banks.values()] == [1, 4, 4]
 
 
 @pytest.mark.parametrize("block", blocks("python"))

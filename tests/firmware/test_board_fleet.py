@@ -39,7 +39,7 @@ def test_a_boards_link(tmp_path: Path) -> None:
     (tmp_path / "links" / "fast.toml").write_text("[air]\nchip_rate_hz = 20000.0\n")
     extra = {1: "link = {air = {pilot_every = 4, frames_per_packet = 8}}\n", 2: 'link = "links/fast.toml"\n'}
     file = inventory(tmp_path / "three.toml", ["unix:/a", "unix:/b", "unix:/c"], extra)
-    banks = [bank for _, bank in read_inventory(file).boards]
+    banks = list(read_inventory(file).banks.values())
     assert [b.packet.pilot_every for b in banks] == [1, 4, 1]
     assert [b.packet.frames for b in banks] == [10, 8, 10]
     assert [b.chip_rate_hz for b in banks] == [10_000, 10_000, 20_000]
@@ -53,7 +53,7 @@ def test_a_link_for_all_boards(tmp_path: Path) -> None:
     file.write_text(
         file.read_text().replace("random = 16", 'random = 16\nlink = {modulation = {id = "wh8"}}')
     )
-    assert [bank.codebook.profile for _, bank in read_inventory(file).boards] == ["wh8", "wh4x2"]
+    assert [bank.codebook.profile for bank in read_inventory(file).banks.values()] == ["wh8", "wh4x2"]
 
 
 def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
@@ -62,7 +62,7 @@ def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
     file = tmp_path / "one.toml"
     entry = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\npayload = "m.json"\n'
     file.write_text("[[board]]\n" + entry)
-    ((_, bank),) = read_inventory(file).boards
+    (bank,) = read_inventory(file).banks.values()
     assert (bank.codebook.profile, bank.chip_rate_hz) == ("wh8", 5000)
     file.write_text("[[board]]\n" + entry + "link = {air = {chip_rate_hz = 5000.0}}\n")
     with pytest.raises(IncompatibleError, match=r"board\[0\]: .*modulation\.id: sent with .*wh8"):

@@ -170,8 +170,8 @@ def test_the_packets_of_an_inventory_are_those_of_tx_message(evlcp: Evlcp, tmp_p
     (tmp_path / "two.toml").write_text(
         '[[board]]\nid = "a"\nport = "native:"\nposition_m = [0, 0, 0]\npayload = "symbols.json"\n'
     )
-    ((_, one),) = read_inventory(tmp_path / "one.toml").boards
-    ((_, two),) = read_inventory(tmp_path / "two.toml").boards
+    (one,) = read_inventory(tmp_path / "one.toml").banks.values()
+    (two,) = read_inventory(tmp_path / "two.toml").banks.values()
     assert one.content == two.content
     assert one.packets == json.loads(done.out)["packets"]
 
