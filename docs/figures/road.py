@@ -22,7 +22,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from evlcp_sdk.sim import Scene, simulate, truth_of
+from evlcp_sdk.sim import Scene, Simulation, truth_of
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import summarize
 from evlcp_sdk.study.tally import Statistics, Tally
@@ -194,7 +194,7 @@ def draw_scenes(scenes: Sequence[tuple[str, Scene]], path: Path, window_us: int 
     for axis in axes[len(scenes) :]:
         axis.set_visible(False)
     for axis, (name, scene) in zip(axes, scenes, strict=False):
-        events = Events.concat(list(simulate(scene)))
+        events = Events.concat(Simulation(scene).stream())
         end_us = int(scene.duration_s * 1e6)
         events = events[events.t_us >= end_us - window_us]
         x, y = (float(v) for v in truth_of(scene).bars[0].centre_px[-1 - window_us // 2000])

@@ -27,10 +27,10 @@ from evlcp_sdk.sim import (
     LensSpec,
     Scene,
     SensorSpec,
+    Simulation,
     Truth,
     read_truth,
     scene_of_truth,
-    simulate,
     truth_of,
 )
 from evlcp_sdk.sim.optics import blur_of
@@ -191,7 +191,7 @@ def compare() -> None:
     for events, truth_ in (
         (read_events(SHARED / "night-50m-30kmh.raw"), told),
         *(
-            (Events.concat(list(simulate(made))), truth_of(made))
+            (Events.concat(Simulation(made).stream()), truth_of(made))
             for made in (
                 scene,
                 replace(scene, sensor=SENSOR),
@@ -209,7 +209,7 @@ def compare() -> None:
         made = scene_of_truth(told)
         for name, events, truth_ in (
             (path.stem, read_events(path), told),
-            ("simulated", Events.concat(list(simulate(made))), truth_of(made)),
+            ("simulated", Events.concat(Simulation(made).stream()), truth_of(made)),
         ):
             score = receive([events], truth_)
             tails = chi2.ppf([0.975, 0.025], score.ranged)
@@ -231,7 +231,7 @@ def compare_road() -> None:
     for path in paths:
         told = read_truth(path.with_suffix(".truth.json"))
         made = scene_of_truth(told)
-        theirs, ours = read_events(path), Events.concat(list(simulate(made)))
+        theirs, ours = read_events(path), Events.concat(Simulation(made).stream())
         rates = (f"{len(events) / made.duration_s / 1e6:.2f}" for events in (theirs, ours))
         shares = (f"{events.p.mean():.3f}" for events in (theirs, ours))
         print(f"| {path.stem} | " + " | ".join((*rates, *shares)) + " |", flush=True)
@@ -240,7 +240,7 @@ def compare_road() -> None:
 def draw_scene(figure: Figure) -> None:
     image, chips = figure.subplots(1, 2, width_ratios=[1, 2.2])
     scene = Scene(duration_s=0.02, background=BackgroundSpec(light_w_m2=0.05))
-    events = Events.concat(list(simulate(scene)))
+    events = Events.concat(Simulation(scene).stream())
     counts = np.zeros((720, 1280))
     np.add.at(counts, (events.y, events.x), 1)
     x, y = (int(np.median(v)) for v in (events.x, events.y))

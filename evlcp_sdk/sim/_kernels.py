@@ -697,7 +697,7 @@ class _Shining(NamedTuple):
         part: Light of the source on each pixel, W/m2, (sources, LANES).
         halo: Of each halo: its light on each pixel, that if all shone, and the part of a node beyond `node`.
         node: Its node on the grid.
-        nodes: Room of `_near_weights`, int32 (2, LANES).
+        nodes: Room of `_take_clusters`, int32 (2, LANES).
         beside: Likewise, (LANES * (clusters + 1),).
     """
 
@@ -722,16 +722,30 @@ def _place(lanes: int, f: Array, strips: Strips, g: int, pose: int) -> None:
 
 
 @njit(fastmath={"contract"})
-def _near_weights(
-    of_strip: tuple[int, int, float, float], f: Array, edges: Array, near: Near, room: _Shining, a: int
+def _take_clusters(
+    a: int, g: int, pose: int, size: tuple[int, int], f: Array, strips: Strips, near: Near, room: _Shining
 ) -> None:
-    """Write how much light each of a strip's clusters gives each pixel, when it shines: weight of row `a`.
-
-    `of_strip` are (lanes, its number, its width in px, its light that is in the near part, W/m2); `edges`
-    (clusters + 1,) are where the clusters start and end along it, px.
+    """Find which of a source's clusters light some of `size` (lanes, pixels), and how much each does: weight
+    of row `a`.
     """
-    lanes, g, strip_px, gain = of_strip
-    table, scale, reach = near.tables[g], near.scale[g], near.reach[g]
+    lanes, count = size
+    _place(lanes, f, strips, g, pose)
+    nearest = furthest = f[_ALONG]
+    beyond, reach, strip_px = False, near.reach[g], strips.width_px[g, pose]
+    for i in range(count):
+        nearest, furthest = min(nearest, f[_ALONG + i]), max(furthest, f[_ALONG + i])
+        beyond |= abs(f[_ACROSS + i]) < reach + 0.5 * strip_px
+    bounds, b = strips.bounds[g], 0
+    while b < strips.clusters[g] and bounds[b + 1, pose] <= nearest - reach:
+        b += 1
+    m = b
+    while beyond and m < strips.clusters[g] and bounds[m, pose] < furthest + reach:
+        m += 1
+    room.clusters[a, 0], room.clusters[a, 1] = b, m
+    if m == b:
+        return
+    table, scale = near.tables[g], near.scale[g]
+    edges, gain = bounds[b : m + 1, pose], strips.gain[g] * near.share
     rows, nodes, beside, weight = room.nodes[0], room.nodes[1], room.beside, room.weight[a]
     columns = table.shape[1]
     flat = table.reshape(-1)
@@ -745,56 +759,32 @@ def _near_weights(
     half = 0.5 * (columns - 1)
     below = np.uint64(columns)
     one = np.uint64(1)
-    for b in range(edges.size):
+    for c in range(edges.size):
         # Apart, the first loop is one of vector instructions.
-        edge = edges[b]
+        edge = edges[c]
         for i in range(lanes):
             z = f[_ALONG + i] - edge
             at = half + half * z / (abs(z) + scale)
             node = min(np.int32(at), np.int32(columns - 2))
             f[_NODE_PART + i] = at - node
             nodes[i] = rows[i] + node
-        first = np.uint64(b * LANES)
+        first = np.uint64(c * LANES)
         for i in range(lanes):
             k = np.uint64(nodes[i])
             low = flat[k] + f[_NODE_PART + i] * (flat[k + one] - flat[k])
             k += below
             high = flat[k] + f[_NODE_PART + i] * (flat[k + one] - flat[k])
             beside[first + np.uint64(i)] = low + f[_ROW_PART + i] * (high - low)
-    for b in range(edges.size - 1):
-        first, behind = np.uint64(b * LANES), np.uint64((b + 1) * LANES)
+    for c in range(edges.size - 1):
+        first, behind = np.uint64(c * LANES), np.uint64((c + 1) * LANES)
         for i in range(lanes):
             seen = (
-                (f[_ALONG + i] > edges[b] - reach)
-                & (f[_ALONG + i] < edges[b + 1] + reach)
+                (f[_ALONG + i] > edges[c] - reach)
+                & (f[_ALONG + i] < edges[c + 1] + reach)
                 & (abs(f[_ACROSS + i]) < reach + 0.5 * strip_px)
             )
             share = beside[first + np.uint64(i)] - beside[behind + np.uint64(i)]
             weight[first + np.uint64(i)] = gain * share if seen else 0.0
-
-
-@njit(fastmath={"contract"})
-def _take_clusters(
-    a: int, g: int, pose: int, size: tuple[int, int], f: Array, strips: Strips, near: Near, room: _Shining
-) -> None:
-    """Find which of a source's clusters light some of `size` (lanes, pixels), and how much each does."""
-    lanes, count = size
-    _place(lanes, f, strips, g, pose)
-    nearest = furthest = f[_ALONG]
-    beyond, reach = False, near.reach[g]
-    for i in range(count):
-        nearest, furthest = min(nearest, f[_ALONG + i]), max(furthest, f[_ALONG + i])
-        beyond |= abs(f[_ACROSS + i]) < reach + 0.5 * strips.width_px[g, pose]
-    bounds, b = strips.bounds[g], 0
-    while b < strips.clusters[g] and bounds[b + 1, pose] <= nearest - reach:
-        b += 1
-    m = b
-    while beyond and m < strips.clusters[g] and bounds[m, pose] < furthest + reach:
-        m += 1
-    room.clusters[a, 0], room.clusters[a, 1] = b, m
-    if m > b:
-        of_strip = lanes, g, strips.width_px[g, pose], strips.gain[g] * near.share
-        _near_weights(of_strip, f, bounds[b : m + 1, pose], near, room, a)
 
 
 @njit(fastmath={"contract"})
@@ -864,56 +854,6 @@ def _shine(
             part[i] += room.halo[a, h, 0, i]
 
 
-@njit
-def _load(
-    pixels: Array, width: int, block: int, store: tuple[Array, Array], batch: Batch, model: PixelModel
-) -> int:
-    """Take pixels into a batch; those that were not active in the block before are new."""
-    f = batch.f
-    for i in range(pixels.size):
-        pixel = pixels[i]
-        s, c = store[0][pixel], store[1][pixel]
-        batch.code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
-        batch.key[i], batch.draw[i] = _key_of(model.seed, pixel), c[DRAW]
-        f[_X + i], f[_Y + i] = pixel % width, pixel // width
-        f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = s[ON_FACTOR], s[OFF_FACTOR], s[T_LAST_OUT]
-        f[_U + i], f[_REFERENCE + i], f[_READY + i] = s[U_BASE], s[REFERENCE], s[T_READY]
-        f[_NOW + i], f[_FOLLOWER + i], f[_ARMED + i] = s[LIGHT], s[FOLLOWER], float(c[ARMED])
-        f[_NEW + i] = 1.0 if c[BLOCK] != block + 1 else 0.0
-        if s[ON_FACTOR] == 0.0:
-            _set_thresholds(i, pixel, batch, model)
-    return _fill_up(pixels.size, batch)
-
-
-@njit
-def _keep(pixels: Array, block: int, store: tuple[Array, Array], batch: Batch) -> None:
-    """Put a batch's pixels back."""
-    f = batch.f
-    for i in range(pixels.size):
-        s, c = store[0][pixels[i]], store[1][pixels[i]]
-        s[ON_FACTOR], s[OFF_FACTOR] = f[_ON + i], f[_OFF + i]
-        s[U_BASE], s[REFERENCE] = f[_U + i], f[_REFERENCE + i]
-        s[T_READY], s[T_LAST_OUT] = f[_READY + i], f[_LAST_OUT + i]
-        s[LIGHT], s[FOLLOWER] = f[_NOW + i], f[_FOLLOWER + i]
-        c[DRAW], c[ARMED], c[BLOCK] = batch.draw[i], int(f[_ARMED + i]), block + 2
-
-
-@njit
-def _list_entries(line: TimeLine, mask: Any, stride: int, mine: Array) -> int:
-    """The entries of a time line that a batch sees: of its sources, and every so many poses; how many."""
-    n = 0
-    for e in range(line.t_us.size):
-        what = line.kind[e]
-        if what == -2:
-            takes = line.pose[e] % stride == 0
-        else:
-            takes = what == -1 or (mask >> np.uint64(what)) & np.uint64(1) != np.uint64(0)
-        if takes:
-            mine[n] = e
-            n += 1
-    return n
-
-
 @njit(fastmath={"contract"})
 def _run_batch(
     size: tuple[int, int],
@@ -935,7 +875,17 @@ def _run_batch(
         if (mask >> np.uint64(g)) & np.uint64(1):
             lit[many] = g
             many += 1
-    own = _list_entries(line, mask, stride, mine)
+    # The entries that it sees: of its sources, and every so many poses.
+    own = 0
+    for e in range(line.t_us.size):
+        what = line.kind[e]
+        if what == -2:
+            takes = line.pose[e] % stride == 0
+        else:
+            takes = what == -1 or (mask >> np.uint64(what)) & np.uint64(1) != np.uint64(0)
+        if takes:
+            mine[own] = e
+            own += 1
     pose = -1
     for q in range(own):
         e = mine[q]
@@ -1013,8 +963,9 @@ def run_pixels(
     """
     line, strips, halos, _, _ = world
     sources, many, most = strips.gain.size, halos.share.size, strips.levels.shape[1]
-    state = store[0], store[1]
+    states, counters, width = store
     batch = _make_batch()
+    f = batch.f
     shining = _Shining(
         np.empty((sources, 3), np.int64),
         np.empty((sources, LANES * most)),
@@ -1029,10 +980,28 @@ def run_pixels(
         if out.made[0] + LANES * most_events > out.t_us.size:
             return j
         pixels = block.pixels[block.batches[j] : block.batches[j + 1]]
-        size = _load(pixels, store[2], block.number, state, batch, model), pixels.size
+        for i, pixel in enumerate(pixels):
+            s, c = states[pixel], counters[pixel]
+            batch.code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
+            batch.key[i], batch.draw[i] = _key_of(model.seed, pixel), c[DRAW]
+            f[_X + i], f[_Y + i] = pixel % width, pixel // width
+            f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = s[ON_FACTOR], s[OFF_FACTOR], s[T_LAST_OUT]
+            f[_U + i], f[_REFERENCE + i], f[_READY + i] = s[U_BASE], s[REFERENCE], s[T_READY]
+            f[_NOW + i], f[_FOLLOWER + i], f[_ARMED + i] = s[LIGHT], s[FOLLOWER], float(c[ARMED])
+            # Those that were not active in the block before are new.
+            f[_NEW + i] = 1.0 if c[BLOCK] != block.number + 1 else 0.0
+            if s[ON_FACTOR] == 0.0:
+                _set_thresholds(i, pixel, batch, model)
+        size = _fill_up(pixels.size, batch), pixels.size
         of_batch = block.masks[j], block.strides[j]
         _run_batch(size, of_batch, block.end_us, world, room, batch, model, out)
-        _keep(pixels, block.number, state, batch)
+        for i, pixel in enumerate(pixels):
+            s, c = states[pixel], counters[pixel]
+            s[ON_FACTOR], s[OFF_FACTOR] = f[_ON + i], f[_OFF + i]
+            s[U_BASE], s[REFERENCE] = f[_U + i], f[_REFERENCE + i]
+            s[T_READY], s[T_LAST_OUT] = f[_READY + i], f[_LAST_OUT + i]
+            s[LIGHT], s[FOLLOWER] = f[_NOW + i], f[_FOLLOWER + i]
+            c[DRAW], c[ARMED], c[BLOCK] = batch.draw[i], int(f[_ARMED + i]), block.number + 2
     return last
 
 

@@ -1,10 +1,9 @@
 """What the sources send: strips of light whose parts switch at exact times."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,54 +39,30 @@ _WIPER_STEP_LN = 0.05
 """Steps of the light while a wiper's edge passes: a quarter of a threshold, so that none is an event."""
 
 
-@dataclass(frozen=True)
-class Pane:
-    """What a pane of glass does to the place of an image.
+@dataclass(frozen=True, eq=False)
+class Source:
+    """A strip of light that switches as a whole or part by part, or an image of one.
 
     Attributes:
-        turn_rad: By how much it turns the light's direction, to the right and down.
-        shift_px: By how much it shifts the image, to the right and down.
+        strip: Where it is.
+        light_w_m2: Irradiance of a pixel that it fills.
+        longest_us: How long its light may move a slow pixel the same way at full swing, us.
+        switches: Takes two times, us, and gives those of switching between them, float64 (n,), and the levels
+            0 to 1 from each on, float64 (n + 1, parts), the first those at the first time.
+        image: The reflection that shows it; None for the direct view.
     """
 
-    turn_rad: tuple[float, float] = (0.0, 0.0)
-    shift_px: tuple[float, float] = (0.0, 0.0)
+    strip: Strip
+    light_w_m2: float
+    longest_us: float
+    switches: Callable[[float, float], tuple[Floats, Floats]]
+    image: ReflectionSpec | None = None
 
 
-class Source(Protocol):
-    """A strip of light that switches as a whole or cluster by cluster."""
-
-    @property
-    def strip(self) -> Strip:
-        """Where it is."""
-        ...
-
-    @property
-    def light_w_m2(self) -> float:
-        """Irradiance of a pixel that it fills."""
-        ...
-
-    @property
-    def longest_us(self) -> float:
-        """How long its light may move a slow pixel the same way at full swing, us."""
-        ...
-
-    @property
-    def blur_px(self) -> float:
-        """Sigma of the blur that it has beside the lens's, px."""
-        ...
-
-    @property
-    def pane(self) -> Pane | None:
-        """The pane that shows it; None for the direct view."""
-        ...
-
-    def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-        """Return times of switching after `begin_us` and before `end_us`, and the levels 0 to 1 from each on.
-
-        Returns:
-            Times float64 (n,), us; levels float64 (n + 1, clusters), the first those at `begin_us`.
-        """
-        ...
+def cut_changes(when_us: Floats, held: Floats, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+    """Of times of change, with what holds before, between and after them, those inside a span of time."""
+    first, last = np.searchsorted(when_us, begin_us, "right"), np.searchsorted(when_us, end_us, "left")
+    return when_us[first:last], held[first : last + 1]
 
 
 class BarLight:
@@ -161,49 +136,37 @@ class BarLight:
         self.start_chip = start
         self._covers = self._checked_covers(source)
         shares = [light / self.light_w_m2 if self.light_w_m2 else 1.0 for light in lights]
-        self.strips = tuple(map(self._strip, strips, shares))
-        self.images = tuple(image for one in reflections for image in self._images(one))
+        self.strips = tuple(map(self._source, strips, shares))
+        self.images = tuple(
+            self._source(strip, share, one)
+            for one in reflections
+            for strip, share in zip(strips, shares, strict=True)
+        )
 
-    def _strip(self, strip: LitStrip, share: float) -> "StripLight":
-        """A strip of the layout in the scene, with its share of the light."""
+    def _source(self, lit: LitStrip, share: float, image: ReflectionSpec | None = None) -> Source:
+        """A strip of the layout in the scene, with its share of the light, or as a reflection shows it."""
         axes = np.stack([bar_across(self.bar), bar_axis(self.bar), bar_towards(self.bar)])
-        x, y, z = (np.array(self.centre_m) + np.array(strip.centre_m) @ axes).tolist()
-        along_x, along_y, along_z = (strip.length_m * axes[int(strip.down)]).tolist()
-        along = along_x, along_y, along_z
-        placed = Strip((x, y, z), along, strip.width_m, len(strip.clusters), strip.cuts)
-        return StripLight(self, placed, strip.clusters, share)
+        centre_m = np.array(self.centre_m) + np.array(lit.centre_m) @ axes
+        along_m = lit.length_m * axes[int(lit.down)]
+        if image is not None:
+            share *= image.share
+            if image.kind != "window":
+                plane_m, axis = self.centre_m[0], 0
+                if image.kind == "road":
+                    plane_m, axis = max(one.strip.cuts_m()[[0, -1], 1].max() for one in self.strips), 1
+                plane_m += 0.5 * image.gap_m
+                centre_m[axis], along_m[axis] = 2 * plane_m - centre_m[axis], -along_m[axis]
 
-    def _images(self, reflection: ReflectionSpec) -> tuple["StripLight", ...]:
-        """The columns as a reflection shows them."""
-        ends = np.concatenate([column.strip.cuts_m()[[0, -1]] for column in self.strips])
-        if reflection.kind == "road":
-            plane, axis = ends[:, 1].max() + 0.5 * reflection.gap_m, 1
-        else:
-            plane, axis = self.centre_m[0] + 0.5 * reflection.gap_m, 0
-        right, down = reflection.turn_deg
-        pane = Pane((math.radians(right), math.radians(down)), reflection.shift_px)
-        found = []
-        for column in self.strips:
-            strip = column.strip
-            if reflection.kind != "window":
-                centre, along = list(strip.centre_m), list(strip.along_m)
-                centre[axis], along[axis] = 2 * plane - centre[axis], -along[axis]
-                strip = replace(
-                    strip,
-                    centre_m=(centre[0], centre[1], centre[2]),
-                    along_m=(along[0], along[1], along[2]),
-                )
-            found.append(
-                replace(
-                    column,
-                    strip=strip,
-                    share=column.share * reflection.share,
-                    blur_px=reflection.blur_px,
-                    pane=pane if reflection.kind == "window" else None,
-                    direct=False,
-                )
-            )
-        return tuple(found)
+        def switches(begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+            when, levels = self.switches(begin_us, end_us)
+            if image is None:
+                when, levels = self.cover(when, levels, begin_us, end_us)
+            shown = levels[:, lit.clusters]
+            shown[:, lit.clusters < 0] = 0.0
+            return when, shown
+
+        strip = Strip(centre_m, along_m, lit.width_m, len(lit.clusters), lit.cuts)
+        return Source(strip, self.light_w_m2 * share, self.longest_us, switches, image)
 
     def _checked_covers(self, source: str) -> tuple[tuple[float, float, int, int], ...]:
         """What passes before it, poles included: (from us, to us, first cluster, last cluster)."""
@@ -314,57 +277,13 @@ class BarLight:
         return rows[first - begin * self.packet_chips : last - begin * self.packet_chips]
 
     def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-        """Times of switching and levels of all clusters; see `Source.switches`."""
+        """Times of switching and levels of all clusters; see `Source`."""
         first = math.floor(self.start_chip + begin_us * 1e-6 * self.rate_hz) - 1
         last = math.ceil(self.start_chip + end_us * 1e-6 * self.rate_hz) + 2
         first = max(first, 0)
         when: Floats = (np.arange(first, last, dtype=np.float64) - self.start_chip) / self.rate_hz * 1e6
-        inside = (when > begin_us) & (when < end_us)
-        begin = first + int((when <= begin_us).sum()) - 1
-        end = begin + 1 + int(inside.sum())
-        return when[inside], self.chips(begin, end).astype(np.float64)
-
-
-@dataclass(frozen=True, eq=False)
-class StripLight:
-    """The light of one strip of a bar's LEDs, or of an image of it.
-
-    Attributes:
-        bar: The bar.
-        strip: Where it is.
-        clusters: Which of the bar's clusters each of its parts shows, -1 for a dark part, int64 (parts,).
-        share: Share of the bar's light.
-        blur_px: Sigma of the blur that it has beside the lens's, px.
-        pane: The pane that shows it; None for none.
-        direct: Whether it is the bar itself, before which covers stand.
-    """
-
-    bar: BarLight
-    strip: Strip
-    clusters: NDArray[np.int64]
-    share: float = 1.0
-    blur_px: float = 0.0
-    pane: Pane | None = None
-    direct: bool = True
-
-    @property
-    def light_w_m2(self) -> float:
-        """Irradiance of a pixel that it fills."""
-        return self.bar.light_w_m2 * self.share
-
-    @property
-    def longest_us(self) -> float:
-        """How long its light may do the same."""
-        return self.bar.longest_us
-
-    def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-        """See `Source.switches`."""
-        when, levels = self.bar.switches(begin_us, end_us)
-        if self.direct:
-            when, levels = self.bar.cover(when, levels, begin_us, end_us)
-        shown = levels[:, self.clusters]
-        shown[:, self.clusters < 0] = 0.0
-        return when, shown
+        begin, end = np.searchsorted(when, begin_us, "right"), np.searchsorted(when, end_us, "left")
+        return when[begin:end], self.chips(first + int(begin) - 1, first + int(end)).astype(np.float64)
 
 
 def _read_chips(path: Path, clusters: int) -> NDArray[np.uint8]:
@@ -387,47 +306,25 @@ def _longest_run(chips: NDArray[np.uint8]) -> int:
     return longest
 
 
-@dataclass(frozen=True)
-class LampLight:
+def lamp_source(lamp: LampSpec) -> Source:
     """A lamp's light: a square wave, or the square of a sine in steps."""
+    if lamp.waveform == "square":
+        offsets, values = np.array([0.0, lamp.duty]), np.array([1.0, 0.0])
+    else:
+        offsets = np.arange(_SINE_STEPS) / _SINE_STEPS
+        values = np.sin(math.pi * (offsets + 0.5 / _SINE_STEPS)) ** 2
+    levels = 1 - lamp.depth + lamp.depth * values
 
-    lamp: LampSpec
-    blur_px: float = 0.0
-    pane: Pane | None = None
-
-    @property
-    def strip(self) -> Strip:
-        """Where it is."""
-        lamp = self.lamp
-        return Strip((lamp.x_m, lamp.y_m, lamp.z_m), (0, lamp.height_m, 0), lamp.width_m, 1)
-
-    @property
-    def light_w_m2(self) -> float:
-        """Irradiance of a pixel that it fills, at its peak."""
-        return self.lamp.light_w_m2
-
-    @property
-    def longest_us(self) -> float:
-        """How long its light may do the same."""
-        return 1e6 / self.lamp.flicker_hz
-
-    def switches(self, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-        """See `Source.switches`."""
-        lamp = self.lamp
-        if lamp.waveform == "square":
-            offsets, values = np.array([0.0, lamp.duty]), np.array([1.0, 0.0])
-        else:
-            offsets = np.arange(_SINE_STEPS) / _SINE_STEPS
-            values = np.sin(math.pi * (offsets + 0.5 / _SINE_STEPS)) ** 2
-        n = len(offsets)
+    def switches(begin_us: float, end_us: float) -> tuple[Floats, Floats]:
         first = math.floor(begin_us * 1e-6 * lamp.flicker_hz + lamp.phase) - 1
         last = math.ceil(end_us * 1e-6 * lamp.flicker_hz + lamp.phase) + 1
         periods = np.arange(first, last)
         when = ((periods[:, None] + offsets - lamp.phase) / lamp.flicker_hz * 1e6).ravel()
-        inside = (when > begin_us) & (when < end_us)
-        begin = int((when <= begin_us).sum()) - 1
-        which = np.arange(begin, begin + 1 + int(inside.sum())) % n
-        return when[inside], (1 - lamp.depth + lamp.depth * values[which])[:, None]
+        held = np.append(levels[-1], np.tile(levels, len(periods)))
+        return cut_changes(when, held[:, None], begin_us, end_us)
+
+    strip = Strip((lamp.x_m, lamp.y_m, lamp.z_m), (0, lamp.height_m, 0), lamp.width_m, 1)
+    return Source(strip, lamp.light_w_m2, 1e6 / lamp.flicker_hz, switches)
 
 
 def wiper_switches(wiper: WiperSpec, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
@@ -453,10 +350,7 @@ def wiper_switches(wiper: WiperSpec, begin_us: float, end_us: float) -> tuple[Fl
         first, last = (max(0, math.floor((t_us - first_us) / every_us)) for t_us in (begin_us, end_us))
         wipes = np.arange(first, last + 1, dtype=np.float64) * every_us
     when: Floats = (first_us + wipes[:, None] + once_us).ravel()
-    share = np.append(1.0, np.tile(once, len(wipes)))
-    inside = (when > begin_us) & (when < end_us)
-    begin = int((when <= begin_us).sum())
-    return when[inside], share[begin : begin + 1 + int(inside.sum())]
+    return cut_changes(when, np.append(1.0, np.tile(once, len(wipes))), begin_us, end_us)
 
 
 def reflections_of(scene: Scene, bar: int) -> tuple[ReflectionSpec, ...]:
@@ -490,7 +384,7 @@ def _random_lamps(scene: Scene) -> list[LampSpec]:
     return lamps
 
 
-def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[BarLight], list[LampLight]]:
+def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[BarLight], list[Source]]:
     """The bars and the lamps of a scene, ready to send.
 
     Args:
@@ -516,7 +410,7 @@ def sources_of(scene: Scene, registry: Registry | None = None) -> tuple[list[Bar
         )
         for i, (bar, link, site) in enumerate(zip(scene.bars, links, sites, strict=True))
     ]
-    lamps = [LampLight(lamp) for lamp in (*scene.lamps, *_random_lamps(scene))]
+    lamps = [lamp_source(lamp) for lamp in (*scene.lamps, *_random_lamps(scene))]
     columns = sum(len(bar.strips) + len(bar.images) for bar in bars)
     if columns + len(lamps) > MOST_SOURCES:
         raise ConfigError(

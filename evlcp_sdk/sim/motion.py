@@ -159,7 +159,7 @@ def _read_path(path: Path, duration_s: float) -> CubicSpline:
     return CubicSpline(table[:, 0], table[:, 1:])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Strip:
     """A straight strip of light in the world, cut into clusters from its first end.
 
@@ -171,8 +171,8 @@ class Strip:
         cuts: Where they start and end, shares of its length from -0.5 to 0.5; none: they are equal.
     """
 
-    centre_m: tuple[float, float, float]
-    along_m: tuple[float, float, float]
+    centre_m: ArrayLike
+    along_m: ArrayLike
     width_m: float
     clusters: int
     cuts: tuple[float, ...] = ()

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -16,7 +16,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.optics import Blur
 from evlcp_sdk.sim import _kernels
-from evlcp_sdk.sim.light import Source, sources_of, wiper_switches
+from evlcp_sdk.sim.light import Source, cut_changes, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.optics import blur_of, step_table, strip_table
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
@@ -302,22 +302,8 @@ def _between(slope: float, low: Floats, high: Floats) -> tuple[Floats, Floats]:
     return np.minimum(low / slope, high / slope), np.maximum(low / slope, high / slope)
 
 
-def _part(changes: tuple[Floats, Floats], begin_us: float, end_us: float) -> tuple[Floats, Floats]:
-    """Of times of change, with what holds before, between and after them, those inside a block."""
-    when, held = changes
-    first, last = np.searchsorted(when, begin_us, "right"), np.searchsorted(when, end_us, "left")
-    return when[first:last], held[first : last + 1]
-
-
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """The active pixels of a block of time, and what they see: the arguments of `run_pixels`."""
-
-    pixels: NDArray[np.int32]
-    batches: NDArray[np.int64]
-    masks: NDArray[np.uint64]
-    strides: NDArray[np.int64]
-    world: tuple[Any, ...]
+_Block = tuple[_kernels.ActivePixels, tuple[Any, ...]]
+"""The active pixels of a block of time, and what they see: arguments of `run_pixels`."""
 
 
 class Simulation:
@@ -367,13 +353,11 @@ class Simulation:
         self._texture_every = max(1, round(scene.background.texture_step_px / MOTION_STEP_PX))
         if scene.lens.bloom > 0:
             self._halos.append(_Halo.of(scene.lens.bloom, scene.lens.bloom_px, _BLOOM_EVERY))
-        self._halo_grids = (
+        self._halo_columns = (
             np.array([-one.reach_px for one in self._halos]),
             np.array([one.per_px for one in self._halos]),
             np.array([one.share for one in self._halos]),
             np.array([one.every for one in self._halos]),
-        )
-        self._halo_tables = (
             np.stack([one.table for one in self._halos]),
             np.array([(_WIDE_NODES - 1) / (2 * one.reach_px) for one in self._halos]),
         )
@@ -419,36 +403,22 @@ class Simulation:
             for number in range(math.ceil(end_us / _BLOCK_US))
         ]
         served = _Served(self)
-        if self._threads == 1:
-            for number, begin, end in spans:
-                signal = [
-                    part
-                    for job in self._jobs(number, self._prepare(begin, end), begin, end)
-                    for part in job()
-                ]
-                yield from self._given(served.of(number, end, signal), end)
-            return
-        # While the pixels of a block run, the next is prepared; whichever thread finds no more of them reads
-        # out the last one's events, and is not waited for before the next one's pixels run.
+        # While the pixels of a block run, the next is prepared, and the last one's events are read out.
         with ThreadPoolExecutor(self._threads) as pool:
-            ahead = pool.submit(self._prepare, *spans[0][1:])
+            ahead = pool.submit(self._prepare, *spans[0])
             behind: Future[Events] | None = None
-            waiting: list[_Requests] = []
             for number, begin, end in spans:
                 block = ahead.result()
                 if end < end_us:
-                    ahead = pool.submit(self._prepare, *spans[number + 1][1:])
-                running = [pool.submit(job) for job in self._jobs(number, block, begin, end)]
-                events = behind.result() if behind is not None else None
-                if number > 0:
-                    behind = pool.submit(served.of, number - 1, begin, waiting)
+                    ahead = pool.submit(self._prepare, *spans[number + 1])
+                running = [pool.submit(job) for job in self._jobs(block, begin, end)]
                 # Whoever takes the events works beside the pixels.
-                if events is not None:
-                    yield from self._given(events, begin - _BLOCK_US)
-                waiting = [part for one in running for part in one.result()]
+                if behind is not None:
+                    yield from self._given(behind.result(), begin)
+                signal = [part for one in running for part in one.result()]
+                behind = pool.submit(served.of, number, end, signal)
             if behind is not None:
-                yield from self._given(behind.result(), spans[-1][1])
-            yield from self._given(served.of(len(spans) - 1, end_us, waiting), end_us)
+                yield from self._given(behind.result(), end_us)
 
     def _given(self, events: Events, end_us: float) -> Iterator[Events]:
         """The events up to `end_us`, if there are any."""
@@ -472,27 +442,26 @@ class Simulation:
         return t[:n], code[:n]
 
     def _jobs(
-        self, number: int, block: "_Block | None", begin_us: float, end_us: float
+        self, block: _Block | None, begin_us: float, end_us: float
     ) -> list[Callable[[], list[_Requests]]]:
         """What runs the active pixels through a block, in parts; each returns their requests, unsorted."""
         if block is None:
             return []
+        active, world = block
         most = int((end_us - begin_us) / self.scene.sensor.refr_us) + 8
-        cuts = [0, len(block.masks)]
+        cuts = [0, len(active.masks)]
         if self._threads > 1:
             # Ever smaller, so that all threads are done at about the same time.
             left = (1 - 0.5 / self._threads) ** np.arange(_PARTS * self._threads)
-            cuts = (len(block.masks) * np.append(1 - left, 1)).astype(int).tolist()
-
+            cuts = (len(active.masks) * np.append(1 - left, 1)).astype(int).tolist()
         store = self._state, self._counters, self.scene.camera.width
-        now = _kernels.ActivePixels(number, end_us, block.pixels, block.batches, block.masks, block.strides)
 
         def run(first: int, last: int) -> list[_Requests]:
             found = []
             while first < last:
                 size = max(_ROOM, _kernels.LANES * most)
                 out = requests_room(size)
-                first = _kernels.run_pixels(first, last, now, store, block.world, self._model, most, out)
+                first = _kernels.run_pixels(first, last, active, store, world, self._model, most, out)
                 n = int(out.made[0])
                 found.append((out.t_us[:n], out.code[:n]))
             return found
@@ -527,7 +496,7 @@ class Simulation:
     def _look(self, source: Source, depth_m: float, strip_px: float, cuts_px: Floats) -> _Look:
         """How a source looks at this depth, where its clusters start and end so far along it."""
         scene = self.scene
-        blur = blur_of(depth_m, scene.lens, scene.camera, source.blur_px)
+        blur = blur_of(depth_m, scene.lens, scene.camera, source.image.blur_px if source.image else 0.0)
         scale = _NEAR_SCALE * float(blur.sigma_px[0])
         near = strip_table(blur, strip_px, scale, _NEAR_NODES)
         z = np.arange(0, self._wide_reach, 0.25)
@@ -565,7 +534,7 @@ class Simulation:
             )
         return self._stretch
 
-    def _prepare(self, begin_us: float, end_us: float) -> _Block | None:
+    def _prepare(self, number: int, begin_us: float, end_us: float) -> _Block | None:
         """Where the sources are in a block, how they switch, and which pixels they may excite."""
         scene = self.scene
         camera, sensor = scene.camera, scene.sensor
@@ -573,14 +542,14 @@ class Simulation:
         of_block = slice(*np.searchsorted(stretch.starts_us, (begin_us, end_us)))
         starts, attitude = stretch.starts_us[of_block], stretch.attitude[of_block]
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
-        wiped_us, shade = _part(stretch.wiped, begin_us, end_us)
+        wiped_us, shade = cut_changes(*stretch.wiped, begin_us, end_us)
         lightest = float(shade.max())
         darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._darkest_texture * shade.min())
         shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Floats, Floats, _Look]] = []
         marked: list[NDArray[np.int64]] = []
         beyond: list[NDArray[np.uint8]] = []
-        for number, source in enumerate(self._sources):
-            (places, depths), sent = stretch.seen[number], stretch.sent[number]
+        for i, source in enumerate(self._sources):
+            (places, depths), sent = stretch.seen[i], stretch.sent[i]
             place, depth = places[of_block], depths[of_block]
             if depth.min() <= NEAREST_M:
                 continue
@@ -591,12 +560,12 @@ class Simulation:
             bounds = ((place - place[:, :1]) * axis[:, None]).sum(-1)
             m = len(place) // 2
             depth_m = float(middle_depth[m])
-            look = self._looks.get(number)
+            look = self._looks.get(i)
             if look is None or abs(depth_m / look.depth_m - 1) > _SAME_DEPTH:
                 # That of a depth that it is on its way to, so that it is as often too near as too far.
                 nearer = 1 + _SAME_DEPTH * float(np.sign(middle_depth[0] - middle_depth[-1]))
                 look = self._look(source, depth_m / nearer, float(strip_px[m]) * nearer, bounds[m] * nearer)
-                self._looks[number] = look
+                self._looks[i] = look
             least = ACTIVITY_FLOOR * max(darkest, sensor.charge_us_w_m2 / source.longest_us)
             lit, far = self._lit_pixels(place, 0.5 * float(strip_px.max()), look, least / lightest)
             if len(lit):
@@ -629,7 +598,7 @@ class Simulation:
             strips[i], clusters[i], gain[i] = strip_px, k, source.light_w_m2
             near_scale[i], near_reach[i] = look.scale_px, look.blur.reach_px
             tables[i] = look.near
-            when, levels = _part(sent, begin_us, end_us)
+            when, levels = cut_changes(*sent, begin_us, end_us)
             switches.append(when)
             levels_of.append(levels)
             for of, share in zip(halos_of, look.halos, strict=True):
@@ -639,21 +608,23 @@ class Simulation:
         world = (
             line,
             _kernels.Strips(levels, origin, axis, bounds, strips, clusters, gain),
-            _kernels.Halos(halo, *self._halo_grids, *self._halo_tables),
+            _kernels.Halos(halo, *self._halo_columns),
             _kernels.Near(self._near_share, tables, near_scale, near_reach),
             _kernels.Scenery(turn, self._texture_every, self._texture, background),
         )
-        return _Block(*_batches(pixels, masks, far, self._texture_every), world)
+        batches = _batches(pixels, masks, far, self._texture_every)
+        return _kernels.ActivePixels(number, end_us, *batches), world
 
     def seen(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
         """Where a source's clusters start and end in the image, and their depths; see `project`."""
-        pane = source.pane
-        if pane is None:
+        image = source.image
+        if image is None or image.kind != "window":
             return project(source.strip.cuts_m(), position, attitude, self.scene.camera)
         # Light that comes from further to the right is light seen by a camera that looks further to the left.
-        turned = attitude + np.array([-pane.turn_rad[0], pane.turn_rad[1], 0.0])
+        right, down = map(math.radians, image.turn_deg)
+        turned = attitude + np.array([-right, down, 0.0])
         place, depth = project(source.strip.cuts_m(), position, turned, self.scene.camera)
-        return place + np.array(pane.shift_px), depth
+        return place + np.array(image.shift_px), depth
 
     def _with_background(
         self,
@@ -792,34 +763,3 @@ class _Served:
         if simulation.scene.t0_us:
             columns[0][:written] += simulation.scene.t0_us
         return Events(columns[0][:written], columns[1][:written], columns[2][:written], columns[3][:written])
-
-
-def simulate(
-    scene: Scene,
-    seed: int | None = None,
-    *,
-    threads: int = 1,
-    max_events: int = 1 << 16,
-    registry: Registry | None = None,
-) -> Iterator[Events]:
-    """Yield a scene's events in order of time, in pieces of at most `max_events`.
-
-    Args:
-        scene: What to render.
-        seed: Instead of the scene's.
-        threads: Threads that share the pixels; the events do not depend on it.
-        max_events: Length of a piece; the events do not depend on it.
-        registry: Where the algorithms of its links are found; None for all that are installed.
-
-    Raises:
-        ConfigError: The scene cannot be rendered.
-        InputError: One of its files cannot be read.
-    """
-    for events in Simulation(scene, seed, threads, registry).stream():
-        for begin in range(0, len(events), max_events):
-            yield events[begin : begin + max_events]
-
-
-def scene_table(scene: Scene) -> dict[str, Any]:
-    """The scene as plain values, every default written out; `resolve_scene` takes it back."""
-    return asdict(scene)

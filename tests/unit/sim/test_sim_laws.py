@@ -22,7 +22,6 @@ from evlcp_sdk.sim import (
     Simulation,
     load_scene,
     scene_of_truth,
-    simulate,
     simulation,
     truth_of,
 )
@@ -36,7 +35,7 @@ QUIET = SensorSpec(noise_hz=0.0, hot_share=0.0)
 
 
 def every(scene: Scene, seed: int | None = None, threads: int = 1) -> Events:
-    return Events.concat(list(simulate(scene, seed, threads=threads)))
+    return Events.concat(Simulation(scene, seed, threads).stream())
 
 
 def same(a: Events, b: Events) -> bool:
@@ -54,19 +53,16 @@ def test_threads_pieces_and_runs_do_not_matter() -> None:
     assert (np.diff(events.t_us) >= 0).all()
     assert same(events, every(SHORT))
     assert same(events, every(SHORT, threads=3))
-    pieces = list(simulate(SHORT, max_events=777))
-    assert max(map(len, pieces)) == 777
-    assert same(events, Events.concat(pieces))
     assert not same(events, every(SHORT, seed=1))
 
 
 def test_what_is_worked_out_anew_less_often_changes_next_to_no_event(monkeypatch: pytest.MonkeyPatch) -> None:
     scene = load_scene("drive-30kmh", {"motion.distance_m": 30.0, "duration_s": 0.04})
     simulated = Simulation(scene)
-    block = simulated._prepare(0.0, 4000.0)
+    block = simulated._prepare(0, 0.0, 4000.0)
     assert block is not None
     # Pixels far beside the strip are most of them and see only every second to eighth pose.
-    assert set(block.strides.tolist()) == {1, 2, 4, 8}
+    assert set(block[0].strides.tolist()) == {1, 2, 4, 8}
     coarse = every(scene)
     monkeypatch.setattr(simulation, "_FAR_PX", ())
     monkeypatch.setattr(simulation, "_SAME_DEPTH", 0.0)

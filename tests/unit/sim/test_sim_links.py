@@ -2,7 +2,7 @@
 
 import math
 import pickle
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +27,6 @@ from evlcp_sdk.sim import (
     load_scene,
     resolve_scene,
     scene_of_truth,
-    scene_table,
-    simulate,
     truth_of,
 )
 from evlcp_sdk.sim.light import BarLight
@@ -57,7 +55,7 @@ class Stranger:
 
 
 def every(scene: Scene, seed: int = 1, registry: Registry | None = None) -> Events:
-    return Events.concat(list(simulate(scene, seed, registry=registry)))
+    return Events.concat(Simulation(scene, seed, registry=registry).stream())
 
 
 def test_a_bar_lays_its_tables_over_the_scene_s(tmp_path: Path) -> None:
@@ -86,7 +84,7 @@ def test_a_bar_lays_its_tables_over_the_scene_s(tmp_path: Path) -> None:
     for name in ("scene", "common", "other"):
         (tmp_path / f"{name}.toml").unlink()
     assert links_of(pickle.loads(pickle.dumps(scene))) == links_of(scene)
-    assert resolve_scene(scene_table(scene)) == scene
+    assert resolve_scene(asdict(scene)) == scene
     assert links_of(scene_of_truth(truth_of(scene).to_table())) == links_of(scene)
 
 

@@ -14,7 +14,7 @@ from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import Truth, load_scene, resolve_scene, simulate, sites_of, truth_of
+from evlcp_sdk.sim import Simulation, Truth, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.light import sources_of
 from evlcp_sdk.study.measure import message_tallies
 from evlcp_sdk.study.tally import Tally
@@ -89,7 +89,9 @@ def test_what_cannot_be_sent_is_told(bar: dict[str, Any], told: str) -> None:
 def received() -> tuple[Truth, list[Packet]]:
     scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
     receiver = Receiver(load_link())
-    packets = [p for events in simulate(scene, 3) for p in receiver.feed(events)] + receiver.close()
+    packets = [
+        p for events in Simulation(scene, 3).stream() for p in receiver.feed(events)
+    ] + receiver.close()
     return truth_of(scene, 3), packets
 
 
@@ -147,7 +149,7 @@ def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> No
 @pytest.mark.parametrize("after_us", [4_000, 10_000, 17_000, 24_600])
 def test_ten_milliseconds_lost_in_every_packet(after_us: int) -> None:
     scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
-    events = Events.concat(simulate(scene, 3))
+    events = Events.concat(Simulation(scene, 3).stream())
     # Packets of 34.6 ms begin 4.6 ms after the scene; their preambles stay, or nothing tells where they are.
     left = events[(events.t_us - 4_600 - after_us) % 34_600 >= 10_000]
     assert len(left) < 0.75 * len(events)
@@ -168,6 +170,8 @@ def test_one_cluster_dark(cluster: int, tmp_path: Path) -> None:
     dark = {"bars.chips_file": str(tmp_path / "chips.npy"), "bars.payload": "symbols"}
     scene = load_scene("drive-30kmh", settings | dark)
     receiver = Receiver(load_link())
-    packets = [p for events in simulate(scene, 3) for p in receiver.feed(events)] + receiver.close()
+    packets = [
+        p for events in Simulation(scene, 3).stream() for p in receiver.feed(events)
+    ] + receiver.close()
     found = [p.block.sequence for p in packets if p.block is not None]
     assert found == [1, 2, 3]

@@ -115,17 +115,20 @@ def test_the_kernel_looks_up_what_the_table_says() -> None:
     along[0] = 1e20
     expected = table_at(table, 1.9, across, along)
     # One cluster that begins here and ends at infinity.
-    edges = np.array([0.0, 1e30])
+    none, one = np.empty(0), np.ones((1, 1))
+    origin, down = np.zeros((2, 1, 1)), np.array([0.0, 1.0]).reshape(2, 1, 1)
+    bounds = np.array([0.0, 1e30]).reshape(1, 2, 1)
+    strips = _kernels.Strips(none, origin, down, bounds, 0.7 * one, np.ones(1, int), np.array([3.0]))
     lanes = np.zeros(_kernels._ROOM)
-    lanes[_kernels._ALONG : _kernels._ALONG + pixels] = along
-    lanes[_kernels._ACROSS : _kernels._ACROSS + pixels] = across
-    weight, none = np.empty((1, _kernels.LANES)), np.empty(0)
+    lanes[_kernels._X : _kernels._X + pixels] = across
+    lanes[_kernels._Y : _kernels._Y + pixels] = along
+    weight, clusters = np.empty((1, _kernels.LANES)), np.empty((1, 3), int)
     nodes = np.empty((2, pixels), np.int32)
-    room = _kernels._Shining(none, weight, none, none, none, nodes, np.empty(2 * _kernels.LANES))
+    room = _kernels._Shining(clusters, weight, none, none, none, nodes, np.empty(2 * _kernels.LANES))
 
     def look_up(reach_px: float) -> None:
         near = _kernels.Near(1.0, table[None], np.array([1.9]), np.array([reach_px]))
-        _kernels._near_weights.py_func((pixels, 0, 0.7, 3.0), lanes, edges, near, room, 0)
+        _kernels._take_clusters.py_func(0, 0, 0, (pixels, pixels), lanes, strips, near, room)
 
     look_up(1e40)
     np.testing.assert_allclose(weight[0, :pixels], 3.0 * expected, rtol=0, atol=1e-11)

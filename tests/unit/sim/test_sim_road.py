@@ -2,7 +2,7 @@
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +26,6 @@ from evlcp_sdk.sim import (
     WiperSpec,
     resolve_scene,
     scene_of_truth,
-    scene_table,
-    simulate,
     truth_of,
 )
 from evlcp_sdk.sim._kernels import COLUMN_BITS, read_out, texture_at
@@ -51,7 +49,7 @@ Floats = NDArray[np.float64]
 
 
 def every(scene: Scene, **options: int) -> Events:
-    return Events.concat(list(simulate(scene, **options)))
+    return Events.concat(Simulation(scene, **options).stream())
 
 
 def rows(events: Events) -> list[tuple[int, int, int, int]]:
@@ -179,11 +177,11 @@ def light_on(scene: Scene, column: int, row: int) -> tuple[Floats, Floats]:
     for source, (when, levels) in zip(sources, switched, strict=True):
         cuts = source.strip.cuts_m()
         depth = scene.motion.distance_m
-        shift = source.pane.shift_px if source.pane is not None else (0.0, 0.0)
+        shift, blur_px = (source.image.shift_px, source.image.blur_px) if source.image else ((0.0, 0.0), 0.0)
         x = 640 + cuts[:, 0] / depth * FOCAL_PX + shift[0]
         y = 360 + cuts[:, 1] / depth * FOCAL_PX + shift[1]
         half = source.strip.width_m / depth * FOCAL_PX / 2
-        blur = blur_of(depth, lens, scene.camera, source.blur_px)
+        blur = blur_of(depth, lens, scene.camera, blur_px)
         near = (1 - lens.halo - lens.bloom) * blur.share
         weight = np.zeros(len(cuts) - 1)
         for share, sigma in (*zip(near, blur.sigma_px, strict=True), *halos):
@@ -336,7 +334,7 @@ def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
     assert rows(events[events.t_us < until]) == rows(long[long.t_us < until])
     table = json.loads(json.dumps(truth_of(scene).to_table()))
     assert scene_of_truth(table) == scene
-    assert resolve_scene(json.loads(json.dumps(scene_table(scene)))) == scene
+    assert resolve_scene(json.loads(json.dumps(asdict(scene)))) == scene
 
 
 def held_by_hand(t: Floats, y: Floats, x: Floats, row_us: float) -> list[tuple[int, int, int]]:

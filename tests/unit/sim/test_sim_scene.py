@@ -26,7 +26,7 @@ from evlcp_sdk.sim import (
     resolve_scene,
     truth_of,
 )
-from evlcp_sdk.sim.light import BarLight, LampLight
+from evlcp_sdk.sim.light import BarLight, lamp_source
 from evlcp_sdk.sim.motion import CameraPath, Vibration, project
 from evlcp_sdk.sim.optics import blur_sigma_px, step_table
 
@@ -145,13 +145,13 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
 
 
 def test_lamps_keep_their_period_and_duty() -> None:
-    square = LampLight(LampSpec(flicker_hz=1000.0, duty=0.3, depth=0.8, phase=0.5))
+    square = lamp_source(LampSpec(flicker_hz=1000.0, duty=0.3, depth=0.8, phase=0.5))
     when, levels = square.switches(0.0, 10_000.0)
     assert np.diff(when[::2]) == pytest.approx(1000)
     assert sorted({round(float(v), 9) for v in levels.ravel()}) == [0.2, 1.0]
     on = np.diff(np.concatenate([[0], when, [10_000]]))[levels[:, 0] == 1].sum()
     assert on == pytest.approx(3000, rel=0.1)
-    sine = LampLight(LampSpec(flicker_hz=100.0, waveform="sine"))
+    sine = lamp_source(LampSpec(flicker_hz=100.0, waveform="sine"))
     when, levels = sine.switches(0.0, 10_000.0)
     assert len(when) == 31
     assert levels.max() > 0.99

@@ -11,6 +11,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
+from evlcp_sdk.sim.leds import lit_strips
 from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.world import attitude_log, scene_to_enu, sites_said
 
@@ -69,9 +70,9 @@ def test_clusters_that_are_not_in_line_stand_where_their_light_is(layout: dict[s
     scene = resolve_scene({"world": WORLD, "motion": {"distance_m": 50.0}, "bars": [bar]})
     (site,), (light,) = sites_of(scene), Simulation(scene).bars
     found = site.layout_positions_m(light.link.bar, LocalAxes(35.1, 137.2, 40.0))
-    for strip in light.strips:
+    for lit, strip in zip(lit_strips(light.bar, light.link.bar), light.strips, strict=True):
         cuts = strip.strip.cuts_m()
-        for k, middle in zip(strip.clusters, (cuts[1:] + cuts[:-1]) / 2, strict=True):
+        for k, middle in zip(lit.clusters, (cuts[1:] + cuts[:-1]) / 2, strict=True):
             if k >= 0:
                 np.testing.assert_allclose(found[k], scene_to_enu(middle, 30.0), atol=1e-5)
 
