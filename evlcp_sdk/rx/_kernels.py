@@ -46,9 +46,6 @@ _CLOCK = np.uint32(CLOCK_AT)
 _BLOCK = 32
 """Events that are looked at together: of a bar alone in the dark, every other block has no stray in it."""
 
-FEW_BOXES = 16
-"""Boxes up to which comparing all events with each takes less than looking up which box is near."""
-
 _ROUND = np.uint32(CLOCK_ROUND - 1)
 
 
@@ -327,116 +324,6 @@ def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) ->
         out_p[n] = p[i]
         n += np.uint64(np.uint16(x[i] - left) < width) & np.uint64(np.uint16(y[i] - top) < height)
     return int(np.int64(n))
-
-
-@njit
-def label_boxes(boxes: Array, cell_shift: int, labels: Array, alone: Array) -> None:
-    """Label the cells of 2^cell_shift px that boxes (n, 4) touch, k + 1, but of those that touch others'.
-
-    `alone` (n,) says which boxes were labelled, the first of those that touch the same cell.
-    """
-    for k in range(len(boxes)):
-        left, top = boxes[k, 0] >> cell_shift, boxes[k, 1] >> cell_shift
-        right, bottom = (boxes[k, 2] - 1 >> cell_shift) + 1, (boxes[k, 3] - 1 >> cell_shift) + 1
-        if boxes[k, 0] >= boxes[k, 2]:
-            right = left
-        alone[k] = True
-        for v in range(top, bottom):
-            for u in range(left, right):
-                alone[k] &= labels[v, u] == 0
-        if alone[k]:
-            for v in range(top, bottom):
-                for u in range(left, right):
-                    labels[v, u] = k + 1
-
-
-@njit
-def _name_few(x: Array, y: Array, boxes: Array, of: Array, alone: Array) -> None:
-    """Say which box (n, 4) each event is in, k + 1, or 0; not of those that share events with one before.
-
-    Box by box: so a comparison takes sixteen events at a time.
-    """
-    of[:] = 0
-    for k in range(len(boxes)):
-        left, top = np.uint16(boxes[k, 0]), np.uint16(boxes[k, 1])
-        width = np.uint16(max(boxes[k, 2] - boxes[k, 0], 0))
-        height = np.uint16(max(boxes[k, 3] - boxes[k, 1], 0))
-        name, shared = np.uint16(k + 1), np.uint16(0)
-        for i in range(x.size):
-            inside = np.uint16(np.uint16(x[i] - left) < width) & np.uint16(np.uint16(y[i] - top) < height)
-            free = np.uint16(of[i] == 0)
-            shared |= inside & ~free
-            of[i] |= np.uint16(inside & free) * name
-        alone[k] = shared == 0
-        for i in range(x.size if shared else 0):
-            of[i] *= np.uint16(of[i] != name)
-
-
-@njit
-def _name_by_label(x: Array, y: Array, boxes: Array, cell_shift: int, labels: Array, of: Array) -> None:
-    """Say which labelled box (n, 4) each event is in, k + 1, or 0: as quick however many there are."""
-    shift = np.uint64(cell_shift)
-    for i in range(x.size):
-        name = labels[np.uint64(y[i]) >> shift, np.uint64(x[i]) >> shift]
-        k = np.uint64(max(name - 1, 0))
-        u, v = np.int64(x[i]), np.int64(y[i])
-        inside = (boxes[k, 0] <= u) & (u < boxes[k, 2]) & (boxes[k, 1] <= v) & (v < boxes[k, 3])
-        of[i] = name * inside
-
-
-@njit
-def select_boxes(
-    events: Columns,
-    boxes: Array,
-    filtered: Array,
-    pixels: Array,
-    heard: tuple[int, int],
-    labels: tuple[int, Array],
-    alone: Array,
-    begins: Array,
-) -> Columns:
-    """Events inside some boxes (n, 4), one box after the other, but for those that are not `alone` (n,).
-
-    Those of a box begin at `begins` (n + 1,). Of one that is `filtered` (n,), they are events that
-    `in_rhythm` marks, by the least score and the same time so often. Labels, with their cells' shift, see
-    `label_boxes`, are taken of more than `FEW_BOXES`, with `alone` by them.
-    """
-    t_us, x, y, p = events
-    least, same = heard
-    many, size = len(boxes), t_us.size
-    of = np.empty(size, np.uint16)
-    if many <= FEW_BOXES:
-        _name_few(x, y, boxes, of, alone)
-    else:
-        _name_by_label(x, y, boxes, labels[0], labels[1], of)
-    if filtered.any():
-        for i in range(size):
-            if of[i] and filtered[of[i] - 1]:
-                of[i] *= _listened(pixels[y[i], x[i]], least, same)
-    counts = np.zeros(many + 1, np.int64)
-    if many <= FEW_BOXES:
-        for k in range(many):
-            for i in range(size):
-                counts[k + 1] += of[i] == np.uint16(k + 1)
-    else:
-        for i in range(size):
-            counts[of[i]] += 1
-    # Events in none are written, too, each over the one before: a branch would be a coin toss.
-    place, step = np.empty(many + 1, np.uint64), np.ones(many + 1, np.uint64)
-    begins[0], step[0] = 0, 0
-    for k in range(many):
-        place[k + 1] = begins[k]
-        begins[k + 1] = begins[k] + counts[k + 1]
-    place[0] = begins[many]
-    room = begins[many] + 1
-    out_t, out_p = np.empty(room, np.int64), np.empty(room, np.uint8)
-    out_x, out_y = np.empty(room, np.uint16), np.empty(room, np.uint16)
-    for i in range(size):
-        name = np.uint64(of[i])
-        at = place[name]
-        place[name] = at + step[name]
-        out_t[at], out_x[at], out_y[at], out_p[at] = t_us[i], x[i], y[i], p[i]
-    return out_t, out_x, out_y, out_p
 
 
 @njit

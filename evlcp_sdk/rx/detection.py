@@ -66,9 +66,6 @@ _MIN_PIXELS = 4
 _CENTRE_SIGMA_PX = 0.25
 """Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
 
-_FEW = 1
-"""Boxes up to which whole blocks of events are copied: of two bars, few blocks are one's alone."""
-
 BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
 
@@ -258,10 +255,11 @@ class RegionFollower(RegionTracker):
 
     def _select(self, events: Events, boxes: list[Box]) -> list[Events]:
         """The events of a step inside the box of each region; those that it listens to."""
-        if len(boxes) <= _FEW and self._all_known():
-            return [select(events, box) for box in boxes]
-        unknown = np.array([followed.size_px is None for followed in self.alive])
-        return self._rhythm.select(events, np.array(boxes, np.int64), unknown)
+        inside = (select(events, box) for box in boxes)
+        return [
+            part if one.size_px else self._rhythm.of(part)
+            for one, part in zip(self.alive, inside, strict=True)
+        ]
 
     def _remember(self, start_us: int, events: Events) -> None:
         """Keep a step's events of the whole image, and as many before it as there is room for."""

@@ -53,9 +53,6 @@ for one by the second, but for nine of the one pilot of sixteen that is two chip
 misses one rise in ten is so by both for more than half of the time, one that misses none always. More
 repetitions would spare more of a code, and take longer to know a panel, which costs the frames before."""
 
-_LABEL_SHIFT = 3
-"""Cells of 8 x 8 px say which box is near: few, so that they stay in the cache."""
-
 _LATE, _OFF = 0, 16
 """Kind of a time between rises: see `_TIMES`, or 0 beyond; so much more where it is off the chips."""
 
@@ -107,7 +104,6 @@ class Rhythm:
         self._lows = _lows(gap_chips)
         self._min_score = min_score
         self._pixels = np.zeros((height, width), np.uint32)
-        self._labels = np.zeros([(n - 1 >> _LABEL_SHIFT) + 1 for n in (height, width)], np.int16)
         # No time that is looked up is longer; nor are rows looked at one by one after so long a gap.
         self._turn = _kernels.CLOCK_ROUND // 4
         self._old = self._turn + self._turn // 8
@@ -158,33 +154,6 @@ class Rhythm:
         keep = np.empty(len(events), np.bool_)
         _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, most_same, keep)
         return keep
-
-    def select(self, events: Events, boxes: NDArray[np.int64], filtered: NDArray[np.bool_]) -> list[Events]:
-        """Those inside each of some boxes, in no more memory than twice what they need.
-
-        Args:
-            events: Of one step.
-            boxes: (left, top, right, bottom) of each, int64 (n, 4), px.
-            filtered: Of which boxes only candidates that are no lamps are meant, bool (n,).
-        """
-        alone = np.empty(len(boxes), np.bool_)
-        if len(boxes) > _kernels.FEW_BOXES:
-            self._labels[:] = 0
-            _kernels.label_boxes(boxes, _LABEL_SHIFT, self._labels, alone)
-        begins = np.empty(len(boxes) + 1, np.int64)
-        taken, heard, labels = columns_of(events), (self._min_score, _LAMP), (_LABEL_SHIFT, self._labels)
-        columns = _kernels.select_boxes(taken, boxes, filtered, self._pixels, heard, labels, alone, begins)
-        total, found = int(begins[-1]), []
-        for k, (begin, end) in enumerate(pairwise(begins.tolist())):
-            if not alone[k]:
-                inside = select(events, tuple(boxes[k].tolist()))
-                found.append(self.of(inside) if filtered[k] else inside)
-                continue
-            part = [column[begin:end] for column in columns]
-            if 2 * (end - begin) < total:
-                part = [column.copy() for column in part]
-            found.append(Events.as_is(*part))
-        return found
 
     def measure(
         self,

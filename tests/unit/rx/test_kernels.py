@@ -256,31 +256,6 @@ def test_events_in_boxes(n, freeze):
         assert taken == len(want)
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("many", [0, 1, 2, 9, 40])
-def test_events_in_many_boxes_at_once(seed, many):
-    rng = np.random.default_rng(seed)
-    events = random_events(rng, 700)
-    shape = (HEIGHT, WIDTH)
-    score, same = rng.integers(0, 41, shape), rng.integers(0, 32, shape)
-    pixels = states(rng.integers(0, 2**17, shape), rng.integers(0, 14, shape), score, same)
-    # Empty ones and equal ones among them, and such that overlap.
-    left, top = rng.integers(0, WIDTH, many), rng.integers(0, HEIGHT, many)
-    right = np.minimum(left + rng.integers(0, 9, many), WIDTH)
-    boxes = np.stack([left, top, right, np.minimum(top + rng.integers(1, 9, many), HEIGHT)], 1)
-    boxes[1::7] = boxes[::7][: len(boxes[1::7])]
-    filtered = rng.random(many) < 0.5
-    rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 20)
-    rhythm._pixels[:] = pixels
-    found = rhythm.select(events, boxes, filtered)
-    listened = ((score >= 20) & (same < 14))[events.y, events.x]
-    assert len(found) == many
-    for got, box, only in zip(found, boxes.tolist(), filtered, strict=True):
-        want = twins.select_box(events[listened] if only else events, tuple(box))
-        for name in ("t_us", "x", "y", "p"):
-            assert_array_equal(getattr(got, name), getattr(want, name))
-
-
 @pytest.mark.parametrize("freeze", [1, 2])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_polarity_sums(seed, freeze):
