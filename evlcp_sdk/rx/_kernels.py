@@ -125,16 +125,12 @@ def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: in
 
 
 @njit
-def _listened(state: int, least: int, same: int) -> bool:
-    again = (np.uint32(state) >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
-    return bool((np.uint32(state) & np.uint32(SCORES)) >= np.uint32(least)) & bool(again < np.uint32(same))
-
-
-@njit
 def in_rhythm(x: Array, y: Array, pixels: Array, least: int, same: int, keep: Array) -> None:
     """Mark events of pixels with a score of `least` or more whose rises are not `same` time after time."""
     for i in range(x.size):
-        keep[i] = _listened(pixels[y[i], x[i]], least, same)
+        state = pixels[y[i], x[i]]
+        again = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
+        keep[i] = (state & np.uint32(SCORES)) >= np.uint32(least) and again < np.uint32(same)
 
 
 @njit
@@ -1596,16 +1592,6 @@ def farthest_off(selected: Array, grid: int, on: complex, turn: complex) -> floa
 
 
 @njit
-def bounds_of(places: Array) -> tuple[float, float, float, float]:
-    """Least and greatest column and row of places (K,), columns + rows * 1j."""
-    left, right, top, bottom = np.inf, -np.inf, np.inf, -np.inf
-    for place in places:
-        left, right = min(left, place.real), max(right, place.real)
-        top, bottom = min(top, place.imag), max(bottom, place.imag)
-    return left, right, top, bottom
-
-
-@njit
 def cells_by_place(
     at: Array,
     cluster: Array,
@@ -1646,17 +1632,6 @@ def cells_by_place(
             many += 1
             total += in_place[k]
     return shown, many, total, left
-
-
-@njit
-def mean_off(points: Array, places: Array) -> complex | None:
-    """How far points (K, 2) are off their places on average, without those that are NaN; None without any."""
-    total, n = complex(0.0, 0.0), 0
-    for k in range(places.size):
-        if np.isfinite(points[k, 0]) and np.isfinite(points[k, 1]):
-            total += complex(points[k, 0], points[k, 1]) - places[k]
-            n += 1
-    return total / n if n else None
 
 
 @njit

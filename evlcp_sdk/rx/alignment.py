@@ -1,6 +1,7 @@
 """A frame with the bar held still: the image of a moving bar, chip by chip, and where its clusters are."""
 
 import math
+from cmath import isfinite
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
@@ -196,10 +197,12 @@ class FrameAligner:
         Points are finer than the cells that placed the layout; without any, those count.
         """
         placed = aligned.placement
-        off = _kernels.mean_off(points_px, placed.places(self._layout))
-        if off is None:
+        places = placed.places(self._layout).tolist()
+        off = [complex(*at) - place for at, place in zip(points_px.tolist(), places, strict=True)]
+        off = [one for one in off if isfinite(one)]
+        if not off:
             return aligned.centre_px
-        centre = placed.shift + off
+        centre = placed.shift + sum(off) / len(off)
         return centre.real, centre.imag
 
     def box(
@@ -212,8 +215,9 @@ class FrameAligner:
             placement: The bar's own or that of another instance, taken to be as wide.
         """
         places, right_px, down_px = self._spots(aligned, placement)
-        left, right, top, bottom = _kernels.bounds_of(places)
-        left, right, top, bottom = left - right_px, right + right_px, top - down_px, bottom + down_px
+        columns, rows = places.real.tolist(), places.imag.tolist()
+        left, right = min(columns) - right_px, max(columns) + right_px
+        top, bottom = min(rows) - down_px, max(rows) + down_px
         x, y = aligned.corner_px
         return (x + (left + right) / 2, y + (top + bottom) / 2), (right - left, bottom - top)
 
@@ -247,9 +251,10 @@ class FrameAligner:
         if placement.scale == 0 or False not in placement.seen.tolist():
             return None
         places, _, down_px = self._spots(aligned, placement)
-        _, _, top, bottom = _kernels.bounds_of(places)
-        rows = places.imag[placement.seen]
-        first, last, centre = float(rows.min()), float(rows.max()), (top + bottom) / 2
+        rows = places.imag
+        shown = rows[placement.seen].tolist()
+        top, bottom, first, last = float(rows.min()), float(rows.max()), min(shown), max(shown)
+        centre = (top + bottom) / 2
         if first <= top and last >= bottom:
             return None
         return first - down_px - centre, last + down_px - centre

@@ -581,17 +581,6 @@ def test_the_core_of_a_profile(seed):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_points_off_their_places(seed):
-    rng = np.random.default_rng(seed)
-    places = rng.normal(0, 9, (5, 2)) @ [1, 1j]
-    points = rng.normal(0, 9, (5, 2))
-    points[[1, 3]] = np.nan
-    off = points @ [1, 1j] - places
-    assert _kernels.mean_off(points, places) == pytest.approx(off[[0, 2, 4]].mean())
-    assert _kernels.mean_off(np.full((5, 2), np.nan), places) is None
-
-
-@pytest.mark.parametrize("seed", SEEDS)
 def test_a_centre_is_held_in_the_middle(seed):
     x, y = np.random.default_rng(seed).uniform(-3, 1300, (2, 20))
     shift, rest = np.empty((2, 20), np.int64), np.empty((2, 20))
@@ -661,12 +650,11 @@ def test_places_are_interpolated_and_go_straight_on(seed, n):
         assert_allclose(centre[axis], np.interp(asked, way[0], way[axis + 1]), rtol=1e-12)
 
 
-def test_rows_that_are_not_dark_and_bounds_of_places():
+def test_rows_that_are_not_dark():
     image = np.zeros((7, 5), np.float32)
     assert _kernels.rows_of(image) == (0, 0)
     image[2, 4] = image[5, 0] = 0.5
     assert _kernels.rows_of(image) == (2, 6)
-    assert _kernels.bounds_of(np.array([3 + 9j, -1 + 4j, 2 - 5j])) == (-1, 3, -5, 9)
 
 
 @pytest.mark.parametrize("seed", SEEDS)
