@@ -11,7 +11,7 @@ from collections import deque
 import numpy as np
 
 from evlcp_sdk import _kernels
-from evlcp_sdk.values import Events
+from evlcp_sdk.values import Events, plain
 
 LEAP_US = 1_000_000
 """The longest pause that is believed at once: what was seen before a longer one is forgotten anyway."""
@@ -100,7 +100,9 @@ class CameraClock:
         self._counts["events"] += len(events)
         if not len(events):
             return []
-        t_us, x, y = events.t_us, events.x, events.y
+        # Kernels take them as they are from here on.
+        t_us, x, y, p = plain(events.t_us), plain(events.x), plain(events.y), plain(events.p)
+        events = Events.as_is(t_us, x, y, p)
         if (
             self._starts_us
             and not self._state[3]
@@ -111,7 +113,7 @@ class CameraClock:
             if _kernels.all_ordered(t_us, x, y, *self._size, self._offset_us, inside_us):
                 self._state[0] = t_us[-1]
                 self.last_us = int(inside_us[-1])
-                return [Events.as_is(inside_us, x, y, events.p)]
+                return [Events.as_is(inside_us, x, y, p)]
         return self._sorted(events)
 
     def close(self) -> list[Events]:

@@ -2,22 +2,20 @@
 
 import math
 from collections import deque
-from collections.abc import Collection, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Detector
 from evlcp_sdk.rx.detection import BACKFILL_STEPS
 from evlcp_sdk.rx.followed import Followed, same_place
+from evlcp_sdk.rx.framer import RegionTracker
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.places import Places
-from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.values import Events, Region
 
 _BACKFILL_FRAMES = 2
@@ -27,15 +25,13 @@ when it is found, and a shaking camera has seen it elsewhere before."""
 
 
 class DetectedRegions(RegionTracker):
-    """Holds the events of the regions that a detector gives; a framing may not move them.
+    """Holds the events of the regions that a detector gives; they stay where it has them.
 
     Args:
         link: The resolved configuration.
         detector: What its detection compiled to.
         limits: How much is held.
     """
-
-    goes_ahead = False
 
     def __init__(self, link: Link, detector: Detector, limits: Limits = LIMITS) -> None:
         self._guard = Guard(link, "detection")
@@ -53,10 +49,7 @@ class DetectedRegions(RegionTracker):
         self.counts = {"regions_left_out": 0, "dropped_no_room": 0}
 
     def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
-        """Take the events of one time step; return the regions that are alive or ended in it.
-
-        What is found in places that are `taken` by others is left out.
-        """
+        """Take the events of one time step; return the regions that are alive or ended in it."""
         with self._guard:
             given = self._detector.step(self._state, start_us, events)
         self._state, found = self._guard.expect_step(given, "step()")
@@ -112,58 +105,14 @@ class DetectedRegions(RegionTracker):
             self.counts["dropped_no_room"] += many
             oldest.cut_us = oldest.first_us = start_us + self._step_us
 
-    def ahead(
-        self, start_us: int, until_us: int, events: Events, meant: Collection[int]
-    ) -> AbstractContextManager[None]:
-        """Never asked for: a detector says where regions are at the end of a step."""
-        return nullcontext()
-
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""
         self._recent.clear()
 
-    def close(self) -> None:
-        """End the stream: forget all events."""
-        self.skip()
-        self.alive = []
-
-    def has_room(self) -> bool:
-        """Whether a framing may open another region: a detector says itself what there is."""
-        return False
-
     def drop(self, followed: Followed) -> None:
         """Let a region go at once."""
-        followed.released = True
+        super().drop(followed)
         self._left |= {followed.id}
-        self.alive = [other for other in self.alive if other is not followed]
-
-    def shape(
-        self, followed: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
-    ) -> float:
-        """Note how large a bar is that a frame showed; the region stays where the detector has it."""
-        followed.size_px = size_px
-        return 0.0
-
-    def light(
-        self,
-        followed: Followed,
-        lit_px: tuple[float, float] | None,
-        strips_px: NDArray[np.float64] | None = None,
-    ) -> None:
-        """Note which part of a bar a frame showed."""
-        followed.lit_px, followed.strips_px = lit_px, strips_px
-
-    def gather(self, followed: Followed, from_us: float = -np.inf, until_us: float = np.inf) -> None:
-        """Take a region's events once more: they are those that it has."""
-
-    def unite(self, followed: Followed, other: Followed) -> None:
-        """Take another region into one: the detector says what is one."""
-
-    def beside(
-        self, like: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
-    ) -> Followed:
-        """Never asked for, as there is no room."""
-        return like
 
 
 def _inside(events: Events, region: Region) -> Events:

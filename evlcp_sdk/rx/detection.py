@@ -13,10 +13,10 @@ from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.followed import SAME_PX, Followed, Piece, same_place
+from evlcp_sdk.rx.framer import RegionTracker
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.places import Places, region_of
 from evlcp_sdk.rx.rhythm import Rhythm, select
-from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
@@ -89,8 +89,6 @@ class RegionFollower(RegionTracker):
         rhythm: Scores of the pixels, of another follower in the same rhythm; None for its own.
     """
 
-    goes_ahead = True
-
     def __init__(
         self,
         spec: RegionSpec,
@@ -122,13 +120,7 @@ class RegionFollower(RegionTracker):
         self.counts = dict.fromkeys(_COUNTS, 0)
 
     def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
-        """Take the events of one time step; return the regions that are alive or ended in it.
-
-        Args:
-            start_us: Start of the step, us.
-            events: Those in it, in order.
-            taken: Places that are others': no region is opened there, nor reaches into them.
-        """
+        """Take the events of one time step; return the regions that are alive or ended in it."""
         spec = self._spec
         self._remember(start_us, events)
         rises = self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
@@ -291,11 +283,6 @@ class RegionFollower(RegionTracker):
                     self.counts["dropped_no_room"] += many
                     followed.cut_us = followed.first_us = oldest_us + self._spec.step_us
 
-    def close(self) -> None:
-        """End the stream: forget all events."""
-        self.skip()
-        self.alive = []
-
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""
         self._fresh = []
@@ -303,7 +290,13 @@ class RegionFollower(RegionTracker):
         self._recent_bytes = 0
 
     def shape(
-        self, followed: Followed, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]
+        self,
+        followed: Followed,
+        t_us: float,
+        centre_px: tuple[float, float],
+        size_px: tuple[float, float],
+        lit_px: tuple[float, float] | None = None,
+        strips_px: NDArray[np.float64] | None = None,
     ) -> float:
         """Set a region right by what a frame showed of its bar; return by how much, px, 0 for nothing.
 
@@ -315,7 +308,13 @@ class RegionFollower(RegionTracker):
             t_us: When the bar was seen, us.
             centre_px: Centre (column, row) of the whole bar at that time.
             size_px: Its (width, height).
+            lit_px: Where it shines, see `Followed.lit_px`.
+            strips_px: See `Followed.strips_px`.
         """
+        if followed.lit_px != lit_px and abs(_height(followed.lit_px) - _height(lit_px)) > _STRAY_PX:
+            # Heights of another part.
+            followed.heights.clear()
+        followed.lit_px, followed.strips_px = lit_px, strips_px
         x, y = followed.positions.place_at(t_us)
         off = centre_px[0] - x, centre_px[1] - y
         known, before_us, followed.shown_us = followed.size_px, followed.shown_us, t_us
@@ -409,24 +408,6 @@ class RegionFollower(RegionTracker):
         room = len(self.alive) < self._limits.regions
         self.counts["regions_left_out"] += not room
         return room
-
-    def light(
-        self,
-        followed: Followed,
-        lit_px: tuple[float, float] | None,
-        strips_px: NDArray[np.float64] | None = None,
-    ) -> None:
-        """Say where a region's bar shines, by its newest frame: see `Followed.lit_px`, `.strips_px`."""
-        before, followed.lit_px = followed.lit_px, lit_px
-        followed.strips_px = strips_px
-        if before != lit_px and abs(_height(before) - _height(lit_px)) > _STRAY_PX:
-            # Heights of another part.
-            followed.heights.clear()
-
-    def drop(self, followed: Followed) -> None:
-        """Let a region go at once."""
-        followed.released = True
-        self.alive = [other for other in self.alive if other is not followed]
 
     def _rhythmic(self, events: Events) -> Events:
         """Those of pixels that blink in rhythm.

@@ -1,13 +1,105 @@
-"""What finds the packets of regions and reads their frames, for a link's listener."""
+"""What receives a link's packets: a tracker finds regions, a framer finds packets in them and reads them."""
 
+import math
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count
 from typing import ClassVar
 
+import pluggy
+
+from evlcp_sdk.clock import CameraClock
 from evlcp_sdk.rx.followed import Followed
-from evlcp_sdk.rx.lit import LitTimes
+from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.values import Region
+from evlcp_sdk.scene.attitude import Attitude
+from evlcp_sdk.utc import ClockZero
+from evlcp_sdk.values import Events, Region
+
+_MOST_LIT = 1024
+"""Transmitters that are remembered: those seen last."""
+
+
+class LitTimes:
+    """Remembers of each transmitter its first and its last frame in which its light was there.
+
+    Attributes:
+        by_number: Transmitter number to start of the first and of the last such frame, camera clock, us.
+
+    >>> lit = LitTimes()
+    >>> lit.note(3, 500.0, 500.0)
+    >>> lit.note(3, 500.0, 3700.0)
+    >>> lit.by_number
+    {3: (500.0, 3700.0)}
+    """
+
+    def __init__(self) -> None:
+        self.by_number: dict[int, tuple[float, float]] = {}
+
+    def note(self, number: int, first_us: float, start_us: float) -> None:
+        """Take a frame: when it starts, and when the first one did if the transmitter is new."""
+        first_us, _ = self.by_number.pop(number, (first_us, start_us))
+        self.by_number[number] = (first_us, start_us)
+        if len(self.by_number) > _MOST_LIT:
+            del self.by_number[next(iter(self.by_number))]
+
+
+@dataclass(frozen=True)
+class StreamContext:
+    """A stream of events, and what is known of it.
+
+    Attributes:
+        clock: Its clock.
+        attitude_at: What is known of the camera's attitude at a time.
+        clock_zero: UTC of the camera clock's 0; None if it is not known.
+        hook: Where finished stages are announced; None for nowhere.
+        limits: How much each link holds at the most.
+        numbers: Where the numbers of transmitters come from.
+    """
+
+    clock: CameraClock
+    attitude_at: Callable[[float], Attitude | None]
+    clock_zero: ClockZero = None
+    hook: pluggy.HookRelay | None = None
+    limits: Limits = LIMITS
+    numbers: Iterator[int] = field(default_factory=count)
+
+
+class RegionTracker(ABC):
+    """Regions of a stream with their events, followed from time step to time step.
+
+    Attributes:
+        alive: Those that are followed.
+        counts: What was left out for want of room.
+    """
+
+    alive: list[Followed]
+    counts: dict[str, int]
+
+    @abstractmethod
+    def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
+        """Take the events of a time step; give the regions that are alive or ended in it.
+
+        Args:
+            start_us: Start of the step, us.
+            events: Those in it, in order.
+            taken: Places that are others': no region is opened there, nor reaches into them.
+        """
+
+    @abstractmethod
+    def skip(self) -> None:
+        """Pass over a gap in time, with no region alive."""
+
+    def close(self) -> None:
+        """End the stream: forget all events."""
+        self.skip()
+        self.alive = []
+
+    def drop(self, followed: Followed) -> None:
+        """Let a region go at once."""
+        followed.released = True
+        self.alive = [other for other in self.alive if other is not followed]
 
 
 class Framer(ABC):
@@ -32,13 +124,13 @@ class Framer(ABC):
         """Receive and decode what the regions of a time step send."""
 
     @property
-    @abstractmethod
     def due_us(self) -> float:
         """When the next frame can be decoded, us; infinite where that waits for the end of a time step."""
+        return math.inf
 
-    @abstractmethod
     def ahead(self, step: TimeStep) -> None:
-        """Decode the frames that are due in the part so far of a time step."""
+        """Decode the frames that are due in the part so far of a time step, if there can be any."""
+        return
 
     @property
     @abstractmethod
@@ -49,13 +141,14 @@ class Framer(ABC):
     def leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
         """Let regions go in places that are others', but for those of transmitters that hold theirs."""
 
-    @abstractmethod
-    def discard_place(self, place: Region) -> int:
-        """Count no frame that was not read in a place that is another link's; return how many they were."""
+    def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
+        """Count no frame that was not read where another link's packet was; return how many they were.
 
-    @abstractmethod
-    def discard_packet(self, number: int) -> int:
-        """Count no frame that was not read where a packet was another link's; return how many they were."""
+        Args:
+            place: The packet's place; None for that of the transmitter that is another link's.
+            number: Its number.
+        """
+        return 0
 
     @abstractmethod
     def close(self) -> None:

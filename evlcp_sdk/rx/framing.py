@@ -11,18 +11,15 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.alignment import AlignedFrame, FrameAligner
-from evlcp_sdk.rx.context import StreamContext
 from evlcp_sdk.rx.delays import RowDelays
-from evlcp_sdk.rx.detection import MARGIN_PX
+from evlcp_sdk.rx.detection import MARGIN_PX, RegionFollower
 from evlcp_sdk.rx.followed import SAME_PX, Followed, same_place
-from evlcp_sdk.rx.framer import Framer
+from evlcp_sdk.rx.framer import Framer, LitTimes, RegionTracker, StreamContext
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.reading import FrameReader, ReadableFrame, Reading
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Missed, Transmitter, Transmitters
 from evlcp_sdk.values import Frame, Region, SyncLock, changed
 
@@ -81,6 +78,7 @@ class PacketFraming(Framer):
         stream: What it is a part of.
         steps: The algorithms of the other roles.
         regions: The regions of the stream.
+        follower: The same where frames correct them; None where they stay as a detector has them.
         queue: Where decoded frames go.
         announcer: Gets every frame.
     """
@@ -94,6 +92,7 @@ class PacketFraming(Framer):
         stream: StreamContext,
         steps: Steps,
         regions: RegionTracker,
+        follower: RegionFollower | None,
         queue: ReflectionQueue,
         announcer: Announcer,
     ) -> None:
@@ -104,7 +103,7 @@ class PacketFraming(Framer):
         self._clock = stream.clock
         self._announcer = announcer
         self._steps = steps
-        self._regions = regions
+        self._regions, self._follower = regions, follower
         self._name = name
         self._transmitters = Transmitters(
             link.packet, self._step_us, stream.limits, stream.numbers, link.codebook.chips_after
@@ -125,8 +124,8 @@ class PacketFraming(Framer):
         self._reflections = queue.reflections
         self._queue = queue
         self._joined: set[int] = set()
-        self._ended: deque[tuple[tuple[float, float], Missed]] = deque(maxlen=_MOST_ENDED)
-        self._missed_by: dict[int, Missed] = {}
+        # Number, place and what was missed.
+        self._ended: deque[tuple[int | None, tuple[float, float], Missed]] = deque(maxlen=_MOST_ENDED)
         self._due: deque[Followed] = deque()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
@@ -165,7 +164,7 @@ class PacketFraming(Framer):
     @property
     def due_us(self) -> float:
         """When the next frame can be decoded, us; infinite where that waits for the end of a time step."""
-        if not self._regions.goes_ahead:
+        if self._follower is None:
             return math.inf
         due_us = math.inf
         for one in self._transmitters.alive:
@@ -175,14 +174,14 @@ class PacketFraming(Framer):
 
     def ahead(self, step: TimeStep) -> None:
         """Decode the frames that are due in the part so far of a time step."""
-        if not self._regions.goes_ahead:
+        if self._follower is None:
             return
         self._joined.clear()
         self._due.clear()
         until_us = step.end_us - self._tail_us
         due = [one for one in self._transmitters.alive if _in_time(one) and one.grid.due_us <= until_us]
         meant = {one.region.id for one in due}
-        with self._regions.ahead(step.start_us, step.end_us, step.events, meant):
+        with self._follower.ahead(step.start_us, step.end_us, step.events, meant):
             for transmitter in due:
                 self._decode_ahead(transmitter, until_us)
 
@@ -201,25 +200,21 @@ class PacketFraming(Framer):
                 self._regions.drop(region)
                 self._let_go(region)
 
-    def discard_place(self, place: Region) -> int:
-        """Count no frame that was not read in a place that is another link's; return how many they were."""
+    def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
+        """Count no frame that was not read where another link's packet was; return how many they were."""
         missed = Missed()
-        for transmitter in self._transmitters.alive:
-            if same_place(transmitter.region.latest, place):
-                missed, transmitter.missed = missed + transmitter.missed, Missed()
-        for one in list(self._ended):
-            (x, y), ended = one
-            if same_place(changed(place, x_px=x, y_px=y), place):
-                self._ended.remove(one)
-                missed += ended
-        return self._discarded(missed)
-
-    def discard_packet(self, number: int) -> int:
-        """Count no frame that was not read where a packet was another link's; return how many they were."""
-        missed = self._missed_by.pop(number, Missed())
-        for transmitter in self._transmitters.alive:
-            if transmitter.number == number:
-                missed, transmitter.missed = missed + transmitter.missed, Missed()
+        for one in self._transmitters.alive:
+            if one.number == number if place is None else same_place(one.region.latest, place):
+                missed, one.missed = missed + one.missed, Missed()
+        for ended in list(self._ended):
+            known, (x, y), its = ended
+            if place is not None and known is None:
+                found = same_place(changed(place, x_px=x, y_px=y), place)
+            else:
+                found = place is None and known == number
+            if found:
+                self._ended.remove(ended)
+                missed += its
         return self._discarded(missed)
 
     def _discarded(self, missed: Missed) -> int:
@@ -359,7 +354,7 @@ class PacketFraming(Framer):
             transmitter=number,
             packet=due.packet - transmitter.first,
             frame=due.index,
-            t_us=due.start_us,
+            t_us=self._clock.camera_us(due.start_us),
             soft=soft,
             range=distance,
             filtered=filtered,
@@ -368,12 +363,12 @@ class PacketFraming(Framer):
             points_px=reading.points_px,
             points_sigma_px=reading.sigma_px,
             points_flank_px=reading.flank_px,
-            points_t_us=shown.aligned.middle_us,
+            points_t_us=self._clock.camera_us(shown.aligned.middle_us),
             echo_of=self._reflections.echo_of(number),
             link=self._name,
         )
         self._announcer.frame(frame)
-        return FrameDetection.of(frame, shown.aligned.placement, reading.spread)
+        return FrameDetection.of(frame, due.start_us, shown.aligned.placement, reading.spread)
 
     def _is_ranged(self) -> bool:
         """Whether the turn of a frame with a pilot has come to be ranged."""
@@ -399,7 +394,7 @@ class PacketFraming(Framer):
 
     def _align(self, transmitter: Transmitter, due: DueFrame) -> AlignedFrame | None:
         """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
-        region = transmitter.region
+        region, follower = transmitter.region, self._follower
         others: list[tuple[float, tuple[float, float], tuple[float, float]]] = []
         most_px = 0.0
         for _ in range(_LOOKS):
@@ -407,27 +402,29 @@ class PacketFraming(Framer):
             aligned, transmitter.pilot = self._aligner.align(region, due, transmitter.pilot)
             if aligned is None or not due.has_pilot:
                 break
+            centre_px, size_px = self._aligner.box(aligned, aligned.placement)
+            if follower is None:
+                region.size_px = size_px
+                break
             # What the first look shows beside the bar is out of the second one's sight.
             others += [(aligned.middle_us, *self._aligner.box(aligned, other)) for other in aligned.others]
-            off_px = self._regions.shape(
-                region, aligned.middle_us, *self._aligner.box(aligned, aligned.placement)
-            )
-            self._regions.light(region, self._aligner.lit_rows(aligned), self._aligner.strips(aligned))
+            lit_px, strips_px = self._aligner.lit_rows(aligned), self._aligner.strips(aligned)
+            off_px = follower.shape(region, aligned.middle_us, centre_px, size_px, lit_px, strips_px)
             most_px = max(most_px, off_px)
             if off_px > 0 and not self._join(region, aligned.middle_us):
                 return None
             # Within half of the seam, motion in the frame is known as well as by its next look.
             if off_px == 0 or (whole and off_px <= MARGIN_PX / 2):
                 break
-            self._regions.gather(region, due.start_us, due.read_us)
-        if most_px > MARGIN_PX / 2:
-            self._regions.gather(region)
-        if aligned is None:
-            return None
+            follower.gather(region, due.start_us, due.read_us)
+        if follower is not None and most_px > MARGIN_PX / 2:
+            follower.gather(region)
+        if follower is None or aligned is None:
+            return aligned
         for middle_us, centre_px, size_px in others:
             known = any(one.covers(middle_us, centre_px) for one in self._regions.alive)
-            if not known and self._regions.has_room():
-                self._due.append(self._regions.beside(region, middle_us, centre_px, size_px))
+            if not known and follower.has_room():
+                self._due.append(follower.beside(region, middle_us, centre_px, size_px))
         return aligned
 
     def _join(self, region: Followed, t_us: float) -> bool:
@@ -445,10 +442,10 @@ class PacketFraming(Framer):
     def _put_together(self, transmitter: Transmitter) -> bool:
         """Unite a region that shows too little of a bar with others in step with it, if there are any."""
         parts = self._transmitters.in_step(transmitter)
-        if transmitter.region.id in self._joined or not parts:
+        if self._follower is None or transmitter.region.id in self._joined or not parts:
             return False
         for part in parts:
-            self._regions.unite(transmitter.region, part.region)
+            self._follower.unite(transmitter.region, part.region)
             self._let_go(part.region)
         return True
 
@@ -469,8 +466,8 @@ class PacketFraming(Framer):
     def _find_parts(self, region: Followed, t_us: float) -> None:
         """Look among the regions that ended for parts of a bar whose first frame is read."""
         for one in list(self._ended):
-            place_px, missed = one
-            if _is_part(region, t_us, place_px):
+            number, place_px, missed = one
+            if number is None and _is_part(region, t_us, place_px):
                 self._ended.remove(one)
                 self._was_part(missed)
 
@@ -481,18 +478,13 @@ class PacketFraming(Framer):
         if transmitter.region.id in self._joined:
             return
         number, missed = transmitter.number, transmitter.missed
-        if number is not None and missed:
-            # One that was out of sight has the number that it had.
-            self._missed_by[number] = self._missed_by.get(number, Missed()) + missed
-            if len(self._missed_by) > _MOST_ENDED:
-                del self._missed_by[min(self._missed_by)]
-        if number is None and missed:
+        if missed:
             place_px = transmitter.region.positions.place_at(seen_us)
             bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
-            if any(_is_part(bar, seen_us, place_px) for bar in bars):
+            if number is None and any(_is_part(bar, seen_us, place_px) for bar in bars):
                 self._was_part(missed)
             else:
-                self._ended.append((place_px, missed))
+                self._ended.append((number, place_px, missed))
         self._queue.end(transmitter.packets)
 
 

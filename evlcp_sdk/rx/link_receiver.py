@@ -1,23 +1,19 @@
 """One link's part of a receiver: the regions that it follows, what they send, and its messages."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Sequence
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.plugin.roles import Tracker
-from evlcp_sdk.rx.context import StreamContext
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
-from evlcp_sdk.rx.framer import Framer
+from evlcp_sdk.rx.framer import Framer, RegionTracker, StreamContext
 from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.inbox import MessageAssembler
-from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.plugin_framing import PluginFraming
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.rx.steps import Announcer, Steps, on_camera, tracker_of
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.values import Frame, Packet, Region, changed
 
@@ -45,17 +41,36 @@ class LinkReceiver:
         self._clock = stream.clock
         self._announcer = Announcer(stream.hook, stream.clock.camera_us, on_frame)
         tracker = tracker_of(link)
-        self._regions = _regions_of(link, tracker, stream.limits, rhythm)
+        self._regions: RegionTracker
+        follower: RegionFollower | None = None
+        with Guard(link, "detection", may_refuse=True):
+            detector = link.algorithm("detection").compile(link.camera, link.codebook, link.packet)
+        if detector is None:
+            self._regions = follower = RegionFollower(
+                link.regions,
+                link.camera,
+                link.packet.chip_us,
+                tracker.position,
+                LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
+                stream.limits,
+                link.codebook.longest_gap_chips,
+                rhythm,
+            )
+        else:
+            self._regions = DetectedRegions(link, detector, stream.limits)
         self._queue = ReflectionQueue(Reflections(link.packet, len(link.codebook.codewords)))
         with Guard(link, "framing", may_refuse=True):
             deframer = link.algorithm("framing").compile(link.codebook, link.packet)
-        shared = self._regions, self._queue, self._announcer
         self._framing: Framer
         if deframer is None:
             steps = Steps(link, self._announcer, tracker)
-            self._framing = PacketFraming(link, name, stream, steps, *shared)
+            self._framing = PacketFraming(
+                link, name, stream, steps, self._regions, follower, self._queue, self._announcer
+            )
         else:
-            self._framing = PluginFraming(link, name, stream, deframer, *shared)
+            self._framing = PluginFraming(
+                link, name, stream, deframer, self._regions, self._queue, self._announcer
+            )
         self._messages = MessageAssembler.of(link, stream.clock_zero)
         self._given = {"frames_reflected": 0, "packets": 0}
         self._of_others = self._rejected_of_others = 0
@@ -114,7 +129,9 @@ class LinkReceiver:
         """Decode the frames that are due in the part so far of a time step."""
         self._framing.ahead(step)
 
-    def step(self, step: TimeStep, taken: list[Region], owning: set[int]) -> list[Packet]:
+    def step(
+        self, step: TimeStep, taken: Sequence[Region] = (), owning: Collection[int] = ()
+    ) -> list[Packet]:
         """Follow the regions through a time step; receive and decode what they send.
 
         Args:
@@ -147,7 +164,7 @@ class LinkReceiver:
         """Read the messages that packets carry."""
         self._given["packets"] += len(packets)
         self._given["frames_reflected"] += sum(len(p.frames) for p in packets if p.echo_of is not None)
-        packets = [self._on_camera(packet) for packet in packets]
+        packets = [changed(packet, t_us=self._clock.camera_us(packet.t_us)) for packet in packets]
         if self._messages is None:
             return packets
         read = []
@@ -161,11 +178,11 @@ class LinkReceiver:
     def refuse(self, packet: Packet) -> None:
         """Count a packet that another link fits better."""
         self._of_others += len(packet.frames)
-        self._rejected_of_others += self._framing.discard_packet(packet.transmitter)
+        self._rejected_of_others += self._framing.discard(number=packet.transmitter)
 
     def discard_place(self, place: Region) -> None:
         """Count frames that were rejected in another link's place apart from those that no link reads."""
-        self._rejected_of_others += self._framing.discard_place(place)
+        self._rejected_of_others += self._framing.discard(place=place)
 
     def close(self) -> None:
         """End the stream: what messages still lack is missing."""
@@ -173,26 +190,3 @@ class LinkReceiver:
             self._messages.close()
         # Whoever draws or writes now needs the room.
         self._regions.close()
-
-    def _on_camera(self, packet: Packet) -> Packet:
-        """A packet with the times of the camera's clock."""
-        frames = tuple(on_camera(frame, self._clock.camera_us) for frame in packet.frames)
-        return changed(packet, t_us=self._clock.camera_us(packet.t_us), frames=frames)
-
-
-def _regions_of(link: Link, tracker: Tracker, limits: Limits, rhythm: Rhythm | None) -> RegionTracker:
-    """What finds and follows the regions of a stream."""
-    with Guard(link, "detection", may_refuse=True):
-        detector = link.algorithm("detection").compile(link.camera, link.codebook, link.packet)
-    if detector is not None:
-        return DetectedRegions(link, detector, limits)
-    return RegionFollower(
-        link.regions,
-        link.camera,
-        link.packet.chip_us,
-        tracker.position,
-        LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
-        limits,
-        link.codebook.longest_gap_chips,
-        rhythm,
-    )

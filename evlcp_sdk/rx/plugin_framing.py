@@ -9,17 +9,14 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
-from evlcp_sdk.rx.context import StreamContext
 from evlcp_sdk.rx.followed import Followed, same_place
-from evlcp_sdk.rx.framer import Framer
+from evlcp_sdk.rx.framer import Framer, LitTimes, RegionTracker, StreamContext
 from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.guard import Guard
-from evlcp_sdk.rx.lit import LitTimes
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.rx.tracker import RegionTracker
 from evlcp_sdk.values import DecodedFrame, Frame, Range, Region, SyncLock
 
 _COUNTED = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
@@ -124,14 +121,6 @@ class PluginFraming(Framer):
                 del self._listeners[region.id]
 
     @property
-    def due_us(self) -> float:
-        """When the next frame can be decoded: not before the end of a time step."""
-        return math.inf
-
-    def ahead(self, step: TimeStep) -> None:
-        """Nothing: a framing says itself when a frame is certain."""
-
-    @property
     def places(self) -> dict[int, Region]:
         """Where the transmitters are that have a number and are in sight, by number."""
         return {one.number: one.region.latest for one in self._listeners.values() if one.number is not None}
@@ -148,14 +137,6 @@ class PluginFraming(Framer):
                     self.counts["regions_released"] += 1
                     self._queue.end(listener.packets)
                     del self._listeners[region.id]
-
-    def discard_place(self, place: Region) -> int:
-        """Nothing: a framing says what it receives, not what it rejects."""
-        return 0
-
-    def discard_packet(self, number: int) -> int:
-        """Nothing, likewise."""
-        return 0
 
     def close(self) -> None:
         """End the stream: give what the regions still say."""
@@ -198,7 +179,7 @@ class PluginFraming(Framer):
                 transmitter=listener.number,
                 packet=one.packet,
                 frame=one.frame,
-                t_us=one.t_us,
+                t_us=self._camera_us(one.t_us),
                 soft=one.soft,
                 range=_NO_RANGE,
                 filtered=None,
@@ -209,8 +190,7 @@ class PluginFraming(Framer):
             )
             self.counts["frames"] += 1
             self._announcer.frame(frame)
-            start_us = self._camera_us(one.t_us)
-            self.lit.note(listener.number, start_us, start_us)
+            self.lit.note(listener.number, frame.t_us, frame.t_us)
             lock = SyncLock(one.packet_t_us, one.chip_us, 0.0, 0.0, 1.0)
             number = one.packet * self._packet.frames + one.frame
             due = DueFrame(
@@ -218,7 +198,7 @@ class PluginFraming(Framer):
             )
             light = listener.events / len(heard)
             self._queue.add(
-                listener.packets, due, FrameDetection(frame, light, self._codebook.clusters, False)
+                listener.packets, due, FrameDetection(frame, one.t_us, light, self._codebook.clusters, False)
             )
         if heard:
             listener.events = 0

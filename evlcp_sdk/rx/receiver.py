@@ -1,7 +1,7 @@
 """The receiver: events in, packets out."""
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import pluggy
@@ -9,12 +9,10 @@ import pluggy
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
-from evlcp_sdk.rx.arbitration import ArbitratedPacket, LinkArbiter
-from evlcp_sdk.rx.context import StreamContext
-from evlcp_sdk.rx.early import EarlyFrames
+from evlcp_sdk.rx.framer import StreamContext
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.link_receiver import LinkReceiver
-from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.multi import SeveralLinks
 from evlcp_sdk.rx.timeline import Timeline, TimeStep
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
@@ -77,16 +75,11 @@ class Receiver:
         if len(links) > 1:
             limits = replace(limits, region_bytes=limits.region_bytes // len(links))
         stream = StreamContext(self._clock, attitude_source(attitude), clock_zero, hook, limits)
-        tell = on_frame if len(links) == 1 or on_frame is None else self._decoded
-        rhythms = _rhythms(links)
-        self._receivers = [
-            LinkReceiver(one, name, stream, rhythms.get(name), tell) for name, one in links.items()
-        ]
-        self._arbiter: LinkArbiter | None = None
-        self._early = EarlyFrames(on_frame)
-        if len(links) > 1:
-            wait_us = max(one.patience_us for one in self._receivers)
-            self._arbiter = LinkArbiter(list(links.values()), wait_us, first.regions.step_us)
+        self._several = SeveralLinks(links, stream, on_frame) if len(links) > 1 else None
+        if self._several is None:
+            self._receivers = [LinkReceiver(first, "", stream, on_frame=on_frame)]
+        else:
+            self._receivers = self._several.receivers
         self._closed = False
         self.left: list[Packet] = []
 
@@ -120,13 +113,13 @@ class Receiver:
         for one in self._receivers:
             total.update(one.counts)
         crowded = {"dropped_crowded": self._timeline.dropped}
-        withdrawn = {"frames_withdrawn": self._early.withdrawn} if self._arbiter is not None else {}
+        withdrawn = {} if self._several is None else {"frames_withdrawn": self._several.early.withdrawn}
         return self._clock.counts | crowded | dict(total) | withdrawn
 
     @property
     def link_counts(self) -> dict[str, dict[str, int]]:
         """What each of several links found and dropped so far, by its name; nothing of a single link."""
-        return {one.name: one.counts for one in self._receivers} if self._arbiter is not None else {}
+        return {one.name: one.counts for one in self._receivers if one.name}
 
     def feed(self, events: Events) -> list[Packet]:
         """Take the next events of the stream; return the packets that are complete.
@@ -156,20 +149,17 @@ class Receiver:
         for one in self._receivers:
             one.end_at(self._clock.last_us)
         packets = [packet for step in self._timeline.close() for packet in self._run(step)]
-        ends = [one.finish() for one in self._receivers]
-        if self._arbiter is None:
-            packets += self._receivers[0].read(ends[0])
+        if self._several is None:
+            packets += self._receivers[0].read(self._receivers[0].finish())
         else:
-            for number, found in enumerate(ends):
-                self._arbiter.add(number, found, self._clock.last_us)
-            packets += self._judged(self._arbiter.close())
+            packets += self._several.close(self._clock.last_us)
         for one in self._receivers:
             one.close()
         return packets
 
     def _waits(self) -> bool:
         """Whether anything waits for the next step."""
-        return any(self._receivers) or bool(self._arbiter)
+        return any(self._receivers) or bool(self._several)
 
     def _due_us(self) -> float:
         """When the next frame can be decoded, us."""
@@ -181,51 +171,7 @@ class Receiver:
             for one in self._receivers:
                 one.ahead(step)
             return []
-        arbiter = self._arbiter
-        if arbiter is None:
-            (one,) = self._receivers
-            return one.read(one.step(step, [], set()))
-        for number, one in enumerate(self._receivers):
-            found = one.step(step, arbiter.taken(number), arbiter.owning)
-            arbiter.see(number, one.places)
-            arbiter.add(number, found, step.end_us)
-        return self._judged(arbiter.step(step.end_us))
-
-    def _decoded(self, frame: Frame) -> None:
-        """Take a frame of one of several links."""
-        assert self._arbiter is not None
-        self._early.decoded(frame, owns=frame.transmitter in self._arbiter.owning)
-
-    def _judged(self, judged: Sequence[ArbitratedPacket]) -> list[Packet]:
-        """Read what is given; count what is not."""
-        packets = []
-        for one in judged:
-            mine = self._receivers[one.link]
-            if not one.fits:
-                mine.refuse(one.packet)
-                self._early.refused(one.packet)
-                continue
-            given = mine.read([one.packet])
-            assert self._arbiter is not None
-            self._early.given(given[0], owns=one.packet.transmitter in self._arbiter.owning)
-            packets += given
-            for other in self._receivers:
-                if other is not mine:
-                    other.discard_place(one.place)
-        return packets
-
-
-def _rhythms(links: Mapping[str, Link]) -> dict[str, Rhythm]:
-    """Scores of the pixels for links whose rhythms agree, by name: one pass over the events for all."""
-    alike: dict[tuple[float, int, int], list[str]] = {}
-    for name, link in links.items():
-        key = link.packet.chip_us, link.regions.min_score, link.codebook.longest_gap_chips
-        alike.setdefault(key, []).append(name)
-    camera = next(iter(links.values())).camera
-    return {
-        name: rhythm
-        for (chip_us, min_score, gap_chips), names in alike.items()
-        if len(names) > 1
-        for rhythm in [Rhythm(camera.width, camera.height, chip_us, min_score, gap_chips, shared=True)]
-        for name in names
-    }
+        if self._several is not None:
+            return self._several.step(step)
+        (one,) = self._receivers
+        return one.read(one.step(step))

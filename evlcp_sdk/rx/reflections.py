@@ -76,6 +76,7 @@ class FrameDetection:
 
     Attributes:
         frame: The frame.
+        t_us: Start of the frame inside, see `CameraClock`, us.
         light: Grid cells that show a cluster, on average: what shines more shows in more of them.
         seen: Clusters that are seen.
         mirrored: The order of the clusters is the opposite of the layout's.
@@ -83,16 +84,17 @@ class FrameDetection:
     """
 
     frame: Frame
+    t_us: float
     light: float
     seen: int
     mirrored: bool
     spread: Spread | None = None
 
     @classmethod
-    def of(cls, frame: Frame, placed: Placement, spread: Spread | None) -> "FrameDetection":
+    def of(cls, frame: Frame, t_us: float, placed: Placement, spread: Spread | None) -> "FrameDetection":
         """What a frame's image shows, by where it shows the layout."""
         seen = max(sum(placed.seen.tolist()), 1)
-        return cls(frame, placed.cells / seen, seen, placed.mirrored, spread)
+        return cls(frame, t_us, placed.cells / seen, seen, placed.mirrored, spread)
 
 
 def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:
@@ -199,7 +201,7 @@ class _Pair:
             known = self.spread
             both = one.spread, other.spread
             self.spread = both if known is None else (known[0] + both[0], known[1] + both[1])
-        self.last_us = max(one.frame.t_us, other.frame.t_us, self.last_us)
+        self.last_us = max(one.t_us, other.t_us, self.last_us)
 
     def odds(self) -> float:
         """Log odds of the first being the bar and the second its reflection."""
@@ -241,7 +243,7 @@ class Reflections:
             for detection in known:
                 frame = detection.frame
                 off_px = max(abs(frame.x_px - centre_px[0]), abs(frame.y_px - centre_px[1]))
-                if off_px <= SAME_PX and abs(frame.t_us - t_us) < self._chip_us / 2:
+                if off_px <= SAME_PX and abs(detection.t_us - t_us) < self._chip_us / 2:
                     return True
         return False
 
@@ -251,10 +253,10 @@ class Reflections:
         Args:
             seen: Of one transmitter in order of time.
         """
-        fresh = sorted(seen, key=lambda s: (s.frame.t_us, s.frame.transmitter))
+        fresh = sorted(seen, key=lambda s: (s.t_us, s.frame.transmitter))
         if not fresh:
             return
-        self._now_us = max(self._now_us, fresh[-1].frame.t_us)
+        self._now_us = max(self._now_us, fresh[-1].t_us)
         for detection in fresh:
             for number, known in self._seen.items():
                 if number != detection.frame.transmitter and (other := self._beside(detection, known)):
@@ -271,7 +273,7 @@ class Reflections:
         nearest, least_us = None, math.inf
         # In order of time: from the newest back, until they are farther away again.
         for other in reversed(known):
-            apart_us = abs(other.frame.t_us - frame.t_us)
+            apart_us = abs(other.t_us - detection.t_us)
             if apart_us > least_us:
                 break
             nearest, least_us = other, apart_us
@@ -283,7 +285,7 @@ class Reflections:
 
     def _forget(self) -> None:
         for known in self._seen.values():
-            while known and known[0].frame.t_us < self._now_us - self._keep_us:
+            while known and known[0].t_us < self._now_us - self._keep_us:
                 known.popleft()
         if not all(self._seen.values()):
             self._seen = {number: known for number, known in self._seen.items() if known}

@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.values import Events, plain
+from evlcp_sdk.values import Events
 
 _MOST_SCORE = 40
 """Scores rise no further: what has blinked in rhythm for long is forgotten after so many rises off it."""
@@ -200,13 +200,8 @@ class Rhythm:
 
 
 def columns_of(events: Events, first: int = 0) -> _kernels.Columns:
-    """The columns of events from one on, as kernels take them."""
-    return (
-        plain(events.t_us[first:]),
-        plain(events.x[first:]),
-        plain(events.y[first:]),
-        plain(events.p[first:]),
-    )
+    """The columns of events from one on."""
+    return events.t_us[first:], events.x[first:], events.y[first:], events.p[first:]
 
 
 def select(events: Events, box: tuple[int, int, int, int]) -> Events:

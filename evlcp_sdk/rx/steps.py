@@ -37,9 +37,6 @@ def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
             return changed(value, t_us=camera_us(value.t_us))
         case SyncLock():
             return changed(value, packet_t_us=camera_us(value.packet_t_us))
-        case Frame():
-            points_t_us = camera_us(value.points_t_us)
-            return changed(value, t_us=camera_us(value.t_us), points_t_us=points_t_us)
     return value
 
 
@@ -82,7 +79,7 @@ class Announcer:
     def frame(self, frame: Frame) -> None:
         """Announce a frame, which took all laps since the start together."""
         if self._on_frame is not None:
-            self._on_frame(on_camera(frame, self._camera_us))
+            self._on_frame(frame)
         if self._hook is not None:
             self._say("frame", frame, self._lap_s - self._start_s)
 

@@ -164,8 +164,8 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
         regions.step(start, part)
         if start == 12_000:
             (region,) = regions.alive
-            regions.shape(region, region.latest.t_us, (bar.x_px - 0.5, bar.y_px - 0.5), (4.0, 128.0))
-            regions.light(region, (-64.0, 32.0))
+            centre_px, lit_px = (bar.x_px - 0.5, bar.y_px - 0.5), (-64.0, 32.0)
+            regions.shape(region, region.latest.t_us, centre_px, (4.0, 128.0), lit_px)
         elif start > 12_000:
             assert region.latest.y_px == pytest.approx(bar.y_px - 0.5, abs=1.5), start
 

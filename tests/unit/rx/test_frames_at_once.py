@@ -11,7 +11,7 @@ from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.rx.detection import RegionFollower
-from evlcp_sdk.rx.early import EarlyFrames
+from evlcp_sdk.rx.multi import EarlyFrames
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel

@@ -50,7 +50,7 @@ def sighting(
     none = Range(math.nan, math.nan, 0)
     x_px = 400.0 + 40 * transmitter if x_px is None else x_px
     frame = Frame(transmitter, packet, index, t_us, soft, none, None, x_px, y_px)
-    return FrameDetection(frame, light, int((symbols >= 0).sum()), mirrored)
+    return FrameDetection(frame, t_us, light, int((symbols >= 0).sum()), mirrored)
 
 
 def said(number: int, seed: int = 0) -> Symbols:

@@ -12,9 +12,9 @@ from hypothesis import given, settings, strategies as st
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.rx.arbitration import explained_us
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
+from evlcp_sdk.rx.multi import explained_us
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols

@@ -1,0 +1,345 @@
+"""Several links at once, and which of them a packet is of: what explains most of the light in its place.
+
+A region is tried by each link, and where codes or layouts are akin, more than one may read something there:
+a bar by half of its clusters, symbols of another modulation, characters in what is none. So packets wait
+until every link had its time to answer. What a packet explains of the light is the time of its clusters whose
+symbols are right, by their LLRs: seconds of light are the same for all links, however many bits their symbols
+have. A transmitter that explains half of its light holds its place: other links let their regions there go.
+"""
+
+from collections import OrderedDict, deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.rx.followed import same_place
+from evlcp_sdk.rx.framer import StreamContext
+from evlcp_sdk.rx.link_receiver import LinkReceiver
+from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.values import Frame, Packet, Region, changed
+
+_CLEARLY = 1.25
+"""How many times more light one link explains than another before nothing else matters."""
+
+_HELD = 2.0
+"""What light counts of a link that holds the place: what wavers by less changes nothing."""
+
+_OWNS = 0.5
+"""Share of the light that a packet explains by which its transmitter holds its place."""
+
+_MOST_KNOWN = 1024
+"""Transmitters of which is known where they were last."""
+
+_MOST_FRAMES = 4096
+"""Frames that wait at a time; of more, the oldest are judged by what is known."""
+
+
+def explained_us(packet: Packet, form: PacketFormat) -> float:
+    """How much of the light a packet explains: the time of each cluster in which its symbols are right, us.
+
+    Args:
+        packet: As it was decoded.
+        form: Lengths of its parts.
+    """
+    total = 0.0
+    for frame in packet.frames:
+        chips = form.info_chips + form.has_pilot(frame.frame) * form.pilot_chips
+        right = np.exp(-np.logaddexp(0.0, -np.abs(frame.soft.llr.astype(np.float64))).sum(1))
+        total += float(right[frame.soft.symbols >= 0].sum()) * chips * packet.chip_us
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class _Shown:
+    """A packet that was decoded, and what it explains.
+
+    Attributes:
+        link: Number of its link; of two that fit alike, the one with fewer codewords counts, or the first.
+        packet: The packet.
+        place: Where its transmitter was when it was complete.
+        from_us: Its start, us.
+        until_us: Its end, us.
+        leaves_us: When it is judged, us.
+        light_us: What it explains, us.
+        whole_us: All there is to explain, us.
+    """
+
+    link: int
+    packet: Packet
+    place: Region
+    from_us: float
+    until_us: float
+    leaves_us: float
+    light_us: float
+    whole_us: float
+
+
+class SeveralLinks:
+    """Receives several links of one stream: lets packets wait, and gives those that fit their place best.
+
+    Args:
+        links: The links by their names.
+        stream: The stream.
+        on_frame: Gets each frame once, see `EarlyFrames`; None for nobody.
+
+    Attributes:
+        receivers: One a link.
+        early: Which frames were told.
+    """
+
+    def __init__(
+        self, links: Mapping[str, Link], stream: StreamContext, on_frame: Callable[[Frame], None] | None
+    ) -> None:
+        rhythms, tell = _rhythms(links), None if on_frame is None else self._decoded
+        self.receivers = [
+            LinkReceiver(link, name, stream, rhythms.get(name), tell) for name, link in links.items()
+        ]
+        self.early = EarlyFrames(on_frame)
+        some = list(links.values())
+        self._gap_px = max(link.regions.merge_px for link in some)
+        # Until the slowest link has answered.
+        self._wait_us = max(one.patience_us for one in self.receivers) + some[0].regions.step_us
+        self._longest_us = max(link.packet.packet_chips * link.packet.chip_us for link in some)
+        self._waiting: deque[_Shown] = deque()
+        self._judged: deque[_Shown] = deque()
+        self._frames = 0
+        self._places: list[Mapping[int, Region]] = [{} for _ in some]
+        self._known: dict[int, Region] = {}
+        # Numbers of the transmitters that hold their places.
+        self._owning: set[int] = set()
+
+    def __bool__(self) -> bool:
+        """Whether anything waits."""
+        return bool(self._waiting)
+
+    def step(self, step: TimeStep) -> list[Packet]:
+        """Give each link a time step; give the packets that have waited long enough and fit."""
+        for number, one in enumerate(self.receivers):
+            found = one.step(step, self._taken(number), self._owning)
+            self._see(number, one.places)
+            self._add(number, found, step.end_us)
+        return self._given(step.end_us)
+
+    def close(self, last_us: float) -> list[Packet]:
+        """End the stream's events; give all packets that wait."""
+        for number, found in enumerate([one.finish() for one in self.receivers]):
+            self._add(number, found, last_us)
+        return self._given(float("inf"))
+
+    def _decoded(self, frame: Frame) -> None:
+        self.early.decoded(frame, owns=frame.transmitter in self._owning)
+
+    def _taken(self, link: int) -> list[Region]:
+        """Places that transmitters of other links hold, with the gap below which areas are one."""
+        return [
+            _grown(place, 2 * self._gap_px)
+            for other, places in enumerate(self._places)
+            if other != link
+            for number, place in places.items()
+            if number in self._owning
+        ]
+
+    def _see(self, link: int, places: Mapping[int, Region]) -> None:
+        """Take where the transmitters of a link are now, by their numbers."""
+        self._places[link] = places
+        for number, place in places.items():
+            self._known.pop(number, None)
+            self._known[number] = place
+        while len(self._known) > _MOST_KNOWN:
+            number = next(iter(self._known))
+            del self._known[number]
+            self._owning.discard(number)
+
+    def _add(self, link: int, packets: list[Packet], now_us: float) -> None:
+        """Take packets that a link has decoded by now."""
+        form, clusters = self.receivers[link].link.packet, self.receivers[link].link.codebook.clusters
+        for packet in packets:
+            newest = packet.frames[-1]
+            seen = self._known.get(packet.transmitter)
+            size = (seen.width_px, seen.height_px) if seen is not None else (0.0, 0.0)
+            place = Region(packet.transmitter, now_us, newest.x_px, newest.y_px, *size)
+            long_us = form.packet_chips * packet.chip_us
+            times = packet.t_us, packet.t_us + long_us, now_us + self._wait_us
+            light_us = explained_us(packet, form)
+            self._waiting.append(_Shown(link, packet, place, *times, light_us, long_us * clusters))
+            self._frames += len(packet.frames)
+
+    def _given(self, now_us: float) -> list[Packet]:
+        """Judge the packets that have waited long enough: read what fits, count what does not."""
+        packets = []
+        while self._waiting and (self._waiting[0].leaves_us <= now_us or self._frames > _MOST_FRAMES):
+            shown = self._waiting[0]
+            mine, number = self.receivers[shown.link], shown.packet.transmitter
+            fits = self._winner(shown) == shown.link
+            self._frames -= len(shown.packet.frames)
+            self._judged.append(self._waiting.popleft())
+            if not fits:
+                self._owning.discard(number)
+                mine.refuse(shown.packet)
+                self.early.refused(shown.packet)
+                continue
+            owns = shown.light_us >= _OWNS * shown.whole_us
+            (self._owning.add if owns else self._owning.discard)(number)
+            (given,) = mine.read([shown.packet])
+            self.early.given(given, owns=owns)
+            packets.append(given)
+            for other in self.receivers:
+                if other is not mine:
+                    other.discard_place(_grown(shown.place, 2 * self._gap_px))
+        oldest_us = now_us - 2 * self._wait_us - self._longest_us
+        while self._judged and (self._judged[0].leaves_us < oldest_us or len(self._judged) > _MOST_FRAMES):
+            self._judged.popleft()
+        return packets
+
+    def _winner(self, shown: _Shown) -> int:
+        """The link that explains most of the light in a packet's place about its time."""
+        about = [
+            other
+            for other in (*self._judged, *self._waiting)
+            if max(other.from_us - shown.until_us, shown.from_us - other.until_us) <= self._wait_us
+        ]
+        mine = [other for other in about if other.packet.transmitter == shown.packet.transmitter]
+        rivals = {shown.packet.transmitter}
+        rivals.update(
+            other.packet.transmitter
+            for other in about
+            if other.link != shown.link and any(self._overlap(one, other) for one in mine)
+        )
+        light, whole = dict.fromkeys((shown.link,), 0.0), dict.fromkeys((shown.link,), 0.0)
+        for other in about:
+            if (number := other.packet.transmitter) in rivals:
+                held = _HELD if number in self._owning else 1.0
+                light[other.link] = light.get(other.link, 0.0) + held * other.light_us
+                whole[other.link] = whole.get(other.link, 0.0) + other.whole_us
+        best, *others = sorted(light)
+        for one in others:
+            if self._fits_better(one, best, light, whole):
+                best = one
+        return best
+
+    def _fits_better(
+        self, one: int, than: int, light: Mapping[int, float], whole: Mapping[int, float]
+    ) -> bool:
+        """Whether a link fits better: by the light that it explains, and by its share of all there is."""
+        pairs = (
+            (light[one], light[than]),
+            (light[one] / whole[one], light[than] / whole[than]),
+        )
+        for mine, its in pairs:
+            if mine > _CLEARLY * its:
+                return True
+            if its > _CLEARLY * mine:
+                return False
+        one_link, other_link = self.receivers[one].link, self.receivers[than].link
+        return len(one_link.codebook.codewords) < len(other_link.codebook.codewords)
+
+    def _overlap(self, one: _Shown, other: _Shown) -> bool:
+        """Whether two packets were in one place at one time: by their frames that are nearest in time."""
+        if max(other.from_us - one.until_us, one.from_us - other.until_us) > 0:
+            return False
+        a, b = min(
+            ((a, b) for a in one.packet.frames for b in other.packet.frames),
+            key=lambda pair: abs(pair[0].t_us - pair[1].t_us),
+        )
+        here = _grown(changed(one.place, x_px=a.x_px, y_px=a.y_px), self._gap_px)
+        there = _grown(changed(other.place, x_px=b.x_px, y_px=b.y_px), self._gap_px)
+        return same_place(here, there)
+
+
+def _grown(place: Region, by_px: float) -> Region:
+    """A place that is wider and higher."""
+    return changed(place, width_px=place.width_px + by_px, height_px=place.height_px + by_px)
+
+
+class EarlyFrames:
+    """Tells frames in order: those of a transmitter that holds its place at once, others with their packet.
+
+    Args:
+        tell: Gets each frame once; None for nobody.
+
+    Attributes:
+        withdrawn: Frames that were told, of packets that another link took later.
+    """
+
+    def __init__(self, tell: Callable[[Frame], None] | None) -> None:
+        self._tell = tell
+        self._waiting: OrderedDict[int, deque[Frame]] = OrderedDict()
+        self._told: dict[int, deque[tuple[int, int]]] = {}
+        self.withdrawn = 0
+
+    def decoded(self, frame: Frame, *, owns: bool) -> None:
+        """Take a frame, in order of its transmitter's.
+
+        Args:
+            frame: The frame, on the camera's clock.
+            owns: Its transmitter owns its place now.
+        """
+        number = frame.transmitter
+        if number not in self._waiting:
+            self._waiting[number] = deque(maxlen=_MOST_FRAMES)
+            self._told[number] = deque(maxlen=_MOST_FRAMES)
+        self._waiting.move_to_end(number)
+        while len(self._waiting) > _MOST_KNOWN:
+            gone, _ = self._waiting.popitem(last=False)
+            del self._told[gone]
+        self._waiting[number].append(frame)
+        if owns:
+            self._tell_waiting(number)
+
+    def given(self, packet: Packet, *, owns: bool) -> None:
+        """Take a packet that is given: tell those of its frames that were not; all that wait if it holds."""
+        if self._tell is None:
+            return
+        told = self._forget(packet)
+        for frame in packet.frames:
+            if (frame.packet, frame.frame) not in told:
+                self._tell(frame)
+        if owns and packet.transmitter in self._waiting:
+            self._tell_waiting(packet.transmitter)
+
+    def refused(self, packet: Packet) -> None:
+        """Take a packet that is not given: its frames are not told any more."""
+        self.withdrawn += len(self._forget(packet))
+
+    def _tell_waiting(self, number: int) -> None:
+        assert self._tell is not None
+        waiting, told = self._waiting[number], self._told[number]
+        while waiting:
+            frame = waiting.popleft()
+            told.append((frame.packet, frame.frame))
+            self._tell(frame)
+
+    def _forget(self, packet: Packet) -> set[tuple[int, int]]:
+        """Let go what is known of a packet's frames, and of earlier ones; give those of it that were told."""
+        number = packet.transmitter
+        if number not in self._waiting:
+            return set()
+        waiting, told = self._waiting[number], self._told[number]
+        while waiting and waiting[0].packet <= packet.packet:
+            waiting.popleft()
+        mine = set()
+        while told and told[0][0] <= packet.packet:
+            one = told.popleft()
+            if one[0] == packet.packet:
+                mine.add(one)
+        return mine
+
+
+def _rhythms(links: Mapping[str, Link]) -> dict[str, Rhythm]:
+    """Scores of the pixels for links whose rhythms agree, by name: one pass over the events for all."""
+    alike: dict[tuple[float, int, int], list[str]] = {}
+    for name, link in links.items():
+        key = link.packet.chip_us, link.regions.min_score, link.codebook.longest_gap_chips
+        alike.setdefault(key, []).append(name)
+    camera = next(iter(links.values())).camera
+    return {
+        name: rhythm
+        for (chip_us, min_score, gap_chips), names in alike.items()
+        if len(names) > 1
+        for rhythm in [Rhythm(camera.width, camera.height, chip_us, min_score, gap_chips, shared=True)]
+        for name in names
+    }
