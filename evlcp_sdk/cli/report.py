@@ -143,8 +143,7 @@ def _series_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
 
 
 def _within(tally: Tally) -> str:
-    half, most = (tally.position_quantile_m(share) for share in (0.5, 0.95))
-    return f"{half:.3f}, {most:.3f}" if tally.fixes else "-"
+    return f"{tally.position_median_m:.3f}, {tally.position_95_m:.3f}" if tally.fixes else "-"
 
 
 def _positions_table(summary: Summary) -> tuple[list[str], list[list[str]]]:

@@ -77,11 +77,6 @@ class Measured:
         """The tally of all distances."""
         return self.statistics.total()
 
-    @property
-    def found_share(self) -> float:
-        """Share of the sent frames that were decoded; NaN without truth."""
-        return self.tally.frames_found / self.tally.frames_sent if self.tally.frames_sent else math.nan
-
     def figure(self, kind: str) -> Figure:
         """A figure of `measure` with its interval over recordings."""
         return measure([one.total() for one in self.recordings.values()], kind)
@@ -185,7 +180,7 @@ def _ends(m: Measured, key: str) -> tuple[float, float]:
 
 COLUMNS = (
     # Who finds none is not the best of those.
-    Column("found_share", "frames", _frames, lambda m: -m.found_share or math.nan),
+    Column("found_share", "frames", _frames, lambda m: -m.tally.found_share or math.nan),
     Column("packets", "packets", lambda m: str(m.statistics.packets), None),
     Column("ber", "BER", _ber, lambda m: m.tally.ber),
     Column("ber_interval", "95 %", _interval, None),
@@ -338,7 +333,7 @@ class Table:
                 "frames": m.statistics.rows,
                 "frames_sent": tally.frames_sent if known else None,
                 "frames_found": tally.frames_found if known else None,
-                "found_share": m.found_share,
+                "found_share": tally.found_share,
                 "unmatched": m.statistics.unmatched if known else None,
                 "echoes": m.statistics.echoes,
                 "packets": m.statistics.packets,

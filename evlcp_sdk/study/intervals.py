@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from evlcp_sdk.study.tally import Tally
+from evlcp_sdk.study.tally import Ratio, Tally
 
 FEWEST_RECORDINGS = 5
 """With fewer recordings than this there is no interval: what is known of the tails is guessed more than
@@ -66,30 +66,16 @@ class Figure:
         return f"{first}{self.low:{form}}, {self.high:{form}}{last}"
 
 
-_SHARES = {
-    # A bit is wrong in a wrong frame: the share of these is a limit of that of bits.
-    "ber": ("bit_errors", "bits", "frames_found"),
-    "gross_share": ("gross", "ranged", "ranged"),
-    "found_share": ("frames_found", "frames_sent", "frames_sent"),
-    "lost_share": ("messages_lost", "messages_sent", "messages_sent"),
-    "wrong_share": ("messages_wrong", "messages_read", "messages_read"),
-}
-"""Of each share what is summed above the line, below it, and what is independent at best, for a limit."""
-
-_SQUARES = {"rmse_m": ("squares_nm2", "ranged"), "position_rmse_m": ("position_squares_nm2", "fixes")}
-"""Of each root mean square what is summed above the line and below it."""
-
-
 def measure(recordings: Sequence[Tally], kind: str) -> Figure:
-    """A figure of independent recordings.
+    """A figure of independent recordings, by its name in `Tally`.
 
     >>> round(measure([Tally(frames_found=10, bits=1000)] * 10, "ber").high, 4)
     0.0362
     """
-    share = kind in _SHARES
-    above, below = _SHARES[kind][:2] if share else _SQUARES[kind]
-    some = [tally for tally in recordings if getattr(tally, below)]
-    parts, wholes = ([getattr(tally, name) for tally in some] for name in (above, below))
+    ratio: Ratio = getattr(Tally, kind)
+    share = not ratio.root
+    some = [tally for tally in recordings if getattr(tally, ratio.below)]
+    parts, wholes = ([getattr(tally, name) for tally in some] for name in (ratio.above, ratio.below))
     part, whole = sum(parts), sum(wholes)
     if not whole:
         return Figure(math.nan, math.nan, math.nan, 0, 0)
@@ -97,7 +83,7 @@ def measure(recordings: Sequence[Tally], kind: str) -> Figure:
         # SciPy's statistics take half a second to load.
         from scipy.stats import binomtest
 
-        trials = sum(getattr(tally, _SHARES[kind][2]) for tally in some)
+        trials = sum(getattr(tally, ratio.of or ratio.below) for tally in some)
         low, high = binomtest(trials if part else 0, trials).proportion_ci() if trials else (0.0, 1.0)
     elif len(some) == 1:
         low = high = math.nan
@@ -110,10 +96,7 @@ def measure(recordings: Sequence[Tally], kind: str) -> Figure:
     else:
         low, high = ratio_interval(parts, wholes)
         high = min(high, 1.0) if share else high
-    if share:
-        return Figure(part / whole, low, high, whole, len(some))
-    # Squares of nm; the root of a ratio's interval is the interval of its root.
-    value, low, high = (math.sqrt(v) * 1e-9 for v in (part / whole, low, high))
+    value, low, high = map(ratio.value, (part / whole, low, high))
     return Figure(value, low, high, whole, len(some))
 
 

@@ -168,24 +168,13 @@ def _figures(recordings: Sequence[Tally]) -> dict[str, Any]:
         *("fixes_contradicted", "fixes_excluded", "fixes_protected", "fixes_beyond", "fixes_silent"),
         "fixes_uncovered",
     )
-    counts = {name: getattr(tally, name) for name in names}
-    others = {
-        "erased_share": tally.erased_share,
-        "claimed_share": tally.claimed_share,
-        "bias_m": tally.bias_m,
-        "worst_m": tally.worst_m,
-        "nees": tally.nees,
-        "filtered_rmse_m": tally.filtered_rmse_m,
-        "position_median_m": tally.position_quantile_m(0.5),
-        "position_95_m": tally.position_quantile_m(0.95),
-        "position_nees": tally.position_nees,
-        "kept_share": tally.kept_share,
-        "track_rmse_m": tally.track_rmse_m,
-        "track_nees": tally.track_nees,
-        "smoothed_rmse_m": tally.smoothed_rmse_m,
-        "smoothed_nees": tally.smoothed_nees,
-    }
-    return _plain(counts | others) | {kind: _plain(asdict(measure(recordings, kind))) for kind in kinds}
+    figures = (
+        *("erased_share", "claimed_share", "bias_m", "worst_m", "nees", "filtered_rmse_m"),
+        *("position_median_m", "position_95_m", "position_nees"),
+        *("kept_share", "track_rmse_m", "track_nees", "smoothed_rmse_m", "smoothed_nees"),
+    )
+    found = _plain({name: getattr(tally, name) for name in (*names, *figures)})
+    return found | {kind: _plain(asdict(measure(recordings, kind))) for kind in kinds}
 
 
 def _plain(values: Mapping[str, Any]) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, field, fields, replace
-from typing import Annotated, Any, Self
+from typing import Annotated, Any, Self, overload
 
 from pydantic import Field
 
@@ -56,6 +56,39 @@ def in_nm(length_m: float) -> int:
     -50000000
     """
     return round(length_m * 1e9)
+
+
+@dataclass(frozen=True)
+class Ratio:
+    """A figure of a tally: the ratio of two of its sums, NaN of nothing.
+
+    Attributes:
+        above: What is summed above the line.
+        below: What is summed below it.
+        scale: What the ratio is multiplied by; of a root mean square, its root.
+        root: It is a root mean square.
+        of: What is independent at best, for a limit where `above` is 0; empty for `below`.
+    """
+
+    above: str
+    below: str
+    scale: float = 1.0
+    root: bool = False
+    of: str = ""
+
+    @overload
+    def __get__(self, tally: None, owner: type) -> Self: ...
+    @overload
+    def __get__(self, tally: object, owner: type) -> float: ...
+    def __get__(self, tally: object | None, owner: type) -> Self | float:
+        if tally is None:
+            return self
+        below = getattr(tally, self.below)
+        return self.value(getattr(tally, self.above) / below) if below else math.nan
+
+    def value(self, ratio: float) -> float:
+        """The figure of a ratio."""
+        return (math.sqrt(ratio) if self.root else ratio) * self.scale
 
 
 @dataclass(frozen=True)
@@ -227,50 +260,64 @@ class Tally:
     def __add__(self, other: "Tally") -> "Tally":
         return Tally.together((self, other))
 
-    @property
-    def ber(self) -> float:
-        """Share of wrong bits among those given; NaN without bits."""
-        return _ratio(self.bit_errors, self.bits)
+    ber = Ratio("bit_errors", "bits", of="frames_found")
+    """Share of wrong bits among those given. A bit is wrong in a wrong frame: of these there are fewer."""
 
-    @property
-    def erased_share(self) -> float:
-        """Share of the visible clusters' symbols that are not given; NaN without any."""
-        return _ratio(self.erased, self.visible)
+    erased_share = Ratio("erased", "visible")
+    """Share of the visible clusters' symbols that are not given."""
 
-    @property
-    def claimed_share(self) -> float:
-        """Share of the hidden clusters' symbols that are given all the same; NaN without any."""
-        return _ratio(self.claimed, self.hidden)
+    claimed_share = Ratio("claimed", "hidden")
+    """Share of the hidden clusters' symbols that are given all the same."""
 
-    @property
-    def rmse_m(self) -> float:
-        """Root mean square of the distance errors, m; NaN without any."""
-        return _rms_m(self.squares_nm2, self.ranged)
+    found_share = Ratio("frames_found", "frames_sent")
+    """Share of the sent frames that were decoded."""
 
-    @property
-    def bias_m(self) -> float:
-        """Mean of the distance errors, m; NaN without any."""
-        return _ratio(self.sum_nm, self.ranged) * 1e-9
+    rmse_m = Ratio("squares_nm2", "ranged", 1e-9, root=True)
+    """Root mean square of the distance errors, m."""
+
+    bias_m = Ratio("sum_nm", "ranged", 1e-9)
+    """Mean of the distance errors, m."""
+
+    nees = Ratio("nees_micro", "with_sigma", 1e-6)
+    """Mean of the distances' (error / sigma)^2, ideally 1."""
+
+    filtered_rmse_m = Ratio("filtered_squares_nm2", "filtered", 1e-9, root=True)
+    """Root mean square of the filtered distances' errors, m."""
+
+    gross_share = Ratio("gross", "ranged")
+    """Share of distance errors of half a metre or more."""
+
+    lost_share = Ratio("messages_lost", "messages_sent")
+    """Share of the messages that were sent and not read."""
+
+    wrong_share = Ratio("messages_wrong", "messages_read")
+    """Share of the messages that were read wrong."""
+
+    position_rmse_m = Ratio("position_squares_nm2", "fixes", 1e-9, root=True)
+    """Root mean square of the positions' errors in space, m."""
+
+    position_nees = Ratio("position_nees_micro", "fixes", 1e-6)
+    """Mean of the positions' errors squared in their own sigmas, ideally 3."""
+
+    kept_share = Ratio("fixes", "fixes_determined")
+    """Share of the positions that what is in view determines which are given."""
+
+    track_rmse_m = Ratio("track_squares_nm2", "track", 1e-9, root=True)
+    """Root mean square of the filtered track's errors in space, m."""
+
+    track_nees = Ratio("track_nees_micro", "track", 1e-6)
+    """Mean of the filtered track's errors squared in their own sigmas, ideally 3."""
+
+    smoothed_rmse_m = Ratio("smoothed_squares_nm2", "track", 1e-9, root=True)
+    """Root mean square of the smoothed track's errors in space, m."""
+
+    smoothed_nees = Ratio("smoothed_nees_micro", "track", 1e-6)
+    """Mean of the smoothed track's errors squared in their own sigmas, ideally 3."""
 
     @property
     def worst_m(self) -> float:
         """Size of the largest distance error, m; NaN without any."""
         return self.worst_nm * 1e-9 if self.ranged else math.nan
-
-    @property
-    def nees(self) -> float:
-        """Mean of the distances' (error / sigma)^2, ideally 1; NaN without any."""
-        return _ratio(self.nees_micro, self.with_sigma) * 1e-6
-
-    @property
-    def filtered_rmse_m(self) -> float:
-        """Root mean square of the filtered distances' errors, m; NaN without any."""
-        return _rms_m(self.filtered_squares_nm2, self.filtered)
-
-    @property
-    def gross_share(self) -> float:
-        """Share of distance errors of half a metre or more; NaN without any."""
-        return _ratio(self.gross, self.ranged)
 
     @property
     def messages_lost(self) -> int:
@@ -283,39 +330,19 @@ class Tally:
         return self.messages_found + self.messages_wrong
 
     @property
-    def position_rmse_m(self) -> float:
-        """Root mean square of the positions' errors in space, m; NaN without any."""
-        return _rms_m(self.position_squares_nm2, self.fixes)
+    def fixes_determined(self) -> int:
+        """Positions that what was in view determines, given or not."""
+        return self.fixes + self.fixes_contradicted
 
     @property
-    def position_nees(self) -> float:
-        """Mean of the positions' errors squared in their own sigmas, ideally 3; NaN without any."""
-        return _ratio(self.position_nees_micro, self.fixes) * 1e-6
+    def position_median_m(self) -> float:
+        """Error in space that half of the positions stay below, to a bin, m; NaN without any."""
+        return self.position_quantile_m(0.5)
 
     @property
-    def kept_share(self) -> float:
-        """Share of the positions that what is in view determines which are given; NaN without any."""
-        return _ratio(self.fixes, self.fixes + self.fixes_contradicted)
-
-    @property
-    def track_rmse_m(self) -> float:
-        """Root mean square of the filtered track's errors in space, m; NaN without any."""
-        return _rms_m(self.track_squares_nm2, self.track)
-
-    @property
-    def track_nees(self) -> float:
-        """Mean of the filtered track's errors squared in their own sigmas, ideally 3; NaN without any."""
-        return _ratio(self.track_nees_micro, self.track) * 1e-6
-
-    @property
-    def smoothed_rmse_m(self) -> float:
-        """Root mean square of the smoothed track's errors in space, m; NaN without any."""
-        return _rms_m(self.smoothed_squares_nm2, self.track)
-
-    @property
-    def smoothed_nees(self) -> float:
-        """Mean of the smoothed track's errors squared in their own sigmas, ideally 3; NaN without any."""
-        return _ratio(self.smoothed_nees_micro, self.track) * 1e-6
+    def position_95_m(self) -> float:
+        """The same of 95 % of them."""
+        return self.position_quantile_m(0.95)
 
     def position_quantile_m(self, share: float) -> float:
         """Error in space that a share of the positions stays below, to a bin, m; NaN without any.
@@ -337,14 +364,6 @@ def _sigmas(error: float, sigma: float) -> float:
 
 def _nees_micro(nees: float) -> int:
     return round(min(nees, _MOST_SIGMAS**2) * 1e6)
-
-
-def _ratio(hits: int, of: int) -> float:
-    return hits / of if of else math.nan
-
-
-def _rms_m(squares_nm2: int, count: int) -> float:
-    return math.sqrt(squares_nm2 / count) * 1e-9 if count else math.nan
 
 
 @dataclass(frozen=True)
@@ -396,10 +415,8 @@ class Statistics:
         """The tally of all segments."""
         return Tally.together(self.segments.values())
 
-    @property
-    def sigma_m(self) -> float:
-        """Root mean square of the standard deviations that come with distances, m; NaN without any."""
-        return _rms_m(self.sigma_squares_nm2, self.stated)
+    sigma_m = Ratio("sigma_squares_nm2", "stated", 1e-9, root=True)
+    """Root mean square of the standard deviations that come with distances, m."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values, as for JSON."""

@@ -99,8 +99,8 @@ def _counts(tally: Tally, kind: str) -> str:
         "gross_share": f"{tally.gross} of {tally.ranged} distances",
         "found_share": f"{tally.frames_found} of {tally.frames_sent} frames",
         "position_rmse_m": f"{tally.fixes} position{'s' * (tally.fixes != 1)},"
-        f" half within {tally.position_quantile_m(0.5):.3f} m,"
-        f" 95 % within {tally.position_quantile_m(0.95):.3f} m; {tally.fixes_refused} refused",
+        f" half within {tally.position_median_m:.3f} m,"
+        f" 95 % within {tally.position_95_m:.3f} m; {tally.fixes_refused} refused",
     }[kind]
 
 

@@ -176,7 +176,7 @@ def position_rows(summary: Summary) -> list[tuple[str, ...]]:
             (
                 f"{t.kept_share:.1%}",
                 f"{t.fixes_excluded}",
-                f"{t.position_quantile_m(0.5):.3f}, {t.position_quantile_m(0.95):.3f}",
+                f"{t.position_median_m:.3f}, {t.position_95_m:.3f}",
                 f"{t.position_nees:.3g}",
                 f"{t.fixes_silent}",
                 f"{t.fixes_uncovered}",
@@ -240,8 +240,8 @@ def _positions(recordings: Sequence[Tally]) -> tuple[str, ...]:
     return (
         f"{tally.fixes} of {tally.fixes + tally.fixes_refused}",
         _shown(measure(recordings, "position_rmse_m"), ".3f"),
-        f"{tally.position_quantile_m(0.5):.3f}",
-        f"{tally.position_quantile_m(0.95):.3f}",
+        f"{tally.position_median_m:.3f}",
+        f"{tally.position_95_m:.3f}",
         f"{tally.position_nees:.2f}",
     )
 

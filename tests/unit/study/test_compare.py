@@ -118,7 +118,7 @@ def test_figures_by_hand() -> None:
     assert m.tally.gross_share == pytest.approx(1 / 3)
     assert m.tally.filtered_rmse_m == pytest.approx(math.sqrt((0.05**2 + 0.02**2) / 2))
     assert m.statistics.sigma_m == pytest.approx(math.sqrt(0.05))
-    assert (m.us_per_frame, m.times_real_time, m.found_share) == (700, 2, 0.88)
+    assert (m.us_per_frame, m.times_real_time, m.tally.found_share) == (700, 2, 0.88)
     both = m + measured(bit_errors=5)
     assert (both.tally.bits, both.tally.bit_errors) == (16896, 8)
     assert (both.statistics.packets, both.statistics.rows) == (18, 180)
