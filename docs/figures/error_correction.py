@@ -26,7 +26,7 @@ from scipy import stats
 from scipy.special import ndtri
 
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
-from evlcp_sdk.report.figures import plain, titled
+from evlcp_sdk.report.drawing import plain, titled
 
 AIR_S = 346 * 100e-6
 """A packet of the default profile on air."""

@@ -18,7 +18,8 @@ from matplotlib.figure import Figure
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.codebook import edges_of_chips
-from evlcp_sdk.report.figures import cluster_colours, plain, titled
+from evlcp_sdk.report.colours import cluster_colours
+from evlcp_sdk.report.drawing import plain, titled
 from evlcp_sdk.study.bound import frame_bound
 
 ROOT = Path(__file__).parents[2]

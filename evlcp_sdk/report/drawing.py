@@ -32,6 +32,28 @@ def draw_plot(plot: Plot, title: str) -> Figure:
     """Draw a chart, its names below, where no line runs."""
     figure = Figure(figsize=(8, 5), layout="constrained")
     axis = figure.subplots()
+    _draw_on(axis, plot)
+    titled(axis, f"{title}: {plot.title}")
+    # A column is as wide as the longest name.
+    columns = max(1, min(len(plot.legend), 110 // (8 + max(map(len, plot.legend), default=0))))
+    _name_lines(figure, axis, plot, "outside lower left", columns)
+    return figure
+
+
+def draw_plots(plots: Sequence[Plot], title: str) -> Figure:
+    """Draw charts in two columns."""
+    rows = max(1, (len(plots) + 1) // 2)
+    figure = Figure(figsize=(12, 3.4 * rows), layout="constrained")
+    for number, plot in enumerate(plots, 1):
+        axis = figure.add_subplot(rows, 2, number)
+        _draw_on(axis, plot)
+        titled(axis, plot.title)
+        _name_lines(axis, axis, plot, "best", 1)
+    figure.suptitle(title, fontsize=11, color=INK_COLOUR, parse_math=False)
+    return figure
+
+
+def _draw_on(axis: Axes, plot: Plot) -> None:
     for shape in plot.shapes:
         _draw_shape(axis, shape)
     for x, y, text in plot.names:
@@ -46,19 +68,21 @@ def draw_plot(plot: Plot, title: str) -> Figure:
         axis.yaxis.set_minor_formatter(NullFormatter())
     if plot.from_zero:
         axis.set_ylim(bottom=0)
+    if plot.y_limits is not None:
+        axis.set_ylim(*plot.y_limits)
+    if plot.aspect is not None:
+        axis.set_aspect("equal", adjustable="datalim")
     axis.set(xlabel=plot.x_name, ylabel=plot.y_name)
-    titled(axis, f"{title}: {plot.title}")
     plain(axis)
+
+
+def _name_lines(where: Any, axis: Axes, plot: Plot, place: str, columns: int) -> None:
+    """Write what each line is, in a figure or in axes."""
     if plot.legend:
         handles = [_draw_shape(axis, shape, legend=True) for shape in plot.legend.values()]
-        # A column is as wide as the longest name.
-        columns = max(1, min(len(plot.legend), 110 // (8 + max(map(len, plot.legend)))))
-        legend = figure.legend(
-            handles, [*plot.legend], loc="outside lower left", frameon=False, fontsize=8, ncols=columns
-        )
+        legend = where.legend(handles, [*plot.legend], loc=place, frameon=False, fontsize=8, ncols=columns)
         for entry in legend.get_texts():
             entry.set_parse_math(False)
-    return figure
 
 
 def _draw_shape(axis: Axes, shape: Shape, *, legend: bool = False) -> Any:

@@ -7,7 +7,7 @@ memory; all frames are in `frames.csv`, all messages in `packets.jsonl`.
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from typing import Any
 
@@ -17,10 +17,19 @@ from evlcp_sdk.diagnosis.facts import Diagnostic
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import transmitter_colour
-from evlcp_sdk.report.figures import Thinned
 from evlcp_sdk.report.motion import MotionProbe
 from evlcp_sdk.report.pages import render_page
-from evlcp_sdk.report.plots import INK, SCRIPT, Plot, ellipse, enlarge_ellipses
+from evlcp_sdk.report.plots import SCRIPT, Plot
+from evlcp_sdk.report.recording import (
+    Thinned,
+    TimeAxis,
+    label_frames,
+    name_transmitter,
+    plot_distances,
+    plot_positions,
+    plot_quality,
+    seconds_since,
+)
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.spelling import counted
@@ -30,7 +39,6 @@ _MOST_TRANSMITTERS = 6
 _MOST_POINTS = 512
 _MOST_ROWS = 40
 _MOST_MESSAGES = 50
-_MOST_ELLIPSES = 40
 _MOST_CHARACTERS = 2_000
 
 _SECONDS = 5.0
@@ -64,16 +72,16 @@ class Report(Sink):
         self._motion = MotionProbe(3 * max(len(run.links), 1))
         self._track = Thinned[Settled](1024)
         self._seen: dict[int, _Seen] = {}
-        self._first_us: int | None = None
         self._messages: list[tuple[str, ...]] = []
         self._latest: deque[tuple[str, ...]] = deque(maxlen=_MOST_MESSAGES)
         self._many_messages = 0
-        self._axis, self._step_ms = "ms since the first event", 1.0
+        self._axis = TimeAxis("ms since the first event", 0.0, 1.0)
+        self._begun = False
 
     def events(self, events: Events) -> None:
         """Note when the recording starts."""
-        if self._first_us is None and len(events):
-            self._first_us = int(events.t_us[0])
+        if not self._begun and len(events):
+            self._begun, self._axis = True, replace(self._axis, zero_us=float(events.t_us[0]))
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
@@ -94,7 +102,7 @@ class Report(Sink):
         for message in packet.messages:
             self._many_messages += 1
             row = (
-                f"{self._ms(message.t_us):.1f}",
+                f"{self._axis.ms(message.t_us):.1f}",
                 message.kind.name,
                 str(message.message.transmitter_id),
                 message.trust,
@@ -110,17 +118,22 @@ class Report(Sink):
     def conclude(self, summary: Mapping[str, Any]) -> None:
         """Write the page, which is the same for the same recording: how long it took is not in it."""
         if summary["recording"]["duration_s"] > _SECONDS:
-            self._axis, self._step_ms = "s since the first event", 1000.0
+            self._axis = seconds_since(self._axis.zero_us)
         motions = [
-            motion.to_dict(link.codebook, link.packet.chip_us, self._ms)
+            motion.to_dict(link.codebook, link.packet.chip_us, self._axis.ms)
             for motion in self._motion.motions()
             # What another link fitted better is not given.
             if motion.frame.transmitter in self._seen or not self.run.links
             for link in [self.run.link_of(motion.frame.link)]
         ]
-        distances, quality, image = self._charts()
-        places = self._map()
-        plots = [*distances, quality, image] * bool(self._seen) + (places or [])
+        frames = self._frames()
+        distances = [p for number, one in frames.items() for p in plot_distances(number, *one, self._axis)]
+        navigator = self.run.navigator
+        places = None
+        if navigator is not None:
+            places = plot_positions([*self._track], navigator.bars_enu_m(), self._axis)
+        of_frames = [*distances, plot_quality(frames, self._axis), self._plot_places()]
+        plots = of_frames * bool(self._seen) + (places or [])
         messages = [*self._messages, *self._latest]
         # Its labels are known once a chart is drawn.
         held = {plot.id: plot.markup() for plot in plots}
@@ -150,10 +163,6 @@ class Report(Sink):
             symbols=self._symbols(),
         )
         self.folder.open("report.html").write(page)
-
-    def _ms(self, t_us: float) -> float:
-        """Time since the first event, ms."""
-        return (t_us - (self._first_us or 0)) * 1e-3
 
     def _headline(self, summary: Mapping[str, Any]) -> list[tuple[str, str, str]]:
         """The figures that a reader looks for first: what each is, its value, and a note."""
@@ -189,11 +198,9 @@ class Report(Sink):
         ]
         return figures
 
-    def _charts(self) -> tuple[list[Plot], Plot, Plot]:
-        """Distance of each transmitter and quality over time, and where in the image."""
+    def _plot_places(self) -> Plot:
+        """Where in the image transmitters are."""
         camera = self.run.link.camera
-        distances: list[Plot] = []
-        quality = Plot("quality", self._axis, "quality", y_limits=(-0.03, 1.06))
         image = Plot(
             "image",
             "column, px",
@@ -203,73 +210,23 @@ class Report(Sink):
             x_limits=(0, camera.width),
             y_limits=(0, camera.height),
         )
-        for number, seen in sorted(self._seen.items()):
-            frames = sorted(seen.frames, key=lambda frame: frame.t_us)
-            colour, who = transmitter_colour(number), _who(number, seen.echo_of, seen.link)
-            t = np.array([self._ms(frame.t_us) for frame in frames]) / self._step_ms
-            depth = np.array([frame.range.distance_m for frame in frames])
-            sigma = np.array([frame.range.sigma_m for frame in frames])
-            labels = [f"{who}\n{_describe(frame, self._ms(frame.t_us))}" for frame in frames]
-            known = np.isfinite(depth)
-            distance = Plot(f"distance-{number}", self._axis, "distance, m")
-            distances.append(distance)
-            name = f"{who}, with one sigma"
-            distance.dots(t, depth, colour, name, labels)
-            distance.band(t[known], (depth - sigma)[known], (depth + sigma)[known], colour, name)
-            filtered = [math.nan if f.filtered is None else f.filtered.distance_m for f in frames]
-            if np.isfinite(filtered).any():
-                distance.line(t, filtered, colour, f"{who}, filtered")
-            quality.dots(t, [frame.soft.quality for frame in frames], colour, who, labels)
+        for number, (who, frames) in self._frames().items():
             places = np.array([(frame.x_px, frame.y_px) for frame in frames])
-            image.dots(places[:, 0], places[:, 1], colour, who, labels)
+            labels = label_frames(who, frames, self._axis)
+            image.dots(places[:, 0], places[:, 1], transmitter_colour(number), who, labels)
             if len(frames) and np.isfinite(places[-1]).all():
                 image.name(float(places[-1, 0]), float(places[-1, 1]), str(number))
-        return [plot for plot in distances if not plot.empty], quality, image
+        return image
 
-    def _map(self) -> list[Plot] | None:
-        """Fixes and bars in local metres, and the sigmas over time; None where no positions are computed."""
-        navigator = self.run.navigator
-        if navigator is None:
-            return None
-        points = list(self._track)
-        plan = Plot("map", "east, m", "north, m", aspect=4 / 3)
-        close = Plot("track", "east, m", "north, m", aspect=4 / 3)
-        height = Plot("height", self._axis, "up, m")
-        spread = Plot("spread", self._axis, "sigma, m")
-        if points:
-            fixed = np.array([point.fix.enu_m for point in points])
-            smooth = np.array([point.smoothed.enu_m for point in points])
-            t_ms = np.array([self._ms(point.fix.t_us) for point in points])
-            sigma = np.sqrt([np.diag(point.fix.covariance_m2) for point in points])
-            labels = [
-                f"{ms:.1f} ms, {p.fix.source}\neast {e:z.3f} ± {se:.2g} m\nnorth {n:z.3f} ± {sn:.2g} m"
-                f"\nup {u:z.3f} ± {su:.2g} m"
-                for p, ms, (e, n, u), (se, sn, su) in zip(
-                    points, t_ms.tolist(), fixed.tolist(), sigma.tolist(), strict=True
-                )
-            ]
-            chosen = points[:: max(1, -(-len(points) // _MOST_ELLIPSES))]
-            larger = enlarge_ellipses([point.fix.covariance_m2 for point in chosen], fixed)
-            name = "95 % ellipse" + (f", {larger} times as large" if larger > 1 else "")
-            for point in chosen:
-                covariance = point.fix.covariance_m2[:2, :2] * larger**2
-                close.ring(ellipse(point.fix.enu_m[:2], covariance, 0.95), "#999999", name)
-            for plot in (plan, close):
-                plot.line(smooth[:, 0], smooth[:, 1], "#d55e00", "smoothed")
-                plot.dots(fixed[:, 0], fixed[:, 1], "#56b4e9", "fix", labels)
-            t = t_ms / self._step_ms
-            height.band(t, fixed[:, 2] - sigma[:, 2], fixed[:, 2] + sigma[:, 2], "#56b4e9")
-            height.dots(t, fixed[:, 2], "#56b4e9", "fix, with one sigma", labels)
-            height.line(t, smooth[:, 2], "#d55e00", "smoothed")
-            for i, name in enumerate(("east", "north", "up")):
-                spread.dots(t, sigma[:, i], transmitter_colour(i), name, labels)
-        for number, enu in sorted(navigator.bars_enu_m().items()):
-            who = f"bar {number}"
-            east, north, up = enu.tolist()
-            place = f"{who}\neast {east:z.3f} m\nnorth {north:z.3f} m\nup {up:z.3f} m"
-            plan.dots([east], [north], INK, "bar", [place])
-            plan.name(east, north, who)
-        return [plot for plot in (plan, close, height, spread) if not plot.empty]
+    def _frames(self) -> dict[int, tuple[str, list[Frame]]]:
+        """What each transmitter is called, and its frames that are shown, in order."""
+        return {
+            number: (
+                name_transmitter(number, seen.echo_of, seen.link),
+                sorted(seen.frames, key=lambda frame: frame.t_us),
+            )
+            for number, seen in sorted(self._seen.items())
+        }
 
     def _symbols(self) -> list[tuple[str, int, int, list[Any]]]:
         """The symbols of the first frames of each transmitter: title, clusters, codewords, and rows."""
@@ -282,30 +239,15 @@ class Report(Sink):
                 found = f"{depth.distance_m:.2f} ± {depth.sigma_m:.2f}"
                 start = (
                     f"{frame.packet}/{frame.frame}",
-                    f"{self._ms(frame.t_us):.1f}",
+                    f"{self._axis.ms(frame.t_us):.1f}",
                     found if math.isfinite(depth.distance_m) else "-",
                     f"{frame.soft.quality:.2f}",
                 )
                 rows.append((start, frame.soft.symbols.tolist()))
-            title = f"{_who(number, seen.echo_of, seen.link)}: {counted(seen.count, 'frame')}"
+            title = f"{name_transmitter(number, seen.echo_of, seen.link)}: {counted(seen.count, 'frame')}"
             title += f", the first {len(seen.first)}" * (seen.count > len(seen.first))
             tables.append((title, book.clusters, max(len(book.codewords), 1), rows))
         return tables
-
-
-def _who(number: int, echo_of: int | None, link: str) -> str:
-    who = f"transmitter {number}" + (f" ({link})" if link else "")
-    return who + ("" if echo_of is None else f", reflection of {echo_of}")
-
-
-def _describe(frame: Frame, ms: float) -> str:
-    """A frame where the pointer is."""
-    depth = frame.range
-    lines = [f"packet {frame.packet}, frame {frame.frame}, {ms:.1f} ms"]
-    if math.isfinite(depth.distance_m):
-        lines.append(f"{depth.distance_m:.4f} ± {depth.sigma_m:.4f} m")
-    lines.append(f"quality {frame.soft.quality:.4f}")
-    return "\n".join(lines)
 
 
 def _distances(own: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:

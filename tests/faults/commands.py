@@ -239,7 +239,7 @@ def receive(work: Path, demo: Path, *more: str) -> Trial:
 def sinks(work: Path, demo: Path) -> Trial:
     """The same with every format that one may ask for; pictures of one colour, drawn at once."""
     picture = Figure(figsize=(0.1, 0.1))
-    for name in ("draw_regions", "draw_presence", "draw_distance", "draw_track"):
+    for name in ("draw_regions", "draw_presence", "draw_plots"):
         setattr(evlcp_sdk.report.figures, name, lambda *_: picture)
     site = work / "site.toml"
     place = "latitude_deg = 35.0\nlongitude_deg = 137.0\nheight_m = 2.0\nheading_deg = 0.0\n"

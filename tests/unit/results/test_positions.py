@@ -29,7 +29,7 @@ from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.report.figures import draw_track
+from evlcp_sdk.report.recording import plot_positions, seconds_since
 from evlcp_sdk.results.alternatives_csv import AlternativesCsv
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.fixes_csv import FixesCsv
@@ -285,17 +285,16 @@ def test_the_figure_of_a_track(tmp_path: Path) -> None:
     way = Navigator(LINK, PositionPlan((SITE,)), ATTITUDE)
     way.feed(packets(13))
     _, settled = way.close()
-    plan, close, *_ = draw_track(settled, way.bars_enu_m(), "").axes
-    (ellipse, *_) = close.patches
-    assert not plan.patches
+    _, close, *_ = plot_positions(settled, way.bars_enu_m(), seconds_since(0.0))
+    ring = next(shape for shape in close.shapes if shape.kind == "ring")
     # Drawn larger by as much as the legend says.
-    said = " ".join(close.get_legend().get_texts()[0].get_text().split())
+    said = ring.name
     times = int(said.removeprefix("95 % ellipse, ").removesuffix(" times as large")) if "," in said else 1
     # 95 % of a normal distribution of the plane lies within 2.4477 sigma.
     fix = settled[0].fix
     values = np.linalg.eigvalsh(fix.covariance_m2[:2, :2])
     want = (2 * 2.44775 * times * np.sqrt(values)).tolist()
-    radii = np.linalg.norm(ellipse.get_xy() - fix.enu_m[:2], axis=1)
+    radii = np.linalg.norm(ring.points - fix.enu_m[:2], axis=1)
     assert (2 * radii.min(), 2 * radii.max()) == pytest.approx(tuple(want), rel=1e-4)
 
 
@@ -347,7 +346,7 @@ def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
     assert rows(tmp_path / "track.csv") == []
     first = (tmp_path / "fixes.nmea").read_text().splitlines()[0]
     assert pynmea2.parse(first, check=True).gps_qual == 0
-    assert draw_track([], {}, "nothing").axes
+    assert plot_positions([], {}, seconds_since(0.0)) == []
 
 
 def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

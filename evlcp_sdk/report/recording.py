@@ -1,0 +1,223 @@
+"""The charts of a recording, for its page and for figures beside it: frames, and positions, over time."""
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.place.navigator import Settled
+from evlcp_sdk.report.colours import transmitter_colour
+from evlcp_sdk.report.plots import DASHES, INK, Plot, ellipse, enlarge_ellipses
+from evlcp_sdk.values import Frame
+
+_MOST_ELLIPSES = 40
+_FIX, _FILTERED, _SMOOTHED = "#56b4e9", "#009e73", "#d55e00"
+
+T = TypeVar("T")
+
+
+class Thinned(Generic[T]):
+    """Keeps at most `limit` values of a stream, evenly spread: every value, then every second, fourth, ...
+
+    >>> kept = Thinned(4)
+    >>> for i in range(10):
+    ...     kept.add(i)
+    >>> list(kept)
+    [0, 4, 8]
+    """
+
+    def __init__(self, limit: int) -> None:
+        self._limit = limit
+        self._every = 1
+        self._seen = 0
+        self._values: list[T] = []
+
+    def add(self, value: T) -> None:
+        """Take the next value of the stream."""
+        if self._seen % self._every == 0:
+            if len(self._values) == self._limit:
+                self._values = self._values[::2]
+                self._every *= 2
+            if self._seen % self._every == 0:
+                self._values.append(value)
+        self._seen += 1
+
+    def __iter__(self) -> Iterator[T]:
+        return iter(self._values)
+
+    def __len__(self) -> int:
+        return len(self._values)
+
+
+@dataclass(frozen=True)
+class TimeAxis:
+    """How charts count time.
+
+    Attributes:
+        name: What it is, with the unit.
+        zero_us: Where it begins, camera clock, us.
+        step_ms: Its unit, ms.
+    """
+
+    name: str
+    zero_us: float
+    step_ms: float
+
+    def ms(self, t_us: float) -> float:
+        """Time since its beginning, ms."""
+        return (t_us - self.zero_us) * 1e-3
+
+
+def seconds_since(zero_us: float) -> TimeAxis:
+    """An axis in seconds."""
+    return TimeAxis("s since the first event", zero_us, 1000.0)
+
+
+def name_transmitter(number: int, echo_of: int | None, link: str = "") -> str:
+    """A transmitter, its link, and of which it is a reflection."""
+    who = f"transmitter {number}" + (f" ({link})" if link else "")
+    return who + ("" if echo_of is None else f", reflection of {echo_of}")
+
+
+def plot_distances(number: int, who: str, frames: Sequence[Frame], axis: TimeAxis) -> list[Plot]:
+    """Distance of a transmitter with its one-sigma band, and how far each is off its neighbours, over time.
+
+    None where no frame has a distance.
+    """
+    frames = [frame for frame in frames if math.isfinite(frame.range.distance_m)]
+    if not frames:
+        return []
+    colour, name = transmitter_colour(number), f"{who}, with one sigma"
+    t = np.array([axis.ms(frame.t_us) for frame in frames]) / axis.step_ms
+    depth = np.array([frame.range.distance_m for frame in frames])
+    sigma = np.array([frame.range.sigma_m for frame in frames])
+    labels = label_frames(who, frames, axis)
+    distance = Plot(f"distance-{number}", axis.name, "distance, m", f"{who}, {len(frames)} distances")
+    distance.dots(t, depth, colour, name, labels)
+    distance.band(t, depth - sigma, depth + sigma, colour, name)
+    filtered = [math.nan if f.filtered is None else f.filtered.distance_m for f in frames]
+    if np.isfinite(filtered).any():
+        distance.line(t, filtered, colour, f"{who}, filtered")
+    off = Plot(f"off-{number}", axis.name, "off its neighbours, m", f"{who}, off its neighbours")
+    off.dots(
+        t, off_neighbours(t, depth), colour, "off a line through eleven frames, beside one sigma", labels
+    )
+    off.band(t, -sigma, sigma, colour, "off a line through eleven frames, beside one sigma")
+    return [distance, off]
+
+
+def plot_quality(frames: Mapping[int, tuple[str, Sequence[Frame]]], axis: TimeAxis) -> Plot:
+    """Quality of the frames of each transmitter over time, by its number; with what it is called."""
+    quality = Plot("quality", axis.name, "quality", "quality", y_limits=(-0.03, 1.06))
+    for number, (who, some) in frames.items():
+        t = [axis.ms(frame.t_us) / axis.step_ms for frame in some]
+        values = [frame.soft.quality for frame in some]
+        quality.dots(t, values, transmitter_colour(number), who, label_frames(who, some, axis))
+    return quality
+
+
+def label_frames(who: str, frames: Iterable[Frame], axis: TimeAxis) -> list[str]:
+    """Frames where the pointer is."""
+    labels = []
+    for frame in frames:
+        depth = frame.range
+        lines = [who, f"packet {frame.packet}, frame {frame.frame}, {axis.ms(frame.t_us):.1f} ms"]
+        if math.isfinite(depth.distance_m):
+            lines.append(f"{depth.distance_m:.4f} ± {depth.sigma_m:.4f} m")
+        labels.append("\n".join([*lines, f"quality {frame.soft.quality:.4f}"]))
+    return labels
+
+
+def plot_positions(
+    points: Sequence[Settled], bars_enu_m: Mapping[int, NDArray[np.float64]], axis: TimeAxis
+) -> list[Plot]:
+    """Fixes, track and bars in local metres; height, sigmas and protection levels over time.
+
+    Args:
+        points: The trajectory.
+        bars_enu_m: Centre of each bar in the local axes, m, float64 (3,), by transmitter.
+        axis: How time is counted.
+    """
+    plan = Plot("map", "east, m", "north, m", "bars and track", aspect=4 / 3)
+    close = Plot("track", "east, m", "north, m", "the track alone", aspect=4 / 3)
+    height = Plot("height", axis.name, "up, m", "height")
+    spread = Plot("spread", axis.name, "sigma, m", "sigmas")
+    protected = Plot("protection", axis.name, "protection, m", "protection levels", from_zero=True)
+    if points:
+        fixes = [point.fix for point in points]
+        fixed = np.array([fix.enu_m for fix in fixes])
+        t_ms = np.array([axis.ms(fix.t_us) for fix in fixes])
+        sigma = np.sqrt([np.diag(fix.covariance_m2) for fix in fixes])
+        labels = [
+            f"{ms:.1f} ms, {fix.source}\neast {e:z.3f} ± {se:.2g} m\nnorth {n:z.3f} ± {sn:.2g} m"
+            f"\nup {u:z.3f} ± {su:.2g} m"
+            for fix, ms, (e, n, u), (se, sn, su) in zip(
+                fixes, t_ms.tolist(), fixed.tolist(), sigma.tolist(), strict=True
+            )
+        ]
+        chosen = fixes[:: max(1, -(-len(fixes) // _MOST_ELLIPSES))]
+        larger = enlarge_ellipses([fix.covariance_m2 for fix in chosen], fixed)
+        name = "95 % ellipse" + (f", {larger} times as large" if larger > 1 else "")
+        for fix in chosen:
+            close.ring(ellipse(fix.enu_m[:2], fix.covariance_m2[:2, :2] * larger**2, 0.95), "#999999", name)
+        t = t_ms / axis.step_ms
+        ways = (
+            (np.array([point.filtered.enu_m for point in points]), _FILTERED, "filtered"),
+            (np.array([point.smoothed.enu_m for point in points]), _SMOOTHED, "smoothed"),
+        )
+        for way, colour, name in ways:
+            for plot in (plan, close):
+                plot.line(way[:, 0], way[:, 1], colour, name)
+            height.line(t, way[:, 2], colour, name)
+        for plot in (plan, close):
+            plot.dots(fixed[:, 0], fixed[:, 1], _FIX, "fix", labels)
+        height.dots(t, fixed[:, 2], _FIX, "fix, with one sigma", labels)
+        height.band(t, fixed[:, 2] - sigma[:, 2], fixed[:, 2] + sigma[:, 2], _FIX, "fix, with one sigma")
+        # Those of satellites are far larger than those of bars.
+        of_bars = np.array([fix.source == "bars" for fix in fixes])
+        for i, name in enumerate(("east", "north", "up")):
+            spread.dots(t, np.where(of_bars, sigma[:, i], math.nan), transmitter_colour(i), name, labels)
+        protected.line(t, [fix.hpl_m for fix in fixes], INK, "horizontal level")
+        protected.line(t, [fix.vpl_m for fix in fixes], INK, "vertical level", DASHES[2])
+        without = [0.0 if fix.excluded else math.nan for fix in fixes]
+        protected.dots(t, without, _SMOOTHED, "a part left out" if any(fix.excluded for fix in fixes) else "")
+    for number, enu in sorted(bars_enu_m.items()):
+        who = f"bar {number}"
+        east, north, up = enu.tolist()
+        place = f"{who}\neast {east:z.3f} m\nnorth {north:z.3f} m\nup {up:z.3f} m"
+        plan.dots([east], [north], INK, "bar", [place])
+        plan.name(east, north, who)
+    return [plot for plot in (plan, close, height, spread, protected) if not plot.empty]
+
+
+def off_neighbours(t_s: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What each value lies off a straight line through itself and its neighbours in time.
+
+    Args:
+        t_s: Times, s, float64 (n,), ascending.
+        values: Float64 (n,).
+
+    Returns:
+        Float64 (n,), of the values' unit.
+    """
+    n = len(values)
+    wide = min(_NEIGHBOURS, n)
+    if wide < 3:
+        return np.zeros(n)
+    first = np.clip(np.arange(n) - wide // 2, 0, n - wide)
+    near = first[:, None] + np.arange(wide)
+    t, v = t_s[near], values[near]
+    middle_t, middle_v = t.mean(1), v.mean(1)
+    apart = t - middle_t[:, None]
+    slope = (apart * v).sum(1) / np.maximum((apart**2).sum(1), 1e-30)
+    line = middle_v + slope * (t_s - middle_t)
+    # The line goes through a value itself, too: as much nearer as it weighs.
+    weight = 1 / wide + (t_s - middle_t) ** 2 / np.maximum((apart**2).sum(1), 1e-30)
+    found: NDArray[np.float64] = (values - line) / np.sqrt(np.maximum(1 - weight, 1 / wide))
+    return found
+
+
+_NEIGHBOURS = 11
