@@ -24,7 +24,7 @@ def show_faults(progress: "Progress") -> None:
 
 
 @contextmanager
-def progress_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
+def campaign_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
     """A bar by tasks, with the errors so far, on a terminal only."""
     from rich.progress import (
         BarColumn,

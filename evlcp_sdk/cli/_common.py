@@ -13,7 +13,8 @@ from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.printable import printable
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
+    from contextlib import AbstractContextManager
 
     from rich.console import Console, ConsoleOptions, RenderableType
     from rich.segment import Segment
@@ -150,11 +151,18 @@ def shows_bars() -> bool:
     return bool(told) or (sys.stderr is not None and sys.stderr.isatty())
 
 
+def share_done(done: float, total: float | None, _elapsed_s: float) -> str:
+    """What a bar says of bytes, seconds or recordings: the share that is done."""
+    return f"{done / total:.0%}" if total else ""
+
+
 @contextmanager
-def bytes_bar(name: str) -> "Iterator[Advance]":
-    """A bar by bytes read, on a terminal only; of what has no size it says how much, or how long it took."""
+def progress_bar(
+    name: str, words: "Callable[[float, float | None, float], str]" = share_done
+) -> "Iterator[Callable[[float, float | None], None]]":
+    """A bar on stderr, on a terminal only: a function of what is done, and of how much if that is known."""
     if not shows_bars():
-        yield lambda _done, _of: None
+        yield lambda _done, _total: None
         return
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -162,20 +170,25 @@ def bytes_bar(name: str) -> "Iterator[Advance]":
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
-        TextColumn("{task.fields[read]}", markup=False),
+        TextColumn("{task.fields[words]}", markup=False),
         TimeRemainingColumn(),
     )
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(name, total=None, read="")
+        task = bar.add_task(name, total=None, words="")
 
-        def advance(done: int, total: int | None) -> None:
-            elapsed_s = bar.tasks[0].elapsed or 0.0
-            bar.update(task, completed=done, total=total, read=read_so_far(done, total, elapsed_s))
+        def advance(done: float, total: float | None) -> None:
+            said = words(done, total, bar.tasks[0].elapsed or 0.0)
+            bar.update(task, completed=done, total=total, words=said)
 
         yield advance
 
 
-def read_so_far(done: int, total: int | None, elapsed_s: float) -> str:
+def bytes_bar(name: str) -> "AbstractContextManager[Advance]":
+    """A bar by bytes read; of what has no size it says how much, or how long it took."""
+    return progress_bar(name, read_so_far)
+
+
+def read_so_far(done: float, total: float | None, elapsed_s: float) -> str:
     """What a bar says: of a file how much of it, of a pipe how much, of what counts no bytes how long.
 
     >>> read_so_far(1_500_000, 2_000_000, 1.0), read_so_far(1_500_000, None, 1.0), read_so_far(0, None, 7.2)

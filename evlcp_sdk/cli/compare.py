@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo, make_executor
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, echo, make_executor
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
@@ -166,19 +166,8 @@ def _run(job: CompareJob, *, variants: tuple[Variant, ...]) -> Table:
     """Compare the variants on one recording, here or in a worker."""
     from evlcp_sdk.study.compare import compare_recording
 
-    with _bar(job) as advance:
-        return compare_recording(job.url, variants, advance=advance)
-
-
-@contextmanager
-def _bar(job: CompareJob) -> Iterator[Callable[[int, int | None], None]]:
-    from evlcp_sdk.cli._common import bytes_bar
-
-    if not job.here:
-        yield lambda _done, _total: None
-        return
-    with bytes_bar(Path(job.url).name) as advance:
-        yield advance
+    with bytes_bar(Path(job.url).name) if job.here else nullcontext() as advance:
+        return compare_recording(job.url, variants, advance=advance or (lambda _done, _of: None))
 
 
 def _write(comparison: Comparison, paths: Sequence[Path]) -> None:

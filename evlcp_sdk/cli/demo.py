@@ -67,7 +67,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     from contextlib import suppress
     from dataclasses import replace
 
-    from evlcp_sdk.cli._campaign import progress_bar, show_faults
+    from evlcp_sdk.cli._campaign import campaign_bar, show_faults
     from evlcp_sdk.cli._common import make_executor
     from evlcp_sdk.files import Outputs, output_fault
     from evlcp_sdk.report.drawing import save_plots
@@ -90,7 +90,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
         with suppress(FileNotFoundError):
             name.unlink()
     with Store(results, create=True) as store:
-        with progress_bar(plan.name) as show_progress:
+        with campaign_bar(plan.name) as show_progress:
             # Here, where it shows and is done once: what each worker would compile by itself.
             job = plan.jobs[0]
             run_job(replace(job, scene=replace(job.scene, duration_s=_FIRST_S)))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Dask, bytes_bar, console, echo, hush, make_executor, shows_bars
+from evlcp_sdk.cli._common import Dask, bytes_bar, echo, hush, make_executor, progress_bar
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._receiving import CameraOptions, LinePrinter, LinkOptions, ResultOptions
 from evlcp_sdk.cli._summary import print_end
@@ -151,13 +151,14 @@ def _run_jobs(
     outcomes: list[Outcome[ReceiveJob, dict[str, Any]]] = []
     with (
         stop_on_request(pass_on) as stopped,
-        _recordings_bar(len(jobs) if registry is None else 0) as count,
+        progress_bar("recordings") if registry is None else nullcontext() as advance,
         ExitStack() as stack,
     ):
         run = partial(decode, here=None if registry is None else (registry, stopped))
         for outcome in stack.enter_context(closing(executor.run(run, _until(stopped, jobs)))):
-            count()
             outcomes.append(outcome)
+            if advance is not None:
+                advance(len(outcomes), len(jobs))
             if outcome.value is None:
                 _print_failure(outcome, as_json=result.as_json)
             else:
@@ -293,17 +294,3 @@ def _stem(url: str) -> str:
     """The recording's name without its kind: `night.csv.gz` gives `night`."""
     name = Path(url).name
     return name.removesuffix(".gz").rsplit(".", 1)[0] or name
-
-
-@contextmanager
-def _recordings_bar(number: int) -> Iterator[Callable[[], None]]:
-    """A bar by recordings, on a terminal only; none for 0."""
-    if not number or not shows_bars():
-        yield lambda: None
-        return
-    from rich.progress import Progress
-
-    err = console(stderr=True)
-    with Progress(console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task("recordings", total=number)
-        yield lambda: bar.advance(task)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console, echo
+from evlcp_sdk.cli._common import Json, console, echo, progress_bar
 from evlcp_sdk.spelling import counted
 
 
@@ -129,8 +127,8 @@ def _render(
     simulated = render(source, seed, link=link, overrides=overrides, threads=threads)
     scene = simulated.scene
     began = time.perf_counter()
-    with _progress(out.name, scene.duration_s) as advance:
-        written = simulated.save(out, advance)
+    with progress_bar(out.name) as advance:
+        written = simulated.save(out, lambda done_s: advance(done_s, scene.duration_s))
     elapsed_s = time.perf_counter() - began
     counts = simulated.simulation.counts
     size = out.stat().st_size
@@ -159,20 +157,3 @@ def _render(
             f"lost to the event-rate limit: {counted(counts['dropped_by_rate_cap'], 'event')}", style="yellow"
         )
     screen.print(f"written: {', '.join(map(str, written))}", style="dim")
-
-
-@contextmanager
-def _progress(name: str, duration_s: float) -> Iterator[Callable[[float], None]]:
-    """A bar by seconds of the scene, on a terminal only."""
-    from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
-
-    err = console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TaskProgressColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(name, total=duration_s)
-        yield lambda done_s: bar.update(task, completed=done_s)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._campaign import progress_bar, show_faults
+from evlcp_sdk.cli._campaign import campaign_bar, show_faults
 from evlcp_sdk.cli._common import Dask, Json, Workers, console, echo, make_executor
 
 
@@ -69,7 +69,7 @@ def sweep(
         executor = make_executor(workers, dask)
         with Store(path, create=True) as store:
             try:
-                with progress_bar(plan.name) as show:
+                with campaign_bar(plan.name) as show:
                     progress = collect(plan, store, executor, run_job, show)
             except KeyboardInterrupt:
                 so_far = progress_of(plan, store.results())

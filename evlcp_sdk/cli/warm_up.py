@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evlcp_sdk.cli._common import Json, console, echo
+from evlcp_sdk.cli._common import Json, console, echo, progress_bar
 
 
 def warm_up(as_json: Json = False) -> None:
@@ -16,20 +16,11 @@ def warm_up(as_json: Json = False) -> None:
     import json
     from dataclasses import asdict
 
-    from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
     from evlcp_sdk.spelling import counted
     from evlcp_sdk.warming import STEPS, warm_up as warm
 
-    err = console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task("", total=len(STEPS))
-
-        def advance(step: str) -> None:
-            bar.update(task, description=step, completed=STEPS.index(step))
-
-        warmth = warm(advance)
+    with progress_bar("compiling") as advance:
+        warmth = warm(lambda step: advance(STEPS.index(step), len(STEPS)))
     if as_json:
         echo(json.dumps(asdict(warmth) | {"kept_in": warmth.kept_in and str(warmth.kept_in)}))
         return

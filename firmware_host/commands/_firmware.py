@@ -6,8 +6,9 @@ from typing import Annotated
 
 import typer
 
+from evlcp_sdk.cli._common import progress_bar
 from firmware_host.commands._json import AsJson, say
-from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board, progress_bar
+from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board
 
 
 class Target(StrEnum):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
-from evlcp_sdk.cli._common import console, echo
+from evlcp_sdk.cli._common import echo
 from firmware_host.commands._json import JsonCommand, print_json
 
 if TYPE_CHECKING:
@@ -146,17 +146,6 @@ def open_board(context: typer.Context) -> "Iterator[Board]":
     line: BoardLine = context.obj
     with line.open() as board:
         yield board
-
-
-@contextlib.contextmanager
-def progress_bar(what: str) -> "Iterator[Any]":
-    """A bar by bytes, on a terminal only: a function of what is done and what there is."""
-    from rich.progress import Progress
-
-    screen = console(stderr=True)
-    with Progress(console=screen, disable=not screen.is_terminal, transient=True) as bar:
-        task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def say_watchdog(action: str, timeout_ms: int) -> None:

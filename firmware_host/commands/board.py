@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import LinkFile, Overrides, echo
+from evlcp_sdk.cli._common import LinkFile, Overrides, echo, progress_bar
 from firmware_host.commands import _firmware
 from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_json, say
 from firmware_host.commands._line import (
@@ -24,7 +24,6 @@ from firmware_host.commands._line import (
     keep_alive,
     line_options,
     open_board,
-    progress_bar,
     say_done,
     say_watchdog,
 )
