@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import json
-import os
 import shutil
 import signal
 import subprocess
@@ -170,6 +169,7 @@ def test_a_recording_of_which_much_is_dropped_is_degraded(
     assert told["losses"]["reserved_words"]["count"] == len(data) // 10
     assert done.err.startswith(f"evlcp: {path}: ")
     assert "were dropped" in done.err
+    assert f"lost: {len(data) // 10} " in done.out
 
 
 def test_receive_json_is_one_line_a_recording(
@@ -181,18 +181,6 @@ def test_receive_json_is_one_line_a_recording(
     assert [t["status"] for t in tables] == ["complete", "complete", "failed"]
     assert tables[1] == summary_of(tmp_path / "out" / demo_raw.stem)
     assert done.err == f"evlcp: {tmp_path}/none.raw: No such file or directory\n"
-
-
-def test_of_several_recordings_the_others_are_decoded(
-    evlcp: Evlcp, noise_raw: Path, demo_raw: Path, tmp_path: Path
-) -> None:
-    (tmp_path / "photo.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(64))
-    done = evlcp("receive", tmp_path / "photo.png", noise_raw, demo_raw, "-o", tmp_path / "out")
-    assert done.code == 3
-    assert done.err.startswith(f"evlcp: {tmp_path}/photo.png: ")
-    assert len(done.err.splitlines()) == 1
-    assert names_in(tmp_path / "out") == {"noise", demo_raw.stem}
-    assert summary_of(tmp_path / "out" / "noise")["status"] == "complete"
 
 
 @pytest.mark.parametrize(
@@ -337,16 +325,6 @@ def test_info_tells_triggers_and_anomalies(evlcp: Evlcp, tmp_path: Path) -> None
     assert len(table["losses"]) == 1
 
 
-def test_what_a_reader_lost_is_told(evlcp: Evlcp, noise_raw: Path, tmp_path: Path) -> None:
-    noise_raw.write_bytes(noise_raw.read_bytes() + b"\x01")
-    done = evlcp("receive", noise_raw, "-o", tmp_path / "out")
-    assert done.code == 0
-    assert "lost: 1 " in done.out
-    (loss,) = summary_of(tmp_path / "out")["losses"].values()
-    assert (loss["count"], loss["unit"]) == (1, "byte")
-    assert loss["first"] == noise_raw.stat().st_size - 1
-
-
 def test_config_prints_what_it_loads(evlcp: Evlcp, tmp_path: Path) -> None:
     text = evlcp("config", "--set", "modulation.id=wh8").out
     (tmp_path / "link.toml").write_text(text)
@@ -377,14 +355,6 @@ def test_demo_against_the_truth(evlcp: Evlcp, tmp_path: Path) -> None:
     shown = evlcp("demo", "--recording", "-o", tmp_path).out
     assert "against the truth: " in shown
     assert all(len(line) <= 80 for line in shown.splitlines() if "±" in line)
-
-
-@pytest.mark.skipif(os.name != "posix", reason="needs a POSIX shell")
-def test_a_closed_pipe_is_silent() -> None:
-    command = f"{sys.executable} -c 'from evlcp_sdk.cli.main import main; main()' config | head -1"
-    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
-    assert done.stderr == ""
-    assert done.stdout.startswith("# EVLCP link")
 
 
 def test_a_preset_named_as_a_file_is_told_as_one(
@@ -530,9 +500,6 @@ def test_an_attitude_alone_corrects_distances(evlcp: Evlcp, street: Path, tmp_pa
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--clock-zero", "noon"], "expected a time such as"),
-        (["--heading-deg", "3"], "a heading needs gravity"),
-        (["--attitude", "none.csv"], "none.csv: cannot be read"),
         (["--sites", "S", "--heading-deg", "3"], "a heading needs gravity"),
         (["--sites", "S", "--pitch-deg", "3"], "gravity needs --pitch-deg and --roll-deg"),
         (["--sites", "S", "--attitude", "a.csv", "--pitch-deg", "3", "--roll-deg", "0"], "not both"),
@@ -648,28 +615,6 @@ def nmea_of(path: dict[str, list[float]], at_ms: Sequence[int], file: Path) -> P
         lines.append(f"GPGST,{clock},,,,,0.1,0.1,0.1")
     file.write_text("".join(f"${line}*{checksum(line)}\r\n" for line in lines))
     return file
-
-
-def test_satellites_by_nmea_are_in_the_track(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
-    path = json.loads((street / "rec.truth.json").read_text())["camera_path"]
-    nmea = nmea_of(path, (40, 120), tmp_path / "gnss.nmea")
-    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--heading-deg", "0")
-    receive = ("receive", street / "rec.raw", "--sites", street / "site.toml", *angles, "--gnss", nmea)
-    assert evlcp(*receive, "-o", tmp_path / "none").code == 2
-    done = evlcp(*receive, "-o", tmp_path / "out", "--clock-zero", "2026-03-01T12:00:00Z")
-    assert done.code == 0, done.err
-    with (tmp_path / "out" / "fixes.csv").open() as file:
-        rows = [row for row in csv.DictReader(file) if row["source"] == "gnss"]
-    assert [float(row["t_us"]) for row in rows] == [40_000, 120_000]
-    for row, ms in zip(rows, (40, 120), strict=True):
-        for key in ("latitude_deg", "longitude_deg"):
-            assert float(row[key]) == pytest.approx(path[key][ms], abs=1e-8)
-        assert float(row["height_m"]) == pytest.approx(path["height_m"][ms], abs=1e-3)
-        assert float(row["sigma_east_m"]) == pytest.approx(0.1)
-    # An hour off: none of them is within the recording.
-    done = evlcp(*receive, "-o", tmp_path / "late", "--clock-zero", "2026-03-01T11:00:00Z")
-    summary = json.loads((tmp_path / "late" / "summary.json").read_text())
-    assert summary["positions"]["gnss_outside"] == 2
 
 
 def test_live_takes_what_receive_takes(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:

@@ -52,21 +52,10 @@ def test_the_numbers_are_those_of_receive_and_score(evlcp: Evlcp, recording: Pat
         for mine, theirs in (
             (row["frames"], told["rows"]),
             (row["unmatched"], told["unmatched"]),
-            (row["frames_found"], bar["frames_found"]),
-            (row["frames_sent"], bar["frames_sent"]),
-            (row["bits"], bar["bits"]),
-            (row["bit_errors"], bar["bit_errors"]),
-            (row["ranged"], bar["ranged"]),
             (round(row["ber"], 6), bar["ber"]),
             (round(row["gross_share"], 4), bar["over_half_metre"]),
-            (row["bits"], road["bits"]),
-            (row["erased_share"], road["erased"]),
-            (row["claimed_share"], road["claimed"]),
         ):
             assert mine == theirs
-        # frames.csv has tenths of millimetres.
-        for key in ("rmse_m", "bias_m"):
-            assert row[key] == pytest.approx(road[key], abs=1.1e-4)
         assert row["nees"] == pytest.approx(road["nees"], rel=0.02)
         frames = read_frames(tmp_path / name)
         assert row["packets"] == len((tmp_path / name / "packets.jsonl").read_text().splitlines())
@@ -127,8 +116,6 @@ def test_text_and_files(
     ("arguments", "code", "told"),
     [
         ((), 2, "name at least one"),
-        (("--variant", "a"), 2, "evlcp: --variant a: expected NAME:TABLE.KEY=VALUE"),
-        (("--variant", "a:", "--variant", "a:"), 2, "the name 'a' is taken"),
         (("--variant", "a:ranging.id=pco"), 2, "--variant a: no ranging algorithm named 'pco'"),
         (("--variant", "a:", "-o", "t.pdf"), 2, ".csv, .html"),
         (("--variant", "a:", "-o", "none/t.csv"), 1, "none/t.csv: cannot be written: no folder none"),

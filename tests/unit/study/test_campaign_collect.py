@@ -4,7 +4,6 @@ import os
 import random
 import resource
 import signal
-import sqlite3
 import subprocess
 import sys
 import threading
@@ -226,35 +225,6 @@ def test_a_store_that_is_none(tmp_path: Path, content: bytes) -> None:
         with pytest.raises(InputError, match=r"a\.sqlite: "):
             Store(path, create=create)
     assert path.read_bytes() == content
-
-
-def test_someone_elses_database_is_left_alone(tmp_path: Path) -> None:
-    path = tmp_path / "a.sqlite"
-    other = sqlite3.connect(path)
-    other.execute("CREATE TABLE theirs (x)")
-    other.commit()
-    other.close()
-    with pytest.raises(InputError, match="not a results file"):
-        Store(path, create=True)
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        "UPDATE plan SET body = '{'; UPDATE result SET statistics = '{'",
-        "UPDATE plan SET body = x'ff'; UPDATE result SET statistics = '[1]'",
-    ],
-)
-def test_a_damaged_store_is_named(tmp_path: Path, damage: str) -> None:
-    path = tmp_path / "r.sqlite"
-    collected(fake_plan(), path)
-    base = sqlite3.connect(path)
-    base.executescript(damage)
-    base.close()
-    with Store(path) as store:
-        for read in (store.plan, store.results):
-            with pytest.raises(InputError, match=r"r\.sqlite: damaged, or no results file of evlcp sweep"):
-                read()
 
 
 def test_stores_that_cannot_be_opened(tmp_path: Path) -> None:

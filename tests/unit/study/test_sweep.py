@@ -113,13 +113,6 @@ def test_a_bar_that_the_link_does_not_speak_to(evlcp: Evlcp, campaign: Path, tmp
     assert len(done.err.splitlines()) == 1
 
 
-def test_results_that_cannot_be_written(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
-    done = evlcp("sweep", campaign, "-o", tmp_path / "no" / "r.sqlite")
-    assert done.code == 1
-    assert done.err == f"evlcp: {tmp_path}/no/r.sqlite: cannot be written: unable to open database file\n"
-    assert evlcp("report", tmp_path / "none.sqlite").code == 3
-
-
 def test_other_code_is_refused(campaign: Path) -> None:
     plan = plan_of(campaign)
     job = plan.jobs[0]
