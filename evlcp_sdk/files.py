@@ -554,12 +554,15 @@ def read_whole(path: Path | str) -> bytes:
     """The bytes of a file.
 
     Raises:
-        OSError: It cannot be read, or is too large to be read whole, as a device without end.
+        InputError: It cannot be read, or is too large to be read whole, as a device without end.
     """
-    with Path(path).open("rb") as file:
-        data = file.read(MOST_BYTES + 1)
-    if len(data) > MOST_BYTES:
-        raise OSError(errno.EFBIG, f"larger than {MOST_BYTES >> 20} MiB")
+    try:
+        with Path(path).open("rb") as file:
+            data = file.read(MOST_BYTES + 1)
+        if len(data) > MOST_BYTES:
+            raise OSError(errno.EFBIG, f"larger than {MOST_BYTES >> 20} MiB")
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
     return data
 
 
@@ -571,10 +574,9 @@ def read_numbers(path: Path | str) -> "NDArray[Any]":
     """
     import numpy as np
 
+    data = read_whole(path)
     try:
-        array = np.load(io.BytesIO(read_whole(path)), allow_pickle=False)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
+        array = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as fault:
         # NumPy evaluates the header as a piece of Python, which may fail in any way.
         said = " ".join(str(fault).split())
@@ -595,8 +597,6 @@ def read_json(path: Path | str) -> Any:
     """
     try:
         value = json.loads(read_whole(path))
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (ValueError, RecursionError) as fault:
         raise InputError(f"{path}: not JSON: {fault}") from fault
     if value == _UNFINISHED:

@@ -10,7 +10,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 
 from pydantic import BaseModel, ConfigDict, ValidationError, create_model
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_whole
 from evlcp_sdk.spelling import nearest
 
@@ -122,8 +122,8 @@ def read_toml(path: Path | str) -> dict[str, Any]:
     """
     try:
         text = read_whole(path).decode().replace("\r\n", "\n")
-    except OSError as fault:
-        raise ConfigError(f"{path}: cannot be read: {fault.strerror}") from fault
+    except InputError as fault:
+        raise ConfigError(str(fault)) from fault
     except UnicodeDecodeError as fault:
         raise ConfigError(f"{path}: at byte {fault.start}: not UTF-8 text") from fault
     return parse_toml(text, str(path))

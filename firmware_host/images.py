@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Self
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.files import read_whole
 
 FLASH_START = 0x0800_0000
 """Where an STM32's flash begins."""
@@ -47,10 +48,7 @@ class FlashImage:
         Raises:
             InputError: It cannot be read, is damaged, or does not fit the flash.
         """
-        try:
-            data = path.read_bytes()
-        except OSError as fault:
-            raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+        data = read_whole(path)
         if data[:4] == b"\x7fELF":
             pieces = list(_elf_pieces(path, data))
         elif path.suffix.lower() in (".hex", ".ihex", ".ihx"):

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import csv_number, read_whole
 from evlcp_sdk.place.poses import PLACE
 
@@ -111,10 +111,7 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
 
 def _sentences(path: Path | str) -> Iterator[tuple[int, str, list[str]]]:
     """Line, kind and fields of each sentence, of which there are 15 or more: empty ones are added."""
-    try:
-        lines = read_whole(path).decode("ascii", "replace").splitlines()
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    lines = read_whole(path).decode("ascii", "replace").splitlines()
     for line, text in enumerate(lines, 1):
         if not text.strip():
             continue

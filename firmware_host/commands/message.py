@@ -65,6 +65,7 @@ class ContentOptions:
         from time import time as clock_s
 
         from evlcp_sdk.errors import ConfigError
+        from evlcp_sdk.files import read_whole
         from evlcp_sdk.link.compose import utf8
         from firmware_host.board.messages import Content
         from firmware_host.board.sites import site_that_sends
@@ -81,7 +82,7 @@ class ContentOptions:
         site = None if self.beacon is None else site_that_sends(self.beacon, self.transmitter_id, "--id")
         return Content(
             text=self.text,
-            data=None if self.file is None else _read(self.file),
+            data=None if self.file is None else read_whole(self.file),
             site=site,
             user=self.user.encode(),
             key=self.key,
@@ -314,12 +315,3 @@ def keygen(
 
     public = public_key(read_key(private)) if show else make_key(private)
     say(public, {"public_key": public}, as_json)
-
-
-def _read(path: Path) -> bytes:
-    from evlcp_sdk.errors import InputError
-
-    try:
-        return path.read_bytes()
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
