@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.io import read_events
-from evlcp_sdk.io.evt2 import EVT2
+from evlcp_sdk.io.evt import EVT2
 from evlcp_sdk.io.raw import RawWriter, format_header
 from evlcp_sdk.values import Events
 

@@ -1,73 +1,93 @@
-"""Every numba kernel of `evlcp_sdk.io`; imported only when a file is decoded or encoded.
+"""Every kernel of `evlcp_sdk.io`, what the words of a RAW file are, and what a decoder remembers and counts.
 
 Indices that advance in a loop are `uintp`: numba then leaves out its test for negative indices.
 """
 
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.io._words import (
-    BASE,
-    BEFORE_TIME,
-    COLUMN,
-    COLUMN_UNKNOWN,
-    DOUBT,
-    EVT2_CD_ON,
-    EVT2_CONTINUED,
-    EVT2_EXT_TRIGGER,
-    EVT2_OTHERS,
-    EVT2_TIME_HIGH,
-    EVT2_TYPES,
-    EVT3_ADDR_X,
-    EVT3_ADDR_Y,
-    EVT3_CONTINUED_4,
-    EVT3_CONTINUED_12,
-    EVT3_EXT_TRIGGER,
-    EVT3_OTHERS,
-    EVT3_TIME_HIGH,
-    EVT3_TIME_LOW,
-    EVT3_TYPES,
-    EVT3_VECT_8,
-    EVT3_VECT_12,
-    EVT3_VECT_BASE_X,
-    FOLLOWERS,
-    HIGH,
-    LAST,
-    LEVEL,
-    LEVEL_WORDS,
-    LOOK_BYTES,
-    NEAR_US,
-    OTHER_WORDS,
-    OUTSIDE_SENSOR,
-    PACKED,
-    PACKED_CARRY,
-    PACKED_COLUMN,
-    PACKED_LOW,
-    PACKED_POLARITY,
-    PACKED_ROW,
-    PACKED_TIME,
-    POLARITY,
-    REALIGNED,
-    RESERVED,
-    ROLLOVERS,
-    ROW_UNKNOWN,
-    SOON_WORDS,
-    STRIDE_US,
-    TELLING_RESERVED,
-    TELLING_WORDS,
-    TIME_BACKWARD,
-    TIME_DOUBTFUL,
-    TIME_GAPS,
-    TIME_GLITCH,
-    UNKNOWN_COLUMN,
-    UNKNOWN_ROW,
-    VECTOR_AT,
-    VECTOR_CUT,
-    VECTOR_LEFT,
-)
 from evlcp_sdk.kernels import njit
+
+# Word types of EVT3, the top 4 bits of 16: those with events or times, then all that exist; 1, 9, B, C and D
+# are reserved.
+EVT3_ADDR_Y: Final = 0x0
+EVT3_ADDR_X: Final = 0x2
+EVT3_VECT_BASE_X: Final = 0x3
+EVT3_VECT_12: Final = 0x4
+EVT3_VECT_8: Final = 0x5
+EVT3_TIME_LOW: Final = 0x6
+EVT3_TIME_HIGH: Final = 0x8
+EVT3_EXT_TRIGGER: Final = 0xA
+EVT3_TYPES: Final = 0b1100_0101_1111_1101  # bit by bit, from type 0
+
+# Word types of EVT2, the top 4 bits of 32, likewise: 0, 1, 8, A, E and F exist.
+EVT2_CD_ON: Final = 0x1
+EVT2_TIME_HIGH: Final = 0x8
+EVT2_EXT_TRIGGER: Final = 0xA
+EVT2_TYPES: Final = 0b1100_0101_0000_0011
+
+# Slots of a decoder's state, int64. All of it; nothing else passes from one call to the next.
+BASE: Final = 0  # EVT3: 2^24 a rollover; EVT2: 2^34; UNKNOWN_TIME before the first TIME_HIGH, us
+LAST: Final = 1  # time of the last event or trigger given out, us
+PACKED: Final = 2  # EVT3 only, as all to VECTOR_AT: the last event with its time and row, see below
+COLUMN: Final = 3  # where the next vector word starts, or UNKNOWN_COLUMN or more
+POLARITY: Final = 4  # of the last VECT_BASE_X
+VECTOR_LEFT: Final = 5  # vector words still to come after the last VECT_BASE_X
+VECTOR_AT: Final = 6  # byte offset of that VECT_BASE_X
+DOUBT: Final = 7  # both: 1 behind a TIME_HIGH that is not believed
+LEVEL: Final = 8  # both: words before this byte offset are known not to stand askew
+HIGH: Final = 9  # both: the last TIME_HIGH that is believed
+STATE_SLOTS: Final = 10
+
+# A step of TIME_HIGH by more than one is believed unless most of the next `FOLLOWERS` in so many bytes are
+# still on the clock before it. One back by up to `NEAR_US` is an early word, not another clock.
+FOLLOWERS: Final = 3
+LOOK_BYTES: Final = 1 << 18
+NEAR_US: Final = 10_000
+
+# Where bytes are missing, all words behind stand askew. Of words as they were sent none is of a reserved
+# type, of others a third: so many words tell, if so many of them are reserved, and an eighth as many where
+# others are taken for their starts; and if times then follow one another by less than `STRIDE_US`. What is
+# found level is not looked at again for `LEVEL_WORDS`, where there is doubt for `SOON_WORDS`; but at any
+# TIME_HIGH that does not go on by one.
+TELLING_WORDS: Final = 256
+TELLING_RESERVED: Final = 8
+STRIDE_US: Final = 1_000_000
+LEVEL_WORDS: Final = 64
+SOON_WORDS: Final = 8
+
+UNKNOWN_TIME: Final = -1
+UNKNOWN_ROW: Final = 0x8000
+UNKNOWN_COLUMN: Final = 0x7000
+
+# An EVT3 event in one integer: the words that it comes from side by side, types and all, so that a word is
+# put in its place as it is. What of a vector's column exceeds 11 bits is in place of the type, with the type.
+PACKED_COLUMN: Final = 0  # ADDR_X: 11 bits, then the polarity, then the type
+PACKED_POLARITY: Final = 11
+PACKED_CARRY: Final = 12
+PACKED_ROW: Final = 16  # ADDR_Y, of which bit 11 means nothing; its type is 0, with UNKNOWN_ROW 8
+PACKED_LOW: Final = 32  # TIME_LOW
+PACKED_TIME: Final = EVT3_TIME_LOW << 12  # what its type adds to the time
+
+# Rows of a decoder's tally, int64 (rows, 2): how many, and the byte offset of the first.
+BEFORE_TIME: Final = 0
+TIME_GLITCH: Final = 1
+TIME_BACKWARD: Final = 2
+OUTSIDE_SENSOR: Final = 3
+ROW_UNKNOWN: Final = 4
+COLUMN_UNKNOWN: Final = 5
+VECTOR_CUT: Final = 6
+RESERVED: Final = 7
+ODD_BYTES: Final = 8
+HEADER_OPEN: Final = 9
+ROLLOVERS: Final = 10
+TIME_GAPS: Final = 11
+OTHER_WORDS: Final = 12
+TIME_DOUBTFUL: Final = 13
+REALIGNED: Final = 14
+TALLY_ROWS: Final = 15
 
 Column = NDArray[Any]
 EventColumns = tuple[Column, Column, Column, Column]
@@ -227,26 +247,6 @@ def _unlevel(
 
 
 @njit
-def _realign(shift: Integer, here: Integer, state: Column, tally: Column) -> None:
-    """Pass over bytes; what follows has no time before the next TIME_HIGH."""
-    _note(tally, int64(REALIGNED), here)
-    tally[REALIGNED, 0] += shift - 1
-    state[DOUBT] = 1
-    state[LEVEL] = here + shift
-
-
-@njit
-def _are_common(words: Column, start: Integer) -> Any:
-    """Whether a run of words is of the three common types alone."""
-    odd = uint16(0)
-    for k in range(RUN_WORDS):
-        w = words[start + k]
-        # Types 0, 2 and 6 are those below 8 that are even and not 4.
-        odd = max(odd, uint16((w >> 12) & 9), uint16((w >> 13) & 3 == 2))
-    return odd == 0
-
-
-@njit
 def _pack_evt3(
     words: Column,
     start: Integer,
@@ -271,7 +271,12 @@ def _pack_evt3(
         if i >= odd_until and i + RUN_WORDS <= end and n + RUN_WORDS <= room:
             # Which of the three it is cannot be predicted, so nothing branches on it: each is put in the
             # packed event and writes that, and only an ADDR_X moves on.
-            if _are_common(words, i):
+            odd = uint16(0)
+            for k in range(RUN_WORDS):
+                w = words[i + k]
+                # Types 0, 2 and 6 are those below 8 that are even and not 4.
+                odd = max(odd, uint16((w >> 12) & 9), uint16((w >> 13) & 3 == 2))
+            if odd == 0:
                 for k in range(RUN_WORDS):
                     w = int64(words[i + k])
                     kind = uintp(w >> 12)
@@ -431,15 +436,6 @@ def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
 
 
 @njit
-def _note_other(kind: Integer, at: Integer, tally: Column) -> None:
-    """Take note of an EVT3 word that brings neither event nor time."""
-    if kind in (EVT3_OTHERS, EVT3_CONTINUED_4, EVT3_CONTINUED_12):
-        _note(tally, int64(OTHER_WORDS), at)
-    else:
-        _note(tally, int64(RESERVED), at)
-
-
-@njit
 def _take_time(
     words: Column, i: Integer, at: Integer, size: Integer, state: Column, tally: Column, final: Any
 ) -> Integer:
@@ -501,14 +497,13 @@ def _pass_doubtful(
             _note(tally, int64(TIME_DOUBTFUL), at + 2 * start)
         if i == start:
             kind = words[i] >> 12
+            row = TIME_DOUBTFUL if kind == EVT3_EXT_TRIGGER else OTHER_WORDS
             if not (EVT3_TYPES >> kind) & 1:
                 askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
                 if askew:
                     return i, askew
-            if kind == EVT3_EXT_TRIGGER:
-                _note(tally, int64(TIME_DOUBTFUL), at + 2 * i)
-            else:
-                _note_other(kind, at + 2 * i, tally)
+                row = RESERVED
+            _note(tally, int64(row), at + 2 * i)
             i += 1
     return i, int64(0)
 
@@ -589,17 +584,14 @@ def decode_evt3(
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0xF, w & 1
                 state[LAST] = clock
                 m += 1
+        elif (EVT3_TYPES >> kind) & 1:
+            _note(tally, int64(OTHER_WORDS), at + 2 * i)
         else:
-            if not (EVT3_TYPES >> kind) & 1:
-                askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
-                if askew:
-                    break
-            _note_other(kind, at + 2 * i, tally)
+            askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
+            if askew:
+                break
+            _note(tally, int64(RESERVED), at + 2 * i)
         i += 1
-    if askew > 0:
-        _realign(askew, at + 2 * i, state, tally)
-        state[PACKED] = (state[PACKED] & KEEP[EVT3_ADDR_Y]) | UNKNOWN_ROW << PACKED_ROW
-        state[COLUMN], state[VECTOR_LEFT] = UNKNOWN_COLUMN, 0
     return i, n, m, max(askew, int64(0))
 
 
@@ -655,7 +647,7 @@ def decode_evt2(
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0x1F, w & 1
                 last = clock
                 m += 1
-        elif kind in (EVT2_OTHERS, EVT2_CONTINUED):
+        elif (EVT2_TYPES >> kind) & 1:
             _note(tally, int64(OTHER_WORDS), here)
         else:
             askew = _unlevel(words, i, at, 4, EVT2_TYPES, 6, state, final)
@@ -664,8 +656,6 @@ def decode_evt2(
             _note(tally, int64(RESERVED), here)
         i += 1
     state[LAST] = last
-    if askew > 0:
-        _realign(askew, at + 4 * i, state, tally)
     return i, n, m, max(askew, int64(0))
 
 

@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 
 from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
-from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import RawSource, format_header
 from evlcp_sdk.io.urls import flag, positive, split_options
 from evlcp_sdk.plugin.source import Loss

@@ -13,10 +13,8 @@ import numpy as np
 
 from evlcp_sdk.errors import InputError, RawFormatError, StreamError
 from evlcp_sdk.files import Outputs
-from evlcp_sdk.io import _words
-from evlcp_sdk.io._codec import MAX_SIDE, Codec, Columns, Decoder
-from evlcp_sdk.io.evt2 import EVT2
-from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io import _kernels
+from evlcp_sdk.io.evt import EVT2, EVT3, MAX_SIDE, Codec, Columns, Decoder
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers
@@ -214,7 +212,7 @@ class RawSource(EventSource):
         self, path: Path | str, buffer_bytes: int = BUFFER_BYTES, file: RawBytes | None = None
     ) -> None:
         self._path = Path(path)
-        self._buffer = np.empty(max(buffer_bytes, 2 * _words.LOOK_BYTES), np.uint8)
+        self._buffer = np.empty(max(buffer_bytes, 2 * _kernels.LOOK_BYTES), np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
@@ -234,7 +232,7 @@ class RawSource(EventSource):
             shape = header.width, header.height
             super().__init__(self._path, header.codec.name, *shape, header.fields, size, self._decoder)
             if not header.closed:
-                self._decoder.note(_words.HEADER_OPEN, header.size_bytes)
+                self._decoder.note(_kernels.HEADER_OPEN, header.size_bytes)
             self._start = self._position = self._data_start = header.size_bytes
             if not self._is_pipe:
                 self._fill()
@@ -392,7 +390,6 @@ class RawEncoder:
     def __init__(self, codec: Codec, width: int) -> None:
         self._columns = width
         self._codec = codec
-        self._kernel = codec.kernel(codec.encoder)
         self._state = np.full(3, -1, np.int64)
         self._words = np.empty(WRITE_WORDS, codec.word)
         self._begun = False
@@ -411,7 +408,7 @@ class RawEncoder:
         trigger_columns = tuple(np.ascontiguousarray(c) for c in columns)
         i = j = 0
         while i < len(events) or j < len(triggers):
-            n, i, j = self._kernel(
+            n, i, j = self._codec.encoder(
                 self._words, self._columns, self._state, event_columns, i, trigger_columns, j
             )
             yield self._words[:n].tobytes()

@@ -5,7 +5,7 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io._codec import MAX_SIDE
+from evlcp_sdk.io.evt import MAX_SIDE
 from evlcp_sdk.spelling import nearest
 
 

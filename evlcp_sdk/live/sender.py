@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Final
 
 from evlcp_sdk.errors import OutputError
-from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.patience import pieces_until
 from evlcp_sdk.io.raw import RawEncoder, format_header
 from evlcp_sdk.live.publisher import Publisher, Subscription

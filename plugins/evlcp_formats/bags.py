@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Final
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import RawSource, format_header
 from evlcp_sdk.io.urls import split_options
 from evlcp_sdk.plugin.source import Loss

@@ -8,8 +8,7 @@ import numpy as np
 
 from evlcp_sdk.errors import ConfigError, StreamError
 from evlcp_sdk.files import Outputs
-from evlcp_sdk.io._codec import MAX_SIDE
-from evlcp_sdk.io.evt3 import EVT3
+from evlcp_sdk.io.evt import EVT3, MAX_SIDE
 from evlcp_sdk.io.raw import RawEncoder, RawWriter
 from evlcp_sdk.plugin.writer import EventWriter
 from evlcp_sdk.values import Events, Triggers

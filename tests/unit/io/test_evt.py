@@ -7,7 +7,7 @@ from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.io import RawSource, RawWriter, open_source, read_events, write_events
-from evlcp_sdk.io._codec import Columns, Decoder
+from evlcp_sdk.io.evt import Columns, Decoder
 from evlcp_sdk.io.raw import CODECS
 from evlcp_sdk.values import Events, Triggers
 

@@ -1,14 +1,13 @@
-"""How events become words and words events: what EVT2 and EVT3 share, without any file."""
+"""How events become words and words events: EVT2, 32 bits an event; EVT3, 16 bits a change."""
 
-import importlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.io import _words
+from evlcp_sdk.io import _kernels
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events, Triggers
 
@@ -17,6 +16,48 @@ MAX_SIDE = 2048
 
 
 NO_TRIGGERS = Triggers.empty()
+
+LOSSES: Final = {
+    "words_before_time": (
+        _kernels.BEFORE_TIME,
+        "words before the first TIME_HIGH, which have no time; skipped",
+    ),
+    "time_glitches": (_kernels.TIME_GLITCH, "TIME_HIGH words that no others agree with, or that are early"),
+    "time_doubtful": (
+        _kernels.TIME_DOUBTFUL,
+        "events and triggers behind a TIME_HIGH that no others agree with, or before the first one"
+        " where words stood askew; dropped",
+    ),
+    "time_backward": (_kernels.TIME_BACKWARD, "events and triggers earlier than the one before; dropped"),
+    "outside_sensor": (_kernels.OUTSIDE_SENSOR, "events outside the sensor; dropped"),
+    "row_unknown": (_kernels.ROW_UNKNOWN, "events before the first ADDR_Y, which have no row; dropped"),
+    "column_unknown": (
+        _kernels.COLUMN_UNKNOWN,
+        "vector events before the first VECT_BASE_X, which have no column; dropped",
+    ),
+    "vectors_cut": (
+        _kernels.VECTOR_CUT,
+        "vectors that are not whole (12 + 12 + 8 columns): words are missing",
+    ),
+    "reserved_words": (_kernels.RESERVED, "words of a reserved type; skipped"),
+    "bytes_askew": (
+        _kernels.REALIGNED,
+        "bytes passed over where words stood askew, as bytes are missing there or too many",
+    ),
+    "odd_bytes": (_kernels.ODD_BYTES, "bytes at the end of the file that make no whole word; skipped"),
+    "header_without_end": (
+        _kernels.HEADER_OPEN,
+        "header without '% end'; data taken to start at the first line without '% '",
+    ),
+}
+"""What a RAW file may lose: name -> (row of the tally, meaning)."""
+
+COUNTS: Final = {
+    "rollovers": (_kernels.ROLLOVERS, "rollovers of the camera clock"),
+    "time_gaps": (_kernels.TIME_GAPS, "steps of TIME_HIGH by more than one"),
+    "other_words": (_kernels.OTHER_WORDS, "OTHERS and CONTINUED words, which carry no events"),
+}
+"""What is worth knowing about a RAW file and is not a loss: name -> (row of the tally, meaning)."""
 
 
 @dataclass(frozen=True)
@@ -28,29 +69,24 @@ class Codec:
         version: As after `% evt`.
         word: Type of a word, little-endian.
         burst: Most events that one word may bring.
-        types: The word types that exist; the top 4 bits of a word.
+        types: The word types that exist, bit by bit; the top 4 bits of a word.
         channels: Trigger inputs that a word can name.
         time_bits: Bits of TIME_HIGH, and of the time below it.
         rollover: Words with which the clock rolls over once and stands at 0, in steps that are believed.
-        decoder: Name of its decoding kernel in `evlcp_sdk.io._kernels`.
-        encoder: Name of its encoding kernel there.
+        decoder: Its decoding kernel.
+        encoder: Its encoding kernel.
     """
 
     name: str
     version: str
     word: np.dtype[Any]
     burst: int
-    types: frozenset[int]
+    types: int
     channels: int
     time_bits: tuple[int, int]
     rollover: tuple[int, ...]
-    decoder: str
-    encoder: str
-
-    def kernel(self, name: str) -> Callable[..., Any]:
-        """Return a kernel; compiles it, or loads it from the cache, when first called."""
-        kernel: Callable[..., Any] = getattr(importlib.import_module("evlcp_sdk.io._kernels"), name)
-        return kernel
+    decoder: Callable[..., Any]
+    encoder: Callable[..., Any]
 
     def prelude(self, first_us: int) -> tuple[NDArray[Any], int]:
         """Return the words before a first time, and the number of the TIME_HIGH that they end with."""
@@ -63,7 +99,37 @@ class Codec:
 
     def reserved(self, words: NDArray[Any]) -> NDArray[np.bool_]:
         """Return which of `words` are of a type that does not exist."""
-        return np.isin(words >> (8 * self.word.itemsize - 4), list(self.types), invert=True)
+        kinds = words >> (8 * self.word.itemsize - 4)
+        return np.asarray(self.types >> kinds.astype(np.int64) & 1 == 0)
+
+
+EVT2: Final = Codec(
+    name="EVT2",
+    version="2.0",
+    word=np.dtype("<u4"),
+    burst=1,
+    types=_kernels.EVT2_TYPES,
+    channels=32,
+    time_bits=(28, 6),
+    rollover=(0x85555555, 0x8AAAAAAA, 0x8FFFFFFF, 0x80000000, 0x80000000),
+    decoder=_kernels.decode_evt2,
+    encoder=_kernels.encode_evt2,
+)
+"""t = rollovers * 2^34 + TIME_HIGH * 2^6 + the event's own 6 bits, us."""
+
+EVT3: Final = Codec(
+    name="EVT3",
+    version="3.0",
+    word=np.dtype("<u2"),
+    burst=12,
+    types=_kernels.EVT3_TYPES,
+    channels=16,
+    time_bits=(12, 12),
+    rollover=(0x8555, 0x6000, 0x8AAA, 0x6000, 0x8FFF, 0x6000, 0x8000, 0x6000, 0x8000, 0x6000),
+    decoder=_kernels.decode_evt3,
+    encoder=_kernels.encode_evt3,
+)
+"""t = rollovers * 2^24 + TIME_HIGH * 2^12 + TIME_LOW, us."""
 
 
 class Columns:
@@ -103,19 +169,22 @@ class Decoder:
     def __init__(self, codec: Codec, width: int | None, height: int | None) -> None:
         self.codec = codec
         self._bounds = (width or MAX_SIDE, height or MAX_SIDE)
-        self._state = np.zeros(_words.STATE_SLOTS, np.int64)
-        self._state[_words.BASE] = _words.UNKNOWN_TIME
-        self._state[_words.PACKED] = (
-            _words.PACKED_TIME << _words.PACKED_LOW | _words.UNKNOWN_ROW << _words.PACKED_ROW
-        )
-        self._state[_words.COLUMN] = _words.UNKNOWN_COLUMN
-        self._tally = np.zeros((_words.TALLY_ROWS, 2), np.int64)
-        self._kernel = codec.kernel(codec.decoder)
+        self._state = np.zeros(_kernels.STATE_SLOTS, np.int64)
+        self._state[_kernels.BASE] = _kernels.UNKNOWN_TIME
+        self._state[_kernels.PACKED] = _kernels.PACKED_TIME << _kernels.PACKED_LOW
+        self._forget()
+        self._tally = np.zeros((_kernels.TALLY_ROWS, 2), np.int64)
+
+    def _forget(self) -> None:
+        """Know neither the row nor the column of an event that comes, as EVT3 has them in words before it."""
+        packed = int(self._state[_kernels.PACKED]) & ~(0xFFFF << _kernels.PACKED_ROW)
+        self._state[_kernels.PACKED] = packed | _kernels.UNKNOWN_ROW << _kernels.PACKED_ROW
+        self._state[_kernels.COLUMN], self._state[_kernels.VECTOR_LEFT] = _kernels.UNKNOWN_COLUMN, 0
 
     @property
     def has_time(self) -> bool:
         """Whether a TIME_HIGH has come by."""
-        return bool(self._state[_words.BASE] != _words.UNKNOWN_TIME)
+        return bool(self._state[_kernels.BASE] != _kernels.UNKNOWN_TIME)
 
     def decode(self, words: NDArray[Any], at: int, out: Columns, final: bool) -> int:
         """Decode `words`, whose first is at byte `at`, behind what is in `out`; return the bytes used.
@@ -124,7 +193,7 @@ class Decoder:
         it takes more words, up to `LOOK_BYTES`, to believe the time, unless these are the `final` ones; and
         where words do not go on behind the last one, but some bytes later, which are used, too.
         """
-        used, out.events, out.triggers, askew = self._kernel(
+        used, out.events, out.triggers, askew = self.codec.decoder(
             words,
             (at, final),
             self._bounds,
@@ -134,15 +203,21 @@ class Decoder:
             (out.trigger_t_us, out.channel, out.value),
             (out.events, out.triggers),
         )
-        return int(used * self.codec.word.itemsize + askew)
+        used = int(used) * self.codec.word.itemsize
+        if askew:
+            # What follows has no time before the next TIME_HIGH.
+            self.note(_kernels.REALIGNED, at + used, int(askew))
+            self._state[_kernels.DOUBT], self._state[_kernels.LEVEL] = 1, at + used + askew
+            self._forget()
+        return used + int(askew)
 
     def finish(self, at: int, odd_bytes: int) -> None:
         """Take note of how the stream ends: at byte `at`, with `odd_bytes` that make no word."""
         if odd_bytes:
-            self.note(_words.ODD_BYTES, at, odd_bytes)
-        if self._state[_words.VECTOR_LEFT]:
-            self.note(_words.VECTOR_CUT, int(self._state[_words.VECTOR_AT]))
-            self._state[_words.VECTOR_LEFT] = 0
+            self.note(_kernels.ODD_BYTES, at, odd_bytes)
+        if self._state[_kernels.VECTOR_LEFT]:
+            self.note(_kernels.VECTOR_CUT, int(self._state[_kernels.VECTOR_AT]))
+            self._state[_kernels.VECTOR_LEFT] = 0
 
     def note(self, row: int, at: int, count: int = 1) -> None:
         """Count a loss, at byte `at`."""
@@ -155,7 +230,7 @@ class Decoder:
         """As `EventSource.losses`."""
         return {
             name: Loss(int(count), int(first), "byte", meaning)
-            for name, (row, meaning) in _words.LOSSES.items()
+            for name, (row, meaning) in LOSSES.items()
             for count, first in [self._tally[row]]
             if count
         }
@@ -163,4 +238,4 @@ class Decoder:
     @property
     def counts(self) -> dict[str, int]:
         """The format's own part of `EventSource.counts`."""
-        return {name: int(self._tally[row, 0]) for name, (row, _) in _words.COUNTS.items()}
+        return {name: int(self._tally[row, 0]) for name, (row, _) in COUNTS.items()}
