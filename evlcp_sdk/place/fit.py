@@ -1,7 +1,7 @@
 """The weighted least-squares fit of a pose, and of every error that is shared, to all observations."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -42,28 +42,29 @@ def fit_pose(
     here, equations = start, linearize(problem, start, huber)
     if equations is None:
         return replace(start, cost=math.nan, settled=False)
-    reduced = _reduce(problem, equations)
+    matrix, side = _normal(problem, equations)
     near = 1e-6 if robust else 1e-4
-    surveyed = bool(problem.bar_sigma[:, :2].any())
     damping, growth, stalled = 1e-4, 4.0, 0
     for _ in range(steps):
         cost = equations.cost
-        step = _solve(reduced.matrix, reduced.side, damping)
+        step = _solve(matrix, side, damping)
         if step is None:
             break
-        there = move(problem, here, reduced.step(step))
+        shared = np.zeros(SHARED)
+        shared[problem.free] = step
+        there = move(problem, here, equations.step(shared))
         found = linearize(problem, there, huber)
-        if found is not None and found.cost > cost and surveyed:
+        if found is not None and found.cost > cost and problem.surveyed:
             # What a long turn leaves of second order, errors of the sites take up where they are large.
-            there = move(problem, there, _reduce(problem, found).step(None))
+            there = move(problem, there, found.step(np.zeros(SHARED)))
             found = linearize(problem, there, huber)
-        promise = float(reduced.side @ step)
-        hoped = promise + damping * float(step @ (np.diag(reduced.matrix) * step))
+        promise = float(side @ step)
+        hoped = promise + damping * float(step @ (np.diag(matrix) * step))
         stalled = 0 if found is not None and found.cost < 0.7 * cost else stalled + 1
         if found is not None and found.cost <= cost:
             won = cost - found.cost
             here, equations = there, found
-            reduced = _reduce(problem, equations)
+            matrix, side = _normal(problem, equations)
             ratio = won / hoped if hoped > 0 else 1.0
             damping = min(max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12), 1e12)
             growth = 4.0
@@ -78,48 +79,16 @@ def fit_pose(
                 return replace(here, cost=cost, settled=promise < 1e-3)
         if stalled == _STALLED and equations.cost > hopeless:
             stalled = 0
-            last = _solve(reduced.matrix, reduced.side, 1e-9)
-            if equations.cost - (0.0 if last is None else float(reduced.side @ last)) > hopeless:
+            last = _solve(matrix, side, 1e-9)
+            if equations.cost - (0.0 if last is None else float(side @ last)) > hopeless:
                 return replace(here, cost=equations.cost, settled=True)
     return replace(here, cost=equations.cost, settled=False)
 
 
-@dataclass(frozen=True, eq=False)
-class _Reduced:
-    """Normal equations of the shared unknowns that are free, the bars' own following.
-
-    Attributes:
-        problem: Whose they are.
-        matrix: float64 (m, m).
-        side: float64 (m,).
-        follow: How the bars' own follow them, and in the last column what they do by themselves, float64
-            (k, m + 1).
-    """
-
-    problem: Problem
-    matrix: Floats
-    side: Floats
-    follow: Floats
-
-    def step(self, shared: Floats | None) -> Floats:
-        """A step of all unknowns; None: only of the bars' own."""
-        unknowns = self.problem.unknowns
-        whole, m = np.zeros(SHARED + self.problem.bar_sigma.size), len(self.side)
-        moved = np.zeros(m) if shared is None else shared
-        whole[unknowns[:m]], whole[unknowns[m:]] = moved, self.follow[:, -1] - self.follow[:, :-1] @ moved
-        return whole
-
-
-def _reduce(problem: Problem, equations: Equations) -> _Reduced:
-    """The equations at a point without the bars' own unknowns."""
+def _normal(problem: Problem, equations: Equations) -> tuple[Floats, Floats]:
+    """Normal equations of the shared unknowns that are free."""
     matrix, side = equations.normal()
-    unknowns = problem.unknowns
-    m = int(np.searchsorted(unknowns, SHARED))
-    matrix, side = matrix[np.ix_(unknowns, unknowns)], side[unknowns]
-    between = matrix[m:, :m]
-    follow = np.linalg.solve(matrix[m:, m:], np.column_stack([between, side[m:]]))
-    shared = matrix[:m, :m] - between.T @ follow[:, :-1]
-    return _Reduced(problem, shared, side[:m] - between.T @ follow[:, -1], np.asarray(follow, np.float64))
+    return matrix[np.ix_(problem.free, problem.free)], side[problem.free]
 
 
 def _solve(matrix: Floats, side: Floats, damping: float) -> Floats | None:

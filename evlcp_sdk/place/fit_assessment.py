@@ -7,7 +7,6 @@ length - a test of whether the rest contradicts it, and how far the position may
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -132,25 +131,11 @@ class _Solution:
 
     Attributes:
         spread: Covariance of the 14 shared unknowns, 0 of those that are not free, float64 (14, 14).
-        info: What each bar says of them, its own errors free, float64 (bars, 14, 14).
-        right: Right-hand sides of that, float64 (bars, 14).
-        gain: By how much each bar's own errors follow, float64 (bars, 9, 14).
-        own: By how much they would move by themselves, float64 (bars, 9).
-        position: Where that is, m, float64 (3,).
         equations: There.
     """
 
     spread: Floats
-    info: Floats
-    right: Floats
-    gain: Floats
-    own: Floats
-    position: Floats
     equations: Equations
-
-    def step(self, shared: Floats) -> Floats:
-        """A move of the shared unknowns, and what follows."""
-        return np.concatenate([shared, (self.own - self.gain @ shared).ravel()])
 
 
 def _solve(problem: Problem, fit: Fit) -> _Solution | None:
@@ -158,32 +143,13 @@ def _solve(problem: Problem, fit: Fit) -> _Solution | None:
     equations = linearize(problem, fit, problem.spec.huber_sigmas)
     if equations is None:
         return None
-    bars = len(problem.transmitters)
-    rows = equations.rows.reshape(-1, 2, equations.rows.shape[1])
-    miss = equations.miss.reshape(-1, 2)
-    # Of each bar what its own errors, the shared unknowns and the misses say of one another.
-    size = LOCAL + SHARED + 1
-    whole_bar = np.empty((bars, size, size))
-    for bar, mine in enumerate(problem.parts):
-        first, part = SHARED + LOCAL * bar, rows[mine].reshape(-1, rows.shape[2])
-        of_bar = np.column_stack([part[:, first : first + LOCAL], part[:, :SHARED], miss[mine].ravel()])
-        whole_bar[bar] = of_bar.T @ of_bar
-    whole_bar[:, :LOCAL, -1] -= fit.local
-    between = whole_bar[:, :LOCAL, LOCAL:]
-    follow = np.asarray(np.linalg.solve(whole_bar[:, :LOCAL, :LOCAL] + np.eye(LOCAL), between), np.float64)
-    gain, own = follow[:, :, :-1], follow[:, :, -1]
-    left = whole_bar[:, LOCAL:-1, LOCAL:] - between[:, :, :-1].transpose(0, 2, 1) @ follow
-    info, right = left[:, :, :-1], left[:, :, -1]
-    angles = equations.angles[:, :SHARED]
-    whole = info.sum(0) + angles.T @ angles
-    whole.flat[LENS * (SHARED + 1) :: SHARED + 1] += 1.0
-    free = np.flatnonzero(problem.free)
-    spread = np.zeros((SHARED, SHARED))
-    inverse = _inverted(whole[np.ix_(free, free)])
+    free = np.ix_(problem.free, problem.free)
+    inverse = _inverted(equations.normal()[0][free])
     if inverse is None:
         return None
-    spread[np.ix_(free, free)] = inverse
-    return _Solution(spread, info, right, gain, own, fit.position, equations)
+    spread = np.zeros((SHARED, SHARED))
+    spread[free] = inverse
+    return _Solution(spread, equations)
 
 
 def _inverted(matrix: Floats) -> Floats | None:
@@ -219,7 +185,7 @@ def assess_fit(problem: Problem, fit: Fit) -> AssessedPose | Rejection:
     levels, tests, worst = _test_parts(problem, solution)
     doubt = f"the points miss the sites by {math.sqrt(fit.cost / freedom):.1f} sigmas (rms)" if amiss else ""
     moves = _moves_by_errors(problem, solution)
-    noise, slow = _rest(solution, moves)
+    noise, slow = _rest(problem, solution, moves)
     doubted = _doubted(problem, solution)
     pose = Pose(
         fit.position,
@@ -260,9 +226,9 @@ each bar's (bars, 3, 7)."""
 
 def _moves_by_errors(problem: Problem, solution: _Solution) -> Moves:
     place = solution.spread[:3]
-    angles = solution.equations.angles[:, :SHARED]
+    angles = solution.equations.angles
     by_attitude = place @ angles.T @ problem.said[: len(angles)]
-    by_bars = place @ solution.gain[:, 2:].swapaxes(1, 2)
+    by_bars = place @ solution.equations.bars.gain[:, 2:].swapaxes(1, 2)
     return -place[:, LENS:], by_attitude if len(angles) else np.zeros((3, 4)), by_bars
 
 
@@ -278,11 +244,11 @@ def _bend(problem: Problem, fit: Fit, solution: _Solution, size: Floats, axes: F
     bent, slopes = 1.0, tuple(np.zeros_like(part) for part in _moves_by_errors(problem, solution))
     for way in (-2 / wide, 2 / wide):
         shared = way * solution.spread[:, :3] @ axes[:, -1]
-        there = move(problem, fit, solution.step(shared))
+        there = move(problem, fit, solution.equations.step(shared))
         again = _solve(problem, there)
         if again is not None and again.equations.cost - fit.cost > _FAR_COST:
             # Errors of sites take up what is left of second order.
-            there = move(problem, there, again.step(np.zeros(SHARED)))
+            there = move(problem, there, again.equations.step(np.zeros(SHARED)))
             again = _solve(problem, there)
         growth = 1e-9 if again is None else max((again.equations.cost - fit.cost) / 4, 1e-9)
         off = axes.T @ (there.position - fit.position - shared[:3])
@@ -325,50 +291,50 @@ def _widest(covariance: Floats) -> float:
 def _test_parts(problem: Problem, solution: _Solution) -> tuple[_Levels, dict[str, float], str]:
     """Protection levels, each part's test value, and the part that fits the rest the least, if any fails."""
     spec, spread = problem.spec, solution.spread
-    turns = bool(problem.free[3:6].any())
-    names = _parts(problem.transmitters, problem.angles if turns else 0)
-    limits = _limits(spec.false_alarm / 2 / len(names))
+    tested = list(_tested_parts(problem, solution))
+    chance = spec.false_alarm / 2 / len(tested)
     flat, high = (math.sqrt(chi_square(spec.risk, freedom)) for freedom in (2, 1))
     levels = _Levels(spread[:3, :3], flat, high)
     levels.widen(np.zeros((3, 3)), np.zeros((3, 3)), 0.0)
     tests, worst, doubt = {}, 1.0, ""
-    for name, (value, freedom, added, unseen) in zip(names, _tested_parts(problem, solution), strict=False):
+    for name, (value, freedom, added, unseen) in tested:
+        limit = chi_square(chance, freedom) if freedom else 0.0
         if freedom:
             tests[name] = value
-            if value / limits[freedom] > worst:
-                worst = value / limits[freedom]
+            if value / limit > worst:
+                worst = value / limit
                 doubt = f"{name} does not fit the rest: {math.sqrt(value):.1f} sigmas"
         if name != "heading":
             # A heading that is off is an attitude that is.
-            levels.widen(added, unseen, limits[freedom])
+            levels.widen(added, unseen, limit)
     return levels, tests, doubt
 
 
 Tested = tuple[float, int, Floats, Floats]
 
 
-def _tested_parts(problem: Problem, solution: _Solution) -> Iterator[Tested]:
-    """`_test` of each bar, the focal length, the attitude and the heading, as far as there are."""
+def _tested_parts(problem: Problem, solution: _Solution) -> Iterator[tuple[str, Tested]]:
+    """Names and `_test` of each bar, the focal length, the attitude and the heading, as far as there are."""
     spec, free = problem.spec, problem.free[:, None]
-    for bar in range(len(problem.transmitters)):
-        own, side = solution.info[bar, :6, :6], solution.right[bar, :6]
-        columns = solution.info[bar, :, :6] * free
-        yield _test(own, columns, side, solution.spread, _bar_bound(problem, solution, bar))
-    columns = solution.info.sum(0)[:, FAULT : FAULT + 1] * free
-    information = solution.info[:, FAULT, FAULT].sum().reshape(1, 1)
+    for bar, number in enumerate(problem.transmitters):
+        own, side = solution.equations.bars.info[bar, :6, :6], solution.equations.bars.right[bar, :6]
+        columns = solution.equations.bars.info[bar, :, :6] * free
+        yield f"bar {number}", _test(own, columns, side, solution.spread, _bar_bound(problem, solution, bar))
+    columns = solution.equations.bars.info.sum(0)[:, FAULT : FAULT + 1] * free
+    information = solution.equations.bars.info[:, FAULT, FAULT].sum().reshape(1, 1)
     focal = (FOCAL_UNIT / spec.focal_fault) ** 2 if spec.focal_fault else 0.0
-    side = solution.right[:, FAULT].sum().reshape(1)
-    yield _test(information, columns, side, solution.spread, np.full((1, 1), focal))
-    angles, miss = solution.equations.angles[:, :SHARED], solution.equations.angles_miss
+    side = solution.equations.bars.right[:, FAULT].sum().reshape(1)
+    yield FOCAL, _test(information, columns, side, solution.spread, np.full((1, 1), focal))
+    angles, miss = solution.equations.angles, solution.equations.angles_miss
     bound: NDArray[np.floating] = np.zeros((len(angles), len(angles)))
     if spec.attitude_fault_deg and len(angles):
         white = math.radians(spec.attitude_fault_deg) * problem.white[: len(angles), : len(angles)]
         bound = np.linalg.inv(white @ white.T)
-    for first in (0, 2):
-        if len(angles) > first:
+    for first, name in ((0, "attitude"), (2, "heading")):
+        if len(angles) > first and problem.free[3:6].any():
             alone = np.eye(len(angles) - first)
             columns = angles[first:].T * free
-            yield _test(alone, columns, miss[first:], solution.spread, bound[first:, first:])
+            yield name, _test(alone, columns, miss[first:], solution.spread, bound[first:, first:])
 
 
 def _test(
@@ -421,15 +387,16 @@ def _bar_bound(problem: Problem, solution: _Solution, bar: int) -> Floats:
     row = problem.points[int((problem.bar == bar).argmax())]
     half = np.zeros((6, 6))
     half[:3, :3], half[3:, 3:] = np.eye(3) / place_m, np.eye(3) / _BAR_TURN_RAD
-    half[:3, 3:] = skewed((row[:3] - row[3:6] - solution.position)[None])[0].T / place_m
+    half[:3, 3:] = skewed((row[:3] - row[3:6] - solution.equations.at.position)[None])[0].T / place_m
     return half.T @ half
 
 
-def _rest(solution: _Solution, moves: Moves) -> tuple[Floats, Floats]:
+def _rest(problem: Problem, solution: _Solution, moves: Moves) -> tuple[Floats, Floats]:
     """What the position's covariance is made of beside the errors that stay: noise and slow, (3, 3) each."""
     place, equations = solution.spread[:3], solution.equations
-    follow = np.concatenate([np.eye(SHARED), -solution.gain.reshape(-1, SHARED)])
-    rows = equations.rows @ follow @ place.T
+    follow = (equations.bars.gain @ place.T)[problem.bar]
+    rows = equations.rows[:, :, LOCAL:-1] @ place.T - equations.rows[:, :, :LOCAL] @ follow
+    rows = rows.reshape(-1, 3)
     slow = rows.T @ (rows * equations.stands[:, None])
     by_camera, by_attitude, by_bars = moves
     rest = place[:, :3] - slow - by_camera @ by_camera.T - by_attitude @ by_attitude.T
@@ -446,7 +413,7 @@ def _doubted(problem: Problem, solution: _Solution) -> Floats:
     is so `_RARELY`. What is no likelier after the fit than before is in the sigmas already. Of position and
     turn, float64 (6, 6); 0 where it is too little to count.
     """
-    rows, miss = solution.equations.angles[:, :SHARED], solution.equations.angles_miss
+    rows, miss = solution.equations.angles, solution.equations.angles_miss
     nothing = np.zeros((6, 6))
     if not (len(miss) and problem.free[3:6].any()):
         return nothing
@@ -482,19 +449,6 @@ def _level(level_m: float, spec: ErrorModel) -> float:
 def misfits(problem: Problem, fit: Fit) -> bool:
     """Whether the sum of the squared misses is more than chance makes it."""
     return fit.cost > chi_square(problem.spec.false_alarm / 2, problem.freedom)
-
-
-@lru_cache(maxsize=256)
-def _parts(transmitters: tuple[int, ...], angles: int) -> tuple[str, ...]:
-    """What may be at fault, in the order of `_tested_parts`; `angles` that are known, and free."""
-    names = *(f"bar {number}" for number in transmitters), FOCAL
-    return (*names, *("attitude", "heading")[: angles - 1]) if angles else names
-
-
-@lru_cache(maxsize=256)
-def _limits(chance: float) -> Floats:
-    """What a test exceeds by this chance, by its degrees of freedom, float64 (7,)."""
-    return np.array([0.0, *(chi_square(chance, freedom) for freedom in range(1, 7))])
 
 
 def _doubt(doubted: Floats) -> dict[str, Floats]:

@@ -8,7 +8,10 @@ east, north and up, and of its attitude about these; all in their own sigmas.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,36 +54,67 @@ class Fit:
         return cls(position, rotation, np.zeros((len(problem.transmitters), LOCAL)), np.zeros(7))
 
 
-@dataclass(frozen=True, eq=False)
-class Equations:
-    """The problem at a point, linear.
+class BarEquations(NamedTuple):
+    """What bars say of the shared unknowns, each with its own errors free.
 
     Attributes:
-        rows: What the unknowns do to the points, whitened, float64 (2 n, 14 + 9 bars).
-        miss: Seen less expected points, whitened, float64 (2 n,).
+        info: The matrix of their equations, float64 (bars, 14, 14).
+        right: Right-hand sides, float64 (bars, 14).
+        gain: By how much each bar's own errors follow, float64 (bars, 9, 14).
+        own: By how much they move by themselves, float64 (bars, 9).
+    """
+
+    info: Floats
+    right: Floats
+    gain: Floats
+    own: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class Equations:
+    """The problem at a point, linear; the camera's and the bars' errors are expected to be 0 to a sigma.
+
+    Attributes:
+        at: The point.
+        parts: Where each bar's points are.
+        rows: Of each point what its bar's own errors do, then the shared unknowns, and last seen less
+            expected; whitened, float64 (n, 2, 9 + 14 + 1).
         stands: The share of each row's variance that stands for a while, float64 (2 n,).
-        angles: What the unknowns do to the attitude as it is known, whitened, float64 (k, 14 + 9 bars).
+        angles: What the shared unknowns do to the attitude as it is known, whitened, float64 (k, 14).
         angles_miss: Said less expected angles, whitened, float64 (k,).
-        errors: The camera's and the bars' errors, which are expected to be 0 to a sigma, float64 (7 + 9
-            bars,).
         cost: Twice the robust cost.
     """
 
+    at: Fit
+    parts: Sequence[slice]
     rows: Floats
-    miss: Floats
     stands: Floats
     angles: Floats
     angles_miss: Floats
-    errors: Floats
     cost: float
 
+    @cached_property
+    def bars(self) -> BarEquations:
+        """What each bar says."""
+        flat = [self.rows[mine].reshape(-1, self.rows.shape[2]) for mine in self.parts]
+        whole = np.stack([part.T @ part for part in flat])
+        whole[:, :LOCAL, -1] -= self.at.local
+        between = whole[:, :LOCAL, LOCAL:]
+        follow = np.asarray(np.linalg.solve(whole[:, :LOCAL, :LOCAL] + np.eye(LOCAL), between), np.float64)
+        left = whole[:, LOCAL:-1, LOCAL:] - between[:, :, :-1].transpose(0, 2, 1) @ follow
+        return BarEquations(left[:, :, :-1], left[:, :, -1], follow[:, :, :-1], follow[:, :, -1])
+
     def normal(self) -> tuple[Floats, Floats]:
-        """Normal equations: the matrix, float64 (m, m), and the right-hand side, float64 (m,)."""
-        matrix = self.rows.T @ self.rows + self.angles.T @ self.angles
-        matrix.flat[LENS * (len(matrix) + 1) :: len(matrix) + 1] += 1.0
-        side = self.rows.T @ self.miss + self.angles.T @ self.angles_miss
-        side[LENS:] -= self.errors
+        """Normal equations of the shared unknowns: the matrix, float64 (14, 14), and the right-hand side."""
+        matrix = self.bars.info.sum(0) + self.angles.T @ self.angles
+        matrix.flat[LENS * (SHARED + 1) :: SHARED + 1] += 1.0
+        side = self.bars.right.sum(0) + self.angles.T @ self.angles_miss
+        side[LENS:] -= self.at.lens
         return matrix, side
+
+    def step(self, shared: Floats) -> Floats:
+        """A move of the shared unknowns, float64 (14,), and of the bars' own, which follow."""
+        return np.concatenate([shared, (self.bars.own - self.bars.gain @ shared).ravel()])
 
 
 def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
@@ -106,36 +140,24 @@ def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
     cost = float((np.where(size > huber, huber * (2 * size - huber), size**2)).sum())
     white = known.even * (np.sqrt(weight) * points[:, 8])[:, None, None]
     by_point = _by_point(white @ camera.distort_slope(direction), direction, seen[:, 2], at.rotation)
-    rows = np.zeros((len(points), 2, SHARED + at.local.size))
-    rows[:, :, :3] = -by_point
-    rows[:, :, 3:6] = by_point @ skewed(offset)
+    rows = np.zeros((len(points), 2, LOCAL + SHARED + 1))
+    own_errors, shared = rows[:, :, :LOCAL], rows[:, :, LOCAL:-1]
+    own_errors[:, :, :2] = white @ known.root
+    own_errors[:, :, 2:3] = by_point @ known.stretched[:, :, None]
+    if problem.surveyed:
+        own_errors[:, :, 3:6] = by_point * known.place[:, :, None]
+        own_errors[:, :, 6:] = by_point @ known.arm * -known.turn[:, :, None]
+    shared[:, :, :3] = -by_point
+    shared[:, :, 3:6] = by_point @ skewed(offset)
     by_focal = (expected - camera.centre_px) * (FOCAL_UNIT * problem.camera.focal_px / camera.focal_px)
-    rows[:, :, FAULT] = _by(by_focal, white)
+    shared[:, :, FAULT] = _by(by_focal, white)
     if problem.free[LENS:].any():
-        rows[:, :, LENS:SHARED] = white @ (camera.parameter_slope(direction) @ problem.lens_root)
-    local = np.concatenate(
-        [
-            white @ known.root,
-            by_point @ known.stretched[:, :, None],
-            by_point * known.place[:, :, None],
-            by_point @ known.arm * -known.turn[:, :, None],
-        ],
-        -1,
-    )
-    for number, mine in enumerate(problem.parts):
-        first = SHARED + LOCAL * number
-        rows[mine, :, first : first + LOCAL] = local[mine]
-    angles, angles_miss = _attitude(problem, at.rotation, rows.shape[2])
-    errors = np.concatenate([at.lens, at.local.ravel()])
-    return Equations(
-        rows.reshape(-1, rows.shape[2]),
-        (miss * np.sqrt(weight)[:, None]).ravel(),
-        np.repeat(points[:, 9] * weight, 2),
-        angles,
-        angles_miss,
-        errors,
-        cost + float(errors @ errors + angles_miss @ angles_miss),
-    )
+        shared[:, :, LENS:] = white @ (camera.parameter_slope(direction) @ problem.lens_root)
+    rows[:, :, -1] = miss * np.sqrt(weight)[:, None]
+    angles, angles_miss = _attitude(problem, at.rotation)
+    cost += float(at.lens @ at.lens + at.local.ravel() @ at.local.ravel() + angles_miss @ angles_miss)
+    stands = np.repeat(points[:, 9] * weight, 2)
+    return Equations(at, problem.parts, rows, stands, angles, angles_miss, cost)
 
 
 def move(problem: Problem, at: Fit, step: Floats) -> Fit:
@@ -185,7 +207,7 @@ def _by_point(slope: Floats, direction: Floats, ahead: Floats, rotation: Floats)
     return np.concatenate([by, -by @ direction[:, :, None]], -1) @ rotation.T
 
 
-def _attitude(problem: Problem, rotation: Floats, unknowns: int) -> tuple[Floats, Floats]:
+def _attitude(problem: Problem, rotation: Floats) -> tuple[Floats, Floats]:
     """What the turns do to pitch, roll and heading as they are known, whitened, and by how much they miss."""
     known = problem.angles
     east, north, high = rotation[:, 2].tolist()
@@ -203,6 +225,6 @@ def _attitude(problem: Problem, rotation: Floats, unknowns: int) -> tuple[Floats
         ]
     )
     white = problem.white[:known, :known]
-    rows = np.zeros((known, unknowns))
+    rows = np.zeros((known, SHARED))
     rows[:, 3:6] = white @ by_turn[:known]
     return rows, white @ raw[:known]

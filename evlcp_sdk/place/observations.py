@@ -265,11 +265,9 @@ class Problem:
         return replace(self, points=np.array(points), bar=np.array(bar))
 
     @cached_property
-    def unknowns(self) -> NDArray[np.int64]:
-        """Numbers of the fit's unknowns that are free and that points depend on: see `model`."""
-        places = 9 if self.bar_sigma[:, :2].any() else 3
-        own = 14 + 9 * np.arange(len(self.transmitters))[:, None] + np.arange(places)
-        return np.concatenate([np.flatnonzero(self.free), own.ravel()])
+    def surveyed(self) -> bool:
+        """Whether places or attitudes of bars are not exact."""
+        return bool(self.bar_sigma[:, :2].any())
 
 
 def _told(

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.fit import fit_pose
 from evlcp_sdk.place.fit_assessment import AssessedPose, _doubted, _solve, _test, assess_fit
-from evlcp_sdk.place.model import FOCAL_UNIT, Fit, linearize, move
+from evlcp_sdk.place.model import FOCAL_UNIT, Equations, Fit, linearize, move
 from evlcp_sdk.place.observations import (
     BarView,
     Problem,
@@ -102,6 +102,25 @@ def misses(p: Problem, at: Fit, change: Floats) -> Floats:
     return np.concatenate(found)
 
 
+def whole(p: Problem, equations: Equations) -> tuple[Floats, Floats, Floats]:
+    """Rows of points by all unknowns, each bar's own behind the shared ones, and their normal equations."""
+    rows = np.zeros((len(p.points), 2, 14 + 9 * len(p.transmitters)))
+    rows[:, :, :14] = equations.rows[:, :, 9:-1]
+    for i, b in enumerate(p.bar.tolist()):
+        rows[i, :, 14 + 9 * b : 23 + 9 * b] = equations.rows[i, :, :9]
+    rows = rows.reshape(-1, rows.shape[2])
+    angles = np.pad(equations.angles, ((0, 0), (0, rows.shape[1] - 14)))
+    prior = np.r_[np.zeros(7), np.ones(rows.shape[1] - 7)]
+    errors = np.r_[np.zeros(7), equations.at.lens, equations.at.local.ravel()]
+    side = rows.T @ equations.rows[:, :, -1].ravel() + angles.T @ equations.angles_miss - errors
+    return rows, rows.T @ rows + angles.T @ angles + np.diag(prior), side
+
+
+def free_of(p: Problem) -> NDArray[np.int64]:
+    """Which of all unknowns are free."""
+    return np.flatnonzero(np.r_[p.free, np.ones(9 * len(p.transmitters), bool)])
+
+
 def test_equations_are_those_of_numerical_slopes() -> None:
     rng = np.random.default_rng(1)
     p, position, rotation = problem(rng, noise=0.8)
@@ -110,7 +129,7 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     assert found is not None
     at_rest = misses(p, at, np.zeros(32))
     slope = -approx_fprime(np.zeros(32), lambda x: misses(p, at, x), 1e-6)
-    matrix, side = found.normal()
+    _, matrix, side = whole(p, found)
     scale = np.sqrt(np.diag(slope.T @ slope))
     # The roll is about the level forward axis, not the pitched one.
     np.testing.assert_allclose(
@@ -126,7 +145,7 @@ def sigmas_of(p: Problem, fit: Fit) -> Floats:
     """Of the position, by the whole matrix."""
     equations = linearize(p, fit, SPEC.huber_sigmas)
     assert equations is not None
-    matrix = equations.normal()[0][np.ix_(p.unknowns, p.unknowns)]
+    matrix = whole(p, equations)[1][np.ix_(free_of(p), free_of(p))]
     sigma: Floats = np.sqrt(np.diag(np.linalg.inv(matrix))[:3])
     return sigma
 
@@ -261,22 +280,23 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     found, equations = assess_fit(p, fit), linearize(p, fit, SPEC.huber_sigmas)
     assert isinstance(found, AssessedPose)
     assert equations is not None
-    pose, keep = found.pose, p.unknowns
+    pose, keep = found.pose, free_of(p)
+    rows, matrix, _ = whole(p, equations)
     spread = np.zeros((14 + 9 * bars, 14 + 9 * bars))
-    spread[np.ix_(keep, keep)] = np.linalg.inv(equations.normal()[0][np.ix_(keep, keep)])
+    spread[np.ix_(keep, keep)] = np.linalg.inv(matrix[np.ix_(keep, keep)])
     np.testing.assert_allclose(pose.covariance, spread[:6, :6], rtol=1e-6, atol=1e-12)
-    by_points = spread[:3] @ equations.rows.T
+    by_points = spread[:3] @ rows.T
     slow = by_points @ np.diag(equations.stands) @ by_points.T
     np.testing.assert_allclose(pose.slow, slow, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(pose.standing["camera"], -spread[:3, 7:14], rtol=1e-6, atol=1e-9)
     assert p.attitude is not None
-    angles = spread[:3] @ equations.angles.T @ p.white @ p.attitude.standing()
+    angles = spread[:3, :14] @ equations.angles.T @ p.white @ p.attitude.standing()
     np.testing.assert_allclose(pose.standing["attitude"], angles, rtol=1e-6, atol=1e-9)
     for b in range(bars):
         own = slice(14 + 9 * b + 2, 23 + 9 * b)
         np.testing.assert_allclose(pose.standing[f"bar {b}"], -spread[:3, own], rtol=1e-6, atol=1e-9)
-    whole = pose.noise + pose.slow + sum(m @ m.T for m in pose.standing.values())
-    np.testing.assert_allclose(whole, spread[:3, :3], rtol=1e-6, atol=1e-9)
+    together = pose.noise + pose.slow + sum(m @ m.T for m in pose.standing.values())
+    np.testing.assert_allclose(together, spread[:3, :3], rtol=1e-6, atol=1e-9)
     assert abs(np.linalg.eigh(spread[:3, :3])[1][:, -1] @ pose.along) == pytest.approx(1)
 
 
@@ -290,8 +310,9 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
     assert solution is not None
     risk = stats.chi2.isf(SPEC.risk, 1)
     for b in range(3):
-        column = solution.info[b, :, :6] * p.free[:, None]
-        own, side = solution.info[b, :6, :6], solution.right[b, :6]
+        bars = solution.equations.bars
+        column = bars.info[b, :, :6] * p.free[:, None]
+        own, side = bars.info[b, :6, :6], bars.right[b, :6]
         value, freedom, added, unseen = _test(own, column, side, solution.spread, np.zeros((6, 6)))
         assert value == pytest.approx(found.tests[f"bar {b}"])
         hidden = np.sqrt(stats.chi2.isf(SPEC.false_alarm / 2 / len(found.tests), freedom) * np.diag(unseen))
