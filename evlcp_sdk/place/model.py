@@ -97,7 +97,7 @@ class Equations:
     def bars(self) -> BarEquations:
         """What each bar says."""
         flat = [self.rows[mine].reshape(-1, self.rows.shape[2]) for mine in self.parts]
-        whole = np.stack([part.T @ part for part in flat])
+        whole = np.array([part.T @ part for part in flat])
         whole[:, :LOCAL, -1] -= self.at.local
         between = whole[:, :LOCAL, LOCAL:]
         follow = np.asarray(np.linalg.solve(whole[:, :LOCAL, :LOCAL] + np.eye(LOCAL), between), np.float64)
@@ -152,7 +152,7 @@ def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
     by_focal = (expected - camera.centre_px) * (FOCAL_UNIT * problem.camera.focal_px / camera.focal_px)
     shared[:, :, FAULT] = _by(by_focal, white)
     if problem.free[LENS:].any():
-        shared[:, :, LENS:] = white @ (camera.parameter_slope(direction) @ problem.lens_root)
+        shared[:, :, LENS:] = white @ (camera.parameter_slope(direction, expected) @ problem.lens_root)
     rows[:, :, -1] = miss * np.sqrt(weight)[:, None]
     angles, angles_miss = _attitude(problem, at.rotation)
     cost += float(at.lens @ at.lens + at.local.ravel() @ at.local.ravel() + angles_miss @ angles_miss)
@@ -166,14 +166,14 @@ def move(problem: Problem, at: Fit, step: Floats) -> Fit:
     A turn takes the camera about the points' centre, to first order along the straight line: their image
     hardly changes on that arc, so that long steps hold.
     """
-    turn, angle = step[3:6], math.sqrt(step[3:6] @ step[3:6])
+    angle, cross = math.sqrt(step[3:6] @ step[3:6]), skewed(step[None, 3:6])[0]
     # Rodrigues.
-    axis = skewed(turn[None] / max(angle, 1e-300))[0]
+    axis = cross / max(angle, 1e-300)
     turned = np.eye(3) + math.sin(angle) * axis + (1 - math.cos(angle)) * axis @ axis
-    centre = problem.points[:, :3].mean(0)
+    centre = problem.centre
     away = at.position - centre
     return Fit(
-        centre + step[:3] + turned @ away - skewed(turn[None])[0] @ away,
+        centre + step[:3] + turned @ away - cross @ away,
         turned @ at.rotation,
         at.local + step[SHARED:].reshape(at.local.shape),
         at.lens + step[LENS:SHARED],

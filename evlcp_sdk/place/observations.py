@@ -265,6 +265,11 @@ class Problem:
         return replace(self, points=np.array(points), bar=np.array(bar))
 
     @cached_property
+    def centre(self) -> Floats:
+        """The mean of the points' places, float64 (3,)."""
+        return np.asarray(self.points[:, :3].mean(0))
+
+    @cached_property
     def surveyed(self) -> bool:
         """Whether places or attitudes of bars are not exact."""
         return bool(self.bar_sigma[:, :2].any())

@@ -89,7 +89,9 @@ class CameraModel:
     def distort_slope(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
         """Derivatives of `distort`, px, float64 (..., 2, 2): of column and row by the direction's parts."""
         if self.is_pinhole:
-            return np.broadcast_to(self.focal_px * np.eye(2), (*direction.shape[:-1], 2, 2))
+            straight = np.zeros((*direction.shape, 2))
+            straight[..., 0, 0] = straight[..., 1, 1] = self.focal_px
+            return straight
         u, v = direction[..., 0], direction[..., 1]
         r2 = u * u + v * v
         radial = 1 + r2 * (self.k1 + r2 * (self.k2 + r2 * self.k3))
@@ -109,12 +111,20 @@ class CameraModel:
         turned[..., 2] = -direction / z[..., None]
         return self.distort_slope(direction) @ turned
 
-    def parameter_slope(self, direction: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Derivatives of `distort` by `CAMERA_PARAMETERS`, the focal length in px: float64 (..., 2, 7)."""
+    def parameter_slope(
+        self, direction: NDArray[np.float64], seen_px: NDArray[np.float64] | None = None
+    ) -> NDArray[np.float64]:
+        """Derivatives of `distort` by `CAMERA_PARAMETERS`, the focal length in px: float64 (..., 2, 7).
+
+        Args:
+            direction: float64 (..., 2).
+            seen_px: `distort` of it, where that is known.
+        """
+        seen_px = self.distort(direction) if seen_px is None else seen_px
         u, v, f = direction[..., 0], direction[..., 1], self.focal_px
         r2 = u * u + v * v
         slope = np.zeros((*direction.shape, len(CAMERA_PARAMETERS)))
-        slope[..., 0] = (self.distort(direction) - self.centre_px) / f
+        slope[..., 0] = (seen_px - self.centre_px) / f
         slope[..., 0, 1] = slope[..., 1, 2] = 1.0
         slope[..., 3] = f * direction * r2[..., None]
         slope[..., 4] = slope[..., 3] * r2[..., None]
