@@ -1,7 +1,7 @@
 """What a simulation leaves beside its recording: the truth, and the scene that a truth describes."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
@@ -190,65 +190,33 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
     if "simulator" in truth:
         return resolve_scene(truth["simulator"], source="truth")
     try:
-        told, camera = truth["scene"], truth["camera"]
-        if told["hpf_us"] != 0:
-            raise ConfigError(f"truth: scene.hpf_us = {told['hpf_us']}: a high-pass filter is not modelled")
-        same = (
-            *(
-                "th_on",
-                "th_off",
-                "noise_ln",
-                "noise_hz",
-                "p_on_miss",
-                "p_off_miss",
-                "dly_on_us",
-                "dly_off_us",
-            ),
-            *("jitter_us", "tau_sf_us", "refr_us", "t_row_us", "cap_mev_s"),
-        )
-        shape = (
-            "x_m",
-            "y_m",
-            "z_m",
-            "width_m",
-            "ppm",
-            "led_w_m2",
-        )
-        pixels = camera["width"] * camera["height"]
+        given, camera = truth["scene"], truth["camera"]
+        if given["hpf_us"] != 0:
+            raise ConfigError(f"truth: scene.hpf_us = {given['hpf_us']}: a high-pass filter is not modelled")
+        optics = {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")}
+        focal_px = CameraModel(**optics).focal_px
         table = {
-            "name": told["name"],
-            "duration_s": told["duration_s"],
-            "t0_us": told["t0_us"],
-            "seed": told["seed"],
-            "flicker_lamps": told["flicker_lamps"],
-            "camera": {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")},
+            **_taken(given, ("name", "duration_s", "t0_us", "seed", "flicker_lamps")),
+            "camera": optics,
             # Its blur is stated as one sigma: a Gaussian without wings.
-            "lens": {key: told[key] for key in ("f_number", "focus_m", "halo")}
-            | {"wings": False}
-            | {key: told[key] for key in ("bloom", "bloom_px") if key in told},
-            "motion": {key: told[key] for key in ("distance_m", "speed_mps", "vib_rate_rad_s")}
-            | _motion_told(told, CameraModel(**{key: camera[key] for key in ("focal_mm", "pitch_um")})),
+            "lens": {**_taken(given, ("f_number", "focus_m", "halo"), ("bloom", "bloom_px")), "wings": False},
+            "motion": _motion_of(given, focal_px),
             "background": {
-                "light_w_m2": told["background_w_m2"],
-                "texture": told["background_texture"],
-            }
-            | {key: told[key] for key in ("texture_px",) if key in told}
-            # How far around the bar such recordings have events of a background that moves.
-            | ({"around_px": 24, "texture_step_px": 0.4} if told.get("bg_moves") else {}),
-            "wiper": dict(zip(("at_s", "lasts_s", "share"), told["wiper"], strict=True)) | {"edge_s": 0.0}
-            if told.get("wiper")
-            else {},
-            "sensor": {key: told[key] for key in same} | {"hot_share": told["hot_pixels"] / pixels},
-            "bars": [
-                {key: bar[key] for key in (*shape, "start_chip")}
-                | {key: bar[key] for key in _WHERE_TOLD if key in bar}
-                | ({"led_w_m2": told["led_w_m2_all"]} if told.get("led_w_m2_all") else {})
-                | {"link": _link_table(truth, bar, f"bars.{i}")}
-                | ({"symbols": bar["symbols"]} if bar["symbols"] else {})
-                for i, bar in enumerate(truth["bars"])
-            ],
+                "light_w_m2": given["background_w_m2"],
+                "texture": given["background_texture"],
+                **_taken(given, (), ("texture_px",)),
+                # How far around the bar such recordings have events of a background that moves.
+                **({"around_px": 24, "texture_step_px": 0.4} if given.get("bg_moves") else {}),
+            },
+            "sensor": {
+                **_taken(given, _OF_SENSOR),
+                "hot_share": given["hot_pixels"] / (camera["width"] * camera["height"]),
+            },
+            "bars": [_bar_spec_of(truth, bar, f"bars.{i}") for i, bar in enumerate(truth["bars"])],
+            **_others_of(truth, given["distance_m"] / focal_px),
         }
-        table |= _others_told(truth)
+        if given.get("wiper"):
+            table["wiper"] = dict(zip(("at_s", "lasts_s", "share"), given["wiper"], strict=True), edge_s=0.0)
     except (KeyError, TypeError) as fault:
         raise ConfigError(f"truth: not a scene's truth: {fault}") from fault
     except InputError as fault:
@@ -256,31 +224,47 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
     return resolve_scene(table, source="truth")
 
 
-_WHERE_TOLD = ("chips_file", "lean_deg", "tilt_deg", "covered", "cover_s", "pole_s")
-"""Keys of a bar that a scene has under the same name, and a truth where there is something to say."""
+def _taken(given: Mapping[str, Any], keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Any]:
+    """Values under keys that a scene has, too; the optional ones where they are."""
+    return {key: given[key] for key in (*keys, *(key for key in optional if key in given))}
 
 
-def _motion_told(told: Mapping[str, Any], camera: CameraModel) -> dict[str, Any]:
-    """What another generator's scene says of yaw, attitude and potholes, as keys of `[motion]`."""
+def _bar_spec_of(truth: Mapping[str, Any], bar: Mapping[str, Any], where: str) -> dict[str, Any]:
+    """A bar's table of a scene; its link is what it names, or follows from what it says of its frames."""
+    found = _taken(
+        bar,
+        ("x_m", "y_m", "z_m", "width_m", "ppm", "led_w_m2", "start_chip"),
+        ("chips_file", "lean_deg", "tilt_deg", "covered", "cover_s", "pole_s"),
+    )
+    link = bar.get("link")
+    found["link"] = link_table_of(bar, "truth", where) if link is None else truth["links"][link]["table"]
+    if truth["scene"].get("led_w_m2_all"):
+        found["led_w_m2"] = truth["scene"]["led_w_m2_all"]
+    if bar["symbols"]:
+        found["symbols"] = bar["symbols"]
+    return found
+
+
+def _motion_of(given: Mapping[str, Any], focal_px: float) -> dict[str, Any]:
+    """What a scene's table says of the camera's motion, as keys of `[motion]`."""
+    found = _taken(given, ("distance_m", "speed_mps", "vib_rate_rad_s"), ("lateral_mps",))
     names = {
-        "lateral_mps": "lateral_mps",
         "cam_yaw_deg": "yaw_deg",
         "cam_pitch_deg": "pitch_deg",
         "cam_roll_deg": "roll_deg",
         "yaw_share": "vib_yaw_share",
     }
-    found = {ours: told[theirs] for theirs, ours in names.items() if theirs in told}
-    if told.get("pothole_px_ms"):
-        found["pothole_s"] = [told["pothole_s"]]
-        found["pothole_rad_s"] = told["pothole_px_ms"] * 1000 / camera.focal_px
-        found["pothole_hz"] = told["pothole_hz"]
+    found |= {ours: given[theirs] for theirs, ours in names.items() if theirs in given}
+    if given.get("pothole_px_ms"):
+        found["pothole_s"] = [given["pothole_s"]]
+        found["pothole_rad_s"] = given["pothole_px_ms"] * 1000 / focal_px
+        found["pothole_hz"] = given["pothole_hz"]
     return found
 
 
-def _others_told(truth: Mapping[str, Any]) -> dict[str, Any]:
+def _others_of(truth: Mapping[str, Any], m_per_px: float) -> dict[str, Any]:
     """What another generator's truth says of mirror images, ghost images and panels."""
-    camera, distance = truth["camera"], truth["scene"]["distance_m"]
-    m_per_px = distance / CameraModel(focal_mm=camera["focal_mm"], pitch_um=camera["pitch_um"]).focal_px
+    camera = truth["camera"]
     reflections, lamps = [], []
     for i, other in enumerate(truth.get("others", [])):
         kind = other["kind"]
@@ -313,10 +297,3 @@ def _others_told(truth: Mapping[str, Any]) -> dict[str, Any]:
             raise ConfigError(f"truth: others.{i}.kind = {kind!r}: expected mirror, ghost or pwm")
         reflections.append(one)
     return {"reflections": reflections, "lamps": lamps}
-
-
-def _link_table(truth: Mapping[str, Any], bar: Mapping[str, Any], where: str) -> Any:
-    """The table of a bar's link, which it names, or which follows from what it says of its frames."""
-    if bar.get("link") is None:
-        return link_table_of(bar, "truth", where)
-    return truth["links"][bar["link"]]["table"]
