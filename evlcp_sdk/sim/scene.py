@@ -673,40 +673,28 @@ def _parse_override(text: str) -> tuple[str, Any]:
 
 
 def _set(table: dict[str, Any], key: str, value: Any) -> None:
-    parts = key.split(".")
     if isinstance(value, np.generic):
         value = value.item()
-    if len(parts) == 1:
-        table[parts[0]] = value
-    elif parts[0] == "link":
-        _set_link(table, parts[1:], value, key)
-    elif len(parts) == 2 and parts[0] in _TABLES:
-        table.setdefault(parts[0], {})[parts[1]] = value
-    elif parts[0] == "bars" and "link" in parts[1:3] and parts[-1] != "link":
-        rows = _rows(table, "bars")
-        at = parts.index("link")
-        for row in rows if at == 1 else [_row(rows, parts, key)]:
-            _set_link(row, parts[at + 1 :], value, key)
-    elif len(parts) in (2, 3) and parts[0] in _LISTS:
-        rows = _rows(table, parts[0])
-        if len(parts) == 2:
-            for row in rows:
-                row[parts[1]] = value
+    head, *rest = key.split(".")
+    holders = [table]
+    if not rest or head == "link":
+        rest = [head, *rest]
+    elif head in _TABLES:
+        holders = [table.setdefault(head, {})]
+    elif head in _LISTS:
+        holders = rows = table.setdefault(head, [{}])
+        if len(rest) > 1 and (head, rest[0]) != ("bars", "link"):
+            number, *rest = rest
+            if not number.isdigit() or int(number) >= len(rows):
+                raise ConfigError(f"--set {key}: there are {len(rows)} {head}, counted from 0")
+            holders = [rows[int(number)]]
+    for holder in holders:
+        if rest[0] == "link" and len(rest) > 1 and head in ("link", "bars"):
+            _set_link(holder, rest[1:], value, key)
+        elif len(rest) == 1 and head in (rest[0], *_TABLES, *_LISTS):
+            holder[rest[0]] = value
         else:
-            _row(rows, parts, key)[parts[2]] = value
-    else:
-        raise ConfigError(f"--set {key}: unknown table{nearest(parts[0], [*_TABLES, *_LISTS, 'link'])}")
-
-
-def _rows(table: dict[str, Any], name: str) -> list[dict[str, Any]]:
-    rows: list[dict[str, Any]] = table.setdefault(name, [{}])
-    return rows
-
-
-def _row(rows: list[dict[str, Any]], parts: Sequence[str], key: str) -> dict[str, Any]:
-    if not parts[1].isdigit() or int(parts[1]) >= len(rows):
-        raise ConfigError(f"--set {key}: there are {len(rows)} {parts[0]}, counted from 0")
-    return rows[int(parts[1])]
+            raise ConfigError(f"--set {key}: unknown table{nearest(head, [*_TABLES, *_LISTS, 'link'])}")
 
 
 def _set_link(holder: dict[str, Any], parts: Sequence[str], value: Any, key: str) -> None:
