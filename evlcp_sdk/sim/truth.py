@@ -223,29 +223,22 @@ class _Reader:
         missing = [key for key in wanted if not isinstance(table, Mapping) or key not in table]
         if missing:
             raise InputError(f"{self._source}: not a scene's truth: {', '.join(missing)} missing")
-        scene = self._table(table, "scene")
-        rows = self._list(table, "bars")
+        scene, rows = self._table(table["scene"], "scene"), self._list(table["bars"], "bars")
         t_us = self._numbers(table["t_s"], "t_s", 1) * 1e6
-        if (np.diff(t_us) <= 0).any():
-            raise self._fault("t_s", table["t_s"], "rising times")
         n = len(t_us)
-        if not n:
-            raise self._fault("t_s", table["t_s"], "at least one time")
-        depths, centres = self._list(table, "distance_m"), self._list(table, "bar_centre_px")
-        for key, columns in (("distance_m", depths), ("bar_centre_px", centres)):
-            if len(columns) < len(rows):
-                raise self._fault(key, columns, f"one list a bar, {len(rows)}")
-        links = self._links(table.get("links")) if links is None else links
+        if not n or (np.diff(t_us) <= 0).any():
+            raise self._fault("t_s", table["t_s"], "rising times, one at the least")
+        for key in ("distance_m", "bar_centre_px"):
+            if len(self._list(table[key], key)) < len(rows):
+                raise self._fault(key, table[key], f"one list a bar, {len(rows)}")
+        if links is None:
+            links = self._links(self._table(table.get("links") or {}, "links"))
         bars = []
         for i, row in enumerate(rows):
-            if not isinstance(row, Mapping):
-                raise self._fault(f"bars.{i}", row, "a table")
-            depth = self._numbers(depths[i], f"distance_m.{i}", 1, n)
-            centre = self._numbers(centres[i], f"bar_centre_px.{i}", 2, 2, n).T
-            bars.append(self._bar(row, f"bars.{i}", links, centre, depth))
-        path = table.get("camera_path", {})
-        if not isinstance(path, Mapping):
-            raise self._fault("camera_path", path, "a table")
+            depth = self._numbers(table["distance_m"][i], f"distance_m.{i}", 1, n)
+            centre = self._numbers(table["bar_centre_px"][i], f"bar_centre_px.{i}", 2, 2, n).T
+            bars.append(self._bar(self._table(row, f"bars.{i}"), f"bars.{i}", links, centre, depth))
+        path = self._table(table.get("camera_path", {}), "camera_path")
         rest = {
             key: value
             for key, value in table.items()
@@ -275,7 +268,13 @@ class _Reader:
     def _bar(
         self, row: Mapping[str, Any], where: str, links: Mapping[str, Link], centre: Floats, depth: Floats
     ) -> SentBar:
-        link = self._link(row, where, links)
+        digest = row.get("link")
+        if digest is None and not links:
+            link = self._resolved(link_table_of(row, self._source, where), where)
+        elif isinstance(digest, str) and digest in links:
+            link = links[digest]
+        else:
+            raise self._fault(f"{where}.link", digest, "the digest of one of the links")
         ppm = self._number(row, "ppm", f"{where}.", -_MOST_PPM, _MOST_PPM)
         light = row.get("led_w_m2")
         lit = light is None or self._number(row, "led_w_m2", f"{where}.") > _DARK_W_M2
@@ -301,17 +300,12 @@ class _Reader:
             pole_s=tuple((a, b) for a, b in self._spans(row, "pole_s", where, 2, clusters).tolist()),
         )
 
-    def _links(self, told: Any) -> dict[str, Link]:
-        if told is None:
-            return {}
-        if not isinstance(told, Mapping):
-            raise self._fault("links", told, "a table")
+    def _links(self, given: Mapping[str, Any]) -> dict[str, Link]:
         found = {}
-        for digest, entry in told.items():
+        for digest, value in given.items():
             where = f"links.{digest[:12]}"
-            if not isinstance(entry, Mapping):
-                raise self._fault(where, entry, "a table")
-            table = self._table(entry, "table", f"{where}.")
+            entry = self._table(value, where)
+            table = self._table(entry.get("table"), f"{where}.table")
             link = self._resolved(table, where)
             if link.codebook.digest != entry.get("codebook"):
                 raise InputError(
@@ -338,83 +332,64 @@ class _Reader:
 
     def _revisions(self, entry: Mapping[str, Any], link: Link) -> str:
         """Which algorithms have another revision here than in the file."""
-        told = entry.get("revisions")
-        told = told if isinstance(told, Mapping) else {}
+        given = entry.get("revisions")
+        given = given if isinstance(given, Mapping) else {}
         other = [
-            f"{role} {link.table[role]['id']} {told.get(role)} there, {here} here"
+            f"{role} {link.table[role]['id']} {given.get(role)} there, {here} here"
             for role, here in link.revisions.items()
-            if told.get(role) != here
+            if given.get(role) != here
         ]
         return f" (revisions: {'; '.join(other)})" if other else ""
-
-    def _link(self, row: Mapping[str, Any], where: str, links: Mapping[str, Link]) -> Link:
-        digest = row.get("link")
-        if digest is not None:
-            if not isinstance(digest, str) or digest not in links:
-                raise self._fault(f"{where}.link", digest, "the digest of one of the links")
-            return links[digest]
-        if links:
-            raise InputError(
-                f"{self._source}: {where}.link: missing; expected the digest of one of the links"
-            )
-        return self._resolved(link_table_of(row, self._source, where), where)
 
     def _symbols(self, row: Mapping[str, Any], where: str, link: Link) -> NDArray[np.int64]:
         frames, clusters = link.packet.frames, link.codebook.clusters
         if "symbols" not in row:
             raise InputError(f"{self._source}: {where}.symbols: missing")
-        told, top = row["symbols"], len(link.codebook.codewords)
+        given, top = row["symbols"], len(link.codebook.codewords)
         wanted = f"packets of {frames} frames of {clusters} symbols, 0 to {top - 1}"
-        if isinstance(told, list) and not told:
+        if given == []:
             return np.empty((0, frames, clusters), np.int64)
         try:
-            symbols = np.array(told)
+            symbols = np.array(given)
         except ValueError as fault:
-            raise self._fault(f"{where}.symbols", told, wanted) from fault
+            raise self._fault(f"{where}.symbols", given, wanted) from fault
         if symbols.shape[1:] != (frames, clusters) or symbols.dtype.kind != "i":
-            raise self._fault(f"{where}.symbols", told, wanted)
-        if symbols.min() < 0 or symbols.max() >= top:
-            q, f, k = np.argwhere((symbols < 0) | (symbols >= top))[0].tolist()
+            raise self._fault(f"{where}.symbols", given, wanted)
+        for q, f, k in np.argwhere((symbols < 0) | (symbols >= top))[:1].tolist():
             raise self._fault(f"{where}.symbols.{q}.{f}.{k}", int(symbols[q, f, k]), f"0 to {top - 1}")
         return symbols.astype(np.int64)
 
-    def _sites(self, told: Any) -> tuple[BarSite, ...]:
-        if not isinstance(told, list):
-            raise self._fault("sites", told, "a list")
-        if not told:
+    def _sites(self, given: Any) -> tuple[BarSite, ...]:
+        if not self._list(given, "sites"):
             return ()
         try:
-            return resolve_sites({"bar": told}, source=f"{self._source}: not a scene's truth: sites")
+            return resolve_sites({"bar": given}, source=f"{self._source}: not a scene's truth: sites")
         except ConfigError as refused:
             raise InputError(str(refused).splitlines()[0]) from refused
 
     def _spans(self, row: Mapping[str, Any], key: str, where: str, columns: int, clusters: int) -> Floats:
-        told = row.get(key) or []
-        rows = [[v] for v in told] if columns == 1 and isinstance(told, list) else told
+        given = row.get(key) or []
+        rows = [[v] for v in given] if columns == 1 and isinstance(given, list) else given
         found = self._numbers(rows, f"{where}.{key}", None)
         if not found.size:
             return np.empty((0, columns))
         if found.ndim != 2 or found.shape[1] != columns:
-            raise self._fault(f"{where}.{key}", told, f"a list of lists of {columns} numbers")
+            raise self._fault(f"{where}.{key}", given, f"a list of lists of {columns} numbers")
         # Behind the times, or alone, stand numbers of clusters.
         numbers = found[:, 2:] if columns > 1 else found
         if ((numbers < 0) | (numbers >= clusters) | (numbers % 1 != 0)).any():
-            raise self._fault(f"{where}.{key}", told, f"clusters 0 to {clusters - 1}")
+            raise self._fault(f"{where}.{key}", given, f"clusters 0 to {clusters - 1}")
         return found
 
-    def _table(self, table: Mapping[str, Any], key: str, before: str = "") -> Mapping[str, Any]:
-        if key not in table:
-            raise InputError(f"{self._source}: {before}{key}: missing; expected a table")
-        if not isinstance(table[key], Mapping):
-            raise self._fault(before + key, table[key], "a table")
-        found: Mapping[str, Any] = table[key]
-        return found
+    def _table(self, value: Any, where: str) -> Mapping[str, Any]:
+        if not isinstance(value, Mapping):
+            raise self._fault(where, value, "a table")
+        return value
 
-    def _list(self, table: Mapping[str, Any], key: str) -> Sequence[Any]:
-        if not isinstance(table[key], list | tuple):
-            raise self._fault(key, table[key], "a list")
-        found: Sequence[Any] = table[key]
-        return found
+    def _list(self, value: Any, where: str) -> Sequence[Any]:
+        if not isinstance(value, list | tuple):
+            raise self._fault(where, value, "a list")
+        return value
 
     def _number(
         self,
@@ -433,15 +408,15 @@ class _Reader:
             raise self._fault(before + key, value, wanted)
         return value
 
-    def _numbers(self, told: Any, where: str, ndim: int | None, *shape: int) -> Floats:
+    def _numbers(self, given: Any, where: str, ndim: int | None, *shape: int) -> Floats:
         wanted = f"finite numbers, {' x '.join(map(str, shape))}" if shape else "a list of finite numbers"
         try:
-            found = np.array(told, np.float64)
+            found = np.array(given, np.float64)
         except (TypeError, ValueError, OverflowError) as fault:
-            raise self._fault(where, told, wanted) from fault
+            raise self._fault(where, given, wanted) from fault
         right = ndim is None or (found.ndim == ndim and (not shape or found.shape == shape))
         if not right or not (np.abs(found) <= _MOST).all():
-            raise self._fault(where, told, wanted)
+            raise self._fault(where, given, wanted)
         return found
 
     def _fault(self, where: str, value: Any, wanted: str) -> InputError:
