@@ -3,7 +3,7 @@
 import math
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 
-from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
@@ -94,14 +93,12 @@ class Footage:
         first_us: The recording's first event, us.
         frames: Frames of its time.
         regions: Regions of its time.
-        sent_with: Name of the link of each transmitter.
     """
 
     start_us: float
     first_us: float = 0.0
     frames: Sequence[Frame] = ()
     regions: Sequence[Region] = ()
-    sent_with: Mapping[int, str] = field(default_factory=dict)
 
 
 def pictures_of(for_ms: float, slow: float) -> int:
@@ -172,7 +169,7 @@ def gather_footage(
     Raises:
         InputError: The recording has nothing there.
     """
-    probe, frames, sent_with = _RegionProbe(), list[Frame](), dict[int, str]()
+    probe, frames = _RegionProbe(), list[Frame]()
     start_us = first_us = last_us = None
     longest_us = max(one.packet.packet_chips * one.packet.chip_us for one in links.values())
     # Of several links, what one has read waits for the others.
@@ -180,7 +177,6 @@ def gather_footage(
 
     def keep(packets: Sequence[Packet], start_us: float | None) -> float | None:
         """Keep frames of the film's time; where it starts, by the first one where nothing else says so."""
-        sent_with.update({packet.transmitter: packet.link for packet in packets})
         found = [frame for packet in packets for frame in packet.frames]
         if start_us is None and found:
             start_us = min(frame.t_us for frame in found)
@@ -210,7 +206,7 @@ def gather_footage(
             f" from {from_ms:g} ms on"
         )
     regions = [one for one in probe.regions if start_us - 1e4 <= one.t_us <= start_us + for_us]
-    return Footage(start_us, first_us, frames, regions, sent_with)
+    return Footage(start_us, first_us, frames, regions)
 
 
 def plan_film(
@@ -381,7 +377,6 @@ class _Overlay:
         self._frames = sorted(footage.frames, key=lambda frame: frame.t_us)
         self._regions = sorted(footage.regions, key=lambda region: region.t_us)
         self._packets = {name: link.packet for name, link in links.items()}
-        self._sent_with = footage.sent_with
         self._step_us = next(iter(links.values())).regions.step_us
         most = max(link.codebook.clusters for link in links.values())
         colours = (255 * cluster_colours(most)).astype(int)
@@ -425,24 +420,20 @@ class _Overlay:
         for frame in self._frames:
             if frame.t_us > t_us:
                 break
-            packet = self._packet_of(frame)
+            packet = self._packets[frame.link]
             if frame.t_us > t_us - packet.packet_chips * packet.chip_us:
                 newest[frame.transmitter] = frame
         for frame in newest.values():
-            packet = self._packet_of(frame)
+            packet = self._packets[frame.link]
             chips = packet.frame_chips if packet.has_pilot(frame.frame) else packet.info_chips
             (left, top), (right, _) = _box_of_frame(frame)
             self._name(pen, frame, self._at(left, top))
             if t_us < frame.t_us + chips * packet.chip_us:
                 self._symbols(pen, frame, right)
 
-    def _packet_of(self, frame: Frame) -> PacketFormat:
-        return self._packets[self._sent_with[frame.transmitter]]
-
     def _name(self, pen: ImageDraw.ImageDraw, frame: Frame, corner: tuple[float, float]) -> None:
         distance = frame.range
-        link = self._sent_with[frame.transmitter]
-        text = f"{frame.transmitter} ({link})" if link else f"{frame.transmitter}"
+        text = f"{frame.transmitter} ({frame.link})" if frame.link else f"{frame.transmitter}"
         if frame.echo_of is not None:
             text += f", reflection of {frame.echo_of}"
         if math.isfinite(distance.distance_m):

@@ -1,9 +1,7 @@
-"""Statistics of decoded frames, beside the independent scorer's figures on its recordings."""
+"""Statistics of decoded frames, and of positions beside the camera's path."""
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,7 +13,6 @@ from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.sim import (
     Simulation,
     Truth,
-    read_truth,
     resolve_scene,
     sites_of,
     truth_from_table,
@@ -23,13 +20,10 @@ from evlcp_sdk.sim import (
 )
 from evlcp_sdk.sim.scene import WorldSpec
 from evlcp_sdk.sim.world import attitude_log, sites_said
-from evlcp_sdk.study.frames import frames_of, row_of_frame
+from evlcp_sdk.study.frames import row_of_frame
 from evlcp_sdk.study.measure import position_tallies, statistics_of
 from evlcp_sdk.study.tally import Statistics, Tally
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
-from tests.conftest import ROOT, Run
-
-SHARED = ROOT.parent / "shared"
 
 CHIPS = 26 + 32 * 2
 TRUTH = truth_from_table(
@@ -92,50 +86,6 @@ def test_each_frame_is_held_beside_the_sent_one() -> None:
 def test_a_scene_without_bars_has_only_ghosts() -> None:
     found = statistics_of([row_of_frame(frame(20, [1, 2], float("nan")))], replace(TRUTH, bars=()))
     assert found == Statistics(tasks=1, duration_us=20_000, rows=1, unmatched=1)
-
-
-# The scorer, not this project's, leaves its files to the collector.
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
-@pytest.mark.skipif(not SHARED.is_dir(), reason="needs the recordings with truth in ../shared")
-@pytest.mark.parametrize("name", ["night-50m-30kmh", "two-bars-60m-75m", "no-bar"])
-def test_figures_are_the_scorers(name: str, tmp_path: Path, evlcp: Any) -> None:
-    spec = importlib.util.spec_from_file_location("score", SHARED / "tools" / "score.py")
-    assert spec is not None
-    assert spec.loader is not None
-    scorer = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(scorer)
-    recording = SHARED / "recordings" / f"{name}.raw"
-    done: Run = evlcp("receive", recording, "-o", tmp_path)
-    assert done.code == 0
-    truth_file = recording.with_suffix(".truth.json")
-    expected = scorer.score(tmp_path, truth_file)
-    ours = statistics_of(frames_of(received(recording)), read_truth(truth_file))
-    assert ours.unmatched == expected["unmatched"]
-    total = ours.total()
-    bars = expected["bars"]
-    for mine, theirs in (
-        (total.frames_sent, "frames_sent"),
-        (total.frames_found, "frames_found"),
-        (total.bits, "bits"),
-        (total.bit_errors, "bit_errors"),
-        (total.ranged, "ranged"),
-    ):
-        assert mine == sum(bar[theirs] for bar in bars)
-    for begin, tally in ours.segments.items():
-        key = f"{begin}-{begin + 10}m"
-        segments = [bar["segments"][key] for bar in bars if key in bar["segments"]]
-        if len(segments) == 1:
-            assert tally.rmse_m == pytest.approx(segments[0]["rmse_m"], abs=2e-3)
-            assert abs(tally.ranged - segments[0]["n"]) <= 1
-
-
-def received(recording: Path) -> list[Packet]:
-    from evlcp_sdk.io import open_source
-    from evlcp_sdk.rx.receiver import Receiver
-
-    receiver = Receiver(load_link())
-    with open_source(str(recording)) as source:
-        return [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
 
 
 GATE = {
