@@ -24,7 +24,7 @@ from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.several import load_links, named_links, placing_links
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.results.summary import Status
+from evlcp_sdk.results.summary import RunEnd, Status
 from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
@@ -504,7 +504,7 @@ def _run(
             writer.write(close())
     if status == "complete" and (told := _much_dropped(source, receiver)):
         status, error = "degraded", f"{url}: {told}"
-    summary = writer.finish(
+    end = RunEnd(
         status,
         **_tables_of(source, url, watch, first_us, last_us),
         counts=receiver.counts,
@@ -514,6 +514,7 @@ def _run(
         link_counts=receiver.link_counts,
         live=None if live is None else live(),
     )
+    summary = writer.finish(end)
     if broken is not None:
         raise broken
     return summary

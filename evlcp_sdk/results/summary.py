@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 from evlcp_sdk.diagnosis.facts import Facts
@@ -18,31 +19,47 @@ Status = Literal["complete", "degraded", "interrupted", "failed"]
 input that cannot be read."""
 
 
+@dataclass(frozen=True, eq=False)
+class RunEnd:
+    """How a run ended, and what it read.
+
+    Attributes:
+        status: How it ended.
+        recording: What was read: path, format, size, duration, events.
+        processing: How long it took.
+        counts: The receiver's counts.
+        losses: What the reader skipped, by kind, with byte offsets.
+        error: The message, when `status` is `failed` or `degraded`.
+        lit_us: From when until when the light of each transmitter was there, us; None if it is not known.
+        live: Delays, and what was shed, of a live run; None for others.
+        link_counts: The receiver's counts of each of several links, by name.
+    """
+
+    status: Status
+    recording: Mapping[str, Any] = field(default_factory=dict)
+    processing: Mapping[str, Any] = field(default_factory=dict)
+    counts: Mapping[str, int] = field(default_factory=dict)
+    losses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    error: str | None = None
+    lit_us: Mapping[int, tuple[float, float]] | None = None
+    live: Mapping[str, Any] | None = None
+    link_counts: Mapping[str, Mapping[str, int]] = field(default_factory=dict)
+
+
 def summary_of(
-    status: Status,
+    end: RunEnd,
     facts: Facts,
-    *,
-    recording: Mapping[str, Any],
-    processing: Mapping[str, Any],
-    losses: Mapping[str, Mapping[str, Any]],
     versions: Mapping[str, str],
-    error: str | None = None,
-    sinks: Mapping[str, Mapping[str, Any]] | None = None,
-    live: Mapping[str, Any] | None = None,
-    pps: Mapping[str, Any] | None = None,
+    sinks: Mapping[str, Mapping[str, Any]],
+    pps: Mapping[str, Any] | None,
 ) -> dict[str, Any]:
     """The content of `summary.json`.
 
     Args:
-        status: How the run ended.
+        end: How the run ended.
         facts: What the receiver found, with the configuration that it ran with.
-        recording: What was read: path, format, size, duration, events.
-        processing: How long it took.
-        losses: What the reader skipped, by kind, with byte offsets.
         versions: Installed versions.
-        error: The message, when `status` is `failed` or `degraded`.
         sinks: What sinks say, by name; those that say nothing are left out.
-        live: Delays, and what was shed, of a live run; None for others.
         pps: Pulses of UTC, and the rate of the camera's clock by them; None where nobody asked.
     """
     tally = facts.tally
@@ -51,24 +68,24 @@ def summary_of(
     else:
         described = _describe(facts.link)
     return {
-        "status": status,
-        "error": error,
+        "status": end.status,
+        "error": end.error,
         "result": tally.headline(),
         "transmitters": [one | _text(one, facts) for one in tally.to_list()],
-        "recording": dict(recording),
-        "processing": dict(processing),
+        "recording": dict(end.recording),
+        "processing": dict(end.processing),
         "counts": dict(facts.counts),
         "messages": tally.messages(),
         "messages_off": None if facts.reads_messages else messages_off(facts.link),
         "warnings": [warning.to_dict() for warning in find_warnings(facts)],
         "notes": [note.to_dict() for note in find_notes(facts)],
-        "losses": {kind: dict(loss) for kind, loss in losses.items()},
+        "losses": {kind: dict(loss) for kind, loss in end.losses.items()},
         **described,
         "versions": dict(versions),
         **({"positions": dict(facts.positions)} if facts.positions else {}),
         **({"sinks": {name: dict(part) for name, part in sinks.items()}} if sinks else {}),
         **({"pps": dict(pps)} if pps is not None else {}),
-        **({"live": dict(live)} if live is not None else {}),
+        **({"live": dict(end.live)} if end.live is not None else {}),
     }
 
 

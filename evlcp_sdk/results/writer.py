@@ -22,7 +22,7 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.lines import JsonLines
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.sinks import Sinks, load_sinks
-from evlcp_sdk.results.summary import Status, messages_off, summary_of, write_summary
+from evlcp_sdk.results.summary import RunEnd, messages_off, summary_of, write_summary
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.utc import ClockZero, PulseClock
 from evlcp_sdk.values import Events, Packet
@@ -128,30 +128,8 @@ class ResultWriter:
             if self._navigator is not None:
                 self._place(self._navigator.feed([packet]))
 
-    def finish(
-        self,
-        status: Status,
-        recording: Mapping[str, Any],
-        processing: Mapping[str, Any],
-        counts: Mapping[str, int],
-        losses: Mapping[str, Mapping[str, Any]],
-        error: str | None = None,
-        lit_us: Mapping[int, tuple[float, float]] | None = None,
-        live: Mapping[str, Any] | None = None,
-        link_counts: Mapping[str, Mapping[str, int]] | None = None,
-    ) -> dict[str, Any]:
+    def finish(self, end: RunEnd) -> dict[str, Any]:
         """End the sinks, move all files into place, the summary last, and drop what an earlier run left.
-
-        Args:
-            status: How the run ended.
-            recording: What was read: path, format, size, duration, events.
-            processing: How long it took.
-            counts: The receiver's counts.
-            losses: What the reader skipped, by kind, with byte offsets.
-            error: The message, when `status` is `failed` or `degraded`.
-            lit_us: From when until when the light of each transmitter was there, us; None if it is not known.
-            live: Delays, and what was shed, of a live run; None for others.
-            link_counts: The receiver's counts of each of several links, by name.
 
         Returns:
             The content of `summary.json`.
@@ -167,18 +145,13 @@ class ResultWriter:
             if self._sinks is not None:
                 self._sinks.settle(settled)
             positions = self._positions.to_dict(self._navigator)
-        facts = self._facts(recording, counts, losses, lit_us, link_counts or {}, positions)
+        facts = self._facts(end, positions)
         table = summary_of(
-            status,
+            end,
             facts,
-            recording=recording,
-            processing=processing,
-            losses=losses,
-            versions=self._registry.versions(),
-            error=error,
-            sinks={} if self._sinks is None else self._sinks.finish(),
-            live=live,
-            pps=None if self._pulses is None else self._pulses.to_dict(),
+            self._registry.versions(),
+            {} if self._sinks is None else self._sinks.finish(),
+            None if self._pulses is None else self._pulses.to_dict(),
         )
         table["files"] = {}
         if self._sinks is not None and self._folder is not None:
@@ -188,27 +161,20 @@ class ResultWriter:
             self._folder.finish()
         return table
 
-    def _facts(
-        self,
-        recording: Mapping[str, Any],
-        counts: Mapping[str, int],
-        losses: Mapping[str, Mapping[str, Any]],
-        lit_us: Mapping[int, tuple[float, float]] | None,
-        link_counts: Mapping[str, Mapping[str, int]],
-        positions: Mapping[str, Any],
-    ) -> Facts:
+    def _facts(self, end: RunEnd, positions: Mapping[str, Any]) -> Facts:
         """What is known in the end, for warnings."""
+        recording = end.recording
         first_us, last_us = recording.get("first_us"), recording.get("last_us")
         read = recording.get("counts", {})
         facts = Facts(
             next(iter(self._links.values())),
             self._tally,
-            counts,
+            end.counts,
             math.nan if first_us is None else first_us,
             math.nan if last_us is None else last_us,
-            lit_us,
+            end.lit_us,
             self._readout,
-            sum(loss["count"] for loss in losses.values()),
+            sum(loss["count"] for loss in end.losses.values()),
             guessed=str(recording.get("guessed", "")),
             step_us=recording.get("step_us", 0),
             skipped=(read.get("silences_skipped", 0), read.get("silences_skipped_us", 0)),
@@ -219,7 +185,7 @@ class ResultWriter:
                 facts,
                 link=link,
                 tally=self._tally.of_link(name),
-                counts=link_counts.get(name, counts),
+                counts=end.link_counts.get(name, end.counts),
                 reads_messages=messages_off(link) is None,
                 others=partial(other_codewords, link, self._registry),
                 positions=positions if name == self._placing else {},

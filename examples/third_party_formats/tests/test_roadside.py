@@ -6,6 +6,7 @@ import pytest
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import bits_of_symbols
+from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.inbox import MessageAssembler
 
@@ -39,7 +40,7 @@ def test_both_are_received(tmp_path: Path) -> None:
     inbox = MessageAssembler.of(link)
     with ResultWriter(tmp_path, link, sinks=["distance-lines"]) as writer:
         writer.write([inbox.add(packet_of(symbols, link))])
-        summary = writer.finish("complete", {}, {}, inbox.counts, {})
+        summary = writer.finish(RunEnd("complete", counts=inbox.counts))
     _, line = (json.loads(text) for text in (tmp_path / "packets.jsonl").read_text().splitlines())
     assert (line["kind"], line["transmitter_id"], line["trust"]) == ("speed-limit", 7, "unverified")
     assert (line["speed_km_h"], line["length_m"]) == (30, 2000)

@@ -17,6 +17,7 @@ from evlcp_sdk.report.motion import Motion, cluster_map
 from evlcp_sdk.report.page import Report
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
+from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
@@ -184,7 +185,7 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, LINK, sinks=["report"], plan=PositionPlan((SITE,)), attitude=ATTITUDE) as out:
         out.write(packets(13))
         recording = {"path": "a.raw", "duration_s": 0.5, "counts": {"events": 1}}
-        summary = out.finish("complete", recording, {"times_real_time": 1.0}, {}, {})
+        summary = out.finish(RunEnd("complete", recording, {"times_real_time": 1.0}))
     told = held((tmp_path / "report.html").read_text())["plots"]
     with (tmp_path / "fixes.csv").open(newline="") as file:
         fixes = list(csv.DictReader(file))
@@ -215,7 +216,7 @@ def test_nothing_found_has_a_page(tmp_path: Path) -> None:
     with ResultWriter(tmp_path, LINK, sinks=["report"]) as out:
         out.events(events)
         recording = {"path": "a.raw", "duration_s": 0.0, "counts": {"events": 0}}
-        out.finish("complete", recording, {"times_real_time": None}, {}, {})
+        out.finish(RunEnd("complete", recording, {"times_real_time": None}))
     text = Elements((tmp_path / "report.html").read_text()).text
     assert "no transmitter was found" in text
     assert "Nothing looks wrong" not in text

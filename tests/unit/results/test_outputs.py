@@ -23,6 +23,7 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
 from evlcp_sdk.results.columns import FRAME_COLUMNS
+from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -76,7 +77,7 @@ def finish(writer: ResultWriter, **kw: Any) -> dict[str, Any]:
         "counts": {"events": 3},
         "losses": {"odd_byte": {"count": 1, "first": 7}},
     }
-    return writer.finish(**(given | kw))
+    return writer.finish(RunEnd(**(given | kw)))
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:

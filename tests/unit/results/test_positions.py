@@ -38,6 +38,7 @@ from evlcp_sdk.results.geojson import GeoJson
 from evlcp_sdk.results.nmea import Nmea
 from evlcp_sdk.results.points_csv import PointsCsv
 from evlcp_sdk.results.sink import Run
+from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.trail import cut
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
@@ -106,7 +107,7 @@ def write(
         if span_us is not None:
             results.events(Events.of(span_us, [1, 1], [1, 1], [1, 1]))
         results.write(stream)
-        told: dict[str, Any] = results.finish("complete", {}, {}, {}, {})["positions"]
+        told: dict[str, Any] = results.finish(RunEnd("complete"))["positions"]
     return told
 
 
@@ -369,7 +370,7 @@ def test_a_run_without_sites_drops_an_earlier_ones_positions(tmp_path: Path) -> 
     write(tmp_path, packets(3), PositionPlan((SITE,)))
     assert (tmp_path / "fixes.csv").exists()
     with ResultWriter(tmp_path, LINK) as results:
-        results.finish("complete", {}, {}, {}, {})
+        results.finish(RunEnd("complete"))
     assert {p.name for p in tmp_path.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
 
 
@@ -442,7 +443,7 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         region = Region(0, 1_000.0, 100.0, 200.0, 10.0, 20.0)
         registry.hook.evlcp_stage_finished(stage="regions", value=region, elapsed_s=0.0)
         results.write(stream)
-        results.finish("complete", {}, {}, {}, {})
+        results.finish(RunEnd("complete"))
     fixes = rows(tmp_path / "fixes.csv")
     found: dict[str, list[tuple[str, int, object]]] = {}
     with (tmp_path / "fixes.mcap").open("rb") as file:
