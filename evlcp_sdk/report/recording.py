@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.report.colours import transmitter_colour
 from evlcp_sdk.report.plots import DASHES, INK, Plot, ellipse, enlarge_ellipses
-from evlcp_sdk.values import Frame
+from evlcp_sdk.values import Fix, Frame
 
 _MOST_ELLIPSES = 40
-_FIX, _FILTERED, _SMOOTHED = "#56b4e9", "#009e73", "#d55e00"
+_FIX = "#56b4e9"
 
 T = TypeVar("T")
 
@@ -141,56 +141,77 @@ def plot_positions(
         bars_enu_m: Centre of each bar in the local axes, m, float64 (3,), by transmitter.
         axis: How time is counted.
     """
+    fixes = [point.fix for point in points]
+    labels = []
+    for fix in fixes:
+        (e, n, u), (se, sn, su) = fix.enu_m.tolist(), _sigmas_m(fix).tolist()
+        labels.append(
+            f"{axis.ms(fix.t_us):.1f} ms, {fix.source}\neast {e:z.3f} ± {se:.2g} m"
+            f"\nnorth {n:z.3f} ± {sn:.2g} m\nup {u:z.3f} ± {su:.2g} m"
+        )
+    plots = [*_plot_maps(points, labels, bars_enu_m), *(_plot_times(points, labels, axis) if points else ())]
+    return [plot for plot in plots if not plot.empty]
+
+
+def _sigmas_m(fix: Fix) -> NDArray[np.float64]:
+    return np.sqrt(np.diag(fix.covariance_m2))
+
+
+def _ways(points: Sequence[Settled]) -> list[tuple[NDArray[np.float64], str, str]]:
+    """The track with its colour and name, as filtered and as smoothed, m, float64 (n, 3)."""
+    return [
+        (np.array([point.filtered.enu_m for point in points]), "#009e73", "filtered"),
+        (np.array([point.smoothed.enu_m for point in points]), "#d55e00", "smoothed"),
+    ]
+
+
+def _plot_maps(
+    points: Sequence[Settled], labels: Sequence[str], bars_enu_m: Mapping[int, NDArray[np.float64]]
+) -> list[Plot]:
     plan = Plot("map", "east, m", "north, m", "bars and track", aspect=4 / 3)
     close = Plot("track", "east, m", "north, m", "the track alone", aspect=4 / 3)
-    height = Plot("height", axis.name, "up, m", "height")
-    spread = Plot("spread", axis.name, "sigma, m", "sigmas")
-    protected = Plot("protection", axis.name, "protection, m", "protection levels", from_zero=True)
     if points:
         fixes = [point.fix for point in points]
         fixed = np.array([fix.enu_m for fix in fixes])
-        t_ms = np.array([axis.ms(fix.t_us) for fix in fixes])
-        sigma = np.sqrt([np.diag(fix.covariance_m2) for fix in fixes])
-        labels = [
-            f"{ms:.1f} ms, {fix.source}\neast {e:z.3f} ± {se:.2g} m\nnorth {n:z.3f} ± {sn:.2g} m"
-            f"\nup {u:z.3f} ± {su:.2g} m"
-            for fix, ms, (e, n, u), (se, sn, su) in zip(
-                fixes, t_ms.tolist(), fixed.tolist(), sigma.tolist(), strict=True
-            )
-        ]
         chosen = fixes[:: max(1, -(-len(fixes) // _MOST_ELLIPSES))]
         larger = enlarge_ellipses([fix.covariance_m2 for fix in chosen], fixed)
         name = "95 % ellipse" + (f", {larger} times as large" if larger > 1 else "")
         for fix in chosen:
             close.ring(ellipse(fix.enu_m[:2], fix.covariance_m2[:2, :2] * larger**2, 0.95), "#999999", name)
-        t = t_ms / axis.step_ms
-        ways = (
-            (np.array([point.filtered.enu_m for point in points]), _FILTERED, "filtered"),
-            (np.array([point.smoothed.enu_m for point in points]), _SMOOTHED, "smoothed"),
-        )
-        for way, colour, name in ways:
-            for plot in (plan, close):
-                plot.line(way[:, 0], way[:, 1], colour, name)
-            height.line(t, way[:, 2], colour, name)
         for plot in (plan, close):
+            for way, colour, name in _ways(points):
+                plot.line(way[:, 0], way[:, 1], colour, name)
             plot.dots(fixed[:, 0], fixed[:, 1], _FIX, "fix", labels)
-        height.dots(t, fixed[:, 2], _FIX, "fix, with one sigma", labels)
-        height.band(t, fixed[:, 2] - sigma[:, 2], fixed[:, 2] + sigma[:, 2], _FIX, "fix, with one sigma")
-        # Those of satellites are far larger than those of bars.
-        of_bars = np.array([fix.source == "bars" for fix in fixes])
-        for i, name in enumerate(("east", "north", "up")):
-            spread.dots(t, np.where(of_bars, sigma[:, i], math.nan), transmitter_colour(i), name, labels)
-        protected.line(t, [fix.hpl_m for fix in fixes], INK, "horizontal level")
-        protected.line(t, [fix.vpl_m for fix in fixes], INK, "vertical level", DASHES[2])
-        without = [0.0 if fix.excluded else math.nan for fix in fixes]
-        protected.dots(t, without, _SMOOTHED, "a part left out" if any(fix.excluded for fix in fixes) else "")
     for number, enu in sorted(bars_enu_m.items()):
         who = f"bar {number}"
         east, north, up = enu.tolist()
         place = f"{who}\neast {east:z.3f} m\nnorth {north:z.3f} m\nup {up:z.3f} m"
         plan.dots([east], [north], INK, "bar", [place])
         plan.name(east, north, who)
-    return [plot for plot in (plan, close, height, spread, protected) if not plot.empty]
+    return [plan, close]
+
+
+def _plot_times(points: Sequence[Settled], labels: Sequence[str], axis: TimeAxis) -> list[Plot]:
+    fixes = [point.fix for point in points]
+    t = [axis.ms(fix.t_us) / axis.step_ms for fix in fixes]
+    up, sigma = np.array([fix.enu_m[2] for fix in fixes]), np.array([_sigmas_m(fix) for fix in fixes])
+    height = Plot("height", axis.name, "up, m", "height")
+    for way, colour, name in _ways(points):
+        height.line(t, way[:, 2], colour, name)
+    height.dots(t, up, _FIX, "fix, with one sigma", labels)
+    height.band(t, up - sigma[:, 2], up + sigma[:, 2], _FIX, "fix, with one sigma")
+    spread = Plot("spread", axis.name, "sigma, m", "sigmas")
+    # Those of satellites are far larger than those of bars.
+    sigma[[fix.source != "bars" for fix in fixes]] = math.nan
+    for i, name in enumerate(("east", "north", "up")):
+        spread.dots(t, sigma[:, i], transmitter_colour(i), name, labels)
+    protected = Plot("protection", axis.name, "protection, m", "protection levels", from_zero=True)
+    protected.line(t, [fix.hpl_m for fix in fixes], INK, "horizontal level")
+    protected.line(t, [fix.vpl_m for fix in fixes], INK, "vertical level", DASHES[2])
+    excluding = [at for at, fix in zip(t, fixes, strict=True) if fix.excluded]
+    if excluding:
+        protected.dots(excluding, np.zeros(len(excluding)), "#d55e00", "a part left out")
+    return [height, spread, protected]
 
 
 def off_neighbours(t_s: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
