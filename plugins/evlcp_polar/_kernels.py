@@ -57,27 +57,12 @@ def discrepancy_limit(weight: Array, log_share: float) -> float:
 
 
 @njit
-def _either(one: Array, other: Array, out: Array) -> None:
-    """LLR of the sum of two bits, min-sum."""
-    for i in range(len(out)):
-        a, b = one[i], other[i]
-        least = min(abs(a), abs(b))
-        out[i] = -least if (a < 0) != (b < 0) else least
-
-
-@njit
-def _both(one: Array, other: Array, known: Array, out: Array) -> None:
-    """LLR of a bit seen twice, once added to a known one."""
-    for i in range(len(out)):
-        out[i] = other[i] - one[i] if known[i] else other[i] + one[i]
-
-
-@njit
-def _fork(metric: Array, penalty: Array, limit: float, alive: Array, fork: Array) -> int:
+def _fork(metric: Array, penalty: Array, limit: float, alive: Array, rows: Array, fork: Array) -> int:
     """Continue each path by bit 0 and bit 1, keep the best that have room; their number.
 
     `penalty` (2, size) is what the bits add to the metric. Where both continuations of a path stay, that by 1
-    gets a free row; `fork` (2, size) says of which path each row is the continuation, and by which bit.
+    gets a free row, and shares `rows`; `fork` (2, size) says of which path each row is the continuation, and
+    by which bit.
     """
     size, origin, bit = len(metric), fork[0], fork[1]
     cost, which = np.empty(2 * size), np.empty(2 * size, np.int64)
@@ -113,6 +98,8 @@ def _fork(metric: Array, penalty: Array, limit: float, alive: Array, fork: Array
             origin[free] = path
             metric[free] = metric[path] + penalty[1, path]
             bit[free] = 1
+            for s in range(rows.shape[2]):
+                rows[0, free, s], rows[1, free, s] = rows[0, path, s], rows[1, path, s]
         if kept[path]:
             value = 0 if kept[path] & 1 else 1
             metric[path] += penalty[value, path]
@@ -121,8 +108,9 @@ def _fork(metric: Array, penalty: Array, limit: float, alive: Array, fork: Array
 
 
 @njit
-def _decide_free(
+def _decide(
     stage: int,
+    repeated: bool,
     alpha: Array,
     rows: Array,
     limit: float,
@@ -132,12 +120,13 @@ def _decide_free(
     fork: Array,
     codewords: Array,
 ) -> int:
-    """Decide a node whose inputs are all free, in the first code bits of each path; the paths kept.
+    """Decide a node in the first code bits of each path; the paths kept.
 
-    Of `size` paths none goes against more than the `size - 1` weakest signs of such a node.
+    Where its inputs are all 0 but the last (`repeated`), its code bits are all the same. Else they are all
+    free: of `size` paths none goes against more than the `size - 1` weakest signs.
     """
     size, length = len(metric), 1 << stage
-    splits = min(size - 1, length)
+    splits = 0 if repeated else min(size - 1, length)
     weakest = np.empty((size, splits), np.int64)
     count = 0
     for path in range(size):
@@ -145,8 +134,11 @@ def _decide_free(
             continue
         count += 1
         values, found, many = alpha[rows[0, path, stage], length:], weakest[path], 0
+        penalty[0, path] = penalty[1, path] = 0.0
         for i in range(length):
             codewords[path, i] = values[i] < 0
+            if repeated:
+                penalty[int(values[i] >= 0), path] += abs(values[i])
             # The places of the values next to 0, the nearest first.
             at = min(many, splits - 1)
             if splits == 0 or (at < many and not abs(values[i]) < abs(values[found[at]])):
@@ -156,58 +148,25 @@ def _decide_free(
                 at -= 1
             found[at] = i
             many = min(many + 1, splits)
+    if repeated:
+        count = _fork(metric, penalty, limit, alive, rows, fork)
+        for path in range(size):
+            if alive[path]:
+                codewords[path, :length] = fork[1, path]
     for split in range(splits):
         for path in range(size):
             if alive[path]:
                 penalty[0, path] = 0.0
                 penalty[1, path] = abs(alpha[rows[0, path, stage], length + weakest[path, split]])
-        count = _fork(metric, penalty, limit, alive, fork)
+        count = _fork(metric, penalty, limit, alive, rows, fork)
         for path in range(size):
             other = fork[0, path]
             if alive[path] and other != path:
-                for s in range(rows.shape[2]):
-                    rows[0, path, s], rows[1, path, s] = rows[0, other, s], rows[1, other, s]
-                for s in range(splits):
-                    weakest[path, s] = weakest[other, s]
-                for i in range(length):
-                    codewords[path, i] = codewords[other, i]
+                weakest[path] = weakest[other]
+                codewords[path, :length] = codewords[other, :length]
         for path in range(size):
             if alive[path] and fork[1, path]:
                 codewords[path, weakest[path, split]] ^= 1
-    return count
-
-
-@njit
-def _decide_same(
-    stage: int,
-    alpha: Array,
-    rows: Array,
-    limit: float,
-    metric: Array,
-    alive: Array,
-    penalty: Array,
-    fork: Array,
-    codewords: Array,
-) -> int:
-    """Decide a node whose inputs are all 0 but the last: its code bits are all the same; the paths kept."""
-    size, length = len(metric), 1 << stage
-    for path in range(size):
-        if alive[path]:
-            penalty[0, path] = penalty[1, path] = 0.0
-            row = alpha[rows[0, path, stage]]
-            for i in range(length, 2 * length):
-                if row[i] < 0:
-                    penalty[0, path] -= row[i]
-                else:
-                    penalty[1, path] += row[i]
-    count = _fork(metric, penalty, limit, alive, fork)
-    for path in range(size):
-        if alive[path]:
-            other = fork[0, path]
-            for s in range(rows.shape[2]):
-                rows[0, path, s], rows[1, path, s] = rows[0, other, s], rows[1, other, s]
-            for i in range(length):
-                codewords[path, i] = fork[1, path]
     return count
 
 
@@ -253,16 +212,21 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
                 half = 1 << s
                 up, out = alpha[rows[0, path, s + 1]], alpha[path, half : 2 * half]
                 one, other = up[2 * half : 3 * half], up[3 * half : 4 * half]
-                if s == top and first:
-                    _both(one, other, beta[rows[1, path, s], half : 2 * half], out)
-                else:
-                    _either(one, other, out)
+                known = beta[rows[1, path, s], half : 2 * half]
+                for i in range(half):
+                    a, b = one[i], other[i]
+                    if s == top and first:
+                        # A bit seen twice, once added to a known one.
+                        out[i] = b - a if known[i] else b + a
+                    else:
+                        # The sum of two bits, min-sum.
+                        least = min(abs(a), abs(b))
+                        out[i] = -least if (a < 0) != (b < 0) else least
                 rows[0, path, s] = path
         count = 0
-        if kind == REPEATED:
-            count = _decide_same(stage, alpha, rows, limit, metric, alive, penalty, fork, codewords)
-        elif kind == FREE:
-            count = _decide_free(stage, alpha, rows, limit, metric, alive, penalty, fork, codewords)
+        if kind != FROZEN:
+            repeated = kind == REPEATED
+            count = _decide(stage, repeated, alpha, rows, limit, metric, alive, penalty, fork, codewords)
         else:
             for path in range(size):
                 if alive[path]:
