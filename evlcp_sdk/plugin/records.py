@@ -1,10 +1,10 @@
 """What plugins bring besides algorithms: output formats by name, kinds of messages by number."""
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any
+from typing import Any, TypeVar
 
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError, PluginError
@@ -16,6 +16,8 @@ SUMMARY = "summary.json"
 """What every result has: no sink writes it."""
 
 _MOST_KIND = 15
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -54,25 +56,8 @@ def installed_sinks(registry: Registry) -> dict[str, InstalledSink]:
 
     A plugin with a format that cannot be used, or of a name or a file that another one has, is left out.
     """
-    found: dict[str, InstalledSink] = {}
-    writers: dict[str, InstalledSink] = {}
-    for plugin, records in _ask(registry, "evlcp_sinks"):
-        if not _all_are(SinkRecord, records):
-            registry.leave_out(plugin, "evlcp_sinks() gave something else than records of SinkRecord")
-            continue
-        sinks, files = dict(found), dict(writers)
-        fault = None
-        for record in records:
-            sink = InstalledSink(record, registry.owner(plugin)[0])
-            fault = fault or _record_fault(record) or _clash(sink, sinks, files)
-            if fault is None:
-                sinks[record.name] = sink
-                files |= dict.fromkeys(record.files, sink)
-        if fault is not None:
-            registry.leave_out(plugin, fault)
-            continue
-        found, writers = sinks, files
-    return found
+    found = _collect(registry, "evlcp_sinks", SinkRecord, _sink_fault)
+    return {record.name: InstalledSink(record, owner) for record, owner in found}
 
 
 def choose_sinks(registry: Registry, names: Sequence[str], *, positions: bool) -> list[InstalledSink]:
@@ -104,34 +89,47 @@ def message_kinds(registry: Registry) -> dict[int, MessageKind]:
 
     A plugin with a kind that cannot be used, or of a number or a name that another one has, is left out.
     """
-    found = dict(BUILT_IN_KINDS)
-    owners = dict.fromkeys(found, "evlcp-sdk")
-    for plugin, kinds in _ask(registry, "evlcp_message_kinds"):
-        if not _all_are(MessageKind, kinds):
-            registry.leave_out(plugin, "evlcp_message_kinds() gave something else than MessageKinds")
-            continue
-        more = dict(found)
-        fault = None
-        for kind in kinds:
-            fault = fault or _kind_fault(kind, more, owners)
-            if fault is None:
-                more[kind.number] = kind
-                owners[kind.number] = registry.owner(plugin)[0]
-        if fault is not None:
+    own = [(kind, "evlcp-sdk") for kind in BUILT_IN_KINDS.values()]
+    found = _collect(registry, "evlcp_message_kinds", MessageKind, _kind_fault, own)
+    return {kind.number: kind for kind, _ in found}
+
+
+def _collect(
+    registry: Registry,
+    hook: str,
+    wanted: type[T],
+    fault_of: Callable[[T, Sequence[tuple[T, str]]], str | None],
+    own: Sequence[tuple[T, str]] = (),
+) -> list[tuple[T, str]]:
+    """What plugins give at a hook, each with its distribution, behind what is there already.
+
+    The SDK's come first: where two clash, the other one's plugin is left out, with all that it gives.
+
+    Args:
+        registry: The plugins.
+        hook: The hook.
+        wanted: What they are to give.
+        fault_of: What is wrong with one beside those before it; None where nothing is.
+        own: What is there already.
+    """
+    found = list(own)
+    answers = [(*answer, registry.owner(answer[0])[0]) for answer in registry.ask(hook)]
+    for plugin, given, owner in sorted(answers, key=lambda answer: answer[2] != "evlcp-sdk"):
+        more, fault = list(found), None
+        if not (isinstance(given, list | tuple) and all(isinstance(one, wanted) for one in given)):
+            given, fault = (), f"{hook}() gave something else than {wanted.__name__}s"
+        for one in given:
+            fault = fault or fault_of(one, more)
+            more.append((one, owner))
+        if fault is None:
+            found = more
+        else:
             registry.leave_out(plugin, fault)
-            continue
-        found = more
     return found
 
 
-def _ask(registry: Registry, hook: str) -> list[tuple[str, Any]]:
-    """The answers to a hook, those of the SDK first: where two clash, the other one is left out."""
-    answers = registry.ask(hook)
-    return sorted(answers, key=lambda answer: registry.owner(answer[0])[0] != "evlcp-sdk")
-
-
-def _record_fault(record: SinkRecord) -> str | None:
-    """What is wrong with the record of a sink."""
+def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, str]]) -> str | None:
+    """What is wrong with the record of a sink, or with which of the others it clashes."""
     for key in ("name", "target", "summary"):
         value = getattr(record, key)
         if not (isinstance(value, str) and value):
@@ -140,6 +138,13 @@ def _record_fault(record: SinkRecord) -> str | None:
         return (
             f"sink '{record.name}': files = {record.files!r}, expected names of files in the result's folder"
         )
+    if SUMMARY in record.files:
+        return f"sink '{record.name}': {SUMMARY} is the summary's file"
+    for other, owner in others:
+        if record.name == other.name:
+            return f"sink '{record.name}': {owner} has one of this name"
+        if shared := [name for name in record.files if name in other.files]:
+            return f"sink '{record.name}': {shared[0]} is a file of the {InstalledSink(other, owner)}, too"
     return None
 
 
@@ -147,23 +152,8 @@ def _is_file_name(name: Any) -> bool:
     return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & {"/", "\\", "\0"}
 
 
-def _clash(
-    sink: InstalledSink, sinks: Mapping[str, InstalledSink], writers: Mapping[str, InstalledSink]
-) -> str | None:
-    """With what a sink clashes."""
-    record = sink.record
-    if record.name in sinks:
-        return f"sink '{record.name}': {sinks[record.name].distribution} has one of this name"
-    for name in record.files:
-        if name == SUMMARY:
-            return f"sink '{record.name}': {name} is the summary's file"
-        if name in writers:
-            return f"sink '{record.name}': {name} is a file of the {writers[name]}, too"
-    return None
-
-
-def _kind_fault(kind: MessageKind, kinds: Mapping[int, MessageKind], owners: Mapping[int, str]) -> str | None:
-    """What is wrong with a kind of messages, or with what it clashes."""
+def _kind_fault(kind: MessageKind, others: Sequence[tuple[MessageKind, str]]) -> str | None:
+    """What is wrong with a kind of messages, or with which of the others it clashes."""
     # A class that does not set them passes for a kind.
     number, name = getattr(kind, "number", None), getattr(kind, "name", None)
     who = f"message kind {name!r}"
@@ -173,14 +163,10 @@ def _kind_fault(kind: MessageKind, kinds: Mapping[int, MessageKind], owners: Map
         return f"{who}: number = {number!r}, expected 7 to {_MOST_KIND}"
     if name == "packet":
         return f"{who}: its name is that of a packet's line; choose another"
-    for other in kinds.values():
+    for other, owner in others:
         if number == other.number or name == other.name:
             return (
-                f"{who}: number {number} or its name is that of '{other.name}' of {owners[other.number]};"
+                f"{who}: number {number} or its name is that of '{other.name}' of {owner};"
                 " the SDK's are 1 to 6"
             )
     return None
-
-
-def _all_are(kind: type[Any], found: Any) -> bool:
-    return isinstance(found, list | tuple) and all(isinstance(one, kind) for one in found)

@@ -73,6 +73,12 @@ def _found(
     return tuple(find(group=ENTRY_POINT_GROUP))
 
 
+@lru_cache
+def _name_and_version(owner: Distribution) -> tuple[str, str]:
+    """Of a distribution: each parses all its metadata, and one brings many plugins."""
+    return owner.name, owner.version
+
+
 class _Manager(pluggy.PluginManager):
     """Looks for hooks among a plugin's own names alone, not among those that every module has."""
 
@@ -97,14 +103,10 @@ class Registry:
         self._manager = _Manager(ENTRY_POINT_GROUP)
         self._manager.add_hookspecs(hookspecs)
         self._owners: dict[str, Distribution | None] = {}
-        self._names: dict[int, tuple[str, str]] = {}
         self._broken: list[Broken] = []
         self._collected: dict[tuple[str, str], list[Installed]] | None = None
         for plugin in plugins:
-            name = getattr(plugin, "__name__", type(plugin).__name__)
-            fault = self._join(plugin, f"{name}-{id(plugin):x}", None)
-            if fault is not None:
-                raise PluginError(f"plugin {name}: {fault}")
+            self._add(plugin)
 
     @classmethod
     def load(cls, *plugins: object) -> "Registry":
@@ -168,14 +170,10 @@ class Registry:
         names: list[str] = []
         try:
             for plugin in plugins:
-                name = f"{type(plugin).__name__}-{id(plugin):x}"
-                if (fault := self._join(plugin, name, None)) is not None:
-                    raise PluginError(f"plugin {type(plugin).__name__}: {fault}")
-                names.append(name)
+                names.append(self._add(plugin))
             yield
         finally:
             for name in names:
-                self._owners.pop(name, None)
                 if self._manager.has_plugin(name):
                     self._manager.unregister(name=name)
 
@@ -246,13 +244,15 @@ class Registry:
     def owner(self, plugin: str) -> tuple[str, str]:
         """Name and version of the distribution that brought a plugin; of one without, its name and "-"."""
         found = self._owners.get(plugin)
-        return (plugin, "-") if found is None else self._told(found)
+        return (plugin, "-") if found is None else _name_and_version(found)
 
-    def _told(self, owner: Distribution) -> tuple[str, str]:
-        """Name and version of a distribution: each parses all its metadata, and one brings many plugins."""
-        if id(owner) not in self._names:
-            self._names[id(owner)] = owner.name, owner.version
-        return self._names[id(owner)]
+    def _add(self, plugin: object) -> str:
+        """Have an object with hooks join; the name that it has from then on."""
+        kind = getattr(plugin, "__name__", type(plugin).__name__)
+        name = f"{kind}-{id(plugin):x}"
+        if (fault := self._join(plugin, name, None)) is not None:
+            raise PluginError(f"plugin {kind}: {fault}")
+        return name
 
     def _load(self, entry: EntryPoint) -> None:
         name = entry.name
@@ -288,7 +288,7 @@ class Registry:
 
     def _note(self, name: str, reason: str, algorithms: frozenset[tuple[str, str]]) -> None:
         owner = self._owners.get(name)
-        distribution = "" if owner is None else " ".join(self._told(owner))
+        distribution = "" if owner is None else " ".join(_name_and_version(owner))
         broken = Broken(name, distribution, reason, algorithms)
         self._broken.append(broken)
         # Not imported at start-up, as it takes long and is needed only here.

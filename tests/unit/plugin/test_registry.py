@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, NamedTuple
 
 import pytest
 
@@ -46,12 +46,17 @@ def test_one_wrong_id_has_one_answer() -> None:
         registry.find("pilots", "wh")
 
 
+class Owner(NamedTuple):
+    """A distribution."""
+
+    name: str
+    version: str = "1.0"
+
+
 def install(monkeypatch: pytest.MonkeyPatch, *found: tuple[str, str, Callable[[], object]]) -> None:
     """Let entry points be these: name, distribution, what loads the plugin."""
     points = [
-        SimpleNamespace(
-            name=name, value=f"{owner}:it", load=load, dist=SimpleNamespace(name=owner, version="1.0")
-        )
+        SimpleNamespace(name=name, value=f"{owner}:it", load=load, dist=Owner(owner))
         for name, owner, load in found
     ]
     monkeypatch.setattr("evlcp_sdk.plugin.registry.entry_points", lambda group: points)
