@@ -97,7 +97,7 @@ def message_kinds(registry: Registry) -> dict[int, MessageKind]:
 def _collect(
     registry: Registry,
     hook: str,
-    wanted: type[T],
+    wanted: type[Any],
     fault_of: Callable[[T, Sequence[tuple[T, str]]], str | None],
     own: Sequence[tuple[T, str]] = (),
 ) -> list[tuple[T, str]]:
