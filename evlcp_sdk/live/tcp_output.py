@@ -3,8 +3,6 @@
 import asyncio
 import json
 import socket
-from collections import deque
-from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
@@ -15,35 +13,14 @@ from evlcp_sdk.results.nmea import sentences
 from evlcp_sdk.utc import ClockZero, zero_at
 
 _MOST_WAITING: Final = 1000
-"""Fixes that wait for a client; the oldest go."""
+"""Fixes that wait to be told; the oldest go."""
+_MOST_BYTES: Final = 1 << 18
+"""What waits for a client, beside what the kernel holds; more is not sent to it, and counted."""
 _MOST_CLIENTS: Final = 32
 _MOST_LINE: Final = 4096
 _KERNEL_BYTES: Final = 1 << 16
 """What the kernel holds for a client: what waits there is old."""
 _FINISH_S: Final = 1.0
-
-
-@dataclass(eq=False)
-class _Client:
-    """Who listens.
-
-    Attributes:
-        watch: What it listens to.
-        waiting: What it has not been sent, the newest.
-        dropped: How much of that was pushed out.
-        filled: Something waits.
-    """
-
-    watch: dict[str, Any]
-    waiting: deque[bytes] = field(default_factory=lambda: deque(maxlen=_MOST_WAITING))
-    dropped: int = 0
-    filled: asyncio.Event = field(default_factory=asyncio.Event)
-
-    def put(self, data: bytes) -> None:
-        """Have something sent; of a queue that is full the oldest goes."""
-        self.dropped += len(self.waiting) == self.waiting.maxlen
-        self.waiting.append(data)
-        self.filled.set()
 
 
 class TcpOutput:
@@ -76,17 +53,17 @@ class TcpOutput:
         self._publisher, self._gpsd = publisher, gpsd
         self._host, self.port = host, port
         self._zero = clock_zero
-        self._clients: set[_Client] = set()
+        self._clients: dict[asyncio.StreamWriter, dict[str, Any]] = {}
         self._newest: dict[str, dict[str, Any]] = {}
         self._pump: asyncio.Task[None] | None = None
-        self._left = 0
+        self._unsent = 0
         self._mine: Subscription | None = None
 
     @property
     def dropped(self) -> int:
         """What clients were not sent as they did not take it, or as there was no time, so far."""
         late = 0 if self._mine is None else self._mine.dropped
-        return late + self._left + sum(client.dropped for client in self._clients)
+        return late + self._unsent
 
     async def start(self) -> None:
         """Listen.
@@ -136,51 +113,44 @@ class TcpOutput:
         fix, place = news.value.fix, news.value.filtered
         zero = zero_at(self._zero, fix.t_us)
         text = b""
-        if any(client.watch["nmea"] for client in self._clients):
+        if any(watch["nmea"] for watch in self._clients.values()):
             text = sentences(fix, place, zero).encode("ascii", "replace")
         told = b""
         if self._gpsd:
             self._newest = {"TPV": tpv(fix, place, zero), "SKY": sky(fix, zero)}
             told = b"".join(_line(report) for report in self._newest.values())
-        for client in self._clients:
-            if client.watch["enable"]:
-                client.put((told if client.watch["json"] else b"") + (text if client.watch["nmea"] else b""))
+        for writer, watch in self._clients.items():
+            if watch["enable"]:
+                self._put(writer, (told if watch["json"] else b"") + (text if watch["nmea"] else b""))
+
+    def _put(self, writer: asyncio.StreamWriter, data: bytes) -> None:
+        """Send something to a client, unless too much waits for it."""
+        if writer.transport.get_write_buffer_size() > _MOST_BYTES:
+            self._unsent += 1
+        else:
+            writer.write(data)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         """Serve one client until it leaves."""
         if len(self._clients) >= _MOST_CLIENTS:
             writer.close()
             return
-        client = _Client({"enable": not self._gpsd, "json": False, "nmea": not self._gpsd})
+        watch = {"enable": not self._gpsd, "json": False, "nmea": not self._gpsd}
         if self._gpsd:
-            client.put(_line(VERSION))
-        self._clients.add(client)
-        sending = asyncio.create_task(self._send(client, writer))
+            self._put(writer, _line(VERSION))
+        self._clients[writer] = watch
         try:
             writer.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _KERNEL_BYTES)
             while line := await reader.readline():
                 if self._gpsd:
                     for request in line.decode("utf-8", "replace").split(";"):
                         if request.strip():
-                            for said in answer(request, client.watch, self._newest):
-                                client.put(_line(said))
+                            for said in answer(request, watch, self._newest):
+                                self._put(writer, _line(said))
         except (OSError, ValueError, asyncio.CancelledError):
             pass  # It has gone, sends no lines, or the run is over.
         finally:
-            sending.cancel()
-            self._clients.discard(client)
-            self._left += client.dropped
-            writer.transport.abort()
-
-    async def _send(self, client: _Client, writer: asyncio.StreamWriter) -> None:
-        try:
-            while True:
-                await client.filled.wait()
-                client.filled.clear()
-                while client.waiting:
-                    writer.write(client.waiting.popleft())
-                    await writer.drain()
-        except OSError:
+            del self._clients[writer]
             writer.transport.abort()
 
 
