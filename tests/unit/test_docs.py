@@ -67,6 +67,10 @@ def blocks(path: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```$", path.read_text(), re.MULTILINE | re.DOTALL)
 
 
+RUNS_ON = {line: page for page in FILES for text in blocks(page, "console") for line in text.splitlines()}
+"""The page with which a command is run that stands on several: the last, whose next commands may need it."""
+
+
 def section_of(page: str, head: str) -> str:
     """The text under a heading of the second level."""
     return (ROOT / "docs" / f"{page}.md").read_text().split(f"\n## {head}\n")[1].split("\n## ")[0]
@@ -104,7 +108,6 @@ def test_code_and_commands_run(path: Path, workplace: Path, evlcp: Callable[...,
         assert evlcp("receive", "REC.raw", "-o", "OUT").code == 0
     names: dict[str, Any] = {"__name__": "example"}
     modules = set(sys.modules)
-    blocks_of_quickstart = (ROOT / "docs" / "quickstart.md").read_text().splitlines()
     for code in blocks(path, "python"):
         if "firmware_host" in code:
             needs_compiler()
@@ -119,9 +122,7 @@ def test_code_and_commands_run(path: Path, workplace: Path, evlcp: Callable[...,
                 needs_compiler()
             if " keygen " in line or " --key " in line:
                 pytest.importorskip("cryptography", reason="the extra sign is not installed")
-            if path.stem == "README" and line in blocks_of_quickstart:
-                continue
-            if line.startswith("$ evlcp "):
+            if line.startswith("$ evlcp ") and RUNS_ON[line] == path:
                 done = evlcp(*shlex.split(line.removeprefix("$ evlcp ")))
                 assert done.code == 0, f"{line}\n{done.err}"
     for name in set(sys.modules) - modules:

@@ -459,7 +459,7 @@ def test_protection_levels_cover_what_no_test_finds() -> None:
     """Faults of every size, most of them too small to be found: none of these few is beyond a level."""
     rng = np.random.default_rng(16)
     hidden = 0
-    for trial in range(150):
+    for trial in range(60):
         three = trial % 2
         seen, told, _ = drawn(
             rng, THREE if three else POLES, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), (0.0, 0.0, 0.0), 0.0
@@ -480,7 +480,7 @@ def test_protection_levels_cover_what_no_test_finds() -> None:
         assert abs(found.enu_m[2]) < found.vpl_m
         square = found.enu_m @ np.linalg.solve(found.covariance[:3, :3], found.enu_m)
         hidden += square > stats.chi2.isf(0.0027, 3)
-    assert hidden > 20
+    assert hidden > 8
 
 
 def test_a_lone_bar_has_no_protection() -> None:
@@ -552,12 +552,12 @@ def test_false_alarms_are_as_rare_as_said() -> None:
     """At a chance that can be counted: one of fifty."""
     rng, spec = np.random.default_rng(18), ErrorModel(false_alarm=0.02)
     alarms = 0
-    for _ in range(500):
+    for _ in range(200):
         seen, told, sigma = drawn(rng, THREE, Attitude(5.0, 0.0, 0.0, 0.1, 0.1), SURVEY, 0.002)
         found = solve_pose(seen, CAMERA, told, spec, sigma)
         alarms += isinstance(found, Rejection) or bool(found.excluded)
     # Tests of overlapping parts share alarms, and the total is counted by Huber: never more, and not none.
-    assert 1 <= alarms <= stats.binom.isf(1e-3, 500, 0.02)
+    assert 1 <= alarms <= stats.binom.isf(1e-3, 200, 0.02)
 
 
 def test_a_point_out_of_place_does_not_matter() -> None:
