@@ -111,11 +111,17 @@ class Detector(Protocol):
 
 
 class Detection(ABC):
-    """Events of the image to regions that blink, followed."""
+    """Events of the image to regions that blink, followed.
+
+    Attributes:
+        rhythmic: The receiver itself follows what blinks in the rhythm of the chips; nothing is compiled.
+    """
+
+    rhythmic: ClassVar[bool] = False
 
     @abstractmethod
-    def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> Detector | None:
-        """Precompute for a camera and a link's codes; None for the receiver's own tracker of regions."""
+    def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> Detector:
+        """Precompute for a camera and a link's codes."""
 
 
 class Deframer(Protocol):
@@ -147,7 +153,8 @@ class Framing(ABC):
     may have any length, the pilots none at all.
 
     Attributes:
-        roles: The roles that do its steps; a link has tables of these only, of those in `STEPS`.
+        roles: The roles that do its steps; a link has tables of these only, of those in `STEPS`. Where it is
+            all of these, the receiver reads packets by them, and the framing itself is not compiled.
         detection: Id of the detection of a link that names none; empty for the role's default.
         characters_on_air: A symbol is the code of a character, so that packets without a block say a text.
         clock_share: Share by which a transmitter's clock may be off and still be read; 0: not said.
@@ -167,8 +174,8 @@ class Framing(ABC):
         """
 
     @abstractmethod
-    def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer | None:
-        """Precompute for codes and a packet format; None where the receiver reads packets by the roles."""
+    def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer:
+        """Precompute for codes and a packet format."""
 
     def rest(self) -> int | None:
         """What LEDs must do while nothing is sent, 1 on, 0 off; None where any pattern may stand there."""

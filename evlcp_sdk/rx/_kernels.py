@@ -741,32 +741,25 @@ def core_profile(hits: Array, cells: Array, edge: float, out: Array) -> int:
 
 
 @njit
-def line_prior(places: Array, unit: complex, spacing: float, grid: int, profile: Array, out: Array) -> None:
-    """Probability of each cluster of a line in each cell, by its share of the cell and its distance off."""
+def place_prior(places: Array, unit: complex, spacing: float, grid: int, profile: Array, out: Array) -> None:
+    """Probability of each cluster in each cell, by its share of the cell, into zeros.
+
+    Of a line it goes by the distance off its axis, too, as the profile says; of a panel there is none.
+    """
     _, rows, columns = out.shape
-    wide, high = _strip(unit, spacing / 2 + grid, profile.size)
+    half = spacing / 2 + grid
+    wide, high = _strip(unit, half, profile.size if profile.size else half)
     for k in range(places.size):
         x, y = places[k].real, places[k].imag
         for r in range(max(int((y - high) / grid), 0), min(int((y + high) / grid) + 1, rows)):
             for c in range(max(int((x - wide) / grid), 0), min(int((x + wide) / grid) + 1, columns)):
                 off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
                 off *= unit.conjugate()
-                if abs(off.imag) < profile.size:
-                    out[k, r, c] = _share(off.real, spacing / 2, grid) * profile[int(abs(off.imag))]
-
-
-@njit
-def block_prior(places: Array, unit: complex, spacing: float, grid: int, out: Array) -> None:
-    """Probability of each cluster of a panel in each cell, by its share of the cell."""
-    _, rows, columns = out.shape
-    reach = spacing + grid
-    for k in range(places.size):
-        x, y = places[k].real, places[k].imag
-        for r in range(max(int((y - reach) / grid), 0), min(int((y + reach) / grid) + 1, rows)):
-            for c in range(max(int((x - reach) / grid), 0), min(int((x + reach) / grid) + 1, columns)):
-                off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
-                off *= unit.conjugate()
-                out[k, r, c] = _share(off.real, spacing / 2, grid) * _share(off.imag, spacing / 2, grid)
+                share = _share(off.real, spacing / 2, grid)
+                if profile.size == 0:
+                    out[k, r, c] = share * _share(off.imag, spacing / 2, grid)
+                elif abs(off.imag) < profile.size:
+                    out[k, r, c] = share * profile[int(abs(off.imag))]
 
 
 @njit
@@ -981,15 +974,15 @@ def mask(
     """
     (likely, selected, pixels), (prior, probability, chosen, near) = presence, out
     places, unit, spacing, grid = place
-    across = spacing
+    across, wide = spacing, 0
+    hits, cells, profile = np.zeros(bins), np.zeros(bins), np.empty(bins)
     if bins:
-        hits, cells, profile = np.zeros(bins), np.zeros(bins), np.empty(bins)
         across_profile(likely, seen, places, unit, spacing, grid, hits, cells)
         wide = core_profile(hits, cells, edge, profile)
         across = float(wide)
-        line_prior(places, unit, spacing, grid, profile[:wide], prior)
-    else:
-        block_prior(places, unit, spacing, grid, prior)
+        if wide == 0:
+            wide, profile[0] = 1, 0.0
+    place_prior(places, unit, spacing, grid, profile[:wide], prior)
     copy_near(pixels, places, unit, spacing, across, near)
     clusters, rows, columns = prior.shape
     for k in range(clusters):

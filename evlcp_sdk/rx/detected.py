@@ -13,7 +13,7 @@ from evlcp_sdk.plugin.roles import Detector
 from evlcp_sdk.rx.detection import BACKFILL_STEPS
 from evlcp_sdk.rx.followed import Followed, same_place
 from evlcp_sdk.rx.framer import RegionTracker
-from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import Events, Region
@@ -29,20 +29,20 @@ class DetectedRegions(RegionTracker):
 
     Args:
         link: The resolved configuration.
-        detector: What its detection compiled to.
         limits: How much is held.
     """
 
-    def __init__(self, link: Link, detector: Detector, limits: Limits = LIMITS) -> None:
+    def __init__(self, link: Link, limits: Limits = LIMITS) -> None:
         self._guard = Guard(link, "detection")
-        self._guard.expect_compiled(detector, "init", "step")
-        self._detector = detector
+        self._detector: Detector = compiled(
+            link, "detection", link.camera, link.codebook, link.packet, methods=("init", "step")
+        )
         self._limits = limits
         self._step_us = link.regions.step_us
         frames_us = _BACKFILL_FRAMES * link.packet.frame_chips * link.packet.chip_us
         self._most_recent = max(BACKFILL_STEPS, math.ceil(frames_us / self._step_us))
         with self._guard:
-            self._state: Any = detector.init()
+            self._state: Any = self._detector.init()
         self._recent: deque[tuple[int, Events]] = deque(maxlen=self._most_recent)
         self._left: frozenset[int] = frozenset()
         self.alive: list[Followed] = []

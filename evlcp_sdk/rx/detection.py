@@ -130,7 +130,7 @@ class RegionFollower(RegionTracker):
         for followed, box, inside in zip(self.alive, self._own(boxes), selected, strict=True):
             followed.add(start_us, inside)
             rows = np.empty(box[3] - box[1], np.int64)
-            measured = self._measured(followed, box, end_us, rows)
+            measured = self._measure(followed, box, end_us, rows)
             if measured is not None:
                 measured = self._whole(followed, measured, box[1], rows)
                 followed.filter, place = self._filtered(followed, measured)
@@ -190,7 +190,7 @@ class RegionFollower(RegionTracker):
     def _glance(self, followed: Followed, box: Box, now_us: int) -> Region | None:
         """Where a region of known size is in the middle of a step."""
         rows = np.empty(box[3] - box[1], np.int64)
-        measured = self._measured(followed, box, now_us, rows)
+        measured = self._measure(followed, box, now_us, rows)
         if measured is None:
             return None
         heights = followed.heights.copy()
@@ -486,34 +486,28 @@ class RegionFollower(RegionTracker):
             top, bottom = min(max(top, 0), height), min(max(bottom, 0), height)
         return left, top, right, bottom
 
-    def _measured(self, followed: Followed, box: Box, end_us: int, rows: NDArray[np.int64]) -> Region | None:
-        """What `_measure` says of a region, by what is known of it."""
-        width_px = followed.size_px[0] if followed.size_px else math.inf
-        strips = None
-        if followed.strips_px is not None:
-            expected_px, _ = self._expected(followed, end_us - self._age_us)
-            strips = expected_px, float(MARGIN_PX), followed.strips_px
-        return self._measure(followed.id, box, end_us, rows, width_px, strips)
-
     def _measure(
-        self,
-        id: int,
-        box: Box,
-        end_us: int,
-        rows: NDArray[np.int64],
-        width_px: float = math.inf,
-        strips: tuple[float, float, NDArray[np.float64]] | None = None,
+        self, followed: Followed | None, box: Box, end_us: int, rows: NDArray[np.int64] | None = None
     ) -> Region | None:
         """Centre and size of what blinks in a box at the end of a step; `rows`: its pixels in each row.
 
         Of a bar of known width, rows count no pixels beside it, and of strips none between them.
         """
+        width_px, strips = math.inf, None
+        if followed is not None and followed.size_px is not None:
+            width_px = followed.size_px[0]
+        if followed is not None and followed.strips_px is not None:
+            expected_px, _ = self._expected(followed, end_us - self._age_us)
+            strips = expected_px, float(MARGIN_PX), followed.strips_px
+        if rows is None:
+            rows = np.empty(box[3] - box[1], np.int64)
         # Half the score suffices inside a region: its seam is new to the light as the bar moves.
         total, column, left, right, upper, lower = self._rhythm.measure(
             box, end_us, self._measure_us, _SEAM_PX, width_px / 2 + 1, rows, strips
         )
         if total < _MIN_PIXELS:
             return None
+        id = self._next_id if followed is None else followed.id
         return region_of(
             id, end_us - self._age_us, column, (upper + lower - 1) / 2, right - left + 1.0, lower - upper
         )
@@ -571,11 +565,11 @@ class RegionFollower(RegionTracker):
         left, top = cells[0] << _CELL_SHIFT, cells[1] << _CELL_SHIFT
         right = min(cells[2] << _CELL_SHIFT, self._camera.width)
         bottom = min(cells[3] << _CELL_SHIFT, self._camera.height)
-        region = self._measure(0, (left, top, right, bottom), end_us, np.empty(bottom - top, np.int64))
+        region = self._measure(None, (left, top, right, bottom), end_us)
         return None if region is None else _box_of(region)
 
     def _start(self, box: Box, end_us: int) -> None:
-        region = self._measure(self._next_id, box, end_us, np.empty(box[3] - box[1], np.int64))
+        region = self._measure(None, box, end_us)
         if region is None:
             return
         reach = self._reach(region.x_px, region.y_px, region.width_px, region.height_px)

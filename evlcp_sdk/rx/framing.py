@@ -1,7 +1,7 @@
 """The built-in framing: packets of a preamble and frames, from the events of regions to frames."""
 
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Collection, Sequence
 from enum import StrEnum
 
@@ -20,7 +20,7 @@ from evlcp_sdk.rx.reading import FrameReader, ReadableFrame, Reading
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Missed, Transmitter, Transmitters
+from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
 from evlcp_sdk.values import Frame, Region, SyncLock, changed
 
 _TAIL_CHIPS = 0.5
@@ -125,7 +125,7 @@ class PacketFraming(Framer):
         self._queue = queue
         self._joined: set[int] = set()
         # Number, place and what was missed.
-        self._ended: deque[tuple[int | None, tuple[float, float], Missed]] = deque(maxlen=_MOST_ENDED)
+        self._ended: deque[tuple[int | None, tuple[float, float], Counter[str]]] = deque(maxlen=_MOST_ENDED)
         self._due: deque[Followed] = deque()
         # Frames that end in one step, and how long it takes to decode those before a first lock.
         per_step = self._step_us / (link.packet.info_chips * link.packet.chip_us)
@@ -202,10 +202,10 @@ class PacketFraming(Framer):
 
     def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
         """Count no frame that was not read where another link's packet was; return how many they were."""
-        missed = Missed()
+        missed: Counter[str] = Counter()
         for one in self._transmitters.alive:
             if one.number == number if place is None else same_place(one.region.latest, place):
-                missed, one.missed = missed + one.missed, Missed()
+                missed, one.missed = missed + one.missed, Counter()
         for ended in list(self._ended):
             known, (x, y), its = ended
             if place is not None and known is None:
@@ -217,10 +217,10 @@ class PacketFraming(Framer):
                 missed += its
         return self._discarded(missed)
 
-    def _discarded(self, missed: Missed) -> int:
-        self.counts["frames_rejected"] -= missed.rejected
-        self.counts["frames_unread"] -= missed.unread
-        return missed.total
+    def _discarded(self, missed: Counter[str]) -> int:
+        for name, many in missed.items():
+            self.counts[name] -= many
+        return missed.total()
 
     def close(self) -> None:
         """End the stream: decode what the regions still show."""
@@ -287,8 +287,8 @@ class PacketFraming(Framer):
                 transmitter.grid.frame += 1
                 if found is not Skipped.DARK:
                     self._lit_in(transmitter, due)
+                    transmitter.missed[found] += 1
                 self.counts[found] += 1
-                transmitter.missed += Missed(found is Skipped.REJECTED, found is Skipped.UNREAD)
                 continue
             self._take(transmitter, due, found)
 
@@ -459,7 +459,7 @@ class PacketFraming(Framer):
             self._queue.end(transmitter.packets)
             self._transmitters.release(transmitter)
 
-    def _was_part(self, missed: Missed) -> None:
+    def _was_part(self, missed: Counter[str]) -> None:
         """Count the frames that a part of a bar could not show apart from those that no bar shows."""
         self.counts["frames_of_parts"] += self._discarded(missed)
 

@@ -84,7 +84,7 @@ class Guard:
         if not isinstance(found, kind):
             self.refuse(type(found).__name__, kind.__name__)
 
-    def expect_compiled(self, found: object, *methods: str) -> None:
+    def expect_compiled(self, found: object, methods: tuple[str, ...]) -> None:
         """Check what `compile` gave: a function, or an object with these methods.
 
         Raises:
@@ -245,6 +245,20 @@ class Guard:
             self.refuse(f"values {values.tolist()!r:.40}", "finite ones")
         if not _unknown(sigma):
             self.expect_number(sigma, "sigma", 0.0, math.inf)
+
+
+def compiled(link: Link, role: str, *given: object, methods: tuple[str, ...] = ()) -> Any:
+    """What a link's algorithm of a role compiles to: a function, or an object with these methods.
+
+    Raises:
+        ConfigError: It refuses the link.
+        PluginError: It fails, or gives something else.
+    """
+    guard = Guard(link, role, may_refuse=True)
+    with guard:
+        found = link.algorithm(role).compile(*given)
+        guard.expect_compiled(found, methods)
+    return found
 
 
 def _all_within(found: NDArray[np.floating[Any]], least: float, most: float) -> bool:

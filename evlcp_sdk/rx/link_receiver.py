@@ -3,11 +3,11 @@
 from collections.abc import Callable, Collection, Sequence
 
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.framer import Framer, RegionTracker, StreamContext
 from evlcp_sdk.rx.framing import PacketFraming
-from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.plugin_framing import PluginFraming
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
@@ -27,6 +27,9 @@ class LinkReceiver:
         stream: What it is a part of.
         rhythm: Scores of the pixels, of another link in the same rhythm; None for its own.
         on_frame: Gets each frame as soon as it is decoded; None for nobody.
+
+    Attributes:
+        framing: What reads its frames.
     """
 
     def __init__(
@@ -43,9 +46,7 @@ class LinkReceiver:
         tracker = tracker_of(link)
         self._regions: RegionTracker
         follower: RegionFollower | None = None
-        with Guard(link, "detection", may_refuse=True):
-            detector = link.algorithm("detection").compile(link.camera, link.codebook, link.packet)
-        if detector is None:
+        if link.algorithm("detection").rhythmic:
             self._regions = follower = RegionFollower(
                 link.regions,
                 link.camera,
@@ -57,33 +58,19 @@ class LinkReceiver:
                 rhythm,
             )
         else:
-            self._regions = DetectedRegions(link, detector, stream.limits)
+            self._regions = DetectedRegions(link, stream.limits)
         self._queue = ReflectionQueue(Reflections(link.packet, len(link.codebook.codewords)))
-        with Guard(link, "framing", may_refuse=True):
-            deframer = link.algorithm("framing").compile(link.codebook, link.packet)
-        self._framing: Framer
-        if deframer is None:
+        self.framing: Framer
+        if link.algorithm("framing").roles >= STEPS:
             steps = Steps(link, self._announcer, tracker)
-            self._framing = PacketFraming(
+            self.framing = PacketFraming(
                 link, name, stream, steps, self._regions, follower, self._queue, self._announcer
             )
         else:
-            self._framing = PluginFraming(
-                link, name, stream, deframer, self._regions, self._queue, self._announcer
-            )
+            self.framing = PluginFraming(link, name, stream, self._regions, self._queue, self._announcer)
         self._messages = MessageAssembler.of(link, stream.clock_zero)
         self._given = {"frames_reflected": 0, "packets": 0}
         self._of_others = self._rejected_of_others = 0
-
-    @property
-    def patience_us(self) -> float:
-        """How late a frame may be given, us."""
-        return self._framing.patience_us
-
-    @property
-    def lit_us(self) -> dict[int, tuple[float, float]]:
-        """See `Receiver`."""
-        return self._framing.lit.by_number
 
     @property
     def regions(self) -> list[Region]:
@@ -91,24 +78,10 @@ class LinkReceiver:
         return [on_camera(one.latest, self._clock.camera_us) for one in self._regions.alive]
 
     @property
-    def ranging_every(self) -> int:
-        """See `Receiver`."""
-        return self._framing.ranging_every
-
-    @ranging_every.setter
-    def ranging_every(self, every: int) -> None:
-        self._framing.ranging_every = every
-
-    @property
-    def places(self) -> dict[int, Region]:
-        """Where its transmitters are that have a number and are in sight, by number."""
-        return self._framing.places
-
-    @property
     def counts(self) -> dict[str, int]:
         """What was found so far, and dropped."""
         messages = self._messages.counts if self._messages is not None else {}
-        found = self._regions.counts | self._framing.counts
+        found = self._regions.counts | self.framing.counts
         found["frames"] -= self._queue.cut
         found["frames_at_end"] = self._queue.cut
         if self.name:
@@ -119,15 +92,6 @@ class LinkReceiver:
     def __bool__(self) -> bool:
         """Whether anything waits for the next step."""
         return bool(self._regions.alive or self._queue)
-
-    @property
-    def due_us(self) -> float:
-        """When the next frame can be decoded before the end of its time step, us; infinite for none."""
-        return self._framing.due_us
-
-    def ahead(self, step: TimeStep) -> None:
-        """Decode the frames that are due in the part so far of a time step."""
-        self._framing.ahead(step)
 
     def step(
         self, step: TimeStep, taken: Sequence[Region] = (), owning: Collection[int] = ()
@@ -142,22 +106,22 @@ class LinkReceiver:
         if step.after_gap:
             self._regions.skip()
         if taken:
-            self._framing.leave(taken, owning)
+            self.framing.leave(taken, owning)
         self._announcer.start()
         regions = self._regions.step(step.start_us, step.events, taken)
         for region in regions:
             self._announcer.lap("regions", region.latest)
-        self._framing.step(regions, step)
+        self.framing.step(regions, step)
         return self._queue.step()
 
     def end_at(self, end_us: float) -> None:
         """Let the stream end at a time, us: frames that are cut by it are not given."""
-        if self._framing.cut_by_the_end:
+        if self.framing.cut_by_the_end:
             self._queue.ends_us = end_us
 
     def finish(self) -> list[Packet]:
         """End the stream's events; give the packets that were still incomplete."""
-        self._framing.close()
+        self.framing.close()
         return self._queue.close()
 
     def read(self, packets: list[Packet]) -> list[Packet]:
@@ -178,11 +142,11 @@ class LinkReceiver:
     def refuse(self, packet: Packet) -> None:
         """Count a packet that another link fits better."""
         self._of_others += len(packet.frames)
-        self._rejected_of_others += self._framing.discard(number=packet.transmitter)
+        self._rejected_of_others += self.framing.discard(number=packet.transmitter)
 
     def discard_place(self, place: Region) -> None:
         """Count frames that were rejected in another link's place apart from those that no link reads."""
-        self._rejected_of_others += self._framing.discard(place=place)
+        self._rejected_of_others += self.framing.discard(place=place)
 
     def close(self) -> None:
         """End the stream: what messages still lack is missing."""

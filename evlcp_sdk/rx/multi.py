@@ -102,7 +102,7 @@ class SeveralLinks:
         some = list(links.values())
         self._gap_px = max(link.regions.merge_px for link in some)
         # Until the slowest link has answered.
-        self._wait_us = max(one.patience_us for one in self.receivers) + some[0].regions.step_us
+        self._wait_us = max(one.framing.patience_us for one in self.receivers) + some[0].regions.step_us
         self._longest_us = max(link.packet.packet_chips * link.packet.chip_us for link in some)
         self._waiting: deque[_Shown] = deque()
         self._judged: deque[_Shown] = deque()
@@ -120,7 +120,7 @@ class SeveralLinks:
         """Give each link a time step; give the packets that have waited long enough and fit."""
         for number, one in enumerate(self.receivers):
             found = one.step(step, self._taken(number), self._owning)
-            self._see(number, one.places)
+            self._see(number, one.framing.places)
             self._add(number, found, step.end_us)
         return self._given(step.end_us)
 

@@ -12,7 +12,7 @@ from evlcp_sdk.plugin.roles import Deframer
 from evlcp_sdk.rx.followed import Followed, same_place
 from evlcp_sdk.rx.framer import Framer, LitTimes, RegionTracker, StreamContext
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer
@@ -57,7 +57,6 @@ class PluginFraming(Framer):
         link: The resolved configuration.
         name: Name of the link, that its frames have; empty for none.
         stream: What it is a part of.
-        deframer: What the link's framing compiled to.
         regions: The regions of the stream.
         queue: Where frames go.
         announcer: Gets every frame.
@@ -70,14 +69,14 @@ class PluginFraming(Framer):
         link: Link,
         name: str,
         stream: StreamContext,
-        deframer: Deframer,
         regions: RegionTracker,
         queue: ReflectionQueue,
         announcer: Announcer,
     ) -> None:
         self._guard = Guard(link, "framing")
-        self._guard.expect_compiled(deframer, "init", "step", "close", "counts")
-        self._deframer = deframer
+        self._deframer: Deframer = compiled(
+            link, "framing", link.codebook, link.packet, methods=("init", "step", "close", "counts")
+        )
         self._codebook, self._packet = link.codebook, link.packet
         self._step_us = link.regions.step_us
         self._queue = queue

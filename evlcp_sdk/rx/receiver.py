@@ -89,7 +89,7 @@ class Receiver:
 
         Starts of the first and the last frame that was due while it was, given or not, camera clock, us.
         """
-        return {number: lit for one in self._receivers for number, lit in one.lit_us.items()}
+        return {number: lit for one in self._receivers for number, lit in one.framing.lit.by_number.items()}
 
     @property
     def regions(self) -> tuple[Region, ...]:
@@ -99,12 +99,12 @@ class Receiver:
     @property
     def ranging_every(self) -> int:
         """The distance of every n-th frame with a pilot is measured, 1: of all; for when time is short."""
-        return self._receivers[0].ranging_every
+        return self._receivers[0].framing.ranging_every
 
     @ranging_every.setter
     def ranging_every(self, every: int) -> None:
         for one in self._receivers:
-            one.ranging_every = every
+            one.framing.ranging_every = every
 
     @property
     def counts(self) -> dict[str, int]:
@@ -163,13 +163,13 @@ class Receiver:
 
     def _due_us(self) -> float:
         """When the next frame can be decoded, us."""
-        return min(one.due_us for one in self._receivers)
+        return min(one.framing.due_us for one in self._receivers)
 
     def _run(self, step: TimeStep) -> list[Packet]:
         """Give each link a time step; give the packets that are complete, of the links that fit."""
         if not step.whole:
             for one in self._receivers:
-                one.ahead(step)
+                one.framing.ahead(step)
             return []
         if self._several is not None:
             return self._several.step(step)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import STEPS, Filter, Synchronizer, Tracker
-from evlcp_sdk.rx.guard import Guard
+from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import (
@@ -104,7 +104,7 @@ def tracker_of(link: Link) -> Tracker:
         guard.expect(tracker, Tracker)
         for filter_ in (tracker.position, tracker.distance):
             if filter_ is not None:
-                guard.expect_compiled(filter_, "init", "step", "predict")
+                guard.expect_compiled(filter_, ("init", "step", "predict"))
     guard = Guard(link, "tracking")
     return Tracker(_guarded(tracker.position, guard), _guarded(tracker.distance, guard))
 
@@ -124,21 +124,13 @@ class Steps:
         self._keeper = RangeKeeper()
         self._announcer = announcer
         self._guards = {role: Guard(link, role) for role in STEPS}
-        guards = {role: Guard(link, role, may_refuse=True) for role in STEPS}
-        with guards["synchronization"]:
-            self._synchronizer: Synchronizer = link.algorithm("synchronization").compile(
-                link.codebook, link.packet
-            )
-            guards["synchronization"].expect_compiled(self._synchronizer, "init", "step")
-        with guards["separation"]:
-            self._separate = link.algorithm("separation").compile(link.codebook)
-            guards["separation"].expect_compiled(self._separate)
-        with guards["decoding"]:
-            self._decode: Callable[..., SoftSymbols] = link.algorithm("decoding").compile(link.codebook)
-            guards["decoding"].expect_compiled(self._decode)
-        with guards["ranging"]:
-            self._measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
-            guards["ranging"].expect_compiled(self._measure)
+        book = link.codebook
+        self._synchronizer: Synchronizer = compiled(
+            link, "synchronization", book, link.packet, methods=("init", "step")
+        )
+        self._separate = compiled(link, "separation", book)
+        self._decode: Callable[..., SoftSymbols] = compiled(link, "decoding", book)
+        self._measure = compiled(link, "ranging", link.camera, link.bar, book)
         self._distance = tracker.distance
 
     def sync_init(self) -> Any:

@@ -1,6 +1,6 @@
 """The transmitters that a receiver knows: numbered at their first frame, remembered when lost from sight."""
 
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from itertools import count
@@ -29,35 +29,6 @@ _UNSEEN_STEPS = 5
 """Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
 
 
-@dataclass(frozen=True)
-class Missed:
-    """How many frames that were due were not given; of several, they add up.
-
-    Attributes:
-        rejected: They did not show their clusters.
-        unread: They showed them, and no symbol that is sure.
-
-    >>> Missed(1, 0) + Missed(1, 2)
-    Missed(rejected=2, unread=2)
-    >>> bool(Missed())
-    False
-    """
-
-    rejected: int = 0
-    unread: int = 0
-
-    def __add__(self, other: "Missed") -> "Missed":
-        return Missed(self.rejected + other.rejected, self.unread + other.unread)
-
-    def __bool__(self) -> bool:
-        return self.total > 0
-
-    @property
-    def total(self) -> int:
-        """Of both kinds."""
-        return self.rejected + self.unread
-
-
 @dataclass
 class Transmitter:
     """What the receiver knows of one region.
@@ -73,7 +44,7 @@ class Transmitter:
         rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
         said: Number of the newest frame that was decoded, on the grid, and its symbols.
-        missed: Frames due that were not given.
+        missed: Frames due that were not given, by the count that they belong to.
         behind: Frames that are due wait for the next step.
         tried: Number of the newest frame on the grid that was not given as soon as it was due.
         lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
@@ -89,7 +60,7 @@ class Transmitter:
     rows: RowDelay = field(default_factory=RowDelay)
     pilot: Pilot | None = None
     said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
-    missed: Missed = Missed()
+    missed: Counter[str] = field(default_factory=Counter)
     behind: bool = False
     tried: int = -1
     lit_us: float | None = None

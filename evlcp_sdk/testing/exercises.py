@@ -12,7 +12,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.blocks import packet_bits
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.plugin.roles import ROLES
+from evlcp_sdk.plugin.roles import ROLES, STEPS
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compile_or_skip
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 from evlcp_sdk.testing.views import ideal_frame, ideal_sums, ideal_view
@@ -102,6 +102,15 @@ def arguments_of(subject: Subject) -> tuple[Any, ...]:
     return _ARGUMENTS[subject.role](link_of(subject))
 
 
+def compile_given(subject: Subject, arguments: tuple[Any, ...]) -> Any:
+    """What the subject's `compile` gives; None of a detection or framing that the receiver does by itself."""
+    if subject.role == "detection" and subject.algorithm.rhythmic:
+        return None
+    if subject.role == "framing" and subject.algorithm.roles >= STEPS:
+        return None
+    return subject.algorithm.compile(*arguments)
+
+
 def compile_subject(subject: Subject) -> Any:
     """What the subject compiles to on its link; a role that compiles to nothing, itself.
 
@@ -111,7 +120,7 @@ def compile_subject(subject: Subject) -> Any:
     if subject.role not in _ARGUMENTS:
         return subject.algorithm
     arguments = arguments_of(subject)
-    return compile_or_skip(lambda: subject.algorithm.compile(*arguments))
+    return compile_or_skip(lambda: compile_given(subject, arguments))
 
 
 def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:

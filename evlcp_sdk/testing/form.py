@@ -13,7 +13,7 @@ from pydantic.fields import FieldInfo
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.specs import spec_model
-from evlcp_sdk.testing.exercises import arguments_of, exercise_of
+from evlcp_sdk.testing.exercises import arguments_of, compile_given, exercise_of
 from evlcp_sdk.testing.law import LawError, Subject, expect, expect_same, law
 from evlcp_sdk.testing.trees import map_arrays
 
@@ -77,7 +77,7 @@ def _picklable(subject: Subject) -> None:
 @law("compiles", "compiles for the camera, bar and codebook of the link")
 def _compiles(subject: Subject) -> None:
     try:
-        subject.algorithm.compile(*arguments_of(subject))
+        compile_given(subject, arguments_of(subject))
     except ConfigError as refused:
         which = "the default" if subject.link is None else "the link's"
         raise LawError(f"expected {which} camera, bar and codebook to do, got: {refused}") from refused

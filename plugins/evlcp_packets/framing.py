@@ -18,6 +18,6 @@ class Packets(Framing):
         """None: the codes are those of the roles."""
         return None
 
-    def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer | None:
-        """None: the receiver reads them."""
-        return None
+    def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer:
+        """Not asked for."""
+        raise NotImplementedError

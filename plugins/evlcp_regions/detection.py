@@ -1,7 +1,7 @@
 """The two detections: by rhythm, and none."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 from pydantic import Field
 
@@ -16,9 +16,11 @@ from evlcp_sdk.values import Events, Region
 class Rhythmic(Detection):
     """What blinks in the rhythm of the chips, followed; its parameters are the table `[regions]`."""
 
-    def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> Detector | None:
-        """None: the receiver's own tracker of regions."""
-        return None
+    rhythmic: ClassVar[bool] = True
+
+    def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> Detector:
+        """Not asked for."""
+        raise NotImplementedError
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,27 @@
 """Regions that a detection gives: the events from before it did."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
+from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.roles import Detection, Detector
 from evlcp_sdk.rx.detected import DetectedRegions
+from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
 GIVEN_AT = 100
 
 
-class Late:
+@dataclass(frozen=True)
+class Late(Detection):
     """Gives one region, from a step on."""
+
+    def compile(self, camera: CameraModel, codebook: Codebook, packet: PacketFormat) -> Detector:
+        return self
 
     def init(self) -> int:
         return 0
@@ -38,7 +48,7 @@ def test_events_from_before_are_kept_for_two_frames(rate_hz: float, kept_us: int
             f"air.chip_rate_hz={rate_hz}",
         ]
     )
-    regions = DetectedRegions(link, Late())  # type: ignore[arg-type]
+    regions = DetectedRegions(link.with_algorithm("detection", Late()))
     step_us = link.regions.step_us
     for start_us in range(0, (GIVEN_AT + 1) * step_us, step_us):
         one = np.array([start_us]), *(np.array([10], np.uint16) for _ in range(2)), np.array([1], np.uint8)

@@ -352,10 +352,10 @@ def test_footprints(seed, grid):
     want = twins.across_profile(probability, seen, places, unit, spacing, grid, 7)
     assert_allclose([hits, cells], want, rtol=1e-9, atol=1e-9)
     profile, out = rng.random(7), np.zeros(shape, np.float32)
-    _kernels.line_prior(places, unit, spacing, grid, profile, out)
+    _kernels.place_prior(places, unit, spacing, grid, profile, out)
     assert_allclose(out, twins.line_prior(shape, places, unit, spacing, grid, profile), rtol=1e-5, atol=1e-6)
     out[:] = 0
-    _kernels.block_prior(places, unit, spacing, grid, out)
+    _kernels.place_prior(places, unit, spacing, grid, profile[:0], out)
     assert_allclose(out, twins.block_prior(shape, places, unit, spacing, grid), rtol=1e-5, atol=1e-6)
     near = np.zeros(shape, np.float32)
     _kernels.copy_near(probability, places, unit, spacing, 3.0, near)
