@@ -316,22 +316,17 @@ class _Text:
             _LineError: A line is no row of the table.
         """
         assert self.fields is not None
-        which = self.fields.which
-        kept = [line for _, line in self._data(lines, first)]
-        if not kept:
-            return (np.empty(0, np.int64), np.empty(0, np.int64), None), 0
-        if self._separator != b",":
-            kept = [_DECIMAL_COMMA.sub(b".", line) for line in kept] if b"," in kept[0] else kept
-        if found := self._loaded(kept, which):
-            return found, 0
-        cut = 0
-        if last_is_cut and not self._is_row(kept[-1]):
-            # Whoever wrote it was stopped.
-            kept, cut = kept[:-1], 1
-            if not kept or (found := self._loaded(kept, which)):
-                return found or (np.empty(0, np.int64), np.empty(0, np.int64), None), cut
-        whole = lines[:-1] if cut else lines
-        return _split(np.array([self._cells_of(k, line) for k, line in self._data(whole, first)])), cut
+        data = list(self._data(lines, first))
+        # Whoever wrote it was stopped.
+        cut = int(last_is_cut and bool(data) and not self._is_row(data[-1][1]))
+        data = data[: len(data) - cut]
+        if not data:
+            return (np.empty(0, np.int64), np.empty(0, np.int64), None), cut
+        kept = [line for _, line in data]
+        if self._separator != b"," and b"," in kept[0]:
+            kept = [_DECIMAL_COMMA.sub(b".", line) for line in kept]
+        found = self._loaded(kept, self.fields.which)
+        return found or _split(np.array([self._cells_of(k, line) for k, line in data])), cut
 
     def _data(self, lines: list[bytes], first: int) -> Iterator[tuple[int, bytes]]:
         """Number and text of those that are rows of the table, from `first` on."""
@@ -348,8 +343,7 @@ class _Text:
 
     def number(self, lines: list[bytes], first: int, row: int) -> int:
         """In which line the row stands, of these from `first` on, the row from 0."""
-        data = (k for k, line in enumerate(lines, first) if k >= self.first and _is_data(line))
-        return next(itertools.islice(data, row, None))
+        return next(itertools.islice(self._data(lines, first), row, None))[0]
 
     def _loaded(
         self, lines: list[bytes], which: tuple[int, ...]

@@ -237,18 +237,22 @@ def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not (tmp_path / "out").exists()
 
 
-def test_parquet_imports_no_pandas() -> None:
+def test_parquet_imports_no_pandas(demo_raw: Path, tmp_path: Path) -> None:
     """Which takes 50 MB, and a second."""
     pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
     code = (
-        "import sys, math, pyarrow\n"
-        "from evlcp_formats.parquet import _array\n"
-        "real, rows = pyarrow.float64(), pyarrow.list_(pyarrow.int64())\n"
-        "print(_array([1.5, math.nan, None, 2], real).to_pylist())\n"
-        "print(_array([[1, None], [], [3]], rows).to_pylist(), 'pandas' in sys.modules)\n"
+        "import sys, pyarrow.parquet\n"
+        "from evlcp_sdk.cli.main import main\n"
+        "sys.argv = ['evlcp', 'receive', *sys.argv[1:], '--sink', 'parquet']\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "rows = pyarrow.parquet.ParquetFile(sys.argv[4] + '/frames.parquet').read().to_pylist()\n"
+        "print(len(rows), sum(len(row['symbols']) for row in rows), 'pandas' in sys.modules)\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert done.stdout == "[1.5, None, None, 2.0]\n[[1, None], [], [3]] False\n"
+    arguments = [sys.executable, "-c", code, demo_raw, "-o", tmp_path]
+    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
+    frames = (tmp_path / "frames.csv").read_text().splitlines()[1:]
+    assert done.stdout.splitlines()[-1] == f"{len(frames)} {16 * len(frames)} False"
 
 
 def test_the_median_needs_no_memory_of_every_frame() -> None:
