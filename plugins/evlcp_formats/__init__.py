@@ -1,6 +1,7 @@
 """The formats that few use: bags, HDF5, MAT, AEDAT4, DAT, ES; Parquet, KML, MCAP."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -15,6 +16,12 @@ if TYPE_CHECKING:
 
 __all__ = ["evlcp_open_events", "evlcp_open_writer", "evlcp_sinks"]
 
+_OPENERS = {
+    "bag": "evlcp_formats.bags:open_bag",
+    "hdf5": "evlcp_formats.hdf5:open_hdf5",
+    "mat": "evlcp_formats.matlab:open_mat",
+    "faery": "evlcp_formats.faery:FaerySource",
+}
 _STARTS = {
     b"#ROSBAG V2.0": "bag",
     b"SQLite format 3": "bag",
@@ -30,11 +37,13 @@ _SUFFIXES = {".aedat4": "faery", ".aedat": "faery", ".dat": "faery", ".es": "fae
 @hookimpl
 def evlcp_open_events(url: str) -> "EventSource | None":
     """Open a file of one of these formats, by its first bytes or its suffix; or as `bag:` and the like."""
-    scheme, _, rest = url.partition(":")
-    if is_there(url) or scheme not in ("bag", "hdf5", "list"):
+    scheme, colon, rest = url.partition(":")
+    if not colon or is_there(url):
         return _open(url, _format_of(url))
-    if scheme != "list":
+    if scheme in ("bag", "hdf5"):
         return _open(url, scheme)
+    if scheme != "list":
+        return None
     path = rest.rpartition("?")[0] or rest
     found = _format_of(path)
     if found == "hdf5":
@@ -43,30 +52,19 @@ def evlcp_open_events(url: str) -> "EventSource | None":
 
 
 def _open(url: str, found: str) -> "EventSource | None":
-    if found == "bag":
-        from evlcp_formats.bags import open_bag
-
-        return open_bag(url)
-    if found == "hdf5":
-        from evlcp_formats.hdf5 import open_hdf5
-
-        return open_hdf5(url)
-    if found == "mat":
-        from evlcp_formats.matlab import open_mat
-
-        return open_mat(url)
-    if found == "faery":
-        from evlcp_formats.faery import FaerySource
-
-        return FaerySource(url)
-    return None
+    if not found:
+        return None
+    module, _, name = _OPENERS[found].partition(":")
+    opener: Callable[[str], EventSource] = getattr(import_module(module), name)
+    return opener(url)
 
 
 def _format_of(name: str) -> str:
     """The format of a file, by its suffix or its first bytes, or of a folder; empty for another."""
     path = Path(name)
-    if path.suffix.lower() in _SUFFIXES and _SUFFIXES[path.suffix.lower()] == "faery":
-        return "faery"
+    by_suffix = _SUFFIXES.get(path.suffix.lower(), "")
+    if by_suffix == "faery":
+        return by_suffix
     try:
         if path.is_dir():
             return "bag" if (path / "metadata.yaml").is_file() else ""
@@ -77,7 +75,7 @@ def _format_of(name: str) -> str:
     except OSError:
         return ""
     by_start = next((found for magic, found in _STARTS.items() if start.startswith(magic)), "")
-    return by_start or _SUFFIXES.get(path.suffix.lower(), "")
+    return by_start or by_suffix
 
 
 @hookimpl

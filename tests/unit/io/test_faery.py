@@ -57,3 +57,8 @@ def test_missing_package_is_named_with_the_way_to_install_it(monkeypatch, tmp_pa
     monkeypatch.setitem(sys.modules, "faery", None)
     with pytest.raises(InputError, match=r"pip install 'evlcp-sdk\[faery\]'"):
         open_source(tmp_path / "a.es")
+
+
+def test_another_scheme_before_such_a_name_is_not_its_file():
+    with pytest.raises(InputError, match=r"^none\.dat: No such file"):
+        open_source("replay:none.dat")
