@@ -7,9 +7,11 @@ far as these are not known. A parameter that the views do not determine keeps it
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -128,8 +130,7 @@ def calibrate(
     spec = ErrorModel() if spec is None else spec
     for view in views:
         _check_near(view, camera, spec)
-    seen = [SeenView.of(view, camera, spec) for view in views]
-    seen = [view for view in seen if len(view.points_px)]
+    seen = [one for view in views if (one := SeenView.of(view, camera, spec)) is not None]
     if not seen:
         raise ConfigError("no view shows a bar at a known site: nothing to calibrate from")
     start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
@@ -225,8 +226,8 @@ class SeenView:
     turn_sigma_rad: float
 
     @classmethod
-    def of(cls, view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> "SeenView":
-        """The points of the bars of which enough is seen."""
+    def of(cls, view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> "SeenView | None":
+        """The points of the bars of which enough is seen; None where none is."""
         enu, points, whiten, number, arm, bend = [], [], [], [], [], []
         survey: dict[int, tuple[float, float, float]] = {}
         between = between_of(view.bars)
@@ -243,22 +244,27 @@ class SeenView:
             survey[bar.transmitter] = (site[0], site[1], site[2])
             covariance = np.diag((max(bar.across, 1.0) * bar.sigma_px[good]) ** 2) + shift**2
             whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
-        size = sum(map(len, points))
-        joined, at = np.zeros((size, size)), 0
-        for part in whiten:
-            joined[at : at + len(part), at : at + len(part)] = part
-            at += len(part)
-        flat = np.concatenate([np.empty((0, 3)), *enu])
-        seen = np.concatenate([np.empty((0, 2)), *points])
+        if not enu:
+            return None
+        flat, seen = np.concatenate(enu), np.concatenate(points)
         rotation = view.rotation
         shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
         sigma = math.hypot(math.radians(view.attitude_sigma_deg), shaken_rad)
         if rotation is None:
             rotation, sigma = _turned(flat - view.enu_m, seen, camera), _FREE_SIGMA_RAD
-        bars = np.concatenate([np.empty(0, np.int64), *number])
-        arms, bends = np.concatenate([np.empty((0, 3)), *arm]), np.concatenate([np.empty((0, 2)), *bend])
-        place_m, place_sigma_m = view.enu_m, view.position_sigma_m
-        return cls(flat, seen, joined, bars, arms, bends, survey, place_m, place_sigma_m, rotation, sigma)
+        return cls(
+            flat,
+            seen,
+            block_diag(*whiten),
+            np.concatenate(number),
+            np.concatenate(arm),
+            np.concatenate(bend),
+            survey,
+            view.enu_m,
+            view.position_sigma_m,
+            rotation,
+            sigma,
+        )
 
 
 def _bend(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
@@ -278,8 +284,6 @@ def _bend(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
 
 def _turned(offset_m: Floats, points_px: Floats, camera: CameraModel) -> Floats:
     """The attitude that brings sights best onto directions (Kabsch)."""
-    if not len(points_px):
-        return np.eye(3)
     flat = camera.undistort(points_px)
     sights = np.concatenate([flat, np.ones((len(flat), 1))], 1)
     sights /= np.linalg.norm(sights, axis=1, keepdims=True)
@@ -341,7 +345,14 @@ class _Model:
     common: tuple[float, float] | None
     surveys: Mapping[int, tuple[float, float, float]]
 
-    @property
+    @cached_property
+    def prior(self) -> Floats:
+        """What whitens the unknowns as they are known before anything is seen, float64 (n, n)."""
+        poses = [(view.place_sigma_m, view.turn_sigma_rad) for view in self.views]
+        sigmas = np.concatenate([np.repeat(poses, 3), np.ones(_OF_BAR * len(self.surveys))])
+        return block_diag(self.loose, np.diag(1 / np.append(sigmas, np.repeat(self.common or (), 3))))
+
+    @cached_property
     def start(self) -> Floats:
         """The unknowns before anything is seen."""
         first = [float(getattr(self.camera, name)) for name in PARAMETERS]
@@ -368,28 +379,17 @@ class _Model:
 
     def parts(self, x: Floats) -> tuple[Floats, Floats]:
         """Misses in sigmas, float64 (m,), and their slopes, float64 (m, n)."""
-        shared, start, last = len(PARAMETERS), self.start, self.last
-        misses, rows = [self.loose @ (x - start)[:shared]], [self.loose @ np.eye(shared, len(x))]
+        shared, last = len(PARAMETERS), self.last
+        misses, rows = [self.prior @ (x - self.start)], [self.prior]
         drift = x[last] if self.common is not None else np.zeros(6)
         now = self.camera_of(x)
         for i, view in enumerate(self.views):
-            at = shared + 6 * i
-            place, block = self._seen(x, view, at, now, drift)
+            place, block = self._seen(x, view, shared + 6 * i, now, drift)
             for axis in (0, 1):
                 # A step that turns a point behind the camera is not to be taken.
                 off = np.nan_to_num(place[:, axis] - view.points_px[:, axis], nan=1e6)
                 misses.append(view.whiten @ off)
                 rows.append(view.whiten @ np.nan_to_num(block[:, axis]))
-            scale = np.repeat([1 / view.place_sigma_m, 1 / view.turn_sigma_rad], 3)
-            misses.append(x[at : at + 6] * scale)
-            rows.append(np.eye(len(x))[at : at + 6] * scale[:, None])
-        begin = shared + 6 * len(self.views)
-        misses.append(x[begin : last.start])
-        rows.append(np.eye(len(x))[begin : last.start])
-        if self.common is not None:
-            scale = np.repeat([1 / self.common[0], 1 / self.common[1]], 3)
-            misses.append(drift * scale)
-            rows.append(np.eye(len(x))[last] * scale[:, None])
         return np.concatenate(misses), np.concatenate(rows)
 
     def _seen(

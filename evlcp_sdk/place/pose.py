@@ -15,11 +15,11 @@ from itertools import combinations
 import numpy as np
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.fault_estimate import estimate_fault
 from evlcp_sdk.place.fit import fit_pose
 from evlcp_sdk.place.fit_assessment import FOCAL, AssessedPose, Pose, assess_fit, covering, misfits
 from evlcp_sdk.place.model import Fit
-from evlcp_sdk.place.observations import BarView, Problem
+from evlcp_sdk.place.observations import BarView, Problem, project_bars
+from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.place.rejections import Candidate, Rejection
 from evlcp_sdk.place.starts import ODDS, is_hopeless, likely_starts
 from evlcp_sdk.scene.attitude import Attitude
@@ -47,6 +47,13 @@ _FOCALS = np.geomspace(1 / 4.0, 4.0, 47)
 
 _FINER_FOCALS = np.linspace(0.94, 1.06, 25)
 """Those about the best of them."""
+
+
+_FAULT_STEPS = 4
+"""Of Gauss and Newton; the image of a bar is nearly linear in where it stands."""
+
+_FREEDOM = 6
+"""Of the test of a bar: three of its place, three of its attitude."""
 
 
 def solve_pose(
@@ -145,6 +152,45 @@ def _failed(problem: Problem, name: str, pose: Pose, tests: Mapping[str, float])
         if name == f"bar {number}":
             return estimate_fault(problem, i, pose, tests[name], len(tests)) if name in tests else None
     return None
+
+
+def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: int) -> FailedBar:
+    """Where a bar stands by its image, seen from a pose that does without it.
+
+    Weighted least squares over its points, which share the shift of its image, for its place; its attitude
+    and length are taken as its site says.
+
+    Args:
+        problem: All that is seen, this bar, too.
+        bar: Its place among `problem.transmitters`.
+        pose: The pose without it.
+        test: Its test value.
+        parts: How many parts are tested.
+    """
+    from scipy.special import chndtr
+
+    rows = problem.points[problem.bar == bar]
+    shift, even = (
+        np.array([[one[0], one[1]], [one[1], one[2]]]) for one in problem.bar_sigma[bar, 3:].reshape(2, 3)
+    )
+    weight = rows[:, 8, None, None] * even
+    shift = (weight @ shift).reshape(-1, 2)
+    whole = np.linalg.inv(np.eye(2 * len(rows)) + shift @ shift.T)
+    off_m = np.zeros(3)
+    for _ in range(_FAULT_STEPS):
+        points, slope = project_bars(rows[:, :3] + off_m, pose.enu_m, pose.rotation, problem.camera)
+        by_pose = (weight @ slope).reshape(-1, 6)
+        by_place = -by_pose[:, :3]
+        missed = (weight @ (rows[:, 6:8] - points)[:, :, None]).ravel()
+        follow = np.linalg.solve(by_place.T @ whole @ by_place, by_place.T @ whole)
+        off_m = off_m + follow @ missed
+    place_m = problem.bar_sigma[bar, 0]
+    by_camera = follow @ by_pose
+    covariance = follow @ np.linalg.inv(whole) @ follow.T + by_camera @ pose.covariance @ by_camera.T
+    covariance = covariance + place_m**2 * np.eye(3)
+    limit = chi_square(problem.spec.false_alarm / 2 / parts, _FREEDOM)
+    missed = float(chndtr(limit, _FREEDOM, test))
+    return FailedBar(problem.transmitters[bar], off_m, covariance, missed)
 
 
 def fitting_focal_mm(

@@ -2,7 +2,6 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import check_columns, csv_number, read_csv
@@ -72,33 +71,25 @@ def read_poses(path: Path | str) -> list[KnownPose]:
         raise ConfigError(f"{path}: expected one line of values or more")
     poses = []
     for line, row in rows:
-
-        def value(
-            name: str, usual: float | None = None, line: int = line, row: dict[str, Any] = row
-        ) -> float:
-            text = row.get(name)
-            if usual is not None and text in (None, ""):
-                return usual
-            return csv_number(path, line, name, text, _RANGES[name])
-
-        angles = [name for name in _ANGLES if row.get(name)]
-        attitude = None
+        given = [n for n in _RANGES if n in ("t_us", *PLACE) or row.get(n)]
+        angles = [name for name in _ANGLES if name in given]
         if angles:
             if absent := [name for name in _ANGLES if name not in names]:
                 raise ConfigError(
                     f"{path}: line 1: no column {absent[0]}: angles come together, {', '.join(_ANGLES)}"
                 )
-            attitude = Attitude(value("pitch_deg"), value("roll_deg"), value("heading_deg"))
+            given = [*dict.fromkeys([*given, *_ANGLES])]
+        value = {name: csv_number(path, line, name, row[name], _RANGES[name]) for name in given}
         poses.append(
             KnownPose(
                 row.get("recording") or "",
-                value("t_us"),
-                value("latitude_deg"),
-                value("longitude_deg"),
-                value("height_m"),
-                value("position_sigma_m", 0.01),
-                attitude,
-                value("attitude_sigma_deg", 0.1),
+                value["t_us"],
+                value["latitude_deg"],
+                value["longitude_deg"],
+                value["height_m"],
+                value.get("position_sigma_m", 0.01),
+                Attitude(value["pitch_deg"], value["roll_deg"], value["heading_deg"]) if angles else None,
+                value.get("attitude_sigma_deg", 0.1),
             )
         )
     return poses

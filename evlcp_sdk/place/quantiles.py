@@ -13,14 +13,3 @@ def chi_square(chance: float, freedom: int) -> float:
     from scipy.special import chdtri
 
     return float(chdtri(freedom, chance))
-
-
-def chance_below(value: float, freedom: int, noncentral: float) -> float:
-    """Chance that a non-central chi-square of so many degrees of freedom is below a value.
-
-    >>> round(chance_below(chi_square(1e-4, 6), 6, 50.0), 3)
-    0.014
-    """
-    from scipy.special import chndtr
-
-    return float(chndtr(value, freedom, noncentral))

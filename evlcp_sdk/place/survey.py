@@ -76,14 +76,14 @@ def survey(
     spec = ErrorModel() if spec is None else spec
     if any(view.rotation is None for view in views):
         raise ConfigError("a survey needs poses with heading_deg, pitch_deg and roll_deg")
-    numbers = _numbers(views)
+    numbers = sorted({bar.transmitter for view in views for bar in view.bars})
     long_m = length_m if isinstance(length_m, Mapping) else dict.fromkeys(numbers, length_m)
     started = {number: _start(views, number, camera, long_m[number]) for number in numbers}
     start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
     loose = _whitening(camera, sigma)
     for _ in range(_PASSES):
-        placed = [SeenView.of(_placed(view, started, long_m), camera, spec) for view in views]
-        placed = [view for view in placed if len(view.points_px)]
+        about = [_placed(view, started, long_m) for view in views]
+        placed = [one for view in about if (one := SeenView.of(view, camera, spec)) is not None]
         if not placed:
             raise ConfigError("no view shows a bar: nothing to survey")
         common = (max(v.place_sigma_m for v in placed), max(v.turn_sigma_rad for v in placed))
@@ -126,10 +126,6 @@ def survey(
         )
         found.append(SurveyedBar(site, covariance, sum(number in v.bar for v in placed)))
     return found
-
-
-def _numbers(views: Sequence[CalibrationView]) -> list[int]:
-    return sorted({bar.transmitter for view in views for bar in view.bars})
 
 
 def _start(
