@@ -8,7 +8,7 @@ import numpy as np
 
 from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.link.sections import PositionSpec
-from evlcp_sdk.place.quantiles import chi_square
+from evlcp_sdk.place.error_model import chi_square
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, site_of_transmitter
 from evlcp_sdk.values import Packet
 

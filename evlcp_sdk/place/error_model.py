@@ -1,6 +1,7 @@
 """What image points, an IMU and GNSS are off by, as positions take it."""
 
 from dataclasses import asdict, dataclass
+from functools import lru_cache
 from typing import Self
 
 from evlcp_sdk.link.sections import PositionSpec
@@ -66,3 +67,15 @@ class ErrorModel(PositionSpec):
         1.0
         """
         return cls(**asdict(spec))
+
+
+@lru_cache(maxsize=4096)
+def chi_square(chance: float, freedom: int) -> float:
+    """What a chi-square of so many degrees of freedom exceeds by this chance.
+
+    >>> round(chi_square(0.0027, 3), 2)
+    14.16
+    """
+    from scipy.special import chdtri
+
+    return float(chdtri(freedom, chance))

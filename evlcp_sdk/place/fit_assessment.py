@@ -11,7 +11,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.error_model import ErrorModel, chi_square
 from evlcp_sdk.place.model import (
     FAULT,
     FOCAL_UNIT,
@@ -24,7 +24,6 @@ from evlcp_sdk.place.model import (
     move,
 )
 from evlcp_sdk.place.observations import Problem, skewed
-from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.values import FailedBar
 

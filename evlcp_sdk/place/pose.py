@@ -14,12 +14,11 @@ from itertools import combinations
 
 import numpy as np
 
-from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.error_model import ErrorModel, chi_square
 from evlcp_sdk.place.fit import fit_pose
 from evlcp_sdk.place.fit_assessment import FOCAL, AssessedPose, Pose, assess_fit, covering, misfits
 from evlcp_sdk.place.model import Fit
 from evlcp_sdk.place.observations import BarView, Problem, project_bars
-from evlcp_sdk.place.quantiles import chi_square
 from evlcp_sdk.place.rejections import Candidate, Rejection
 from evlcp_sdk.place.starts import ODDS, is_hopeless, likely_starts
 from evlcp_sdk.scene.attitude import Attitude

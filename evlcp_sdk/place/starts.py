@@ -6,10 +6,10 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.place.error_model import chi_square
 from evlcp_sdk.place.fit import STEPS, fit_pose
 from evlcp_sdk.place.model import Fit
 from evlcp_sdk.place.observations import Problem
-from evlcp_sdk.place.quantiles import chi_square
 
 Floats = NDArray[np.float64]
 

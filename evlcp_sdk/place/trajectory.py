@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.dead_reckoning import Reckoned, imu_sigmas, reckon
-from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.quantiles import chi_square
+from evlcp_sdk.place.error_model import ErrorModel, chi_square
 from evlcp_sdk.scene.swing import Swing
 from evlcp_sdk.values import Fix
 

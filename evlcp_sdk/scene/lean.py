@@ -32,8 +32,6 @@ class BarSight:
         askew: The attitude is known, but the image shows that the bar does not stand plumb.
         magnification: How long the lens's distortion makes the bar look, in what it would be without.
         bow: What the distortion's change along the bar looks like: the sine of a lean.
-        magnification: How long the lens's distortion makes the bar look, in what it would be without.
-        bow: What the distortion's change along the bar looks like: the sine of a lean.
 
     A default one is in the middle of the image, and nothing is known of its lean.
     """

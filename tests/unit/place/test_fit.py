@@ -19,7 +19,6 @@ from evlcp_sdk.place.model import FOCAL_UNIT, Equations, Fit, linearize, move
 from evlcp_sdk.place.observations import (
     BarView,
     Problem,
-    _flatness,
     project_bars,
     shared_sigmas,
     whole_clusters,
@@ -257,18 +256,6 @@ def test_clusters_that_count() -> None:
     points[3], sigma[4], sigma[5] = np.nan, 0.0, np.inf
     points[6, 0] = 9.4
     assert np.flatnonzero(whole_clusters(points, sigma, 1280, 720)).tolist() == [1, 2, 7]
-
-
-@pytest.mark.parametrize("offset", [0.0, 0.1, 5.0])
-def test_how_far_bars_are_from_a_line(offset: float) -> None:
-    rng = np.random.default_rng(16)
-    bar = np.repeat([0, 1, 2, 3], [5, 7, 4, 6])
-    line = np.array([[0, 0, offset], [3, 6, 0], [6, 12, 0], [9, 18, 0]])
-    points = rng.normal(0, 0.01, (len(bar), 10))
-    points[:, :3] += line[bar]
-    centres = np.stack([points[bar == b, :3].mean(0) for b in range(4)])
-    extent = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
-    assert _flatness(points, bar, 4) == pytest.approx(extent[1] / extent[0], rel=1e-6)
 
 
 @pytest.mark.parametrize("bars", [2, 3])
