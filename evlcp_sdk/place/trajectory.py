@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.dead_reckoning import Reckoned, imu_sigmas, reckon
+from evlcp_sdk.place.dead_reckoning import imu_sigmas, reckon
 from evlcp_sdk.place.error_model import ErrorModel, chi_square
 from evlcp_sdk.scene.swing import Swing
 from evlcp_sdk.values import Fix
@@ -248,16 +248,13 @@ def _again(
     for i, (point, there) in enumerate(zip(points, smoothed, strict=True)):
         if point.fix is None:
             continue
+        away = point.fix.enu_m - _seen(there.causes, point.fix) @ _still(there)
         if point.starts:
-            seen = _seen(point.causes, point.fix)
-            again[i] = replace(
-                _first(_moved(point.fix, point.fix.enu_m - seen @ _still(there))), fix=point.fix
-            )
+            again[i] = replace(_first(_moved(point.fix, away)), fix=point.fix)
         elif i:
             assert point.swing is not None
             ahead = _joined(_ahead(again[i - 1], point.t_us, point.swing, spec), point.fix)
-            seen = _seen(ahead.causes, point.fix)
-            seen = _seen(ahead.causes, _moved(point.fix, point.fix.enu_m - seen @ _still(there)))
+            seen = _seen(ahead.causes, _moved(point.fix, away))
             taken = _faced(ahead, point.fix) if point.misses else _taken(ahead, point.fix, seen)
             again[i] = replace(taken, misses=point.misses, course=point.course, taken=point.taken)
     return again
@@ -269,9 +266,9 @@ def _smoothed(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[Traje
     for i in range(len(points) - 2, -1, -1):
         if points[i + 1].starts:
             continue
-        here, after = points[i], smoothed[i + 1]
-        swing = points[i + 1].swing
+        after, swing = smoothed[i + 1], points[i + 1].swing
         assert swing is not None
+        here = _biased(points[i], after.t_us, swing, spec)
         ahead, move, noise, causes, _ = _motion(here, after.t_us, swing, spec)
         # Causes that came later are independent of this point: what is common has passed on.
         common = _shared(causes, after.causes)
@@ -393,15 +390,27 @@ def _joined(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
     causes = [replace(c, t_us=fix.t_us) if c.name in fix.standing else c for c in point.causes]
     known = {cause.name for cause in causes}
     new = [Cause(n, moves.shape[1], fix.t_us) for n, moves in fix.standing.items() if n not in known]
-    more = sum(cause.size for cause in new)
-    size = len(point.mean)
+    return _widened(replace(point, causes=tuple(causes)), new)
+
+
+def _biased(point: TrajectoryPoint, t_us: float, swing: Swing, spec: ErrorModel) -> TrajectoryPoint:
+    """A point with the biases of the IMU that its next swing is by, which nothing may have shown before."""
+    biases = len(imu_sigmas(swing, spec))
+    known = not biases or any(cause.name == IMU for cause in point.causes)
+    return point if known else _widened(point, [Cause(IMU, biases, t_us)])
+
+
+def _widened(point: TrajectoryPoint, new: Sequence[Cause]) -> TrajectoryPoint:
+    """A point with further causes, of which nothing is known but their sigmas."""
+    more, size = sum(cause.size for cause in new), len(point.mean)
     covariance = np.eye(size + more)
     covariance[:size, :size] = point.covariance
     mean = np.concatenate([point.mean, np.zeros(more)])
-    return replace(point, mean=mean, covariance=covariance, causes=(*causes, *new))
+    return replace(point, mean=mean, covariance=covariance, causes=(*point.causes, *new))
 
 
 def _ahead(point: TrajectoryPoint, t_us: float, swing: Swing, spec: ErrorModel) -> TrajectoryPoint:
+    point = _biased(point, t_us, swing, spec)
     mean, move, noise, causes, turn_rad = _motion(point, t_us, swing, spec)
     covariance = move @ point.covariance @ move.T + noise
     ahead = replace(
@@ -437,8 +446,13 @@ def _motion(
     rows = [*range(_FIXED), *(i for _, at in kept for i in range(at.start, at.stop))]
     move = np.eye(len(point.mean))[rows]
     noise = np.zeros((len(rows), len(rows)))
-    own = next((at for c, at in _columns(point.causes) if c.name == IMU), None)
-    way, biases = _way(point, swing, own, spec)
+    own = next((at for c, at in _columns(point.causes) if c.name == IMU), slice(0, 0))
+    if swing.push_m_s2 is not None and not math.isfinite(point.heading_deg):
+        # Where a push points to is not known without a heading.
+        swing = replace(swing, push_m_s2=None)
+    imu = point.mean[own][: len(imu_sigmas(swing, spec))]
+    heading_rad, sigma_rad = math.radians(point.heading_deg), math.radians(point.heading_sigma_deg)
+    way = reckon(swing, point.mean[3:_MOTION], heading_rad, sigma_rad, imu, spec)
     move[:_MOTION, :_MOTION] = way.move
     noise[:_MOTION, :_MOTION] = way.noise
     fade = math.exp(-dt / spec.slow_s)
@@ -452,34 +466,9 @@ def _motion(
             noise[at, at] = (1 - fade**2) * np.eye(cause.size)
     mean = move @ point.mean
     mean[:_MOTION] += way.added
-    if not biases:
-        return mean, move, noise, tuple(causes), way.turn_rad
-    if own is not None:
-        # The mean has them already, the move by them is what is left.
-        move[:_MOTION, own.start : own.start + biases] = way.by_imu
-        return mean, move, noise, tuple(causes), way.turn_rad
-    # Biases that nothing has shown are new, and have moved the point by as much.
-    new = np.concatenate([way.by_imu, np.zeros((len(rows) - _MOTION, biases)), np.eye(biases)])
-    wide = np.zeros((len(new), len(new)))
-    wide[: len(rows), : len(rows)] = noise
-    move = np.concatenate([move, np.zeros((biases, move.shape[1]))])
-    causes.append(Cause(IMU, biases, t_us))
-    return np.append(mean, np.zeros(biases)), move, wide + new @ new.T, tuple(causes), way.turn_rad
-
-
-def _way(point: TrajectoryPoint, swing: Swing, own: slice | None, spec: ErrorModel) -> tuple[Reckoned, int]:
-    """Position and velocity as a swing carries them, and how many biases it has."""
-    biases = len(imu_sigmas(swing, spec))
-    imu = np.zeros(biases) if own is None else point.mean[own][:biases]
-    heading = point.heading_deg
-    if swing.push_m_s2 is not None and not math.isfinite(heading):
-        # Where a push points to is not known without a heading.
-        swing = replace(swing, push_m_s2=None)
-        imu = imu[: len(imu_sigmas(swing, spec))]
-    sigma = math.radians(point.heading_sigma_deg)
-    way = reckon(swing, point.mean[3:_MOTION], math.radians(heading), sigma, imu, spec)
-    unused = np.zeros((_MOTION, biases - way.by_imu.shape[1]))
-    return replace(way, by_imu=np.concatenate([way.by_imu, unused], 1)), biases
+    # The mean has them already, the move by them is what is left.
+    move[:_MOTION, own.start : own.start + len(imu)] = way.by_imu
+    return mean, move, noise, tuple(causes), way.turn_rad
 
 
 def _stays(cause: Cause, t_us: float) -> bool:
