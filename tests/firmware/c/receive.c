@@ -9,8 +9,9 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 
 static void drain(struct native *board)
 {
-    native_run(board, board->now + NATIVE_TICK_HZ / 1000u);
+    board_run_us(board, 1000u);
     board->output_length = 0u;
+    board->record_count = 0u;
 }
 
 static void send_datagram(struct native *board, uint16_t sequence, uint16_t session, uint8_t type,
@@ -20,23 +21,24 @@ static void send_datagram(struct native *board, uint16_t sequence, uint16_t sess
     const struct evlcp_datagram d = {
         .type = type, .sequence = sequence, .session = session, .payload = payload, .length = length};
     evlcp_link_put(&link, &d);
-    native_input(board, link.wire, link.wire_length);
+    board_input(board, link.wire, link.wire_length);
     drain(board);
 }
 
 int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
 {
-    static struct native board;
-    native_init(&board);
+    static const uint8_t id[12];
     if (size == 0u)
         return 0;
+    struct native *board = board_new(id);
     const uint8_t hello[EVLCP_HELLO_REQUEST_BYTES] = {EVLCP_PROTOCOL_MAJOR, EVLCP_PROTOCOL_MINOR, 1u};
-    send_datagram(&board, 0u, EVLCP_NO_SESSION, EVLCP_TYPE_HELLO, hello, sizeof hello);
+    send_datagram(board, 0u, EVLCP_NO_SESSION, EVLCP_TYPE_HELLO, hello, sizeof hello);
     if ((data[0] & 1u) == 0u) {
         for (size_t at = 1; at < size; at += 512u) {
-            native_input(&board, data + at, size - at < 512u ? size - at : 512u);
-            drain(&board);
+            board_input(board, data + at, size - at < 512u ? size - at : 512u);
+            drain(board);
         }
+        board_free(board);
         return 0;
     }
     uint16_t sequence = 1u;
@@ -47,10 +49,11 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size)
         at += 2u;
         if (length > size - at)
             length = size - at;
-        send_datagram(&board, sequence++, board.core.session, type, data + at, (uint32_t)length);
+        send_datagram(board, sequence++, board->core.session, type, data + at, (uint32_t)length);
         at += length;
     }
     for (uint32_t i = 0; i < 400u; i++)
-        drain(&board);
+        drain(board);
+    board_free(board);
     return 0;
 }

@@ -1,5 +1,6 @@
 #include "board.h"
 
+#include <stdlib.h>
 #include <string.h>
 #include <sys/random.h>
 
@@ -25,14 +26,17 @@ void hal_info(struct evlcp_hal_info *info)
 
 void hal_leds(const uint8_t *row, uint32_t chip)
 {
-    uint8_t record[NATIVE_RECORD_BYTES];
     memcpy(self->shown, row, EVLCP_ROW_BYTES);
-    if (self->record == NULL)
-        return;
+    if (self->record_count == self->record_room) {
+        self->record_room = self->record_room == 0u ? 4096u : 2u * self->record_room;
+        self->records = realloc(self->records, self->record_room * NATIVE_RECORD_BYTES);
+        if (self->records == NULL)
+            abort();
+    }
+    uint8_t *record = self->records + self->record_count++ * NATIVE_RECORD_BYTES;
     evlcp_put32(record, (uint32_t)self->now);
     evlcp_put32(record + 4, chip);
     memcpy(record + 8, row, EVLCP_ROW_BYTES);
-    self->record(self->record_context, record);
 }
 
 void hal_chips(uint32_t ticks)
@@ -195,16 +199,7 @@ void hal_restart(void)
     self->restart = true;
 }
 
-void native_init(struct native *board)
-{
-    memset(board, 0, sizeof *board);
-    memset(board->flash, 0xff, sizeof board->flash);
-    memset(board->images, 0xff, sizeof board->images);
-    board->health.temperature_dc = 250;
-    native_reset(board);
-}
-
-void native_reset(struct native *board)
+void board_reset(struct native *board)
 {
     self = board;
     board->reset_at = board->now;
@@ -220,6 +215,25 @@ void native_reset(struct native *board)
     evlcp_init(&board->core);
 }
 
+struct native *board_new(const uint8_t unique_id[12])
+{
+    struct native *board = calloc(1, sizeof *board);
+    if (board == NULL)
+        return NULL;
+    memset(board->flash, 0xff, sizeof board->flash);
+    memset(board->images, 0xff, sizeof board->images);
+    memcpy(board->unique_id, unique_id, sizeof board->unique_id);
+    board->health.temperature_dc = 250;
+    board_reset(board);
+    return board;
+}
+
+void board_free(struct native *board)
+{
+    free(board->records);
+    free(board);
+}
+
 static void serve(struct native *board)
 {
     uint32_t before;
@@ -228,11 +242,12 @@ static void serve(struct native *board)
         evlcp_poll(&board->core);
     } while (board->core.requests != before);
     if (board->restart)
-        native_reset(board);
+        board_reset(board);
 }
 
-void native_run(struct native *board, uint64_t until)
+void board_run_us(struct native *board, uint64_t us)
 {
+    uint64_t until = board->now + us * (NATIVE_TICK_HZ / 1000000u);
     self = board;
     serve(board);
     /* A START that waits is looked at often enough to begin in time. */
@@ -254,17 +269,100 @@ void native_run(struct native *board, uint64_t until)
     serve(board);
 }
 
-void native_input(struct native *board, const uint8_t *bytes, size_t count)
+void board_input(struct native *board, const uint8_t *bytes, size_t count)
 {
     self = board;
     evlcp_receive(&board->core, bytes, (uint32_t)count);
 }
 
-size_t native_output(struct native *board, uint8_t *bytes, size_t room)
+size_t board_output(struct native *board, uint8_t *bytes, size_t room)
 {
     size_t count = board->output_length < room ? board->output_length : room;
     memcpy(bytes, board->output, count);
     memmove(board->output, board->output + count, board->output_length - count);
     board->output_length -= count;
     return count;
+}
+
+size_t board_record_count(const struct native *board)
+{
+    return board->record_count;
+}
+
+/* Moves all records out; `bytes` has room for board_record_count of them. */
+void board_take_records(struct native *board, uint8_t *bytes)
+{
+    if (board->record_count != 0u)
+        memcpy(bytes, board->records, board->record_count * NATIVE_RECORD_BYTES);
+    board->record_count = 0u;
+}
+
+void board_set_health(struct native *board, int16_t temperature_dc, uint8_t faults, uint8_t open_led)
+{
+    board->health = (struct evlcp_health){.temperature_dc = temperature_dc, .faults = faults};
+    if (open_led < EVLCP_LEDS)
+        board->health.open_leds[open_led / 8u] = (uint8_t)(0x80u >> open_led % 8u);
+}
+
+void board_set_late(struct native *board, uint32_t ticks)
+{
+    board->late = ticks;
+}
+
+void board_set_failures(struct native *board, uint8_t level, uint8_t flash)
+{
+    board->level_fails = level != 0u;
+    board->flash_fails = flash != 0u;
+}
+
+void board_shown(const struct native *board, uint8_t row[EVLCP_ROW_BYTES])
+{
+    memcpy(row, board->shown, EVLCP_ROW_BYTES);
+}
+
+uint16_t board_level(const struct native *board)
+{
+    return board->level_ma;
+}
+
+uint8_t board_running(const struct native *board)
+{
+    return board->running;
+}
+
+/* The flash does so many words and erases more, the last one by half; 0: all of them. */
+void board_cut_power(struct native *board, uint32_t left)
+{
+    board->power_left = left;
+    board->power_fails = false;
+}
+
+/* What stands in the place of an image, EVLCP_IMAGE_SLOT_BYTES. */
+void board_image(const struct native *board, uint8_t image, uint8_t *bytes)
+{
+    memcpy(bytes, board->images[image - 1u], EVLCP_IMAGE_SLOT_BYTES);
+}
+
+/* Pulses from tick `next` on, a period in ticks; 0: none. */
+void board_set_pulse(struct native *board, double period, double next)
+{
+    board->pulse_period = period;
+    board->pulse_next = next;
+}
+
+size_t board_flash_bytes(void)
+{
+    return sizeof((struct native *)0)->flash;
+}
+
+void board_flash(const struct native *board, uint8_t *bytes)
+{
+    memcpy(bytes, board->flash, sizeof board->flash);
+}
+
+/* The flash of another board, and a reset. */
+void board_set_flash(struct native *board, const uint8_t *bytes)
+{
+    memcpy(board->flash, bytes, sizeof board->flash);
+    board_reset(board);
 }

@@ -1,5 +1,5 @@
-/* The driver board in a process: HAL over memory and a virtual tick counter. Time moves only in native_run, so
-   the caller decides when chips fall due. */
+/* The driver board in a process: HAL over memory and a virtual tick counter. A shared library; time moves
+   only in board_run_us, so the caller decides when chips fall due. */
 #ifndef EVLCP_NATIVE_BOARD_H
 #define EVLCP_NATIVE_BOARD_H
 
@@ -41,24 +41,19 @@ struct native {
     uint8_t output[1u << 16]; /* sent, not yet collected */
     size_t output_length;
     uint8_t shown[EVLCP_ROW_BYTES];
-    /* LED records: u32 tick, u32 chip, row; little-endian. */
-    void (*record)(void *context, const uint8_t record[NATIVE_RECORD_BYTES]);
-    void *record_context;
+    uint8_t *records; /* of LEDs: u32 tick, u32 chip, row; little-endian */
+    size_t record_count;
+    size_t record_room;
 };
 
-/* Power on: empty flash. */
-void native_init(struct native *board);
+/* Power on: empty flash; NULL without memory. */
+struct native *board_new(const uint8_t unique_id[12]);
+void board_free(struct native *board);
 
-/* Reset: everything but the flash is lost. */
-void native_reset(struct native *board);
-
-/* Let time go on to `until`: chips fall due, requests are answered between them. */
-void native_run(struct native *board, uint64_t until);
+/* Let time go on: chips fall due, requests are answered between them. */
+void board_run_us(struct native *board, uint64_t us);
 
 /* Bytes arrive. */
-void native_input(struct native *board, const uint8_t *bytes, size_t count);
-
-/* Collect up to `room` bytes that were sent. */
-size_t native_output(struct native *board, uint8_t *bytes, size_t room);
+void board_input(struct native *board, const uint8_t *bytes, size_t count);
 
 #endif
