@@ -18,8 +18,9 @@ A recording of which much was dropped is no error, but ends a command with `DEGR
 `PluginWarning` is a warning: a plugin is broken and left out, and all others go on.
 """
 
+from importlib import import_module
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 __all__ = [
     "ConfigError",
@@ -104,6 +105,21 @@ class InterruptedRunError(EvlcpError):
     """The user stopped the run; what was done until then is kept, or the message says that nothing is."""
 
     exit_code = 130
+
+
+def import_extra(module: str, extra: str) -> Any:
+    """A module of a package that comes with an extra.
+
+    Raises:
+        ConfigError: It is not installed.
+    """
+    try:
+        return import_module(module)
+    except ImportError as fault:
+        package = module.partition(".")[0]
+        raise ConfigError(
+            f"{package} is not installed; it comes with the extra: pip install 'evlcp-sdk[{extra}]'"
+        ) from fault
 
 
 DEGRADED = 4

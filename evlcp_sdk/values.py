@@ -13,7 +13,7 @@ from evlcp_sdk import _kernels
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message
 from evlcp_sdk.air.kinds import MessageKind
-from evlcp_sdk.errors import ConfigError, StreamError
+from evlcp_sdk.errors import StreamError, import_extra
 
 if TYPE_CHECKING:
     import pandas
@@ -37,8 +37,6 @@ __all__ = [
     "SyncLock",
     "Triggers",
     "Trust",
-    "arrow_table",
-    "pandas_frame",
     "plain",
 ]
 
@@ -127,7 +125,9 @@ class Events:
         Raises:
             ConfigError: pandas is not installed.
         """
-        return pandas_frame({name: getattr(self, name) for name, _ in _COLUMNS})
+        columns = {name: getattr(self, name).copy() for name, _ in _COLUMNS}
+        frame: pandas.DataFrame = import_extra("pandas", "pandas").DataFrame(columns)
+        return frame
 
     def to_arrow(self) -> "pyarrow.Table":
         """The events as a table of Arrow, with the columns t_us, x, y, p.
@@ -135,7 +135,7 @@ class Events:
         Raises:
             ConfigError: pyarrow is not installed.
         """
-        return arrow_table({name: getattr(self, name) for name, _ in _COLUMNS})
+        return import_extra("pyarrow", "parquet").table({name: getattr(self, name) for name, _ in _COLUMNS})
 
     def __repr__(self) -> str:
         return f"Events({_counted(self.t_us, 'event')})"
@@ -729,36 +729,6 @@ def plain(array: NDArray[_S]) -> NDArray[_S]:
     For each other kind Numba would compile a kernel once more, which takes seconds.
     """
     return array if array.flags.carray else array.copy()
-
-
-def pandas_frame(columns: Mapping[str, Any]) -> "pandas.DataFrame":
-    """A table of pandas from columns of equal length.
-
-    Raises:
-        ConfigError: pandas is not installed.
-    """
-    try:
-        import pandas
-    except ImportError as fault:
-        raise ConfigError(
-            "pandas is not installed; it comes with the extra: pip install 'evlcp-sdk[pandas]'"
-        ) from fault
-    return pandas.DataFrame({name: column.copy() for name, column in columns.items()})
-
-
-def arrow_table(columns: Mapping[str, Any]) -> "pyarrow.Table":
-    """A table of Arrow from columns of equal length.
-
-    Raises:
-        ConfigError: pyarrow is not installed.
-    """
-    try:
-        import pyarrow
-    except ImportError as fault:
-        raise ConfigError(
-            "pyarrow is not installed; it comes with the extra: pip install 'evlcp-sdk[parquet]'"
-        ) from fault
-    return pyarrow.table(dict(columns))
 
 
 def _counted(t_us: NDArray[np.int64], what: str) -> str:

@@ -22,7 +22,7 @@ from urllib.parse import urlsplit
 
 from markupsafe import Markup
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import import_extra
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.loop_thread import cannot_listen, stop_listening
@@ -124,12 +124,7 @@ class Viewer:
         Raises:
             ConfigError: The port cannot be had, or the package `websockets` is not installed.
         """
-        try:
-            from websockets.asyncio.server import serve
-        except ImportError as fault:
-            raise ConfigError(
-                "websockets is not installed; it comes with the extra: pip install 'evlcp-sdk[live]'"
-            ) from fault
+        serve = import_extra("websockets.asyncio.server", "live").serve
         self._body = page(self._name).encode()
         try:
             server: Server = await serve(

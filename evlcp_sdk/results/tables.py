@@ -4,9 +4,9 @@ import math
 from collections.abc import Iterable
 from typing import Any, Literal
 
-from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.errors import ConfigError, import_extra
 from evlcp_sdk.results.columns import frame_columns, frame_value
-from evlcp_sdk.values import Packet, arrow_table, pandas_frame
+from evlcp_sdk.values import Packet
 
 
 def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "pandas") -> Any:
@@ -32,10 +32,10 @@ def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "
     )
     columns = {name: [frame_value(frame, name) for frame in frames] for name in names}
     if kind == "pandas":
-        return pandas_frame(columns).astype({"echo_of": "Int64"})
+        return import_extra("pandas", "pandas").DataFrame(columns).astype({"echo_of": "Int64"})
     for name, values in columns.items():
         if values and isinstance(values[0], float):
             columns[name] = [v if math.isfinite(v) else None for v in values]
-    table, at = arrow_table(columns), names.index("echo_of")
+    table, at = import_extra("pyarrow", "parquet").table(columns), names.index("echo_of")
     # Where nothing is a reflection, the column has no type of its own.
     return table.set_column(at, "echo_of", table.column(at).cast("int64"))

@@ -1,7 +1,7 @@
 """Values: short reprs, pages for notebooks, tables for pandas and Arrow."""
 
-import builtins
 import math
+import sys
 from dataclasses import replace
 from html.parser import HTMLParser
 from pathlib import Path
@@ -208,13 +208,6 @@ def test_frames_as_arrow_with_nulls_and_the_filtered_distance() -> None:
 def test_a_library_that_is_missing_is_named(
     method: str, library: str, extra: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    load = builtins.__import__
-
-    def without(name: str, *rest: Any) -> Any:
-        if name == library:
-            raise ImportError(name)
-        return load(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(evlcp.ConfigError, match=rf"{library} is not installed.*evlcp-sdk\[{extra}\]"):
         getattr(EVENTS, method)()
