@@ -115,12 +115,12 @@ class ResultOptions:
 
 
 @dataclass(frozen=True)
-class CameraOptions:
-    """Where the bars stand, how the camera is turned, and what time it is."""
+class PlaceOptions:
+    """What places the camera: bars, its attitude over time, satellites, and UTC of its clock's 0."""
 
     sites: Annotated[
         Path | None,
-        typer.Option("--sites", metavar="site.toml", help="Where the bars stand: compute positions."),
+        typer.Option("--sites", metavar="site.toml", help="Where known bars stand: compute positions."),
     ] = None
     attitude_file: Annotated[
         Path | None,
@@ -138,6 +138,39 @@ class CameraOptions:
             help="Fixes of satellites, with sigmas, which enter the track: CSV, or .nmea with --clock-zero.",
         ),
     ] = None
+    clock_zero: Annotated[
+        datetime | None,
+        typer.Option(
+            "--clock-zero",
+            parser=parse_utc,
+            metavar="UTC",
+            help="UTC of the camera clock's 0, for the age of signed beacons, NMEA and MCAP.",
+        ),
+    ] = None
+
+    def plan(self, links: "Sequence[Link]", *, mcap: bool = False) -> "PositionPlan | None":
+        """What positions are computed from, of those of several links that allow it; None without sites."""
+        if self.sites is None:
+            for name, given in (("--mcap", mcap), ("--gnss", self.gnss is not None)):
+                if given:
+                    raise typer.BadParameter("needs --sites", param_hint=name)
+            return None
+        from evlcp_sdk.link.several import named_links, placing_links
+        from evlcp_sdk.place.gnss import GnssLog
+        from evlcp_sdk.place.navigator import PositionPlan
+        from evlcp_sdk.scene.sites import load_sites
+
+        link = next(iter(placing_links(named_links(links)).values()))
+        log = None
+        if self.gnss is not None:
+            log = GnssLog.read(self.gnss, self.clock_zero, link.position.gnss_sigma_m)
+        return PositionPlan(load_sites(self.sites), log)
+
+
+@dataclass(frozen=True)
+class CameraOptions:
+    """How the camera is turned, and what tells its clock."""
+
     heading_deg: Annotated[
         float | None, typer.Option("--heading-deg", help="Its heading, clockwise from north, if known.")
     ] = None
@@ -167,15 +200,6 @@ class CameraOptions:
         float,
         typer.Option("--time-sigma-us", min=0, help="Of the offset of the file's times from the camera's."),
     ] = 0.0
-    clock_zero: Annotated[
-        datetime | None,
-        typer.Option(
-            "--clock-zero",
-            parser=parse_utc,
-            metavar="UTC",
-            help="UTC of the camera clock's 0, for the age of signed beacons, NMEA and MCAP.",
-        ),
-    ] = None
     pps: Annotated[
         int | None,
         typer.Option(
@@ -187,7 +211,7 @@ class CameraOptions:
         ),
     ] = None
 
-    def attitude(self) -> "Attitude | AttitudeLog | None":
+    def attitude(self, place: PlaceOptions) -> "Attitude | AttitudeLog | None":
         """What is known of the camera's attitude; None for nothing."""
         import math
 
@@ -196,10 +220,10 @@ class CameraOptions:
         gravity_deg = self.gravity_sigma_deg
         if gravity_deg is None:
             # An IMU's samples follow a camera that sways; angles by hand hold for a whole drive.
-            gravity_deg = 0.5 if self.attitude_file is None else 0.1
+            gravity_deg = 0.5 if place.attitude_file is None else 0.1
         sigmas = gravity_deg, self.heading_sigma_deg, self.white_sigma_deg, self.time_sigma_us
         angles = heading, pitch, roll = self.heading_deg, self.pitch_deg, self.roll_deg
-        if self.attitude_file is not None and angles != (None, None, None):
+        if place.attitude_file is not None and angles != (None, None, None):
             raise typer.BadParameter("give a file or angles, not both", param_hint="--attitude")
         if (pitch is None) != (roll is None) or (heading is not None and pitch is None):
             raise typer.BadParameter(
@@ -212,33 +236,15 @@ class CameraOptions:
         for name, value in zip(names, (*angles, *sigmas), strict=True):
             if value is not None and not math.isfinite(value):
                 raise typer.BadParameter(f"{value}: expected a finite number", param_hint=name)
-        if self.attitude_file is not None:
-            return AttitudeLog.read(self.attitude_file, Attitude(0.0, 0.0, None, *sigmas))
+        if place.attitude_file is not None:
+            return AttitudeLog.read(place.attitude_file, Attitude(0.0, 0.0, None, *sigmas))
         return Attitude(pitch, roll, heading, *sigmas) if pitch is not None and roll is not None else None
 
-    def clock(self) -> "datetime | PulseClock | None":
+    def clock(self, place: PlaceOptions) -> "datetime | PulseClock | None":
         """What says the UTC of a camera's clock: pulses of a recording, or its zero; None for nothing."""
         from evlcp_sdk.utc import PulseClock
 
-        return self.clock_zero if self.pps is None else PulseClock(self.pps, self.clock_zero)
-
-    def plan(self, links: "Sequence[Link]", *, mcap: bool = False) -> "PositionPlan | None":
-        """What positions are computed from, of those of several links that allow it; None without sites."""
-        if self.sites is None:
-            for name, given in (("--mcap", mcap), ("--gnss", self.gnss is not None)):
-                if given:
-                    raise typer.BadParameter("needs --sites", param_hint=name)
-            return None
-        from evlcp_sdk.link.several import named_links, placing_links
-        from evlcp_sdk.place.gnss import GnssLog
-        from evlcp_sdk.place.navigator import PositionPlan
-        from evlcp_sdk.scene.sites import load_sites
-
-        link = next(iter(placing_links(named_links(links)).values()))
-        log = None
-        if self.gnss is not None:
-            log = GnssLog.read(self.gnss, self.clock_zero, link.position.gnss_sigma_m)
-        return PositionPlan(load_sites(self.sites), log)
+        return place.clock_zero if self.pps is None else PulseClock(self.pps, place.clock_zero)
 
 
 class LinePrinter:

@@ -14,7 +14,7 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import console
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.cli._receiving import CameraOptions, LinkOptions, ResultOptions
+from evlcp_sdk.cli._receiving import CameraOptions, LinkOptions, PlaceOptions, ResultOptions
 from evlcp_sdk.cli._summary import delays_text, print_end
 
 if TYPE_CHECKING:
@@ -106,6 +106,7 @@ def live(
     ],
     link: LinkOptions,
     result: ResultOptions,
+    place: PlaceOptions,
     camera: CameraOptions,
     reconnect: Annotated[
         bool,
@@ -166,11 +167,11 @@ def live(
     out, lines = result.out, result.lines([url])
     registry = Registry.load()
     links = link.load(registry)
-    plan = camera.plan(links, mcap=result.mcap)
-    clock = camera.clock()
+    plan = place.plan(links, mcap=result.mcap)
+    clock = camera.clock(place)
     chosen = serving.chosen(out, positions=plan is not None)
     sinks = result.names(registry, positions=plan is not None)
-    attitude, publisher = camera.attitude(), Publisher()
+    attitude, publisher = camera.attitude(place), Publisher()
     sites = plan.sites if plan is not None else ()
     services = Services(
         chosen, publisher, named_links(links), name=Path(url).name, sites=sites, clock_zero=clock

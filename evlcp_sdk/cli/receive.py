@@ -16,17 +16,20 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Dask, bytes_bar, echo, hush, make_executor, progress_bar
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.cli._receiving import CameraOptions, LinePrinter, LinkOptions, ResultOptions
+from evlcp_sdk.cli._receiving import CameraOptions, LinePrinter, LinkOptions, PlaceOptions, ResultOptions
 from evlcp_sdk.cli._summary import print_end
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
 if TYPE_CHECKING:
+    from datetime import datetime
+
     from evlcp_sdk.link.resolve import Link
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.signals import EndRequest
     from evlcp_sdk.study.jobs import Executor, Outcome
+    from evlcp_sdk.utc import PulseClock
 
 
 class LinkMode(StrEnum):
@@ -68,6 +71,7 @@ def receive(
         int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
     ] = 0,
     dask: Dask = None,
+    place: PlaceOptions,
     camera: CameraOptions,
 ) -> None:
     """Decode recordings: symbols and distances into OUT.
@@ -117,9 +121,9 @@ def receive(
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
         jobs = [_fitted(job, links[0], registry) for job in jobs]
-    plan = camera.plan(links, mcap=result.mcap)
+    plan = place.plan(links, mcap=result.mcap)
     sinks = result.names(registry, positions=plan is not None)
-    decode = DecodeJob(links, plan, camera.attitude(), camera, sinks, lines)
+    decode = DecodeJob(links, plan, camera.attitude(place), partial(camera.clock, place), sinks, lines)
     here = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not here:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
@@ -216,7 +220,7 @@ class DecodeJob:
     links: tuple[Link, ...]
     plan: PositionPlan | None
     attitude: Attitude | AttitudeLog | None
-    camera: CameraOptions
+    clock: Callable[[], datetime | PulseClock | None]
     sinks: tuple[str, ...]
     lines: LinePrinter | None
 
@@ -232,7 +236,7 @@ class DecodeJob:
             job.link or self.links,
             plan=self.plan,
             attitude=self.attitude,
-            clock_zero=self.camera.clock(),
+            clock_zero=self.clock(),
             sinks=self.sinks,
         )
         if here is not None:

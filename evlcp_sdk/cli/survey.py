@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo
-from evlcp_sdk.cli._receiving import CameraOptions, parse_utc
+from evlcp_sdk.cli._receiving import PlaceOptions
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
@@ -18,7 +18,9 @@ if TYPE_CHECKING:
     from evlcp_sdk.place.survey import SurveyedBar
 
 
+@command
 def survey(
+    *,
     recordings: Annotated[
         list[str], typer.Argument(metavar="REC...", help="Recordings of bars that send their ids.")
     ],
@@ -29,32 +31,7 @@ def survey(
             "--poses", metavar="poses.csv", help="Where the camera was, how it was turned, and when."
         ),
     ] = None,
-    sites: Annotated[
-        Path | None,
-        typer.Option(
-            "--sites",
-            metavar="known.toml",
-            help="Known bars; the others follow from the camera's own track.",
-        ),
-    ] = None,
-    attitude: Annotated[
-        Path | None,
-        typer.Option("--attitude", metavar="FILE.csv", help="With --sites: the camera's attitude over time."),
-    ] = None,
-    gnss: Annotated[
-        Path | None,
-        typer.Option(
-            "--gnss",
-            metavar="FILE",
-            help="With --sites: fixes of satellites, with sigmas: CSV, or .nmea with --clock-zero.",
-        ),
-    ] = None,
-    clock_zero: Annotated[
-        datetime | None,
-        typer.Option(
-            "--clock-zero", parser=parse_utc, metavar="UTC", help="UTC of the camera clock's 0, for NMEA."
-        ),
-    ] = None,
+    place: PlaceOptions,
     link_files: LinkFiles = None,
     overrides: Overrides = None,
     as_json: Json = False,
@@ -79,20 +56,23 @@ def survey(
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import AttitudeLog
 
-    if (poses is None) == (sites is None):
+    if (poses is None) == (place.sites is None):
         raise typer.BadParameter("give --poses, or --sites of known bars", param_hint="--poses")
     registry = Registry.load()
     links = load_links(link_files, overrides or [], registry)
     if poses is not None:
-        for name, given in (("--attitude", attitude), ("--gnss", gnss), ("--clock-zero", clock_zero)):
+        for name, given in (
+            ("--attitude", place.attitude_file),
+            ("--gnss", place.gnss),
+            ("--clock-zero", place.clock_zero),
+        ):
             if given is not None:
                 raise typer.BadParameter("needs --sites", param_hint=name)
         found = run.survey(recordings, read_poses(poses), links, registry=registry, name=str(poses))
     else:
-        camera = CameraOptions(sites=sites, attitude_file=attitude, gnss=gnss, clock_zero=clock_zero)
-        plan = camera.plan(links)
+        plan = place.plan(links)
         assert plan is not None
-        known = None if attitude is None else AttitudeLog.read(attitude)
+        known = None if place.attitude_file is None else AttitudeLog.read(place.attitude_file)
         found = run.survey_on_the_way(recordings, plan, links, attitude=known, registry=registry)
     _write(found, out, as_json=as_json)
 

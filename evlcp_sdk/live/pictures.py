@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.values import Events, Region
@@ -46,11 +45,6 @@ class Picture:
         for piece in (oldest[first:], *self.pieces[1:]):
             image.paint(piece)
         return image
-
-    @property
-    def cells(self) -> NDArray[np.uint8]:
-        """What each pixel showed, uint8 (height, width): 0 nothing, 1 OFF, 2 ON, 3 both."""
-        return self.image().cells
 
 
 class PictureSlot:

@@ -97,7 +97,7 @@ def test_a_picture_shows_what_each_pixel_did() -> None:
         for polarity in (0, 1):
             some = events[inside & (events.p == polarity)]
             cells[some.y, some.x] |= 1 << polarity
-        assert (picture.cells == cells).all()
+        assert (picture.image().cells == cells).all()
 
 
 def test_what_is_shed_and_counted_is_what_lies_outside() -> None:
