@@ -617,6 +617,28 @@ def nmea_of(path: dict[str, list[float]], at_ms: Sequence[int], file: Path) -> P
     return file
 
 
+def test_satellites_by_nmea_are_in_the_track(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
+    path = json.loads((street / "rec.truth.json").read_text())["camera_path"]
+    nmea = nmea_of(path, (40, 120), tmp_path / "gnss.nmea")
+    angles = ("--pitch-deg", "4", "--roll-deg", "0", "--heading-deg", "0")
+    receive = ("receive", street / "rec.raw", "--sites", street / "site.toml", *angles, "--gnss", nmea)
+    assert evlcp(*receive, "-o", tmp_path / "none").code == 2
+    done = evlcp(*receive, "-o", tmp_path / "out", "--clock-zero", "2026-03-01T12:00:00Z")
+    assert done.code == 0, done.err
+    with (tmp_path / "out" / "fixes.csv").open() as file:
+        rows = [row for row in csv.DictReader(file) if row["source"] == "gnss"]
+    assert [float(row["t_us"]) for row in rows] == [40_000, 120_000]
+    for row, ms in zip(rows, (40, 120), strict=True):
+        for key in ("latitude_deg", "longitude_deg"):
+            assert float(row[key]) == pytest.approx(path[key][ms], abs=1e-8)
+        assert float(row["height_m"]) == pytest.approx(path["height_m"][ms], abs=1e-3)
+        assert float(row["sigma_east_m"]) == pytest.approx(0.1)
+    # An hour off: none of them is within the recording.
+    done = evlcp(*receive, "-o", tmp_path / "late", "--clock-zero", "2026-03-01T11:00:00Z")
+    summary = json.loads((tmp_path / "late" / "summary.json").read_text())
+    assert summary["positions"]["gnss_outside"] == 2
+
+
 def test_live_takes_what_receive_takes(evlcp: Evlcp, street: Path, tmp_path: Path) -> None:
     """Attitude, satellites and MCAP: the files of a live run are those of `receive`."""
     reader = pytest.importorskip("mcap.reader", reason="the extra mcap is not installed")
