@@ -236,7 +236,8 @@ def _ticks(low: float, high: float) -> list[float]:
 def _decades(low: float, high: float) -> list[float]:
     """Ticks of a logarithmic axis from 10^low to 10^high."""
     ticks = LogLocator(subs=(1.0, 2.0, 5.0) if high - low < 2 else (1.0,)).tick_values(10**low, 10**high)
-    return [float(v) for v in ticks if low <= math.log10(v) <= high]
+    inside = [float(v) for v in ticks if low <= math.log10(v) <= high]
+    return inside if len(inside) > 1 else _ticks(10**low, 10**high)
 
 
 def _points(x: ArrayLike, y: ArrayLike) -> NDArray[np.float64]:
