@@ -21,7 +21,11 @@ if TYPE_CHECKING:
         preset_text as preset_text,
         resolve_scene as resolve_scene,
     )
-    from evlcp_sdk.sim.simulation import Simulation as Simulation
+    from evlcp_sdk.sim.simulation import (
+        Simulation as Simulation,
+        scene_table as scene_table,
+        simulate as simulate,
+    )
     from evlcp_sdk.sim.truth import (
         SentBar as SentBar,
         Truth as Truth,
@@ -37,7 +41,7 @@ _HOMES = {
         "BackgroundSpec BarSpec LampSpec LensSpec MotionSpec ReflectionSpec Scene SensorSpec WiperSpec "
         "WorldSpec load_scene preset_names preset_text resolve_scene"
     ),
-    "simulation": "Simulation",
+    "simulation": "Simulation scene_table simulate",
     "truth": "SentBar Truth read_truth truth_from_table truth_path",
     "world": "sites_of",
 }

@@ -32,7 +32,8 @@ class Cluster:
         options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show"]
         self._start("distributed.cli.dask_scheduler", *options, "--scheduler-file", self.file)
         until = time.monotonic() + 30
-        while not self.file.exists() and time.monotonic() < until:
+        # The file is there before what it says is.
+        while not (self.file.exists() and self.file.stat().st_size) and time.monotonic() < until:
             time.sleep(0.05)
         self.address: str = json.loads(self.file.read_text())["address"]
 
