@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg.lapack import dposv
 
 from evlcp_sdk.place.model import SHARED, Equations, Fit, linearize, move
 from evlcp_sdk.place.observations import Problem
@@ -96,11 +97,5 @@ def _solve(matrix: Floats, side: Floats, damping: float) -> Floats | None:
     damped = matrix.copy()
     damped.flat[:: len(matrix) + 1] *= 1 + damping
     scale = 1 / np.sqrt(np.maximum(np.diag(damped), 1e-300))
-    scaled = damped * scale * scale[:, None]
-    try:
-        # Says whether it is positive definite; NumPy solves nothing with it.
-        np.linalg.cholesky(scaled)
-    except np.linalg.LinAlgError:
-        return None
-    found: Floats = np.linalg.solve(scaled, side * scale) * scale
-    return found
+    _, found, singular = dposv(damped * scale * scale[:, None], side * scale)
+    return None if singular else found * scale
