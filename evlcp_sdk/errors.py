@@ -22,20 +22,6 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, ClassVar
 
-__all__ = [
-    "ConfigError",
-    "EvlcpError",
-    "InputError",
-    "InterruptedRunError",
-    "OutputError",
-    "PluginError",
-    "PluginWarning",
-    "RawFormatError",
-    "StreamError",
-    "UnknownAlgorithmError",
-    "UnpluggedError",
-]
-
 
 class EvlcpError(Exception):
     """Anything the SDK raises on purpose; the message is one line a user can act on."""

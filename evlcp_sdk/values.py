@@ -19,27 +19,6 @@ if TYPE_CHECKING:
     import pandas
     import pyarrow
 
-__all__ = [
-    "Alternative",
-    "Bend",
-    "DecodedFrame",
-    "Events",
-    "FailedBar",
-    "Fix",
-    "Frame",
-    "FrameView",
-    "Packet",
-    "PresenceMap",
-    "Range",
-    "ReceivedMessage",
-    "Region",
-    "SoftSymbols",
-    "SyncLock",
-    "Triggers",
-    "Trust",
-    "plain",
-]
-
 _COLUMNS = (
     ("t_us", np.dtype(np.int64)),
     ("x", np.dtype(np.uint16)),

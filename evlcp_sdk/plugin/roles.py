@@ -34,32 +34,6 @@ if TYPE_CHECKING:
         SyncLock,
     )
 
-__all__ = [
-    "ROLES",
-    "STEPS",
-    "Code",
-    "Corrected",
-    "Decode",
-    "Decoding",
-    "Deframer",
-    "Detection",
-    "Detector",
-    "ErrorCorrection",
-    "Filter",
-    "Framing",
-    "Measure",
-    "Modulation",
-    "Pilots",
-    "Ranging",
-    "Role",
-    "Separate",
-    "Separation",
-    "Synchronization",
-    "Synchronizer",
-    "Tracker",
-    "Tracking",
-]
-
 
 class Separate(Protocol):
     """What `Separation.compile` returns."""

@@ -4,13 +4,14 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
+from matplotlib.ticker import NullLocator, StrMethodFormatter
 
 from evlcp_sdk.files import Outputs, output_fault
-from evlcp_sdk.report.plots import INK, WIDTHS_PX, Plot, Shape
+from evlcp_sdk.report.plots import INK, WIDTHS_PX, Plot, Shape, log_ticks
 
 INK_COLOUR = "#333333"
 
@@ -63,9 +64,9 @@ def _draw_on(axis: Axes, plot: Plot) -> None:
         )  # fmt: skip
     if plot.log_y:
         axis.set_yscale("log")
-        axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.set_yticks(log_ticks(*np.log10(axis.get_ylim())))
         axis.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-        axis.yaxis.set_minor_formatter(NullFormatter())
+        axis.yaxis.set_minor_locator(NullLocator())
     if plot.from_zero:
         axis.set_ylim(bottom=0)
     if plot.y_limits is not None:

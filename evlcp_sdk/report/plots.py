@@ -172,7 +172,7 @@ class Plot:
                 share[:, 1] = 1 - share[:, 1]
             return share
 
-        across, upwards = _ticks(*limits[0]), (_decades if self.log_y else _ticks)(*limits[1])
+        across, upwards = _ticks(*limits[0]), (log_ticks if self.log_y else _ticks)(*limits[1])
         number = {name: i for i, name in enumerate(self.legend)}
         at = place([(x, y) for x, y, _, _ in self._labelled]).tolist()
         self.labels = [
@@ -233,8 +233,8 @@ def _ticks(low: float, high: float) -> list[float]:
     return [float(v) for v in MaxNLocator(5).tick_values(low, high) if low <= v <= high]
 
 
-def _decades(low: float, high: float) -> list[float]:
-    """Ticks of a logarithmic axis from 10^low to 10^high."""
+def log_ticks(low: float, high: float) -> list[float]:
+    """Ticks of a logarithmic axis from 10^low to 10^high; over less than a step of 1, 2, 5, even ones."""
     ticks = LogLocator(subs=(1.0, 2.0, 5.0) if high - low < 2 else (1.0,)).tick_values(10**low, 10**high)
     inside = [float(v) for v in ticks if low <= math.log10(v) <= high]
     return inside if len(inside) > 1 else _ticks(10**low, 10**high)

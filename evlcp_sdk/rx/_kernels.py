@@ -981,6 +981,7 @@ def mask(
         wide = core_profile(hits, cells, edge, profile)
         across = float(wide)
         if wide == 0:
+            # A line that shows nowhere is still none of a panel, which is what no profile says.
             wide, profile[0] = 1, 0.0
     place_prior(places, unit, spacing, grid, profile[:wide], prior)
     copy_near(pixels, places, unit, spacing, across, near)

@@ -16,8 +16,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
     from firmware_host.board.bank import Bank
 
-__all__ = ["BankOptions", "SymbolOptions"]
-
 
 @dataclass(frozen=True)
 class SymbolOptions:

@@ -10,8 +10,6 @@ from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import NoBoardError, ToolchainError
 from firmware_host.ports.transport import SocketTransport
 
-__all__ = ["HostLine", "check_free"]
-
 _MOST_BYTES = 2048
 
 

@@ -11,8 +11,6 @@ from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.images import check_flash_file
 
-__all__ = ["NativeBoard", "NativeLine", "serve"]
-
 _PIECE = 2048
 """Bytes that the board receives at once: half of what it has room for."""
 

@@ -7,8 +7,6 @@ from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar, get_type_hi
 
 from firmware_host.errors import DatagramError
 
-__all__ = ["I16", "U8", "U16", "U32", "Rest", "WireMessage", "WireRequest"]
-
 U8 = Annotated[int, "B"]
 U16 = Annotated[int, "H"]
 U32 = Annotated[int, "I"]

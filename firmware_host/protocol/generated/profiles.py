@@ -2,8 +2,6 @@
 
 from firmware_host.protocol.generated.requests import Profile
 
-__all__ = ["DIGESTS"]
-
 DIGESTS = {
     Profile.WH4X2: "168d0d2dc197c75a8587a65d156a2d1633d185a2194fb2f78e4352bf0d278991",
     Profile.WH8: "973a1bf77fffa7ec860e56229005dffd993f7c4309d431f7194ee6aea32d7fd1",
