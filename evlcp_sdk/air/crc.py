@@ -5,6 +5,8 @@ x^2 + x + 1. The register starts with ones, so that zeros alone, a block of whic
 pass; bits enter as they are, first bit first, and the register is sent as it is, highest power first.
 """
 
+from functools import cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -28,10 +30,23 @@ def crc24(bits: NDArray[np.uint8], polynomial: int = CRC24C, start: int = _ONES)
     >>> "".join(map(str, crc24(np.ones(8, np.uint8))))
     '111111111111111100000000'
     """
-    register = start
-    for bit in bits.tolist():
-        feedback = (register >> 23) ^ bit
-        register = (register << 1) & _ONES
-        if feedback:
-            register ^= polynomial
+    register, odd = start, len(bits) % 8
+    for bit in bits[:odd].tolist():
+        register = _shift(register ^ bit << 23, polynomial)
+    by_byte = _remainders(polynomial)
+    for byte in np.packbits(bits[odd:]).tolist():
+        register = (register << 8 & _ONES) ^ by_byte[register >> 16 ^ byte]
     return np.array([register >> i & 1 for i in range(CRC_BITS - 1, -1, -1)], np.uint8)
+
+
+def _shift(register: int, polynomial: int) -> int:
+    return (register << 1 & _ONES) ^ (polynomial if register >> 23 else 0)
+
+
+@cache
+def _remainders(polynomial: int) -> list[int]:
+    """What each byte leaves in a register of zeros."""
+    registers = [byte << 16 for byte in range(256)]
+    for _ in range(8):
+        registers = [_shift(register, polynomial) for register in registers]
+    return registers

@@ -47,11 +47,10 @@ _FOCALS = np.geomspace(1 / 4.0, 4.0, 47)
 _FINER_FOCALS = np.linspace(0.94, 1.06, 25)
 """Those about the best of them."""
 
-
 _FAULT_STEPS = 4
 """Of Gauss and Newton; the image of a bar is nearly linear in where it stands."""
 
-_FREEDOM = 6
+_FAULT_FREEDOM = 6
 """Of the test of a bar: three of its place, three of its attitude."""
 
 
@@ -187,8 +186,8 @@ def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: i
     by_camera = follow @ by_pose
     covariance = follow @ np.linalg.inv(whole) @ follow.T + by_camera @ pose.covariance @ by_camera.T
     covariance = covariance + place_m**2 * np.eye(3)
-    limit = chi_square(problem.spec.false_alarm / 2 / parts, _FREEDOM)
-    missed = float(chndtr(limit, _FREEDOM, test))
+    limit = chi_square(problem.spec.false_alarm / 2 / parts, _FAULT_FREEDOM)
+    missed = float(chndtr(limit, _FAULT_FREEDOM, test))
     return FailedBar(problem.transmitters[bar], off_m, covariance, missed)
 
 

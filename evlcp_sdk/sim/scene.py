@@ -691,7 +691,7 @@ def _set(table: dict[str, Any], key: str, value: Any) -> None:
     for holder in holders:
         if rest[0] == "link" and len(rest) > 1 and head in ("link", "bars"):
             _set_link(holder, rest[1:], value, key)
-        elif len(rest) == 1 and head in (rest[0], *_TABLES, *_LISTS):
+        elif len(rest) == 1 and head in (key, *_TABLES, *_LISTS):
             holder[rest[0]] = value
         else:
             raise ConfigError(f"--set {key}: unknown table{nearest(head, [*_TABLES, *_LISTS, 'link'])}")

@@ -347,7 +347,7 @@ class _Reader:
             raise InputError(f"{self._source}: {where}.symbols: missing")
         given, top = row["symbols"], len(link.codebook.codewords)
         wanted = f"packets of {frames} frames of {clusters} symbols, 0 to {top - 1}"
-        if given == []:
+        if isinstance(given, list) and not given:
             return np.empty((0, frames, clusters), np.int64)
         try:
             symbols = np.array(given)

@@ -1,7 +1,7 @@
 """What a law is, and how an algorithm is held against one."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
 from evlcp_sdk.errors import ConfigError
@@ -82,11 +82,13 @@ class Verdict:
         law: The law.
         status: Whether it was kept.
         detail: What was expected and found, or why the law was passed over; empty if it was kept.
+        fault: How it was broken, with where that was in the algorithm; None otherwise.
     """
 
     law: Law
     status: Status
     detail: str = ""
+    fault: LawError | None = field(default=None, compare=False)
 
 
 def expect(holds: object, what: str) -> None:
@@ -124,7 +126,9 @@ def judge(law: Law, subject: Subject, excuses: Mapping[str, str]) -> Verdict:
             return Verdict(law, "failed", f"excused ({reason}), but the law does not apply: {why}")
         return Verdict(law, "skipped", str(why))
     except LawError as fault:
-        return Verdict(law, "failed", str(fault)) if reason is None else Verdict(law, "excused", reason)
+        if reason is not None:
+            return Verdict(law, "excused", reason)
+        return Verdict(law, "failed", str(fault), fault)
     if reason is not None:
         return Verdict(law, "failed", f"excused ({reason}), but it holds: drop the excuse")
     return Verdict(law, "ok")

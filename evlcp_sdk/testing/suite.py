@@ -141,7 +141,7 @@ def _hold(law: Law, subject: Subject, excuses: Mapping[str, str]) -> None:
 
     verdict = judge(law, subject, excuses)
     if verdict.status == "failed":
-        raise LawError(verdict.detail)
+        raise verdict.fault or LawError(verdict.detail)
     if verdict.status == "excused":
         pytest.xfail(verdict.detail)
     if verdict.status == "skipped":

@@ -108,6 +108,16 @@ def test_what_is_refused_is_skipped_but_for_one_law() -> None:
     assert found["exact"].detail == "excused (because), but the law does not apply: refused: a panel only"
 
 
+def test_a_broken_law_says_where_the_algorithm_failed() -> None:
+    class Failing(Ranging):
+        def compile(self, *given: Any) -> Any:
+            raise KeyError("here")
+
+    (found,) = (one for one in check("ranging", Failing()) if one.law.name == "compiles")
+    assert found.fault is not None
+    assert isinstance(found.fault.__cause__, KeyError)
+
+
 def test_the_command_says_one_line_a_law(evlcp: Evlcp) -> None:
     done = evlcp("check", "ranging", "centroid")
     *lines, last = done.out.splitlines()

@@ -135,6 +135,9 @@ def test_equations_are_those_of_numerical_slopes() -> None:
         matrix / np.outer(scale, scale), slope.T @ slope / np.outer(scale, scale), atol=1e-3
     )
     np.testing.assert_allclose(side / scale, slope.T @ at_rest / scale, atol=2e-3)
+    # Without the bars' own, the step is that of all.
+    step = found.step(np.linalg.solve(*found.normal()))
+    np.testing.assert_allclose(matrix @ step / scale, side / scale, atol=1e-6 * np.abs(side / scale).max())
     assert found.cost == pytest.approx(at_rest @ at_rest, rel=1e-6)
     behind = dataclasses.replace(at, position=position + rotation @ np.array([0, 0, 100.0]))
     assert linearize(p, behind, 100.0) is None

@@ -610,6 +610,11 @@ def test_what_is_not_determined_is_refused() -> None:
     assert refused(solve_pose(seen(*POLES), CAMERA, None)) == "gravity-unknown"
     line = [(-4.0, 50.0, 4.5), (0.0, 50.0, 4.5), (4.0, 50.0, 4.5)]
     assert refused(solve_pose(seen(*line), CAMERA, None)) == "gravity-unknown"
+    # Hardly beside the line, and clearly.
+    line[1] = (0.0, 50.0, 4.54)
+    assert refused(solve_pose(seen(*line), CAMERA, None)) == "gravity-unknown"
+    line[1] = (0.0, 50.0, 4.9)
+    solved(solve_pose(seen(*line), CAMERA, None))
     # At the camera's own height, two bars leave a circle through them; ranges alone say where on it.
     level = views([bar((-3.0, 50.0, 0.0)), bar((3.0, 50.0, 0.0))], here, Attitude().rotation(), rng, 0.3)
     assert refused(solve_pose(level, CAMERA, LEVEL)) in ("uncertain", "not-determined", "two-solutions")

@@ -22,6 +22,7 @@ from evlcp_sdk.sim import (
     Simulation,
     load_scene,
     scene_of_truth,
+    simulate,
     simulation,
     truth_of,
 )
@@ -53,6 +54,9 @@ def test_threads_pieces_and_runs_do_not_matter() -> None:
     assert (np.diff(events.t_us) >= 0).all()
     assert same(events, every(SHORT))
     assert same(events, every(SHORT, threads=3))
+    pieces = list(simulate(SHORT, max_events=777))
+    assert max(map(len, pieces)) == 777
+    assert same(events, Events.concat(pieces))
     assert not same(events, every(SHORT, seed=1))
 
 

@@ -2,7 +2,7 @@
 
 import math
 import pickle
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +27,7 @@ from evlcp_sdk.sim import (
     load_scene,
     resolve_scene,
     scene_of_truth,
+    scene_table,
     truth_of,
 )
 from evlcp_sdk.sim.light import BarLight
@@ -84,7 +85,7 @@ def test_a_bar_lays_its_tables_over_the_scene_s(tmp_path: Path) -> None:
     for name in ("scene", "common", "other"):
         (tmp_path / f"{name}.toml").unlink()
     assert links_of(pickle.loads(pickle.dumps(scene))) == links_of(scene)
-    assert resolve_scene(asdict(scene)) == scene
+    assert resolve_scene(scene_table(scene)) == scene
     assert links_of(scene_of_truth(truth_of(scene).to_table())) == links_of(scene)
 
 

@@ -74,6 +74,7 @@ def test_every_fault_is_told() -> None:
     [
         ("nonsense", "expected table.key=value"),
         ("mation.x=1", "unknown table; did you mean 'motion'?"),
+        ("seed.seed=5", "unknown table"),
         ("bars.7.ppm=1", "there are 1 bars"),
     ],
 )
