@@ -647,7 +647,8 @@ def emulate(
     emulator: Annotated[
         Emulator,
         typer.Argument(
-            help="native: a program; qemu: an ARM image; stm32: the image as flashed; rom: a part to flash."
+            help="native: the firmware in this process; qemu: an ARM image; stm32: the image as flashed;"
+            " rom: a part to flash."
         ),
     ],
     listen: Annotated[
@@ -682,6 +683,8 @@ def emulate(
         host, _, number = place.rpartition(":")
         if not host or not re.fullmatch("[0-9]{1,5}", number) or not 1 <= int(number) <= 65535:
             raise ConfigError(f"--listen {listen}: expected tcp:HOST:PORT with a port from 1 to 65535")
+    if scheme == "unix" and not place:
+        raise ConfigError(f"--listen {listen}: expected unix:PATH")
     check_free(listen)
     if leds is not None:
         check_output(leds, regular=False)

@@ -52,7 +52,7 @@ class HostLine:
                 self._server = self._listen(scheme)
                 self.place = listen
         except OSError as fault:
-            raise ToolchainError(f"{listen}: no board can listen there: {fault.strerror}") from fault
+            raise ToolchainError(f"{listen}: no board can listen there: {fault.strerror or fault}") from fault
 
     def _listen(self, scheme: str) -> socket.socket:
         if scheme == "tcp":

@@ -1,12 +1,14 @@
 """The native board: the firmware compiled for this machine, whose chips fall due by the clock."""
 
+import os
+import stat
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import Outputs, output_fault
+from evlcp_sdk.files import Outputs, output_fault, read_whole
 from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.images import check_flash_file
@@ -28,15 +30,15 @@ class _Rated:
 
     def pass_on(self, data: bytes) -> bytes:
         """What has passed the line by now."""
-        self.waiting += data
         now_s = time.monotonic()
         self.room += (now_s - self.at_s) * self.baud / 10
         self.at_s = now_s
+        if not self.waiting:
+            self.room = min(self.room, 2.0)
+        self.waiting += data
         count = min(len(self.waiting), int(self.room)) if self.baud else len(self.waiting)
         self.room -= count
         passed, self.waiting = self.waiting[:count], self.waiting[count:]
-        if not self.waiting:
-            self.room = min(self.room, 2.0)
         return passed
 
 
@@ -64,13 +66,13 @@ class NativeBoard:
         if flash is not None:
             check_flash_file(flash)
             if flash.is_file():
-                self._held = flash.read_bytes()
-                if len(self._held) != len(self._device.flash()):
-                    raise InputError(f"{flash}: not a flash file of {len(self._device.flash())} bytes")
-                self._device.set_flash(self._held)
-            self._store()  # a place that takes no SAVE is known now
+                held = read_whole(flash)
+                if len(held) != len(self._held):
+                    raise InputError(f"{flash}: not a flash file of {len(self._held)} bytes")
+                self._device.set_flash(held)
+            self._store(self._device.flash())  # a place that takes no SAVE is known now
         try:
-            self._leds = None if leds is None else leds.open("wb", buffering=0)
+            self._leds = None if leds is None else leds.open("wb")
         except OSError as fault:
             raise output_fault(leds or "", fault) from fault
         self._to_board, self._to_host = _Rated(baud), _Rated(baud)
@@ -86,12 +88,12 @@ class NativeBoard:
             self._device.run(0)
         # Before the answer to a SAVE goes out, the slots are in the file.
         if self._flash is not None and (held := self._device.flash()) != self._held:
-            self._held = held
-            self._store()
+            self._store(held)
         records = self._device.take_records()
         if self._leds is not None:
             try:
                 self._leds.write(records.tobytes())
+                self._leds.flush()
             except OSError as fault:
                 raise output_fault(self._leds.name, fault) from fault
         return self._to_host.pass_on(self._device.sent())
@@ -101,12 +103,19 @@ class NativeBoard:
         if self._leds is not None:
             self._leds.close()
 
-    def _store(self) -> None:
-        """A new file takes the place of the old one when it is whole; a link stays one."""
+    def _store(self, held: bytes) -> None:
+        """A new file takes the place of the old one when it is whole; a link stays one.
+
+        It may hold a key: it is as private as the old one was, and at first for its owner alone.
+        """
         if self._flash is not None:
-            with Outputs() as outputs:
-                outputs.open_binary(self._flash).write(self._held)
+            with Outputs() as outputs, outputs.told(self._flash):
+                mode = stat.S_IMODE(self._flash.stat().st_mode) if self._flash.exists() else 0o600
+                file = outputs.open_binary(self._flash)
+                os.fchmod(file.fileno(), mode)
+                file.write(held)
                 outputs.commit()
+        self._held = held
 
 
 class NativeLine:

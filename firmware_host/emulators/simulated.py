@@ -1,4 +1,4 @@
-"""The firmware in this process, in virtual time: for tests of hosts, links and chip streams."""
+"""The firmware in this process, in virtual time: under `native:`, and for tests."""
 
 import ctypes
 from functools import cache

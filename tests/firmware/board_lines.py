@@ -36,6 +36,7 @@ class Native:
     def end(self) -> None:
         self.ended.set()
         self.thread.join(10)
+        assert not self.thread.is_alive()
         self.line.close()
         self.board.close()
 

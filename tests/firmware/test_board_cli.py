@@ -406,6 +406,16 @@ def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path: Path, option: st
     assert path.read_text() == "mine"
 
 
+@pytest.mark.parametrize(
+    ("place", "code", "says"),
+    [("unix:", 2, "expected unix:PATH"), ("unix:" + "x" * 200, 1, "AF_UNIX path too long")],
+)
+def test_a_place_where_no_emulator_can_listen(evlcp, place: str, code: int, says: str) -> None:
+    done = evlcp("board", "emulate", "native", "--listen", place)
+    assert (done.code, done.err.count("\n")) == (code, 1)
+    assert says in done.err
+
+
 def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
     flash, place = tmp_path / "flash.bin", f"unix:{tmp_path / 'board'}"
     payload = Bank.of_symbols(random_symbols(1, 10, book, np.random.default_rng(0)), book)
@@ -420,6 +430,8 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
             emulated.end()
 
     with started() as (emulated, board):
+        assert flash.stat().st_mode & 0o777 == 0o600  # it may hold a key
+        flash.chmod(0o640)
         board.program(payload)
         for number in range(1, 6):
             with flash.open("rb") as old:
@@ -429,6 +441,7 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path, book: Codebook) -> None:
                 assert old.read() == before
             assert flash.read_bytes() != before
         saved = flash.read_bytes()
+        assert flash.stat().st_mode & 0o777 == 0o640
         # The system takes no more in the middle of the next write.
         resource.prlimit(emulated.process.pid, resource.RLIMIT_FSIZE, (40_000, 40_000))
         with pytest.raises(LineError):

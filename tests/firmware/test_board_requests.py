@@ -41,6 +41,7 @@ from firmware_host.protocol.generated.requests import (
     WriteRequest,
 )
 from firmware_host.protocol.wire import WireRequest
+from tests.firmware.wire_vectors import read_vectors
 
 pytestmark = pytest.mark.usefixtures("compiler")
 
@@ -121,6 +122,26 @@ def test_the_line_counts_what_it_drops(wire: Wire) -> None:
     wire.device.run(0)
     wire.device.receive(b"\0")
     assert wire.status().overflow_errors == 100
+
+
+def test_a_board_takes_the_golden_wires_and_no_noise(wire: Wire) -> None:
+    requests = [one for one in read_vectors() if not one.datagram.type & REPLY_BIT]
+    for one in requests:
+        wire.device.receive(one.wire)
+        wire.device.run(0)
+    found = [reply.type for reply in DatagramDecoder().feed(wire.device.sent())]
+    assert found == [one.datagram.type | REPLY_BIT for one in requests]
+    wire.hello(7)
+    before = wire.status()
+    assert (before.crc_errors, before.framing_errors) == (0, 0)
+    rng = np.random.default_rng(1)
+    for length in rng.integers(1, 700, 1000).tolist():
+        wire.device.receive(rng.bytes(length) + b"\0")
+        wire.device.run(0)
+        wire.device.sent()
+    after = wire.status()
+    assert after.crc_errors + after.framing_errors >= 1000
+    assert after.state == before.state
 
 
 def test_sessions(wire: Wire) -> None:

@@ -1,4 +1,4 @@
-"""The golden wire vectors: datagrams and their bytes on the wire, read by the host's and by the C tests.
+"""The golden wire vectors: datagrams and their bytes on the wire, read by tests of host and board.
 
 Lines `name type status sequence session payload wire`, numbers and bytes in hex, `-` for no payload.
 """

@@ -14,7 +14,7 @@
 
 struct native {
     struct evlcp core;
-    uint64_t now;       /* ticks since the process began */
+    uint64_t now;       /* ticks since it was made */
     uint64_t reset_at;  /* ticks at the last reset */
     uint64_t due;       /* next chip */
     uint32_t period;    /* ticks a chip; 0: no chips */
