@@ -433,7 +433,7 @@ def convert(
     counts = {"events": 0, "triggers": 0}
     with open_until(source, registry, stopped) as opened:
         width, height = size or (opened.width, opened.height)
-        with open_writer(out, width, height, format) as writer:
+        with open_writer(out, width, height, format, registry=registry) as writer:
             try:
                 for events, triggers in pieces_until(opened, stopped):
                     writer.write(events, triggers)

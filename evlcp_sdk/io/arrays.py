@@ -3,7 +3,7 @@
 import math
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import IO, Any, Final, Literal, Protocol
@@ -22,6 +22,8 @@ _LOOKED_AT: Final = 1 << 14
 
 _TRIGGER_ROWS: Final = 1 << 12
 _MOST_COLUMNS: Final = 8
+_MOST_ITEM_BYTES: Final = 1 << 12
+"""Bytes of a value or a record: more are no event's."""
 
 
 class Array(Protocol):
@@ -96,7 +98,8 @@ def choose_columns(
     """
     found = fields or fields_of(names)
     if found is None and len(names) == 2:
-        found = _fields_of([ArrayColumn(name, array(name)) for name in names])
+        with suppress(InputError):  # beside a table, something else
+            found = _fields_of([ArrayColumn(name, array(name)) for name in names])
     if found is None or max(found.which) >= len(names):
         columns, found = _choose_table(path, names, array, fields, hint)
     else:
@@ -185,14 +188,16 @@ class Stored:
         self._name, self._opened = name, opened
         shape, on_end, self.dtype = self._open()
         self.shape = (shape[0] * shape[1],) if len(shape) == 2 and 1 in shape else shape
-        if self.dtype.hasobject or min(shape, default=0) < 0:
+        if self.dtype.hasobject or self.dtype.itemsize > _MOST_ITEM_BYTES or min(shape, default=0) < 0:
             raise InputError(f"{name}: found {self.dtype} {shape}, expected numbers (n,)")
         self._whole: NDArray[Any] | None = None
-        if len(self.shape) == 2 and (on_end or shape[0] < shape[1]):
+        # No table has more columns.
+        if len(self.shape) == 2 and min(shape) <= _MOST_COLUMNS and (on_end or shape[0] < shape[1]):
             order: Literal["F", "C"] = "F" if on_end else "C"
-            data = self._file.read()
-            if len(data) > math.prod(shape) * self.dtype.itemsize:
-                raise InputError(f"{name}: found {len(data)} bytes, expected {self.dtype} {shape}")
+            size = math.prod(shape) * self.dtype.itemsize
+            data = self._file.read(size + 1)
+            if len(data) > size:
+                raise InputError(f"{name}: found more than {size} bytes, expected {self.dtype} {shape}")
             values = self._values(data, math.prod(shape))
             self._whole = upright(values.reshape(shape, order=order))
             self.shape = self._whole.shape
@@ -226,6 +231,7 @@ class Stored:
         if self._whole is not None:
             return self._whole[first:last]
         if first != self._row:
+            self._file.close()
             self._open()
         width = self.shape[1] if len(self.shape) == 2 else 1
         many = (last - first) * width

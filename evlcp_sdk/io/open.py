@@ -5,7 +5,7 @@ import re
 from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final, TypeVar
 from urllib.parse import unquote
 
 from evlcp_sdk.errors import EvlcpError, InputError, StreamError
@@ -27,10 +27,15 @@ else:
     # What most runs do not read.
     camera, lists = (Late(f"evlcp_sdk.io.{name}") for name in ("camera", "lists"))
 
+T = TypeVar("T")
+
 WRITABLE: Final = {".raw": "EVT3", ".npz": "NPZ", ".csv": "CSV", ".csv.gz": "CSV"}
 
 STDIN: Final = "-"
 """What is opened as standard input."""
+
+_RECORDED: Final = ("", "file", "replay", "list", "bag", "hdf5")
+"""Schemes of what waits for its reader; what else a plugin opens may have a pace of its own."""
 
 _SCHEME: Final = re.compile(r"([A-Za-z][A-Za-z0-9+.-]+):")
 
@@ -43,8 +48,7 @@ def _scheme_of(url: str) -> str:
 
 def is_recording(url: Path | str) -> bool:
     """Whether a name is that of a recording, by what stands before its `:`."""
-    scheme, path = _scheme_of(str(url)), str(url).partition(":")[2].partition("?")[0]
-    return str(url) != STDIN and (not scheme or scheme in ("file", "replay", "list") or is_there(path))
+    return str(url) != STDIN and _scheme_of(str(url)) in _RECORDED
 
 
 def open_source(url: Path | str, registry: Registry | None = None) -> EventSource:
@@ -68,7 +72,9 @@ def open_source(url: Path | str, registry: Registry | None = None) -> EventSourc
     name = str(url)
     if _scheme_of(name) == "file":
         name = unquote(name.partition(":")[2].removeprefix("//"))
-    source = _ask_plugins(name, registry)
+        if name == STDIN or _scheme_of(name):
+            name = f"./{name}"  # a file's name, whatever it looks like
+    source = _ask(registry, "evlcp_open_events", EventSource, url=name)  # type: ignore[type-abstract]
     if source is not None:
         return source
     if name == STDIN:
@@ -96,22 +102,23 @@ _SCHEMES: Final[dict[str, Callable[[str], EventSource]]] = {
 }
 
 
-def _ask_plugins(url: str, registry: Registry) -> EventSource | None:
-    """The source that the first plugin gives; None where none knows the url. One that fails is left out."""
-    for impl in reversed(registry.hook.evlcp_open_events.get_hookimpls()):
+def _ask(registry: Registry, hook: str, kind: type[T], **given: Any) -> T | None:
+    """What the first plugin gives that knows what is asked for; None without. One that fails is left out."""
+    about = str(next(iter(given.values())))
+    for impl in reversed(getattr(registry.hook, hook).get_hookimpls()):
         try:
-            source: object = impl.function(*(url for _ in impl.argnames))
+            answer: object = impl.function(*(given[name] for name in impl.argnames))
         except EvlcpError:
             raise
         except (Exception, SystemExit) as fault:
             what = " ".join(f"{type(fault).__name__}: {fault}".split())
-            registry.leave_out(impl.plugin_name, f"evlcp_open_events({url!r}) fails: {what}")
+            registry.leave_out(impl.plugin_name, f"{hook}({about!r}) fails: {what}")
             continue
-        if isinstance(source, EventSource):
-            return source
-        if source is not None:
-            what = f"gave {type(source).__name__}, expected an EventSource"
-            registry.leave_out(impl.plugin_name, f"evlcp_open_events({url!r}) {what}")
+        if isinstance(answer, kind):
+            return answer
+        if answer is not None:
+            what = f"gave {type(answer).__name__}, expected an {kind.__name__}"
+            registry.leave_out(impl.plugin_name, f"{hook}({about!r}) {what}")
     return None
 
 
@@ -187,6 +194,7 @@ def open_writer(
     height: int | None = None,
     format: str | None = None,
     outputs: Outputs | None = None,
+    registry: Registry | None = None,
 ) -> EventWriter:
     """Create a recording to write piece by piece, a context manager.
 
@@ -197,6 +205,7 @@ def open_writer(
         format: `EVT3` (the default for `.raw`), `EVT2`, `BAG` (of ROS 2, by the extra `ros`), `NPZ` or `CSV`,
             whatever the file's name.
         outputs: The files that it comes into place with; None for alone, as soon as it is closed.
+        registry: The plugins that are asked for other formats; None for all that are installed.
 
     Raises:
         ConfigError: A package that a bag needs is not installed.
@@ -211,7 +220,8 @@ def open_writer(
         return CsvWriter(path, width, height, outputs)
     if name not in CODECS:
         given = {"path": Path(path), "width": width, "height": height, "format": format or ""}
-        writer: EventWriter | None = Registry.load().hook.evlcp_open_writer(**given, outputs=outputs)
+        registry = Registry.load() if registry is None else registry
+        writer = _ask(registry, "evlcp_open_writer", EventWriter, **given, outputs=outputs)  # type: ignore[type-abstract]
         if writer is not None:
             return writer
         found = f"format {format!r}" if format else f"suffix {suffix!r}"

@@ -176,6 +176,7 @@ class Registry:
             for name in names:
                 if self._manager.has_plugin(name):
                     self._manager.unregister(name=name)
+                self._owners.pop(name, None)
 
     def leave_out(self, plugin: str, reason: str) -> None:
         """Leave out a plugin whose answer to a hook cannot be used.

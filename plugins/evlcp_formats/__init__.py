@@ -14,8 +14,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.plugin.source import EventSource
     from evlcp_sdk.plugin.writer import EventWriter
 
-__all__ = ["evlcp_open_events", "evlcp_open_writer", "evlcp_sinks"]
-
 _OPENERS = {
     "bag": "evlcp_formats.bags:open_bag",
     "hdf5": "evlcp_formats.hdf5:open_hdf5",
@@ -29,26 +27,27 @@ _STARTS = {
     b"\x89HDF\r\n\x1a\n": "hdf5",
     # In which HDF5 begins later.
     b"MATLAB 7.3": "hdf5",
-    b"MATLAB ": "mat",
+    b"MATLAB 5.0": "mat",
 }
 _SUFFIXES = {".aedat4": "faery", ".aedat": "faery", ".dat": "faery", ".es": "faery", ".mat": "mat"}
 
 
-@hookimpl
+@hookimpl(trylast=True)
 def evlcp_open_events(url: str) -> "EventSource | None":
     """Open a file of one of these formats, by its first bytes or its suffix; or as `bag:` and the like."""
     scheme, colon, rest = url.partition(":")
     if not colon or is_there(url):
         return _open(url, _format_of(url))
+    scheme = scheme.lower()
     if scheme in ("bag", "hdf5"):
-        return _open(url, scheme)
+        return _open(f"{scheme}:{rest}", scheme)
     if scheme != "list":
         return None
     path = rest.rpartition("?")[0] or rest
     found = _format_of(path)
     if found == "hdf5":
         raise InputError(f"{path}: a file of MATLAB 7.3 or HDF5, expected to be named hdf5:{path}")
-    return _open(url, found) if found == "mat" else None
+    return _open(f"{scheme}:{rest}", found) if found == "mat" else None
 
 
 def _open(url: str, found: str) -> "EventSource | None":
@@ -78,7 +77,7 @@ def _format_of(name: str) -> str:
     return by_start or by_suffix
 
 
-@hookimpl
+@hookimpl(trylast=True)
 def evlcp_open_writer(
     path: Path, width: int | None, height: int | None, format: str, outputs: "Outputs | None"
 ) -> "EventWriter | None":

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import EvlcpError, InputError
 from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import RawSource, format_header
 from evlcp_sdk.io.urls import split_options
@@ -57,7 +57,14 @@ def open_bag(url: str) -> "BagSource":
         InputError: It is no bag, has no such topic, or other words than EVT3; or the extra `ros` is needed.
     """
     named, options = split_options(url, {"topic": str}) if url.startswith("bag:") else (url, {})
-    return BagSource(named.removeprefix("bag:"), options.get("topic"))
+    path = named.removeprefix("bag:")
+    try:
+        return BagSource(path, options.get("topic"))
+    except EvlcpError:
+        raise
+    except Exception as fault:
+        # A damaged bag makes a reader fail in any way.
+        raise InputError(f"{path}: a damaged bag: {type(fault).__name__}: {fault}") from fault
 
 
 class BagSource(RawSource):

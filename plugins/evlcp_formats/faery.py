@@ -11,7 +11,13 @@ from evlcp_sdk.io._sieve import Sieve
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.values import Events, Triggers
 
-_FORMATS: Final = {".aedat4": "AEDAT4", ".aedat": "AEDAT4", ".dat": "DAT", ".es": "ES"}
+_FORMATS: Final = {
+    ".aedat4": ("AEDAT4", "aedat"),
+    ".aedat": ("AEDAT4", "aedat"),
+    ".dat": ("DAT", "dat"),
+    ".es": ("ES", "es"),
+}
+"""Name of a format, and what `faery` calls it, by suffix."""
 
 UNKNOWN_SIZE = (0xFFFF, 0xFFFF)
 
@@ -30,7 +36,7 @@ class FaerySource(EventSource):
 
     def __init__(self, path: Path | str) -> None:
         target = Path(path)
-        name = _FORMATS[target.suffix.lower()]
+        name, kind = _FORMATS[target.suffix.lower()]
         if not target.is_file():
             raise InputError(f"{path}: {'not a file' if target.exists() else 'No such file or directory'}")
         try:
@@ -39,7 +45,6 @@ class FaerySource(EventSource):
             raise InputError(
                 f"{path}: reading {name} takes the package faery: pip install 'evlcp-sdk[faery]'"
             ) from error
-        kind = {"AEDAT4": "aedat", "DAT": "dat", "ES": "es"}[name]
         try:
             stream = faery.events_stream_from_file(target, dimensions_fallback=UNKNOWN_SIZE, file_type=kind)
             size = stream.dimensions()

@@ -90,7 +90,9 @@ class _DataSet:
         try:
             block = np.asarray(self._dataset[:, rows].T if self._on_its_side else self._dataset[rows])
         except Exception as fault:
-            raise InputError(f"{self._path}: row {rows.start + 1}: damaged: {one_line(fault)}") from fault
+            raise InputError(
+                f"{self._path}: row {(rows.start or 0) + 1}: damaged: {one_line(fault)}"
+            ) from fault
         return block.ravel() if len(self.shape) == 1 else block
 
 

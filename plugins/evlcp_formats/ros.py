@@ -1,12 +1,11 @@
 """Bags of ROS 2, written without ROS: one MCAP file, its messages packed by `rosbags`."""
 
-import importlib
 from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
 
-from evlcp_sdk.errors import ConfigError, StreamError
+from evlcp_sdk.errors import ConfigError, StreamError, import_extra
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.io.evt import EVT3, MAX_SIDE
 from evlcp_sdk.io.raw import RawEncoder, RawWriter
@@ -36,10 +35,7 @@ class RosBag:
     """
 
     def __init__(self, file: IO[bytes]) -> None:
-        try:
-            writer, typesys = (importlib.import_module(name) for name in ("mcap.writer", "rosbags.typesys"))
-        except ImportError as fault:
-            raise ConfigError("a bag of ROS 2 needs the extra: pip install 'evlcp-sdk[ros]'") from fault
+        writer, typesys = (import_extra(name, "ros") for name in ("mcap.writer", "rosbags.typesys"))
         self._store: Any = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
         for kind, text in _DEFINITIONS.items():
             self._store.register(typesys.get_types_from_msg(text, kind))

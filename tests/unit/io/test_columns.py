@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import open_source, read_events
 from evlcp_sdk.io.columns import PIECE_ROWS
 from evlcp_sdk.values import Events
@@ -275,3 +276,19 @@ def test_more_than_a_hundredth_dropped_is_no_whole_result(
     done = evlcp("receive", tmp_path / "a.csv", "-o", tmp_path / "out")
     assert done.code == 4
     assert "1600 events or words, 2.0%, were dropped" in " ".join((done.out + done.err).split())
+
+
+def test_beside_a_table_stands_what_is_none(events: Events, tmp_path: Path) -> None:
+    table = table_of(columns_of(events), "txyp", np.int64)
+    info, wide = np.array({"a": 1}, dtype=object), np.zeros((100, 4000), np.uint8)
+    for other in (info, wide, np.zeros((90, 60), order="F")):
+        np.savez(tmp_path / "a.npz", events=table, img=other)
+        same(tmp_path / "a.npz", events)
+
+
+def test_a_value_of_a_gigabyte_is_refused(tmp_path: Path) -> None:
+    with (tmp_path / "a.npy").open("wb") as file:
+        header = {"descr": "<U500000000", "fortran_order": False, "shape": (3,)}
+        np.lib.format.write_array_header_1_0(file, header)
+    with pytest.raises(InputError, match="expected numbers"):
+        read_events(tmp_path / "a.npy")

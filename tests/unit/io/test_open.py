@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import InputError, PluginWarning
-from evlcp_sdk.io import EventSource, open_source, read_events, write_events
+from evlcp_sdk.errors import InputError, PluginWarning, StreamError
+from evlcp_sdk.io import EventSource, open_source, open_writer, read_events, write_events
+from evlcp_sdk.io.open import is_recording
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.values import Events, Triggers
@@ -118,3 +119,63 @@ def test_a_camera_that_is_not_there_says_so() -> None:
 
     with pytest.raises(InputError, match=r"^cam:0: no camera is plugged in$"):
         open_source("cam:0", Registry.load(Unplugged()))
+
+
+def test_what_is_a_recording_waits_for_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "0").touch()
+    for name in ("a.raw", "file:a.raw", "replay:a.raw", "list:a.csv?unit=ms", "bag:none.mcap", "HDF5:a"):
+        assert is_recording(name), name
+    for name in ("-", "camera:", "cam:0", "tcp://127.0.0.1:1", "unix:0"):
+        assert not is_recording(name), name
+
+
+class OwnDat:
+    """Reads and writes a format that the SDK's own plugin would take."""
+
+    @hookimpl
+    def evlcp_open_events(self, url: str) -> Any:
+        return CameraSource() if url.endswith(".dat") else None
+
+    @hookimpl
+    def evlcp_open_writer(self, path: Path) -> Any:
+        if path.suffix == ".bad":
+            raise KeyError("no room")
+        return Events.empty() if path.suffix == ".odd" else None
+
+
+def test_a_strangers_plugin_comes_before_the_formats_of_ours(tmp_path: Path) -> None:
+    (tmp_path / "x.dat").write_bytes(bytes(64))
+    with open_source(tmp_path / "x.dat", Registry.load(OwnDat())) as source:
+        assert isinstance(source, CameraSource)
+
+
+@pytest.mark.parametrize(
+    ("suffix", "reason"),
+    [("bad", "fails: KeyError: 'no room'"), ("odd", "gave Events, expected an EventWriter")],
+)
+def test_a_writer_that_cannot_be_used_is_named(tmp_path: Path, suffix: str, reason: str) -> None:
+    registry = Registry.load(OwnDat())
+    with (
+        pytest.warns(PluginWarning, match=re.escape(reason)),
+        pytest.raises(StreamError, match=f"suffix '.{suffix}', expected"),
+    ):
+        open_writer(tmp_path / f"a.{suffix}", 8, 8, registry=registry)
+
+
+@pytest.mark.parametrize("name", ["-", "camera:", "tcp:x"])
+def test_after_file_stands_a_files_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_events(tmp_path / "a.raw", EVENTS, 1280, 720)
+    (tmp_path / "a.raw").rename(tmp_path / name)
+    with open_source(f"file:{name}") as source:
+        assert len(source.read()[0]) == 50
+
+
+def test_a_bad_bag_leaves_its_reader_in(tmp_path: Path) -> None:
+    registry = Registry.load()
+    (tmp_path / "bag" / "a.mcap").mkdir(parents=True)
+    for _ in range(2):
+        with pytest.raises(InputError, match="a damaged bag: IsADirectoryError"):
+            open_source(f"bag:{tmp_path / 'bag'}", registry)
+    assert not registry.broken

@@ -240,6 +240,7 @@ def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_parquet_imports_no_pandas(demo_raw: Path, tmp_path: Path) -> None:
     """Which takes 50 MB, and a second."""
     pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+    pytest.importorskip("pandas", reason="pandas is not installed, so that nothing could import it")
     code = (
         "import sys, pyarrow.parquet\n"
         "from evlcp_sdk.cli.main import main\n"
