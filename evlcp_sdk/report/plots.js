@@ -18,11 +18,12 @@ for (const [id, labels] of Object.entries(plots)) {
       if (away < least && !hidden.has(one[3])) { least = away; best = one; }
     }
     if (best === null) { hide(); return; }
-    const left = best[0] / 1000 * box.width, top = best[1] / 1000 * box.height;
+    const left = `${best[0] / 10}%`, top = best[1] / 1000 * box.height;
     tip.textContent = best[2];
     tip.hidden = at.hidden = false;
-    at.style.left = `${left}px`; at.style.top = `${top}px`;
-    tip.style.left = `${Math.max(0, Math.min(left + 12, box.width - tip.offsetWidth))}px`;
+    at.style.left = left; at.style.top = `${best[1] / 10}%`;
+    // By shares: both stay within the chart when the page becomes narrower under a pointer that rests.
+    tip.style.left = `max(0px, min(${left} + 12px, 100% - ${tip.offsetWidth}px))`;
     tip.style.top = `${top > tip.offsetHeight + 12 ? top - tip.offsetHeight - 10 : top + 12}px`;
   };
   area.addEventListener("pointermove", show);
