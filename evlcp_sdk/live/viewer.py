@@ -148,9 +148,12 @@ class Viewer:
                     for kind, line in self._serializer.take(frames=bool(self._browsers)):
                         self._tell(kind, line)
                     self._send_all()
-                # The last words.
-                await asyncio.sleep(2 / PICTURES_PER_S)
-                self._send_all()
+                # The last words, once a browser has shown what it was sent before.
+                for _ in range(round(_FINISH_S * PICTURES_PER_S / 2)):
+                    await asyncio.sleep(2 / PICTURES_PER_S)
+                    self._send_all()
+                    if not any(browser.waiting for browser in self._browsers):
+                        break
             finally:
                 self._serializer.leave()
                 await stop_listening(server)

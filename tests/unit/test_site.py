@@ -69,17 +69,15 @@ def test_the_site_is_whole_and_asks_no_other_server(tmp_path: Path) -> None:
         for width, dark in ((1280, False), (390, True)):
             browser.dress(width, dark=dark)
             browser.open(site / "index.html")
-            assert browser.value("document.documentElement.scrollWidth") <= width
+            assert browser.fits()
             shown = "getComputedStyle(document.body).backgroundColor.match(/\\d+/)[0] < 128"
             assert browser.value(shown) is dark
-            asked = [m["params"] for m in browser.heard if m.get("method") == "Network.requestWillBeSent"]
-            assert len(asked) > 5
-            assert all(a["request"]["url"].startswith(("file:", "data:")) for a in asked)
-        browser.say("Page.navigate", url=(site / "search.html").as_uri() + "?q=lean")
-        found = """new Promise(done => { const look = () => {
-            const links = [...document.querySelectorAll('#search-results li a')].map(a => a.href);
-            links.length > 2 ? done(links) : setTimeout(look, 50); }; look(); })"""
-        assert any("receiver.html" in link for link in browser.value(found))
+            assert len(browser.requests) > 5
+            assert all(url.startswith(("file:", "data:")) for url in browser.requests)
+        browser.open((site / "search.html").as_uri() + "?q=lean")
+        links = "[...document.querySelectorAll('#search-results li a')].map(a => a.href)"
+        browser.until(f"{links}.length > 2")
+        assert any("receiver.html" in link for link in browser.value(links))
 
 
 def test_every_fault_that_code_raises_is_in_the_index_of_messages(monkeypatch: pytest.MonkeyPatch) -> None:

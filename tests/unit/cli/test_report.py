@@ -3,7 +3,6 @@
 import json
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -141,18 +140,10 @@ def test_the_page_tells_everything(summary: Summary) -> None:
         assert 'href="data:,"' in tag or "href=" not in tag
 
 
-# A pointer that rests on the last point of every chart.
-REST = """for (const [id, labels] of Object.entries(plots)) {
-  const e = document.querySelector(`#${id} .area`), r = e.getBoundingClientRect();
-  const [x, y] = labels.reduce((a, b) => b[0] > a[0] ? b : a);
-  const at = {clientX: r.left + x / 1000 * r.width, clientY: r.top + y / 1000 * r.height};
-  e.dispatchEvent(new PointerEvent("pointermove", at));
-}"""
-
-
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) -> None:
     (tmp_path / "report.html").write_text(page(summary), encoding="utf-8")
+    (tmp_path / "compare.html").write_text(of_campaign(summary).to_html(), encoding="utf-8")
     with Browser(tmp_path / "profile") as browser:
         browser.open(tmp_path / "report.html")
         drawn = browser.value(
@@ -163,21 +154,21 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
         assert drawn["histogram"] == 4
         assert drawn["rmse"] > 4, "the paper's figures are missing"
         assert browser.value("document.querySelectorAll('table tr').length") > 20
-        for chart in CHARTS:
-            told = hovered(browser, chart)
-            assert "km/h" in told, f"{chart}: nothing is told where the pointer is"
+        plots = browser.value("plots")
         for width in (1280, 390):
             for dark in (False, True):
                 browser.dress(width, dark=dark)
-                if width == 1280:
-                    browser.value(REST)
                 for chart in CHARTS:
                     area = f"document.querySelector('#{chart} .area')"
                     room = browser.value(f"{area}.clientWidth")
                     assert 0.7 * width - 200 < room <= width - 20, f"{chart}: of {width} px"
                     ink = browser.value(f"getComputedStyle({area}.querySelector('.x')).color")
                     assert (int(re.findall(r"\d+", ink)[0]) > 128) is dark, f"{chart}: not for this scheme"
-                assert browser.value("document.documentElement.scrollWidth") <= width
+                # What is told of the last points of wide charts stays within those that become narrow.
+                assert browser.fits()
+                for chart in CHARTS if width == 1280 else ():
+                    told = browser.hover(chart, max(plots[chart]))
+                    assert "km/h" in told, f"{chart}: nothing is told where the pointer is"
         drawn_lines = (
             "[...document.querySelectorAll('#rmse .area path')].filter(e => e.checkVisibility()).length"
         )
@@ -187,19 +178,12 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
         assert browser.value("document.querySelectorAll('#rmse button[aria-pressed=false]').length") == 1
         browser.value("document.querySelector('#rmse button').click()")
         assert browser.value(drawn_lines) == before
-        asked = [
-            m["params"]["request"]["url"]
-            for m in browser.heard
-            if m.get("method") == "Network.requestWillBeSent"
-        ]
-        assert {url.split(":")[0] for url in asked} <= {"file", "data", "blob"}
-        wrong = [m for m in browser.heard if m.get("method") == "Runtime.exceptionThrown"]
-        assert wrong == []
-        (tmp_path / "compare.html").write_text(of_campaign(summary).to_html(), encoding="utf-8")
+        assert {url.split(":")[0] for url in browser.requests} <= {"file", "data", "blob"}
+        assert browser.faults == []
         browser.open(tmp_path / "compare.html")
         for width in (1280, 390):
             browser.dress(width, dark=True)
-            assert browser.value("document.documentElement.scrollWidth") <= width
+            assert browser.fits()
             bars = "[...document.querySelectorAll('.bar div')]"
             rooms = browser.value(f"{bars}.filter(e => e.checkVisibility()).map(e => e.clientWidth)")
             assert min(rooms) > 100
@@ -229,22 +213,3 @@ def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_pa
     assert off[1:5] == ("0 of 3", "2", "0.0%", "0")
     assert "<h2>Positions</h2>" in page(found)
     assert "| right | 2 of 2 | 0 | 100.0% |" in as_markdown(found)
-
-
-def hovered(browser: Browser, chart: str) -> str:
-    """What a chart tells when the pointer is on a dot of its first line."""
-    place: dict[str, Any] = browser.value(
-        f"(() => {{ const e = document.querySelector('#{chart} .area');"
-        " e.scrollIntoView({block: 'center'});"
-        f" const r = e.getBoundingClientRect(), t = plots['{chart}'].find(one => one[3] === 0);"
-        " return {x: r.left + t[0] / 1000 * r.width, y: r.top + Math.min(t[1] / 1000, 0.98) * r.height} })()"
-    )
-    browser.point_at(place["x"], place["y"])
-    tip = f"document.querySelector('#{chart} .tip')"
-    return str(
-        browser.value(
-            "new Promise(done => { const until = Date.now() + 1000; const look = () => {"
-            f" !{tip}.hidden || Date.now() > until ? done({tip}.hidden ? '' : {tip}.textContent)"
-            " : setTimeout(look, 30) }; look() })"
-        )
-    )

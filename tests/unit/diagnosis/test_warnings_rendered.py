@@ -1,28 +1,14 @@
 """Warnings of recordings that the simulator renders: of each fault the one that is meant, of none none."""
 
-from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import pytest
 
-import evlcp_sdk as evlcp
-from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.diagnosis.facts import Facts
-from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import find_warnings
-from evlcp_sdk.io import write_events
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.plugin.roles import Measure, Ranging
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.rx.limits import LIMITS
-from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.values import FrameView, Range
 
 Keys = dict[str, Any]
 
@@ -85,10 +71,6 @@ def test_a_link_that_is_not_the_senders(
     assert any(says in one["next_step"] for one in found)
 
 
-def test_a_readout_at_its_limit() -> None:
-    assert "saturated" in [one["code"] for one in warned(**{"sensor.cap_mev_s": 1.5})]
-
-
 def test_messages_that_cannot_be_read() -> None:
     """Another error correction than the sender's: its beacon comes again and again."""
     (one,) = warned(("error-correction.id=reed-solomon",), duration_s=0.2, **MESSAGES)
@@ -103,61 +85,6 @@ def test_a_bar_of_another_length() -> None:
     assert "25% too long" in found[0]["text"]
 
 
-def test_a_picture_that_is_upside_down(tmp_path: Path) -> None:
-    with rendered((), 0.12, {}) as source:
-        events, _ = source.read()
-    turned = type(events)(events.t_us, 1279 - events.x, 719 - events.y, events.p)
-    write_events(tmp_path / "turned.npz", turned, 1280, 720)
-    summary = receive_to_folder(tmp_path / "turned.npz", None)
-    assert [one["code"] for one in summary["warnings"]] == ["turned"]
-
-
-def test_events_that_are_of_no_pixel(tmp_path: Path) -> None:
-    """One event in a hundred lies beyond the sensor, as of another camera's or of a broken line."""
-    with rendered((), 0.12, {}) as source:
-        events, _ = source.read()
-    x = events.x.copy()
-    x[::100] += 1280
-    write_events(tmp_path / "beside.npz", type(events)(events.t_us, x, events.y, events.p), 2560, 720)
-    link = load_link()
-    with evlcp.open(tmp_path / "beside.npz") as beside:
-        receiver, tally = Receiver(link), RunTally(link.packet)
-        for packet in [*(p for e in beside.chunks() for p in receiver.feed(e)), *receiver.close()]:
-            tally.add(packet)
-    (one,) = find_warnings(Facts(link, tally, receiver.counts))
-    assert (one.code, "off sensor" in one.text) == ("dropped", True)
-
-
 def test_clusters_that_are_hidden() -> None:
     (one,) = warned(**{"bars.0.covered": [4, 5]})
     assert (one["code"], one["text"]) == ("clusters-hidden", "clusters never seen: 4, 5")
-
-
-@dataclass(frozen=True)
-class TooLong(Ranging):
-    """Distances an eighth too long."""
-
-    def compile(self, camera: CameraModel, bar: BarLayout, codebook: Codebook) -> Measure:
-        measure = load_link().algorithm("ranging").compile(camera, bar, codebook)
-
-        def too_long(view: FrameView) -> Range:
-            found = measure(view)
-            return replace(found, distance_m=1.12 * found.distance_m)
-
-        return too_long
-
-
-def test_distances_that_are_not_those_of_the_bar() -> None:
-    link = load_link().with_algorithm("ranging", TooLong())
-    (one,) = receive_to_folder(rendered((), 0.12, {}), None, link)["warnings"]
-    assert (one["code"], "12% too long" in one["text"]) == ("size", True)
-
-
-def test_more_than_there_is_room_for() -> None:
-    link = load_link()
-    receiver, tally = Receiver(link, limits=replace(LIMITS, region_bytes=1 << 18)), RunTally(link.packet)
-    with rendered((), 0.12, {}) as source:
-        for packet in [*(p for e in source.chunks() for p in receiver.feed(e)), *receiver.close()]:
-            tally.add(packet)
-    found = {one.code: one for one in find_warnings(Facts(link, tally, receiver.counts))}
-    assert "events of regions forgotten early" in found["no-room"].text

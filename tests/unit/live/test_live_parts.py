@@ -42,24 +42,6 @@ def test_each_listener_gets_its_kinds_and_its_queue() -> None:
     assert publisher.subscribe().ended
 
 
-def test_who_waits_is_woken_by_news_and_by_the_end() -> None:
-    publisher = Publisher()
-    mine = publisher.subscribe({"status"})
-    got: list[object] = []
-
-    def listen() -> None:
-        while not mine.ended:
-            got.extend(news.value for news in mine.take())
-
-    thread = threading.Thread(target=listen)
-    thread.start()
-    publisher.publish("status", 0.0, "a")
-    publisher.close()
-    thread.join(5)
-    assert not thread.is_alive()
-    assert got == ["a"]
-
-
 def test_quantiles_are_those_of_numpy_to_two_percent() -> None:
     rng = np.random.default_rng(1)
     delays_ms = rng.lognormal(0.5, 1.5, 5000)

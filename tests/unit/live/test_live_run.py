@@ -25,22 +25,10 @@ from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import live, receive
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
 from evlcp_sdk.utc import PulseClock
-from evlcp_sdk.values import Events, Frame, Triggers
+from evlcp_sdk.values import Events, Triggers
+from tests.unit.live.helpers import PATIENT, key
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
-PATIENT = Budget(waiting_ms=1e6, most_ms=1e7)
-
-
-def key(frame: Frame) -> tuple[Any, ...]:
-    distance = frame.range.distance_m
-    return (
-        frame.transmitter,
-        frame.packet,
-        frame.frame,
-        frame.t_us,
-        frame.soft.symbols.tolist(),
-        repr(distance),
-    )
 
 
 def gathered(subscription: Subscription) -> dict[str, list[Any]]:
@@ -232,15 +220,13 @@ def test_a_recording_is_replayed_at_its_own_pace(demo_raw: Path) -> None:
 
 
 def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
-    run = evlcp("live", f"replay:{demo_raw}?speed=20", "--json", "--waiting-ms", "100000")
+    run = evlcp("live", f"replay:{demo_raw}?speed=20", "--json-lines", "-", "--waiting-ms", "100000")
     assert run.code == 0
-    summary = json.loads(run.out)
+    *lines, summary = [json.loads(line) for line in run.out.splitlines()]
+    assert "frame" in {line["line"] for line in lines}
+    assert summary["line"] == "summary"
     assert summary["transmitters"]
     assert set(summary["live"]) == {"delays", "shed", "levels_s", "health", "unplugged"}
-    run = evlcp("live", f"replay:{demo_raw}?speed=20", "--json-lines", "-", "--waiting-ms", "100000")
-    lines = [json.loads(line) for line in run.out.splitlines()]
-    assert lines[-1]["line"] == "summary"
-    assert {"frame"} <= {line["line"] for line in lines}
     run = evlcp("live", "nowhere:1")
     assert run.code == 3
     assert "scheme 'nowhere', expected file:, replay:, " in run.err
@@ -258,8 +244,6 @@ def test_the_command(evlcp: Callable[..., Any], demo_raw: Path) -> None:
     ],
 )
 def test_what_is_wrong_with_a_replay_is_said(url: str, told: str, demo_raw: Path) -> None:
-    from evlcp_sdk.io import open_source
-
     with pytest.raises(InputError) as fault:
         open_source(url.format(demo_raw))
     assert told in str(fault.value)

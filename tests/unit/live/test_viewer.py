@@ -1,6 +1,5 @@
 """The web view: who may look on, what a browser gets and when, and what it shows."""
 
-import base64
 import csv
 import http.client
 import io
@@ -8,8 +7,8 @@ import json
 import math
 import struct
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -23,9 +22,7 @@ from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.air.kinds import TextKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
-from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.link.several import named_links
-from evlcp_sdk.live import Budget, Publisher
+from evlcp_sdk.live import Publisher, viewer
 from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.live.viewer import page
@@ -33,6 +30,7 @@ from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Events, Fix, ReceivedMessage, Triggers
+from tests.unit.live.helpers import LINKS, PATIENT, sender, until
 from tests.unit.report.test_pages import HOSTILE
 from tests.unit.results.test_positions import SITE, packets
 from tests.unit.study.browser import CHROMIUM, Browser
@@ -41,7 +39,6 @@ websockets = pytest.importorskip("websockets", reason="the extra live is not ins
 from websockets.exceptions import ConnectionClosedError, InvalidStatus  # noqa: E402
 from websockets.sync.client import ClientConnection, connect  # noqa: E402
 
-LINKS = named_links(load_link())
 FRAMES = [frame for packet in packets(3) for frame in packet.frames]
 
 
@@ -101,7 +98,7 @@ def unpacked(bundle: str | bytes) -> tuple[dict[str, Any], bytes]:
     return json.loads(bundle[4 : 4 + size]), bundle[4 + size :]
 
 
-def next_of(link: ClientConnection, timeout_s: float = 5.0) -> tuple[dict[str, Any], bytes]:
+def next_of(link: ClientConnection, timeout_s: float = 30.0) -> tuple[dict[str, Any], bytes]:
     link.send('{"next": true}')
     return unpacked(link.recv(timeout_s))
 
@@ -144,12 +141,12 @@ def test_who_may_look_on(stage: Stage) -> None:
     with pytest.raises(InvalidStatus, match="403"):
         connect(f"ws://{own}/wrong/live")
     with stage.connect(origin=f"http://{own}") as link:
-        assert json.loads(link.recv(5))["about"]["name"] == "a name"
+        assert json.loads(link.recv(30))["about"]["name"] == "a name"
 
 
 def test_a_credit_a_bundle(stage: Stage) -> None:
     with stage.connect() as link:
-        about = json.loads(link.recv(5))["about"]
+        about = json.loads(link.recv(30))["about"]
         assert (about["links"][""]["symbols"], about["may_record"]) == (64, False)
         assert len(about["links"][""]["cluster_colours"]) == 16
         stage.frame(0)
@@ -161,9 +158,12 @@ def test_a_credit_a_bundle(stage: Stage) -> None:
         assert told["symbols"] == FRAMES[0].soft.symbols.tolist()
         assert (head["picture"], picture) == (None, b"")
         link.send('{"next": true}')
-        time.sleep(0.15)  # A picture is drawn once one is asked for.
-        stage.picture(20_000)
-        head, picture = unpacked(link.recv(5))
+        picture = b""
+        # One is drawn once it is asked for.
+        while not picture:
+            stage.picture(20_000)
+            with suppress(TimeoutError):
+                head, picture = unpacked(link.recv(0.1))
         assert (head["news"], head["picture"]["t_us"]) == ([], 20_000)
         with Image.open(io.BytesIO(picture)) as shown:
             assert np.argwhere(np.array(shown)).tolist() == [[7, 5]]
@@ -173,9 +173,8 @@ def test_a_credit_a_bundle(stage: Stage) -> None:
 
 def test_one_that_stalls_costs_the_others_nothing(stage: Stage) -> None:
     with stage.connect() as stalled, stage.connect() as quick:
-        stalled.recv(5)
-        quick.recv(5)
-        began = time.monotonic()
+        stalled.recv(30)
+        quick.recv(30)
         seen = 0
         for n in range(6000):
             stage.frame(n)
@@ -185,7 +184,6 @@ def test_one_that_stalls_costs_the_others_nothing(stage: Stage) -> None:
                 assert head["dropped"] == 0
         while seen < 6000:
             seen += len(next_of(quick)[0]["news"])
-        assert time.monotonic() - began < 60
         head, _ = next_of(stalled)
         # The newest, and how many there were before them.
         assert (len(head["news"]), head["dropped"]) == (4000, 2000)
@@ -201,10 +199,13 @@ def test_what_was_before_is_told_to_who_comes_later(stage: Stage) -> None:
     given = Fix(6e3, *where, enu_m, unit, unit, 0.0, 0.0, 0.0, 1.0, (0,), verified=False)
     filtered = Place(6e3, *where, enu_m, unit, 1.0, 0.0, left_out=False, starts=True)
     stage.publisher.publish("fix", given.t_us, Placed(given, filtered))
-    time.sleep(0.2)
-    with stage.connect() as link:
-        link.recv(5)
-        lines = {(line["line"], line.get("refusal")): line for line in next_of(link)[0]["news"]}
+    # The second one comes when all of it has been told.
+    for _ in range(2):
+        lines: dict[tuple[str, str | None], dict[str, Any]] = {}
+        with stage.connect() as link:
+            link.recv(30)
+            while len(lines) < 3:
+                lines |= {(line["line"], line.get("refusal")): line for line in next_of(link)[0]["news"]}
     assert lines["fix", "misfit"]["latitude_deg"] is None
     assert lines["fix", ""]["track_m"] == [3.0, -20.0, -1.0]
     # The bar is at the origin of its own axes.
@@ -227,15 +228,14 @@ def test_a_message_that_cannot_be_shown_is_counted_and_said() -> None:
     with Services(Serving(view=True), publisher, LINKS, name="a name") as services:
         stage = Stage(publisher, services)
         with stage.connect() as link:
-            link.recv(5)
+            link.recv(30)
             for number, value in enumerate(("raises", math.nan, "read me")):
                 message = ReceivedMessage(
                     0, 0, 5.0, Message(2, 7, number, b"-"), Failing(), value, "unverified", ""
                 )
                 publisher.publish("message", 5.0, message)
             lines: list[dict[str, Any]] = []
-            until_s = time.monotonic() + 10
-            while "message" not in [line["line"] for line in lines] and time.monotonic() < until_s:
+            while "message" not in [line["line"] for line in lines]:
                 lines += next_of(link)[0]["news"]
         publisher.close()
     assert [line["count"] for line in lines if line["line"] == "untold"] == [1, 2]
@@ -249,10 +249,10 @@ def test_a_message_that_cannot_be_shown_is_counted_and_said() -> None:
 def test_browsers_only_look_on(stage: Stage) -> None:
     for said in ('{"record": true}', "{", '{"next": 2}', "[]", "x" * 5000):
         with stage.connect() as link:
-            link.recv(5)
+            link.recv(30)
             link.send(said)
             with pytest.raises(ConnectionClosedError, match=r"1008|1009"):
-                link.recv(5)
+                link.recv(30)
 
 
 def test_a_recording_is_what_came(tmp_path: Path) -> None:
@@ -262,17 +262,17 @@ def test_a_recording_is_what_came(tmp_path: Path) -> None:
     with Services(serving, publisher, LINKS, name="x") as services:
         stage = Stage(publisher, services)
         with stage.connect() as link:
-            link.recv(5)
+            link.recv(30)
             publish(publisher, 1_000)
             link.send('{"record": true}')
-            _until(lambda: publisher.wanted("events"))
+            until(lambda: publisher.wanted("events"))
             publish(publisher, 2_000)
             publisher.publish("triggers", 2_500, Triggers.of([2_500, 3_004], [0, 0], [1, 0]))
             publish(publisher, 3_000)
             link.send('{"record": false}')
-            _until(lambda: not publisher.wanted("events"))
+            until(lambda: not publisher.wanted("events"))
             publish(publisher, 4_000)
-            _until(lambda: any(folder.glob("live-*.raw")))
+            until(lambda: any(folder.glob("live-*.raw")))
             stage.frame(0)
             assert next_of(link)[0]["record"]["events"] == 20
         (path,) = folder.iterdir()
@@ -291,11 +291,11 @@ def test_what_was_recorded_stays_where_a_recording_has_to_end(
     recorder = Recorder(publisher, tmp_path, 1280, 720)
     recorder.start()
     publish(publisher, 2_000)
-    _until(lambda: recorder.state["events"] == 10)
+    until(lambda: recorder.state["events"] == 10)
     if why == "disk":
         monkeypatch.setattr("shutil.disk_usage", lambda _: SimpleNamespace(free=7_000_000))
     publish(publisher, 3_000 if why == "disk" else 1_000)
-    _until(lambda: not recorder.state["recording"])
+    until(lambda: not recorder.state["recording"])
     told = {"disk": "7 MB are left on the disk: expected 100", "clock": "event at 1000 us after 2009 us"}
     assert told[why] in recorder.state["fault"]
     with open_source(tmp_path / recorder.state["file"]) as source:
@@ -305,13 +305,6 @@ def test_what_was_recorded_stays_where_a_recording_has_to_end(
 def publish(publisher: Publisher, t_us: int) -> None:
     t = np.arange(t_us, t_us + 10)
     publisher.publish("events", t_us, Events.of(t, t % 1280, t % 720, t % 2))
-
-
-def _until(true: Callable[[], bool], most_s: float = 10.0) -> None:
-    until = time.monotonic() + most_s
-    while not true():
-        assert time.monotonic() < until
-        time.sleep(0.01)
 
 
 def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
@@ -326,53 +319,52 @@ def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> None:
-    """Two browsers and one that stalls: pictures change, numbers are those of frames.csv, links come back."""
-    publisher, summary = Publisher(), {}
+def test_a_browser_shows_what_the_files_say(
+    demo_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside one that stalls: a lost link comes back, pictures change, numbers are those of frames.csv."""
+    # A slow machine shows the last of it late.
+    monkeypatch.setattr(viewer, "_FINISH_S", 60.0)
+    publisher, summary, enough = Publisher(), {}, threading.Event()
+
+    def pieces() -> Iterator[bytes]:
+        """Yields the recording bit by bit, slowly until enough of it was seen."""
+        data = demo_raw.read_bytes()
+        for at in range(0, len(data), size := len(data) // 300):
+            yield data[at : at + size]
+            enough.wait(0.2)
+
     with (
         Services(Serving(view=True), publisher, LINKS, name=demo_raw.name) as services,
-        Browser(tmp_path / "a") as first,
-        Browser(tmp_path / "b") as second,
+        Browser(tmp_path / "profile") as browser,
         Stage(publisher, services).connect(),  # which never says that it is ready
+        sender(pieces()) as source,
     ):
         stage = Stage(publisher, services)
-        for browser, wide in ((first, 1280), (second, 390)):
-            browser.dress(wide, dark=wide == 390)
-            browser.open(stage.url)
-            _until(lambda browser=browser: browser.value("shown.connects") == 1)
+        browser.dress(390, dark=True)
+        browser.open(stage.url)
+        browser.until("shown.connects == 1")
+        browser.value("socket.close()")
+        browser.until("shown.connects == 2")
 
         def run() -> None:
-            summary.update(
-                live(
-                    f"replay:{demo_raw}?speed=0.05",
-                    tmp_path / "out",
-                    list(LINKS.values()),
-                    publisher=publisher,
-                    pictures=services.pictures,
-                    budget=Budget(waiting_ms=1e6, most_ms=1e7),
-                )
-            )
+            given: dict[str, Any] = {"publisher": publisher, "pictures": services.pictures, "budget": PATIENT}
+            summary.update(live(source, tmp_path / "out", list(LINKS.values()), **given, warm=False))
 
         runner = threading.Thread(target=run)
         runner.start()
-        images = set()
-        for _ in range(3):
-            before = first.value("shown.pictures")
-            _until(lambda before=before: first.value("shown.pictures") > before, 30)
-            images.add(first.value("document.querySelector('#image canvas').toDataURL()"))
-        assert len(images) == 3
-        # A link that is lost comes back.
-        first.value("socket.close()")
-        _until(lambda: first.value("shown.connects") == 2)
+        images = set[str]()
+        while len(images) < 3:
+            before = browser.value("shown.pictures")
+            browser.until(f"shown.pictures > {before}")
+            images.add(browser.value("document.querySelector('#image canvas').toDataURL()"))
+        enough.set()
         runner.join(60)
+        assert (summary["status"], summary["live"]["shed"]["too_late"]) == ("complete", 0)
+        assert "complete" in browser.until("document.querySelector('#alarm:not([hidden])')?.innerText")
         with (tmp_path / "out" / "frames.csv").open(newline="") as file:
             rows = list(csv.DictReader(file))
-        assert summary["status"] == "complete"
-        assert summary["live"]["shed"]["too_late"] == 0
-        _until(lambda: second.value("shown.frames") == len(rows))
-        time.sleep(0.3)
-        told = second.value("shown.last")
-        for row, frame in zip(rows, told, strict=True):
+        for row, frame in zip(rows, browser.value("shown.last"), strict=True):
             for name in ("transmitter", "packet", "frame"):
                 assert int(row[name]) == frame[name]
             assert float(row["t_us"]) == pytest.approx(frame["t_us"], abs=0.011)
@@ -380,29 +372,14 @@ def test_browsers_show_what_the_files_say(demo_raw: Path, tmp_path: Path) -> Non
             assert row["symbols"] == symbols
             distance = math.nan if frame["distance_m"] is None else frame["distance_m"]
             assert float(row["distance_m"] or "nan") == pytest.approx(distance, abs=1e-4, nan_ok=True)
-        row = "[...document.querySelector('#frames tr').cells]"
-        newest = second.value(f"{row}.map((cell) => cell.textContent).join(' ')").split()
+        cells = "[...document.querySelector('#frames tr').cells]"
+        newest = browser.value(f"{cells}.map((cell) => cell.textContent).join(' ')").split()
         last = rows[-1]
         assert newest[1:4] == [last["transmitter"], last["packet"], last["frame"]]
         assert newest[6:] == last["symbols"].split()
-        assert second.value("document.documentElement.scrollWidth") <= 390
-        assert "complete" in second.value("document.getElementById('alarm').innerText")
-        assert second.value("[-0.004, -0.5, 0, 12.25, -0].map((v) => digits(v, 2))") == [
-            "0.00",
-            "-0.50",
-            "0.00",
-            "12.25",
-            "0.00",
-        ]
-        faults = [m for b in (first, second) for m in b.heard if m["method"] == "Runtime.exceptionThrown"]
-        assert not faults
-        asked = [
-            m["params"]["request"]["url"]
-            for b in (first, second)
-            for m in b.heard
-            if m["method"] == "Network.requestWillBeSent"
-        ]
-        assert {url.split("/")[2] for url in asked if not url.startswith("data:")} <= {
-            f"127.0.0.1:{stage.port}"
-        }
-        assert base64.b64decode(second.screenshot()).startswith(b"\x89PNG")
+        assert browser.fits()
+        shown = browser.value("[-0.004, -0.5, 0, 12.25, -0].map((v) => digits(v, 2))")
+        assert shown == ["0.00", "-0.50", "0.00", "12.25", "0.00"]
+        assert not [m for m in browser.faults if m["method"] == "Runtime.exceptionThrown"]
+        asked = {url.split("/")[2] for url in browser.requests if not url.startswith("data:")}
+        assert asked <= {f"127.0.0.1:{stage.port}"}

@@ -225,47 +225,24 @@ def test_nothing_found_has_a_page(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs Chromium (Debian: apt-get install chromium)")
 def test_a_browser_shows_it_wide_and_narrow_light_and_dark(result: Path, tmp_path: Path) -> None:
+    plots = held((result / "report.html").read_text())["plots"]
     with Browser(tmp_path / "profile") as browser:
-        for width, scheme in ((1280, "light"), (390, "dark")):
-            browser.say(
-                "Emulation.setDeviceMetricsOverride",
-                width=width,
-                height=900,
-                deviceScaleFactor=1,
-                mobile=width < 500,
-            )
-            features = [
-                {"name": "prefers-color-scheme", "value": scheme},
-                {"name": "prefers-reduced-motion", "value": "reduce"},
-            ]
-            browser.say("Emulation.setEmulatedMedia", features=features)
+        for width, dark in ((1280, False), (390, True)):
+            browser.dress(width, dark=dark)
             browser.open(result / "report.html")
-            assert browser.value("document.documentElement.scrollWidth") <= width
+            assert browser.fits()
             paper = browser.value("getComputedStyle(document.body).backgroundColor")
-            assert (sum(map(int, re.findall(r"\d+", paper))) > 380) == (scheme == "light")
+            assert (sum(map(int, re.findall(r"\d+", paper))) < 380) is dark
             pictures = [picture(browser, chip) for chip in (0, 20, 20)]
             assert pictures[0] != pictures[1] == pictures[2]
             assert "chip 21 of 32, symbol, " in browser.value("document.querySelector('output').textContent")
-            assert (
-                hovered(browser, "distance-0", 10)
-                == held((result / "report.html").read_text())["plots"]["distance-0"][10][2]
-            )
+            dot = plots["distance-0"][10]
+            assert browser.hover("distance-0", dot) == dot[2]
             # The picture moves by itself until it is stopped.
             browser.value("document.querySelector('#motion button').click()")
-            moving = "document.querySelector('#motion input').value"
-            assert browser.value(
-                f"new Promise(done => {{ const at = {moving}, until = Date.now() + 5000; const look = () =>"
-                f" {moving} !== at || Date.now() > until ? done({moving} !== at) : setTimeout(look, 30);"
-                " look() })"
-            )
-            asked = [
-                m["params"]["request"]["url"]
-                for m in browser.heard
-                if m.get("method") == "Network.requestWillBeSent"
-            ]
-            assert {url.split(":")[0] for url in asked} <= {"file", "data"}
-            wrong = ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled")
-            assert [m for m in browser.heard if m.get("method") in wrong] == []
+            browser.until("document.querySelector('#motion input').value != 20")
+            assert {url.split(":")[0] for url in browser.requests} <= {"file", "data"}
+            assert browser.faults == []
 
 
 def picture(browser: Browser, chip: int) -> str:
@@ -274,23 +251,5 @@ def picture(browser: Browser, chip: int) -> str:
         browser.value(
             f"(() => {{ const s = document.querySelector('#motion input'); s.value = {chip};"
             " s.dispatchEvent(new Event('input')); return document.querySelector('canvas').toDataURL() })()"
-        )
-    )
-
-
-def hovered(browser: Browser, chart: str, number: int) -> str:
-    """What a chart tells when the pointer is on one of its dots."""
-    place = browser.value(
-        f"(() => {{ const e = document.querySelector('#{chart} .area');"
-        " e.scrollIntoView({block: 'center'});"
-        f" const r = e.getBoundingClientRect(), t = plots['{chart}'][{number}];"
-        " return {x: r.left + t[0] / 1000 * r.width, y: r.top + t[1] / 1000 * r.height} })()"
-    )
-    browser.point_at(place["x"], place["y"])
-    return str(
-        browser.value(
-            "new Promise(done => { const until = Date.now() + 3000; const look = () => {"
-            f" const t = document.querySelector('#{chart} .tip');"
-            " !t.hidden || Date.now() > until ? done(t.textContent) : setTimeout(look, 30) }; look() })"
         )
     )

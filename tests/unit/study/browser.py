@@ -4,6 +4,7 @@ import json
 import os
 import shutil
 import subprocess
+import time
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -45,7 +46,7 @@ class Browser:
         os.close(theirs_in)
         os.close(theirs_out)
         self._buffer = b""
-        self._number = 0
+        self._number = self._width = 0
         self._session: str | None = None
         self.heard: list[dict[str, Any]] = []
         targets = self.say("Target.getTargets")["targetInfos"]
@@ -82,31 +83,65 @@ class Browser:
         """Load a file, or what a server of this machine gives, and wait until it is there."""
         self.heard.clear()
         self.say("Page.navigate", url=place if isinstance(place, str) else place.as_uri())
-        while not any(m.get("method") == "Page.loadEventFired" for m in self.heard):
-            self.heard.append(self._read())
+        self.until("document.readyState === 'complete'")
 
     def dress(self, width: int, *, dark: bool) -> None:
-        """Show the page as wide as that, in light or in the dark."""
-        self.say(
-            "Emulation.setDeviceMetricsOverride", width=width, height=900, deviceScaleFactor=1, mobile=False
-        )
-        scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
-        self.say("Emulation.setEmulatedMedia", features=[scheme])
+        """Show the page as wide as that, in light or in the dark; narrow as a phone does."""
+        size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width < 500}
+        self.say("Emulation.setDeviceMetricsOverride", **size)
+        features = {"prefers-color-scheme": "dark" if dark else "light", "prefers-reduced-motion": "reduce"}
+        pairs = [{"name": name, "value": value} for name, value in features.items()]
+        self.say("Emulation.setEmulatedMedia", features=pairs)
+        self.until(f"matchMedia('(prefers-color-scheme: dark)').matches === {str(dark).lower()}")
+        # A blank page does not say that it is fit for a phone.
+        self.until(f"location.href === 'about:blank' || matchMedia('(width: {width}px)').matches")
+        self._width = width
 
     def value(self, expression: str) -> Any:
-        """What a JavaScript expression or promise gives."""
-        answer = self.say("Runtime.evaluate", expression=expression, returnByValue=True, awaitPromise=True)
+        """What a JavaScript expression gives."""
+        answer = self.say("Runtime.evaluate", expression=expression, returnByValue=True)
         assert "exceptionDetails" not in answer, answer
         return answer["result"].get("value")
 
-    def point_at(self, x: float, y: float) -> None:
-        """Move the mouse there."""
-        for dx in (-3, 0):
-            self.say("Input.dispatchMouseEvent", type="mouseMoved", x=x + dx, y=y)
+    def until(self, expression: str) -> Any:
+        """What it gives once that is true: however slow the machine is, it waits."""
+        end = time.monotonic() + 60
+        while not (found := self.value(expression)):
+            assert time.monotonic() < end, expression
+            time.sleep(0.02)
+        return found
 
-    def screenshot(self) -> str:
-        """A PNG of what is seen, base64."""
-        return str(self.say("Page.captureScreenshot")["data"])
+    def fits(self) -> bool:
+        """Whether the page is no wider than its window."""
+        return bool(self.value("document.documentElement.scrollWidth") <= self._width)
+
+    def hover(self, chart: str, label: list[Any]) -> str:
+        """What a chart tells when the pointer rests on one of its labels, of the page's `plots`."""
+        # The lowest ones stand on the axis.
+        x, y = label[0] / 1000, min(label[1] / 1000, 0.98)
+        return str(
+            self.value(
+                f"(() => {{ const area = document.querySelector('#{chart} .area');"
+                " area.scrollIntoView({block: 'center', behavior: 'instant'});"
+                " const box = area.getBoundingClientRect(), tip = area.querySelector('.tip');"
+                f" const at = [box.left + {x} * box.width, box.top + {y} * box.height];"
+                " const move = {clientX: at[0], clientY: at[1], bubbles: true};"
+                " document.elementFromPoint(...at).dispatchEvent(new PointerEvent('pointermove', move));"
+                " return tip.hidden ? '' : tip.textContent })()"
+            )
+        )
+
+    @property
+    def requests(self) -> list[str]:
+        """The addresses that the page has asked for."""
+        sent = [m["params"]["request"] for m in self.heard if m.get("method") == "Network.requestWillBeSent"]
+        return [one["url"] for one in sent]
+
+    @property
+    def faults(self) -> list[dict[str, Any]]:
+        """Exceptions of the page's scripts, and what the browser or they complain of."""
+        wrong = ("Runtime.exceptionThrown", "Log.entryAdded", "Runtime.consoleAPICalled")
+        return [m for m in self.heard if m.get("method") in wrong]
 
     def __enter__(self) -> Self:
         return self
