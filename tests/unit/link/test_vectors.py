@@ -86,14 +86,6 @@ def test_a_message_of_several_parts_is_followed_by_its_check() -> None:
         assert check == (struct.pack("<I", binascii.crc32(said)) if len(parts) > 1 else b"")
 
 
-def test_what_is_signed() -> None:
-    beacon = next(p for p in PACKETS if p["kind"] == "beacon")
-    payload = struct.pack("<qqiHHI", 35156789012, -136965432101, 52345, 12345, 250, 960) + b"lane 2"
-    assert beacon["part"] == payload.hex()
-    head = b"EVLCP beacon 1\0" + struct.pack("<II", 7, 1_800_000_000) + bytes.fromhex(beacon["codebook"])
-    assert VECTORS["signed_bytes"] == (head + payload).hex()
-
-
 def test_the_file_is_what_the_command_prints() -> None:
     """Protected packets, too: their code has its own tests."""
     scope: dict[str, Any] = {"__name__": "vectors"}

@@ -30,11 +30,7 @@ def boom(*_: object) -> Any:
 
 
 def heard(t_us: float, packet: int = 0, frame: int = 0, chip_us: float = 100.0, **soft: Any) -> DecodedFrame:
-    given = {
-        "symbols": np.array([65]),
-        "llr": np.ones((1, 8), np.float32),
-        "quality": 0.9,
-    }
+    given = {"symbols": np.array([65]), "llr": np.ones((1, 8), np.float32), "quality": 0.9}
     return DecodedFrame(packet, frame, t_us, t_us, chip_us, SoftSymbols(**given | soft))
 
 
@@ -59,46 +55,6 @@ class Steps:
 
 def at(state: int, *found: Any) -> Any:
     return state + 1, list(found)
-
-
-NAN = float("nan")
-COMPILES: dict[str, Any] = {
-    "compile fails": boom,
-    "compiles to five": lambda *_: 5,
-    "takes nothing": lambda: 5,
-    "step fails": lambda *_: Steps(boom),
-    "gives nothing": lambda *_: Steps(lambda n: None),
-    "gives five": lambda *_: Steps(lambda n: (n, 5)),
-    "gives fives": lambda *_: Steps(lambda n: at(n, 5)),
-}
-FRAMINGS: dict[str, Any] = COMPILES | {
-    "time is NaN": lambda *_: Steps(lambda n: at(n, heard(NAN))),
-    "LLR is NaN": lambda *_: Steps(lambda n: at(n, heard(n, llr=np.full((1, 8), NAN)))),
-    "LLR is int8": lambda *_: Steps(lambda n: at(n, heard(n, llr=np.ones((1, 8), np.int8)))),
-    "LLR of another shape": lambda *_: Steps(lambda n: at(n, heard(n, llr=np.ones((2, 9))))),
-    "symbol is none": lambda *_: Steps(lambda n: at(n, heard(n, symbols=np.array([256])))),
-    "frame is none": lambda *_: Steps(lambda n: at(n, heard(n, frame=20))),
-    "chip is negative": lambda *_: Steps(lambda n: at(n, heard(n, chip_us=-100.0))),
-    "goes back": lambda *_: Steps(lambda n: at(n, heard(n, packet=3), heard(n, packet=1))),
-    "counts five": lambda *_: Steps(at, 5),
-    "counts words": lambda *_: Steps(at, {"words": "many"}),
-}
-BOOKS: dict[str, Any] = {
-    "book fails": boom,
-    "book is five": lambda *_: 5,
-    "book of one": lambda *_: Codebook(
-        "one", np.ones(2, np.uint8), np.empty((1, 0), np.uint8), np.array([[0, 1]], np.uint8)
-    ),
-}
-WORDS: dict[str, Any] = {
-    "words fail": boom,
-    "words are none": lambda _: None,
-    "words are floats": lambda _: np.eye(8) / 2,
-    "words are NaN": lambda _: np.full((8, 4), NAN),
-    "words are flat": lambda _: np.zeros(8, np.uint8),
-    "words are alike": lambda _: np.array([[0, 1], [0, 1]], np.uint8),
-    "one word": lambda _: np.array([[0, 1]], np.uint8),
-}
 
 
 class OddPilots(Pilots):
@@ -141,74 +97,98 @@ class Late(NoData):
     """Fails at the first frame."""
 
 
-@dataclass(frozen=True)
-class NoTracker(Tracking):
-    """Compiles to nothing."""
-
-    def compile(self) -> Any:
-        return None
-
-
 def made(base: type, **methods: Any) -> Any:
     return dataclass(frozen=True)(type("Broken", (base,), methods | {"__doc__": "Broken."}))
 
 
-CLASSES: dict[tuple[str, str], Any] = {
-    **{("framing", name): made(Uart, compile=how) for name, how in FRAMINGS.items()},
-    **{("framing", name): made(Uart, codebook=how) for name, how in BOOKS.items()},
-    **{("detection", name): made(Detection, compile=how) for name, how in COMPILES.items()},
-    **{("modulation", name): made(Modulation, codewords=how) for name, how in WORDS.items()},
-    ("pilots", "odd"): PlainPilots,
-    ("ranging", "unfinished"): Unfinished,
-    ("ranging", "no data"): NoData,
-    ("ranging", "refuses"): Refuses,
-    ("ranging", "late"): Late,
-    ("tracking", "nothing"): NoTracker,
-}
-for (_role, _id), _class in CLASSES.items():
-    globals()[f"{_role} {_id}"] = _class
+def steps(gives: Callable[[int], Any], counts: Any = None) -> Callable[..., Steps]:
+    return lambda *_: Steps(gives, counts)
 
-STEP_FAULTS = {
-    "compile fails": "KeyError: 'boom' (test_broken_algorithms.py, line ",
-    "compiles to five": "gave int at compile(), expected an object with init() and step()",
-    "takes nothing": "TypeError: <lambda>() takes 0 positional arguments but ",
-    "step fails": "KeyError: 'boom' (test_broken_algorithms.py, line ",
-    "gives nothing": "gave NoneType at step(), expected the state and a list",
-    "gives five": "gave int, expected list",
+
+def frames(*faults: dict[str, Any]) -> Any:
+    """A framing that gives frames, each with something wrong."""
+    return made(Uart, compile=steps(lambda n: at(n, *(heard(**({"t_us": n} | fault)) for fault in faults))))
+
+
+def words(given: Any) -> Any:
+    return made(Modulation, codewords=lambda _: given)
+
+
+NAN = float("nan")
+LONE = np.array([[0, 1]], np.uint8)
+COMPILES: dict[str, tuple[Callable[..., Any], str]] = {
+    "compile fails": (boom, "KeyError: 'boom' (test_broken_algorithms.py, line "),
+    "compiles to five": (lambda *_: 5, "gave int at compile(), expected an object with init() and step()"),
+    "takes nothing": (lambda: 5, "TypeError: <lambda>() takes 0 positional arguments but "),
+    "step fails": (steps(boom), "KeyError: 'boom' (test_broken_algorithms.py, line "),
+    "gives nothing": (steps(lambda n: None), "gave NoneType at step(), expected the state and a list"),
+    "gives five": (steps(lambda n: (n, 5)), "gave int, expected list"),
 }
+FIVES = steps(lambda n: at(n, 5))
 CHIPS = "codebook codewords: expected a 2-D array of chips 0 and 1"
-SAYS: dict[tuple[str, str], str] = {
-    **{("framing", name): says for name, says in STEP_FAULTS.items()},
-    **{("detection", name): says for name, says in STEP_FAULTS.items()},
-    ("framing", "gives fives"): "gave int, expected DecodedFrame",
-    ("detection", "gives fives"): "gave int, expected Region",
-    ("framing", "time is NaN"): "gave t_us = nan, expected a number from ",
-    ("framing", "LLR is NaN"): "gave llr of other values, expected finite ones",
-    ("framing", "LLR is int8"): "gave llr of int8, expected floats",
-    ("framing", "LLR of another shape"): "gave llr of shape (2, 9), expected (1, 8)",
-    ("framing", "symbol is none"): "gave symbol 256, expected 0 to 255, or -1 for one not given",
-    ("framing", "frame is none"): "gave frame = 20, expected a number from 0 to 19",
-    ("framing", "chip is negative"): "gave chip_us = -100.0, expected a number from 50 to 200",
-    ("framing", "goes back"): "gave frame 0 of packet 1 behind frame 0 of packet 3, expected frames in order",
-    ("framing", "counts five"): "gave int, expected Mapping",
-    ("framing", "counts words"): "gave str for 'words' at counts(), expected whole numbers",
-    ("framing", "book fails"): "KeyError: 'boom'; ",
-    ("framing", "book is five"): "TypeError: gave int at codebook(), expected a Codebook; ",
-    ("framing", "book of one"): "ValueError: gave 1 codeword, expected two or more; ",
-    ("modulation", "words fail"): "KeyError: 'boom'; ",
-    ("modulation", "words are none"): CHIPS,
-    ("modulation", "words are floats"): CHIPS,
-    ("modulation", "words are NaN"): CHIPS,
-    ("modulation", "words are flat"): CHIPS,
-    ("modulation", "words are alike"): "codebook codewords: rows 0 and 1 are equal",
-    ("modulation", "one word"): "ValueError: gave 1 codeword, expected two or more; ",
-    ("pilots", "odd"): "codebook preamble: expected a 1-D array of chips 0 and 1",
-    ("ranging", "unfinished"): "TypeError: Can't instantiate abstract class Unfinished",
-    ("ranging", "no data"): "TypeError: ",
-    ("ranging", "refuses"): "KeyError: 'boom'; ",
-    ("ranging", "late"): "KeyError: 'boom' (test_broken_algorithms.py, line ",
-    ("tracking", "nothing"): "gave NoneType, expected Tracker; ",
+CASES: dict[tuple[str, str], tuple[Any, str]] = {
+    **{("framing", name): (made(Uart, compile=how), says) for name, (how, says) in COMPILES.items()},
+    **{("detection", name): (made(Detection, compile=how), says) for name, (how, says) in COMPILES.items()},
+    ("framing", "gives fives"): (made(Uart, compile=FIVES), "gave int, expected DecodedFrame"),
+    ("detection", "gives fives"): (made(Detection, compile=FIVES), "gave int, expected Region"),
+    ("framing", "time is NaN"): (frames({"t_us": NAN}), "gave t_us = nan, expected a number from "),
+    ("framing", "LLR is NaN"): (
+        frames({"llr": np.full((1, 8), NAN)}),
+        "gave llr of other values, expected finite ones",
+    ),
+    ("framing", "LLR is int8"): (
+        frames({"llr": np.ones((1, 8), np.int8)}),
+        "gave llr of int8, expected floats",
+    ),
+    ("framing", "LLR of another shape"): (
+        frames({"llr": np.ones((2, 9))}),
+        "gave llr of shape (2, 9), expected (1, 8)",
+    ),
+    ("framing", "symbol is none"): (
+        frames({"symbols": np.array([256])}),
+        "gave symbol 256, expected 0 to 255, or -1 for one not given",
+    ),
+    ("framing", "frame is none"): (frames({"frame": 20}), "gave frame = 20, expected a number from 0 to 19"),
+    ("framing", "chip is negative"): (
+        frames({"chip_us": -100.0}),
+        "gave chip_us = -100.0, expected a number from 50 to 200",
+    ),
+    ("framing", "goes back"): (
+        frames({"packet": 3}, {"packet": 1}),
+        "gave frame 0 of packet 1 behind frame 0 of packet 3, expected frames in order",
+    ),
+    ("framing", "counts five"): (made(Uart, compile=steps(at, 5)), "gave int, expected Mapping"),
+    ("framing", "counts words"): (
+        made(Uart, compile=steps(at, {"words": "many"})),
+        "gave str for 'words' at counts(), expected whole numbers",
+    ),
+    ("framing", "book fails"): (made(Uart, codebook=boom), "KeyError: 'boom'; "),
+    ("framing", "book is five"): (
+        made(Uart, codebook=lambda *_: 5),
+        "TypeError: gave int at codebook(), expected a Codebook; ",
+    ),
+    ("framing", "book of one"): (
+        made(Uart, codebook=lambda *_: Codebook("one", LONE[0], np.empty((1, 0), np.uint8), LONE)),
+        "ValueError: gave 1 codeword, expected two or more; ",
+    ),
+    ("modulation", "words fail"): (made(Modulation, codewords=boom), "KeyError: 'boom'; "),
+    ("modulation", "words are none"): (words(None), CHIPS),
+    ("modulation", "words are floats"): (words(np.eye(8) / 2), CHIPS),
+    ("modulation", "words are flat"): (words(np.zeros(8, np.uint8)), CHIPS),
+    ("modulation", "words are alike"): (
+        words(np.repeat(LONE, 2, 0)),
+        "codebook codewords: rows 0 and 1 are equal",
+    ),
+    ("modulation", "one word"): (words(LONE), "ValueError: gave 1 codeword, expected two or more; "),
+    ("pilots", "odd"): (PlainPilots, "codebook preamble: expected a 1-D array of chips 0 and 1"),
+    ("ranging", "unfinished"): (Unfinished, "TypeError: Can't instantiate abstract class Unfinished"),
+    ("ranging", "no data"): (NoData, "TypeError: "),
+    ("ranging", "refuses"): (Refuses, "KeyError: 'boom'; "),
+    ("ranging", "late"): (Late, "KeyError: 'boom' (test_broken_algorithms.py, line "),
+    ("tracking", "nothing"): (made(Tracking, compile=lambda self: None), "gave NoneType, expected Tracker; "),
 }
+for (_role, _id), (_class, _) in CASES.items():
+    globals()[f"{_role} {_id}"] = _class
 
 
 class Stranger:
@@ -216,7 +196,7 @@ class Stranger:
 
     @hookimpl
     def evlcp_algorithms(self) -> list[Algorithm]:
-        return [Algorithm(role, id, f"{HERE}:{role} {id}", 1, "broken") for role, id in CLASSES]
+        return [Algorithm(role, id, f"{HERE}:{role} {id}", 1, "broken") for role, id in CASES]
 
 
 @pytest.fixture(autouse=True)
@@ -246,20 +226,20 @@ def options(role: str, id: str) -> list[str]:
     return [part for one in settings for part in ("--set", one)]
 
 
-@pytest.mark.parametrize(("role", "id"), SAYS)
+@pytest.mark.parametrize(("role", "id"), CASES)
 def test_it_is_one_line(
     role: str, id: str, evlcp: Evlcp, lamp_raw: Path, demo_raw: Path, tmp_path: Path
 ) -> None:
     raw = lamp_raw if role in ("framing", "detection") else demo_raw
     done = evlcp("receive", raw, "-o", tmp_path / "out", *options(role, id))
     assert done.code == 2, done.err
-    assert done.err.startswith(f"evlcp: {role} algorithm '{id}': {SAYS[role, id]}"), done.err
+    assert done.err.startswith(f"evlcp: {role} algorithm '{id}': {CASES[role, id][1]}"), done.err
     assert done.err.count("\n") == 1
     assert f"try: evlcp check {role} {id}" in done.err
     assert "Traceback" not in done.err
 
 
-@pytest.mark.parametrize(("role", "id"), list(SAYS)[::4])
+@pytest.mark.parametrize(("role", "id"), list(CASES)[::4])
 def test_check_finds_it(role: str, id: str, evlcp: Evlcp) -> None:
     done = evlcp("check", role, id)
     assert done.code in (1, 2)

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
+from importlib.metadata import entry_points
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -53,9 +54,12 @@ class Owner(NamedTuple):
     version: str = "1.0"
 
 
-def install(monkeypatch: pytest.MonkeyPatch, *found: tuple[str, str, Callable[[], object]]) -> None:
-    """Let entry points be these: name, distribution, what loads the plugin."""
-    points = [
+def install(
+    monkeypatch: pytest.MonkeyPatch, *found: tuple[str, str, Callable[[], object]], beside: bool = False
+) -> None:
+    """Let entry points be these, or they beside the installed ones: name, distribution, what loads it."""
+    points: list[Any] = list(entry_points(group="evlcp")) if beside else []
+    points += [
         SimpleNamespace(name=name, value=f"{owner}:it", load=load, dist=Owner(owner))
         for name, owner, load in found
     ]
@@ -189,72 +193,62 @@ def test_a_plugin_that_fails_when_asked_is_left_out_from_then_on() -> None:
     assert registry.ask("evlcp_open_events", url="cam:0") == answers
 
 
-BROKEN_STRANGER = "plugin stranger of evlcp-stranger 2.0 is broken and left out"
+class Commands:
+    """A plugin that adds a command, and may fail behind that."""
 
-COMMANDS = """
-from evlcp_sdk.plugin.hooks import hookimpl
-@hookimpl
-def evlcp_register_commands(app):
-    def {name}({arguments}) -> None:
-        "Added."
-        print("done")
-    app.command()({name})
-    {then}
-"""
+    def __init__(self, command: Callable[..., None], fails: bool = False) -> None:
+        self.command, self.fails = command, fails
+
+    @hookimpl
+    def evlcp_register_commands(self, app: Any) -> None:
+        app.command()(self.command)
+        assert not self.fails, "by design"
+
+
+def mine() -> None:
+    print("done")
+
+
+def receive() -> None: ...
+
+
+def odd(x: "Nothing") -> None: ...  # type: ignore[name-defined]  # noqa: F821
 
 
 @pytest.mark.parametrize(
-    ("source", "reason"),
+    ("stranger", "reason"),
     [
-        ("import camera_driver_that_is_not_there", "cannot be imported: ModuleNotFoundError"),
-        (COMMANDS.format(name="mine", arguments="", then="1 / 0"), "fails: ZeroDivisionError"),
-        (
-            COMMANDS.format(name="mine", arguments="x: 'Nothing'", then=""),
-            "its commands cannot be built: NameError",
-        ),
-        (COMMANDS.format(name="receive", arguments="", then=""), "has the command 'receive', which is there"),
-        (COMMANDS.format(name="mine", arguments="", then=""), None),
+        (missing, "cannot be imported: ModuleNotFoundError"),
+        (lambda: Commands(mine, fails=True), "evlcp_register_commands() fails: AssertionError: by design"),
+        (lambda: Commands(odd), "its commands cannot be built: NameError"),
+        (lambda: Commands(receive), "has the command 'receive', which is there already"),
     ],
-    ids=["import", "register", "build", "twice", "good"],
 )
 def test_the_command_line_goes_on_without_a_broken_plugin(
-    source: str, reason: str | None, tmp_path: Path
+    stranger: Callable[[], object], reason: str, monkeypatch: pytest.MonkeyPatch, evlcp: Any
 ) -> None:
-    (tmp_path / "evlcp_stranger.py").write_text(source)
-    info = tmp_path / "evlcp_stranger-2.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: evlcp-stranger\nVersion: 2.0\n")
-    (info / "entry_points.txt").write_text("[evlcp]\nstranger = evlcp_stranger\n")
-
-    def run(*given: str) -> "subprocess.CompletedProcess[str]":
-        code = f"import sys; sys.path.insert(0, {str(tmp_path)!r})\n"
-        code += "from evlcp_sdk.cli.main import main; main()"
-        return subprocess.run(
-            [sys.executable, "-c", code, *given], capture_output=True, text=True, check=False
-        )
-
-    helped = run("--help")
-    assert helped.returncode == 0
-    assert "receive" in helped.stdout
-    assert ("mine" in helped.stdout) == (reason is None)
-    listed = run("plugins")
-    assert listed.returncode == 0
-    if reason is None:
-        assert helped.stderr == listed.stderr == ""
-        assert run("mine").stdout == "done\n"
-        return
-    for done in (helped, listed):
-        (line,) = done.stderr.splitlines()
-        assert line.startswith(
-            "evlcp: warning: plugin stranger of evlcp-stranger 2.0 is broken and left out: "
-        )
-        assert reason in line
-    asked = run("config", "--set", "ranging.id=mine")
-    assert asked.returncode == 2
-    _, fault = asked.stderr.splitlines()
+    install(monkeypatch, ("stranger", "evlcp-stranger", stranger), beside=True)
+    told = f"evlcp: warning: plugin stranger of evlcp-stranger 1.0 is broken and left out: {reason}"
+    for command in ("--help", "plugins"):
+        done = evlcp(command)
+        assert done.code == 0
+        assert done.err.startswith(told)
+        assert done.err.count("\n") == 1
+    assert "mine" not in evlcp("--help").out
+    asked = evlcp("config", "--set", "ranging.id=mine")
+    assert asked.code == 2
+    fault = asked.err.splitlines()[1]
     assert "no ranging algorithm named 'mine'" in fault
     # A plugin whose commands alone are broken still brings its algorithms.
-    assert (BROKEN_STRANGER in fault) == ("import" in reason)
+    assert ("is broken and left out" in fault) == (stranger is missing)
+
+
+def test_a_command_of_a_plugin_is_one_of_ours(monkeypatch: pytest.MonkeyPatch, evlcp: Any) -> None:
+    install(monkeypatch, ("stranger", "evlcp-stranger", lambda: Commands(mine)), beside=True)
+    done = evlcp("--help")
+    assert (done.code, done.err) == (0, "")
+    assert "mine" in done.out
+    assert evlcp("mine").out == "done\n"
 
 
 def test_broken_and_conflicting_plugins_are_listed(monkeypatch: pytest.MonkeyPatch, evlcp: Any) -> None:

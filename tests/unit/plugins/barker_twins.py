@@ -44,58 +44,6 @@ def raise_to_chance(counts, span, first, squares):
     return np.maximum(squares, 1 / np.maximum(seen, 1))
 
 
-def peaks(rho, first, guard, enough, outstands, least):
-    """Lags that are enough, and more than those before and no less than those after, one by one."""
-    found = []
-    for i, square in enumerate(enough):
-        lag = first + i
-        if rho[lag] < least and not rho[lag] >= max(outstands * np.sqrt(square), least / 2):
-            continue
-        before, after = rho[max(lag - guard, 0) : lag], rho[lag + 1 : lag + guard + 1]
-        if all(value < rho[lag] for value in before) and all(value <= rho[lag] for value in after):
-            found.append(lag)
-    return found
-
-
-def refine(counts, lag, chips, steps, pair, rising):
-    """Chip by chip and lag by lag, in plain loops."""
-    first, last = max(lag - steps, 0), min(lag + steps + 1, counts.shape[1] - steps * len(chips) + 1)
-    found = []
-    for count, sign in ((counts[1], 1), (counts[0], -1)):
-        values = np.zeros((len(chips) // pair, last - first))
-        for c, chip in enumerate(chips):
-            for i in range(last - first):
-                begin = first + i + steps * c
-                values[c // pair, i] += sign * chip * count[begin : begin + steps].sum()
-        found += [first + middle(values.sum(0)), jackknife([middle(values.sum(0) - one) for one in values])]
-    response = np.empty((len(rising), 2 * steps))
-    for e, i in np.ndindex(response.shape):
-        response[e, i] = counts[1][min(max(lag + steps * rising[e] + i - steps, 0), counts.shape[1] - 1)]
-    whole = response.sum(0)
-    return [*found, lag - steps + onset(whole), jackknife([onset(whole - one) for one in response])]
-
-
-def middle(fit):
-    top = max(fit)
-    if not top > 0:
-        return np.nan
-    weight = [max(value - 0.9 * top, 0.0) for value in fit]
-    return sum(w * i for i, w in enumerate(weight)) / sum(weight)
-
-
-def onset(response):
-    half = (sorted(response)[len(response) // 4] + max(response)) / 2
-    k = next(k for k, value in enumerate(response) if value >= half)
-    below = response[k - 1] if k > 0 else 0.0
-    return k - 0.5 + ((half - below) / (response[k] - below) if response[k] > below else 0.0)
-
-
-def jackknife(without):
-    without = [value for value in without if np.isfinite(value)]
-    mean = sum(without) / max(len(without), 1)
-    return (len(without) - 1) * sum((v - mean) ** 2 for v in without) / len(without) if without else 0.0
-
-
 def events_of(
     chips, rng, start_us=5000.0, ppm=0.0, delay_us=(20.0, 45.0), missing_off=0.0, per_edge=2, jitter_us=4.0
 ):

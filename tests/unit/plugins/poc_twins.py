@@ -76,13 +76,6 @@ def cut(image, at, rows, columns):
     return padded[top : top + rows, left : left + columns]
 
 
-def blob_size(cuts):
-    """Four times the mean distance from the middle, down and across."""
-    v, u = np.mgrid[: cuts.shape[1], : cuts.shape[2]]
-    off = [np.abs(v - cuts.shape[1] // 2), np.abs(u - cuts.shape[2] // 2)]
-    return [4 * np.average(np.broadcast_to(d, cuts.shape), weights=cuts) for d in off]
-
-
 def pairs_of(clusters, at_m):
     """All pairs of clusters, and their spacing."""
     first, second = np.triu_indices(len(clusters), 1)

@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
-from evlcp_kalman.tracking import KalmanTracking, NoTracking
+from evlcp_kalman.tracking import KalmanTracking
 from numpy.testing import assert_allclose
 from scipy import stats
 
-from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import Filter
-from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
 
 FRAME_US = 3460.0
 
@@ -106,16 +103,3 @@ def test_a_stray_position_is_no_jolt() -> None:
     measured[50] += (60.0, 0.0)
     errors = position_errors(measured, true)
     assert errors[:, 0].max() < 2
-
-
-def test_the_receiver_filters_only_when_asked() -> None:
-    assert NoTracking().compile().distance is None
-    for override, filtered in (("tracking.id=none", False), ("tracking.id=kalman", True)):
-        link = load_link(overrides=[override])
-        bar = IdealBar(random_symbols(link, 2), shake_px=10, shake_hz=12)
-        receiver = Receiver(link)
-        frames = [f for p in receiver.feed(ideal_events(link, bar)) + receiver.close() for f in p.frames]
-        assert len(frames) == 20
-        assert all((f.filtered is not None) == filtered for f in frames)
-        got = [f.soft.symbols.tolist() for f in frames]
-        assert got == bar.symbols.reshape(-1, 16).tolist()

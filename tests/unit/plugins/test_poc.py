@@ -7,7 +7,6 @@ from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
 from evlcp_poc.correlation import (
     blob_band,
-    blob_size,
     cut_maps,
     full_band,
     pair_shifts,
@@ -79,14 +78,6 @@ def test_what_has_no_phase_counts_for_nothing():
     # Of an even image, the mean alone.
     assert_allclose(found[0], 1 / 48, rtol=1e-6)
     assert not found[1].any()
-
-
-@pytest.mark.parametrize("shape", SHAPES)
-def test_size_of_blobs(shape):
-    rng = np.random.default_rng(shape[0])
-    cuts = (rng.random((5, *shape)) * (rng.random((5, *shape)) < 0.3)).astype(np.float32)
-    assert_allclose(blob_size(cuts), twins.blob_size(cuts), rtol=1e-6)
-    assert blob_size(np.zeros((2, *shape), np.float32)) == (0, 0)
 
 
 @pytest.mark.parametrize("seed", SEEDS)

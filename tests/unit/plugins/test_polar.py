@@ -146,21 +146,6 @@ def test_a_code_decodes_at_least_what_has_no_errors_or_is_refused(length: int, r
 # The decoder.
 
 
-@pytest.mark.parametrize(("n", "k"), [(8, 4), (8, 7), (16, 5), (16, 7), (32, 6)])
-def test_a_list_of_all_is_maximum_likelihood(n: int, k: int) -> None:
-    information = best_inputs(n, k)
-    inputs = np.zeros((1 << k, n), np.uint8)
-    inputs[:, information] = every_word(k)
-    codewords = (inputs @ matrix(n) % 2).astype(np.uint8)
-    rng = np.random.default_rng(n + k)
-    for _ in range(50):
-        llr = rng.normal(0.5, 1.0, n).astype(np.float32)
-        found, metric = decoded(llr, list_nodes(information), 1 << k)
-        wanted = discrepancy(llr, codewords)
-        assert_array_equal(found[0], codewords[wanted.argmin()])
-        assert_allclose(metric, np.sort(wanted), rtol=1e-5, atol=1e-5)
-
-
 def twin(llr: NDArray[np.float64], information: NDArray[np.bool_], size: int) -> list[tuple[float, Bits]]:
     """Successive-cancellation list decoding as it is defined: every LLR from the start, input by input."""
 

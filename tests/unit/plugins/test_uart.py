@@ -14,7 +14,7 @@ from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
 from evlcp_uart.decoder import Character
 from evlcp_uart.framing import Uart, read_characters
-from evlcp_uart.light import BEFORE, CONTEXTS, GAINS, TICKS, Light
+from evlcp_uart.light import BEFORE, CONTEXTS, TICKS
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
@@ -161,14 +161,11 @@ def test_times_that_are_coarse_are_read_in_any_pieces(
     assert [(one.t_us, one.value) for one in again] == [(one.t_us, one.value) for one in found]
 
 
-@pytest.mark.parametrize("seed", [12])
-def test_light_of_which_the_best_guess_is_an_illusion_is_read(seed: int) -> None:
+def test_light_of_which_the_best_guess_is_an_illusion_is_read() -> None:
     """Falls late by a fifth of a bit: characters a bit late explain more events, but no stop bits."""
-    text = b"Shall I compare thee to a summers day? Thou art more lovely and more temperate: rough winds do "
-    sent = list((text + b"shake the darling buds of May")[seed * 3 % 40 :][:80])
+    sent = list(b"y? Thou art more lovely and more temperate: rough winds do shake the darling bud")
     levels = levels_of(np.array(sent), 7, "even", 2)
-    rng = np.random.default_rng(seed)
-    events = seen(rng, levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
+    events = seen(np.random.default_rng(12), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
     found = read_characters(events.t_us - events.t_us[0], events.p, 504.0, Uart(7, "even", 2))
     assert [c.value for c in found][: len(sent) - 1] == sent[: len(sent) - 1]
 
@@ -208,37 +205,14 @@ def test_the_pause_tells_characters_of_a_recording_that_begins_within_a_packet()
         levels += [1] * 16 + levels_of(np.array(packet), 8, "even", 1)
     # From the last data bit of the 35 on.
     cut_bits = 16 + 3 * 11 + 8.7
+    dim = {"events": (20.0, 15.0), "late_us": (20.0, 10.0), "noise_hz": 0.0}
+    events = seen(np.random.default_rng(0), levels, 100.0, cut_bits=cut_bits, **dim)
     for pause_bits in (16, 9):
-        for seed in range(1):
-            events = seen(
-                np.random.default_rng(seed),
-                levels,
-                100.0,
-                events=(20.0, 15.0),
-                late_us=(20.0, 10.0),
-                noise_hz=0.0,
-                cut_bits=cut_bits,
-            )
-            found = read_characters(events.t_us, events.p, 1e4, Uart(8, "even", 1, pause_bits=pause_bits))
-            read = [c.value for c in found]
-            assert read[-15:] == [value for packet in packets[1:] for value in packet]
-            # By the wrong pause it is ambiguous, or another.
-            assert (175 in read) == (pause_bits == 16)
-
-
-@pytest.mark.parametrize(
-    ("data_bits", "parity", "stop_bits"), [(5, "none", 1), (8, "odd", 1), (9, "even", 2)]
-)
-def test_any_format_is_read(data_bits: int, parity: Parity, stop_bits: int) -> None:
-    rng = np.random.default_rng(data_bits)
-    sent = rng.integers(0, 1 << data_bits, 50)
-    levels = levels_of(sent, data_bits, parity, stop_bits)
-    uart = Uart(data_bits, parity, stop_bits)
-    book = uart.codebook(1)
-    np.testing.assert_array_equal(book.codewords[sent].ravel(), levels)
-    events = seen(rng, [1] * 20 + levels, 320.0)
-    found = read_characters(events.t_us, events.p, 3125.0, uart)
-    assert [c.value for c in found] == sent.tolist()
+        found = read_characters(events.t_us, events.p, 1e4, Uart(8, "even", 1, pause_bits=pause_bits))
+        read = [c.value for c in found]
+        assert read[-15:] == [value for packet in packets[1:] for value in packet]
+        # By the wrong pause it is ambiguous, or another.
+        assert (175 in read) == (pause_bits == 16)
 
 
 @cache
@@ -352,35 +326,6 @@ def test_evidence_of_a_bit_is_the_likelihood_of_its_counts() -> None:
         np.testing.assert_allclose(out[s], said - said[-1], atol=1e-9)
 
 
-def test_light_is_learned_as_it_is() -> None:
-    """From bits whose contexts are told; beside the rates and strengths that made their events."""
-    rng = np.random.default_rng(7)
-    rates = rng.gamma(0.5, 0.5, (CONTEXTS, 2, TICKS)) + 0.1
-    of = rng.integers(0, CONTEXTS, 20_000)
-    strong = rng.choice([0.5, 2.0], 20_000)
-    windows = rng.poisson(rates[of] * strong[:, None, None]).astype(np.float64)
-    known = np.eye(CONTEXTS)[of]
-    ones = np.ones(CONTEXTS)
-    light = Light(np.full_like(rates, windows.mean()), ones, np.ones((CONTEXTS, len(GAINS))))
-    for _ in range(12):
-        light = light.learn(windows, known, 0.0, 1.0)
-    mean = np.einsum("nc,npt->cpt", known, windows) / known.sum(0)[:, None, None]
-    # A tick is known to two bars of four ticks, one over the other.
-    bar = np.full(4, 0.25)
-    wide = np.pad(mean, ((0, 0), (0, 0), (3, 3)), mode="edge")
-    mean = np.apply_along_axis(np.convolve, 2, wide, np.convolve(bar, bar), "valid")
-    gains = light.gains / light.gains.sum(1, keepdims=True) @ GAINS
-    np.testing.assert_allclose(light.rates * gains[:, None, None], mean, atol=0.05, rtol=0.12)
-    found, _, _ = light.of_context(windows[:5])
-    shares = light.gains + 12 * np.array([0.02, 0.12, 0.2, 0.4, 0.2, 0.06])
-    rates = GAINS[:, None, None] * light.rates[:, None]
-    for window, likely in zip(windows[:5], found, strict=True):
-        poisson = (window * np.log(rates) - rates).sum((2, 3))
-        over = np.log(shares / shares.sum(1, keepdims=True)) + light.share * poisson
-        np.testing.assert_allclose(likely, np.logaddexp.reduce(over, 1))
-    assert light.explained(windows, known) > light.explained(windows, np.roll(known, 1, 1))
-
-
 @pytest.mark.parametrize(
     ("seed", "pause", "after_pause"), [(4, 0, 5.0), (4, 3, 2.0), (6, 3, 2.0), (6, 2, 4.5)]
 )
@@ -489,7 +434,12 @@ def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) 
 
 @pytest.mark.parametrize(
     ("data_bits", "parity", "stop_bits", "bit_hz", "mark_on"),
-    [(7, "even", 2, 3125.0, True), (8, "none", 1, 504.0, False)],
+    [
+        (7, "even", 2, 3125.0, True),
+        (8, "none", 1, 504.0, False),
+        (5, "none", 1, 3125.0, True),
+        (9, "odd", 2, 3125.0, False),
+    ],
 )
 def test_a_light_the_other_way_round_is_read_as_it_is(
     data_bits: int, parity: Parity, stop_bits: int, bit_hz: float, mark_on: bool
@@ -498,6 +448,7 @@ def test_a_light_the_other_way_round_is_read_as_it_is(
     sent = rng.integers(0, 1 << data_bits, 70)
     bit_us = 1e6 / bit_hz
     levels = levels_of(sent, data_bits, parity, stop_bits)
+    assert Uart(data_bits, parity, stop_bits).codebook(1).codewords[sent].ravel().tolist() == levels
     events = seen(rng, levels, bit_us, mark_on=mark_on, late_us=(40.0, 60.0), noise_hz=50.0)
     for idle in ("on", "off"):
         decoder = Uart(data_bits, parity, stop_bits, idle=idle).decoder(bit_hz)  # type: ignore[arg-type]

@@ -214,24 +214,6 @@ def bits_of(symbols, bits):
     return np.array([[int(b) for b in f"{s:0{bits}b}"] for s in symbols])
 
 
-@pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("silent", [None, 0, 1])
-def test_every_symbol_comes_back(profile, silent):
-    book = book_of(profile)
-    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS)))
-    decode = WhTransform().compile(book)
-    n = len(book.codewords)
-    for first in range(0, n, CLUSTERS):
-        symbols = np.arange(first, first + CLUSTERS) * 5 % n
-        sums = image_of(book.codeword_edges[symbols], range(CLUSTERS))
-        if silent is not None:
-            sums[silent::2] = 0
-        soft = decode(presence, framed(sums))
-        assert_array_equal(soft.symbols, symbols)
-        assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
-        assert soft.quality == pytest.approx(1, abs=1e-12)
-
-
 @pytest.mark.parametrize("symbols", [None, 6, 7])
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("seed", SEEDS)
@@ -252,21 +234,9 @@ def test_llr_is_the_brute_force_max_log(profile, seed, symbols):
     assert soft.quality < 0.99
 
 
-def test_a_dark_cluster_says_nothing():
-    book = book_of()
-    sums = image_of(book.codeword_edges[np.arange(CLUSTERS)], range(CLUSTERS))
-    presence = WhCorrelation().compile(book)(image_of(CODES, range(CLUSTERS)))
-    presence.probability[5] = 0
-    soft = WhTransform().compile(book)(presence, framed(sums))
-    assert_array_equal(soft.llr[5], np.zeros(6))
-    assert (soft.llr[np.arange(CLUSTERS) != 5] != 0).all()
-    assert_array_equal(np.delete(soft.symbols, 5), np.delete(np.arange(CLUSTERS), 5))
-
-
 @pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("positive_only", [False, True])
-def test_learned_likelihoods_decode_every_symbol(profile, positive_only):
-    """Also where negative events are not sent at all: silence after a rise says that it was a fall."""
+def test_learned_likelihoods_decode_every_symbol_without_negative_events(profile):
+    """Silence after a rise says that it was a fall."""
     book = book_of(profile)
     n = len(book.codewords)
     for first in range(0, n, CLUSTERS):
@@ -277,8 +247,7 @@ def test_learned_likelihoods_decode_every_symbol(profile, positive_only):
         # From values to edges: events come where the light changes, not while it stays.
         light = frame > 0
         frame[1:][light[1:] == light[:-1]] = 0
-        if positive_only:
-            frame = np.maximum(frame, 0)
+        frame = np.maximum(frame, 0)
         presence = WhCorrelation().compile(book)(frame[:16])
         soft = MlSoft().compile(book)(presence, frame)
         assert_array_equal(soft.symbols, symbols)
@@ -314,8 +283,8 @@ def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
 
 
 @pytest.mark.parametrize("profile", PROFILES)
-@pytest.mark.parametrize("right_down", [(0, 3), (0, -3), (3, 0), (-3, 0), (2, -3)])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("right_down", [(0, 3), (-3, 0), (2, -3)])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, seed):
     book = book_of(profile)
     symbols = np.random.default_rng(seed).integers(len(book.codewords), size=CLUSTERS)
@@ -335,8 +304,8 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
     assert_array_equal(find_path(matches, book.pilot_edges), path)
 
 
-@pytest.mark.parametrize("right_down", [(0, 6), (0, -6), (6, 0), (-6, 0), (5, -6), (0, 7)])
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("right_down", [(0, -6), (6, 0), (5, -6), (0, 7)])
+@pytest.mark.parametrize("seed", SEEDS)
 def test_a_bar_that_goes_farther_than_is_searched_is_searched_farther(right_down, seed):
     """At the border the path ends, and what lies beyond is read as the clusters beside."""
     book = book_of()
