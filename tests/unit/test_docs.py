@@ -152,7 +152,7 @@ def test_links_of_the_examples_are_links(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ALL, ids=lambda p: p.stem)
-def test_links_lead_somewhere(path: Path) -> None:
+def test_links_files_and_modules_that_a_page_names_exist(path: Path) -> None:
     for target in re.findall(r"\]\(([^)]+)\)", path.read_text()):
         if not target.startswith("http"):
             name, _, anchor = target.partition("#")
@@ -163,6 +163,11 @@ def test_links_lead_somewhere(path: Path) -> None:
                 assert anchor in [h.lower().replace(" ", "-") for h in heads], (
                     f"{path.name} links to {target}"
                 )
+    rooms = "evlcp_sdk|firmware_host|plugins|examples|tests|benchmarks|docs"
+    named = set(re.findall(rf"(?<![\w/.])(?:{rooms})/[\w./-]*[\w/](?!\w)", path.read_text()))
+    assert not [name for name in named if "NAME" not in name and not (ROOT / name).exists()]
+    for name in set(re.findall(r"\b(?:evlcp_\w+|firmware_host)(?:\.\w+)+", path.read_text())):
+        pkgutil.resolve_name(name)
 
 
 def test_the_message_that_is_shown_is_the_message(
@@ -279,19 +284,6 @@ def test_the_drawing_of_the_link_is_what_its_program_draws() -> None:
     assert (ROOT / "docs" / "images" / "link.svg").read_text(encoding="utf-8") == drawing()
     assert drawing().count(f">{TEXT}</text>") == 2
     fromstring(drawing())
-
-
-@pytest.mark.parametrize("path", ALL, ids=lambda p: p.stem)
-def test_files_of_the_repository_that_a_page_names_exist(path: Path) -> None:
-    rooms = "evlcp_sdk|firmware_host|plugins|examples|tests|benchmarks|docs"
-    named = set(re.findall(rf"(?<![\w/.])(?:{rooms})/[\w./-]*[\w/](?!\w)", path.read_text()))
-    assert not [name for name in named if "NAME" not in name and not (ROOT / name).exists()]
-
-
-@pytest.mark.parametrize("path", ALL, ids=lambda p: p.stem)
-def test_modules_that_a_page_names_exist(path: Path) -> None:
-    for name in set(re.findall(r"\b(?:evlcp_\w+|firmware_host)(?:\.\w+)+", path.read_text())):
-        pkgutil.resolve_name(name)
 
 
 def test_every_name_of_the_face_that_a_page_shows_exists() -> None:

@@ -107,23 +107,6 @@ def test_a_light_name_imports_no_kernels(name: str) -> None:
     assert not {"numba", "scipy", "evlcp_sdk.rx", "evlcp_sdk.sim", "matplotlib"} & more
 
 
-def test_what_is_composed_is_sent_and_received() -> None:
-    link = evlcp.load_link()
-    symbols = evlcp.compose(link, text="Tempo 30", transmitter_id=7, sequence=3)
-    scene = {
-        "name": "sent",
-        "duration_s": 0.12,
-        "motion": {"distance_m": 40.0},
-        "bars": [{"symbols": symbols.tolist()}],
-    }
-    source = evlcp.simulate(scene, seed=2)
-    assert np.array_equal(source.truth.bars[0].symbols[0], symbols[0])
-    messages = [m for packet in evlcp.receive(source, link) for m in packet.messages]
-    assert {(m.message.text, m.message.transmitter_id, m.message.sequence) for m in messages} == {
-        ("Tempo 30", 7, 3)
-    }
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -146,21 +129,12 @@ def test_a_simulation_is_a_source_like_a_recording(tmp_path: Path, evlcp: Any) -
     assert repr(source) == "SimulatedSource(night, 1 bar, 0.05 s, seed 4)"
     events, triggers = source.read()
     assert len(triggers) == 0
-    done = evlcp("simulate", "--preset", "night", "--seed", 4, "-o", tmp_path / "a.raw",
-                 *(word for s in settings for word in ("--set", s)))  # fmt: skip
-    assert done.code == 0
-    written = evlcp_sdk.read_events(tmp_path / "a.raw")
-    for column in ("t_us", "x", "y", "p"):
-        assert np.array_equal(getattr(events, column), getattr(written, column)), column
-    assert source.counts["events"] == source.counts["simulated_events"] == len(written)
-
-
-def test_a_simulation_is_saved_as_the_command_does(tmp_path: Path, evlcp: Any) -> None:
-    import evlcp_sdk
-
-    settings = ["duration_s=0.03", "motion.distance_m=70"]
+    assert source.counts["events"] == source.counts["simulated_events"] == len(events)
     source = evlcp_sdk.simulate("night", seed=4, overrides=settings)
     written = source.save(tmp_path / "a.raw")
+    recorded = evlcp_sdk.read_events(tmp_path / "a.raw")
+    for column in ("t_us", "x", "y", "p"):
+        assert np.array_equal(getattr(events, column), getattr(recorded, column)), column
     assert written == (tmp_path / "a.raw", tmp_path / "a.truth.json")
     done = evlcp("simulate", "--preset", "night", "--seed", 4, "-o", tmp_path / "b.raw",
                  *(word for s in settings for word in ("--set", s)))  # fmt: skip

@@ -7,6 +7,7 @@ import os
 import re
 import stat
 import threading
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -25,22 +26,33 @@ from evlcp_sdk.specs import read_toml
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("read", "content", "says"),
     [
-        (b"a = \n", r"a\.toml: not TOML: Invalid value \(at line 1"),
-        (b"a = '\xff'\n", r"a\.toml: at byte 5: not UTF-8 text"),
-        (b"a = " + 2000 * b"[", r"a\.toml: not TOML: "),
+        (read_toml, b"a = \n", "not TOML: Invalid value (at line 1"),
+        (read_toml, b"a = '\xff'\n", "at byte 5: not UTF-8 text"),
+        (read_toml, b"a = " + 2000 * b"[", "not TOML: "),
+        (read_csv, b"a\n\xff\n", "not a CSV file: "),
+        (read_csv, b'a,b\n"' + 140_000 * b"x" + b'",1\n', "not a CSV file: "),
+        (read_json, b"{", "not JSON: "),
+        (read_json, b'"\xff"', "not JSON: "),
+        (read_json, 200_000 * b"[", "not JSON: "),
     ],
 )
-def test_what_is_no_toml_is_one_line(content: bytes, says: str, tmp_path: Path) -> None:
-    (tmp_path / "a.toml").write_bytes(content)
-    with pytest.raises(ConfigError, match=says):
-        read_toml(tmp_path / "a.toml")
+def test_what_cannot_be_read_is_one_line(
+    read: Callable[[Path], object], content: bytes, says: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "a.txt"
+    fault = ConfigError if read is read_toml else InputError
+    with pytest.raises(fault, match=r"a\.txt: cannot be read: No such file"):
+        read(file)
+    file.write_bytes(content)
+    with pytest.raises(fault) as caught:
+        read(file)
+    assert str(caught.value).startswith(f"{file}: {says}")
+    assert "\n" not in str(caught.value)
 
 
-def test_what_cannot_be_read_is_told(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"b\.toml: cannot be read: No such file"):
-        read_toml(tmp_path / "b.toml")
+def test_a_folder_is_no_file(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"cannot be read: Is a directory"):
         read_toml(tmp_path)
 
@@ -270,26 +282,6 @@ def test_columns_that_are_missing_or_there_twice_are_told(tmp_path: Path) -> Non
     (tmp_path / "a.csv").write_text("t_s,x_m,x_m\n1,2,3\n")
     with pytest.raises(ConfigError, match=r"a\.csv: line 1: 2 columns x_m: expected one"):
         read_csv(tmp_path / "a.csv")
-
-
-@pytest.mark.parametrize("content", [b"a\n\xff\n", b'a,b\n"' + 140_000 * b"x" + b'",1\n'])
-def test_what_is_no_csv_is_one_line(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_bytes(content)
-    with pytest.raises(InputError, match=r"a\.csv: not a CSV file: ") as caught:
-        read_csv(tmp_path / "a.csv")
-    assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match=r"b\.csv: cannot be read: No such file"):
-        read_csv(tmp_path / "b.csv")
-
-
-@pytest.mark.parametrize("content", [b"{", b'"\xff"', 200_000 * b"["])
-def test_what_is_no_json_is_one_line(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "a.json").write_bytes(content)
-    with pytest.raises(InputError, match=r"a\.json: not JSON: ") as caught:
-        read_json(tmp_path / "a.json")
-    assert "\n" not in str(caught.value)
-    with pytest.raises(InputError, match=r"b\.json: cannot be read: No such file"):
-        read_json(tmp_path / "b.json")
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs /dev/zero")

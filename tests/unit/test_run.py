@@ -10,7 +10,6 @@ from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import receive
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events, Triggers
@@ -74,45 +73,3 @@ def test_input_that_fails_gives_what_was_decoded_first(demo_raw: Path) -> None:
     with pytest.raises(InputError, match="the disk is gone"):
         read()
     assert sum(len(packet.frames) for packet in packets) == reception.counts["frames"] > 0
-
-
-@pytest.mark.parametrize("back_us", [0, 10**15])
-def test_a_live_source_whose_clock_restarts_is_heard_again(demo_raw: Path, back_us: int) -> None:
-    """A plugin's camera that gives the same drive three times, its clock set anew each time."""
-
-    class Restarting(EventSource):
-        def __init__(self) -> None:
-            super().__init__(Path("camera:0"), "CAMERA", 1280, 720)
-            self._drives = iter(range(3))
-            self._open: RawSource | None = None
-
-        def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-            while True:
-                if self._open is None:
-                    number = next(self._drives, None)
-                    if number is None:
-                        return None
-                    self._open, self._late_us = RawSource(demo_raw), back_us * (number == 1)
-                piece = self._open.take(max_events)
-                if piece is not None:
-                    events = piece[0]
-                    return Events(events.t_us + self._late_us, events.x, events.y, events.p), piece[1]
-                self.close()
-
-        def close(self) -> None:
-            if self._open is not None:
-                self._open.close()
-            self._open = None
-
-    once = [f.soft.symbols.tolist() for f in receive(str(demo_raw)).frames()]
-    reception = receive(Restarting())
-    frames = list(reception.frames())
-    # Where the stream goes on, the frame that a drive's end cuts is read as far as it goes, and the next one.
-    heard = [f for f in frames if f.soft.symbols.tolist() in once]
-    assert len(frames) <= len(heard) + 4
-    assert [f.soft.symbols.tolist() for f in heard] == 3 * once
-    assert reception.counts["clock_restarts"] + reception.counts["clock_leaps"] == 2
-    assert reception.counts["dropped_time_doubtful"] == 0
-    # Times are those of the camera's clock, which the second drive stands elsewhere on.
-    late = [f.t_us > 5e14 for f in heard]
-    assert late == [back_us > 0 and len(once) <= k < 2 * len(once) for k in range(len(heard))]

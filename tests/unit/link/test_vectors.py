@@ -74,18 +74,6 @@ def test_blocks_and_unprotected_packets(p: dict[str, Any]) -> None:
     assert bytes(symbols).hex() == p["symbols"]
 
 
-def test_a_message_of_several_parts_is_followed_by_its_check() -> None:
-    messages: dict[tuple[Any, ...], list[str]] = {}
-    for p in PACKETS:
-        key = (p["profile"], p["error_correction"], p["kind"], p["length"])
-        messages.setdefault(key, []).append(p["part"])
-    assert {len(parts) > 1 for parts in messages.values()} == {True, False}
-    for (*_, length), parts in messages.items():
-        carried = bytes.fromhex("".join(parts))
-        said, check = carried[:length], carried[length:]
-        assert check == (struct.pack("<I", binascii.crc32(said)) if len(parts) > 1 else b"")
-
-
 def test_the_file_is_what_the_command_prints() -> None:
     """Protected packets, too: their code has its own tests."""
     scope: dict[str, Any] = {"__name__": "vectors"}

@@ -70,7 +70,7 @@ def test_dimmed_codes_are_lit_once_a_value(slots: int) -> None:
     assert dimmed_chips([1, -1, -1], 2).tolist() == chips_of_values([1, -1, -1]).tolist()
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_presence_is_bayes_rule_over_edges(seed: int) -> None:
     rng = np.random.default_rng(seed)
     book = Codebook("x", np.array(PREAMBLE), PILOTS, Ppm(4, 1).codewords())
@@ -126,7 +126,7 @@ def logs_of(histograms: dict[str, Histogram], counted: float) -> dict[str, Histo
     return {key: [math.log((s + prior) / (1 + many * prior)) for s in one] for key, one in found.items()}
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_decoding_is_the_likeliest_word_as_pilots_and_the_others_teach(seed: int) -> None:
     rng = np.random.default_rng(seed)
     words = Ppm(4, 1).codewords()
@@ -203,9 +203,7 @@ def test_the_last_chip_is_read_by_the_edge_that_ends_it(last: int) -> None:
 
 
 SCENES = {
-    "nrz": ("modulation.id=nrz",),
     "ppm": ("modulation.id=ppm", "modulation.pulses=2"),
-    "dimmed": ("modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed", "air.frames_per_packet=5"),
     "nrz, few pilots": ("modulation.id=nrz", "modulation.bits=6", "air.pilot_every=4"),
 }
 

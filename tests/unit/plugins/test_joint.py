@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from evlcp_joint import _kernels
-from evlcp_joint.ranging import JointScaleRanging, find_bar, profile
+from evlcp_joint.ranging import JointScaleRanging, profile
 from numpy.testing import assert_allclose
 from scipy.stats import norm, theilslopes
 
@@ -304,29 +304,6 @@ def test_leftovers_are_by_boundary_value_and_row(seed: int) -> None:
     assert_allclose(scores, want, atol=5e-3)
 
 
-def test_rows_belong_to_the_nearest_boundary_only() -> None:
-    known, rows = np.ones((K + 1, 2), np.bool_), 60
-    known[5, 1] = False
-    codes = np.repeat(np.resize([1.0, -1.0], K)[:, None], 2, 1)
-    motion, fit = np.array([[0.2, -0.4], [-0.5, 0.5]]), np.array([2.6, 0.3, 0.0, 1.0, 0.0])
-    values = np.arange(2 * rows, dtype=float).reshape(2, rows)
-    steps, seen = _kernels.list_steps(codes, known, motion, 2.4, fit, values)
-    columns = steps.reshape(len(steps), 10, -1).swapaxes(0, 1).reshape(10, -1)
-    counts = np.zeros((2, rows), int)
-    for step, (many, i, b, first) in enumerate(columns[6:].T.astype(int)):
-        counts[i, first : first + many] += 1
-        block, column = divmod(step, seen.shape[2])
-        np.testing.assert_array_equal(seen[block, :many, column], values[i, first : first + many])
-        if many:
-            assert known[b, i]
-            middle = (rows - 1) / 2 + motion[0, i] + fit[1] + fit[0] * (b - K / 2)
-            assert abs(first - middle + (many - 1) / 2) <= 0.5
-    assert counts.max() == 1
-    # All but the rows of the boundary that is not known, and those beyond the first and the last.
-    assert counts.sum(1)[0] in (38, 39, 40)
-    assert counts.sum(1)[1] in (35, 36, 37, 38)
-
-
 @pytest.mark.parametrize("spacing", [0.9, -0.9])
 def test_rows_are_weighed_by_the_light_between_a_bars_ends(spacing: float) -> None:
     rng = np.random.default_rng(3)
@@ -343,25 +320,6 @@ def test_rows_are_weighed_by_the_light_between_a_bars_ends(spacing: float) -> No
     light = np.abs(clipped[:, int(ends[0]) : int(ends[1]) + 1]).sum((0, 1))
     weight = np.maximum(light - 0.3 * light.max(), 0) * inside
     assert_allclose(out, (clipped * weight).sum(2) / weight.sum(1))
-
-
-def test_solve_leaves_no_score() -> None:
-    twin = Twin(5)
-    rng = np.random.default_rng(5)
-    truth = twin.fit.copy()
-    cells = twin.cells(truth)
-    b, i, v = cells[:, :3].astype(int).T
-    seen = np.zeros((6, twin.rows))
-    seen[i, v] = cells[:, 3] + rng.normal(0, 0.2, len(b))
-    fit, normal, steps = truth * [1.004, 1, 1, 1, 1, 1, 1], np.empty((7, 7)), twin.steps(seen)
-    assert _kernels.solve(*steps, twin.profile, twin.lens, 1e-9, fit, normal)
-    again, score = np.empty((7, 7)), np.empty(7)
-    _kernels.equations(*steps, twin.profile, twin.lens, fit, again, score)
-    assert_allclose(normal, again)
-    # No score is left: a thousandth of a standard deviation of each.
-    assert (np.abs(score) < 1e-3 * np.sqrt(np.diag(normal))).all()
-    sigma = np.sqrt(np.diag(np.linalg.inv(normal))) * 0.2
-    assert (np.abs(fit - truth) < 4 * sigma).all()
 
 
 def test_cells_out_of_place_do_not_count() -> None:
@@ -408,33 +366,6 @@ def test_the_line_is_theil_sen() -> None:
         assert line[at] == pytest.approx(np.median(y - line[at + 1] * x))
     middles[2:] = np.nan
     assert not _kernels.fit_line(middles, line)
-
-
-@pytest.mark.parametrize("tilt", [0.0, 0.1])
-def test_the_line_of_a_bar_leaves_strays_out(tilt: float) -> None:
-    rng = np.random.default_rng(8)
-    selected = np.zeros((K, 60, 40), np.bool_)
-    for k in range(K):
-        for v in range(4 + 3 * k, 7 + 3 * k):
-            left = round(12 + tilt * v)
-            selected[k, v, left : left + 3] = True
-    selected |= rng.random(selected.shape) < 0.002
-    rows, columns = 2 * selected.shape[1], 2 * selected.shape[2]
-    sums = rng.integers(-3, 4, (2, rows, columns)).astype(np.int16)
-    for across in (False, True):
-        cells, image = (a.swapaxes(1, 2) if across else a for a in (selected, sums))
-        presence = PresenceMap(cells.astype(np.float32), 2, cells, np.zeros((K, 1, 1), np.float32))
-        soft = SoftSymbols(np.zeros(K, np.int64), np.zeros((K, 6), np.float32), 1.0)
-        found = find_bar(FrameView(image, np.array([[1.0, 2.0], [3.0, 4.0]]), presence, soft), 2)
-        assert found is not None
-        upright, offset_px, line, seen = found
-        np.testing.assert_array_equal(upright, sums)
-        np.testing.assert_array_equal(offset_px, [1, 2] if across else [3, 4])
-        assert_allclose(line, [10.5, 6, 26.5 - tilt / 2, tilt, 3], atol=0.7)
-        assert seen.all()
-    few = selected.copy()
-    few[2:] = False
-    assert find_bar(FrameView(sums, np.zeros((2, 2)), replace(presence, selected=few), soft), 2) is None
 
 
 def own_motion(shift: np.ndarray, information: np.ndarray, when: np.ndarray) -> np.ndarray:

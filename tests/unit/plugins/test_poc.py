@@ -12,7 +12,6 @@ from evlcp_poc.correlation import (
     pair_shifts,
     phase_only_correlation,
 )
-from evlcp_poc.pairs import choose_pairs, robust_mean
 from evlcp_poc.ranging import PocRanging
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -54,23 +53,6 @@ def test_no_peak_is_no_shift(samples):
     assert fit_peak(samples, 24, 23) == 0
 
 
-@pytest.mark.parametrize("most", [None, (1, 1), (3, 2), (0, 4)])
-@pytest.mark.parametrize("shape", SHAPES)
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_phase_only_correlation(shape, dtype, most):
-    rng = np.random.default_rng(shape[1])
-    images = rng.normal(size=(4, *shape)).astype(dtype)
-    first, second = np.array([0, 0, 2, 3]), np.array([1, 0, 0, 2])
-    got = phase_only_correlation(images, first, second, most)
-    for q, (i, j) in enumerate(zip(first, second, strict=True)):
-        want = twins.phase_only_correlation(images[i], images[j], most)
-        assert_allclose(got[q], want, atol=1e-6)
-    # An image with itself: the kernel of the band kept.
-    kept = most or [(n - 1) // 2 for n in shape]
-    down, right = (twins.dirichlet(np.arange(n), n, 2 * k + 1)[0] for n, k in zip(shape, kept, strict=True))
-    assert_allclose(got[1], np.outer(down, right), atol=1e-6)
-
-
 def test_what_has_no_phase_counts_for_nothing():
     images = np.ones((2, 6, 8), np.float32)
     images[1] = 0
@@ -99,52 +81,14 @@ def test_medians_and_cuts_of_maps(seed):
             assert_array_equal(out[n], twins.cut(image, middle[n], rows, columns))
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(("skip", "share"), [(0, 0.0), (1, 0.5), (2, 0.9), (3, 0.5)])
-def test_pairs_chosen_are_the_far_ones_of_inner_clusters(seed, skip, share):
-    rng = np.random.default_rng(seed)
-    maps = (rng.random((6, 12, 9)) * (rng.random((6, 12, 9)) < 0.3)).astype(np.float32)
-    maps[seed % 6] = 0
-    at = np.arange(6) * 0.25
-    used = np.array([0, 1, 2, 4, 5])
-    every, pairs = twins.pairs_of(np.arange(6), at), twins.pairs_of(used, at)
-    middles = np.empty((6, 2), np.int64)
-    _kernels.find_middles(maps, 4, middles)
-    px_per_m, chosen = choose_pairs(middles, every, used, skip, pairs, share, 0.2)
-    want_scale, want = twins.chosen_pairs(maps, 4, every, used, skip, pairs, share, 0.2)
-    assert px_per_m == pytest.approx(want_scale)
-    assert chosen.tolist() == want
-    dark = choose_pairs(np.full((6, 2), -1), every, used, skip, pairs, share, 1.0)
-    assert (dark[0], len(dark[1])) == (0.0, 0)
-
-
-@pytest.mark.parametrize("clusters", [2, 3, 4, 14])
-@pytest.mark.parametrize("drop", [0, 1, 3])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_robust_mean_and_jackknife(seed, drop, clusters):
-    rng = np.random.default_rng(seed)
-    first, second = np.triu_indices(clusters, 1)
-    kept = rng.random(len(first)) < 0.7
-    kept[0] = True
-    first, second = first[kept], second[kept]
-    # Heavy tails, so that there are outliers.
-    values = 50 + 0.1 * rng.standard_t(1.5, len(first))
-    weights = (second - first) ** rng.uniform(0, 4)
-    mean, sigma, n = robust_mean(values, weights, first, second, drop, 1.5)
-    want = twins.robust_mean(values, weights, first, second, clusters, drop, 1.5)
-    assert n == want[2]
-    assert_allclose([mean, sigma], want[:2], rtol=1e-9)
-
-
 # Exact shifts
 
 
 @pytest.mark.parametrize("most", [None, (3, 4), (1, 2)])
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("samples", [1, 2, 4])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_exact_shifts_are_recovered(seed, samples, shape, most):
-    rng = np.random.default_rng(seed)
+def test_exact_shifts_are_recovered(samples, shape, most):
+    rng = np.random.default_rng(samples)
     spectrum = twins.band_limited(rng, *shape)
     by = np.array([[0, 0], *rng.uniform(-4, 4, (3, 2)), [1, -2], [0.5, -0.5]])
     images = np.stack([twins.shifted(spectrum, shape, *d) for d in by])
@@ -228,14 +172,13 @@ def measured(maps, bar=BAR, **parameters):
 
 # Relative errors seen are a third of this. Gaussians are all but band-limited; boxes are not, and edges that
 # fall between pixels shift their peaks by some 0.01 px. A panel is a quarter as long as the bar.
-@pytest.mark.parametrize("band", ["full", "blob"])
-@pytest.mark.parametrize("tilt_deg", [0, 7, -30, 90])
+@pytest.mark.parametrize(("band", "tilt_deg"), [("full", 7), ("blob", 0), ("blob", -30), ("blob", 90)])
 @pytest.mark.parametrize(
     ("bar", "blob", "tolerance"), [(BAR, "gaussian", 1e-3), (BAR, "box", 5e-3), (PANEL, "gaussian", 5e-3)]
 )
 def test_distance_of_ideal_images(bar, blob, tolerance, tilt_deg, band):
     measure = PocRanging(band=band).compile(CAMERA, bar, LINK.codebook)
-    distances = np.arange(30, 101, 5.0)
+    distances = np.arange(30, 101, 10.0)
     got = [measure(view_of(image_of(bar, d, tilt_deg=tilt_deg, blob=blob))) for d in distances]
     found = np.array([r.distance_m for r in got])
     assert_allclose(found, distances, rtol=tolerance)

@@ -52,15 +52,6 @@ def weighted_values(sums, probability, grid, least):
     return np.einsum("krc,irc->ki", weight, values)
 
 
-def max_log(fit, bits):
-    zero, one = np.full((2, len(fit), bits), -np.inf)
-    for (k, s), f in np.ndenumerate(fit[:, : 2**bits]):
-        for b, bit in enumerate(f"{s:0{bits}b}"):
-            side = one if bit == "1" else zero
-            side[k, b] = max(side[k, b], f)
-    return zero, one
-
-
 def llr(values, words):
     """Symbols, ln P(bit 0) / P(bit 1), and share of energy explained: nearest words at the mean amplitude.
 
@@ -165,12 +156,3 @@ def log_ratio(counts, prior):
     more = counts + prior * (seen / seen.mean() if seen.min() > 0 else 1.0)
     share = more / more.sum((1, 2), keepdims=True)
     return np.log(share[1] / share[0])
-
-
-def match_words(values, words):
-    fit = values @ words.T
-    zero, one = max_log(fit, len(words).bit_length() - 1)
-    symbols = fit.argmax(1)
-    agrees = np.sign(values) * words[symbols] > 0
-    agreement = np.abs(values)[agrees].sum() / max(np.abs(values).sum(), 1e-9)
-    return symbols, fit.max(1), zero - one, agreement
