@@ -225,7 +225,7 @@ def dim(events: tuple[float, float], unseen: float, many: int) -> tuple[np.ndarr
 
 
 DIM_BIT_US = 323.2
-DIM = [((4.0, 3.0), 0.03, 300), ((8.0, 6.0), 0.01, 150)]
+DIM = [((4.0, 3.0), 0.03, 160), ((8.0, 6.0), 0.01, 150)]
 
 
 @pytest.mark.parametrize(("events", "unseen", "many"), DIM)
@@ -271,7 +271,7 @@ def test_errors_are_those_of_a_receiver_that_knows_the_light(
 
 def test_llrs_tell_the_truth() -> None:
     sent, _, found = dim(*DIM[0])
-    assert len(found) == 300
+    assert len(found) == len(sent)
     right = np.array([c.value for c in found]) == sent
     quality = np.array([c.quality for c in found])
     assert quality.mean() == pytest.approx(right.mean(), abs=0.05)
@@ -433,16 +433,16 @@ def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) 
 
 
 @pytest.mark.parametrize(
-    ("data_bits", "parity", "stop_bits", "bit_hz", "mark_on"),
+    ("data_bits", "parity", "stop_bits", "bit_hz", "mark_on", "idle"),
     [
-        (7, "even", 2, 3125.0, True),
-        (8, "none", 1, 504.0, False),
-        (5, "none", 1, 3125.0, True),
-        (9, "odd", 2, 3125.0, False),
+        (7, "even", 2, 3125.0, True, "off"),
+        (8, "none", 1, 504.0, False, "on"),
+        (5, "none", 1, 3125.0, True, "on"),
+        (9, "odd", 2, 3125.0, False, "off"),
     ],
 )
 def test_a_light_the_other_way_round_is_read_as_it_is(
-    data_bits: int, parity: Parity, stop_bits: int, bit_hz: float, mark_on: bool
+    data_bits: int, parity: Parity, stop_bits: int, bit_hz: float, mark_on: bool, idle: Any
 ) -> None:
     rng = np.random.default_rng(data_bits + mark_on)
     sent = rng.integers(0, 1 << data_bits, 70)
@@ -450,12 +450,11 @@ def test_a_light_the_other_way_round_is_read_as_it_is(
     levels = levels_of(sent, data_bits, parity, stop_bits)
     assert Uart(data_bits, parity, stop_bits).codebook(1).codewords[sent].ravel().tolist() == levels
     events = seen(rng, levels, bit_us, mark_on=mark_on, late_us=(40.0, 60.0), noise_hz=50.0)
-    for idle in ("on", "off"):
-        decoder = Uart(data_bits, parity, stop_bits, idle=idle).decoder(bit_hz)  # type: ignore[arg-type]
-        state, found = decoder.step(decoder.init(), events.t_us, events.p, int(events.t_us[-1]))
-        state, more = decoder.close(state)
-        assert [c.value for c in found + more] == sent.tolist()
-        assert state.given["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
+    decoder = Uart(data_bits, parity, stop_bits, idle=idle).decoder(bit_hz)
+    state, found = decoder.step(decoder.init(), events.t_us, events.p, int(events.t_us[-1]))
+    state, more = decoder.close(state)
+    assert [c.value for c in found + more] == sent.tolist()
+    assert state.given["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
 
 
 def test_fixed_bits_speak_as_all_words_say() -> None:
@@ -480,7 +479,7 @@ def test_text_that_fits_both_ways_is_read_as_the_link_says() -> None:
 
 def test_what_a_list_has_wrong_is_said(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
     """Polarities that are turned, or of one kind alone; and what the list did not say."""
-    sent = np.random.default_rng(4).integers(0, 128, 120)
+    sent = np.random.default_rng(4).integers(0, 128, 60)
     events = seen(np.random.default_rng(3), levels_of(sent, 7, "even", 2), 320.0)
 
     def told(kept: Events, query: str = "") -> dict[str, Any]:
@@ -489,7 +488,7 @@ def test_what_a_list_has_wrong_is_said(tmp_path: Path, evlcp: Callable[..., Any]
     turned = Events.of(events.t_us, events.x, events.y, 1 - events.p)
     inverted = told(turned)
     assert [one["code"] for one in inverted["warnings"]] == ["polarity"]
-    assert inverted["counts"]["frames_inverted"] == inverted["counts"]["frames"] == 120
+    assert inverted["counts"]["frames_inverted"] == inverted["counts"]["frames"] == 60
     assert "times in us, guessed" in next(n["text"] for n in inverted["notes"] if n["code"] == "guessed")
     right = told(turned, "?inverted=1&unit=us")
     assert right["warnings"] == []
