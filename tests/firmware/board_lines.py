@@ -1,4 +1,4 @@
-"""Lines to a simulated board that go wrong, and what its LEDs may show all the same."""
+"""Banks for a simulated board, lines to it that go wrong, and what its LEDs may show all the same."""
 
 import threading
 from collections.abc import Callable
@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from firmware_host.board.bank import symbol_chips
+from evlcp_sdk.link.resolve import Link, load_link
+from firmware_host.board.bank import Bank, bank_of, random_symbols, symbol_chips
 from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.emulators.led_record import LedRecord
@@ -16,8 +17,36 @@ from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.native import NativeBoard, serve
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol.client import Timing
+from tests.conftest import Run
 
 PACKET = 346
+LINK = load_link()
+
+
+def board_link(*overrides: str) -> Link:
+    """The default link but for these values."""
+    return load_link(overrides=list(overrides))
+
+
+def symbols_of(packets: int, seed: int = 0, link: Link = LINK) -> NDArray[np.int64]:
+    """Random symbols of packets of a link."""
+    return random_symbols(packets, link.packet.frames, link.codebook, np.random.default_rng(seed))
+
+
+def some_bank(packets: int = 1, seed: int = 0, link: Link = LINK) -> Bank:
+    """Random packets of a link."""
+    return bank_of(symbols_of(packets, seed, link), link)
+
+
+def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
+    """What each LED did since the last look, uint8 (chips, 96)."""
+    return device.records().played().chips(None)
+
+
+def check_fault(done: Run, code: int, *says: str) -> None:
+    """See that a command ended with a code, and one line that says why."""
+    assert (done.code, done.err.count("\n")) == (code, 1), done.err
+    assert [words for words in says if words not in done.err] == [], done.err
 
 
 class HostDiedError(Exception):
@@ -34,6 +63,8 @@ class Native:
         self.thread.start()
 
     def end(self) -> None:
+        if self.ended.is_set():
+            return
         self.ended.set()
         self.thread.join(10)
         assert not self.thread.is_alive()
@@ -107,18 +138,16 @@ class NoisyLine(SimulatedLine):
         return self.spoil(data)
 
 
-def board_on(line: SimulatedLine, nonce: int | None = None) -> Board:
+def board_on(line: SimulatedLine, nonce: int | None = None, key: bytes | None = None) -> Board:
     """A session; with a nonce of one's own its bytes are the same each time."""
-    return Board(Session(line, Timing(latency_s=0.02), first=nonce, nonce=nonce))
+    return Board(Session(line, Timing(latency_s=0.02), first=nonce, nonce=nonce, key=key))
 
 
-def packet_sequence(
-    played: LedRecord, payloads: dict[str, NDArray[np.int64]], book: object
-) -> list[tuple[str, int]]:
+def packet_sequence(played: LedRecord, payloads: dict[str, NDArray[np.int64]]) -> list[tuple[str, int]]:
     """Name and packet number of every whole packet that was played; fails on one that is none of them."""
     known = {}
     for name, symbols in payloads.items():
-        chips = symbol_chips(symbols, book)  # type: ignore[arg-type]
+        chips = symbol_chips(symbols, LINK.codebook)
         for p in range(len(symbols)):
             known[chips[p * PACKET : (p + 1) * PACKET].tobytes()] = (name, p)
     assert len(known) == sum(len(s) for s in payloads.values())

@@ -1,38 +1,35 @@
-"""Any link on a board: other bars, other codes, chips as they are; virtual, in QEMU, on the model."""
+"""Any link on a board, LED by LED: other bars, other codes, characters, chips as they are."""
 
+import json
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import board_on
+from board_lines import LINK, board_link, board_on, check_fault, shown, some_bank, symbols_of
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import Codebook
+from evlcp_sdk.air.codebook import Codebook, hadamard
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import load_link
-from firmware_host import build
+from evlcp_sdk.link.resolve import Link
 from firmware_host.board.bank import Bank, bank_of, random_symbols, symbol_chips
-from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.session import Session
+from firmware_host.board.board import Board, Settings, profile_number, provision
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import IncompatibleError, RefusedError
-from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import (
     BoardFault,
     ChipsRequest,
     CommitRequest,
     Format,
+    Profile,
     State,
     Status,
     StreamRequest,
     Watchdog,
 )
-
-pytestmark = pytest.mark.usefixtures("compiler")
 
 SIZES = (3, 14, 1, 9, 9, 20, 6, 2, 12, 11)
 LED_CLUSTERS = np.random.default_rng(4).permutation(np.repeat(np.arange(10), SIZES))
@@ -68,72 +65,112 @@ EXPECTED = leds_of(symbol_chips(SYMBOLS, BOOK, 2), LED_CLUSTERS)
 """80 chips of preamble, two pilots and three words of 24: twice."""
 
 
-def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
-    return device.records().played().chips(None)
+@dataclass(frozen=True)
+class Case:
+    """What is played, and what the LEDs do then; a link's packets may be streamed, too."""
+
+    bank: Bank
+    leds: NDArray[np.uint8]
+    link: Link | None = None
+    symbols: NDArray[np.int64] | None = None
 
 
-@pytest.fixture
-def device() -> SimulatedBoard:
-    return SimulatedBoard()
+def case_of_link(*overrides: str) -> Case:
+    link = board_link(*overrides)
+    symbols = symbols_of(2, 1, link)
+    chips = np.concatenate([packet_chips(one, link.codebook, link.packet.pilot_every) for one in symbols])
+    return Case(bank_of(symbols, link), leds_of(chips, link.bar.led_clusters()), link, symbols)
 
 
-@pytest.fixture
-def board(device: SimulatedBoard) -> Board:
-    return board_on(SimulatedLine(device))
+def case_of_own_codes() -> Case:
+    rows = hadamard(8)
+    values = np.array([1, 1, 1, -1, 1], np.int8)
+    book = Codebook.of_values("wh8", values, np.concatenate([-rows, rows]), rows)
+    symbols = random_symbols(2, 3, book, np.random.default_rng(0))
+    bank = Bank.of_symbols(symbols, book)
+    assert profile_number(bank) == Profile.CUSTOM
+    return Case(bank, np.repeat(symbol_chips(symbols, book), 6, axis=1))
 
 
-def test_other_clusters_and_codes_of_24_chips_on_every_led(device: SimulatedBoard, board: Board) -> None:
-    bank = a_bank()
+def case_of_rows(book: Codebook, packet: PacketFormat, *led_clusters: NDArray[np.int64]) -> Case:
+    leds = len(led_clusters[0]) if led_clusters else 96
+    rows = np.random.default_rng(2).integers(0, 2, (2 * packet.packet_chips, 96), dtype=np.uint8)
+    rows[:, leds:] = 0
+    return Case(Bank.of_chips(rows[:, :leds], book, packet, *led_clusters), rows)
+
+
+def case_of_drawn_clusters() -> Case:
     assert EXPECTED.shape == (400, 96)
     # ten clusters are two bytes a chip, behind the 12 bytes of each cluster's mask
-    assert (bank.format, len(bank.content)) == (Format.CLUSTERS, 10 * 12 + 400 * 2)
-    done = provision(board, bank, Settings())
+    assert len(a_bank().content) == 10 * 12 + 400 * 2
+    return Case(a_bank(), EXPECTED)
+
+
+EDGES = ("separation.id=edges", "decoding.id=edges")
+CASES: dict[str, tuple[Format, Callable[[], Case]]] = {
+    "wh4x2": (Format.WORDS, case_of_link),
+    "wh8": (Format.WORDS, lambda: case_of_link("modulation.id=wh8")),
+    "raw8": (Format.WORDS, lambda: case_of_link("modulation.id=raw8")),
+    "a pilot in every fourth frame": (Format.WORDS, lambda: case_of_link("air.pilot_every=4")),
+    "one pilot": (
+        Format.WORDS,
+        lambda: case_of_link("air.frames_per_packet=3", "air.pilot_every=64"),
+    ),
+    "own codes": (Format.WORDS, case_of_own_codes),
+    "nrz": (Format.CLUSTERS, lambda: case_of_link(*EDGES, "modulation.id=nrz")),
+    "ppm": (Format.CLUSTERS, lambda: case_of_link(*EDGES, "modulation.id=ppm")),
+    "dimmed": (
+        Format.CLUSTERS,
+        lambda: case_of_link(*EDGES, "modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed"),
+    ),
+    "one LED": (
+        Format.CLUSTERS,
+        lambda: case_of_link(
+            *(*EDGES, "bar.rows=1", "bar.cluster_rows=1", "ranging.id=none", "modulation.id=nrz")
+        ),
+    ),
+    "ten clusters": (Format.CLUSTERS, case_of_drawn_clusters),
+    "rows": (
+        Format.MASKS,
+        lambda: case_of_rows(LINK.codebook, PacketFormat.of(LINK.codebook, 10, 20_000.0)),
+    ),
+    "rows of 87 LEDs": (
+        Format.MASKS,
+        lambda: case_of_rows(BOOK, PacketFormat.of(BOOK, 3, pilot_every=2), LED_CLUSTERS),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_led_does_what_it_is_sent(name: str, device: SimulatedBoard, board: Board) -> None:
+    form, make = CASES[name]
+    case = make()
+    bank, leds = case.bank, case.leds
+    assert bank.format == form
+    share = np.ceil(1000 * leds.mean(0).max() - 1e-9)
+    done = provision(board, bank, Settings(duty_limit=share / 1000))
     assert (done.written, done.swapped) == (len(bank.content), True)
-    device.run(150_000)
-    board.stop()
-    board.wait_dark()
-    rows = shown(device)
-    assert len(rows) > 1200
-    assert len(rows) % 200 == 0, "whole packets"
-    assert (rows == np.resize(EXPECTED, rows.shape)).all()
+    device.run(400_000)
+    record = device.records().played()
+    rows = record.chips(None)
+    assert len(rows) > len(leds)
+    assert (rows == np.resize(leds, rows.shape)).all()
+    assert (record.numbers == np.arange(len(record))).all()
+    assert (np.diff(record.ticks) == device.TICK_HZ // bank.chip_rate_hz).all()
     status = board.status()
-    assert (status.packet_chips, status.clusters, status.hold, status.faults) == (200, 10, 1, 0)
-    assert status.duty == bank.duty == np.ceil(1000 * EXPECTED.mean(0).max() - 1e-9)
+    assert status.duty == bank.duty == share
+    assert (status.packet_chips, status.faults) == (bank.packet.packet_chips, 0)
     assert board.verify(bank) == status.active_bank
     assert provision(board, bank, Settings()).written == 0
-    # and back to words, which are sent as they always were
-    link = load_link()
-    words = bank_of(random_symbols(1, 10, link.codebook, np.random.default_rng(0)), link)
-    assert words.format == Format.WORDS
-    provision(board, words, Settings())
-    device.run(100_000)
-    assert board.status().hold == 0
-    assert board.verify(words) != status.active_bank
-
-
-def test_the_image_on_the_model_of_the_part(needs: Callable[..., None]) -> None:
-    needs("cc", "make", "arm-none-eabi-gcc")
-    pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from tests.models.stm32 import US, Dma, ModelLine, Stm32
-
-    chip = Stm32(build.arm_image("stm32f405"))
-    chip.run(15_000)
-    board = Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
-    assert board.about.chip_rate_min_hz == 1282  # chips of 0.78 ms
-    provision(board, a_bank(), Settings())
-    begin = len(chip.drivers.log)
-    chip.run(12_000)
-    rows = [s.row for s in chip.drivers.log[begin:] if s.latched and not s.dark]
-    leds = np.array([[int(bit) for bit in f"{row:096b}"] for row in rows], np.uint8)
-    lit = int(leds.any(1).argmax())
-    first = int(EXPECTED.any(1).argmax())
-    wanted = np.resize(np.roll(EXPECTED, -first, axis=0), (100, 96))
-    assert (leds[lit : lit + 100] == wanted).all()
-    assert chip.longest[16 + Dma.IRQ] < 12 * US
-    chip.dma.dead = True
-    chip.run(300)
-    assert chip.drivers.dark
-    assert board.status().faults == BoardFault.CHIP_LOST
+    if case.link is None or case.symbols is None:
+        return
+    # a stream, whose idle pattern is no brighter, keeps to the same limit
+    with board.stream(case.link) as stream:
+        stream.wait(0.1)
+        for packet in case.symbols:
+            stream.send(packet)
+    assert (shown(device)[-len(leds) :] == leds).all()
+    assert board.status().faults == 0
 
 
 @given(st.data())
@@ -160,57 +197,9 @@ def test_any_clusters_of_any_leds(data: st.DataObject) -> None:
     assert board.status().duty == bank.duty == np.ceil(1000 * chips.mean(0).max() - 1e-9)
 
 
-def test_every_led_for_itself(device: SimulatedBoard, board: Board) -> None:
-    rows = np.random.default_rng(2).integers(0, 2, (400, 87), dtype=np.uint8)
-    bank = Bank.of_chips(rows, BOOK, PacketFormat.of(BOOK, 3, pilot_every=2), LED_CLUSTERS)
-    assert (bank.format, bank.packets, len(bank.content)) == (Format.MASKS, 2, 400 * 12)
-    provision(board, bank, Settings())
-    device.run(100_000)
-    seen = shown(device)
-    assert (seen[:400, :87] == rows).all()
-    assert not seen[:, 87:].any()
-
-
-@pytest.mark.parametrize(
-    ("overrides", "form"),
-    [
-        (["modulation.id=nrz"], None),
-        (["modulation.id=ppm"], None),
-        (["modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed"], None),
-        (["bar.rows=1", "bar.cluster_rows=1", "ranging.id=none", "modulation.id=nrz"], Format.CLUSTERS),
-    ],
-    ids=["nrz", "ppm", "dimmed", "one LED"],
-)
-def test_the_codes_that_are_installed(
-    device: SimulatedBoard, board: Board, overrides: list[str], form: Format | None
-) -> None:
-    link = load_link(overrides=["separation.id=edges", "decoding.id=edges", *overrides])
-    symbols = random_symbols(2, link.packet.frames, link.codebook, np.random.default_rng(1))
-    bank = bank_of(symbols, link)
-    assert form in (None, bank.format)
-    chips = leds_of(
-        np.concatenate([packet_chips(one, link.codebook, link.packet.pilot_every) for one in symbols]),
-        link.bar.led_clusters(),
-    )
-    share = np.ceil(1000 * chips.mean(0).max() - 1e-9) / 1000
-    provision(board, bank, Settings(duty_limit=share))
-    device.run(200_000)
-    rows = shown(device)
-    assert len(rows) >= 1900
-    assert (rows == np.resize(chips, rows.shape)).all()
-    # a stream, whose idle pattern is no brighter, keeps to the same limit
-    with board.stream(link) as stream:
-        stream.wait(0.1)
-        for packet in symbols:
-            stream.send(packet)
-    rows = shown(device)
-    assert (rows[-len(chips) :] == chips).all()
-    assert board.status().faults == 0
-
-
 def test_packets_that_come_one_by_one(device: SimulatedBoard, board: Board) -> None:
-    link = load_link(overrides=["bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13"])
-    packets = random_symbols(8, link.packet.frames, link.codebook, np.random.default_rng(0))
+    link = board_link("bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13")
+    packets = symbols_of(8, 0, link)
     with board.stream(link, 4) as stream:
         for packet in packets:
             stream.send(packet)
@@ -234,14 +223,6 @@ def test_packets_that_come_one_by_one(device: SimulatedBoard, board: Board) -> N
     assert not device.shown().any()
 
 
-def test_a_packet_longer_than_half_a_bank_is_no_stream(board: Board) -> None:
-    link = load_link(overrides=["bar.rows=90", "bar.cluster_rows=9", "air.frames_per_packet=700"])
-    with pytest.raises(ConfigError, match=r"a packet of 22426 chips takes 44852 bytes.*room for two.*10210"):
-        board.stream(link)
-    with pytest.raises(ConfigError, match=r"has 40960, 120 of them for the clusters: not one fits.*20420"):
-        board.program(bank_of(random_symbols(1, 700, link.codebook, np.random.default_rng(0)), link))
-
-
 def test_a_bank_is_full_to_the_last_byte(device: SimulatedBoard, board: Board) -> None:
     """Ten clusters: 12 bytes each, then two bytes a chip; 20 420 chips fill 40 960 bytes, 2 s of light."""
     chips = np.random.default_rng(5).integers(0, 2, (20_420, 10), dtype=np.uint8)
@@ -251,27 +232,29 @@ def test_a_bank_is_full_to_the_last_byte(device: SimulatedBoard, board: Board) -
     provision(board, bank, Settings())
     device.run(2_050_000)
     rows = shown(device)
-    expected = leds_of(chips, LED_CLUSTERS)
-    assert len(rows) > len(expected)
-    assert (rows == np.resize(expected, rows.shape)).all()
+    assert len(rows) > len(chips)
+    assert (rows == np.resize(leds_of(chips, LED_CLUSTERS), rows.shape)).all()
     more = replace(packet, preamble_chips=packet.preamble_chips + 1)
     with pytest.raises(
         ConfigError, match=r"20421 chips takes 40842 bytes.*not one fits.*at most 20420 chips"
     ):
         board.program(Bank.of_chips(np.zeros((20_421, 10), np.uint8), BOOK, more, LED_CLUSTERS))
+    link = board_link("bar.rows=90", "bar.cluster_rows=9", "air.frames_per_packet=700")
+    with pytest.raises(ConfigError, match=r"a packet of 22426 chips takes 44852 bytes.*room for two.*10210"):
+        board.stream(link)
 
 
 def test_from_words_to_chips_and_back_without_a_dark_chip(device: SimulatedBoard, board: Board) -> None:
-    link = load_link()
-    symbols = random_symbols(2, 10, link.codebook, np.random.default_rng(0))
-    words = np.repeat(symbol_chips(symbols, link.codebook), 6, axis=1)
+    symbols = symbols_of(2)
+    words = np.repeat(symbol_chips(symbols, LINK.codebook), 6, axis=1)
     known = {
         rows.tobytes(): name for name, both in (("w", words), ("c", EXPECTED)) for rows in np.split(both, 2)
     }
-    provision(board, bank_of(symbols, link), Settings())
-    for bank in 3 * [a_bank(), bank_of(symbols, link)]:
+    provision(board, bank_of(symbols, LINK), Settings())
+    for bank in 3 * [a_bank(), bank_of(symbols, LINK)]:
         board.program(bank)
         device.run(60_000)
+    assert board.status().hold == 0
     record = device.records().played()
     assert (np.diff(record.ticks) == 1000).all()
     rows, at, names = record.chips(None), 0, ""
@@ -297,38 +280,7 @@ def test_it_is_kept_over_a_reset(device: SimulatedBoard, board: Board) -> None:
     assert not again.program(bank).written
 
 
-def test_limits_of_light_hold_for_clusters(device: SimulatedBoard, board: Board) -> None:
-    """The share of the brightest cluster is refused before, and a burst ends in the dark."""
-    packet = replace(PacketFormat.of(BOOK, 1), preamble_chips=952)  # 1000 chips in all
-    chips = np.zeros((1000, 10), np.uint8)
-    chips[100:400, 3] = 1
-    bank = Bank.of_chips(chips, BOOK, packet, LED_CLUSTERS)
-    with pytest.raises(RefusedError, match=r"for 0\.3 of the time, the duty limit is 0\.299"):
-        provision(board, bank, Settings(duty_limit=0.299))
-    board.limit(bank, duty=0.299)
-    with pytest.raises(RefusedError) as told:
-        board.program(bank)
-    assert (told.value.status, told.value.detail) == (Status.TOO_BRIGHT, 299)
-    provision(board, bank, Settings(duty_limit=0.3))
-    device.run(200_000)
-    burst = board.about.burst_chips
-    rows = shown(device)
-    # on for n chips in a row is 0.7 n beyond its share
-    assert len(rows) == 100 + int(burst / 0.7)
-    assert (rows == leds_of(chips, LED_CLUSTERS)[: len(rows)]).all()
-    assert not device.shown().any()
-    assert board.status().faults == BoardFault.OVER_LIMIT
-
-
-def test_silence_shows_the_idle_pattern_of_the_bars_leds(device: SimulatedBoard, board: Board) -> None:
-    provision(board, a_bank(), Settings(watchdog=Watchdog.IDLE, watchdog_ms=100))
-    device.run(200_000)
-    idle = shown(device)[-200:]
-    assert (idle[:, :87] != np.roll(idle[:, :87], 1, axis=0))[1:].all()
-    assert not idle[:, 87:].any()
-
-
-@pytest.mark.parametrize(("limit", "every"), [(1.0, 2), (0.5, 2), (0.3, 4), (0.25, 4), (0.001, 1000)])
+@pytest.mark.parametrize(("limit", "every"), [(0.5, 2), (0.3, 4), (0.001, 1000)])
 def test_the_idle_pattern_keeps_to_the_limits(
     device: SimulatedBoard, board: Board, limit: float, every: int
 ) -> None:
@@ -345,11 +297,8 @@ def test_the_idle_pattern_keeps_to_the_limits(
     assert board.status().faults == BoardFault.WATCHDOG
 
 
-def chips_request(**changes: object) -> ChipsRequest:
-    return replace(ChipsRequest(200, 1, 10, bytes.fromhex(BOOK.digest)), **changes)  # type: ignore[arg-type]
-
-
 def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None:
+    good = ChipsRequest(200, 1, 10, bytes.fromhex(BOOK.digest))
     for wrong, nearest in (
         ({"packet_chips": 0}, 1),
         ({"packet_chips": 40961}, 40960),
@@ -358,7 +307,7 @@ def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None
         ({"clusters": 97}, 96),
     ):
         with pytest.raises(RefusedError) as told:
-            board.session.call(chips_request(**wrong))
+            board.session.call(replace(good, **wrong))
         assert (told.value.status, told.value.detail) == (Status.OUT_OF_RANGE, nearest)
     bank = a_bank()
     commit = CommitRequest(0, bank.format, 2, len(bank.content), bank.crc, bytes.fromhex(bank.digest))
@@ -366,18 +315,18 @@ def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None
         board.session.call(commit)  # CLUSTERS with a codebook
     board.prepare(bank)
     board.fill(0, bank.content)
-    for other in (
-        replace(commit, format=Format.WORDS),
-        replace(commit, format=3),
-        replace(commit, packets=0),
-        replace(commit, packets=3),
-        replace(commit, packets=65535),
-        replace(commit, length=len(bank.content) - 2),
-        replace(commit, format=Format.MASKS),
-        replace(commit, digest=bytes(32)),
+    for wrong in (
+        {"format": Format.WORDS},
+        {"format": 3},
+        {"packets": 0},
+        {"packets": 3},
+        {"packets": 65535},
+        {"length": len(bank.content) - 2},
+        {"format": Format.MASKS},
+        {"digest": bytes(32)},
     ):
         with pytest.raises((RefusedError, IncompatibleError)):
-            board.session.call(other)
+            board.session.call(replace(commit, **wrong))
     # an LED of two clusters would be on for longer than either
     overlapping = bytearray(bank.content)
     overlapping[12] |= overlapping[0]
@@ -397,8 +346,7 @@ def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None
     for at in range(121, len(padded), 2):
         padded[at] |= 0x3F
     board.fill(0, bytes(padded))
-    crc = replace(bank, content=bytes(padded)).crc
-    board.session.call(replace(commit, crc=crc))
+    board.session.call(replace(commit, crc=replace(bank, content=bytes(padded)).crc))
     board.start()
     device.run(50_000)
     rows = shown(device)
@@ -411,12 +359,9 @@ def test_what_hello_says_decides(board: Board) -> None:
             object.__setattr__(board.about, name, value)
 
     requests = board.status().requests
-    panel = load_link(
-        overrides=["bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4"]
-    )
-    symbols = random_symbols(1, 10, panel.codebook, np.random.default_rng(0))
+    panel = board_link("bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4")
     with pytest.raises(ConfigError, match=r"a link of 256 LEDs, simulated: has 96: HELLO says so"):
-        board.program(bank_of(symbols, panel))
+        board.program(some_bank(link=panel))
     with pytest.raises(ConfigError, match=r"a link of 256 LEDs"):
         board.stream(panel)
     says(leds=48, clusters=8)
@@ -434,13 +379,6 @@ def test_what_hello_says_decides(board: Board) -> None:
     assert board.status().requests == requests + 1
 
 
-def test_a_rate_that_cannot_be(board: Board) -> None:
-    with pytest.raises(RefusedError, match=r"no chip rate of 7777 Hz: must divide 10000000 Hz, at least 1,"):
-        board.program(a_bank(chip_rate_hz=7777))
-    with pytest.raises(ConfigError, match=r"air.chip_rate_hz = 12.5: a board takes whole"):
-        a_bank(chip_rate_hz=12.5)
-
-
 def test_chips_that_the_board_has_none_as_long_as(device: SimulatedBoard, board: Board) -> None:
     object.__setattr__(board.about, "chip_rate_min_hz", 1282)
     bank = a_bank(chip_rate_hz=500)
@@ -454,27 +392,46 @@ def test_chips_that_the_board_has_none_as_long_as(device: SimulatedBoard, board:
     assert board.holds(bank, status)
     board.check_same_air(bank, status)
     assert board.verify(bank) == 0
-    with board.stream(load_link(overrides=["bar.rows=60", "bar.columns=1", "air.chip_rate_hz=500.0"])) as s:
+    with board.stream(board_link("bar.rows=60", "bar.columns=1", "air.chip_rate_hz=500.0")) as s:
         assert s.packet_s == pytest.approx(346 / 500)
+    # so is what a board would compose
+    link = board_link("air.chip_rate_hz=1000.0", "air.pilot_every=4")
+    symbols = symbols_of(2, 6, link)
+    chips = symbol_chips(symbols, link.codebook, 4)
+    bank = bank_of(symbols, link)
+    assert bank.format == Format.WORDS
+    assert bank.chip_by_chip().duty == bank.duty
+    device.records()
+    provision(board, bank, Settings(duty_limit=0.6))
+    device.run(800_000)
+    rows = shown(device)
+    wanted = np.repeat(np.repeat(chips, 6, axis=1), 2, axis=0)  # 2000 chips/s
+    assert (rows == np.resize(wanted, rows.shape)).all()
+    assert board.verify(bank) == 0
+    assert not board.program(bank).swapped
+    with board.stream(link) as stream:
+        stream.send(symbols[0])
+    packet = 2 * link.packet.packet_chips
+    assert (shown(device)[-packet:] == wanted[:packet]).all()
+    provision(board, Bank.of_chips(chips, link.codebook, link.packet), Settings())
+    assert board.status().hold == 2
 
 
 ANY = ("bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13")
 OPTIONS = [part for setting in ANY for part in ("--set", setting)]
 
 
-def test_the_commands(evlcp, tmp_path: Path) -> None:
-    device = SimulatedBoard()
-    link = load_link(overrides=list(ANY))
-    symbols = random_symbols(2, 10, link.codebook, np.random.default_rng(3))
-    provision(board_on(SimulatedLine(device)), bank_of(symbols, link), Settings())
+def test_the_commands(evlcp, tmp_path: Path, device: SimulatedBoard, board: Board) -> None:
+    link = board_link(*ANY)
+    symbols = symbols_of(2, 3, link)
+    provision(board, bank_of(symbols, link), Settings())
     device.run(200_000)
     record, out = tmp_path / "leds.bin", tmp_path / "chips.npy"
     record.write_bytes(device.records().to_bytes())
     assert evlcp("board", "leds", record, "--chips", out, *OPTIONS).code == 0
-    chips = np.load(out)
-    assert (chips == np.resize(symbol_chips(symbols, link.codebook), chips.shape)).all()
+    chips, whole = np.load(out), symbol_chips(symbols, link.codebook)
+    assert (chips == np.resize(whole, chips.shape)).all()
     # those chips are what a board is sent for the same link, column by column
-    whole = symbol_chips(symbols, link.codebook)
     np.save(out, whole)
     for options in (("--masks", out), ("--random", 2, "--seed", 3)):
         done = evlcp("board", "--port", "native:", "program", *options, *OPTIONS)
@@ -485,9 +442,7 @@ def test_the_commands(evlcp, tmp_path: Path) -> None:
         (90, 6, "the LEDs of cluster 4 differ; take every LED for itself with --per-led"),
     ):
         other = ("--set", f"bar.rows={rows}", "--set", f"bar.cluster_rows={cluster_rows}")
-        done = evlcp("board", "leds", record, "--chips", out, *OPTIONS[4:], *other)
-        assert (done.code, done.err.count("\n")) == (3, 1)
-        assert says in done.err
+        check_fault(evlcp("board", "leds", record, "--chips", out, *OPTIONS[4:], *other), 3, says)
 
 
 def test_a_fleet_of_several_links(evlcp, tmp_path: Path) -> None:
@@ -509,29 +464,142 @@ def test_a_fleet_of_several_links(evlcp, tmp_path: Path) -> None:
     assert "programmed 788 of 788 bytes" in lines["d"]  # 8 clusters, 692 chips
 
 
-@pytest.mark.parametrize("pilot_every", [1, 4])
-def test_what_a_board_composes_is_sent_chip_by_chip_where_it_is_too_slow(
-    device: SimulatedBoard, board: Board, pilot_every: int
+# -- characters and 4-PPM, by the test's own encoders
+
+LAMP = ["bar.rows=6", "bar.columns=1", "bar.cluster_rows=6", "bar.cluster_columns=1", "framing.id=uart"]
+SERIAL = [*LAMP, "framing.data_bits=7", "framing.parity=even", "framing.stop_bits=2"]
+TURNED = [*LAMP, "framing.parity=odd", "framing.idle=off", "framing.first_bit=highest"]
+PULSES = ["modulation.id=ppm", "bar.rows=48"]
+
+
+def serial_chips(text: bytes) -> list[int]:
+    """7E2 as a serial port sends it behind a pause of 16 bits: marks are ones."""
+    bits = [1] * 16
+    for byte in text:
+        data = [byte >> k & 1 for k in range(7)]
+        bits += [0, *data, sum(data) % 2, 1, 1]
+    return bits
+
+
+def turned_chips(text: bytes) -> list[int]:
+    """8O1, highest bit first, by an LED that is dark in pauses: a start bit lights it."""
+    bits = [1] * 16
+    for byte in text:
+        data = [byte >> k & 1 for k in reversed(range(8))]
+        bits += [0, *data, 1 - sum(data) % 2, 1]
+    return [1 - bit for bit in bits]
+
+
+def pulse_chips(symbols: NDArray[np.int64], link: Link) -> NDArray[np.uint8]:
+    """4-PPM: in each four chips one is lit, and its place says two bits."""
+    clusters = symbols.shape[1]
+    rows = [[chip] * clusters for chip in link.codebook.preamble.tolist()]
+    for frame in symbols:
+        rows += link.codebook.pilots.T.tolist()
+        for first in (4, 2, 0):
+            places = frame >> first & 3
+            rows += [[int(place == slot) for place in places] for slot in range(4)]
+    return np.array(rows, np.uint8)
+
+
+def packet_of(kind: str) -> tuple[Link, NDArray[np.int64], NDArray[np.uint8]]:
+    """A link, a packet's symbols, and the chips of its LEDs, (chips, LEDs)."""
+    text = b"Tempo 30!"
+    if kind == "4-PPM":
+        link = board_link(*PULSES, "air.frames_per_packet=3")
+        symbols = symbols_of(1, 2, link)[0]
+        return link, symbols, np.repeat(pulse_chips(symbols, link), 6, axis=1)
+    chips = serial_chips(text) if kind == "7E2" else turned_chips(text)
+    link = board_link(*(SERIAL if kind == "7E2" else TURNED), f"air.frames_per_packet={len(text)}")
+    return link, np.array([[byte] for byte in text]), np.repeat(np.array(chips, np.uint8)[:, None], 6, axis=1)
+
+
+KINDS = ["7E2", "8O1, turned", "4-PPM"]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_characters_and_pulses_are_those_of_the_link(kind: str, device: SimulatedBoard, board: Board) -> None:
+    link, symbols, told = packet_of(kind)
+    provision(board, bank_of(symbols[None], link), Settings())
+    device.run(100_000)
+    rows = shown(device)
+    assert len(rows) > len(told), "more than a packet"
+    assert (rows[:, : told.shape[1]] == np.resize(told, (len(rows), told.shape[1]))).all()
+    assert not rows[:, told.shape[1] :].any()
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "ten clusters"])
+def test_the_image_of_the_part_plays_them_too(kind: str, stm32) -> None:
+    """The image as it is flashed; rows as they are latched, from the first lit one on."""
+    from tests.models.stm32 import US, Dma, lit_rows
+
+    bank, told = a_bank(), EXPECTED
+    if kind in KINDS:
+        link, symbols, told = packet_of(kind)
+        bank = bank_of(symbols[None], link)
+    chip, board = stm32()
+    assert board.about.chip_rate_min_hz == 1282  # chips of 0.78 ms
+    provision(board, bank, Settings(start=False))
+    begin = len(chip.drivers.log)
+    board.start()
+    chip.run(15_000)
+    rows, _ = lit_rows(chip.drivers.log[begin:])
+    told = np.roll(told, -int(told.any(1).argmax()), axis=0)
+    assert len(rows) >= 100
+    assert (rows[:, : told.shape[1]] == np.resize(told, (len(rows), told.shape[1]))).all()
+    assert not rows[:, told.shape[1] :].any()
+    assert chip.longest[16 + Dma.IRQ] < 12 * US
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [[*SERIAL, "air.frames_per_packet=80"], [*PULSES, "air.frames_per_packet=20"]],
+    ids=["7E2", "4-PPM"],
+)
+def test_a_text_by_a_board_and_a_camera(settings: list[str], evlcp, tmp_path: Path) -> None:
+    options = [part for one in settings for part in ("--set", one)]
+    done = evlcp("loop", "--text", "Tempo 30!", "--seed", 2, "--json", "-o", tmp_path, *options)
+    assert (done.code, done.err) == (0, ""), done.err
+    said = {step.pop("step"): step for step in map(json.loads, done.out.splitlines())}
+    assert said["text"]["texts"] == ["Tempo 30!"]
+    receiver = said["receiver"]
+    assert (receiver["bit_errors"], receiver["warnings"]) == (0, [])
+    assert receiver["frames_sent"] - 1 <= receiver["frames"] <= receiver["frames_sent"]
+
+
+@pytest.mark.parametrize("kind", ["7E2", "8O1, turned"])
+def test_a_stream_rests_while_there_is_nothing_to_send(
+    kind: str, device: SimulatedBoard, board: Board
 ) -> None:
-    object.__setattr__(board.about, "chip_rate_min_hz", 1282)
-    link = load_link(overrides=["air.chip_rate_hz=1000.0", f"air.pilot_every={pilot_every}"])
-    symbols = random_symbols(2, 10, link.codebook, np.random.default_rng(6))
-    chips = symbol_chips(symbols, link.codebook, pilot_every)
-    bank = bank_of(symbols, link)
-    assert bank.format == Format.WORDS
-    assert bank.chip_by_chip().duty == bank.duty
-    provision(board, bank, Settings(duty_limit=0.6))
-    device.run(800_000)
-    rows = shown(device)
-    wanted = np.repeat(np.repeat(chips, 6, axis=1), 2, axis=0)  # 2000 chips/s
-    assert (rows == np.resize(wanted, rows.shape)).all()
-    assert board.verify(bank) == 0
-    assert not board.program(bank).swapped
+    """The board's idle pattern would be characters: packets of pause keep it from being shown."""
+    link, symbols, told = packet_of(kind)
     with board.stream(link) as stream:
-        stream.send(symbols[0])
-    rows = shown(device)
-    packet = 2 * link.packet.packet_chips
-    assert (rows[-packet:] == wanted[:packet]).all()
-    masks = Bank.of_chips(chips, link.codebook, link.packet)
-    provision(board, masks, Settings())
-    assert board.status().hold == 2
+        stream.wait(0.05)
+        assert stream.send(symbols) == 0
+        stream.wait(0.1)
+        assert [stream.send(symbols) for _ in range(3)] == [1, 2, 3]
+        assert stream.pauses > 5
+    assert (stream.underruns, stream.sent) == (0, 4)
+    chips = device.records().played().chips(link.bar.led_clusters())
+    packets = chips.reshape(-1, len(told))
+    sent = (packets == told[:, 0]).all(1)
+    assert (packets[~sent] == told[0, 0]).all(), "the level of a pause"
+    assert sent.sum() == 4
+    assert np.flatnonzero(sent)[0] >= 3, "it rests from the first chip on"
+    assert sent[-3:].all(), "behind one another"
+    assert not device.shown().any()
+
+
+def test_what_would_be_characters_is_refused(board: Board) -> None:
+    link, symbols, _ = packet_of("7E2")
+    bank = bank_of(symbols[None], link)
+    with pytest.raises(
+        ConfigError, match="watchdog = idle: LEDs that are on for a chip of two say something"
+    ):
+        provision(board, bank, Settings(watchdog=Watchdog.IDLE))
+    provision(board, bank, Settings(watchdog=Watchdog.DARK, duty_limit=0.8, start=False))
+    with pytest.raises(RefusedError, match="a pause of this link has a LED on for 1 of the time, the duty"):
+        board.stream(link)
+    turned, symbols, _ = packet_of("8O1, turned")
+    with board.stream(turned) as stream:
+        stream.send(symbols)

@@ -13,8 +13,6 @@ from tests.firmware.conftest import SANITIZED
 
 TESTS = Path(__file__).parent / "c" / "Makefile"
 
-pytestmark = pytest.mark.usefixtures("compiler")
-
 
 def run(*command: str, timeout: float = 300) -> "subprocess.CompletedProcess[str]":
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout, check=False)

@@ -9,8 +9,6 @@ import pytest
 
 from firmware_host.board.fleet import read_inventory
 
-pytestmark = pytest.mark.usefixtures("compiler")
-
 PAGE = (Path(__file__).parents[2] / "docs" / "transmitter.md").read_text()
 
 

@@ -3,26 +3,33 @@
 import json
 import socket
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import pytest
-from board_lines import Native
+from board_lines import Native, check_fault
 
-from evlcp_sdk.errors import ConfigError
 from firmware_host.board.fleet import read_inventory
 from firmware_host.errors import IncompatibleError
 
-pytestmark = pytest.mark.usefixtures("compiler")
+SITE = """
+[[bar]]
+transmitter_id = 7
+latitude_deg = 35.156789
+longitude_deg = 136.965432
+height_m = 52.4
+"""
 
 
 @pytest.fixture
-def boards(tmp_path: Path) -> Iterator[list[str]]:
+def boards(tmp_path: Path) -> Iterator[list[Native]]:
     """Native boards on unix sockets."""
-    ports = [f"unix:{tmp_path / f'b{n}'}" for n in range(8)]
-    emulated = [Native(port, unique_id=n) for n, port in enumerate(ports)]
-    yield ports
-    for board in emulated:
-        board.end()
+    with ExitStack() as stack:
+        emulated = [Native(f"unix:{tmp_path / f'b{n}'}", unique_id=n) for n in range(8)]
+        for board in emulated:
+            stack.callback(board.end)
+        yield emulated
 
 
 def inventory(path: Path, ports: list[str], extra: dict[int, str]) -> Path:
@@ -43,16 +50,10 @@ def test_a_boards_link(tmp_path: Path) -> None:
     assert [b.packet.pilot_every for b in banks] == [1, 4, 1]
     assert [b.packet.frames for b in banks] == [10, 8, 10]
     assert [b.chip_rate_hz for b in banks] == [10_000, 10_000, 20_000]
-    inventory(file, ["unix:/a"], {0: "link = {air = {pilot_every = 0}}\n"})
-    with pytest.raises(ConfigError, match=r"board\[0\]: link: air\.pilot_every = 0"):
-        read_inventory(file)
-
-
-def test_a_link_for_all_boards(tmp_path: Path) -> None:
-    file = inventory(tmp_path / "two.toml", ["unix:/a", "unix:/b"], {1: "link = {}\n"})
-    file.write_text(
-        file.read_text().replace("random = 16", 'random = 16\nlink = {modulation = {id = "wh8"}}')
-    )
+    # one for all boards, but for those with their own
+    inventory(file, ["unix:/a", "unix:/b"], {1: "link = {}\n"})
+    text = file.read_text().replace("random = 16", 'random = 16\nlink = {modulation = {id = "wh8"}}')
+    file.write_text(text)
     assert [bank.codebook.profile for bank in read_inventory(file).banks.values()] == ["wh8", "wh4x2"]
 
 
@@ -69,93 +70,157 @@ def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
         read_inventory(file)
 
 
-def test_six_of_eight(evlcp, boards: list[str], tmp_path: Path) -> None:
+def test_six_of_eight(evlcp, boards: list[Native], tmp_path: Path) -> None:
     # one port has nobody, one board cannot take the level
     silent = socket.socket(socket.AF_UNIX)
     silent.bind(str(tmp_path / "silent"))
     silent.listen()
-    ports = [*boards[:3], f"unix:{tmp_path / 'silent'}", *boards[4:]]
-    file = inventory(tmp_path / "tunnel.toml", ports, {5: "level_ma = 500\n"})
+    ports = [board.line.place for board in boards]
+    file = tmp_path / "tunnel.toml"
+    inventory(file, [*ports[:3], f"unix:{tmp_path / 'silent'}", *ports[4:]], {5: "level_ma = 500\n"})
     done = evlcp("board", "program", "--inventory", file)
     silent.close()
     lines = done.out.splitlines()
-    assert len(lines) == 8
-    good = [x for x in lines if "programmed 5120 of 5120 bytes" in x]
     bad = sorted(x for x in lines if "FAILED" in x)
-    assert (len(good), len(bad)) == (6, 2)
+    assert (len([x for x in lines if "programmed 5120 of 5120 bytes" in x]), len(bad)) == (6, 2)
     assert bad[0].startswith("T03")
     assert "FAILED (4)" in bad[0]
     assert bad[1].startswith("T05")
     assert "FAILED (5)" in bad[1]
     assert "nearest value the board can take is 60" in bad[1]
-    assert done.code == 4
-    assert done.err.startswith(f"evlcp: {file}: 2 of 8 boards failed (T03, T05)")
+    check_fault(done, 4, f"evlcp: {file}: 2 of 8 boards failed (T03, T05)")
     for n in (0, 7):
-        same = evlcp("board", "verify", "--random", 16, "--seed", n, "--port", boards[n])
+        same = evlcp("board", "verify", "--random", 16, "--seed", n, "--port", ports[n])
         assert same.code == 0, same.err
 
     # repaired, the next run does only what is missing
-    file = inventory(tmp_path / "tunnel.toml", boards, {})
+    inventory(file, ports, {})
     again = evlcp("board", "program", "--inventory", file, "--json")
     assert again.code == 0, again.err
     rows = [json.loads(x) for x in again.out.splitlines()]
     assert sorted(r["id"] for r in rows if r["written_bytes"]) == ["T03", "T05"]
-    assert all(r["ok"] for r in rows)
-    assert len(rows) == 8
+    assert [r["ok"] for r in rows] == [True] * 8
     assert rows[0]["position_m"][0] == 0.0
 
 
-GOOD = 'id = "a"\nport = "native:"\nposition_m = [0, 0, 0]\nrandom = 1\n'
+def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards: list[Native], tmp_path: Path) -> None:
+    (tmp_path / "site.toml").write_text(SITE)
+    file = tmp_path / "tunnel.toml"
+    text = '[defaults]\nsequence = 4\nbeacon = "site.toml"\nuser = "north"\ntext = "Tempo 30"\n'
+    for n, one in enumerate(boards[:3]):
+        text += f'[[board]]\nid = "T{n}"\nport = "{one.line.place}"\nposition_m = [0, 0, {n}]\n'
+    file.write_text(text)
+
+    def rows(*arguments: object) -> list[dict[str, Any]]:
+        done = evlcp("board", *arguments, "--inventory", file, "--json")
+        assert done.code == 0, done.err
+        return sorted(map(json.loads, done.out.splitlines()), key=lambda row: row["id"])
+
+    assert all(row["ok"] and row["swapped"] for row in rows("program"))
+    assert not any(row["swapped"] for row in rows("program")), "a message with a number stays the same"
+    assert all(row["ok"] and row["bank"] == 0 for row in rows("verify"))
+    assert [row["status"]["state"] for row in rows("status")] == ["playing"] * 3
+    assert [row["state"] for row in rows("blank")] == ["dark"] * 3
+    assert [(row["slot"], row["save_sequence"]) for row in rows("save", "--autostart")] == [(0, 1)] * 3
+    assert [row["state"] for row in rows("start")] == ["playing"] * 3
+    seen = rows("monitor", "--count", 2, "--interval", 0.01)
+    assert [row["id"] for row in seen] == ["T0", "T0", "T1", "T1", "T2", "T2"]
+    assert {row["state"] for row in seen} == {"playing"}
+    said = evlcp("board", "status", "--inventory", file).out.splitlines()
+    assert sorted(line.split("  ")[0] for line in said) == ["T0", "T1", "T2"]
+    assert all("playing, " in line for line in said)
+    # one that is off does not hold up the others
+    boards[1].end()
+    done = evlcp("board", "stop", "--inventory", file, "--json")
+    assert done.code == 4
+    *ended, error = map(json.loads, done.out.splitlines())
+    assert {row["id"]: row["ok"] for row in ended} == {"T0": True, "T1": False, "T2": True}
+    assert error["error"]["kind"] == "FleetError"
+    file.write_text(file.read_text().replace("Tempo 30", "Tempo 50"))
+    check_fault(evlcp("board", "verify", "--inventory", file), 7, "T0")
+    refused = evlcp("board", "status", "--inventory", file, "--port", "native:")
+    check_fault(refused, 2, "write --port there")
+
+
+def test_the_packets_of_an_inventory_are_those_of_tx_message(evlcp, tmp_path: Path) -> None:
+    pytest.importorskip("cryptography", reason="the extra sign is not installed")
+    (tmp_path / "site.toml").write_text(SITE)
+    assert evlcp("tx", "keygen", tmp_path / "private.pem").code == 0
+    options = ("--beacon", tmp_path / "site.toml", "--key", tmp_path / "private.pem", "--user", "north")
+    done = evlcp("tx", "message", "--text", "hi", *options, "--sequence", 9, "--repeat", 2, "--json")
+    (tmp_path / "symbols.json").write_text(done.out)
+    keys = (
+        'text = "hi"\nbeacon = "site.toml"\nkey = "private.pem"\nuser = "north"\nsequence = 9\nrepeat = 2\n'
+    )
+    contents = []
+    for payload in (keys, 'payload = "symbols.json"\n'):
+        head = '[[board]]\nid = "a"\nport = "native:"\nposition_m = [0, 0, 0]\n'
+        (tmp_path / "one.toml").write_text(head + payload)
+        (bank,) = read_inventory(tmp_path / "one.toml").banks.values()
+        contents.append(bank.content)
+        assert bank.packets == json.loads(done.out)["packets"]
+    assert contents[0] == contents[1]
+
+
+BOARD = '[[board]]\nid = "a"\nport = "native:"\nposition_m = [0, 0, 0]\n'
+GOOD = BOARD + "random = 1\n"
 
 
 @pytest.mark.parametrize(
-    ("text", "expected"),
+    ("text", "code", "expected"),
     [
-        ("board = 3", "expected at least one [[board]]"),
-        ("[[board", "not TOML"),
-        ("", "expected at least one [[board]]"),
-        ("[other]\n", "other: unknown table"),
-        ("defaults = 3\n[[board]]\n" + GOOD, "defaults = 3"),
-        ("[[board]]\n" + GOOD.replace("random = 1", ""), "give payload or random or a message"),
-        ("[[board]]\n" + GOOD + 'colour = "red"', 'board[0].colour = "red": unknown key'),
-        ("[[board]]\n" + GOOD.replace("[0, 0, 0]", "[0, 0]"), "board[0].position_m = [0, 0]"),
-        ("[[board]]\n" + GOOD.replace("[0, 0, 0]", "[0, 0, nan]"), "board[0].position_m.2"),
-        ("[[board]]\n" + GOOD.replace("random = 1", 'random = "1"'), 'board[0].random = "1"'),
-        ("[[board]]\n" + GOOD + 'watchdog = "sleep"', 'board[0].watchdog = "sleep"'),
-        ("[[board]]\n" + GOOD + 'profile = "wh8"', 'board[0].profile = "wh8": unknown key'),
+        ("board = 3", 2, "expected at least one [[board]]"),
+        ("[[board", 2, "not TOML"),
+        ("", 2, "expected at least one [[board]]"),
+        ("[other]\n", 2, "other: unknown table"),
+        ("defaults = 3\n" + GOOD, 2, "defaults = 3"),
+        (BOARD, 2, "give payload or random or a message"),
+        (GOOD + 'colour = "red"', 2, 'board[0].colour = "red": unknown key'),
+        (GOOD.replace("[0, 0, 0]", "[0, 0]"), 2, "board[0].position_m = [0, 0]"),
+        (GOOD.replace("[0, 0, 0]", "[0, 0, nan]"), 2, "board[0].position_m.2"),
+        (BOARD + 'random = "1"', 2, 'board[0].random = "1"'),
+        (GOOD + 'watchdog = "sleep"', 2, 'board[0].watchdog = "sleep"'),
         (
-            '[[board]]\nlink = {modulation = {id = "wh9"}}\n' + GOOD,
-            "board[0]: link: no modulation algorithm named 'wh9'",
+            GOOD + 'link = {modulation = {id = "wh9"}}',
+            2,
+            "board[0]: link: no modulation algorithm named",
         ),
-        ('[[board]]\nlink = "no.toml"\n' + GOOD, "no.toml: cannot be read"),
+        (GOOD + "link = {air = {pilot_every = 0}}", 2, "board[0]: link: air.pilot_every = 0"),
+        (GOOD + 'link = "no.toml"', 2, "no.toml: cannot be read"),
         (
-            "[[board]]\nlink = {air = {chip_rate_hz = 2e6}}\n" + GOOD,
-            "board[0]: the driver board cannot play this link: air",
+            GOOD + "link = {air = {chip_rate_hz = 2e6}}",
+            2,
+            "board[0]: the driver board cannot play this link",
         ),
+        (GOOD + "link = {air = {chip_rate_hz = 12.5}}", 2, "air.chip_rate_hz = 12.5: a board takes whole"),
+        (GOOD + GOOD, 2, 'board[1].id = "a", expected another than board[0]\'s'),
+        (BOARD + 'payload = "no.json"', 3, "no.json: cannot be read"),
+        (BOARD + 'text = "a"', 2, "a message needs sequence"),
+        (GOOD + 'text = "a"\nsequence = 1', 2, "give payload or random or a message"),
+        (GOOD + 'key = "k.pem"', 2, "key and user belong to a beacon"),
+        (BOARD + 'beacon = "no.toml"\nsequence = 1', 2, "no.toml: cannot be read"),
         (
-            "[[board]]\nlink = {air = {chip_rate_hz = 12.5}}\n" + GOOD,
-            "air.chip_rate_hz = 12.5: a board takes whole",
+            BOARD + 'beacon = "site.toml"\nsequence = 1\ntransmitter_id = 8',
+            2,
+            "no bar has transmitter_id 8, but 7",
         ),
-        ("[[board]]\n" + GOOD + "[[board]]\n" + GOOD, 'board[1].id = "a", expected another than board[0]\'s'),
-        ("[[board]]\n" + GOOD.replace("random = 1", 'payload = "no.json"'), "no.json: cannot be read"),
+        (BOARD + 'beacon = "site.toml"\nkey = "no.pem"\nsequence = 1', 3, "no.pem: cannot be read"),
     ],
 )
-def test_wrong_inventory_is_one_line(evlcp, tmp_path: Path, text: str, expected: str) -> None:
+def test_wrong_inventory_is_one_line(evlcp, tmp_path: Path, text: str, code: int, expected: str) -> None:
+    (tmp_path / "site.toml").write_text(SITE)
     file = tmp_path / "tunnel.toml"
     file.write_text(text)
     done = evlcp("board", "program", "--inventory", file)
-    assert done.code == (3 if "payload" in text else 2)
+    check_fault(done, code, f"evlcp: {file}: ", expected)
     assert done.out == ""
-    assert done.err.startswith(f"evlcp: {file}: ")
-    assert expected in done.err
-    assert done.err.count("\n") == 1
 
 
 def test_another_board_on_the_port_is_refused(evlcp, tmp_path: Path) -> None:
     file = tmp_path / "tunnel.toml"
-    file.write_text("[[board]]\n" + GOOD + f'unique_id = "{"0" * 23}7"\n')
+    file.write_text(GOOD + f'unique_id = "{"0" * 23}7"\n')
     done = evlcp("board", "program", "--inventory", file)
     assert done.code == 8
     assert "the inventory expects" in done.out
-    file.write_text("[[board]]\n" + GOOD + f'unique_id = "{"0" * 24}"\n')
+    file.write_text(GOOD + f'unique_id = "{"0" * 24}"\n')
     assert evlcp("board", "program", "--inventory", file).code == 0

@@ -1,43 +1,36 @@
-"""What the host tool says and does about a board that is left, taken, silent or of another rate."""
+"""What the host tool says and does about a board that is left, taken, silent, gone or of another rate."""
 
 import json
+import os
+import re
 import signal
 import socket
 import subprocess
+import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-import numpy as np
 import pytest
-from board_lines import Native, board_on
+from board_lines import board_link, board_on, check_fault, some_bank
 from test_board_cli import EVLCP
 
-from evlcp_sdk.air.codebook import Codebook
-from firmware_host.board.bank import Bank, random_symbols
+from evlcp_sdk.errors import OutputError
 from firmware_host.board.board import Board, Settings, provision
+from firmware_host.board.monitor import Back, Gone, watch
 from firmware_host.board.session import Session
+from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
-from firmware_host.errors import NoBoardError, RefusedError, VerifyError
-from firmware_host.ports.transport import SocketTransport
+from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
+from firmware_host.ports.transport import ReplayTransport, SocketTransport, TraceTransport
 from firmware_host.protocol.client import Timing
-from firmware_host.protocol.generated.requests import BoardFault, State, Status, Watchdog
-from tests.conftest import Run
+from firmware_host.protocol.generated.requests import BoardFault, State, Status, StatusReply, Watchdog
 from tests.models.usb import UsbLine
 
-pytestmark = pytest.mark.usefixtures("compiler")
 
-Evlcp = Callable[..., Run]
-
-
-def payload(book: Codebook, seed: int = 0, rate: float = 10_000.0) -> Bank:
-    return Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(seed)), book, 1, rate)
-
-
-def test_a_host_that_stays_keeps_the_watchdog_still(book: Codebook) -> None:
-    device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
-    done = provision(board, payload(book), Settings(watchdog=Watchdog.IDLE, watchdog_ms=300))
+def test_a_host_that_stays_keeps_the_watchdog_still(device: SimulatedBoard, board: Board) -> None:
+    done = provision(board, some_bank(2), Settings(watchdog=Watchdog.IDLE, watchdog_ms=300))
     assert (done.watchdog, done.watchdog_ms) == ("idle", 300)
     status = board.status()
     board.stay(3.0, status)
@@ -48,41 +41,60 @@ def test_a_host_that_stays_keeps_the_watchdog_still(book: Codebook) -> None:
     assert after.requests - status.requests < 40
     device.run(1_000_000)
     assert board.status().faults & BoardFault.WATCHDOG
-
-
-def test_staying_with_a_board_that_plays_on_asks_nothing(book: Codebook) -> None:
-    board = board_on(SimulatedLine(SimulatedBoard()))
-    provision(board, payload(book), Settings())
+    # one that plays on is asked nothing
+    board.watchdog(Watchdog.KEEP, 0)
     before = board.status()
     board.stay(3.0, before)
     assert board.status().requests == before.requests + 1
 
 
-def test_program_keeps_alive_until_it_is_ended(evlcp: Evlcp, tmp_path: Path) -> None:
-    port = f"unix:{tmp_path / 'board'}"
-    emulated = Native(port, leds=tmp_path / "leds.bin")
-    options = ("--random", "1", "--watchdog", "idle", "--watchdog-ms", "300", "--port", port)
-    command = [*EVLCP, "board", "program", *options, "--keep-alive", "--json"]
+def within(seconds: float, done: Callable[[], bool]) -> bool:
+    end = time.monotonic() + seconds
+    while not done() and time.monotonic() < end:
+        time.sleep(0.01)
+    return done()
+
+
+def interrupted(command: list[str], begun: Callable[[], bool]) -> str:
+    """What a command says that is ended with Ctrl-C once it has begun; it ends well."""
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    done = json.loads(process.stdout.readline())
-    assert (done["watchdog"], done["watchdog_ms"]) == ("idle", 300)
-    time.sleep(1.2)
+    assert within(60, begun)
     process.send_signal(signal.SIGINT)
-    assert process.wait(10) == 0
-    assert process.stderr is not None
-    assert process.stderr.read() == ""
-    process.stdout.close()
-    process.stderr.close()
+    out, err = process.communicate(timeout=20)
+    assert (process.returncode, err) == (0, "")
+    return out
+
+
+def test_program_keeps_alive_until_it_is_ended(evlcp, native: str, tmp_path: Path) -> None:
+    options = ("--random", "1", "--watchdog", "idle", "--watchdog-ms", "300", "--port", native)
+    command = [*EVLCP, "board", "program", *options, "--keep-alive", "--json"]
+    # long after it has said what it has done
+    done = json.loads(interrupted(command, lambda: (tmp_path / "leds.bin").stat().st_size > 20_000 * 20))
+    assert (done["watchdog"], done["watchdog_ms"]) == ("idle", 300)
     # nobody else has looked since: no packet of the idle pattern has been played
-    status = json.loads(evlcp("board", "status", "--json", "--port", port).out)
+    status = json.loads(evlcp("board", "status", "--json", "--port", native).out)
     assert "watchdog" not in status["faults"] or status["silence_ms"] >= 300
     assert status["packets_sent"] > 25
-    emulated.end()
+
+
+def has_sent(leds: Path) -> bool:
+    """Whether a packet has begun: no two chips of the idle pattern are alike."""
+    if leds.stat().st_size < 4_000:
+        return False
+    rows = LedRecord.read(leds).played().rows
+    return bool((rows[1:] == rows[:-1]).all(1).any())
+
+
+def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native: str, tmp_path: Path) -> None:
+    command = [*EVLCP, "tx", "message", "--text", "{n}", "--every", "60", "--port", native, "--json"]
+    told = json.loads(interrupted(command, lambda: has_sent(tmp_path / "leds.bin")))
+    status = json.loads(evlcp("board", "--port", native, "status", "--json").out)
+    assert (status["state"], status["packets_sent"]) == ("dark", told["packets"])
+    check_fault(evlcp("board", "--port", native, "start"), 5, "NOTHING_COMMITTED")
 
 
 @pytest.mark.parametrize(("action", "what"), [("idle", "shows its idle pattern"), ("dark", "goes dark")])
-def test_what_the_watchdog_will_do_is_said(evlcp: Evlcp, action: str, what: str) -> None:
+def test_what_the_watchdog_will_do_is_said(evlcp, action: str, what: str) -> None:
     options = ("--port", "native:", "--random", 1)
     done = evlcp("board", "program", *options, "--watchdog", action, "--watchdog-ms", 1500)
     assert f"watchdog: the board {what} once no host has spoken for 1.5 s" in done.out
@@ -91,74 +103,81 @@ def test_what_the_watchdog_will_do_is_said(evlcp: Evlcp, action: str, what: str)
     assert f"the board {what}" in said
 
 
+def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp, native: str) -> None:
+    board = ("board", "--port", native)
+    assert evlcp(*board, "program", "--random", 1, "--no-start").code == 0
+    done = evlcp(*board, "start", "--pulse-hz", 2)
+    assert (done.code, done.err) == (0, "")
+    armed = f"armed: waits for a pulse on PPS ({native} for its pulse 3)"
+    assert done.out == f"{armed}; 'evlcp board status' shows whether it has come\n"
+    assert json.loads(evlcp(*board, "status", "--json").out)["state"] == "waiting"
+    assert evlcp(*board, "stop").code == 0
+
+    done = evlcp(*board, "start", "--pulse-hz", 2, "--timeout", 0.2)
+    assert (done.code, done.out) == (6, f"{armed}, for at most 0.2 s\n")
+    said = "the pulse that it waits for has not come in 0.2 s"
+    assert re.fullmatch(
+        rf"evlcp: {native}: {said} \(pulses since reset: .* 0\): check .*; all are stopped\n", done.err
+    )
+    assert json.loads(evlcp(*board, "status", "--json").out)["state"] == "dark"
+
+
 @pytest.mark.parametrize(("latency_s", "frame_s", "at_most"), [(0.0, 0.0, 1.15), (0.002, 0.001, 1.3)])
 def test_programming_is_near_the_wire_time(
-    book: Codebook, latency_s: float, frame_s: float, at_most: float
+    device: SimulatedBoard, latency_s: float, frame_s: float, at_most: float
 ) -> None:
     """By the board's own clock, over a line alone and behind a USB bridge: few waits for answers."""
     baud = 1_000_000
-    device = SimulatedBoard()
     board = board_on(UsbLine(device, latency_s, baud, frame_s))
-    bank = Bank.of_symbols(random_symbols(64, 10, book, np.random.default_rng(0)), book)
+    bank = some_bank(64)
     began_us = device.now_us
     assert provision(board, bank, Settings()).written == len(bank.content)
     wire_us = 10e6 * len(bank.content) / baud
     assert wire_us < device.now_us - began_us <= at_most * wire_us
 
 
-def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(book: Codebook) -> None:
-    device = SimulatedBoard()
+def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(
+    device: SimulatedBoard, monkeypatch: pytest.MonkeyPatch
+) -> None:
     line = SimulatedLine(device)
     board = board_on(line)
-    provision(board, payload(book), Settings())
+    provision(board, some_bank(2), Settings())
     written: list[int] = []
     write = line.write
-    line.write = lambda data: (written.append(len(data)), write(data))[1]  # type: ignore[method-assign]
+    monkeypatch.setattr(line, "write", lambda data: (written.append(len(data)), write(data))[1])
+    fast = some_bank(2, 1, board_link("air.chip_rate_hz=20000.0"))
     with pytest.raises(
         RefusedError, match=r"plays 10000 chips per second.*has 20000.*stop' first"
     ) as refused:
-        provision(board, payload(book, 1, 20_000.0), Settings())
+        provision(board, fast, Settings())
     assert refused.value.status == Status.BUSY
     assert sum(written) < 100, "only STATUS went out"
     board.stop()
     board.wait_dark()
-    assert provision(board, payload(book, 1, 20_000.0), Settings()).swapped
+    assert provision(board, fast, Settings()).swapped
 
 
-def test_a_bank_that_does_not_hold_is_not_blamed_on_the_rate(book: Codebook) -> None:
-    board = board_on(SimulatedLine(SimulatedBoard()))
+def test_a_bank_that_does_not_hold_is_not_blamed_on_the_rate(
+    board: Board, monkeypatch: pytest.MonkeyPatch
+) -> None:
     crc = board.crc
-    board.crc = lambda *place: crc(*place) ^ 1  # type: ignore[method-assign]
+    monkeypatch.setattr(board, "crc", lambda *place: crc(*place) ^ 1)
     with pytest.raises(VerifyError, match="does not hold what was sent") as told:
-        board.program(payload(book))
+        board.program(some_bank(2))
     assert "baud" not in str(told.value)
 
 
-@pytest.mark.parametrize("url", ["socket://localhost", "socket://", "socket://localhost:x", "rfc2217://"])
-def test_a_url_without_a_port_is_one_line(evlcp: Evlcp, url: str) -> None:
-    done = evlcp("board", "hello", "--port", url)
-    assert done.code == 4
-    assert f"cannot be opened: expected {url.split(':')[0]}://HOST:PORT" in done.err
-    assert done.err.count("\n") == 1
-
-
-def test_a_second_host_learns_of_the_first(evlcp: Evlcp, tmp_path: Path) -> None:
-    port = f"unix:{tmp_path / 'board'}"
-    emulated = Native(port)
-    with Session(SocketTransport.connect(port)) as session:
+def test_a_second_host_learns_of_the_first(evlcp, native: str) -> None:
+    with Session(SocketTransport.connect(native)) as session:
         first = Board(session)
-        start = time.monotonic()
-        second = evlcp("board", "hello", "--port", port)
-        assert second.code == 4
-        assert "another host is connected to it" in second.err
+        second = evlcp("board", "hello", "--port", native)
+        check_fault(second, 4, "another host is connected to it")
         assert "power" not in second.err
-        assert time.monotonic() - start < 5.0
         assert first.status().state == State.DARK
     # the first has left: nobody is turned away
     for _ in range(20):
-        with Session(SocketTransport.connect(port)) as session:
+        with Session(SocketTransport.connect(native)) as session:
             Board(session).status()
-    emulated.end()
 
 
 def test_a_socket_that_stays_silent_is_not_told_to_look_at_power() -> None:
@@ -170,3 +189,114 @@ def test_a_socket_that_stays_silent_is_not_told_to_look_at_power() -> None:
         ):
             session.hello()
         assert "power" not in str(told.value)
+
+
+class Breaking(SimulatedLine):
+    """Breaks after so many portions."""
+
+    def __init__(self, board: SimulatedBoard, left: int) -> None:
+        super().__init__(board)
+        self.left = left
+
+    def write(self, data: bytes) -> None:
+        self.left -= 1
+        if self.left < 0:
+            raise LineError("x: the line broke")
+        super().write(data)
+
+
+def test_a_monitor_finds_its_board_again(device: SimulatedBoard) -> None:
+    """A line that breaks, a board that is off for a while, and one that was reset."""
+    portions: Iterator[int] = iter([4, 0, 1000, 1000])
+
+    def opened() -> AbstractContextManager[Board]:
+        left = next(portions)
+        if not left:
+            raise NoBoardError("x: it is not there")
+        return nullcontext(board_on(Breaking(device, left)))
+
+    seen = []
+    for what in watch(opened, 0.01, count=6):
+        seen.append(what)
+        if len(seen) == 6:
+            device.reset()
+    kinds = [type(s) for s in seen]
+    assert kinds == [StatusReply, StatusReply, Gone, Back, *[StatusReply] * 2, Gone, Back, *[StatusReply] * 2]
+    assert isinstance(seen[2], Gone)
+    assert "the line broke" in str(seen[2].fault)
+    assert isinstance(seen[3], Back)
+    assert seen[3].after_s >= 0.5
+    assert not list(portions)
+    with pytest.raises(NoBoardError):
+        list(watch(lambda: (_ for _ in ()).throw(NoBoardError("off")), 0.01, count=1))  # type: ignore[arg-type]
+
+
+def is_there(pid: int) -> bool:
+    """Whether a process runs; one that has ended and is not yet waited for does not."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell children")
+def test_what_is_bound_ends_with_its_parent() -> None:
+    code = (
+        "import subprocess, sys, time\n"
+        "from firmware_host.emulators.processes import bound\n"
+        "print(subprocess.Popen(bound(['sleep', '600'])).pid, flush=True)\n"
+        "time.sleep(600)\n"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    try:
+        assert within(10, lambda: "sleep" in Path(f"/proc/{child}/cmdline").read_text().split("\0")[0])
+        parent.kill()
+        parent.wait()
+        assert within(10, lambda: not is_there(child))
+    finally:
+        parent.kill()
+        parent.stdout.close()
+        if is_there(child):
+            os.kill(child, signal.SIGKILL)
+
+
+class StillLine:
+    """A line on which nothing happens."""
+
+    name = "line"
+
+    def now(self) -> float:
+        return 0.0
+
+    def read(self, timeout_s: float) -> bytes:
+        del timeout_s
+        return b"\x01" * 100_000
+
+    def write(self, data: bytes) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_trace_follows_no_link_and_outlasts_what_ends_without_a_word(tmp_path: Path) -> None:
+    trace = TraceTransport(StillLine(), tmp_path / "wire.jsonl", 9600, 1, 2)
+    trace.write(b"abc")
+    trace.close()
+    assert ReplayTransport(tmp_path / "wire.jsonl").nonce == 2
+    (tmp_path / "victim").write_text("mine")
+    (tmp_path / "link.jsonl").symlink_to(tmp_path / "victim")
+    for name, says in (("link.jsonl", "it is a link"), ("no/wire.jsonl", "No such file")):
+        with pytest.raises(OutputError, match=rf"{name}: cannot be written: {says}"):
+            TraceTransport(StillLine(), tmp_path / name, 9600, 1, 2)
+    assert (tmp_path / "victim").read_text() == "mine"
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_ends_a_trace_in_one_line() -> None:
+    trace = TraceTransport(StillLine(), Path("/dev/full"), 9600, 1, 2)
+    for end in (lambda: trace.read(0.1), trace.close):
+        with pytest.raises(OutputError, match="/dev/full: cannot be written: No space left"):
+            end()

@@ -2,30 +2,31 @@
 
 import numpy as np
 import pytest
-from board_lines import board_on
+from board_lines import LINK, board_on, shown, some_bank
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
-from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import load_link
-from firmware_host.board.bank import Bank, random_symbols
+from firmware_host.board.bank import Bank
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import RefusedError
 from firmware_host.protocol.generated.requests import BoardFault, State, Status
-
-pytestmark = pytest.mark.usefixtures("compiler")
 
 BURST = 64
 FRAMES = 4
 CHIPS = 26 + 32 * FRAMES
 
 
+GOOD = some_bank(2)
+
+
 def bank_of_rows(rows: NDArray[np.uint8]) -> Bank:
-    book = load_link().codebook
-    return Bank.of_chips(rows, book, PacketFormat.of(book, FRAMES))
+    return Bank.of_chips(rows, LINK.codebook, PacketFormat.of(LINK.codebook, FRAMES))
+
+
+ONES = bank_of_rows(np.ones((CHIPS, 96), np.uint8))
 
 
 def excess(rows: NDArray[np.uint8], duty: float) -> NDArray[np.float64]:
@@ -35,56 +36,44 @@ def excess(rows: NDArray[np.uint8], duty: float) -> NDArray[np.float64]:
     return (sums - lowest).max(1)[1:]
 
 
-def device_and_board() -> tuple[SimulatedBoard, Board]:
-    device = SimulatedBoard()
-    return device, board_on(SimulatedLine(device))
-
-
-def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
-    return device.records().played().chips(None)
-
-
 def test_the_oracle_counts_every_stretch() -> None:
     rows = np.random.default_rng(1).integers(0, 2, (40, 96), dtype=np.uint8)
     every = max(float((rows[a:b].sum(0) - 0.4 * (b - a)).max()) for a in range(40) for b in range(a, 41))
     assert excess(rows, 0.4).max() == pytest.approx(every)
 
 
-def test_all_ones_at_full_current_are_refused_and_the_old_bank_plays_on(book: Codebook) -> None:
-    device, board = device_and_board()
+def test_all_ones_at_full_current_are_refused_and_the_old_bank_plays_on(
+    device: SimulatedBoard, board: Board
+) -> None:
     assert (board.about.level_max_ma, board.about.mean_max_ma, board.about.burst_chips) == (60, 30, BURST)
-    good = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
-    provision(board, good, Settings(level_ma=60))
+    provision(board, GOOD, Settings(level_ma=60))
     assert board.status().duty == 500
-    ones = bank_of_rows(np.ones((CHIPS, 96), np.uint8))
     with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*500 of 1000 chips.*lower the level") as refused:
-        board.program(ones)
+        board.program(ONES)
     assert (refused.value.status, refused.value.detail) == (Status.TOO_BRIGHT, 500)
     device.run(100_000)
-    assert board.holds(good, board.status())
+    assert board.holds(GOOD, board.status())
     assert board.status().state == State.PLAYING
     # what is too bright for 60 mA is not for 30, and the current stays below that then
-    provision(board, ones, Settings(level_ma=30))
+    provision(board, ONES, Settings(level_ma=30))
     with pytest.raises(RefusedError, match="TOO_BRIGHT"):
         board.level(31)
     device.run(100_000)
     status = board.status()
     assert (status.state, status.level_ma, status.duty, status.faults) == (State.PLAYING, 30, 1000, 0)
     # and back in one go, although 60 mA are too much for what plays
-    provision(board, good, Settings(level_ma=60))
+    provision(board, GOOD, Settings(level_ma=60))
     assert board.status().level_ma == 60
 
 
-def test_limits_hold_at_once_and_outlive_a_reset_by_save(book: Codebook) -> None:
-    device, board = device_and_board()
-    good = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
-    provision(board, good, Settings(level_ma=40, start=False))
-    board.limit(good, level_ma=25, duty=0.5)
+def test_limits_hold_at_once_and_outlive_a_reset_by_save(device: SimulatedBoard, board: Board) -> None:
+    provision(board, GOOD, Settings(level_ma=40, start=False))
+    board.limit(GOOD, level_ma=25, duty=0.5)
     status = board.status()
     assert (status.level_ma, status.level_limit_ma, status.duty_limit) == (25, 25, 500)
     with pytest.raises(RefusedError, match="nearest value the board can take is 25"):
         board.level(26)
-    board.limit(good)  # nothing said, nothing changed
+    board.limit(GOOD)  # nothing said, nothing changed
     board.save(autostart=True)
     device.reset()
     board = board_on(SimulatedLine(device))
@@ -94,31 +83,29 @@ def test_limits_hold_at_once_and_outlive_a_reset_by_save(book: Codebook) -> None
     with pytest.raises(
         RefusedError, match=r"a LED on for 0\.5 of the time, the duty limit is 0\.4: .* at least 0\.5"
     ):
-        board.limit(good, duty=0.4)
+        board.limit(GOOD, duty=0.4)
     with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*400 of 1000 chips"):
-        board._configure(good, 20, 400)
+        board._configure(GOOD, 20, 400)
     device.run(200_000)
     status = board.status()
     assert (status.state, status.faults) == (State.PLAYING, 0)
     assert (status.level_ma, status.level_limit_ma, status.duty_limit) == (25, 25, 500)
     with pytest.raises(RefusedError, match="nearest value the board can take is 60"):
-        board.limit(good, level_ma=61)
+        board.limit(GOOD, level_ma=61)
     with pytest.raises(ConfigError, match="duty_limit = 0: expected"):
         Settings(duty_limit=0)
 
 
-def test_a_duty_limit_fits_what_is_programmed_with_it(book: Codebook) -> None:
-    device, board = device_and_board()
-    good = Bank.of_symbols(random_symbols(2, 10, book, np.random.default_rng(0)), book)
+def test_a_duty_limit_fits_what_is_programmed_with_it(device: SimulatedBoard, board: Board) -> None:
     rows = np.zeros((CHIPS, 96), np.uint8)
     rows[::5] = 1
     dim = bank_of_rows(rows)
-    assert (good.duty, dim.duty) == (500, int(np.ceil(1000 * rows.mean(0).max())))
-    provision(board, good, Settings())
-    assert board.status().duty == good.duty
+    assert (GOOD.duty, dim.duty) == (500, int(np.ceil(1000 * rows.mean(0).max())))
+    provision(board, GOOD, Settings())
+    assert board.status().duty == GOOD.duty
     for _ in range(2):  # there already, or another one as bright
         with pytest.raises(RefusedError, match=r"this payload has a LED on for 0\.5 of the time") as refused:
-            provision(board, good, Settings(duty_limit=0.3))
+            provision(board, GOOD, Settings(duty_limit=0.3))
         assert (refused.value.status, refused.value.exit_code) == (Status.TOO_BRIGHT, 5)
         device.run(50_000)
         status = board.status()
@@ -129,12 +116,11 @@ def test_a_duty_limit_fits_what_is_programmed_with_it(book: Codebook) -> None:
     status = board.status()
     assert (status.state, status.faults, status.duty, status.duty_limit) == (State.PLAYING, 0, dim.duty, 300)
     with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*300 of 1000 chips"):
-        board.program(good)
+        board.program(GOOD)
     # limits by which a bank is refused do not stay
     provision(board, dim, Settings(duty_limit=1.0, level_ma=60))
-    ones = bank_of_rows(np.ones((CHIPS, 96), np.uint8))
     with pytest.raises(RefusedError, match=r"TOO_BRIGHT.*545 of 1000 chips"):
-        provision(board, ones, Settings(level_limit_ma=55))
+        provision(board, ONES, Settings(level_limit_ma=55))
     status = board.status()
     assert (status.level_ma, status.level_limit_ma, status.duty_limit) == (60, 60, 1000)
     assert board.holds(dim, status)
@@ -160,7 +146,8 @@ def test_no_stretch_of_what_is_sent_is_beyond_the_limits(
     stream: tuple[NDArray[np.uint8], int, float], stops: list[int]
 ) -> None:
     rows, level_ma, limit = stream
-    device, board = device_and_board()
+    device = SimulatedBoard()
+    board = board_on(SimulatedLine(device))
     bank = bank_of_rows(rows)
     board.level(level_ma)
     board.limit(bank, duty=limit)
@@ -197,10 +184,9 @@ def test_no_stretch_of_what_is_sent_is_beyond_the_limits(
     assert not len(everything) or excess(everything, duty).max() <= BURST + 10 * (len(stops) > 0)
 
 
-def test_a_burst_beyond_the_limits_goes_dark_before_it_is_shown() -> None:
+def test_a_burst_beyond_the_limits_goes_dark_before_it_is_shown(device: SimulatedBoard, board: Board) -> None:
     rows = np.zeros((3 * CHIPS, 96), np.uint8)
     rows[20:160, 5] = 1  # 0.3 of the time, but at once
-    device, board = device_and_board()
     provision(board, bank_of_rows(rows), Settings(level_ma=20, duty_limit=0.54))
     device.run(100_000)
     # 140 * (1 - 0.54) chips are just beyond 64: the last of them is not shown
@@ -214,8 +200,7 @@ def test_a_burst_beyond_the_limits_goes_dark_before_it_is_shown() -> None:
     assert (shown(device)[:900] == np.resize(rows, (900, 96))).all()
 
 
-def test_the_led_test_keeps_to_the_mean_current() -> None:
-    device, board = device_and_board()
+def test_the_led_test_keeps_to_the_mean_current(device: SimulatedBoard, board: Board) -> None:
     board.level(60)
     board.test_leds(3, 4, 50)
     assert device.level_ma() == 30

@@ -1,20 +1,22 @@
-"""`evlcp tx message`: what it writes and plays says what it was told to say."""
+"""`evlcp tx message` and `evlcp board stream`: what they write and play says what it was told to say."""
 
 import json
+import subprocess
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
-from board_lines import Native
+from board_lines import LINK, Native, check_fault
+from test_board_cli import EVLCP
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message, joined
 from evlcp_sdk.air.frames import bits_of_symbols
+from evlcp_sdk.air.kinds import CountdownKind, TimeKind
 from evlcp_sdk.air.signing import TrustedKey, TrustedKeys
 from evlcp_sdk.link.resolve import Link, load_link
+from firmware_host.emulators.led_record import RECORD, LedRecord
 
 SITE = """
 [[bar]]
@@ -26,8 +28,6 @@ heading_deg = 90.0
 tilt_deg = 1.5
 """
 
-Evlcp = Callable[..., Any]
-
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
@@ -36,7 +36,7 @@ def site(tmp_path: Path) -> Path:
     return path
 
 
-def symbols_of(chips: np.ndarray, link: Link) -> np.ndarray:
+def symbols_of(chips: np.ndarray, link: Link = LINK) -> np.ndarray:
     """Symbols (packets, frames, clusters) of chips that begin with a packet."""
     words = link.codebook.codewords
     whole = chips[: len(chips) // link.packet.packet_chips * link.packet.packet_chips]
@@ -50,7 +50,7 @@ def symbols_of(chips: np.ndarray, link: Link) -> np.ndarray:
     return np.array(found).reshape(-1, link.packet.frames, link.codebook.clusters)
 
 
-def messages_of(symbols: np.ndarray, link: Link) -> dict[Kind, Message]:
+def messages_of(symbols: np.ndarray, link: Link = LINK) -> dict[Kind, Message]:
     """The messages that packets carry, each whole, by kind."""
     coder = link.block_coder()
     parts: dict[Kind, dict[int, Block]] = {}
@@ -68,24 +68,25 @@ def messages_of(symbols: np.ndarray, link: Link) -> dict[Kind, Message]:
     return found
 
 
-def test_a_text_a_file_and_a_beacon(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
+def packets_on(leds: Path) -> np.ndarray:
+    """Symbols of the packets that a board showed; what is between them is left out."""
+    chips = LedRecord.read(leds).played().chips()
+    preamble = LINK.codebook.preamble[:, None]
+    found, at = [], 0
+    while at + LINK.packet.packet_chips <= len(chips):
+        if (chips[at : at + len(preamble)] == preamble).all():
+            found.append(chips[at : at + LINK.packet.packet_chips])
+            at += LINK.packet.packet_chips
+        else:
+            at += 1
+    return symbols_of(np.concatenate(found))
+
+
+def test_a_text_a_file_and_a_beacon(evlcp, site: Path, tmp_path: Path) -> None:
     data, out, chips = tmp_path / "data.bin", tmp_path / "m.json", tmp_path / "c.npy"
     data.write_bytes(bytes(range(100)))
-    done = evlcp(
-        *(
-            "tx",
-            "message",
-            "--text",
-            "Tempo 30 für 2 km",
-            "--file",
-            data,
-            "--beacon",
-            site,
-            "--user",
-            "lane 2",
-        ),
-        *("--sequence", "5", "-o", out, "--chips", chips),
-    )
+    sent = ("--text", "Tempo 30 für 2 km", "--file", data, "--beacon", site, "--user", "lane 2")
+    done = evlcp("tx", "message", *sent, "--sequence", "5", "-o", out, "--chips", chips)
     assert done.code == 0, done.err
     assert done.out.splitlines() == [
         "beacon       34 bytes, transmitter 7, sequence 5",
@@ -93,15 +94,14 @@ def test_a_text_a_file_and_a_beacon(evlcp: Evlcp, site: Path, tmp_path: Path) ->
         "data        100 bytes, transmitter 7, sequence 5",
         f"5 packets, 0.173 s, in {out} and {chips}",
     ]
-    link = load_link()
     table = json.loads(out.read_text())
-    assert (table["link"]["modulation"]["id"], table["codebook"]) == ("wh4x2", link.codebook.digest)
-    found = messages_of(np.array(table["symbols"]), link)
+    assert (table["link"]["modulation"]["id"], table["codebook"]) == ("wh4x2", LINK.codebook.digest)
+    found = messages_of(np.array(table["symbols"]))
     assert found[Kind.TEXT] == Message(Kind.TEXT, 7, 5, "Tempo 30 für 2 km".encode())
     assert found[Kind.DATA].payload == bytes(range(100))
     beacon = Beacon.unpack(found[Kind.BEACON].payload)
     assert beacon == Beacon(35.156789, 136.965432, 52.4, 90.0, 1.5, 0.96, b"lane 2")
-    assert (symbols_of(np.load(chips), link) == table["symbols"]).all()
+    assert (symbols_of(np.load(chips)) == table["symbols"]).all()
 
 
 @pytest.mark.parametrize(
@@ -111,14 +111,12 @@ def test_a_text_a_file_and_a_beacon(evlcp: Evlcp, site: Path, tmp_path: Path) ->
         ("modulation.id=wh8", "error-correction.id=reed-solomon"),
     ],
 )
-def test_any_link(evlcp: Evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
+def test_any_link(evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
     chips = tmp_path / "c.npy"
-    options = [part for setting in settings for part in ("--set", setting)]
-    played = evlcp("tx", "message", "--text", "Hello", "--port", "native:", *options)
+    message = ("tx", "message", *(part for setting in settings for part in ("--set", setting)), "--text")
+    played = evlcp(*message, "Hello", "--port", "native:")
     assert played.code == 0, played.err
-    done = evlcp(
-        "tx", "message", "--text", "Hello " * 40, "--chips", chips, "--repeat", 2, "--json", *options
-    )
+    done = evlcp(*message, "Hello " * 40, "--chips", chips, "--repeat", 2, "--json")
     assert done.code == 0, done.err
     link = load_link(overrides=settings)
     symbols = symbols_of(np.load(chips), link)
@@ -132,47 +130,55 @@ def test_any_link(evlcp: Evlcp, tmp_path: Path, settings: tuple[str, ...]) -> No
     assert abs(found.sequence - time.time()) < 60
 
 
-def test_a_signed_beacon(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
+def test_a_signed_beacon(evlcp, site: Path, tmp_path: Path) -> None:
     pytest.importorskip("cryptography", reason="the extra sign is not installed")
     key, out = tmp_path / "private.pem", tmp_path / "m.json"
     made = evlcp("tx", "keygen", key)
     assert made.code == 0
     assert evlcp("tx", "message", "--beacon", site, "--key", key, "-o", out).code == 0
-    link = load_link()
-    found = messages_of(np.array(json.loads(out.read_text())["symbols"]), link)
+    found = messages_of(np.array(json.loads(out.read_text())["symbols"]))
     keys = TrustedKeys([TrustedKey(made.out.strip())])
-    assert keys.check(found[Kind.BEACON], link.block_coder().digest, found[Kind.SIGNATURE]) is True
+    assert keys.check(found[Kind.BEACON], LINK.block_coder().digest, found[Kind.SIGNATURE]) is True
     again = evlcp("tx", "keygen", key)
-    assert (again.code, again.err) == (
-        1,
-        f"evlcp: {key}: exists; a key is not overwritten; --show prints it again\n",
-    )
+    check_fault(again, 1, f"evlcp: {key}: exists; a key is not overwritten; --show prints it again\n")
+    assert evlcp("tx", "keygen", key, "--show").out == made.out
 
 
-def test_faults_are_one_line(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
-    two = tmp_path / "two.toml"
-    two.write_text(SITE + SITE.replace("= 7", "= 8"))
-    for options, code, told in (
-        ((), 2, "give what to send: --text TEXT, --file FILE, --beacon site.toml, --time or --countdown"),
+@pytest.mark.parametrize(
+    ("options", "code", "says"),
+    [
         (("--text", ""), 2, "message: 0 bytes of text, expected 1 to 65535"),
         (("--text", "a\udcff"), 2, "--text: character 2 is not UTF-8"),
-        (("--beacon", two, "--id", "7", "--user", "\udcff"), 2, "--user: character 1 is not UTF-8"),
+        (("--beacon", "two.toml", "--id", "7", "--user", "\udcff"), 2, "--user: character 1 is not UTF-8"),
         (("--text", "a", "--user", "b"), 2, "--key and --user belong to a beacon"),
-        (("--file", tmp_path / "no"), 3, "no: cannot be read"),
-        (("--beacon", tmp_path / "no"), 2, "no: cannot be read"),
-        (("--beacon", two), 2, "2 bars: choose one with --id, of 7, 8"),
-        (("--beacon", two, "--id", "9"), 2, "no bar has transmitter_id 9, but 7, 8"),
+        (("--file", "no"), 3, "no: cannot be read"),
+        (("--beacon", "no"), 2, "no: cannot be read"),
+        (("--beacon", "two.toml"), 2, "2 bars: choose one with --id, of 7, 8"),
+        (("--beacon", "two.toml", "--id", "9"), 2, "no bar has transmitter_id 9, but 7, 8"),
         (("--text", "a", "--set", "air.frames_per_packet=2"), 2, "expected at least 18"),
-        (("--text", "a", "-o", tmp_path), 1, "cannot be written"),
-    ):
-        done = evlcp("tx", "message", *options)
-        assert done.code == code, done.err
-        assert told in done.err
-        assert done.err.count("\n") == 1
-    assert evlcp("tx", "message", "--beacon", two, "--id", 8, "--json").code == 0
+        (("--text", "a", "-o", "."), 1, "cannot be written"),
+        (("--text", "a", "--every", "1"), 2, "--every sends to a board: give --port"),
+        (("--text", "a", "--every", "1", "-o", "m.json"), 2, "-o and --chips hold what stays"),
+        (("--text", "a", "--count", "3"), 2, "--count belongs to --every"),
+        (("--countdown", "3", "--signal", "blue", "--every", "1", "--port", "native:"), 2, "signal = 'blue'"),
+        (("--countdown", "1e9", "--json"), 2, "expected 0 to 86400"),
+        (
+            ("--text", "a" * 8000, "--every", "1", "--port", "native:"),
+            2,
+            "takes 6.955 s on air, 201 packets of 34.6 ms; give --every 7 or more, or send less",
+        ),
+    ],
+)
+def test_faults_are_one_line(
+    evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], code: int, says: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("two.toml").write_text(SITE + SITE.replace("= 7", "= 8"))
+    check_fault(evlcp("tx", "message", *options), code, says)
+    assert evlcp("tx", "message", "--beacon", "two.toml", "--id", 8, "--json").code == 0
 
 
-def test_what_tx_wrote_tx_shows(evlcp: Evlcp, tmp_path: Path) -> None:
+def test_what_tx_wrote_tx_shows(evlcp, tmp_path: Path) -> None:
     out, chips, again = tmp_path / "m.json", tmp_path / "c.npy", tmp_path / "again.npy"
     (tmp_path / "link.toml").write_text('[pilots]\nid = "barker13"\n')
     options = ("--set", "pilots.id=barker13")
@@ -198,56 +204,40 @@ def test_what_tx_wrote_tx_shows(evlcp: Evlcp, tmp_path: Path) -> None:
         ("error-correction.id=reed-solomon", "error-correction.id: sent with"),
     ],
 )
-def test_another_link_is_refused_and_says_where(
-    evlcp: Evlcp, tmp_path: Path, other: str, differ: str
-) -> None:
+def test_another_link_is_refused_and_says_where(evlcp, tmp_path: Path, other: str, differ: str) -> None:
     out = tmp_path / "m.json"
     assert evlcp("tx", "message", "--text", "hi", "-o", out, "--set", "pilots.id=barker13").code == 0
     for command in (("tx", "frames"), ("tx", "check"), ("board", "--port", "native:", "program")):
         done = evlcp(*command, out, "--set", "pilots.id=barker13", "--set", other)
-        assert (done.code, done.out) == (8, "")
-        assert done.err.startswith(f"evlcp: {out}: made with another link: ")
-        assert differ in done.err
-        assert done.err.count("\n") == 1
+        check_fault(done, 8, f"evlcp: {out}: made with another link: ", differ)
+        assert done.out == ""
 
 
 @pytest.mark.parametrize(
-    ("settings", "says"),
+    ("setting", "says"),
     [
-        (("air.chip_rate_hz=12.5",), "air.chip_rate_hz = 12.5: a board takes whole chips per second"),
-        (("air.chip_rate_hz=2e6",), "air.chip_rate_hz = 2000000.0, at most 1000000"),
+        ("air.chip_rate_hz=12.5", "air.chip_rate_hz = 12.5: a board takes whole chips per second"),
+        ("air.chip_rate_hz=2e6", "air.chip_rate_hz = 2000000.0, at most 1000000"),
     ],
 )
-def test_a_link_that_no_board_can_play_is_one_line(
-    evlcp: Evlcp, tmp_path: Path, settings: tuple[str, ...], says: str
-) -> None:
-    options = [part for setting in settings for part in ("--set", setting)]
+def test_a_link_that_no_board_can_play_is_one_line(evlcp, tmp_path: Path, setting: str, says: str) -> None:
     for command in (
         ("tx", "message", "--text", "hi", "--repeat", 2, "--port", "native:"),
         ("board", "--port", "native:", "program", "--random", 1),
         ("board", "--port", "native:", "verify", "--masks", tmp_path / "no.npy"),
     ):
-        done = evlcp(*command, *options)
-        assert done.code == 2, done.err
-        assert done.err.startswith("evlcp: the driver board cannot play this link: ")
-        assert says in done.err
-        assert done.err.count("\n") == 1
+        done = evlcp(*command, "--set", setting)
+        check_fault(done, 2, "evlcp: the driver board cannot play this link: ", says)
 
 
-def test_without_an_output_nothing_is_said_to_be_sent(evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.delenv("EVLCP_PORT", raising=False)
-    done = evlcp("tx", "message", "--text", "hi")
-    assert done.code == 2
-    assert done.out.splitlines()[-1] == "1 packet, 0.0346 s"
-    wanted = "evlcp: nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips\n"
-    assert done.err == wanted
-    assert evlcp("tx", "message", "--text", "hi", "--json").code == 0
-
-
-@pytest.mark.usefixtures("compiler")
-def test_the_port_may_come_from_the_environment(
-    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+def test_without_an_output_nothing_is_said_to_be_sent(
+    evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
+    done = evlcp("tx", "message", "--text", "hi")
+    says = "evlcp: nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips\n"
+    check_fault(done, 2, says)
+    assert done.out.splitlines()[-1] == "1 packet, 0.0346 s"
+    assert evlcp("tx", "message", "--text", "hi", "--json").code == 0
     monkeypatch.setenv("EVLCP_PORT", "native:")
     assert "bank 0 is active" in evlcp("tx", "message", "--text", "hi").out
     monkeypatch.setenv("EVLCP_PORT", "unix:/nowhere")
@@ -256,26 +246,100 @@ def test_the_port_may_come_from_the_environment(
     assert evlcp("tx", "message", "--text", "hi", "-o", tmp_path / "m.json").code == 0
 
 
-@pytest.mark.usefixtures("compiler")
-def test_a_board_plays_it(evlcp: Evlcp, site: Path, tmp_path: Path) -> None:
-    port, leds, chips = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "c.npy"
-    emulated = Native(port, leds=leds)
-    done = evlcp(
-        "tx", "message", "--text", "Tempo 30 " * 20, "--beacon", site, "--sequence", 3, "--port", port
-    )
+def test_a_board_plays_it(evlcp, native: str, site: Path, tmp_path: Path) -> None:
+    text = "Tempo 30 " * 20
+    done = evlcp("tx", "message", "--text", text, "--beacon", site, "--sequence", 3, "--port", native)
     assert done.code == 0, done.err
     assert done.out.splitlines()[-1] == "sent 1920 of 1920 bytes; bank 0 is active"
     assert done.out.splitlines()[-2].endswith(", again and again")
     # More packets than a bank holds are refused, and what plays goes on.
     (tmp_path / "big").write_bytes(bytes(60_000))
-    refused = evlcp("tx", "message", "--file", tmp_path / "big", "--port", port)
-    assert refused.code == 2
-    assert "packets of 320 bytes, a bank of" in refused.err
+    refused = evlcp("tx", "message", "--file", tmp_path / "big", "--port", native)
+    check_fault(refused, 2, "packets of 320 bytes, a bank of")
     time.sleep(0.5)
-    assert evlcp("board", "stop", "--port", port).code == 0
-    emulated.end()
-    assert evlcp("board", "leds", leds, "--chips", chips).code == 0
-    link = load_link()
-    found = messages_of(symbols_of(np.load(chips), link), link)
-    assert found[Kind.TEXT].text == "Tempo 30 " * 20
+    assert evlcp("board", "stop", "--port", native).code == 0
+    found = messages_of(packets_on(tmp_path / "leds.bin"))
+    assert found[Kind.TEXT].text == text
     assert Beacon.unpack(found[Kind.BEACON].payload).height_m == 52.4
+
+
+# -- streams
+
+
+def test_texts_go_out_as_they_come(tmp_path: Path) -> None:
+    port, leds = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin"
+    emulated = Native(port, leds=leds)
+    command = [*EVLCP, "board", "stream", "--port", port, "--id", "7", "--json"]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    # each when the one before has long been played
+    for n in (3, 2, 1):
+        process.stdin.write(f"Green in {n} s\n")
+        process.stdin.flush()
+        seen = leds.stat().st_size
+        while leds.stat().st_size < seen + 2000 * RECORD.itemsize:
+            time.sleep(0.02)
+    process.stdin.close()
+    done = json.loads(process.stdout.read())
+    assert process.wait(20) == 0
+    process.stdout.close()
+    emulated.end()
+    said = [messages_of(packet[None])[Kind.TEXT] for packet in packets_on(leds)]
+    assert [m.text for m in said] == ["Green in 3 s", "Green in 2 s", "Green in 1 s"]
+    assert [m.transmitter_id for m in said] == [7, 7, 7]
+    assert sorted({m.sequence for m in said}) == [m.sequence for m in said], "each with a higher number"
+    assert done["packets"] == 3
+    assert done["underruns"] in (2, 3)
+
+
+def test_symbols_from_a_file(evlcp, native: str, tmp_path: Path) -> None:
+    table = json.loads(evlcp("tx", "frames", "--random", 4, "--seed", 5, "--format", "json").out)["symbols"]
+    file = tmp_path / "lines.jsonl"
+    # a packet a line, then two on one
+    file.write_text("\n".join(map(json.dumps, (table[0], table[1], table[2:]))) + "\n\n")
+    done = evlcp("board", "stream", file, "--lines", "symbols", "--repeat", 2, "--port", native)
+    assert (done.code, done.err) == (0, "")
+    assert done.out.startswith("8 packets, ")
+    assert packets_on(tmp_path / "leds.bin").tolist() == [packet for packet in table for _ in range(2)]
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "says"),
+    [
+        (b"hi\n[", ("--lines", "symbols"), "line 1: not JSON"),
+        (b"[[1]]", ("--lines", "symbols"), "line 1: symbols[0]: found 1 elements, expected 10 frames"),
+        (b"{}", ("--lines", "symbols"), "line 1: symbols: found {}"),
+        (b"[" * 100_000, ("--lines", "symbols"), "line 1: not JSON"),
+        (b"a" * 70_000, (), "line 1: message: 70000 bytes"),
+        (b"\xff", (), "cannot be read"),
+    ],
+)
+def test_a_wrong_line_is_told(
+    evlcp, tmp_path: Path, text: bytes, options: tuple[str, ...], says: str
+) -> None:
+    file = tmp_path / "lines"
+    file.write_bytes(text)
+    check_fault(evlcp("board", "stream", file, "--port", "native:", *options), 3, says)
+
+
+def test_a_message_that_changes(evlcp, native: str, tmp_path: Path) -> None:
+    began = time.time()
+    said = ("--text", "{n}: {left} s left at {time}", "--time", "--countdown", 100, "--sequence", 40)
+    done = evlcp(
+        *("tx", "message", *said, "--signal", "amber", "--next", "red", "--every", 1, "--count", 2),
+        *("--port", native, "--json"),
+    )
+    assert (done.code, done.err) == (0, "")
+    packets = packets_on(tmp_path / "leds.bin")
+    assert len(packets) == json.loads(done.out)["packets"] >= 45
+    first, last = (messages_of(some) for some in (packets[:3], packets[-3:]))
+    assert [m[Kind.TEXT].sequence for m in (first, last)] == [40, 41]
+    for n, found in enumerate((first, last)):
+        time_s = TimeKind().unpack(found[Kind.TIME].payload)
+        left = CountdownKind().unpack(found[Kind.COUNTDOWN].payload)
+        clock = time.strftime("%H:%M:%S", time.gmtime(time_s))
+        assert found[Kind.TEXT].text == f"{n}: {left.left_s:.0f} s left at {clock}"
+        assert (left.signal, left.next_signal) == ("amber", "red")
+        assert began + n <= time_s <= time.time()
+        assert time_s + left.left_s == pytest.approx(began + 100.0, abs=1.0)

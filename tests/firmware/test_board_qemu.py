@@ -16,8 +16,6 @@ from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.processes import start_qemu
 from firmware_host.protocol.generated.requests import StatusReply, StatusRequest
 
-pytestmark = pytest.mark.usefixtures("compiler")
-
 CHIPS = (5_000, 2_000)
 VECTORS = Path(__file__).parents[1] / "vectors" / "air-vectors.json"
 

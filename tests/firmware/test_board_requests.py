@@ -6,9 +6,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from board_lines import some_bank
 
-from evlcp_sdk.air.codebook import Codebook, word_of_chips
-from firmware_host.board.bank import Bank, random_symbols
+from evlcp_sdk.air.codebook import word_of_chips
+from firmware_host.board.bank import Bank
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
 from firmware_host.protocol.generated.profiles import DIGESTS
@@ -42,8 +43,6 @@ from firmware_host.protocol.generated.requests import (
 )
 from firmware_host.protocol.wire import WireRequest
 from tests.firmware.wire_vectors import read_vectors
-
-pytestmark = pytest.mark.usefixtures("compiler")
 
 CHIP_US = 100
 
@@ -93,8 +92,8 @@ def wire() -> Wire:
 
 
 @pytest.fixture
-def bank(book: Codebook) -> Bank:
-    return Bank.of_symbols(random_symbols(1, 10, book, np.random.default_rng(1)), book)
+def bank() -> Bank:
+    return some_bank(1, 1)
 
 
 def commit_of(bank: Bank, number: int = 0) -> CommitRequest:
@@ -226,8 +225,8 @@ def test_stop_ends_with_the_packet_and_blank_at_once(wire: Wire, bank: Bank) -> 
     assert wire.status().state == State.PLAYING
 
 
-def test_banks_are_held(wire: Wire, bank: Bank, book: Codebook) -> None:
-    other = Bank.of_symbols(random_symbols(1, 10, book, np.random.default_rng(2)), book)
+def test_banks_are_held(wire: Wire, bank: Bank) -> None:
+    other = some_bank(1, 2)
     committed(wire, bank)
     assert wire.ask(WriteRequest(0, 0, b"x")) == Status.BUSY
     wire.ask(StartRequest())

@@ -1,22 +1,19 @@
 """The STM32F405 image as it is flashed, on a model of the part: every LED, chip by chip, and what fails."""
 
 import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from board_lines import board_link, symbols_of
 from numpy.typing import NDArray
+from test_board_cli import Emulated
 
-from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.link.resolve import load_link
 from firmware_host import build
-from firmware_host.board.bank import Bank, random_symbols, symbol_chips
-from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.session import Session
+from firmware_host.board.bank import Bank, bank_of, symbol_chips
+from firmware_host.board.board import Settings, provision
 from firmware_host.errors import RefusedError
-from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import BoardFault, State
 
 pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
@@ -25,29 +22,27 @@ from tests.models.stm32 import (
     RESET_BY_PIN,
     US,
     Dma,
-    ModelLine,
     Shown,
     Stm32,
     Usart,
+    connect,
+    lit_rows,
 )
 
 CHIP = 100 * US
 BOOT_US = 15_000
+FOUR = board_link("air.frames_per_packet=4")
 
 
 class Bar:
     """A programmed board on the model, dark."""
 
-    def __init__(self, book: Codebook, seed: int = 1) -> None:
-        self.chip = Stm32(build.arm_image("stm32f405"))
-        self.chip.run(BOOT_US)
-        self.board = self.connect()
-        symbols = random_symbols(1, 4, book, np.random.default_rng(seed))
-        provision(self.board, Bank.of_symbols(symbols, book), Settings(start=False))
-        self.chips = symbol_chips(symbols, book)
-
-    def connect(self) -> Board:
-        return Board(Session(ModelLine(self.chip), Timing(latency_s=0.02)))
+    def __init__(self, chip: Stm32) -> None:
+        self.chip = chip
+        self.board = connect(chip)
+        symbols = symbols_of(1, 1, FOUR)
+        provision(self.board, bank_of(symbols, FOUR), Settings(start=False))
+        self.chips = symbol_chips(symbols, FOUR.codebook)
 
     def expected(self, count: int) -> NDArray[np.uint8]:
         """Rows from the first lit chip on, (count, 96)."""
@@ -64,10 +59,9 @@ class Bar:
 
 
 @pytest.fixture(scope="module")
-def programmed(book: Codebook, needs: Callable[..., None]) -> tuple[Bar, Callable[[], None]]:
+def programmed(stm32) -> tuple[Bar, Callable[[], None]]:
     """The bar that all tests share, and what sets it back."""
-    needs("cc", "make", "arm-none-eabi-gcc")
-    bar = Bar(book)
+    bar = Bar(stm32()[0])
     return bar, bar.chip.snapshot()
 
 
@@ -75,17 +69,8 @@ def programmed(book: Codebook, needs: Callable[..., None]) -> tuple[Bar, Callabl
 def bar(programmed: tuple[Bar, Callable[[], None]]) -> Bar:
     bar, back = programmed
     back()
-    bar.board = bar.connect()
+    bar.board = connect(bar.chip)
     return bar
-
-
-def played(log: list[Shown]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Rows that the latch showed, from the first lit one on, (n, 96), and when."""
-    shown = [s for s in log if s.latched and not s.dark]
-    while shown and not shown[0].row:
-        del shown[0]
-    rows = [[int(bit) for bit in f"{s.row:096b}"] for s in shown]
-    return np.array(rows, np.uint8).reshape(-1, 96), np.array([s.time for s in shown])
 
 
 def test_every_start_shows_every_chip_on_every_led(bar: Bar) -> None:
@@ -95,7 +80,7 @@ def test_every_start_shows_every_chip_on_every_led(bar: Bar) -> None:
         bar.board.start()
         bar.chip.run(21_500)
         assert bar.board.status().state == State.PLAYING
-        rows, times = played(bar.log[begin:])
+        rows, times = lit_rows(bar.log[begin:])
         right = (rows[:200] == expected).all(1)
         assert (int(right.sum()), len(right)) == (200, 200)
         assert (np.diff(times[:200]) == CHIP).all()
@@ -105,7 +90,7 @@ def test_every_start_shows_every_chip_on_every_led(bar: Bar) -> None:
         assert bar.dark
         assert bar.board.status().faults == 0
         # whole packets, chip for chip to the last lit one
-        rows, _ = played(bar.log[begin:])
+        rows, _ = lit_rows(bar.log[begin:])
         lit = np.flatnonzero(rows.any(1))[-1] + 1
         packets = round(lit / len(bar.chips))
         whole = np.flatnonzero(bar.chips.any(1))
@@ -131,33 +116,21 @@ def test_registers_are_those_of_the_schematic(bar: Bar) -> None:
     assert (bar.board.about.tick_hz, bar.board.about.hal.rstrip(b"\0")) == (14_000_000, b"stm32f405")
 
 
-def stop_stream(chip: Stm32) -> None:
-    chip.dma.dead = True
-
-
 def end_stream(chip: Stm32) -> None:
     chip.dma.cr &= ~1
 
 
-def stop_spi(chip: Stm32) -> None:
-    chip.spi.dead = True
-
-
-def stop_interrupt(chip: Stm32) -> None:
-    chip.enabled.discard(16 + Dma.IRQ)
-
-
-BREAKS: dict[str, tuple[Callable[[Stm32], None], BoardFault, float]] = {
+BREAKS: dict[str, tuple[Callable[[Stm32], object], BoardFault, float]] = {
     "tim1": (lambda chip: chip.tim1.stop_for_good(), BoardFault.CHIP_LOST, 1.6),
-    "stream-stands": (stop_stream, BoardFault.CHIP_LOST, 1.6),
+    "stream-stands": (lambda chip: setattr(chip.dma, "dead", True), BoardFault.CHIP_LOST, 1.6),
     "stream-ends": (end_stream, BoardFault.CHIP_LOST, 1.6),
     "transfer-error": (lambda chip: chip.dma.error(Dma.TRANSFER_ERROR), BoardFault.CHIP_LOST, 0.1),
     "direct-mode-error": (lambda chip: chip.dma.error(Dma.DIRECT_ERROR), BoardFault.CHIP_LOST, 0.1),
     "fifo-error": (lambda chip: chip.dma.error(Dma.FIFO_ERROR), BoardFault.CHIP_LOST, 0.1),
-    "interrupt": (stop_interrupt, BoardFault.CHIP_LOST, 1.6),
+    "interrupt": (lambda chip: chip.enabled.discard(16 + Dma.IRQ), BoardFault.CHIP_LOST, 1.6),
     "crystal": (lambda chip: chip.stop_crystal(), BoardFault.CLOCK, 0.1),
     "supply": (lambda chip: chip.pending.add(16 + 1), BoardFault.CHIP_LOST, 0.1),
-    "spi": (stop_spi, BoardFault.CHIP_LOST, 1.7),
+    "spi": (lambda chip: setattr(chip.spi, "dead", True), BoardFault.CHIP_LOST, 1.7),
     "latch-timer": (lambda chip: chip.tim3.stop_for_good(), BoardFault.CHIP_LOST, 1.7),
 }
 
@@ -207,7 +180,7 @@ def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar: Bar) -> None
     begin = len(bar.log)
     bar.board.start()
     bar.chip.run(15_000)
-    rows, _ = played(bar.log[begin:])
+    rows, _ = lit_rows(bar.log[begin:])
     assert (rows[:100] == bar.expected(100)).all()
     assert bar.board.status().state == State.PLAYING
 
@@ -257,7 +230,7 @@ def test_save_outlives_the_watchdog_and_autostart_waits_for_start_after_its_rese
     bar.chip.run(110_000 + BOOT_US)
     assert bar.chip.resets == [RESET_BY_PIN, RESET_BY_PIN, RESET_BY_IWDG]
     assert bar.dark
-    board = bar.connect()
+    board = connect(bar.chip)
     assert board.status().faults == BoardFault.CHIP_LOST
     board.start()
     bar.chip.run(5_000)
@@ -294,7 +267,7 @@ def test_a_core_that_stops_is_reset_and_stays_dark(bar: Bar, what: str) -> None:
     # named, and dark until START
     bar.chip.hse_works, bar.chip.core_stands = True, False
     bar.chip.run(BOOT_US)
-    status = bar.connect().status()
+    status = connect(bar.chip).status()
     assert (status.state, status.faults) == (State.FAULT, BoardFault.CHIP_LOST)
     assert bar.dark
 
@@ -328,7 +301,7 @@ def test_led_test_and_save_wait_until_the_last_rows_have_left(bar: Bar) -> None:
             bar.board.save()
         else:
             bar.board.test_leds(7, 7, 2)
-        rows, _ = played(bar.log[begin:])
+        rows, _ = lit_rows(bar.log[begin:])
         lit = np.flatnonzero(rows.any(1))
         single = [s.row for s in bar.log[begin:] if s.row.bit_count() == 1]
         assert single == ([1 << 95 - 7] * len(single) if then == "test" else [])
@@ -339,30 +312,21 @@ def test_led_test_and_save_wait_until_the_last_rows_have_left(bar: Bar) -> None:
         bar.board.blank()
 
 
-def test_emulate_serves_the_model(evlcp, needs: Callable[..., None], book: Codebook, tmp_path: Path) -> None:
-    needs("cc", "make", "arm-none-eabi-gcc")
-    listen, record = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin"
-    command = "from evlcp_sdk.cli.main import main; main()"
-    arguments = ["board", "emulate", "stm32", "--listen", listen, "--leds", str(record)]
-    process = subprocess.Popen([sys.executable, "-c", command, *arguments], stdout=subprocess.PIPE, text=True)
+def test_emulate_serves_the_model(evlcp, stm32, tmp_path: Path) -> None:
+    listen, record, out = f"unix:{tmp_path / 'board'}", tmp_path / "leds.bin", tmp_path / "chips.npy"
+    emulated = Emulated("stm32", "--listen", listen, "--leds", record)
     try:
-        assert process.stdout is not None
-        assert process.stdout.readline() == f"listening on {listen}\n"
+        assert emulated.said == f"listening on {listen}\n"
         random = ("--random", 1, "--seed", 4, "--set", "air.frames_per_packet=2")
-        done = evlcp("board", "program", *random, "--port", listen)
-        assert done.code == 0, done.err
-        done = evlcp("board", "stop", "--port", listen)
-        assert done.code == 0, done.err
+        for command in (("program", *random), ("stop",)):
+            done = evlcp("board", *command, "--port", listen)
+            assert done.code == 0, done.err
     finally:
-        process.terminate()
-        assert process.wait(10) == 0
-        assert process.stdout is not None
-        process.stdout.close()
-    done = evlcp("board", "leds", record, "--chips", tmp_path / "chips.npy")
+        assert emulated.end() == 0
+    done = evlcp("board", "leds", record, "--chips", out)
     assert done.code == 0, done.err
-    chips = np.load(tmp_path / "chips.npy")
-    packet = load_link(overrides=["air.frames_per_packet=2"]).packet
-    once = symbol_chips(random_symbols(1, 2, book, np.random.default_rng(4)), book, packet.pilot_every)
+    chips, link = np.load(out), board_link("air.frames_per_packet=2")
+    once = symbol_chips(symbols_of(1, 4, link), link.codebook)
     start = int(chips.any(1).argmax()) - int(once.any(1).argmax())
     whole = (len(chips) - start) // len(once) * len(once)
     assert whole >= len(once)
@@ -387,7 +351,7 @@ def test_blank_is_dark_at_once_and_the_next_start_plays_whole(bar: Bar) -> None:
         begin = len(bar.log)
         bar.board.start()
         bar.chip.run(moment)
-        rows, times = played(bar.log[begin:])
+        rows, times = lit_rows(bar.log[begin:])
         assert (rows == bar.expected(len(rows))).all()
         bar.board.blank()
         went = max(s.time for s in bar.log if s.dark)
@@ -398,17 +362,17 @@ def test_blank_is_dark_at_once_and_the_next_start_plays_whole(bar: Bar) -> None:
         assert bar.board.status().state == State.DARK
 
 
-def test_a_swap_leaves_no_chip_out(bar: Bar, book: Codebook) -> None:
+def test_a_swap_leaves_no_chip_out(bar: Bar) -> None:
     begin = len(bar.log)
     bar.board.start()
     bar.chip.run(4_000)
-    other = random_symbols(2, 4, book, np.random.default_rng(9))
-    bar.board.program(Bank.of_symbols(other, book))
+    other = symbols_of(2, 9, FOUR)
+    bar.board.program(bank_of(other, FOUR))
     bar.chip.run(30_000)
-    rows, times = played(bar.log[begin:])
+    rows, times = lit_rows(bar.log[begin:])
     assert (np.diff(times) == CHIP).all()
     lead = int(bar.chips.any(1).argmax())
-    after = symbol_chips(other, book)
+    after = symbol_chips(other, FOUR.codebook)
     found = []
     for packets in range(1, 30):
         chips = np.vstack([np.tile(bar.chips, (packets, 1)), np.tile(after, (40, 1))])[lead:]
@@ -417,7 +381,7 @@ def test_a_swap_leaves_no_chip_out(bar: Bar, book: Codebook) -> None:
     assert len(rows) > (found[0] + 2) * len(bar.chips)
 
 
-def test_a_reset_is_dark_and_what_is_programmed_after_it_plays(bar: Bar, book: Codebook) -> None:
+def test_a_reset_is_dark_and_what_is_programmed_after_it_plays(bar: Bar) -> None:
     bar.board.start()
     bar.chip.run(7_000)
     assert not bar.dark
@@ -426,12 +390,11 @@ def test_a_reset_is_dark_and_what_is_programmed_after_it_plays(bar: Bar, book: C
     assert bar.dark
     bar.chip.run(BOOT_US)
     assert all(s.dark for s in bar.log if s.time > at)
-    board = bar.connect()
-    symbols = random_symbols(1, 4, book, np.random.default_rng(1))
+    board = connect(bar.chip)
     begin = len(bar.log)
-    provision(board, Bank.of_symbols(symbols, book), Settings())
+    provision(board, bank_of(symbols_of(1, 1, FOUR), FOUR), Settings())
     bar.chip.run(15_000)
-    rows, _ = played(bar.log[begin:])
+    rows, _ = lit_rows(bar.log[begin:])
     assert (rows[:100] == bar.expected(100)).all()
     assert board.status().faults == 0
 
@@ -464,13 +427,13 @@ def test_counters_pass_two_to_the_32(bar: Bar) -> None:
     assert 0 < status.packets_sent < 10
     assert 300 < status.chips_sent < 400
     assert (status.state, status.faults) == (State.PLAYING, 0)
-    rows, times = played(bar.log[begin:])
+    rows, times = lit_rows(bar.log[begin:])
     assert len(rows) > 390
     assert (rows == bar.expected(len(rows))).all()
     assert (np.diff(times) == CHIP).all()
 
 
-def test_interrupts_stack_and_line_have_room(bar: Bar, book: Codebook) -> None:
+def test_interrupts_stack_and_line_have_room(bar: Bar) -> None:
     """At 20 000 chips per second and 1 Mbit/s both ways: no byte lost, no chip late."""
     chip = bar.chip
     lowest = symbol("link_bss_end")
@@ -478,8 +441,8 @@ def test_interrupts_stack_and_line_have_room(bar: Bar, book: Codebook) -> None:
     chip.uc.mem_write(lowest, b"\xa5" * room)
     masks = np.zeros((26 + 32 * 30, 96), np.uint8)
     masks[::2] = np.random.default_rng(0).integers(0, 2, masks[::2].shape)
-    link = load_link(overrides=["air.chip_rate_hz=20000.0", "air.frames_per_packet=30"])
-    bank = Bank.of_chips(masks, book, link.packet)
+    link = board_link("air.chip_rate_hz=20000.0", "air.frames_per_packet=30")
+    bank = Bank.of_chips(masks, link.codebook, link.packet)
     provision(bar.board, bank, Settings())
     before = bar.board.status()
     spare = 1 - before.active_bank

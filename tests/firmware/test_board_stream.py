@@ -4,14 +4,14 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from board_lines import NoisyLine
+from board_lines import LINK, NoisyLine, board_link, board_on, shown, some_bank, symbols_of
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link, load_link
-from firmware_host.board.bank import bank_of, queue_of, random_symbols
+from evlcp_sdk.link.resolve import Link
+from firmware_host.board.bank import bank_of, queue_of
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
@@ -25,23 +25,14 @@ from firmware_host.protocol.generated.requests import (
     PushRequest,
     State,
     Status,
+    StatusReply,
+    StatusRequest,
     StreamRequest,
     Watchdog,
 )
 from tests.models.usb import UsbLine
 
-pytestmark = pytest.mark.usefixtures("compiler")
-
-LINK = load_link()
-LONG = load_link(overrides=["air.frames_per_packet=40", "air.pilot_every=4"])
-
-
-def symbols(link: Link, packets: int, seed: int = 0) -> np.ndarray:
-    return random_symbols(packets, link.packet.frames, link.codebook, np.random.default_rng(seed))
-
-
-def board_on(line: SimulatedLine) -> Board:
-    return Board(Session(line, Timing(latency_s=0.02), first=1, nonce=1))
+LONG = board_link("air.frames_per_packet=40", "air.pilot_every=4")
 
 
 def played(device: SimulatedBoard, link: Link) -> tuple[list[bytes], int]:
@@ -67,14 +58,15 @@ def expected(packets: np.ndarray, link: Link) -> list[bytes]:
 
 
 @pytest.mark.parametrize("link", [LINK, LONG], ids=["one piece a packet", "three pieces a packet"])
-@pytest.mark.parametrize("latency_s", [0.0, 0.016])
-@pytest.mark.parametrize("ahead", [2, 5])
-def test_packets_follow_each_other_without_a_gap(link: Link, latency_s: float, ahead: int) -> None:
-    device = SimulatedBoard()
-    packets = symbols(link, 30)
-    with board_on(UsbLine(device, latency_s)).stream(link, ahead) as stream:
+@pytest.mark.parametrize(("latency_s", "ahead"), [(0.0, 5), (0.016, 2), (0.016, 3)])
+def test_packets_follow_each_other_without_a_gap(
+    device: SimulatedBoard, link: Link, latency_s: float, ahead: int
+) -> None:
+    packets = symbols_of(30, 0, link)
+    with board_on(UsbLine(device, latency_s), nonce=1).stream(link, ahead) as stream:
         for n, packet in enumerate(packets):
             assert stream.send(packet) == n
+            assert stream.sent - stream.begun <= ahead + 1
     chips = device.records().played()
     assert (np.diff(chips.ticks) == 1000).all()
     length = link.packet.packet_chips
@@ -89,34 +81,23 @@ def test_packets_follow_each_other_without_a_gap(link: Link, latency_s: float, a
     assert not device.shown().any()
 
 
-def test_two_round_trips_a_packet_at_most_and_no_more_on_the_board_than_asked() -> None:
-    device = SimulatedBoard()
-    board = board_on(UsbLine(device, 0.016))
-    with board.stream(LINK, 3) as stream:
-        for packet in symbols(LINK, 50):
-            stream.send(packet)
-            assert stream.sent - stream.begun <= 4
-    assert stream.requests <= 100
-
-
-def test_an_empty_queue_is_named_and_shows_the_idle_pattern() -> None:
-    device = SimulatedBoard()
-    board = board_on(UsbLine(device, 0.001))
-    packets = symbols(LINK, 4)
+def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device: SimulatedBoard) -> None:
+    board = board_on(UsbLine(device, 0.001), nonce=1)
+    packets = symbols_of(4)
     with board.stream(LINK) as stream:
         stream.wait(0.2)
         assert stream.underruns == 0, "a stream that has not begun is not late"
         for packet in packets[:2]:
             stream.send(packet)
         stream.wait(0.3)
-        probe = board_of_status(stream)
+        probe = status_of(stream)
         assert probe.state == State.IDLE_PATTERN
         assert probe.faults & BoardFault.UNDERRUN
         assert probe.underruns == 1
         for packet in packets[2:]:
             stream.send(packet)
         stream.wait(0.01)
-        assert not board_of_status(stream).faults & BoardFault.UNDERRUN
+        assert not status_of(stream).faults & BoardFault.UNDERRUN
     found, idle = played(device, LINK)
     assert found == expected(packets, LINK)
     assert idle > 2000
@@ -125,21 +106,18 @@ def test_an_empty_queue_is_named_and_shows_the_idle_pattern() -> None:
     assert (after.state, after.faults, after.underruns) == (State.DARK, 0, 1)
 
 
-def board_of_status(stream: Stream) -> object:
+def status_of(stream: Stream) -> StatusReply:
     """STATUS in between; nothing of the stream is under way then."""
-    from firmware_host.protocol.generated.requests import StatusRequest
-
     assert not stream._flight
     return stream._session.call(StatusRequest())
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_a_noisy_line_loses_and_doubles_nothing(seed: int) -> None:
-    device = SimulatedBoard()
+def test_a_noisy_line_loses_and_doubles_nothing(device: SimulatedBoard, seed: int) -> None:
     line = NoisyLine(device, 0.0, 0.0, 0.0, seed)
     board = Board(Session(line, Timing(latency_s=0.004), tries=12, first=1, nonce=1))
     link = LONG if seed % 2 else LINK
-    packets = symbols(link, 25, seed)
+    packets = symbols_of(25, seed, link)
     with board.stream(link, 6) as stream:
         line.rates = (2e-4, 0.05, 0.05)
         for packet in packets:
@@ -151,10 +129,8 @@ def test_a_noisy_line_loses_and_doubles_nothing(seed: int) -> None:
     assert found == expected(packets, link)
 
 
-def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet() -> None:
-    device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
-    first, second, last = symbols(LINK, 2, 1), symbols(LINK, 5, 2), symbols(LINK, 1, 3)
+def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet(device: SimulatedBoard, board: Board) -> None:
+    first, second, last = symbols_of(2, 1), symbols_of(5, 2), symbols_of(1, 3)
     provision(board, bank_of(first, LINK), Settings())
     device.run(100_000)
     stream = board.stream(LINK)
@@ -176,25 +152,20 @@ def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet() -> None:
     assert (status.state, status.underruns, status.packets) == (State.PLAYING, 0, 1)
 
 
-def test_the_watchdog_acts_on_a_stream_whose_host_is_gone() -> None:
-    device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
+def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device: SimulatedBoard, board: Board) -> None:
     board.watchdog(Watchdog.DARK, 200)
     stream = board.stream(LINK)
-    stream.send(symbols(LINK, 1)[0])
+    stream.send(symbols_of(1)[0])
     stream.wait(1.0)
-    assert board_of_status(stream).state == State.IDLE_PATTERN
+    assert status_of(stream).state == State.IDLE_PATTERN
     device.run(500_000)
     assert not device.shown().any()
 
 
-def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told() -> None:
-    device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
-
+def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told(device: SimulatedBoard, board: Board) -> None:
     def fails() -> None:
         with board.stream(LINK, 8) as stream:
-            for packet in symbols(LINK, 4):
+            for packet in symbols_of(4):
                 stream.send(packet)
             raise KeyError("x")
 
@@ -208,28 +179,26 @@ def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told() -> None:
         stream.wait(2.0)
 
 
-def test_what_a_board_refuses() -> None:
-    device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
+def test_what_a_board_refuses(device: SimulatedBoard, board: Board) -> None:
     for ahead, says in ((1, "expected 2 or more"), (500, "holds 127 packets")):
         with pytest.raises(ConfigError, match=says):
             board.stream(LINK, ahead)
-    huge = load_link(overrides=["air.frames_per_packet=700"])
+    huge = board_link("air.frames_per_packet=700")
     with pytest.raises(ConfigError, match=r"700 frames takes 22400 bytes.*room for two; .* 640 frames"):
         board.stream(huge)
     with board.stream(LINK) as stream:
         with pytest.raises(ConfigError, match=r"shape \(9, 16\), expected \(10, 16\)"):
-            stream.send(symbols(LINK, 1)[0][:9])
+            stream.send(symbols_of(1)[0][:9])
         with pytest.raises(ConfigError):
             stream.send(np.full((10, 16), 64))
-    fast = load_link(overrides=["air.chip_rate_hz=20000.0"])
-    provision(board, bank_of(symbols(LINK, 1), LINK), Settings())
+    fast = board_link("air.chip_rate_hz=20000.0")
+    provision(board, some_bank(), Settings())
     with pytest.raises(RefusedError, match=r"keeps its rate"):
         board.stream(fast)
     board.stop()
     board.wait_dark()
     with board.stream(fast) as stream:
-        stream.send(symbols(fast, 1)[0])
+        stream.send(symbols_of(1, 0, fast)[0])
     with pytest.raises(RefusedError) as told:
         board.save()
     assert told.value.status == Status.NOTHING_COMMITTED, "a stream is not saved"
@@ -264,7 +233,7 @@ class Queue:
 @settings(max_examples=30, deadline=None)
 def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
     """Pieces of any number, offset and length, and time between them, against a model."""
-    link = load_link(overrides=["air.frames_per_packet=320"])  # 10 240 bytes a packet: 4 slots
+    link = board_link("air.frames_per_packet=320")  # 10 240 bytes a packet: 4 slots
     device = SimulatedBoard()
     board = board_on(SimulatedLine(device))
     like = queue_of(link)
@@ -298,9 +267,7 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
         assert held[at : at + 10_240] == model.packets[n]
 
 
-def test_masks_may_be_streamed_too() -> None:
-    device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
+def test_masks_may_be_streamed_too(device: SimulatedBoard, board: Board) -> None:
     like = queue_of(LINK)
     board.prepare(like)
     digest = bytes.fromhex(LINK.codebook.digest)
@@ -312,8 +279,7 @@ def test_masks_may_be_streamed_too() -> None:
         board.session.call(PushRequest(1, 0, at, int(at + 480 >= len(content)), piece))
     board.start()
     device.run(60_000)
-    shown = device.records().played().chips(None)
-    assert shown.tobytes() == rows.tobytes()
+    assert shown(device).tobytes() == rows.tobytes()
     assert board.status().state == State.DARK
     for bank, status in ((0, Status.NOTHING_COMMITTED), (2, Status.OUT_OF_RANGE)):
         with pytest.raises(RefusedError) as told:
@@ -321,28 +287,15 @@ def test_masks_may_be_streamed_too() -> None:
         assert told.value.status == status
 
 
-def test_the_benchmark_says_what_it_should() -> None:
-    from benchmarks.board import measure_stream
-
-    alone = measure_stream(0.016, 4, 0.1, packets=6)
-    # a millisecond of USB, 3.4 of wire, at most four chips until the idle pattern is over
-    assert 1.0 + 3.4 <= alone.delays_ms.min() <= alone.delays_ms.max() <= 1.0 + 3.6 + 0.4
-    full = measure_stream(0.016, 2, 0.0, packets=12)
-    assert full.underruns == 0
-    assert full.delays_ms.max() <= 3 * 34.6
-    assert full.round_trips <= 2.0
-
-
 @pytest.mark.parametrize("latency_s", [0.0, 0.016])
-def test_what_changes_is_right_at_its_first_chip(latency_s: float) -> None:
+def test_what_changes_is_right_at_its_first_chip(device: SimulatedBoard, latency_s: float) -> None:
     """A countdown made for `delay_s` ahead, against the ticks at which the board showed it."""
     from benchmarks.board import starts_of
     from evlcp_sdk.air.blocks import Kind, Message
     from evlcp_sdk.air.kinds import Countdown, CountdownKind
     from evlcp_sdk.link.compose import packets_of
 
-    device, coder = SimulatedBoard(), LINK.block_coder()
-    board = board_on(UsbLine(device, latency_s))
+    board, coder = board_on(UsbLine(device, latency_s)), LINK.block_coder()
     made: list[np.ndarray] = []
     due_us: list[float] = []
     with board.stream(LINK, 2) as stream:
@@ -358,72 +311,69 @@ def test_what_changes_is_right_at_its_first_chip(latency_s: float) -> None:
 
         assert stream.play(next_one, 0.25) == 8
     assert stream.underruns == 0
-    played = device.records().played()
-    starts = starts_of(played.chips(), played.ticks, stream.sent, LINK.packet.packet_chips)
-    length = LINK.packet.packet_chips
-    first = played.chips()
-    at = [int(np.searchsorted(played.ticks, t)) for t in starts]
-    shown = [first[n : n + length].tobytes() for n in at]
-    for packets, due in zip(made, due_us, strict=True):
-        (chips,) = expected(packets, LINK)
-        begun_us = starts[shown.index(chips)] / (device.TICK_HZ / 1e6)
+    record = device.records().played()
+    chips, length = record.chips(), LINK.packet.packet_chips
+    starts = starts_of(chips, record.ticks, stream.sent, length)
+    packets = [chips[n : n + length].tobytes() for n in np.searchsorted(record.ticks, starts)]
+    for message, due in zip(made, due_us, strict=True):
+        (told,) = expected(message, LINK)
+        begun_us = starts[packets.index(told)] / (device.TICK_HZ / 1e6)
         # the board's answers come late by the line's latency, and with them what is known of its queue
         assert -8_000 <= due - begun_us <= 8_000 + 1e6 * latency_s
-        assert 6 <= shown.count(chips) <= 10, "round and round for 0.25 s"
+        assert 6 <= packets.count(told) <= 10, "round and round for 0.25 s"
 
 
 @pytest.mark.parametrize("how", ["stop", "blank"])
-def test_a_stream_that_is_stopped_is_empty(how: str) -> None:
+@pytest.mark.parametrize("at_once", [False, True])
+def test_a_stream_that_is_stopped_is_empty(
+    device: SimulatedBoard, board: Board, how: str, at_once: bool
+) -> None:
     """What waits is not played by another START, nor by one that comes before the board is dark."""
-    for at_once in (False, True):
-        device = SimulatedBoard()
-        board = board_on(SimulatedLine(device))
-        sent = symbols(LINK, 6)
-        stream = board.stream(LINK, ahead=6)
-        for packet in sent:
-            stream.send(packet)
-        stream.wait(0.05)
-        assert 1 <= stream.begun < 6
-        getattr(board, how)()
-        begun = stream.begun
-        if not at_once:
-            board.wait_dark()
-        with pytest.raises(RefusedError, match=r"NOTHING_COMMITTED.*a stream that has ended, say, is gone"):
-            board.start()
-        device.run(300_000)
-        assert board.status().state == State.DARK
-        found, _ = played(device, LINK)
-        assert found[:begun] == expected(sent, LINK)[:begun]
-        assert len(found) <= begun + 1
-        provision(board, bank_of(symbols(LINK, 1), LINK), Settings())
-        assert board.status().state == State.PLAYING
-
-
-def test_after_a_stream_nothing_can_be_started_or_compared() -> None:
-    device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
-    with board.stream(LINK) as stream:
-        stream.send(symbols(LINK, 1)[0])
+    sent = symbols_of(6)
+    stream = board.stream(LINK, ahead=6)
+    for packet in sent:
+        stream.send(packet)
+    stream.wait(0.05)
+    begun = stream.begun
+    assert 1 <= begun < 6
+    getattr(board, how)()
+    if not at_once:
+        board.wait_dark()
+    with pytest.raises(RefusedError, match=r"NOTHING_COMMITTED.*a stream that has ended, say, is gone"):
+        board.start()
+    device.run(300_000)
     assert board.status().state == State.DARK
+    found, _ = played(device, LINK)
+    assert found[:begun] == expected(sent, LINK)[:begun]
+    assert len(found) <= begun + 1
+    provision(board, some_bank(), Settings())
+    assert board.status().state == State.PLAYING
+
+
+def test_after_a_stream_nothing_can_be_started_or_compared(device: SimulatedBoard, board: Board) -> None:
+    asked: list[int] = []
+    with board.stream(LINK) as stream:
+        stream.play(lambda _: symbols_of(3), 60.0, lambda: len(asked) > 20 or asked.append(0) is not None)
+    assert stream.sent < 22
+    status = board.status()
+    assert (status.state, status.packets_sent) == (State.DARK, stream.sent)
     with pytest.raises(RefusedError, match=r"NOTHING_COMMITTED.*a stream that has ended, say, is gone"):
         board.start()
     device.run(10_000)
     assert board.status().state == State.DARK
-    bank = bank_of(symbols(LINK, 1), LINK)
     with pytest.raises(
         VerifyError, match="its bank is the queue of a stream, which holds nothing to compare"
     ):
-        board.verify(bank)
-    provision(board, bank, Settings())
+        board.verify(some_bank())
+    provision(board, some_bank(), Settings())
     assert board.status().state == State.PLAYING
-    board.verify(bank)
+    board.verify(some_bank())
 
 
-def test_a_text_of_many_packets_leaves_no_gap() -> None:
+def test_a_text_of_many_packets_leaves_no_gap(board: Board) -> None:
     """Each takes half as long to make as to play: all of them at once would starve the board."""
-    board = board_on(SimulatedLine(SimulatedBoard()))
     line = board.session.transport
-    some = symbols(LINK, 25)
+    some = symbols_of(25)
 
     with board.stream(LINK, 2) as stream:
 

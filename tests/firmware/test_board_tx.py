@@ -5,18 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from board_lines import LINK, board_link, check_fault, symbols_of
 
-from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.link.resolve import load_link
 from firmware_host import flicker
-from firmware_host.board.bank import (
-    Bank,
-    random_symbols,
-    read_masks,
-    symbol_chips,
-)
+from firmware_host.board.bank import Bank, read_masks, symbol_chips
 from firmware_host.protocol.rows import chips_of_rows, rows_of_chips
 
 AIR = json.loads((Path(__file__).parents[1] / "vectors" / "air-vectors.json").read_text())
@@ -61,26 +55,24 @@ def test_every_form_has_the_same_words(evlcp, example: Path) -> None:
     assert [r.split()[5] for r in rows] == expected
 
 
-@pytest.mark.parametrize("profile", ["wh4x2", "wh8", "raw8"])
-def test_random_is_a_seed(evlcp, profile: str, tmp_path: Path) -> None:
+def test_random_is_a_seed(evlcp) -> None:
     def run(seed: int) -> str:
-        options = ("--random", 2, "--seed", seed, "--set", f"modulation.id={profile}", "--format", "hex")
-        return str(evlcp("tx", "frames", *options).out)
+        return str(evlcp("tx", "frames", "--random", 2, "--seed", seed, "--format", "hex").out)
 
     assert run(1) == run(1) != run(2)
     assert len(run(1).splitlines()) == 20
 
 
-def test_payload_is_what_the_chips_say(book: Codebook) -> None:
-    symbols = random_symbols(3, 2, book, np.random.default_rng(0))
-    words = Bank.of_symbols(symbols, book)
-    masks = Bank.of_chips(symbol_chips(symbols, book), book, PacketFormat.of(book, 2))
+def test_payload_is_what_the_chips_say() -> None:
+    link = board_link("air.frames_per_packet=2")
+    chips = symbol_chips(symbols_of(3, 0, link), link.codebook)
+    words = Bank.of_symbols(symbols_of(3, 0, link), link.codebook)
+    masks = Bank.of_chips(chips, link.codebook, PacketFormat.of(link.codebook, 2))
     assert len(words.content) == 3 * 2 * 16 * 2
     assert len(masks.content) == 3 * 90 * 12
     rows = np.frombuffer(masks.content, np.uint8).reshape(-1, 12)
-    assert (chips_of_rows(rows) == symbol_chips(symbols, book)).all()
-    leds = np.unpackbits(rows, axis=1)
-    assert (rows_of_chips(leds) == rows).all()
+    assert (chips_of_rows(rows) == chips).all()
+    assert (rows_of_chips(np.unpackbits(rows, axis=1)) == rows).all()
 
 
 def test_torn_cluster_is_told() -> None:
@@ -114,11 +106,7 @@ def test_torn_cluster_is_told() -> None:
 def test_wrong_symbols_are_one_line(evlcp, tmp_path: Path, text: str, expected: str) -> None:
     path = tmp_path / "s.json"
     path.write_text(text)
-    done = evlcp("tx", "frames", path)
-    assert done.code == 3
-    assert done.err.startswith(f"evlcp: {path}: ")
-    assert expected in done.err
-    assert done.err.count("\n") == 1
+    check_fault(evlcp("tx", "frames", path), 3, f"evlcp: {path}: ", expected)
 
 
 @pytest.mark.parametrize("digest", ['"00"', "5", "null"])
@@ -130,25 +118,10 @@ def test_symbols_of_another_codebook_are_refused(evlcp, tmp_path: Path, digest: 
     own = json.loads(said)["codebook"]
     path.write_text(said.replace(f'"{own}"', digest))
     done = evlcp("tx", "frames", path)
-    assert done.code == 8
-    assert f"{path}: codebook = {digest}" in done.err
-    assert f"expected {own[:16]}" in done.err
-    assert done.err.count("\n") == 1
+    check_fault(done, 8, f"{path}: codebook = {digest}", f"expected {own[:16]}")
 
 
-def test_missing_files_and_usage(evlcp, tmp_path: Path) -> None:
-    missing = evlcp("tx", "frames", tmp_path / "no.json")
-    assert missing.code == 3
-    assert "cannot be read" in missing.err
-    assert evlcp("tx", "frames").code == 2
-    assert evlcp("tx", "frames", "--random", 1, "--set", "modulation.id=wh9").code == 2
-    assert "did you mean" in evlcp("tx", "frames", "--random", 1, "--set", "modulation.id=wh9").err
-    unwritable = evlcp("tx", "frames", "--random", 1, "--chips", tmp_path / "no" / "x.npy")
-    assert unwritable.code == 1
-    assert unwritable.err.count("\n") == 1
-
-
-def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
+def test_wrong_masks_are_told(tmp_path: Path) -> None:
     path = tmp_path / "m.npy"
     for array, expected in (
         (np.zeros((345, 16), np.uint8), "whole packets of 346 chips"),
@@ -158,21 +131,18 @@ def test_wrong_masks_are_told(book: Codebook, tmp_path: Path) -> None:
     ):
         np.save(path, array)
         with pytest.raises(InputError, match=expected):
-            read_masks(path, load_link())
+            read_masks(path, LINK)
     np.savez(tmp_path / "m.npz", np.zeros((346, 16), np.uint8))
     (tmp_path / "m.npz").rename(path)
     with pytest.raises(InputError, match="an archive of several"):
-        read_masks(path, load_link())
-    path.write_bytes(b"")
-    with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, load_link())
-    path.write_text("no array")
-    with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, load_link())
-    loaded = symbol_chips(random_symbols(2, 10, book, np.random.default_rng(0)), book)
-    np.save(path, loaded)
-    payload = read_masks(path, load_link())
-    assert (payload.packets, payload.packet.packet_chips, len(payload.content)) == (2, 346, 2 * 346 * 12)
+        read_masks(path, LINK)
+    with path.open("wb") as file:
+        header = {"descr": "|u1", "fortran_order": False, "shape": (10**13, 16)}
+        np.lib.format.write_array_header_1_0(file, header)
+    for content in (path.read_bytes(), b"", b"no array", b"PK\x03\x04junk"):
+        path.write_bytes(content)
+        with pytest.raises(InputError, match=r"not a \.npy file"):
+            read_masks(path, LINK)
 
 
 def test_codebook_packets_are_balanced_and_do_not_flicker(evlcp) -> None:
@@ -199,45 +169,30 @@ def test_flicker_of_known_waves() -> None:
         assert flicker.check(np.full((100, 1), level, np.uint8), 10_000.0)[0].no_effect
 
 
-def test_a_flickering_payload_ends_with_one(evlcp, tmp_path: Path) -> None:
+def test_a_flickering_payload_ends_with_one(evlcp) -> None:
     # at 300 chips/s the codes themselves are slow enough to see
     done = evlcp("tx", "check", "--random", 10, "--set", "air.chip_rate_hz=300.0")
     assert done.code == 1
     assert "FLICKERS" in done.out
 
 
-def test_pilots_in_some_frames_only(evlcp, tmp_path: Path, book: Codebook) -> None:
-    file = tmp_path / "chips.npy"
-    sparse = ("--set", "air.frames_per_packet=6", "--set", "air.pilot_every=4")
+def test_pilots_in_some_frames_only(evlcp, tmp_path: Path) -> None:
+    file, settings = tmp_path / "chips.npy", ("air.frames_per_packet=6", "air.pilot_every=4")
+    sparse = [part for setting in settings for part in ("--set", setting)]
     options = ("tx", "frames", "--random", 2, "--seed", 3, *sparse)
-    symbols = random_symbols(2, 6, book, np.random.default_rng(3))
+    link = board_link(*settings)
     assert evlcp(*options, "--chips", file).code == 0
-    expected = np.concatenate([packet_chips(packet, book, 4) for packet in symbols])
+    expected = np.concatenate([packet_chips(packet, link.codebook, 4) for packet in symbols_of(2, 3, link)])
     assert np.load(file).tolist() == expected.tolist()
-    masks = read_masks(file, load_link(overrides=["air.frames_per_packet=6", "air.pilot_every=4"]))
-    assert masks.packets == 2
-    assert masks.packet.pilot_every == 4
+    masks = read_masks(file, link)
+    assert (masks.packets, masks.packet.pilot_every, len(masks.content)) == (2, 4, len(expected) * 12)
     rows = [line.split() for line in evlcp(*options, "--format", "table").out.splitlines()[1:]]
     assert {row[1] for row in rows if row[4] == "-"} == {"1", "2", "3", "5"}
     words = evlcp(*options, "--format", "hex").out.splitlines()
     assert [len(line.split()[0]) for line in words] == [8, 4, 4, 4, 8, 4] * 2
     assert json.loads(evlcp(*options, "--format", "json").out)["link"]["air"]["pilot_every"] == 4
     for profile in ("wh4x2", "wh8", "raw8"):
-        settings = ("air.frames_per_packet=20", "air.pilot_every=4", f"modulation.id={profile}")
-        options = ("--random", 20, *(part for setting in settings for part in ("--set", setting)))
-        assert evlcp("tx", "check", *options).code == 0
-
-
-def test_masks_that_are_no_array_are_one_line(book: Codebook, tmp_path: Path) -> None:
-    path = tmp_path / "chips.npy"
-    path.write_bytes(b"PK\x03\x04junk")
-    with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, load_link())
-    with path.open("wb") as file:
-        header = {"descr": "|u1", "fortran_order": False, "shape": (10**13, 16)}
-        np.lib.format.write_array_header_1_0(file, header)
-    with pytest.raises(InputError, match=r"not a \.npy file"):
-        read_masks(path, load_link())
+        assert evlcp("tx", "check", "--random", 20, *sparse, "--set", f"modulation.id={profile}").code == 0
 
 
 def test_check_without_a_line_below_3_khz_is_json(evlcp) -> None:

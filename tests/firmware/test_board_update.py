@@ -2,17 +2,14 @@
 
 import contextlib
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import board_on
+from board_lines import board_link, board_on, some_bank, symbols_of
 
-from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import InputError
-from firmware_host import build
-from firmware_host.board.bank import Bank, random_symbols, symbol_chips
+from firmware_host.board.bank import bank_of, symbol_chips
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
 from firmware_host.board.update import Package, confirm, update, update_status
@@ -35,8 +32,6 @@ from firmware_host.protocol.generated.requests import (
     UpdateWriteRequest,
 )
 
-pytestmark = pytest.mark.usefixtures("compiler")
-
 
 def some(seed: int, count: int = 400) -> bytes:
     return np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes()
@@ -51,8 +46,7 @@ def fresh() -> tuple[SimulatedBoard, Board]:
     return device, board_on(SimulatedLine(device))
 
 
-def test_updates_take_turns_and_run_after_every_reset() -> None:
-    device, board = fresh()
+def test_updates_take_turns_and_run_after_every_reset(device: SimulatedBoard, board: Board) -> None:
     assert device.running() == 0
     assert update_status(board).next == 1
     for n, image in enumerate((1, 2, 1, 2), 1):
@@ -64,14 +58,13 @@ def test_updates_take_turns_and_run_after_every_reset() -> None:
         assert device.running() == image
         assert device.image(image, 3_001) == new.images[image]
         assert update_status(board).trial == 0
-        for _ in range(5):
+        for _ in range(4):
             device.reset()
             assert device.running() == image
         board = board_on(SimulatedLine(device))
 
 
-def test_what_is_not_kept_is_left_at_the_third_reset() -> None:
-    device, board = fresh()
+def test_what_is_not_kept_is_left_at_the_third_reset(device: SimulatedBoard, board: Board) -> None:
     update(board, package(1))
     update(board, package(2), keep=False)
     assert update_status(board).trial == 1
@@ -137,18 +130,18 @@ def test_power_that_fails_at_every_step_leaves_one_of_the_two(before: int) -> No
     assert ended["old"] >= len(moments) - 6
 
 
-def test_what_cannot_be_is_refused(book: Codebook) -> None:
-    device, board = fresh()
+def test_what_cannot_be_is_refused(device: SimulatedBoard, board: Board) -> None:
     with pytest.raises(IncompatibleError, match="is a native, the firmware is for stm32f405-8mhz"):
         update(board, Package("stm32f405-8mhz", {1: b"1234", 2: b"1234"}))
     with pytest.raises(RefusedError, match="65473 bytes of firmware, an image may have 65472"):
         update(board, package(1, 65_473))
-    with pytest.raises(RefusedError, match="NOTHING_COMMITTED"):
-        board.session.call(UpdateWriteRequest(0, b"1234"))
-    with pytest.raises(RefusedError, match="nearest value the board can take is 1"):
-        board.session.call(UpdateBeginRequest(2, 4, 0))
-    with pytest.raises(RefusedError, match="OUT_OF_RANGE"):
-        board.session.call(UpdateBeginRequest(1, 0, 0))
+    for request, says in (
+        (UpdateWriteRequest(0, b"1234"), "NOTHING_COMMITTED"),
+        (UpdateBeginRequest(2, 4, 0), "nearest value the board can take is 1"),
+        (UpdateBeginRequest(1, 0, 0), "OUT_OF_RANGE"),
+    ):
+        with pytest.raises(RefusedError, match=says):
+            board.session.call(request)
     board.session.call(UpdateBeginRequest(1, 4, 5))
     for offset, data in ((2, b"12"), (4, b"1"), (0, b"12345"), (8, b"")):
         with pytest.raises(RefusedError, match="OUT_OF_RANGE"):
@@ -159,63 +152,63 @@ def test_what_cannot_be_is_refused(book: Codebook) -> None:
     device.reset()
     assert device.running() == 0
     board = board_on(SimulatedLine(device))
-    bank = Bank.of_symbols(random_symbols(1, 10, book, np.random.default_rng(0)), book)
-    provision(board, bank, Settings())
+    provision(board, some_bank(), Settings())
     with pytest.raises(RefusedError, match="BUSY") as refused:
         update(board, package(1))
     assert refused.value.status == Status.BUSY
     assert board.status().state == State.PLAYING
 
 
-def test_a_noisy_line_and_a_reset_half_way() -> None:
-    device, board = fresh()
+class Noisy(SimulatedLine):
+    """Flips a bit in every tenth portion."""
 
-    class Noisy(SimulatedLine):
-        rng = np.random.default_rng(3)
+    rng = np.random.default_rng(3)
 
-        def to_board(self, data: bytes) -> bytes:
-            out = bytearray(data)
-            if self.rng.random() < 0.1 and out:
-                out[int(self.rng.integers(len(out)))] ^= 0x20
-            return bytes(out)
+    def to_board(self, data: bytes) -> bytes:
+        out = bytearray(data)
+        if self.rng.random() < 0.1 and out:
+            out[int(self.rng.integers(len(out)))] ^= 0x20
+        return bytes(out)
 
-    board = Board(Session(Noisy(device), Timing(latency_s=0.01)))
-    done = update(board, package(4, 20_000))
+
+class Resets(SimulatedLine):
+    """Resets the board at the eighth portion."""
+
+    left = 8
+
+    def to_board(self, data: bytes) -> bytes:
+        self.left -= 1
+        if self.left == 0:
+            self.board.reset()
+        return data
+
+
+class Ends(SimulatedLine):
+    """Ends after 4000 bytes."""
+
+    left = 4_000
+
+    def to_board(self, data: bytes) -> bytes:
+        self.left -= len(data)
+        return data if self.left > 0 else b""
+
+
+def test_what_is_interrupted_keeps_the_old_one_and_ends_well_when_it_is_run_again(
+    device: SimulatedBoard,
+) -> None:
+    done = update(Board(Session(Noisy(device), Timing(latency_s=0.01))), package(4, 20_000))
     assert device.image(1, 20_000) == package(4, 20_000).images[1]
     assert done.image == device.running() == 1
-
-    class Resets(SimulatedLine):
-        left = 8
-
-        def to_board(self, data: bytes) -> bytes:
-            self.left -= 1
-            if self.left == 0:
-                self.board.reset()
-            return data
-
+    new = package(5, 20_000)
     with pytest.raises((BoardResetError, LineError)):
-        update(Board(Session(Resets(device), Timing())), package(5, 20_000))
+        update(Board(Session(Resets(device), Timing())), new)
     assert device.running() == 1
-    assert update(board_on(SimulatedLine(device)), package(5)).image == 2
-
-
-def test_interrupted_and_run_again() -> None:
-    class Ends(SimulatedLine):
-        left = 4_000
-
-        def to_board(self, data: bytes) -> bytes:
-            self.left -= len(data)
-            return data if self.left > 0 else b""
-
-    device, board = fresh()
-    update(board, package(1, 20_000))
-    board = Board(Session(Ends(device), Timing(latency_s=0.01)))
     with pytest.raises(LineError, match="it begins anew, and the board keeps the firmware that it runs"):
-        update(board, package(2, 20_000))
+        update(Board(Session(Ends(device), Timing(latency_s=0.01))), new)
     board = board_on(SimulatedLine(device))
     assert (update_status(board).running, update_status(board).trial) == (1, 0)
-    done = update(board, package(2, 20_000))
-    assert (done.image, device.image(2, 20_000)) == (2, package(2, 20_000).images[2])
+    assert update(board, new).image == 2
+    assert device.image(2, 20_000) == new.images[2]
 
 
 class SlowLine(SimulatedLine):
@@ -243,8 +236,7 @@ class SlowLine(SimulatedLine):
         return b""
 
 
-def test_a_slow_board_is_waited_for() -> None:
-    device = SimulatedBoard()
+def test_a_slow_board_is_waited_for(device: SimulatedBoard) -> None:
     board = Board(Session(SlowLine(device), Timing()))
     done = update(board, package(3, 30_000))
     assert (done.image, device.running()) == (1, 1)
@@ -252,11 +244,9 @@ def test_a_slow_board_is_waited_for() -> None:
     assert board.session.client.retries < 20
 
 
-def test_a_board_with_a_key_takes_updates_from_its_host_alone(book: Codebook) -> None:
+def test_a_board_with_a_key_takes_updates_from_its_host_alone(device: SimulatedBoard, board: Board) -> None:
     key = bytes(range(16))
-    device, board = fresh()
-    bank = Bank.of_symbols(random_symbols(1, 10, book, np.random.default_rng(0)), book)
-    provision(board, bank, Settings(start=False))
+    provision(board, some_bank(), Settings(start=False))
     board.set_key(key)
     board.save()  # or the key is gone with the restart
     with pytest.raises(RefusedError, match="NEEDS_KEY"):
@@ -292,40 +282,14 @@ def test_a_file_of_an_update(tmp_path: Path) -> None:
 # -- the real images, on the model of the part
 
 
-def test_an_update_without_a_crystal_answers_and_stays_dark(
-    needs: Callable[..., None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """At 16 MHz from power-up on, the watchdog's oscillator as fast as RM0090 allows: it bites soonest."""
-    needs("make", "arm-none-eabi-gcc")
-    pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from tests.models import stm32
-
-    chip = stm32.Stm32(build.arm_image("stm32f405"))
-    chip.run(15_000)
-    update(Board(Session(stm32.ModelLine(chip), Timing(latency_s=0.02))), Package.built("stm32f405-8mhz"))
-    monkeypatch.setattr(stm32, "LSI_HZ", 47_000)
-    chip.hse_works = False
-    chip.reset(stm32.RESET_BY_PIN)
-    chip.run(800_000)
-    assert chip.resets[-1] == stm32.RESET_BY_PIN
-    board = Board(Session(stm32.ModelLine(chip), Timing(latency_s=0.02)))
-    assert update_status(board).running == 1
-    status = board.status()
-    assert (status.state, status.faults) == (State.FAULT, BoardFault.CLOCK)
-    assert chip.drivers.dark
-
-
-def test_the_real_firmware_updates_itself(book: Codebook, needs: Callable[..., None]) -> None:
-    needs("make", "arm-none-eabi-gcc")
-    pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
-    from tests.models.stm32 import RESET_BY_IWDG, RESET_BY_PIN, RESET_BY_SOFTWARE, ModelLine, Stm32
+def test_the_real_firmware_updates_itself(stm32, monkeypatch: pytest.MonkeyPatch) -> None:
+    from tests.models.stm32 import RESET_BY_IWDG, RESET_BY_PIN, RESET_BY_SOFTWARE, connect, lit_rows
 
     new = Package.built("stm32f405-8mhz")
-    chip = Stm32(build.arm_image("stm32f405"))
-    chip.run(15_000)
-    board = Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
-    symbols = random_symbols(1, 4, book, np.random.default_rng(1))
-    provision(board, Bank.of_symbols(symbols, book), Settings(start=False, level_ma=13))
+    chip, board = stm32()
+    link = board_link("air.frames_per_packet=4")
+    symbols = symbols_of(1, 1, link)
+    provision(board, bank_of(symbols, link), Settings(start=False, level_ma=13))
     board.save()
     done = update(board, new)
     assert (done.image, done.sequence) == (1, 1)
@@ -338,11 +302,8 @@ def test_the_real_firmware_updates_itself(book: Codebook, needs: Callable[..., N
     chip.run(12_000)
     status = board.status()
     assert (status.state, status.level_ma, status.faults) == (State.PLAYING, 13, 0)
-    shown = [s.row for s in chip.drivers.log[begin:] if s.latched and not s.dark]
-    while not shown[0]:
-        del shown[0]
-    rows = np.array([[int(bit) for bit in f"{row:096b}"] for row in shown])
-    chips = symbol_chips(symbols, book)
+    rows, _ = lit_rows(chip.drivers.log[begin:])
+    chips = symbol_chips(symbols, link.codebook)
     expected = np.repeat(np.roll(chips, -int(chips.any(1).argmax()), axis=0), 6, axis=1)
     assert (rows == np.resize(expected, rows.shape)).all()
     assert len(rows) > 80
@@ -356,10 +317,21 @@ def test_the_real_firmware_updates_itself(book: Codebook, needs: Callable[..., N
     assert chip.drivers.dark
     assert update_status(board).running == 1
     # power fails while it is written, and before it is sealed
-    wanted = update_status(board).next
-    board.session.call(UpdateBeginRequest(wanted, len(new.images[2]), 0))
+    board.session.call(UpdateBeginRequest(update_status(board).next, len(new.images[2]), 0))
     board.session.call(UpdateWriteRequest(0, new.images[2][:400]))
     chip.reset(RESET_BY_PIN)
     chip.run(60_000)
-    board = Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
+    assert update_status(connect(chip)).running == 1
+
+    # without a crystal it answers and stays dark, at 16 MHz from power-up on; the watchdog's oscillator is as
+    # fast as RM0090 allows: it bites soonest
+    monkeypatch.setattr("tests.models.stm32.LSI_HZ", 47_000)
+    chip.hse_works = False
+    chip.reset(RESET_BY_PIN)
+    chip.run(800_000)
+    assert chip.resets[-1] == RESET_BY_PIN
+    board = connect(chip)
     assert update_status(board).running == 1
+    status = board.status()
+    assert (status.state, status.faults) == (State.FAULT, BoardFault.CLOCK)
+    assert chip.drivers.dark

@@ -23,8 +23,6 @@ from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol import generate
 from firmware_host.protocol.generated.requests import MINOR, State
 
-pytestmark = pytest.mark.usefixtures("compiler")
-
 LATER = MINOR + 1
 
 

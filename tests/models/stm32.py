@@ -18,10 +18,15 @@ from itertools import count
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import unicorn
+from numpy.typing import NDArray
 from unicorn import arm_const
 
+from firmware_host.board.board import Board
+from firmware_host.board.session import Session
 from firmware_host.images import FlashImage
+from firmware_host.protocol.client import Timing
 
 engine: Any = unicorn  # it has no types
 
@@ -984,3 +989,17 @@ class ModelLine:
 
     def close(self) -> None:
         """Nothing to let go."""
+
+
+def connect(chip: Stm32) -> Board:
+    """A session with the firmware on a model."""
+    return Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
+
+
+def lit_rows(log: list[Shown]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Rows that the latch showed, from the first lit one on, (n, 96), and when."""
+    shown = [s for s in log if s.latched and not s.dark]
+    while shown and not shown[0].row:
+        del shown[0]
+    rows = [[int(bit) for bit in f"{s.row:096b}"] for s in shown]
+    return np.array(rows, np.uint8).reshape(-1, 96), np.array([s.time for s in shown])
