@@ -2,20 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from evlcp_sdk.cli._common import Json, Workers, console, echo
-from evlcp_sdk.plugin.hooks import hookimpl
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Mapping
 
     from evlcp_sdk.study.summary import Summary
-    from evlcp_sdk.values import Frame
 
 DEMO_NAME = "night-50m-30kmh-cut"
 CAMPAIGN_NAME = "demo"
@@ -143,44 +140,25 @@ def show_drive(summary: Summary) -> None:
     console().print(table)
 
 
-class _Frames:
-    """Keeps the frames as the receiver announces them."""
-
-    def __init__(self) -> None:
-        self.found: list[Frame] = []
-
-    @hookimpl
-    def evlcp_stage_finished(self, stage: str, value: object) -> None:
-        from evlcp_sdk.values import Frame
-
-        if stage == "frame" and isinstance(value, Frame):
-            self.found.append(value)
-
-
 def _decode_recording(out: Path, as_json: bool) -> None:
     import json
 
     from evlcp_sdk.cli._summary import show
-    from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import receive_to_folder
     from evlcp_sdk.sim.truth import read_truth
     from evlcp_sdk.study.frames import read_frames
     from evlcp_sdk.study.score import score_frames
 
     recording, truth_file = demo_files()
-    frames = _Frames()
-    registry = Registry.load(frames)
-    link = load_link(None, (), registry)
     if not as_json:
         console().print(f"decoding {recording.name} ...", style="dim")
-    summary = receive_to_folder(recording, out, link, registry=registry, sinks=["figures"])
+    summary = receive_to_folder(recording, out, sinks=["figures"])
     # The rows as they are written, which `evlcp score` reads, too.
     found = score_frames(read_frames(out), read_truth(truth_file))
     if as_json:
         echo(json.dumps(summary | {"score": found}))
         return
-    _show_frames([frame for frame in frames.found if frame.echo_of is None])
+    _show_frames(out / "frames.csv")
     show(summary, out)
     _show_score(found)
 
@@ -194,7 +172,9 @@ def _show_score(found: Mapping[str, Any]) -> None:
     )
 
 
-def _show_frames(frames: Sequence[Frame]) -> None:
+def _show_frames(file: Path) -> None:
+    import csv
+
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False, header_style="dim")
@@ -206,13 +186,16 @@ def _show_frames(frames: Sequence[Frame]) -> None:
     )
     for name, side in columns:
         table.add_column(name, justify=side, no_wrap=True)
-    for frame in frames:
-        distance_m, sigma_m = frame.range.distance_m, frame.range.sigma_m
-        sigma = f"{sigma_m:.2f}" if math.isfinite(sigma_m) else "?"
-        table.add_row(
-            f"{frame.packet}/{frame.frame}",
-            f"{frame.t_us / 1e3:.1f}",
-            " ".join(f"{s:2}" if s >= 0 else " -" for s in frame.soft.symbols.tolist()),
-            f"{distance_m:.2f} ± {sigma}" if math.isfinite(distance_m) else "-",
-        )
+    with file.open(newline="") as opened:
+        for row in csv.DictReader(opened):
+            if row["echo_of"]:
+                continue
+            distance_m, sigma_m = row["distance_m"], row["distance_sigma_m"]
+            sigma = f"{float(sigma_m):.2f}" if sigma_m else "?"
+            table.add_row(
+                f"{row['packet']}/{row['frame']}",
+                f"{float(row['t_us']) / 1e3:.1f}",
+                " ".join(f"{symbol:>2}" for symbol in row["symbols"].split()),
+                f"{float(distance_m):.2f} ± {sigma}" if distance_m else "-",
+            )
     console().print(table)

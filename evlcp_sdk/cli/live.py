@@ -194,8 +194,8 @@ def live(
             budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
             stopped=stopped.or_when(lambda: out is None and lines is not None and lines.gone),
         )
-        if services.fault:
-            complain(services.fault)
+        if services.view is not None and services.view.fault:
+            complain(services.view.fault)
         print_end(summary, out, lines, as_json=result.as_json)
         if stopped() and out is not None:
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")

@@ -1,6 +1,5 @@
 """What browsers are told of a live run: results as lines of JSON, pictures with what is drawn on them."""
 
-import asyncio
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -9,19 +8,14 @@ from typing import Any, Final
 from evlcp_sdk.errors import PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.loop import LiveStatus
-from evlcp_sdk.live.pictures import Picture, PictureSlot
-from evlcp_sdk.live.publisher import News, Publisher
+from evlcp_sdk.live.pictures import Picture
+from evlcp_sdk.live.publisher import News
 from evlcp_sdk.results.columns import frame_columns
 from evlcp_sdk.results.lines import fix_line, format_frame
 from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, ReceivedMessage
 
-PICTURES_PER_S: Final = 25
-
-MOST_WAITING: Final = 4000
-"""Results that wait for a browser, some seconds of two bars; the oldest go."""
-_KINDS: Final = frozenset({"frame", "message", "fix", "status", "end"})
 _LATEST_US: Final = 500_000
 _MOST_BARS: Final = 64
 """A bar is drawn as its newest frame shows it, for so long, and so many of them."""
@@ -47,79 +41,37 @@ class Serializer:
     """Writes what a run finds for browsers, in the thread that asks.
 
     Args:
-        publisher: Where results come from.
-        pictures: Where pictures come from.
         links: The configurations by name, as `named_links` gives them.
         sites: Where the bars stand, for the map.
 
     Attributes:
-        dropped: Results that nobody had the time to tell, so far.
         untold: Messages of a kind that failed to show them, so far.
         fault: How the last one failed.
-        ended: Nothing more will come, and all is told.
     """
 
-    def __init__(
-        self,
-        publisher: Publisher,
-        pictures: PictureSlot,
-        links: Mapping[str, Link],
-        sites: Sequence[BarSite] = (),
-    ) -> None:
-        self._publisher, self._pictures = publisher, pictures
+    def __init__(self, links: Mapping[str, Link], sites: Sequence[BarSite] = ()) -> None:
         self._columns = frame_columns(filtered=False, links=len(links) > 1)
         self._sites = tuple(sites)
         self._sites_told = not sites
         self._bars: dict[int, Frame] = {}
         self._shot: Shot | None = None
-        self._turn_s = 0.0
         self.untold, self.fault = 0, ""
-        self._mine = publisher.subscribe(_KINDS, most=MOST_WAITING)
 
-    @property
-    def dropped(self) -> int:
-        """Results that nobody had the time to tell, so far."""
-        return self._mine.dropped
-
-    @property
-    def ended(self) -> bool:
-        """Nothing more will come, and all is told."""
-        return self._mine.ended
-
-    async def turn(self) -> None:
-        """Wait until it is time to tell: at even times, unless they are over already."""
-        now_s = asyncio.get_running_loop().time()
-        self._turn_s = max(self._turn_s + 1 / PICTURES_PER_S, now_s)
-        await asyncio.sleep(self._turn_s - now_s)
-
-    def ask(self) -> None:
-        """Have a picture drawn."""
-        self._pictures.ask()
-
-    def leave(self) -> None:
-        """Listen no more."""
-        self._publisher.leave(self._mine)
-
-    def take(self, *, frames: bool) -> list[tuple[str, str]]:
-        """What has come since, oldest first: a kind of news, or `bars`, and what is said of it, JSON.
+    def lines(self, news: News, *, frames: bool) -> list[tuple[str, str]]:
+        """What is said of some news, JSON, each with its kind: that of the news, or `bars` or `untold`.
 
         Args:
+            news: Of a kind that is shown.
             frames: Tell of frames, too; False where nobody looks on.
         """
-        lines: list[tuple[str, str]] = []
-        for news in self._mine.take(0):
-            if news.kind == "frame":
-                self._keep(news.value)
-                if frames:
-                    lines.append(("frame", self._frame(news)))
-            else:
-                lines += ((kind, json.dumps(values)) for kind, values in self._told(news))
-        return lines
+        if news.kind != "frame":
+            return [(kind, json.dumps({"line": kind} | values)) for kind, values in self._told(news)]
+        self._keep(news.value)
+        return [("frame", self._frame(news))] * frames
 
-    def shot(self) -> Shot | None:
-        """The newest picture; the same again until there is another."""
-        picture = self._pictures.newest
-        if picture is not None and (self._shot is None or self._shot.number != picture.number):
+    def shot(self, picture: Picture) -> Shot:
+        """A picture with what is drawn on it; the same again for the same one."""
+        if self._shot is None or self._shot.number != picture.number:
             latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _LATEST_US]
             self._shot = Shot(picture.number, _told(picture, latest), picture.image().png())
         return self._shot
@@ -134,9 +86,9 @@ class Serializer:
         if kind == "message":
             return [self._message(value)]
         if kind == "status":
-            return [(kind, {"line": kind} | _status(value))]
+            return [(kind, _status(value))]
         if kind == "end":
-            return [(kind, {"line": kind} | {key: value.get(key) for key in ("status", "error", "result")})]
+            return [(kind, {key: value.get(key) for key in ("status", "error", "result")})]
         fix, place = value.fix, value.filtered
         if place is None:
             return [(kind, fix_line(fix))]
@@ -161,8 +113,8 @@ class Serializer:
         except (PluginError, ValueError) as fault:
             self.untold += 1
             self.fault = str(fault)
-            return "untold", {"line": "untold", "count": self.untold, "fault": self.fault}
-        return "message", {"line": "message"} | shown
+            return "untold", {"count": self.untold, "fault": self.fault}
+        return "message", shown
 
     def _bars_of(self, fix: Fix) -> list[tuple[str, dict[str, Any]]]:
         """The bars in local metres, with the first fix that is given."""
@@ -175,7 +127,7 @@ class Serializer:
         for one in self._sites:
             place = here.to_enu(one.latitude_deg, one.longitude_deg, one.height_m) + fix.enu_m
             bars.append([one.transmitter_id, *(round(v, 3) for v in place.tolist())])
-        return [("bars", {"line": "bars", "bars": bars})]
+        return [("bars", {"bars": bars})]
 
 
 def _not_a_number(name: str) -> None:

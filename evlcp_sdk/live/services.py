@@ -12,11 +12,9 @@ from evlcp_sdk.live.loop_thread import LoopThread
 from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.serializer import Serializer
 from evlcp_sdk.live.tcp_output import TcpOutput
 from evlcp_sdk.live.viewer import Viewer
 from evlcp_sdk.scene.sites import BarSite
-from evlcp_sdk.spelling import counted
 from evlcp_sdk.utc import ClockZero
 
 
@@ -74,18 +72,17 @@ class Services:
     ) -> None:
         self.pictures = PictureSlot() if serving.view else None
         self._recorder: Recorder | None = None
-        self._serializer: Serializer | None = None
         self.view: Viewer | None = None
         if self.pictures is not None:
             if serving.record_to is not None:
                 camera = next(iter(links.values())).camera
                 self._recorder = Recorder(publisher, serving.record_to, camera.width, camera.height)
-            self._serializer = Serializer(publisher, self.pictures, links, sites)
             self.view = Viewer(
-                self._serializer,
+                publisher,
+                self.pictures,
                 links,
                 name=name,
-                sites=len(sites),
+                sites=sites,
                 host=serving.host,
                 port=serving.port,
                 recorder=self._recorder,
@@ -103,14 +100,6 @@ class Services:
         """Results that clients were not sent as they did not take them, by server."""
         servers = {"view": self.view, "nmea": self.nmea, "gpsd": self.gpsd}
         return {name: server.dropped for name, server in servers.items() if server is not None}
-
-    @property
-    def fault(self) -> str:
-        """What the page could not show, and why; empty for nothing."""
-        if self._serializer is None or not self._serializer.untold:
-            return ""
-        many = counted(self._serializer.untold, "message")
-        return f"{many} could not be shown on the page: {self._serializer.fault}"
 
     def __enter__(self) -> Self:
         servers = [one for one in (self.view, self.nmea, self.gpsd) if one is not None]

@@ -11,7 +11,7 @@ import json
 import secrets
 import struct
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from email.utils import formatdate
 from http import HTTPStatus
@@ -26,15 +26,23 @@ from evlcp_sdk.errors import import_extra
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.loop_thread import cannot_listen, stop_listening
+from evlcp_sdk.live.pictures import PictureSlot
+from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.serializer import MOST_WAITING, PICTURES_PER_S, Serializer
+from evlcp_sdk.live.serializer import Serializer
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_hex
 from evlcp_sdk.report.pages import TEMPLATES, render_page
+from evlcp_sdk.scene.sites import BarSite
+from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import Server, ServerConnection
     from websockets.http11 import Request, Response
 
+_KINDS: Final = frozenset({"frame", "message", "fix", "status", "end"})
+_PICTURES_PER_S: Final = 25
+_MOST_WAITING: Final = 4000
+"""Results that wait for a browser, some seconds of two bars; the oldest go."""
 _MOST_BROWSERS: Final = 16
 _FINISH_S: Final = 1.0
 _MOST_SAID: Final = 4096
@@ -56,7 +64,7 @@ class _Browser:
     """
 
     socket: "ServerConnection"
-    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=MOST_WAITING))
+    waiting: deque[str] = field(default_factory=lambda: deque(maxlen=_MOST_WAITING))
     dropped: int = 0
     ready: bool = False
     picture: int = -1
@@ -71,10 +79,11 @@ class Viewer:
     """Serves the page and what it shows; runs in the loop of a `LoopThread`.
 
     Args:
-        serializer: What is shown.
+        publisher: Where results come from.
+        pictures: Where pictures come from.
         links: The configurations by name, as `named_links` gives them.
         name: Name of the source, for the title.
-        sites: How many bars the map shows.
+        sites: Where the bars stand, for the map.
         host: Where to listen: of this machine only, unless it is another address of it.
         port: The same; 0 for any that is free.
         recorder: Starts and stops recordings as a browser asks; None: browsers only look on.
@@ -86,17 +95,20 @@ class Viewer:
 
     def __init__(
         self,
-        serializer: Serializer,
+        publisher: Publisher,
+        pictures: PictureSlot,
         links: Mapping[str, Link],
         *,
         name: str,
-        sites: int = 0,
+        sites: Sequence[BarSite] = (),
         host: str = "127.0.0.1",
         port: int = 0,
         recorder: Recorder | None = None,
     ) -> None:
-        self._serializer, self._recorder = serializer, recorder
-        self._name, self._links, self._sites = name, links, sites
+        self._publisher, self._pictures, self._recorder = publisher, pictures, recorder
+        self._mine = publisher.subscribe(_KINDS, most=_MOST_WAITING)
+        self._serializer = Serializer(links, sites)
+        self._name, self._links, self._sites = name, links, len(sites)
         self._host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
@@ -116,7 +128,15 @@ class Viewer:
     @property
     def dropped(self) -> int:
         """Results that browsers were not sent as they did not take them, or as there was no time, so far."""
-        return self._serializer.dropped + self._left + sum(browser.dropped for browser in self._browsers)
+        return self._mine.dropped + self._left + sum(browser.dropped for browser in self._browsers)
+
+    @property
+    def fault(self) -> str:
+        """What the page could not show, and why; empty for nothing."""
+        if not self._serializer.untold:
+            return ""
+        many = counted(self._serializer.untold, "message")
+        return f"{many} could not be shown on the page: {self._serializer.fault}"
 
     async def start(self) -> None:
         """Listen.
@@ -137,25 +157,30 @@ class Viewer:
                 server_header=None,
             )
         except OSError as fault:
-            self._serializer.leave()
+            self._publisher.leave(self._mine)
             raise cannot_listen(self._host, self.port, fault) from fault
         self.port = next(iter(server.sockets)).getsockname()[1]
 
         async def pump() -> None:
+            loop, turn_s = asyncio.get_running_loop(), 0.0
             try:
-                while not self._serializer.ended:
-                    await self._serializer.turn()
-                    for kind, line in self._serializer.take(frames=bool(self._browsers)):
-                        self._tell(kind, line)
+                while not self._mine.ended:
+                    # At even times, unless they are over already.
+                    now_s = loop.time()
+                    turn_s = max(turn_s + 1 / _PICTURES_PER_S, now_s)
+                    await asyncio.sleep(turn_s - now_s)
+                    for news in self._mine.take(0):
+                        for kind, line in self._serializer.lines(news, frames=bool(self._browsers)):
+                            self._tell(kind, line)
                     self._send_all()
                 # The last words, once a browser has shown what it was sent before.
-                for _ in range(round(_FINISH_S * PICTURES_PER_S / 2)):
-                    await asyncio.sleep(2 / PICTURES_PER_S)
+                for _ in range(round(_FINISH_S * _PICTURES_PER_S / 2)):
+                    await asyncio.sleep(2 / _PICTURES_PER_S)
                     self._send_all()
                     if not any(browser.waiting for browser in self._browsers):
                         break
             finally:
-                self._serializer.leave()
+                self._publisher.leave(self._mine)
                 await stop_listening(server)
 
         self._pump = asyncio.create_task(pump())
@@ -305,8 +330,9 @@ class Viewer:
             return
         from websockets.asyncio.server import broadcast
 
-        shot = self._serializer.shot()
-        self._serializer.ask()
+        picture = self._pictures.newest
+        shot = None if picture is None else self._serializer.shot(picture)
+        self._pictures.ask()
         record = None if self._recorder is None else self._recorder.state
         end = f'"record": {json.dumps(record)}}}'
         for browser in ready:
@@ -316,7 +342,7 @@ class Viewer:
             told, data = '"picture": null, "bars": null', b""
             if shot is not None and new:
                 browser.picture, told, data = shot.number, shot.told, shot.png
-            dropped = browser.dropped + self._serializer.dropped
+            dropped = browser.dropped + self._mine.dropped
             text = f'{{"news": [{", ".join(browser.waiting)}], "dropped": {dropped}, {told}, {end}'.encode()
             browser.waiting.clear()
             browser.ready = False

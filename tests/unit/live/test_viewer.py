@@ -241,7 +241,8 @@ def test_a_message_that_cannot_be_shown_is_counted_and_said() -> None:
     assert [line["count"] for line in lines if line["line"] == "untold"] == [1, 2]
     assert "to_dict() fails: ZeroDivisionError: by nothing" in lines[0]["fault"]
     assert lines[-1]["text"] == "read me"
-    assert services.fault == (
+    assert services.view is not None
+    assert services.view.fault == (
         "2 messages could not be shown on the page: a message kind shows NaN, which JSON has not"
     )
 
