@@ -691,6 +691,7 @@ def calibrate(
         ConfigError: A pose belongs to none of the recordings, a site contradicts its beacon, or too little
             was seen.
     """
+    from evlcp_sdk.place.bar_registry import BarRegistry
     from evlcp_sdk.place.calibration import calibrate as fit_camera
     from evlcp_sdk.place.error_model import ErrorModel
     from evlcp_sdk.scene.sites import LocalAxes
@@ -702,8 +703,19 @@ def calibrate(
     axes = LocalAxes.of(sites)
     views: list[CalibrationView] = []
     for url in recordings:
-        mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
-        views += _views(url, mine, link, sites, axes, registry, name)
+        who = BarRegistry(sites, link.position)
+        seen, _ = _seen_at(url, poses, {"": link}, registry, who, name)
+        for how in who.contradicted.values():
+            raise ConfigError(f"{url}: {how}")
+        for pose, points in seen:
+            bars = []
+            for number, found in points.items():
+                if (site := who.stands_at.get(number)) is not None:
+                    enu = site.layout_positions_m(link.bar, axes)
+                    bars.append(
+                        replace(found, transmitter=site.transmitter_id, enu_m=enu, survey=site.survey)
+                    )
+            views.append(_view(pose, bars, axes))
     return fit_camera(views, link.camera, ErrorModel.of(link.position), limit_px=limit_px)
 
 
@@ -728,34 +740,6 @@ def _check_names(recordings: Sequence[str], poses: Sequence[KnownPose], source: 
             raise ConfigError(f"{source}: line {line}: recording: expected one, as there are {len(names)}")
 
 
-def _views(
-    url: str,
-    poses: Sequence[KnownPose],
-    link: Link,
-    sites: Sequence[BarSite],
-    axes: LocalAxes,
-    registry: Registry,
-    source: str,
-) -> list[CalibrationView]:
-    """What a recording shows at the times of known poses."""
-    from evlcp_sdk.place.bar_registry import BarRegistry
-
-    who = BarRegistry(sites, link.position)
-    seen, _ = _seen_at(url, poses, {"": link}, registry, who, source)
-    for how in who.contradicted.values():
-        raise ConfigError(f"{url}: {how}")
-    stands_at, views = who.stands_at, []
-    for pose, points in zip(poses, seen, strict=True):
-        bars = []
-        for number, found in points.items():
-            if number in stands_at:
-                site = stands_at[number]
-                enu = site.layout_positions_m(link.bar, axes)
-                bars.append(replace(found, transmitter=site.transmitter_id, enu_m=enu, survey=site.survey))
-        views.append(_view(pose, bars, axes))
-    return views
-
-
 def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> CalibrationView:
     from evlcp_sdk.place.calibration import CalibrationView
     from evlcp_sdk.scene.sites import LocalAxes
@@ -775,8 +759,8 @@ def _seen_at(
     registry: Registry,
     who: BarRegistry,
     source: str,
-) -> tuple[list[dict[int, BarView]], dict[int, str]]:
-    """What `points_at` gives of each transmitter at the times of known poses; the link of each.
+) -> tuple[list[tuple[KnownPose, dict[int, BarView]]], dict[int, str]]:
+    """The poses of a recording with what `points_at` gives of each transmitter then; the link of each.
 
     Raises:
         InputError: The recording cannot be read.
@@ -785,6 +769,7 @@ def _seen_at(
     from evlcp_sdk.place.error_model import ErrorModel
     from evlcp_sdk.place.points import points_at
 
+    poses = [pose for pose in poses if pose.recording in ("", Path(url).name)]
     placing = placing_links(links)
     periods = {name: one.packet.packet_chips * one.packet.chip_us for name, one in placing.items()}
     frames: dict[int, list[Frame]] = {}
@@ -807,18 +792,19 @@ def _seen_at(
                     abs(one.points_t_us - pose.t_us) <= period_us for pose in poses
                 ):
                     kept.append(one)
-    found: list[dict[int, BarView]] = []
+    found: list[tuple[KnownPose, dict[int, BarView]]] = []
     for pose in poses:
-        found.append({})
+        found.append((pose, {}))
         for number, seen in frames.items():
             name = link_of[number]
             link = placing[name]
             errors = ErrorModel.of(link.position)
             points = points_at(number, seen, pose.t_us, periods[name], link.bar.cluster_positions_m(), errors)
             if points is not None:
-                found[-1][number] = points
+                found[-1][1][number] = points
     times = [pose.t_us for pose in poses]
-    if times and first_us <= last_us and not any(found) and not any(first_us <= t <= last_us for t in times):
+    shown = any(points for _, points in found) or any(first_us <= t <= last_us for t in times)
+    if times and first_us <= last_us and not shown:
         raise ConfigError(
             f"{source}: t_us from {min(times):.16g} to {max(times):.16g}: expected the camera's clock, us,"
             f" which is at {first_us:.0f} to {last_us:.0f} where {url} shows bars"
@@ -867,12 +853,11 @@ def survey(
     sends: dict[int, str] = {}
     heard: list[BarRegistry] = []
     for url in recordings:
-        mine = [pose for pose in poses if pose.recording in ("", Path(url).name)]
         who = BarRegistry((), like.position)
-        seen, link_of = _seen_at(url, mine, links, registry, who, name)
+        seen, link_of = _seen_at(url, poses, links, registry, who, name)
         heard.append(who)
         ids = who.ids
-        for pose, points in zip(mine, seen, strict=True):
+        for pose, points in seen:
             bars = []
             for n, found in points.items():
                 if n not in ids or ids[n] in listed:

@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
-from evlcp_sdk.cli._common import console
+from evlcp_sdk.cli._common import progress_bar
 from evlcp_sdk.cli._complain import complain
 
 if TYPE_CHECKING:
@@ -26,46 +26,23 @@ def show_faults(progress: "Progress") -> None:
 @contextmanager
 def campaign_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
     """A bar by tasks, with the errors so far, on a terminal only."""
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress as Bar,
-        ProgressColumn,
-        Task,
-        TextColumn,
-        TimeRemainingColumn,
-    )
-    from rich.text import Text
-
     from evlcp_sdk.kernels import count_compiled, count_imported
 
-    class Work(ProgressColumn):
-        """What is done now, and what was found so far."""
+    found = ""
 
-        def render(self, task: Task) -> Text:
-            compiled = count_compiled()
-            if compiled and not task.completed:
-                return Text(f"compiling for the first run, {compiled} of {count_imported()}")
-            return Text(task.fields["errors"])
+    def words(done: float, total: float | None, _elapsed_s: float) -> str:
+        compiled = count_compiled()
+        if compiled and not done:
+            return f"compiling for the first run, {compiled} of {count_imported()}"
+        return f"{done:.0f}/{total:.0f} {found}" if total else ""
 
-    err = console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        MofNCompleteColumn(),
-        Work(),
-        TimeRemainingColumn(),
-    )
-    with Bar(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(name, total=None, errors="")
+    with progress_bar(name, words) as advance:
 
         def show(progress: "Progress") -> None:
+            nonlocal found
             failed = f", {len(progress.faults)} failed" if progress.faults else ""
-            errors = (
-                f"{progress.bit_errors:,} errors in {progress.bits:,} bits{failed}"
-                if progress.bits
-                else failed
-            )
-            bar.update(task, completed=progress.done, total=progress.tasks, errors=errors)
+            errors = f"{progress.bit_errors:,} errors in {progress.bits:,} bits" if progress.bits else ""
+            found = errors + failed
+            advance(progress.done, progress.tasks)
 
         yield show

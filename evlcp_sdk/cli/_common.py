@@ -164,23 +164,20 @@ def progress_bar(
     if not shows_bars():
         yield lambda _done, _total: None
         return
-    from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
+    from rich.text import Text
+
+    class Words(ProgressColumn):
+        """What is done, as it is now."""
+
+        def render(self, task: Task) -> Text:
+            return Text(words(task.completed, task.total, task.elapsed or 0.0))
 
     err = console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        TextColumn("{task.fields[words]}", markup=False),
-        TimeRemainingColumn(),
-    )
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), Words(), TimeRemainingColumn())
     with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task(name, total=None, words="")
-
-        def advance(done: float, total: float | None) -> None:
-            said = words(done, total, bar.tasks[0].elapsed or 0.0)
-            bar.update(task, completed=done, total=total, words=said)
-
-        yield advance
+        task = bar.add_task(name, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def bytes_bar(name: str) -> "AbstractContextManager[Advance]":

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -21,14 +20,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.study.variants import Variant
 
 _SQLITE = b"SQLite format 3\0"
-
-
-@dataclass(frozen=True)
-class CompareJob:
-    """One recording, and whether it is received in this process."""
-
-    url: str
-    here: bool
 
 
 def compare(
@@ -148,11 +139,9 @@ def _of_recordings(
     tables: dict[str, Table] = {}
     code = 0
     try:
-        for outcome in executor.run(
-            partial(_run, variants=variants), [CompareJob(url, here) for url in urls]
-        ):
+        for outcome in executor.run(partial(_run, variants=variants, here=here), urls):
             if outcome.value is not None:
-                tables[outcome.job.url] = outcome.value
+                tables[outcome.job] = outcome.value
             elif outcome.fault is not None:
                 complain(outcome.fault.message)
                 code = max(code, outcome.fault.exit_code)
@@ -162,12 +151,12 @@ def _of_recordings(
     return code, comparison_of(ordered, variants, registry.versions())
 
 
-def _run(job: CompareJob, *, variants: tuple[Variant, ...]) -> Table:
+def _run(url: str, *, variants: tuple[Variant, ...], here: bool) -> Table:
     """Compare the variants on one recording, here or in a worker."""
     from evlcp_sdk.study.compare import compare_recording
 
-    with bytes_bar(Path(job.url).name) if job.here else nullcontext() as advance:
-        return compare_recording(job.url, variants, advance=advance or (lambda _done, _of: None))
+    with bytes_bar(Path(url).name) if here else nullcontext() as advance:
+        return compare_recording(url, variants, advance=advance or (lambda _done, _of: None))
 
 
 def _write(comparison: Comparison, paths: Sequence[Path]) -> None:

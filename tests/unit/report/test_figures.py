@@ -16,7 +16,6 @@ from evlcp_sdk.report.figures import (
     draw_presence,
     draw_regions,
 )
-from evlcp_sdk.report.recording import Thinned
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.scene.camera import CameraModel
@@ -44,18 +43,6 @@ def told(probe: FigureProbe, transmitters: int, frames: int, fill: float = 1.0) 
             probe.evlcp_stage_finished("separation", presence(fill))
             probe.evlcp_stage_finished("frame", frame(n, i, 50.0 - i, quality=0.5 + 0.4 * (i == 3)))
     return probe
-
-
-def test_what_is_kept_is_bounded_and_even() -> None:
-    kept = Thinned[int](8)
-    for i in range(1000):
-        kept.add(i)
-    values = list(kept)
-    assert 4 <= len(values) <= 8
-    assert len(set(np.diff(values))) == 1
-    probe = told(FigureProbe(CameraModel(), points=8), 1, 100)
-    assert len(probe.frames[0]) <= 8
-    assert len(probe.regions[0]) <= 8
 
 
 def test_the_image_counts_events_on_the_sensor() -> None:
