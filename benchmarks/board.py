@@ -1,17 +1,16 @@
-"""The board: programming, chips in QEMU and on the model of the STM32F405, streams, flashing.
+"""The board: programming, chips on the model of the STM32F405, streams, flashing.
 
-    python benchmarks/board.py [program] [chips] [stm32] [stream] [flash]
+    python benchmarks/board.py [program] [stm32] [stream] [flash]
 
-Prints Markdown, all sections without a name. Times of QEMU and of models are virtual and the same in every
-run; the model counts an instruction of the core as a clock.
+Prints Markdown, all sections without a name. Times of the model are virtual and the same in every run; it
+counts an instruction of the core as a clock.
 """
 
 import argparse
 import contextlib
 import sys
-import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -21,19 +20,16 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import load_link
 from firmware_host import build
-from firmware_host.board.bank import Bank, bank_of, random_symbols
+from firmware_host.board.bank import Bank, random_symbols
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.session import Session
-from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.native import NativeBoard, NativeLine
-from firmware_host.emulators.processes import start_qemu
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardError
 from firmware_host.images import FlashImage
 from firmware_host.ports.rom import RomLoader, flash_image
-from firmware_host.protocol.client import RequestOutcome, Timing
-from firmware_host.protocol.generated.requests import CommitRequest, StatusReply, StatusRequest
-from firmware_host.protocol.wire import WireMessage
+from firmware_host.protocol.client import Timing
+from firmware_host.protocol.generated.requests import CommitRequest
 from tests.models.usb import UsbLine
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -59,51 +55,14 @@ def program() -> None:
     )
 
 
-def chips() -> None:
-    """Intervals of chips in QEMU while the host asks for STATUS without pause."""
-    for name, bar in (("words", []), ("10 clusters", ["bar.rows=90", "bar.cluster_rows=9"])):
-        link = load_link(overrides=bar)
-        bank = bank_of(random_symbols(8, 10, link.codebook, np.random.default_rng(5)), link)
-        with tempfile.TemporaryDirectory() as folder:
-            leds = Path(folder) / "leds.bin"
-            asked, status = ask_while_playing(leds, bank, 20_000)
-            ticks = LedRecord.read(leds).played().ticks[:20_000]
-        intervals_us = np.diff(ticks) / 25.0
-        print(
-            f"{name}: {len(ticks)} chips, {asked} requests answered, intervals {intervals_us.min():.2f}"
-            f" to {intervals_us.max():.2f} us, {status.lateness_max_ticks / 25:.2f} us late at most"
-        )
-
-
-def ask_while_playing(leds: Path, bank: Bank, chips: int) -> tuple[int, StatusReply]:
-    """How many requests the board in QEMU has answered after so many chips, and the last answer."""
-    with Session(start_qemu(leds)) as session:
-        board = Board(session)
-        provision(board, bank, Settings())
-        asked, last = 0, board.status()
-
-        def requests() -> Iterator[StatusRequest]:
-            while last.chips_sent < chips:
-                yield StatusRequest()
-
-        def handle(request: WireMessage, outcome: RequestOutcome) -> None:
-            nonlocal asked, last
-            reply = session.checked(request, outcome)
-            if isinstance(reply, StatusReply):
-                asked, last = asked + 1, reply
-
-        session.run(requests(), handle)
-        return asked, last
-
-
 def stm32() -> None:
     """What interrupts and COMMIT take on the model, by bank, and how soon it is dark on a fault."""
-    from tests.models.stm32 import US, Dma, ModelLine, Stm32
+    from tests.models.stm32 import US, Dma, Stm32, connect
 
     def model() -> tuple[Stm32, Board]:
         chip = Stm32(build.arm_image("stm32f405"))
         chip.run(15_000)
-        return chip, Board(Session(ModelLine(chip), Timing(latency_s=0.02)))
+        return chip, connect(chip)
 
     print("| bank | chip interrupt, us | COMMIT, ms |\n|---|---|---|")
     for name, bank in full_banks().items():
@@ -248,7 +207,7 @@ def flash() -> None:
 
 
 SECTIONS: dict[str, Callable[[], None]] = {
-    "program": program, "chips": chips, "stm32": stm32, "stream": stream, "flash": flash,
+    "program": program, "stm32": stm32, "stream": stream, "flash": flash,
 }  # fmt: skip
 
 

@@ -21,11 +21,9 @@ TARGETS = {"stm32f405-8mhz": "stm32f405", "stm32f405-12mhz": "stm32f405-12mhz"}
 def build_folder() -> Path:
     """Where the firmware is built: `evlcp/firmware-HASH` in the user's cache."""
     digest = hashlib.sha256()
-    root = Path(__file__).parents[1]
-    # The tests' board for QEMU is built there, too, in a checkout.
-    for path in sorted([*FIRMWARE.rglob("*"), *(root / "tests" / "firmware" / "c").rglob("*")]):
+    for path in sorted(FIRMWARE.rglob("*")):
         if path.suffix in (".c", ".h", ".ld") or path.name == "Makefile":
-            digest.update(path.relative_to(root).as_posix().encode() + b"\0" + path.read_bytes())
+            digest.update(path.relative_to(FIRMWARE).as_posix().encode() + b"\0" + path.read_bytes())
     try:
         cache_folder = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
     except RuntimeError as fault:
@@ -33,8 +31,8 @@ def build_folder() -> Path:
     return cache_folder / "evlcp" / f"firmware-{digest.hexdigest()[:16]}"
 
 
-def make(*targets: str, makefile: Path | None = None) -> Path:
-    """Run make in the firmware tree, by its own makefile or another; returns the build folder.
+def make(*targets: str) -> Path:
+    """Run make in the firmware tree; returns the build folder.
 
     Raises:
         ToolchainError: A tool is missing, or a step fails.
@@ -54,16 +52,7 @@ def make(*targets: str, makefile: Path | None = None) -> Path:
         # Two programs may want the same image at once.
         fcntl.flock(lock, fcntl.LOCK_EX)
         done = subprocess.run(
-            [
-                "make",
-                "-s",
-                "-C",
-                str(FIRMWARE),
-                "-f",
-                str(makefile or "Makefile"),
-                f"BUILD={folder}",
-                *targets,
-            ],
+            ["make", "-s", "-C", str(FIRMWARE), f"BUILD={folder}", *targets],
             capture_output=True,
             text=True,
             check=False,
@@ -94,24 +83,10 @@ def native_library() -> Path:
 def arm_image(board: str) -> Path:
     """The ARM image of a board: `stm32f405` or `stm32f405-12mhz`.
 
-    With `-1` or `-2` one for the two places of updates; in a checkout also QEMU's `mps2-an385`.
+    With `-1` or `-2` one for the two places of updates.
 
     Raises:
         ToolchainError: The cross compiler is missing, or fails.
     """
     _compiler("arm-none-eabi-gcc", "gcc-arm-none-eabi")
-    if board == "mps2-an385":
-        return make("mps2", makefile=tests_folder() / "firmware" / "c" / "Makefile") / f"{board}.elf"
     return make("images" if board[-2:] in ("-1", "-2") else "stm32") / f"{board}.elf"
-
-
-def tests_folder() -> Path:
-    """The checkout's tests, where emulators of the part and QEMU's board stand.
-
-    Raises:
-        ToolchainError: This is no checkout.
-    """
-    folder = Path(__file__).parents[1] / "tests"
-    if not (folder / "models").is_dir():
-        raise ToolchainError("this emulator comes with a checkout of the sources, not with a package")
-    return folder

@@ -201,7 +201,7 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
         first: dict[str, int] = {}
         for i, entry in enumerate(entries):
             value = getattr(entry, key)
-            if value in first and not value.startswith(("native:", "qemu:")):
+            if value in first and not value.startswith("native:"):
                 raise ConfigError(
                     f"{path}: board[{i}].{key} = {shown(value)},"
                     f" expected another than board[{first[value]}]'s"

@@ -88,7 +88,7 @@ def line_options(
         str | None,
         typer.Option(
             envvar="EVLCP_PORT",
-            help="Device, pyserial URL, usb:VID:PID, unix:PATH, tcp:HOST:PORT, native: or qemu:;"
+            help="Device, pyserial URL, usb:VID:PID, unix:PATH, tcp:HOST:PORT, or native:;"
             " by default those are asked whose USB id boards usually have.",
         ),
     ] = None,

@@ -71,7 +71,6 @@ class Emulator(StrEnum):
     """Emulated boards."""
 
     NATIVE = "native"
-    QEMU = "qemu"
     STM32 = "stm32"
     ROM = "rom"
 
@@ -139,7 +138,7 @@ def ports(
         echo(f"{f.port.device}  {f.port.usb or '-'}{serial}  {f.port.description}  {what}")
     if not found:
         which = "no serial ports" if usb is None else f"no serial port with USB id {usb}"
-        echo(f"{which}; emulated boards: --port native: or --port qemu:")
+        echo(f"{which}; an emulated board: --port native:")
 
 
 @app.command(cls=LineCommand)
@@ -647,8 +646,7 @@ def emulate(
     emulator: Annotated[
         Emulator,
         typer.Argument(
-            help="native: the firmware in this process; qemu: an ARM image; stm32: the image as flashed;"
-            " rom: a part to flash."
+            help="native: the firmware in this process; stm32: the image as flashed; rom: a part to flash."
         ),
     ],
     listen: Annotated[
@@ -664,7 +662,7 @@ def emulate(
 ) -> None:
     """Run an emulated board in the foreground; end with Ctrl-C.
 
-    For example: [bold]evlcp board emulate qemu --listen unix:/tmp/board --leds leds.bin[/]
+    For example: [bold]evlcp board emulate native --listen unix:/tmp/board --leds leds.bin[/]
     """
     import re
 
@@ -696,9 +694,7 @@ def emulate(
             echo(f"listening on {line.place}")
             serve(board, line, stopped)
         return
-    if emulator is Emulator.QEMU:
-        command = processes.qemu_command(listen, leds)
-    elif emulator is Emulator.ROM:
+    if emulator is Emulator.ROM:
         command = processes.rom_command(listen, flash, leds)
     else:
         command = processes.stm32_command(listen, leds)

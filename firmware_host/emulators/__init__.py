@@ -1,1 +1,1 @@
-"""Boards without hardware: the native program, QEMU, a virtual board in this process; LED records."""
+"""Boards without hardware: the native program, a virtual board in this process, models; LED records."""

@@ -1,13 +1,12 @@
 """Ports by name, emulators among them.
 
-`native:` (`native:FILE` keeps its flash) and `qemu:` start an emulator that lives as long as the line; all
-else is a port of `firmware_host.ports.transport`.
+`native:` (`native:FILE` keeps its flash) starts an emulator that lives as long as the line; all else is a
+port of `firmware_host.ports.transport`.
 """
 
 from pathlib import Path
 
 from firmware_host.emulators.native import NativeBoard, NativeLine
-from firmware_host.emulators.processes import start_qemu
 from firmware_host.ports.transport import Transport, open_transport
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
@@ -18,11 +17,9 @@ def open_port(spec: str, baud: int = DEFAULT_BAUD) -> Transport:
     Raises:
         InputError: The emulator's flash file cannot be used.
         NoBoardError: The port cannot be opened.
-        ToolchainError: An emulator cannot be built or started.
+        ToolchainError: The emulator cannot be built.
     """
     scheme, _, rest = spec.partition(":")
     if scheme == "native":
         return NativeLine(NativeBoard(flash=Path(rest) if rest else None))
-    if scheme == "qemu":
-        return start_qemu()
     return open_transport(spec, baud)

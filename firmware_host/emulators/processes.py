@@ -1,20 +1,17 @@
-"""Boards that run as programs of their own: the ARM image in QEMU, and models of the part."""
+"""Boards that run as programs of their own: models of the part, which stand with the tests."""
 
 import contextlib
 import importlib.util
 import os
-import shutil
-import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
 
 from evlcp_sdk.errors import InputError
 from firmware_host import build
-from firmware_host.errors import LineError, NoBoardError, ToolchainError
+from firmware_host.errors import NoBoardError, ToolchainError
 from firmware_host.images import FLASH_BYTES, check_flash_file
 from firmware_host.ports.transport import SocketTransport
 
@@ -35,78 +32,20 @@ def bound(command: Sequence[str]) -> list[str]:
     return [sys.executable, "-IS", "-c", _DIES_WITH_PARENT, str(os.getpid()), *command]
 
 
-class ProcessTransport(SocketTransport):
-    """The socket of an emulator that ends with the line."""
-
-    def __init__(
-        self,
-        name: str,
-        connected: socket.socket,
-        process: "subprocess.Popen[bytes]",
-        folder: Path | None = None,
-    ) -> None:
-        super().__init__(name, connected)
-        self.process = process
-        self._folder = folder
-
-    def close(self) -> None:
-        """Close the socket and end the emulator."""
-        super().close()
-        _end(self.process)
-        if self._folder is not None:
-            shutil.rmtree(self._folder, ignore_errors=True)
-
-
-def _end(process: "subprocess.Popen[bytes]") -> None:
-    process.terminate()
-    try:
-        process.wait(5.0)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
-    if process.stderr is not None:
-        process.stderr.close()
-
-
-def qemu_command(listen: str, leds: Path | None = None, wait: bool = False) -> list[str]:
-    """Command line of QEMU with the board's ARM image; it ends with the process that starts it.
-
-    Args:
-        listen: `unix:PATH` or `tcp:HOST:PORT`; QEMU drops bytes on a pseudo-terminal.
-        leds: File for the LED records.
-        wait: Start the board only when a host has connected.
-
-    Raises:
-        ToolchainError: QEMU is missing, or the image cannot be built.
-    """
-    if shutil.which("qemu-system-arm") is None:
-        raise ToolchainError(
-            "qemu-system-arm is missing: apt-get install --no-install-recommends qemu-system-arm"
-        )
-    # A comma in a name stands doubled in QEMU's options.
-    serial = f"{listen.replace(',', ',,')},server=on,wait={'on' if wait else 'off'}"
-    record = "null" if leds is None else f"file:{str(leds).replace(',', ',,')}"
-    return bound(
-        [
-            *("qemu-system-arm", "-M", "mps2-an385", "-kernel", str(build.arm_image("mps2-an385"))),
-            *("-icount", "shift=3,sleep=off", "-display", "none", "-monitor", "none", "-nodefaults"),
-            *("-serial", serial, "-serial", record),
-        ]
-    )
-
-
-def _model(name: str) -> list[str]:
-    """Command line of a model of the part, which stands with the tests.
+def _model(name: str, *options: str) -> list[str]:
+    """Command line of a model; it ends with the process that starts it.
 
     Raises:
         ToolchainError: This is no checkout.
     """
-    root = build.tests_folder().parent
+    root = Path(__file__).parents[2]
+    if not (root / "tests" / "models").is_dir():
+        raise ToolchainError("this emulator comes with a checkout of the sources, not with a package")
     code = (
         f"import runpy, sys; sys.path.insert(0, {str(root)!r});"
         f" runpy.run_module('tests.models.{name}', run_name='__main__', alter_sys=True)"
     )
-    return [sys.executable, "-c", code]
+    return bound([sys.executable, "-c", code, *options])
 
 
 def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
@@ -121,9 +60,8 @@ def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
     """
     if importlib.util.find_spec("unicorn") is None:
         raise ToolchainError("unicorn, the model's core, is missing: pip install unicorn")
-    image = build.arm_image("stm32f405")
-    command = [*_model("stm32_server"), str(image), "--listen", listen]
-    return command if leds is None else [*command, "--leds", str(leds)]
+    record = () if leds is None else ("--leds", str(leds))
+    return _model("stm32_server", str(build.arm_image("stm32f405")), "--listen", listen, *record)
 
 
 def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None) -> list[str]:
@@ -144,11 +82,8 @@ def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None
             raise InputError(
                 f"{flash}: {flash.stat().st_size} bytes, expected {FLASH_BYTES}, the flash of the part"
             )
-    command = [*_model("rom_server"), "--listen", listen]
-    for name, value in (("--flash", flash), ("--leds", leds)):
-        if value is not None:
-            command += [name, str(value)]
-    return command
+    files = [(name, str(path)) for name, path in (("--flash", flash), ("--leds", leds)) if path is not None]
+    return _model("rom_server", "--listen", listen, *(part for option in files for part in option))
 
 
 def wait_for(
@@ -161,23 +96,3 @@ def wait_for(
             return SocketTransport.connect(listen)
         time.sleep(0.02)
     return None
-
-
-def start_qemu(leds: Path | None = None) -> ProcessTransport:
-    """Start the board in QEMU and connect to it.
-
-    Raises:
-        ToolchainError: QEMU or the cross compiler is missing.
-        LineError: QEMU does not come up.
-    """
-    folder = Path(tempfile.mkdtemp(prefix="evlcp-qemu-"))
-    listen = f"unix:{folder / 'uart0'}"
-    process = subprocess.Popen(qemu_command(listen, leds), stdin=subprocess.DEVNULL, stderr=subprocess.PIPE)
-    connected = wait_for(listen, process)
-    if connected is not None:
-        return ProcessTransport("qemu:", connected.detach(), process, folder)
-    process.kill()
-    said = process.stderr.read().decode(errors="replace").strip() if process.stderr else ""
-    _end(process)
-    shutil.rmtree(folder, ignore_errors=True)
-    raise LineError(f"qemu: does not come up: {said or 'no socket'}; try 'evlcp board emulate qemu'")

@@ -1,5 +1,5 @@
 #!/bin/sh
-# Installs what the firmware's tests need, where it is missing: compilers, make, QEMU, cppcheck, libFuzzer.
+# Installs what the firmware's tests need, where it is missing: compilers, make, cppcheck, libFuzzer.
 # Without root or apt it says what to install and ends well; the tests then skip and say so.
 set -eu
 
@@ -11,7 +11,6 @@ need cc "gcc libc6-dev"
 need c++ g++
 need make make
 need arm-none-eabi-gcc gcc-arm-none-eabi
-need qemu-system-arm qemu-system-arm
 need cppcheck cppcheck
 need clang clang
 

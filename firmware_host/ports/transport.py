@@ -106,10 +106,6 @@ class SocketTransport:
             ) from fault
         return cls(spec, connected)
 
-    def detach(self) -> socket.socket:
-        """Give the socket away; this transport is of no further use."""
-        return self._socket
-
     def now(self) -> float:
         """Monotonic time, s."""
         return time.monotonic()

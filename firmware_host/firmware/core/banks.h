@@ -10,9 +10,7 @@
 #include "stream.h"
 
 #define EVLCP_BANKS 2u
-#ifndef EVLCP_BANK_BYTES
 #define EVLCP_BANK_BYTES 40960u
-#endif
 
 struct evlcp_banks {
     uint8_t content[EVLCP_BANKS][EVLCP_BANK_BYTES];
