@@ -13,14 +13,20 @@ a step. `--memory` renders a drive of so many seconds and prints the peak of the
 import argparse
 import math
 import resource
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from numba import njit
 
-from evlcp_sdk.sim import SensorSpec, Simulation, _kernels, load_scene
-from evlcp_sdk.sim.simulation import pixel_model, requests_room
+from evlcp_sdk.sim import SensorSpec, Simulation, load_scene
+from evlcp_sdk.sim.simulation import sensor_vector
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+
+from tests.models.pixels import pixel_events
 
 
 def best(work: Callable[[], int], rounds: int) -> float:
@@ -111,16 +117,13 @@ def main() -> None:
         )
 
     spec = SensorSpec(noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
-    model = pixel_model(spec, 0)
-    sensor = model.sensor
+    sensor = sensor_vector(spec)
     bits = np.random.default_rng(0).integers(0, 2, 2000)
     light = np.where(np.stack([1 - bits, bits], 1).ravel(), 51.0, 0.05)
     edges = np.arange(light.size) * 100.0
 
     def closed_form() -> int:
-        out = requests_room(1 << 20)
-        _kernels.run_given_light(0, 50, edges, light, light.size * 100.0, model, out)
-        return int(out.made[0])
+        return len(pixel_events(spec, edges, light, light.size * 100.0, pixels=2000).on)
 
     closed_form()
     print(f"pixels, closed form           {best(closed_form, args.rounds):8.2f} Mev/s")

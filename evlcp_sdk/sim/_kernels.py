@@ -46,26 +46,16 @@ _NEAREST = 6755399441055744.0
 NOISE_LIMIT = 4.0
 """Where the normal distribution of every draw is cut off, standard deviations."""
 
+PIXEL_STEP, DRAW_STEP = 0x9E3779B97F4A7C15, 0xD1B54A32D192ED03
+"""By how much the keys of two pixels, and of two draws of a pixel, differ before they are scattered."""
+
 
 @njit(inline="always")
-def _mix(z: Any) -> Any:
+def mix(z: Any) -> Any:
     """Return the finalizer of splitmix64: a bijection of 64-bit words that scatters them."""
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
     return z ^ (z >> np.uint64(31))
-
-
-@njit(inline="always")
-def _key_of(seed: Any, pixel: int) -> Any:
-    """Key of a pixel's random numbers."""
-    return _mix(seed + np.uint64(pixel) * np.uint64(0x9E3779B97F4A7C15))
-
-
-@njit
-def hash_uniform(seed: Any, pixel: int, draw: int, purpose: int) -> float:
-    """Uniform number in [0, 1) of one (seed, pixel, draw, purpose)."""
-    z = _mix(_key_of(seed, pixel) + np.uint64(draw) * np.uint64(0xD1B54A32D192ED03) + np.uint64(purpose))
-    return float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)
 
 
 @njit(inline="always")
@@ -79,15 +69,11 @@ def _table_at(table: Array, share: float) -> float:
 
 
 @njit
-def hash_normal(seed: Any, pixel: int, draw: int, purpose: int, quantiles: Array) -> float:
-    """Normal number, cut off at `NOISE_LIMIT`, from a table of the quantiles."""
-    return float(_table_at(quantiles, hash_uniform(seed, pixel, draw, purpose)))
-
-
-@njit(inline="always")
-def _receptor(u_base: float, rest: float, ages: float) -> float:
-    """Receptor after so many time constants; at rest after 60, when nothing of the difference is left."""
-    return rest if ages > 60.0 else rest + (u_base - rest) * math.exp(-ages)
+def hash_normal(seed: Any, pixel: int, draw: Any, purpose: int, quantiles: Array) -> float:
+    """Normal number of one (seed, pixel, draw, purpose), cut off at `NOISE_LIMIT`, from its quantiles."""
+    key = mix(seed + np.uint64(pixel) * np.uint64(PIXEL_STEP))
+    z = mix(key + np.uint64(draw) * np.uint64(DRAW_STEP) + np.uint64(purpose))
+    return float(_table_at(quantiles, float(z >> np.uint64(11)) * (1.0 / 9007199254740992.0)))
 
 
 LANES = 192
@@ -103,7 +89,7 @@ _REST, _END, _NEW, _AROUND, _TOTAL = range(11 * LANES, 16 * LANES, LANES)
 _ALONG, _ACROSS, _ROW_PART, _NODE_PART = range(16 * LANES, 20 * LANES, LANES)
 _M_U, _M_REST, _M_END, _M_REFERENCE, _M_READY, _M_LAST_OUT = range(20 * LANES, 26 * LANES, LANES)
 _M_ON, _M_OFF, _M_AGE, _M_SHIFT, _M_FATE, _M_SPARE = range(26 * LANES, 32 * LANES, LANES)
-_M_LATER, _M_CROSS, _M_LEVEL, _M_REQUEST, _ROOM = range(32 * LANES, 37 * LANES, LANES)
+_M_LATER, _M_LEVEL, _M_REQUEST, _ROOM = range(32 * LANES, 36 * LANES, LANES)
 
 
 class Batch(NamedTuple):
@@ -150,20 +136,12 @@ class Requests(NamedTuple):
     Attributes:
         t_us: When, float64 (n,).
         code: Of pixel and polarity, int32 (n,).
-        cross_us: When the threshold was crossed, float64 (n,) or empty.
         made: How many there are, int64 (1,).
     """
 
     t_us: Array
     code: Array
-    cross_us: Array
     made: Array
-
-
-@njit
-def _make_batch() -> Batch:
-    rows = np.zeros((5, LANES), np.int64)
-    return Batch(np.zeros(_ROOM), np.zeros(LANES, np.uint64), rows[0], rows[1], rows[2], rows[3], rows[4])
 
 
 @njit(inline="always")
@@ -189,33 +167,6 @@ def _decay(age: float) -> float:
     return (p if age <= 60.0 else 0.0) * power
 
 
-@njit(inline="always")
-def _draw_noise(i: int, batch: Batch, model: PixelModel) -> tuple[Any, float]:
-    """A pixel's word of random bits in its draw, and by what factor noise moves its thresholds.
-
-    The upper half of the word decides on the noise, the lower on whether an event goes missing.
-    """
-    word = _mix(batch.key[i] + np.uint64(batch.draw[i]) * np.uint64(0xD1B54A32D192ED03))
-    return word, _table_at(model.shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10)
-
-
-@njit(inline="always")
-def _fire(i: int, t_us: float, on: Any, word: Any, batch: Batch, model: PixelModel, out: Requests) -> None:
-    """Let a pixel fire: it is blind for a while, and asks for its event, unless that goes missing."""
-    f, sensor = batch.f, model.sensor
-    refractory, late, jitter = sensor[1], sensor[2] if on else sensor[3], sensor[4]
-    if jitter > 0.0:
-        late = max(late + jitter * hash_normal(batch.key[i], 0, batch.draw[i], 2, model.quantiles), 0.0)
-    request = max(t_us + late, f[_LAST_OUT + i] + refractory)
-    f[_READY + i], f[_LAST_OUT + i] = t_us + refractory, request
-    if float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10 >= (sensor[5] if on else sensor[6]):
-        n = out.made[0]
-        out.t_us[n], out.code[n] = request, batch.code[i] + (1 if on else 0)
-        if out.cross_us.size:
-            out.cross_us[n] = t_us
-        out.made[0] = n + 1
-
-
 @njit
 def _follow(y_from: float, y_to: float, z: float, whole: float, part: float, tau: float) -> float:
     """Return a low-pass filter's output after `part` of a ramp of `whole` us from y_from to y_to."""
@@ -224,46 +175,43 @@ def _follow(y_from: float, y_to: float, z: float, whole: float, part: float, tau
 
 
 @njit
-def _find_crossing(y_from: float, y_to: float, z: float, half: float, level: float, tau: float) -> float:
-    """When, in a ramp of `half` us, a low-pass filter's output passes a level, to a millionth of the ramp."""
-    rising = z < level
-    before, after = 0.0, half
-    for _ in range(20):
-        guess = 0.5 * (before + after)
-        if (_follow(y_from, y_to, z, half, guess, tau) >= level) == rising:
-            after = guess
-        else:
-            before = guess
-    return after
-
-
-@njit
 def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelModel, out: Requests) -> None:
     """Let a pixel see its light, as in `_run_piece`, with a low-pass filter between receptor and comparator.
 
     The receptor is exact; between its values, as near to one another as they must be for a ramp to hit the
-    middle between them to 0.002, the filter is solved for ramps. Its reference and its output are log
-    signals.
+    middle between them to 0.002, the filter is solved for ramps, and when its output passes a level is found
+    to a millionth of a ramp. Its reference and its output are log signals.
     """
-    f, tau = batch.f, model.sensor[12]
+    f, sensor, tau = batch.f, model.sensor, model.sensor[12]
     light, u_base = f[_NOW + i], f[_U + i]
     threshold_on, threshold_off = -math.log(f[_ON + i]), math.log(f[_OFF + i])
-    rest, settled, rate = 1.0 / light, math.log(light), light / model.sensor[0]
+    rest, settled, rate = 1.0 / light, math.log(light), light / sensor[0]
     t, y, z, length = t_us, -math.log(u_base), f[_FOLLOWER + i], 0.25 * tau
-    word, factor = _draw_noise(i, batch, model)
-    noise, reference = math.log(factor), f[_REFERENCE + i]
+    # Of a word of random bits a draw, the upper half decides on the noise, the lower on whether the event
+    # goes missing.
+    drawn, word, noise = np.int64(-1), np.uint64(0), 0.0
     while True:
-        high, low = reference + threshold_on - noise, reference - threshold_off - noise
-        if f[_ARMED + i] > 0.0:
-            if z >= high or z <= low:
-                f[_ARMED + i] = 0.0
-                _fire(i, t, z >= high, word, batch, model, out)
-        elif t >= f[_READY + i]:
-            reference, f[_ARMED + i] = z, 1.0
+        if batch.draw[i] != drawn:
+            drawn = batch.draw[i]
+            word = mix(batch.key[i] + np.uint64(drawn) * np.uint64(DRAW_STEP))
+            noise = math.log(_table_at(model.shifts, float(word >> np.uint64(32)) * 2.3283064365386963e-10))
+        high = f[_REFERENCE + i] + threshold_on - noise
+        low = f[_REFERENCE + i] - threshold_off - noise
+        if f[_ARMED + i] > 0.0 and (z >= high or z <= low):
+            on = z >= high
+            late = sensor[2] if on else sensor[3]
+            if sensor[4] > 0.0:
+                noisy = sensor[4] * hash_normal(batch.key[i], 0, drawn, 2, model.quantiles)
+                late = max(late + noisy, 0.0)
+            request = max(t + late, f[_LAST_OUT + i] + sensor[1])
+            f[_ARMED + i], f[_READY + i], f[_LAST_OUT + i] = 0.0, t + sensor[1], request
+            if float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10 >= sensor[5 if on else 6]:
+                out.t_us[out.made[0]], out.code[out.made[0]] = request, batch.code[i] + (1 if on else 0)
+                out.made[0] += 1
+        elif f[_ARMED + i] == 0.0 and t >= f[_READY + i]:
+            f[_REFERENCE + i], f[_ARMED + i] = z, 1.0
             batch.draw[i] += 1
-            word, factor = _draw_noise(i, batch, model)
-            noise = math.log(factor)
-            high, low = reference + threshold_on - noise, reference - threshold_off - noise
+            continue
         if t >= until:
             break
         armed = f[_ARMED + i] > 0.0
@@ -273,8 +221,8 @@ def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelM
             continue
         whole = min(length, limit - t)
         last = whole == limit - t
-        middle = -math.log(_receptor(u_base, rest, rate * (t + 0.5 * whole - t_us)))
-        end = -math.log(_receptor(u_base, rest, rate * (t + whole - t_us)))
+        middle = -math.log(rest + (u_base - rest) * math.exp(-rate * (t + 0.5 * whole - t_us)))
+        end = -math.log(rest + (u_base - rest) * math.exp(-rate * (t + whole - t_us)))
         if abs(middle - 0.5 * (y + end)) > 2e-3 and whole > 1e-3:
             length = 0.5 * whole
             continue
@@ -286,15 +234,22 @@ def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelM
             z_to = _follow(y, y_to, z, half, half, tau)
             if armed and (z_to >= high or z_to <= low):
                 level = high if z_to >= high else low
-                t += k * half + _find_crossing(y, y_to, z, half, level, tau)
-                y, z = -math.log(_receptor(u_base, rest, rate * (t - t_us))), level
+                before, after = 0.0, half
+                for _ in range(20):
+                    guess = 0.5 * (before + after)
+                    if (_follow(y, y_to, z, half, guess, tau) >= level) == (z < level):
+                        after = guess
+                    else:
+                        before = guess
+                t += k * half + after
+                y, z = -math.log(rest + (u_base - rest) * math.exp(-rate * (t - t_us))), level
                 crossed = True
                 break
             y, z = y_to, z_to
         if not crossed:
             t = limit if last else t + whole
-    f[_U + i] = _receptor(u_base, rest, rate * (until - t_us))
-    f[_FOLLOWER + i], f[_REFERENCE + i] = z, reference
+    f[_U + i] = rest + (u_base - rest) * math.exp(-rate * (until - t_us))
+    f[_FOLLOWER + i] = z
 
 
 @njit(inline="always")
@@ -382,7 +337,7 @@ def _draw_fates(m: int, batch: Batch, shifts: Array) -> int:
     even = _fill(which, m)
     for a in range(even):
         k = np.uint64(which[a])
-        word = _mix(key[k] + np.uint64(draw[k]) * np.uint64(0xD1B54A32D192ED03))
+        word = mix(key[k] + np.uint64(draw[k]) * np.uint64(DRAW_STEP))
         bits[_M_SPARE + a] = np.int64(word)
     # Half a word becomes the lowest bits of 2^52.
     for a in range(even):
@@ -424,10 +379,10 @@ def _fire_together(
 ) -> int:
     """Let lanes of `which` fire, together; those that see again in the piece are `again`: how many."""
     f, kind, which, again, draw, key = batch.f, batch.kind, batch.which, batch.again, batch.draw, batch.key
-    code, sensor, quantiles = batch.code, model.sensor, model.quantiles
+    code, sensor = batch.code, model.sensor
     charge, refractory, delay_on, delay_off, jitter = sensor[0], sensor[1], sensor[2], sensor[3], sensor[4]
     miss_on, miss_off = sensor[5], sensor[6]
-    out_t, out_code, out_cross, n = out.t_us, out.code, out.cross_us, out.made[0]
+    out_t, out_code, n = out.t_us, out.code, out.made[0]
     even = _fill(which, fires)
     _take(f, _U, which, even, _M_U)
     _take(f, _REST, which, even, _M_REST)
@@ -436,7 +391,7 @@ def _fire_together(
     if jitter > 0.0:
         for a in range(fires):
             k = np.uint64(which[a])
-            f[_M_LATER + a] = jitter * hash_normal(key[k], 0, draw[k], 2, quantiles)
+            f[_M_LATER + a] = jitter * hash_normal(key[k], 0, draw[k], 2, model.quantiles)
     for a in range(even):
         u, rest, level = f[_M_U + a], f[_M_REST + a], f[_M_LEVEL + a]
         ready, on = f[_M_READY + a], f[_M_ON + a] > 0.0
@@ -447,7 +402,6 @@ def _fire_together(
         t = min(max(t_us + _logarithm((u - rest) / (level - rest)) * tau, t), until)
         late = max((delay_on if on else delay_off) + f[_M_LATER + a], 0.0)
         ready = t + refractory
-        f[_M_CROSS + a] = t
         f[_M_REQUEST + a] = max(t + late, f[_M_LAST_OUT + a] + refractory)
         f[_M_READY + a] = ready
         sent = f[_M_FATE + a] >= (miss_on if on else miss_off)
@@ -460,8 +414,6 @@ def _fire_together(
         # What is missed is written over; that is quicker than a branch which cannot be foreseen.
         out_t[np.uint64(n)] = f[_M_REQUEST + a]
         out_code[np.uint64(n)] = code[np.uint64(i)] + (what & 1)
-        if out_cross.size:
-            out_cross[np.uint64(n)] = f[_M_CROSS + a]
         n += (what >> 1) & 1
         again[np.uint64(blind)] = i
         blind += what >> 2
@@ -511,62 +463,6 @@ def _run_piece(lanes: int, t_us: float, until: float, batch: Batch, model: Pixel
         f[_U + i] = f[_END + i]
 
 
-@njit
-def _set_thresholds(i: int, pixel: int, batch: Batch, model: PixelModel) -> None:
-    """Draw a pixel's thresholds: exp(-threshold) for ON and exp(threshold) for OFF, with their spread."""
-    sensor, quantiles = model.sensor, model.quantiles
-    on = sensor[9] * (1.0 + sensor[11] * hash_normal(model.seed, pixel, 0, 3, quantiles))
-    off = sensor[10] * (1.0 + sensor[11] * hash_normal(model.seed, pixel, 0, 4, quantiles))
-    batch.f[_ON + i], batch.f[_OFF + i], batch.f[_LAST_OUT + i] = math.exp(-on), math.exp(off), -1e18
-
-
-@njit
-def _rest(light: float, i: int, batch: Batch, model: PixelModel) -> None:
-    """Put a pixel at rest in a light, armed."""
-    f = batch.f
-    f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = light, 1.0 / light, math.log(light)
-    f[_READY + i], f[_ARMED + i] = -1e18, 1.0
-    f[_REFERENCE + i] = f[_FOLLOWER + i] if model.sensor[12] > 0.0 else f[_U + i]
-
-
-@njit
-def _fill_up(count: int, batch: Batch) -> int:
-    """Fill lanes behind `count` pixels, to a multiple of `_EVEN`, with ones that never fire; how many there
-    are.
-    """
-    f = batch.f
-    lanes = (count + _EVEN - 1) // _EVEN * _EVEN
-    for i in range(count, lanes):
-        f[_X + i] = f[_Y + i] = f[_NEW + i] = f[_ARMED + i] = f[_FOLLOWER + i] = 0.0
-        f[_NOW + i] = f[_U + i] = f[_REFERENCE + i] = 1.0
-        f[_READY + i], f[_LAST_OUT + i], f[_ON + i], f[_OFF + i] = 1e300, -1e18, 1e-300, 1e300
-        batch.key[i], batch.draw[i], batch.code[i] = np.uint64(0), 0, 0
-    return lanes
-
-
-@njit
-def run_given_light(
-    first: int, last: int, edge_us: Array, light: Array, end_us: float, model: PixelModel, out: Requests
-) -> None:
-    """Run pixels [first, last), at most `LANES`, at rest in light[0], through light[i] from edge_us[i] on.
-
-    A code is the pixel's number << 1 | polarity.
-    """
-    batch = _make_batch()
-    lanes = _fill_up(last - first, batch)
-    for i in range(last - first):
-        batch.key[i], batch.code[i] = _key_of(model.seed, first + i), (first + i) << 1
-        _set_thresholds(i, first + i, batch, model)
-        _rest(light[0], i, batch, model)
-    for j in range(light.size):
-        until = edge_us[j + 1] if j + 1 < light.size else end_us
-        for i in range(lanes):
-            batch.f[_NOW + i] = light[j]
-            batch.draw[i] += 1
-        if until > edge_us[j]:
-            _run_piece(lanes, edge_us[j], until, batch, model, out)
-
-
 @njit(inline="always")
 def _step(table: Array, per_px: float, z: float) -> float:
     """Share of a pixel at `z` px beyond a blurred edge: 0 far before, 1 far behind; linear between nodes."""
@@ -578,19 +474,6 @@ def _step(table: Array, per_px: float, z: float) -> float:
         return 1.0
     i = int(at)
     return float(table[i] + (at - i) * (table[i + 1] - table[i]))
-
-
-@njit
-def texture_at(field: Array, u: float, v: float) -> float:
-    """Bilinear value of the periodic texture (size a power of two) at column u, row v."""
-    size = field.shape[0]
-    i, j = math.floor(v), math.floor(u)
-    a, b = v - i, u - j
-    i0, j0 = int(i) & (size - 1), int(j) & (size - 1)
-    i1, j1 = (i0 + 1) & (size - 1), (j0 + 1) & (size - 1)
-    top = field[i0, j0] + b * (field[i0, j1] - field[i0, j0])
-    low = field[i1, j0] + b * (field[i1, j1] - field[i1, j0])
-    return float(top + a * (low - top))
 
 
 class TimeLine(NamedTuple):
@@ -710,17 +593,6 @@ class _Shining(NamedTuple):
     beside: Array
 
 
-@njit
-def _place(lanes: int, f: Array, strips: Strips, g: int, pose: int) -> None:
-    """Write where pixels are from a strip's first end, along it and to its right, px."""
-    x, y = strips.origin[0, g, pose], strips.origin[1, g, pose]
-    axis_x, axis_y = strips.axis[0, g, pose], strips.axis[1, g, pose]
-    for i in range(lanes):
-        dx, dy = f[_X + i] - x, f[_Y + i] - y
-        f[_ALONG + i] = dx * axis_x + dy * axis_y
-        f[_ACROSS + i] = dx * axis_y - dy * axis_x
-
-
 @njit(fastmath={"contract"})
 def _take_clusters(
     a: int, g: int, pose: int, size: tuple[int, int], f: Array, strips: Strips, near: Near, room: _Shining
@@ -729,7 +601,11 @@ def _take_clusters(
     of row `a`.
     """
     lanes, count = size
-    _place(lanes, f, strips, g, pose)
+    x, y = strips.origin[0, g, pose], strips.origin[1, g, pose]
+    axis_x, axis_y = strips.axis[0, g, pose], strips.axis[1, g, pose]
+    for i in range(lanes):
+        dx, dy = f[_X + i] - x, f[_Y + i] - y
+        f[_ALONG + i], f[_ACROSS + i] = dx * axis_x + dy * axis_y, dx * axis_y - dy * axis_x
     nearest = furthest = f[_ALONG]
     beyond, reach, strip_px = False, near.reach[g], strips.width_px[g, pose]
     for i in range(count):
@@ -816,13 +692,15 @@ def _shine(
         follows = before < 0 or (every > 0 and pose // every != before // every)
         if follows:
             at = strips.axis.shape[2] // 2 if every == 0 else here
-            _place(lanes, f, strips, g, at)
+            x, y = strips.origin[0, g, at], strips.origin[1, g, at]
+            axis_x, axis_y = strips.axis[0, g, at], strips.axis[1, g, at]
             half, table, per_px = 0.5 * strips.width_px[g, at], halos.table[h], halos.table_per_px[h]
             for i in range(lanes):
-                across = _step(table, per_px, f[_ACROSS + i] + half)
-                across -= _step(table, per_px, f[_ACROSS + i] - half)
+                dx, dy = f[_X + i] - x, f[_Y + i] - y
+                across_px = dx * axis_y - dy * axis_x
+                across = _step(table, per_px, across_px + half) - _step(table, per_px, across_px - half)
                 room.halo[a, h, 1, i] = strips.gain[g] * halos.share[h] * across
-                node = (f[_ALONG + i] - halos.first[h]) * halos.per_px[h]
+                node = (dx * axis_x + dy * axis_y - halos.first[h]) * halos.per_px[h]
                 node = min(max(node, 0.0), halos.light.shape[2] - 1.001)
                 room.node[a, h, i] = int(node)
                 room.halo[a, h, 2, i] = node - int(node)
@@ -871,6 +749,7 @@ def _run_batch(
     lanes, _ = size
     mask, stride = of_batch
     f, poses, many = batch.f, scenery.turn_px.shape[0], 0
+    field, last = scenery.field, scenery.field.shape[0] - 1
     for g in range(strips.gain.size):
         if (mask >> np.uint64(g)) & np.uint64(1):
             lit[many] = g
@@ -895,8 +774,15 @@ def _run_batch(
         here = min(pose + stride // 2, poses - 1)
         if before < 0 or pose // scenery.every != before // scenery.every:
             for i in range(lanes):
+                # Bilinear in the periodic texture.
                 u, v = f[_X + i] + scenery.turn_px[pose, 0], f[_Y + i] + scenery.turn_px[pose, 1]
-                f[_AROUND + i] = scenery.light[1] + scenery.light[0] * texture_at(scenery.field, u, v)
+                below, right = math.floor(v), math.floor(u)
+                down, aside = v - below, u - right
+                i0, j0 = int(below) & last, int(right) & last
+                i1, j1 = (i0 + 1) & last, (j0 + 1) & last
+                top = field[i0, j0] + aside * (field[i0, j1] - field[i0, j0])
+                low = field[i1, j0] + aside * (field[i1, j1] - field[i1, j0])
+                f[_AROUND + i] = scenery.light[1] + scenery.light[0] * (top + down * (low - top))
         for i in range(lanes):
             f[_TOTAL + i] = f[_AROUND + i]
         for a in range(many):
@@ -913,7 +799,11 @@ def _run_batch(
         if q == 0:
             for i in range(size[1]):
                 if f[_NEW + i] > 0.0:
-                    _rest(f[_TOTAL + i], i, batch, model)
+                    # At rest, armed.
+                    now = f[_TOTAL + i]
+                    f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = now, 1.0 / now, math.log(now)
+                    f[_READY + i], f[_ARMED + i] = -1e18, 1.0
+                    f[_REFERENCE + i] = f[_FOLLOWER + i] if model.sensor[12] > 0.0 else f[_U + i]
                     batch.draw[i] += 1
         redraw = int(line.kind[e] >= 0)
         for i in range(lanes):
@@ -964,8 +854,9 @@ def run_pixels(
     line, strips, halos, _, _ = world
     sources, many, most = strips.gain.size, halos.share.size, strips.levels.shape[1]
     states, counters, width = store
-    batch = _make_batch()
-    f = batch.f
+    rows = np.zeros((5, LANES), np.int64)
+    batch = Batch(np.zeros(_ROOM), np.zeros(LANES, np.uint64), rows[0], rows[1], rows[2], rows[3], rows[4])
+    f, sensor, quantiles = batch.f, model.sensor, model.quantiles
     shining = _Shining(
         np.empty((sources, 3), np.int64),
         np.empty((sources, LANES * most)),
@@ -983,7 +874,7 @@ def run_pixels(
         for i, pixel in enumerate(pixels):
             s, c = states[pixel], counters[pixel]
             batch.code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
-            batch.key[i], batch.draw[i] = _key_of(model.seed, pixel), c[DRAW]
+            batch.key[i], batch.draw[i] = mix(model.seed + np.uint64(pixel) * np.uint64(PIXEL_STEP)), c[DRAW]
             f[_X + i], f[_Y + i] = pixel % width, pixel // width
             f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = s[ON_FACTOR], s[OFF_FACTOR], s[T_LAST_OUT]
             f[_U + i], f[_REFERENCE + i], f[_READY + i] = s[U_BASE], s[REFERENCE], s[T_READY]
@@ -991,10 +882,18 @@ def run_pixels(
             # Those that were not active in the block before are new.
             f[_NEW + i] = 1.0 if c[BLOCK] != block.number + 1 else 0.0
             if s[ON_FACTOR] == 0.0:
-                _set_thresholds(i, pixel, batch, model)
-        size = _fill_up(pixels.size, batch), pixels.size
+                on = sensor[9] * (1.0 + sensor[11] * hash_normal(model.seed, pixel, 0, 3, quantiles))
+                off = sensor[10] * (1.0 + sensor[11] * hash_normal(model.seed, pixel, 0, 4, quantiles))
+                f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = math.exp(-on), math.exp(off), -1e18
+        # Lanes behind them, to a multiple of `_EVEN`, hold pixels that never fire.
+        lanes = (pixels.size + _EVEN - 1) // _EVEN * _EVEN
+        for i in range(pixels.size, lanes):
+            f[_X + i] = f[_Y + i] = f[_NEW + i] = f[_ARMED + i] = f[_FOLLOWER + i] = 0.0
+            f[_NOW + i] = f[_U + i] = f[_REFERENCE + i] = 1.0
+            f[_READY + i], f[_LAST_OUT + i], f[_ON + i], f[_OFF + i] = 1e300, -1e18, 1e-300, 1e300
+            batch.key[i], batch.draw[i], batch.code[i] = np.uint64(0), 0, 0
         of_batch = block.masks[j], block.strides[j]
-        _run_batch(size, of_batch, block.end_us, world, room, batch, model, out)
+        _run_batch((lanes, pixels.size), of_batch, block.end_us, world, room, batch, model, out)
         for i, pixel in enumerate(pixels):
             s, c = states[pixel], counters[pixel]
             s[ON_FACTOR], s[OFF_FACTOR] = f[_ON + i], f[_OFF + i]
@@ -1005,60 +904,13 @@ def run_pixels(
     return last
 
 
-@njit
-def background_events(
-    span_us: tuple[float, float],
-    rates_hz: tuple[float, float],
-    hot: Array,
-    size_px: tuple[int, int],
-    slot: int,
-    seed: Any,
-    out_t: Array,
-    out_code: Array,
-) -> int:
-    """Poisson events of all pixels, then of the hot ones, at these rates of all together; return how many.
-
-    Ends early when the output is full: the caller gives room enough.
-    """
-    begin_us, end_us = span_us
-    width, height = size_px
-    n = 0
-    for kind in range(2):
-        total = rates_hz[kind] * 1e-6
-        if total <= 0.0:
-            continue
-        t = begin_us
-        k = 0
-        while n < out_t.size:
-            t -= math.log(1.0 - hash_uniform(seed, slot, k, 10 + 3 * kind)) / total
-            if t >= end_us:
-                break
-            which = hash_uniform(seed, slot, k, 11 + 3 * kind)
-            pixel = int(which * (width * height)) if kind == 0 else hot[int(which * hot.size)]
-            on = int(hash_uniform(seed, slot, k, 12 + 3 * kind) < 0.5)
-            out_t[n] = t
-            out_code[n] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1 | on
-            n += 1
-            k += 1
-    return n
-
-
 @njit(inline="always")
-def _us_of(word: int, begin_us: float) -> float:
-    """When a request is, us."""
-    return begin_us + np.float64(word >> CODE_BITS) * (1.0 / TICKS)
-
-
-@njit(inline="always")
-def _row_of(word: int) -> Any:
-    """Row of a request; without a sign it is not looked at for being negative."""
-    return np.uint64(word >> (COLUMN_BITS + 1) & ((1 << COLUMN_BITS) - 1))
-
-
-@njit(inline="always")
-def _column_of(word: int) -> Any:
-    """Column of a request."""
-    return np.uint64(word >> 1 & ((1 << COLUMN_BITS) - 1))
+def _parts_of(word: int) -> tuple[float, Any, Any]:
+    """A request's ticks since its block began, its row and its column."""
+    # An index without a sign is not looked at for being negative.
+    row, column = word >> (COLUMN_BITS + 1), word >> 1
+    most = (1 << COLUMN_BITS) - 1
+    return np.float64(word >> CODE_BITS), np.uint64(row & most), np.uint64(column & most)
 
 
 @njit
@@ -1067,8 +919,8 @@ def drop_blind(words: Array, begin_us: float, blind_us: Array, width: int, refra
     kept = 0
     for i in range(words.size):
         word = words[i]
-        pixel = _row_of(word) * np.uint64(width) + _column_of(word)
-        t = _us_of(word, begin_us)
+        ticks, row, column = _parts_of(word)
+        pixel, t = row * np.uint64(width) + column, begin_us + ticks * (1.0 / TICKS)
         # What is dropped is written over.
         words[np.uint64(kept)] = word
         if t >= blind_us[pixel]:
@@ -1118,7 +970,7 @@ def read_out(
     window, used = int(memory[2]), int(memory[3])
     window_end = (window + 1) * cap_window_us
     n = dropped = held = waiting = i = 0
-    due = _us_of(words[0], begin_us) if size else math.inf
+    due = begin_us + _parts_of(words[0])[0] * (1.0 / TICKS) if size else math.inf
     while True:
         if waiting == 0:
             if i >= size:
@@ -1128,20 +980,20 @@ def read_out(
             break
         while due <= free:
             k = np.uint64(i)
-            y = _row_of(words[k])
-            if hold and pending[y, _column_of(words[k])]:
+            _, y, x = _parts_of(words[k])
+            if hold and pending[y, x]:
                 follow[k] = _SERVED
                 held += 1
             else:
                 if hold:
-                    pending[y, _column_of(words[k])] = True
+                    pending[y, x] = True
                 follow[np.uint64(tail[y])] = i
                 follow[k] = -1
                 tail[y] = i
                 waits[y >> np.uint64(6)] |= np.uint64(1) << (y & np.uint64(63))
                 waiting += 1
             i += 1
-            due = _us_of(words[np.uint64(i)], begin_us) if i < size else math.inf
+            due = begin_us + _parts_of(words[np.uint64(i)])[0] * (1.0 / TICKS) if i < size else math.inf
         if waiting == 0:
             continue
         at_row += 1
@@ -1168,15 +1020,16 @@ def read_out(
             next_one = int(follow[k])
             follow[k] = _SERVED
             what = words[k]
+            _, _, x = _parts_of(what)
             waiting -= 1
             if hold:
-                pending[y, _column_of(what)] = False
+                pending[y, x] = False
             if cap > 0 and used >= cap:
                 dropped += 1
                 continue
             used += 1
             # By column, then in the order in which they came; without a branch, which could not be foreseen.
-            it = np.int64(_column_of(what)) << 32 | (n - begin) << 1 | what & 1
+            it = np.int64(x) << 32 | (n - begin) << 1 | what & 1
             for j in range(begin, n):
                 other = together[np.uint64(j)]
                 together[np.uint64(j)] = min(other, it)
@@ -1190,7 +1043,8 @@ def read_out(
     for m in range(size):
         if m >= i or follow[m] != _SERVED:
             if hold:
-                pending[_row_of(words[m]), _column_of(words[m])] = False
+                _, y, x = _parts_of(words[m])
+                pending[y, x] = False
             words[left] = words[m]
             left += 1
     memory[0], memory[1], memory[2], memory[3] = free, at_row, window, used

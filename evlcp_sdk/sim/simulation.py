@@ -6,7 +6,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import pairwise
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,12 +80,6 @@ def pixel_model(sensor: SensorSpec, seed: int) -> _kernels.PixelModel:
     quantiles = quantile_table()
     shifts = np.exp(sensor.noise_ln * quantiles)
     return _kernels.PixelModel(seed_key(seed), sensor_vector(sensor), quantiles, shifts)
-
-
-def requests_room(size: int, *, crossings: bool = False) -> _kernels.Requests:
-    """Room for so many requests; with `crossings`, for when thresholds were crossed, too."""
-    cross_us = np.empty(size if crossings else 0)
-    return _kernels.Requests(np.empty(size), np.empty(size, np.int32), cross_us, np.zeros(1, np.int64))
 
 
 def request_words(t_us: Floats, code: NDArray[np.int32], begin_us: float) -> NDArray[np.int64]:
@@ -427,19 +421,34 @@ class Simulation:
             yield events
 
     def noise(self, number: int, begin_us: float, end_us: float) -> tuple[Floats, NDArray[np.int32]]:
-        """Background activity and hot pixels from `begin_us` to `end_us`."""
+        """Background activity and hot pixels from `begin_us` to `end_us`: Poisson events, times and codes."""
         camera, sensor = self.scene.camera, self.scene.sensor
         size = camera.width * camera.height
-        rate = 2 * sensor.noise_hz * size
-        hot_rate = sensor.hot_hz * len(self._hot)
-        expected = (rate + hot_rate) * max(end_us - begin_us, 0.0) * 1e-6
-        room = int(expected + 12 * math.sqrt(expected) + 64)
-        t, code = np.empty(room), np.empty(room, np.int32)
-        size_px, key = (camera.width, camera.height), self._model.seed
-        n = _kernels.background_events(
-            (begin_us, end_us), (rate, hot_rate), self._hot, size_px, number, key, t, code
-        )
-        return t[:n], code[:n]
+        # As `hash_normal` does: numbers of a block, a draw and a purpose.
+        mix, key = cast(Any, _kernels.mix).py_func, np.array([self._model.seed])
+        key = mix(key + np.uint64(number) * np.array([_kernels.PIXEL_STEP], np.uint64))
+        times, codes = [np.empty(0)], [np.empty(0, np.int64)]
+        for purpose, rate_hz, among in (
+            (10, 2 * sensor.noise_hz * size, size),
+            (13, sensor.hot_hz * len(self._hot), len(self._hot)),
+        ):
+            rate = rate_hz * 1e-6
+            expected = rate * max(end_us - begin_us, 0.0)
+            if expected == 0:
+                continue
+            draws = np.arange(int(expected + 12 * math.sqrt(expected) + 64), dtype=np.uint64)
+            words = key + draws * np.uint64(_kernels.DRAW_STEP)
+            gap, which, sign = (
+                (mix(words + np.uint64(purpose + k)) >> np.uint64(11)) / 2**53 for k in range(3)
+            )
+            t = np.cumsum(np.append(begin_us, -np.log(1.0 - gap) / rate))[1:]
+            t = t[t < end_us]
+            pixel = (which[: len(t)] * among).astype(np.int64)
+            pixel = pixel if purpose == 10 else self._hot[pixel]
+            row, column = np.divmod(pixel, camera.width)
+            times.append(t)
+            codes.append((row << _kernels.COLUMN_BITS | column) << 1 | (sign[: len(t)] < 0.5))
+        return np.concatenate(times), np.concatenate(codes).astype(np.int32)
 
     def _jobs(
         self, block: _Block | None, begin_us: float, end_us: float
@@ -460,7 +469,7 @@ class Simulation:
             found = []
             while first < last:
                 size = max(_ROOM, _kernels.LANES * most)
-                out = requests_room(size)
+                out = _kernels.Requests(np.empty(size), np.empty(size, np.int32), np.zeros(1, np.int64))
                 first = _kernels.run_pixels(first, last, active, store, world, self._model, most, out)
                 n = int(out.made[0])
                 found.append((out.t_us[:n], out.code[:n]))

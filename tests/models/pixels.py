@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from evlcp_sdk.sim import _kernels
-from evlcp_sdk.sim.scene import SensorSpec
-from evlcp_sdk.sim.simulation import pixel_model, request_words, requests_room
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.sim import BackgroundSpec, Scene, SensorSpec, Simulation, _kernels
+from evlcp_sdk.sim.simulation import request_words
 
 __all__ = [
     "MEASURED_AREA",
@@ -23,6 +23,8 @@ __all__ = [
 ]
 
 Floats = NDArray[np.float64]
+
+_WIDTH = 256
 
 MEASURED_LATENCY = {0.006: (555, 635), 0.046: (95, 117), 0.166: (42, 55), 0.277: (32, 43), 0.398: (27, 40)}
 """Measured mean latency of the first ON and OFF event, us, at an irradiance, W/m2: the sensor model's table,
@@ -39,13 +41,11 @@ class PixelEvents:
     Attributes:
         pixel: Number of the pixel, int64 (n,).
         request_us: When each asked to be read out, float64 (n,).
-        cross_us: When its signal crossed the threshold, float64 (n,).
         on: Whether it is an ON event, bool (n,).
     """
 
     pixel: NDArray[np.int64]
     request_us: Floats
-    cross_us: Floats
     on: NDArray[np.bool_]
 
 
@@ -58,7 +58,7 @@ def pixel_events(
     pixels: int = 1,
     seed: int = 0,
 ) -> PixelEvents:
-    """Run pixels, at rest in the first light, through light that changes at given times.
+    """Run pixels, at rest in the first light, through light that changes at given times, by more than 0.1 %.
 
     Args:
         sensor: Its pixels.
@@ -68,21 +68,36 @@ def pixel_events(
         pixels: How many pixels, each with its own thresholds and noise.
         seed: Of thresholds and noise.
     """
-    edges = np.ascontiguousarray(edge_us, np.float64)
-    light = np.ascontiguousarray(light_w_m2, np.float64)
-    model = pixel_model(sensor, seed)
-    room = (int((end_us - edges[0]) / sensor.refr_us) + 8) * min(pixels, _kernels.LANES)
-    found = []
-    for first in range(0, pixels, _kernels.LANES):
-        out = requests_room(room, crossings=True)
-        last = min(first + _kernels.LANES, pixels)
-        _kernels.run_given_light(first, last, edges, light, end_us, model, out)
-        n = int(out.made[0])
-        request, code, cross = out.t_us, out.code, out.cross_us
-        pixel = code[:n].astype(np.int64) >> 1
-        order = np.argsort(pixel, kind="stable")
-        found.append((pixel[order], request[order], cross[order], code[order] % 2 == 1))
-    return PixelEvents(*(np.concatenate(column) for column in zip(*found, strict=True)))
+    begin_us = float(np.ravel(edge_us)[0])
+    scene = Scene(
+        seed=seed,
+        camera=CameraModel(width=_WIDTH, height=-(-pixels // _WIDTH)),
+        sensor=replace(sensor, hot_share=0.0),
+        background=BackgroundSpec(around_px=_WIDTH),
+        bars=(),
+    )
+    simulation = Simulation(scene)
+    prepared = simulation._prepare(0, 0.0, 1000.0)
+    assert prepared is not None
+    active, (_, strips, halos, near, scenery) = prepared
+    number = np.arange(pixels, dtype=np.int32)
+    begins = np.append(np.arange(0, pixels, _kernels.LANES), pixels)
+    batches = np.ones(len(begins) - 1, np.int64)
+    active = _kernels.ActivePixels(0, end_us, number, begins, batches.astype(np.uint64), batches)
+    # The light of an even background, of which a share passes that changes like a source that switches.
+    light = np.array(light_w_m2, np.float64)
+    none = np.zeros(len(light), np.int64)
+    line = _kernels.TimeLine(
+        np.array(edge_us, np.float64), none, none, light, np.zeros((0, len(light)), np.int64)
+    )
+    scenery = scenery._replace(field=np.ones_like(scenery.field), light=np.array([1.0, 0.0]))
+    world = (line, strips, halos, near, scenery)
+    parts = [part for job in simulation._jobs((active, world), begin_us, end_us) for part in job()]
+    request, code = (np.concatenate(column) for column in zip(*parts, strict=True))
+    row, column = code >> _kernels.COLUMN_BITS + 1, code >> 1 & (1 << _kernels.COLUMN_BITS) - 1
+    pixel = row * np.int64(_WIDTH) + column
+    order = np.argsort(pixel, kind="stable")
+    return PixelEvents(pixel[order], request[order], code[order] % 2 == 1)
 
 
 def latency_us(
@@ -171,7 +186,7 @@ def step_response(
     return np.array(shares)
 
 
-def events_per_edge(sensor: SensorSpec, contrast: float, *, rising: bool, steps: int = 4000) -> int:
+def events_per_edge(sensor: SensorSpec, contrast: float, *, rising: bool, steps: int = 400) -> int:
     """Events of one noiseless pixel while its light changes slowly by a log contrast.
 
     The light climbs a stair of `steps` steps, 1 ms each, at 100 W/m2 and less: the receptor is at rest at the

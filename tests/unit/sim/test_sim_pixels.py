@@ -24,6 +24,9 @@ from tests.models.pixels import (
 
 SENSOR = SensorSpec()
 IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
+AT_ONCE = replace(
+    IDEAL, dly_on_us=0.0, dly_off_us=0.0
+)  # asks for its event when its signal crosses a threshold
 
 
 @settings(max_examples=5)
@@ -34,7 +37,7 @@ IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0
 def test_crossings_are_those_of_brute_force_at_10_ns(
     pieces: list[tuple[int, float]], refractory: float
 ) -> None:
-    sensor = replace(IDEAL, refr_us=refractory)
+    sensor = replace(AT_ONCE, refr_us=refractory)
     lengths = np.array([length for length, _ in pieces])
     edges = np.concatenate([[0], np.cumsum(lengths)[:-1]])  # in 10 ns, so that no step has two lights
     light = np.array([value for _, value in pieces])
@@ -46,26 +49,26 @@ def test_crossings_are_those_of_brute_force_at_10_ns(
     stepped = crossing_by_steps(sensor, light_at, 0.0, end)
     exact = pixel_events(sensor, edges / 100, light, end)
     # The last moment of a run and a signal that just touches a threshold may fall on either side.
-    both = min(len(stepped), len(exact.cross_us))
-    assert max(len(stepped), len(exact.cross_us)) - both <= 1
+    both = min(len(stepped), len(exact.request_us))
+    assert max(len(stepped), len(exact.request_us)) - both <= 1
     assert [on for _, on in stepped[:both]] == exact.on[:both].tolist()
-    np.testing.assert_allclose([t for t, _ in stepped[:both]], exact.cross_us[:both], atol=0.02)
+    np.testing.assert_allclose([t for t, _ in stepped[:both]], exact.request_us[:both], atol=0.02)
 
 
 @pytest.mark.parametrize("tau_us", [2.0, 12.0])
 def test_a_source_follower_is_that_of_brute_force(tau_us: float) -> None:
-    sensor = replace(IDEAL, tau_sf_us=tau_us, refr_us=20.0)
+    sensor = replace(AT_ONCE, tau_sf_us=tau_us, refr_us=20.0)
     light = np.array([0.05, 51.0, 0.05, 3.0, 51.0, 0.05, 1.0])
     edges = np.arange(7) * 100.0
     stepped = crossing_by_steps(sensor, lambda t: float(light[int(t // 100)]), 0.0, 700.0)
     exact = pixel_events(sensor, edges, light, 700.0)
     assert [on for _, on in stepped] == exact.on.tolist()
-    np.testing.assert_allclose([t for t, _ in stepped], exact.cross_us, atol=0.2)
+    np.testing.assert_allclose([t for t, _ in stepped], exact.request_us, atol=0.2)
     # It smears a steep rise over more than a refractory time: more than one event.
-    assert exact.on[exact.cross_us < 200].sum() > (tau_us > 5)
+    assert exact.on[exact.request_us < 200].sum() > (tau_us > 5)
     without = pixel_events(replace(sensor, tau_sf_us=0.0), edges, light, 700.0)
     hardly = pixel_events(replace(sensor, tau_sf_us=1e-3), edges, light, 700.0)
-    np.testing.assert_allclose(hardly.cross_us, without.cross_us, atol=0.05)
+    np.testing.assert_allclose(hardly.request_us, without.request_us, atol=0.05)
 
 
 @pytest.mark.parametrize("light", MEASURED_LATENCY)
