@@ -235,12 +235,14 @@ def lit(
     """
     if presence.prior is None:
         return presence, placement
-    seen = np.empty(len(edges), np.bool_)
-    whole = _kernels.lit_clusters(
-        sums, edges, every, presence.prior, presence.grid_px, placement.seen, _LEAST_LIGHT, seen
-    )
+    light = np.empty(len(edges))
+    _kernels.pilot_light(sums, edges, every, presence.prior, presence.grid_px, light)
+    in_place = np.sort(light[placement.seen])
+    middle = len(in_place) // 2
+    usual = (in_place[middle] + in_place[-1 - middle]) / 2 if len(in_place) else 0.0
+    seen = light >= max(_LEAST_LIGHT * usual, 1e-9)
     placement = changed(placement, seen=seen)
-    if whole:
+    if seen.all():
         return presence, placement
     dark = ~seen
     probability, prior = presence.probability.copy(), presence.prior.copy()

@@ -151,9 +151,10 @@ class Rhythm:
         return bool(self._rhythmic(events, _SAME).any())
 
     def _rhythmic(self, events: Events, most_same: int) -> NDArray[np.bool_]:
-        keep = np.empty(len(events), np.bool_)
-        _kernels.in_rhythm(events.x, events.y, self._pixels, self._min_score, most_same, keep)
-        return keep
+        state = self._pixels[events.y, events.x]
+        rhythmic: NDArray[np.bool_] = (state & _kernels.SCORES) >= self._min_score
+        rhythmic &= (state >> _kernels.SAME_AT) & _kernels.MOST_SAME < most_same
+        return rhythmic
 
     def measure(
         self,

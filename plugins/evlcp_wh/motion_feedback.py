@@ -136,8 +136,37 @@ def find_path(matches: NDArray[np.float32], known: NDArray[np.signedinteger]) ->
     # Twice a log-likelihood, as the costs are.
     scores = np.abs(matches).sum(0, np.float64)
     scores[..., :first] = (known[:, None, None] * matches[..., :first]).sum(0, np.float64)
+    return smooth_path(scores, 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values)
+
+
+def smooth_path(scores: NDArray[np.float64], step_cost: float, place_cost: float) -> NDArray[np.int64]:
+    """Shifts (down, right) of all values that score best together (Viterbi), int64 (values, 2), px.
+
+    `scores` are (n, n, values). A shift costs its square times `place_cost`, a change from value to value its
+    square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then along the
+    other.
+    """
+    side, _, values = scores.shape
+    at = np.arange(side) - side // 2
+    scores = scores - place_cost * (at[:, None] ** 2 + at**2)[..., None]
+    steps = step_cost * (at[:, None] - at) ** 2
+    best = scores[..., 0]
+    down = np.empty((values, side, side), np.int64)
+    right = np.empty_like(down)
+    for i in range(1, values):
+        # To row a from row c, then to column b from column d.
+        by_row = best - steps[..., None]
+        down[i] = by_row.argmax(1)
+        by_column = by_row.max(1)[:, None] - steps
+        right[i] = by_column.argmax(2)
+        best = by_column.max(2) + scores[..., i]
+    a, b = np.unravel_index(best.argmax(), best.shape)
     path = np.empty((values, 2), np.int64)
-    _kernels.smooth_path(scores, 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values, path)
+    for i in range(values - 1, -1, -1):
+        path[i] = at[a], at[b]
+        if i:
+            b = right[i, a, b]
+            a = down[i, a, b]
     return path
 
 

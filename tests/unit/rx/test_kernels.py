@@ -180,9 +180,11 @@ def test_old_rises(seed):
     looked_at = np.isin(np.arange(HEIGHT), [*range(10, 16), *range(5)])
     old = (now - rose >= 3000) & looked_at[:, None]
     assert_array_equal(pixels, states(np.where(old, now - 4000, rose), time, score, same))
-    events, keep = random_events(rng, 300), np.empty(300, np.bool_)
-    _kernels.in_rhythm(events.x, events.y, pixels, 20, 5, keep)
-    assert_array_equal(keep, ((score >= 20) & (same < 5))[events.y, events.x])
+    events = random_events(rng, 300)
+    rhythmic = rhythm_of(pixels, min_score=20).of(events)
+    expected = events[((score >= 20) & (same < 14))[events.y, events.x]]
+    assert_array_equal(rhythmic.t_us, expected.t_us)
+    assert_array_equal(rhythmic.x, expected.x)
 
 
 @pytest.mark.parametrize("reach", [2.0, np.inf])
@@ -419,11 +421,6 @@ def test_light_in_step_with_the_pilot(seed, grid, every):
     _kernels.pilot_light(sums, codes, every, prior, grid, out)
     assert_allclose(out, twins.pilot_light(sums, codes, every, prior, grid), rtol=1e-6, atol=1e-9)
     assert out[2] == 0
-    in_place, seen = rng.random(5) < 0.7, np.empty(5, np.bool_)
-    enough = max(0.25 * np.median(out[in_place]) if in_place.any() else 0.0, 1e-9)
-    whole = _kernels.lit_clusters(sums, codes, every, prior, grid, in_place, 0.25, seen)
-    assert_array_equal(seen, out >= enough)
-    assert whole == seen.all()
 
 
 @pytest.mark.parametrize(("turn", "every"), [(1j, 2), (1, 2), (np.exp(1.4j), 2), (1j, 1)])
@@ -599,19 +596,6 @@ def test_cells_that_a_box_touches_are_cleared(box):
     had, want = int(hits[inside].sum()), np.where(inside, 0, hits)
     assert _kernels.clear_cells(hits, box, 2) == had
     assert_array_equal(hits, want)
-
-
-@pytest.mark.parametrize("blocks", [4, 9, 20])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_rows_are_read_one_after_another(seed, blocks):
-    rng = np.random.default_rng(seed)
-    rows, lags = (np.arange(blocks) + 0.5) * 8, np.arange(31)
-    middle = 15 + 0.03 * rows + rng.normal(0, 0.3, blocks)
-    fit = 50 * np.exp(-0.5 * ((lags - middle[:, None]) / 5) ** 2) + rng.normal(0, 1, (blocks, 31))
-    fit[rng.random(blocks) < 0.2] *= 0.05
-    seen = np.full(blocks, 100.0)
-    got = _kernels.slope_of_rows(rows, fit, seen, 4, 4.0, 0.2)
-    assert_allclose(got, twins.slope_of_rows(rows, fit, seen, 4, 4.0, 0.2), rtol=1e-9)
 
 
 @pytest.mark.parametrize("period_us", [200, 222, 300, 400, 500])
