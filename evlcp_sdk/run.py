@@ -39,7 +39,6 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.diagnosis.diagnose import Diagnosis
     from evlcp_sdk.live.budget import Budget
-    from evlcp_sdk.live.pictures import PictureSlot
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.place.bar_registry import BarRegistry
     from evlcp_sdk.place.calibration import Calibrated, CalibrationView
@@ -307,7 +306,6 @@ def live(
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
     publisher: Publisher | None = None,
-    pictures: PictureSlot | None = None,
     budget: Budget | None = None,
     warm: bool = True,
     stopped: Stopped = lambda: False,
@@ -328,8 +326,7 @@ def live(
             known.
         sinks: Output formats beside the default ones, by name.
         lines: Takes a line of JSON for each frame, message and fix as it comes; None for nobody.
-        publisher: Where listeners subscribe; None for nobody. It is closed at the end.
-        pictures: Where pictures of events are drawn when they are asked for; None for none.
+        publisher: Where listeners subscribe, and pictures are drawn; None for nobody. Closed at the end.
         budget: When what is left out.
         warm: Load all kernels before the first event, and before a source that does not wait is opened:
             nothing waits for one later.
@@ -385,7 +382,7 @@ def live(
                     on_frame=lambda frame: loop.frame(frame),
                 )
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
-                loop = LiveLoop(opened, receiver, links, publisher, pictures, budget, pulses=pulses)
+                loop = LiveLoop(opened, receiver, links, publisher, budget, pulses=pulses)
                 pieces = loop.run(stopped)
                 table = _run(
                     opened, url, receiver, writer, pieces, loop.close, _say_nothing, stopped, loop.summary
@@ -394,8 +391,6 @@ def live(
         return table
     finally:
         publisher.close()
-        if pictures is not None:
-            pictures.close()
 
 
 def convert(

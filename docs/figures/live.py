@@ -60,7 +60,6 @@ def main() -> None:
                 "plan": PositionPlan(sites),
                 "attitude": attitude,
                 "publisher": publisher,
-                "pictures": services.pictures,
                 "budget": Budget(waiting_ms=1000, most_ms=10_000),
                 "stopped": over.is_set,
             },
@@ -77,7 +76,7 @@ def main() -> None:
             if over.is_set():
                 break
             time.sleep(0.1)
-        given.out.write_bytes(base64.b64decode(browser.screenshot()))
+        given.out.write_bytes(base64.b64decode(browser.say("Page.captureScreenshot")["data"]))
         over.set()
         runner.join()
 

@@ -190,7 +190,6 @@ def live(
             sinks=sinks,
             lines=lines,
             publisher=publisher,
-            pictures=services.pictures,
             budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
             stopped=stopped.or_when(lambda: out is None and lines is not None and lines.gone),
         )

@@ -2,19 +2,18 @@
 
 ```
 source --reader (a thread)--> slices --LiveLoop--> receiver --> Publisher --> Subscription, Subscription, ...
-                                          +-> PictureSlot (a picture when one is asked for, the newest only)
+                                                     +-> PictureSlot (drawn when asked for, the newest only)
 ```
 
 How a viewer, a server or a recorder joins, from threads of its own:
 
 ```
-publisher, pictures = Publisher(), PictureSlot()
+publisher = Publisher()
 mine = publisher.subscribe({"frame", "message", "fix", "status"}, most=1000, wake=wake_my_loop)
-listeners = {"publisher": publisher, "pictures": pictures}
-threading.Thread(target=run.live, args=("replay:REC.raw",), kwargs=listeners)
+threading.Thread(target=run.live, args=("replay:REC.raw",), kwargs={"publisher": publisher})
 for news in mine.take(timeout_s=1.0):     # [] after the time-out; mine.ended once all is said
     news.kind, news.t_us, news.value, news.late_ms
-picture = pictures.take(timeout_s=0.5)    # asks for one, and waits for it; None after the time-out
+picture = publisher.pictures.take(timeout_s=0.5)    # asks for one, and waits for it; None after the time-out
 ```
 
 The loop never waits for a subscriber: of a queue that is full the oldest go, counted in

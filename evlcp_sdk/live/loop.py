@@ -11,7 +11,6 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.live.budget import LEVELS, Budget, Shedder
 from evlcp_sdk.live.delays import DelayTally
-from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.reader import Reader, Slice
 from evlcp_sdk.place.navigator import Placed
@@ -86,8 +85,7 @@ class LiveLoop:
         source: What is read; not closed.
         receiver: What decodes it; it gives each frame to `frame`.
         links: What it decodes.
-        publisher: Where results go.
-        pictures: Where pictures are drawn; None for none.
+        publisher: Where results and pictures go.
         budget: When what is shed.
         clock: Gives the time, s.
         pulses: Is told of triggers, which say the UTC of the camera's clock; None for nobody.
@@ -103,7 +101,6 @@ class LiveLoop:
         receiver: Receiver,
         links: Sequence[Link],
         publisher: Publisher,
-        pictures: PictureSlot | None = None,
         budget: Budget | None = None,
         clock: Callable[[], float] = time.monotonic,
         pulses: PulseClock | None = None,
@@ -111,7 +108,7 @@ class LiveLoop:
         self._pulses = pulses
         self._source, self._receiver = source, receiver
         self._forms = {name: link.packet for name, link in named_links(links).items()}
-        self._publisher, self._pictures = publisher, pictures
+        self._publisher = publisher
         self._budget = Budget() if budget is None else budget
         self._clock = clock
         self._reader = Reader(source, clock)
@@ -238,8 +235,7 @@ class LiveLoop:
         self._receiver.ranging_every = self._budget.ranging_every if self._level >= 2 else 1
         for one in pieces:
             self._publish_raw(one)
-            if self._pictures is not None:
-                self._pictures.add(one.events, *self._size, regions)
+            self._publisher.pictures.add(one.events, *self._size, regions)
         whole = pieces[0].events if len(pieces) == 1 else Events.concat(one.events for one in pieces)
         if len(whole):
             self._last_us = float(whole.t_us[-1])

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from evlcp_sdk.errors import StreamError
+from evlcp_sdk.live.pictures import PictureSlot
 
 KINDS: Final = ("frame", "packet", "message", "fix", "events", "triggers", "status", "end")
 """What is published; see `evlcp_sdk.live`."""
@@ -89,6 +90,9 @@ class Subscription:
 class Publisher:
     """Gives what a live run finds to its subscriptions; any thread may subscribe, at any time.
 
+    Attributes:
+        pictures: Where a picture of events is drawn when it is asked for.
+
     >>> publisher = Publisher()
     >>> mine = publisher.subscribe({"status"}, most=2)
     >>> for number in range(3):
@@ -98,6 +102,7 @@ class Publisher:
     """
 
     def __init__(self) -> None:
+        self.pictures = PictureSlot()
         self._all: tuple[Subscription, ...] = ()
         self._lock = threading.Lock()
         self._closed = False
@@ -147,9 +152,10 @@ class Publisher:
             one.put(news)
 
     def close(self) -> None:
-        """End all subscriptions; what waits in them can still be taken."""
+        """End all subscriptions, of which what waits can still be taken, and pictures."""
         with self._lock:
             self._closed = True
             everyone, self._all = self._all, ()
         for one in everyone:
             one.close()
+        self.pictures.close()

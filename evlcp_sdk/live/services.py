@@ -9,7 +9,6 @@ from typing import Self
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.loop_thread import LoopThread
-from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.tcp_output import TcpOutput
@@ -51,7 +50,6 @@ class Services:
         clock_zero: UTC of the camera clock's 0; None if it is not known.
 
     Attributes:
-        pictures: What the run draws pictures into; None where nobody looks.
         view: The web view; None for none.
         nmea: The server of NMEA; None for none.
         gpsd: That of gpsd's JSON; None for none.
@@ -70,16 +68,14 @@ class Services:
         sites: Sequence[BarSite] = (),
         clock_zero: ClockZero = None,
     ) -> None:
-        self.pictures = PictureSlot() if serving.view else None
         self._recorder: Recorder | None = None
         self.view: Viewer | None = None
-        if self.pictures is not None:
+        if serving.view:
             if serving.record_to is not None:
                 camera = next(iter(links.values())).camera
                 self._recorder = Recorder(publisher, serving.record_to, camera.width, camera.height)
             self.view = Viewer(
                 publisher,
-                self.pictures,
                 links,
                 name=name,
                 sites=sites,

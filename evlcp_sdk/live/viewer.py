@@ -26,7 +26,6 @@ from evlcp_sdk.errors import import_extra
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
 from evlcp_sdk.live.loop_thread import cannot_listen, stop_listening
-from evlcp_sdk.live.pictures import PictureSlot
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.serializer import Serializer
@@ -79,8 +78,7 @@ class Viewer:
     """Serves the page and what it shows; runs in the loop of a `LoopThread`.
 
     Args:
-        publisher: Where results come from.
-        pictures: Where pictures come from.
+        publisher: Where results and pictures come from.
         links: The configurations by name, as `named_links` gives them.
         name: Name of the source, for the title.
         sites: Where the bars stand, for the map.
@@ -96,7 +94,6 @@ class Viewer:
     def __init__(
         self,
         publisher: Publisher,
-        pictures: PictureSlot,
         links: Mapping[str, Link],
         *,
         name: str,
@@ -105,7 +102,7 @@ class Viewer:
         port: int = 0,
         recorder: Recorder | None = None,
     ) -> None:
-        self._publisher, self._pictures, self._recorder = publisher, pictures, recorder
+        self._publisher, self._recorder = publisher, recorder
         self._mine = publisher.subscribe(_KINDS, most=_MOST_WAITING)
         self._serializer = Serializer(links, sites)
         self._name, self._links, self._sites = name, links, len(sites)
@@ -330,9 +327,9 @@ class Viewer:
             return
         from websockets.asyncio.server import broadcast
 
-        picture = self._pictures.newest
+        picture = self._publisher.pictures.newest
         shot = None if picture is None else self._serializer.shot(picture)
-        self._pictures.ask()
+        self._publisher.pictures.ask()
         record = None if self._recorder is None else self._recorder.state
         end = f'"record": {json.dumps(record)}}}'
         for browser in ready:

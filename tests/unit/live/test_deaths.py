@@ -89,7 +89,7 @@ def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
                     time.sleep(0.01)
 
         try:
-            given: dict[str, Any] = {"publisher": publisher, "pictures": services.pictures, "budget": PATIENT}
+            given: dict[str, Any] = {"publisher": publisher, "budget": PATIENT}
             with sender(pieces()) as source:
                 summary = live(source, **given, warm=False)
         finally:

@@ -20,7 +20,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import RawSource, ReplaySource, open_source, write_events
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.live import Budget, LiveStatus, PictureSlot, Publisher, Subscription
+from evlcp_sdk.live import Budget, LiveStatus, Publisher, Subscription
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.run import live, receive
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events
@@ -42,14 +42,13 @@ def gathered(subscription: Subscription) -> dict[str, list[Any]]:
 def test_a_replay_gives_what_the_file_gives(
     demo_raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    publisher, pictures = Publisher(), PictureSlot()
-    pictures.ask()
+    publisher = Publisher()
+    publisher.pictures.ask()
     mine = publisher.subscribe(most=100_000)
     summary = live(
         f"replay:{demo_raw}?speed=50",
         tmp_path / "out",
         publisher=publisher,
-        pictures=pictures,
         budget=PATIENT,
         warm=False,
     )
@@ -66,7 +65,7 @@ def test_a_replay_gives_what_the_file_gives(
     assert summary["status"] == "complete"
     assert summary["live"]["delays"]["total"]["count"] > 0
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["live"] == summary["live"]
-    assert pictures.newest is not None
+    assert publisher.pictures.newest is not None
     text = going_text(last)
     assert text.startswith(f"{last.elapsed_s:.0f} s, ")
     assert f", {last.counts['frames']} frames" in text

@@ -79,9 +79,8 @@ class Stage:
 
     def picture(self, t_us: int) -> None:
         """A slice with one event, at column 5 of row 7, as the loop gives it."""
-        assert self.services.pictures is not None
         events = Events.of([t_us - 1, t_us], [5, 5], [7, 7], [1, 1])
-        self.services.pictures.add(events, 1280, 720, ())
+        self.publisher.pictures.add(events, 1280, 720, ())
 
 
 @pytest.fixture
@@ -349,7 +348,7 @@ def test_a_browser_shows_what_the_files_say(
         browser.until("shown.connects == 2")
 
         def run() -> None:
-            given: dict[str, Any] = {"publisher": publisher, "pictures": services.pictures, "budget": PATIENT}
+            given: dict[str, Any] = {"publisher": publisher, "budget": PATIENT}
             summary.update(live(source, tmp_path / "out", list(LINKS.values()), **given, warm=False))
 
         runner = threading.Thread(target=run)
