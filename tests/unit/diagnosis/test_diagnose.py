@@ -21,6 +21,7 @@ from evlcp_sdk.io import open_source
 from evlcp_sdk.io.open import write_events
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.report.diagnosis_page import page
+from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import SimulatedSource, simulate
 from evlcp_sdk.values import Events
@@ -86,6 +87,56 @@ def test_what_a_link_has_wrong_is_found_and_said(code: str, sent: tuple[str, ...
     (wrong,) = [one for one in diagnosis.checks if one.verdict == "fail"]
     assert wrong.code == code
     assert step in wrong.next_step
+
+
+MESSAGES = {
+    "bars.0.payload": "messages",
+    "world.latitude_deg": 35.1,
+    "world.longitude_deg": 137.0,
+    "world.height_m": 50.0,
+}
+WH8, REED_SOLOMON = ("modulation.id=wh8",), ("error-correction.id=reed-solomon",)
+
+
+@pytest.mark.parametrize(
+    ("warned", "sent", "read", "duration_s", "changes", "step"),
+    [
+        (set(), (), (), 0.2, {}, ""),
+        (set(), (), (), 0.2, MESSAGES, ""),
+        ({"profile"}, WH8, (), 0.13, {}, "was this sent with wh8? try --set modulation.id=wh8"),
+        ({"unsure"}, (), WH8, 0.13, {}, "was this sent with raw8 or wh4x2 (modulation.id)?"),
+        ({"clock"}, ("air.chip_rate_hz=10012",), (), 0.13, {}, "air.chip_rate_hz = 100"),
+        ({"frames-rejected", "coverage"}, (), ("air.chip_rate_hz=9900",), 0.2, {}, "air.frames_per_packet"),
+        ({"frames-rejected"}, ("air.frames_per_packet=7",), (), 0.13, {}, "--link auto"),
+        # Its beacon comes again and again.
+        ({"blocks-unread"}, REED_SOLOMON, (), 0.2, MESSAGES, "error-correction.id"),
+        # The beacon says .96 m, the link 1.2: all distances are a quarter too long.
+        ({"bar-length"}, (), ("bar.led_pitch_m=0.0125",), 0.12, MESSAGES, "compare the link's [bar]"),
+        ({"clusters-hidden"}, (), (), 0.12, {"bars.0.covered": [4, 5]}, "is something before them?"),
+    ],
+)
+def test_what_receive_warns_of(
+    warned: set[str],
+    sent: tuple[str, ...],
+    read: tuple[str, ...],
+    duration_s: float,
+    changes: dict[str, Any],
+    step: str,
+) -> None:
+    summary = receive_to_folder(rendered(sent, duration_s, **changes), None, load_link(overrides=read))
+    assert {one["code"] for one in summary["warnings"]} == warned
+    assert not warned or any(step in one["next_step"] for one in summary["warnings"])
+
+
+def test_parts_of_a_near_bar_are_no_frames_of_another() -> None:
+    """Pieces of a bar of 480 rows are followed before the whole of it is known."""
+    near = {"motion.distance_m": 15.0, "motion.speed_mps": 0.0, "motion.vib_rate_rad_s": 0.0}
+    day = {"background.light_w_m2": 1.0, "bars.0.led_w_m2": None, "sensor.hold": True, "sensor.refr_us": 20.0}
+    summary = receive_to_folder(rendered((), 0.045, **near, **day, **{"bars.0.x_m": -0.9}), None)
+    counts = summary["counts"]
+    assert counts["frames"] == 13
+    assert (counts["frames_rejected"], counts["frames_of_parts"] >= 10) == (0, True)
+    assert summary["warnings"] == []
 
 
 def judged(
