@@ -12,77 +12,43 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.air.blocks import BlockError, Kind, Message
-from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, Countdown, CountdownKind, MessageKind, TimeKind
 from evlcp_sdk.errors import ConfigError, PluginWarning
 from evlcp_sdk.link.compose import compose, packets_of
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.records import message_kinds
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.rx.inbox import MessageAssembler
+from evlcp_sdk.run import receive, receive_to_folder
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.values import Frame, Packet, Range, ReceivedMessage, SoftSymbols
 from tests.unit.link import wind
 
 REGISTRY = Registry.load(wind)
 LINK = load_link(registry=REGISTRY)
-NOTHING = Range(float("nan"), float("nan"), 0)
-
-
-def packet_of(symbols: np.ndarray, link: Link) -> Packet:
-    """A packet as it is received without an error."""
-    bits = bits_of_symbols(symbols, link.codebook.bits_per_symbol)
-    llr = (8 * (1 - 2.0 * bits)).astype(np.float32).reshape(*symbols.shape, -1)
-    frames = tuple(
-        Frame(0, 0, n, 3200.0 * n, SoftSymbols(symbols[n], llr[n], 1.0), NOTHING, None, 0.0, 0.0)
-        for n in range(len(symbols))
-    )
-    return Packet(0, 0, 0.0, 100.0, frames, len(symbols))
-
-
-def heard(messages: list[Message], link: Link) -> tuple[list[ReceivedMessage], dict[str, int]]:
-    inbox = MessageAssembler.of(link)
-    assert inbox is not None
-    found = [
-        message
-        for symbols in packets_of(messages, link.block_coder())
-        for message in inbox.add(packet_of(symbols, link)).messages
-    ]
-    return found, {name: count for name, count in inbox.counts.items() if count}
 
 
 def test_a_kind_is_one_file_and_one_hook(tmp_path: Path) -> None:
+    """What it does not understand is counted, as are its blocks where it is not installed."""
     symbols = compose(LINK, text="Tempo 30", other={"wind": (7.5, 270.0)}, transmitter_id=3, sequence=9)
-    scene = load_scene("drive-30kmh", {"duration_s": 0.12, "bars.start_chip": 1300.0})
+    symbols = np.concatenate([symbols, packets_of([Message(15, 3, 10, b"abc")], LINK.block_coder())])
+    scene = load_scene("drive-30kmh", {"duration_s": 0.16, "bars.start_chip": 1300.0})
     (bar,) = scene.bars
     sent = tuple(tuple(tuple(frame) for frame in packet) for packet in symbols.tolist())
     scene = replace(scene, bars=(replace(bar, symbols=sent),))
-    summary = receive_to_folder(simulate(scene), tmp_path, LINK, registry=REGISTRY)
-    lines = [json.loads(line) for line in (tmp_path / "packets.jsonl").read_text().splitlines()]
+    raw, _ = simulate(scene).save(tmp_path / "wind.raw")
+    summary = receive_to_folder(raw, tmp_path / "out", LINK, registry=REGISTRY)
+    lines = [json.loads(line) for line in (tmp_path / "out" / "packets.jsonl").read_text().splitlines()]
     found = {line["kind"]: line for line in lines if line["kind"] != "packet"}
     assert found.keys() == {"text", "wind"}
     assert (found["wind"]["speed_m_s"], found["wind"]["from_deg"]) == (7.5, 270.0)
     assert (found["wind"]["transmitter_id"], found["wind"]["sequence"]) == (3, 9)
     assert (found["wind"]["trust"], found["wind"]["reason"]) == ("unverified", "not signed")
-    assert summary["counts"]["messages"] == 2
-
-
-def test_a_receiver_without_the_kind_counts_its_blocks() -> None:
-    message = Message(wind.Wind.number, 3, 9, wind.Wind().pack((7.5, 270.0)))
-    found, counts = heard([message], LINK)
-    assert [(m.kind.name, m.value, m.beacon) for m in found] == [("wind", (7.5, 270.0), None)]
-    found, counts = heard([message], load_link())
-    assert found == []
-    assert counts == {"blocks_tried": 1, "blocks_decoded": 1, "blocks_malformed": 1}
-
-
-def test_what_a_kind_does_not_understand_is_counted_once_and_ends_nothing() -> None:
-    found, counts = heard([Message(15, 3, 9, b"abc")] * 2 + [Message(15, 3, 10, bytes(8))], LINK)
-    assert [m.value for m in found] == [(0.0, 0.0)]
-    assert (counts["messages_undecodable"], counts["messages"]) == (1, 1)
+    assert (summary["counts"]["messages"], summary["counts"]["messages_undecodable"]) == (2, 1)
+    with receive(raw) as reception:
+        (text,) = (message for packet in reception for message in packet.messages)
+        assert text.value == "Tempo 30"
+        assert reception.counts["blocks_malformed"] >= 2
 
 
 def test_the_kinds_go_with_the_link() -> None:
