@@ -259,11 +259,12 @@ def _pack_evt3(
 ) -> tuple[Integer, Integer]:
     """Decode words start..stop to packed events, unchecked, up to the first that is not of the sensor's.
 
-    Those are all but events and times that go on below the last TIME_HIGH. It stops, too, where `packed`,
-    filled from `first` on, may have no room for another word's events. What is written behind the last event
-    means nothing. Returns where it stopped and where the events end.
+    Those are all but events and times that go on below the last TIME_HIGH, if that is believed. It stops,
+    too, where `packed`, filled from `first` on, may have no room for another word's events. What is written
+    behind the last event means nothing. Returns where it stopped and where the events end.
     """
-    event, column, polarity, high = state[PACKED], state[COLUMN], state[POLARITY], state[HIGH]
+    event, column, polarity = state[PACKED], state[COLUMN], state[POLARITY]
+    high = int64(-1) if state[DOUBT] else state[HIGH]
     left, vector_at = state[VECTOR_LEFT], state[VECTOR_AT]
     i, end, n, room = uintp(start), uintp(stop), uintp(first), uintp(len(packed))
     odd_until = i
@@ -473,42 +474,6 @@ def _take_time(
 
 
 @njit
-def _pass_doubtful(
-    words: Column,
-    i: Integer,
-    at: Integer,
-    state: Column,
-    tally: Column,
-    room: tuple[Column, Integer],
-    final: Any,
-) -> tuple[Integer, Integer]:
-    """Pass over EVT3 words up to the next TIME_HIGH, as their time is not known; count what is lost.
-
-    `room` is where events may be packed, and from where on.
-
-    Returns:
-        Where it stopped, and what `_unlevel` says there.
-    """
-    t, n = room
-    while i < len(words) and words[i] >> 12 != EVT3_TIME_HIGH:
-        start = i
-        i, until = _pack_evt3(words, i, i + 1, at, state, tally, t, n)
-        for _ in range(n, until):
-            _note(tally, int64(TIME_DOUBTFUL), at + 2 * start)
-        if i == start:
-            kind = words[i] >> 12
-            row = TIME_DOUBTFUL if kind == EVT3_EXT_TRIGGER else OTHER_WORDS
-            if not (EVT3_TYPES >> kind) & 1:
-                askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
-                if askew:
-                    return i, askew
-                row = RESERVED
-            _note(tally, int64(row), at + 2 * i)
-            i += 1
-    return i, int64(0)
-
-
-@njit
 def decode_evt3(
     words: Column,
     place: tuple[Integer, Any],
@@ -550,18 +515,18 @@ def decode_evt3(
             i += 1
     askew = int64(0)
     while i < len(words) and n <= len(t) - BURST and m < len(trigger_t):
-        if state[DOUBT]:
-            i, askew = _pass_doubtful(words, i, at, state, tally, (t, n), final)
-            if askew or i == len(words):
-                break
-            if int64(words[i]) & 0xFFF == state[HIGH]:
-                state[DOUBT] = 0
         start, first = i, n
         stop = i + min(len(words) - i, BLOCK_WORDS)
         i, n = _pack_evt3(words, start, stop, at, state, tally, t, n)
         is_full = n > len(t) - BURST
         base = state[BASE] + (state[HIGH] << 12)
-        if not _unpack_evt3(base, events, (first, n), size_px, state[LAST]):
+        if state[DOUBT]:
+            # No time is known of these.
+            if n > first and tally[TIME_DOUBTFUL, 0] == 0:
+                tally[TIME_DOUBTFUL, 1] = at + 2 * _word_of_event(words, start, 0)
+            tally[TIME_DOUBTFUL, 0] += n - first
+            n = first
+        elif not _unpack_evt3(base, events, (first, n), size_px, state[LAST]):
             n = _sift(words, start, at, events, (first, n), size_px, state[LAST], tally)
         if n > first:
             state[LAST] = t[n - 1]
@@ -578,7 +543,9 @@ def decode_evt3(
                 state[PACKED] = (state[PACKED] & KEEP[EVT3_TIME_LOW]) | PACKED_TIME << PACKED_LOW
         elif kind == EVT3_EXT_TRIGGER:
             clock = base - PACKED_TIME + (state[PACKED] >> PACKED_LOW)
-            if clock < state[LAST]:
+            if state[DOUBT]:
+                _note(tally, int64(TIME_DOUBTFUL), at + 2 * i)
+            elif clock < state[LAST]:
                 _note(tally, int64(TIME_BACKWARD), at + 2 * i)
             else:
                 trigger_t[m], channel[m], value[m] = clock, (w >> 8) & 0xF, w & 1

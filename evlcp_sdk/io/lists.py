@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io.arrays import read_npy, read_npz
-from evlcp_sdk.io.columns import DAMAGE, WINDOW_US, ColumnSource, EventTable, Piece
+from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, Piece
 from evlcp_sdk.io.fields import Fields, Polarities, fields_of, fields_of_values, unit_named, unit_of
 from evlcp_sdk.io.tables import CSV_HEADER
 from evlcp_sdk.io.urls import flag, split_options
@@ -32,7 +32,7 @@ PIECE_BYTES: Final = 1 << 20
 _COMMENTS: Final = (b"#", b"%", b"//")
 _SEPARATORS: Final = (b";", b"\t", b"|", b",")
 _DECIMAL_COMMA: Final = re.compile(rb"(?<=\d),(?=\d)")
-_UTF_16: Final = (b"\xff\xfe", b"\xfe\xff")
+_UTF_16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
 _TITLES: Final = 10
 """Lines that may stand above a table: a title, what recorded it, `sep=;`."""
 _TEXT: Final = re.compile(rb"[\t\r\n -~\x80-\xff]+")
@@ -111,14 +111,9 @@ def is_list(path: Path) -> bool:
         return True
     with path.open("rb") as file:
         start = file.read(1 << 13)
-    if start.startswith(b"\x1f\x8b"):
-        try:
-            with gzip.open(path) as zipped:
-                start = zipped.read(1 << 13)
-        except DAMAGE:
-            return False
     if start.startswith(_UTF_16):
         start = start[: len(start) // 2 * 2].decode("utf-16", "replace").encode()
+    start = start.removeprefix(codecs.BOM_UTF8)
     return _TEXT.fullmatch(start) is not None and _Text(start, None).fields is not None
 
 
@@ -138,7 +133,7 @@ def read_csv(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
     if start in _UTF_16:
         file = codecs.EncodedFile(raw, "utf-8", "utf-16", "replace")
     raw.seek(0)
-    text = file.read(PIECE_BYTES)
+    text = file.read(PIECE_BYTES).removeprefix(codecs.BOM_UTF8)
     table = _Text(text, fields)
     if table.fields is None:
         raise InputError(
@@ -199,13 +194,12 @@ class _Text:
     """How the lines of a text are read: what separates cells, and which is what.
 
     Args:
-        start: The first bytes.
+        start: The first bytes, behind a byte order mark.
         fields: Which column is what; None: as its heading or its values say.
     """
 
     def __init__(self, start: bytes, fields: Fields | None) -> None:
-        self._mark = start.removeprefix(b"\xef\xbb\xbf") != start
-        lines = start.removeprefix(b"\xef\xbb\xbf").splitlines()[:512]
+        lines = start.splitlines()[:512]
         data = [(k, line) for k, line in enumerate(lines, 1) if _is_data(line)]
         # A heading may stand in a comment, as numpy.savetxt writes it.
         above = [

@@ -234,9 +234,8 @@ class RawSource(EventSource):
             if not header.closed:
                 self._decoder.note(_kernels.HEADER_OPEN, header.size_bytes)
             self._start = self._position = self._data_start = header.size_bytes
-            if not self._is_pipe:
-                self._fill()
-            elif not self._exhausted and self._number is not None:
+            self._fill(0)
+            if self._is_pipe and not self._exhausted and self._number is not None:
                 self._wait_a_little(self._number)
             self._probe()
         except BaseException:
@@ -287,7 +286,7 @@ class RawSource(EventSource):
     def _fill(self, least: int = 1) -> None:
         """Move what is left to the front of the buffer and read on until it is full or the file ends.
 
-        Of a pipe until `least` bytes more are there.
+        Of a pipe until `least` bytes more are there. The bytes that are left are in line with words again.
         """
         left = self._end - self._start
         self._buffer[:left] = self._buffer[self._start : self._end]
@@ -349,10 +348,12 @@ class RawSource(EventSource):
             used = self._decoder.decode(words, self._position, out, self._exhausted)
             self._start += used
             self._position += used
-            if not used or self._start % words.itemsize:
-                if not used and self._is_pipe and not self._exhausted and (out.events or out.triggers):
+            if not used:
+                if self._is_pipe and not self._exhausted and (out.events or out.triggers):
                     return False
                 self._fill()
+            elif self._start % words.itemsize:
+                self._fill(0)
             if self._position - self._data_start > TIMELESS_BYTES and not self._decoder.has_time:
                 self._raise_timeless()
         return False

@@ -1,18 +1,14 @@
 """A small good file of every kind that is read, and its reader."""
 
 import json
-import sqlite3
 from collections.abc import Callable
-from contextlib import closing
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-import h5py
 import numpy as np
 from mcap.reader import make_reader
-from scipy.io import savemat
 
 from evlcp_sdk.io import open_source
 from evlcp_sdk.io.open import open_writer
@@ -33,6 +29,7 @@ from firmware_host.board.bank import read_masks
 from firmware_host.board.fleet import read_inventory
 from firmware_host.board.symbols import read_symbols
 from firmware_host.board.update import Package
+from tests.unit.io.writers import write_hdf5, write_mat, write_mat_73, write_npy, write_sqlite
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 WIDTH, HEIGHT = 64, 48
@@ -94,30 +91,9 @@ def _columns() -> dict[str, Any]:
     return {"t": events.t_us, "x": events.x, "y": events.y, "p": events.p}
 
 
-def _npy(folder: Path) -> bytes:
-    np.save(folder / "a.npy", np.stack([column.astype(np.int64) for column in _columns().values()], 1))
-    return (folder / "a.npy").read_bytes()
-
-
-def _hdf5(folder: Path) -> bytes:
-    with h5py.File(folder / "a.h5", "w") as file:
-        for name, column in _columns().items():
-            file.create_dataset(f"events/{name}", data=column, chunks=(500,), compression="gzip")
-    return (folder / "a.h5").read_bytes()
-
-
-def _matlab_7(folder: Path) -> bytes:
-    with h5py.File(folder / "7.mat", "w", userblock_size=512) as file:
-        for name, column in _columns().items():
-            file[name] = column[None, :]
-    data = (folder / "7.mat").read_bytes()
-    head = b"MATLAB 7.3 MAT-file"
-    return head + data[len(head) :]
-
-
-def _matlab_5(folder: Path) -> bytes:
-    savemat(folder / "5.mat", _columns(), do_compression=True)
-    return (folder / "5.mat").read_bytes()
+def _written(path: Path, write: Callable[..., Any], *what: Any) -> bytes:
+    write(path, *what)
+    return path.read_bytes()
 
 
 def _db3(folder: Path) -> bytes:
@@ -126,13 +102,7 @@ def _db3(folder: Path) -> bytes:
     _recording(folder, path.name)
     with path.open("rb") as file:
         messages = [message.data for _, _, message in make_reader(file).iter_messages()]
-    with closing(sqlite3.connect(folder / "a.db3")) as base, base:
-        base.execute("CREATE TABLE topics(id INTEGER PRIMARY KEY, name TEXT, type TEXT)")
-        base.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, topic_id INT, timestamp INT, data BLOB)")
-        base.execute("INSERT INTO topics VALUES (1, '/events', 'event_camera_msgs/msg/EventPacket')")
-        rows = [(n, n, data) for n, data in enumerate(messages)]
-        base.executemany("INSERT INTO messages VALUES (?, 1, ?, ?)", rows)
-    return (folder / "a.db3").read_bytes()
+    return _written(folder / "a.db3", write_sqlite, messages, range(len(messages)))
 
 
 def _update(folder: Path) -> bytes:
@@ -203,6 +173,7 @@ def kinds(folder: Path, store: bytes) -> list[Kind]:
     packet, clusters = link.packet, link.codebook.clusters
     truth = json.loads((EXAMPLES / "recordings" / "night-50m-30kmh-cut.truth.json").read_text())
     symbols = np.zeros((1, packet.frames, clusters), int).tolist()
+    table = np.stack([column.astype(np.int64) for column in _columns().values()], 1)
     masks = folder / "masks.npy"
     np.save(masks, np.zeros((packet.packet_chips, 16), np.uint8))
     return [
@@ -211,10 +182,10 @@ def kinds(folder: Path, store: bytes) -> list[Kind]:
         Kind("NPZ", "a.npz", _recording(folder, "a.npz"), read_recording),
         Kind("CSV", "a.csv", _recording(folder, "a.csv"), read_recording),
         Kind("CSV in gzip", "a.csv.gz", _recording(folder, "a.csv.gz"), read_recording),
-        Kind("NPY", "a.npy", _npy(folder), read_recording),
-        Kind("HDF5", "a.h5", _hdf5(folder), read_recording),
-        Kind("MAT 7.3", "a.mat", _matlab_7(folder), read_recording),
-        Kind("MAT", "a.mat", _matlab_5(folder), read_recording),
+        Kind("NPY", "a.npy", _written(folder / "a.npy", write_npy, {"": table}), read_recording),
+        Kind("HDF5", "a.h5", _written(folder / "a.h5", write_hdf5, _columns()), read_recording),
+        Kind("MAT 7.3", "a.mat", _written(folder / "7.mat", write_mat_73, _columns()), read_recording),
+        Kind("MAT", "a.mat", _written(folder / "5.mat", write_mat, _columns()), read_recording),
         Kind("MCAP", "a.mcap", _recording(folder, "a.mcap"), read_recording),
         Kind("db3", "a.db3", _db3(folder), read_recording),
         Kind("NMEA", "a.nmea", NMEA, lambda path: read_nmea(path, datetime(2026, 11, 1, tzinfo=UTC), 3.0)),

@@ -97,7 +97,7 @@ def test_whole_vectors_among_other_words_equal_the_twin():
 
 @pytest.mark.parametrize(("name", "bits", "low"), [("EVT3", 12, 12), ("EVT2", 28, 6)])
 def test_one_flipped_bit_of_a_time_costs_its_own_events(name, bits, low, tmp_path):
-    t = np.arange(0, 3_000_000, 25)
+    t = np.arange(0, 3_000_000, 100)
     events = Events.of(t, t % WIDTH, t % HEIGHT, t & 1)
     path = tmp_path / "a.raw"
     write_events(path, events, WIDTH, HEIGHT, format=name)
@@ -254,21 +254,13 @@ def test_writer_leaves_what_was_there_when_it_fails(tmp_path):
         writer.write(Events.empty())
 
 
-def test_any_buffer_and_any_piece_give_the_same_events(tmp_path):
-    rng = np.random.default_rng(1)
-    n = 60_000
-    events = Events.of(
-        np.sort(rng.integers(0, 9_000_000, n)),
-        rng.integers(0, 640, n),
-        rng.integers(0, 480, n),
-        rng.integers(0, 2, n),
-    )
-    write_events(tmp_path / "a.raw", events, 640, 480)
-    for buffer_bytes in (1, 65_537, 100_000):
-        for max_events in (1000, 1 << 20):
-            with RawSource(tmp_path / "a.raw", buffer_bytes) as source:
-                got = Events.concat(source.chunks(max_events))
-            assert all(np.array_equal(getattr(got, c), getattr(events, c)) for c in ("t_us", "x", "y", "p"))
+def test_a_file_larger_than_the_buffer(tmp_path):
+    events = crowd(200_000, 9_000_000)
+    write_events(tmp_path / "a.raw", events, WIDTH, HEIGHT)
+    with RawSource(tmp_path / "a.raw", 1) as source:
+        assert source.size_bytes > 1 << 20
+        got = Events.concat(source.chunks(1000))
+    assert np.array_equal(key(got), key(events))
 
 
 def key(events):
@@ -301,7 +293,7 @@ BYTES = {
 @pytest.mark.parametrize("fault", BYTES)
 def test_words_are_found_again_where_bytes_are_missing(name, fault, tmp_path):
     """Against the events that were written; what is lost ends with the next TIME_HIGH."""
-    events = crowd(60_000, 200_000)
+    events = crowd(30_000, 200_000)
     known = key(events)
     path = tmp_path / "a.raw"
     write_events(path, events, WIDTH, HEIGHT, format=name)
@@ -311,7 +303,7 @@ def test_words_are_found_again_where_bytes_are_missing(name, fault, tmp_path):
     askew = (len(more) - missing) % CODECS[name].word.itemsize != 0
     # Events between two of them, of which an EVT2 file has one in 64 us; and those of the bytes themselves.
     own = 2 * np.bincount(events.t_us >> (12 if name == "EVT3" else 6)).max() + missing
-    for at in np.random.default_rng(3).integers(start + 3000, len(data) - 3000, 12).tolist():
+    for at in np.random.default_rng(3).integers(start + 3000, len(data) - 3000, 6).tolist():
         path.write_bytes(data[:at] + more + data[at + missing :])
         with open_source(path) as source:
             got, losses = source.read()[0], source.losses

@@ -1,111 +1,48 @@
-"""Lists of times and polarities without places."""
+"""Tables of events as people and their tools write them, with places and without: the events are the same."""
 
 import gzip
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
+from evlcp_sdk.io import EventSource, open_source, read_events
+from evlcp_sdk.io.columns import PIECE_ROWS
 from evlcp_sdk.io.fields import fields_of
-from evlcp_sdk.io.open import open_source, read_events
+from tests.unit.io.writers import (
+    Arrays,
+    records,
+    write_hdf5,
+    write_mat,
+    write_mat_73,
+    write_npy,
+    write_npz,
+    write_records,
+)
 
 RNG = np.random.default_rng(5)
-T_US = np.sort(RNG.choice(400_000, 3000, replace=False)).astype(np.int64) + 12_345
-P = RNG.integers(0, 2, 3000).astype(np.uint8)
+N = 3000
+T_US = np.sort(RNG.choice(400_000, N, replace=False)).astype(np.int64) + 12_345
+P = RNG.integers(0, 2, N).astype(np.uint8)
+X, Y = RNG.integers(300, 340, N), RNG.integers(200, 240, N)
+T_S, SIGNS, ROWS = T_US * 1e-6, P.astype(int) * 2 - 1, np.arange(N)
 
 
-def csv(head: str, cell: str, factor: float, low: int = 0, mark: str = ",") -> str:
-    rows = [mark.join((cell % (t * factor), str(int(p) or low))) for t, p in zip(T_US, P, strict=True)]
-    return "\n".join([head.replace(",", mark), *rows] if head else rows) + "\n"
-
-
-CSVS = {
-    "us": csv("t,p", "%d", 1),
-    "us named": csv("t_us,polarity", "%d", 1, low=-1),
-    "ns": csv("timestamp,pol", "%d", 1000),
-    "ms": csv("t,p", "%.3f", 1e-3),
-    "s": csv("time,p", "%.6f", 1e-6),
-    "s semicolon": csv("t (s),p", "%.6f", 1e-6, mark=";"),
-    "no heading": csv("", "%d", 1, mark=" "),
-    "tab": csv("t,p", "%.6e", 1e-6, mark="\t").replace("e-01", "e-1"),
-    "windows": csv("t,p", "%d", 1).replace("\n", "\r\n"),
-    "no last line end": csv("t,p", "%d", 1).rstrip("\n"),
-    "words": csv("t,p", "%d", 1).replace(",1\n", ",True\n").replace(",0\n", ",False\n"),
-}
-
-
-@pytest.mark.parametrize("name", CSVS)
-@pytest.mark.parametrize("zipped", [False, True])
-def test_a_csv_list_in_any_unit(name: str, zipped: bool, tmp_path: Path) -> None:
-    path = tmp_path / ("a.csv.gz" if zipped else "a.csv")
-    text = CSVS[name].encode()
-    path.write_bytes(gzip.compress(text) if zipped else text)
-    events = read_events(path)
-    np.testing.assert_array_equal(events.t_us, T_US)
-    np.testing.assert_array_equal(events.p, P)
-    assert not events.x.any()
-    assert not events.y.any()
-
-
-@pytest.mark.parametrize(
-    ("arrays", "unit"),
-    [
-        ({"t": T_US, "p": P}, "us"),
-        ({"t": T_US.astype(np.uint32), "p": P.astype(bool)}, "us"),
-        ({"t": T_US * 1e-6, "p": P * 2.0 - 1.0}, "s"),
-        ({"t_ns": T_US * 1000, "p": P.astype(np.int8) * 2 - 1}, "ns"),
-        ({"time": T_US * 1e-3, "polarity": P}, "ms"),
-    ],
-)
-def test_an_npz_list(arrays: dict[str, np.ndarray], unit: str, tmp_path: Path) -> None:
-    np.savez_compressed(tmp_path / "a.npz", allow_pickle=False, **arrays)
-    with open_source(tmp_path / "a.npz") as source:
-        assert source.header["time"].startswith(f"in {unit},")
-        assert source.header["pixels"] == "none given: x = y = 0"
+def expect(name: Path | str, *, placed: bool, shift_us: int = 0) -> EventSource:
+    """The source, after it gave the events above, perhaps at other times."""
+    with open_source(name) as source:
         events, _ = source.read()
-    np.testing.assert_array_equal(events.t_us, T_US)
+    np.testing.assert_array_equal(events.t_us - shift_us, T_US)
     np.testing.assert_array_equal(events.p, P)
-
-
-def test_pieces_of_a_long_list_are_the_whole(tmp_path: Path) -> None:
-    t_us = np.arange(300_000) * 7
-    rows = "".join(f"{t},{t % 2}\n" for t in t_us.tolist())
-    (tmp_path / "a.csv").write_text("t,p\n" + rows)
-    np.testing.assert_array_equal(read_events(tmp_path / "a.csv").t_us, t_us)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("t,p\n1,1\n2,5\n", "line 3: polarity 5 beside 1, expected 0 and 1"),
-        (
-            "t,p\n1,1\n2,-1\n3,0\n4,0\n",
-            "line 4: polarity 0 beside -1 and 1, expected 0 and 1, or -1",
-        ),
-        ("t,x,y,p\n1,1,1,1\n2,1,70000,1\n", "line 3: place 70000, expected whole numbers from 0"),
-        ("t,p\n1,1\nx,1\n", "line 3: found 'x,1', expected a time and a polarity"),
-        ("t,p\n1,1\n\n3\n", "line 4: found '3', expected a time and a polarity"),
-        ("t_s,p\n99999999999999999,1\n", "line 2: time 9{17} s, expected a number up to"),
-    ],
-)
-def test_a_fault_is_one_line_with_its_place(text: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(text)
-    with pytest.raises(InputError, match=message):
-        read_events(tmp_path / "a.csv")
-
-
-def test_an_empty_list_has_no_events(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text("t,p\n")
-    assert len(read_events(tmp_path / "a.csv")) == 0
-
-
-T_S = T_US * 1e-6
-EPOCH_US = 1_600_000_000_000_000
-X = RNG.integers(300, 340, 3000)
-Y = RNG.integers(200, 240, 3000)
-SIGNS = P.astype(int) * 2 - 1
-WORDS = np.where(P == 1, "ON", "OFF")
+    np.testing.assert_array_equal(events.x, X * placed)
+    np.testing.assert_array_equal(events.y, Y * placed)
+    assert source.header["pixels"].startswith("none given") is not placed
+    assert "," in source.header["time"], "no reason"
+    assert not source.losses
+    return source
 
 
 def text(*columns: np.ndarray, head: str = "", mark: str = ",", form: str = "%s") -> str:
@@ -116,38 +53,34 @@ def text(*columns: np.ndarray, head: str = "", mark: str = ",", form: str = "%s"
     return "\n".join([head, *rows] if head else rows) + "\n"
 
 
-ODD = {
+LISTS = {
+    "us": text(T_US, P, head="t,p"),
+    "us named, polarity -1": text(T_US, SIGNS, head="t_us,polarity"),
+    "ns": text(T_US * 1000, P, head="timestamp,pol"),
+    "minutes of nanoseconds": text(T_US * 1000 + 7, P, head="t,p"),
+    "ms": text(T_US * 1e-3, P, head="t,p", form="%.3f"),
+    "s": text(T_S, P, head="time,p", form="%.6f"),
+    "no heading": text(T_US, P, mark=" "),
+    "tabs and exponents": text(T_S, P, head="t\tp", mark="\t", form="%.6e").replace("e-0", "e-"),
+    "windows": text(T_US, P, head="t,p").replace("\n", "\r\n"),
+    "no last line end": text(T_US, P, head="t,p").rstrip("\n"),
+    "True and False": text(T_US, P > 0, head="t,p"),
     "of a plot": text(P, T_S, head="Polarity,Time [s]", form="%.6f"),
     "seconds, spelled": text(T_S, SIGNS, head='"timestamp (seconds)","event"', form="%.6f"),
     "as the beacon's authors call them": text(T_S, SIGNS, head="event_t,event", form="%.6f"),
-    "words": text(T_US, WORDS, head="time_us,polarity"),
-    "words, no heading": text(WORDS, T_US, mark="\t"),
-    "with an index": text(np.arange(3000), T_US, P, head=",t,p"),
+    "words": text(T_US, np.where(P == 1, "ON", "OFF"), head="time_us,polarity"),
+    "words, no heading": text(np.where(P == 1, "ON", "OFF"), T_US, mark="\t"),
+    "rising and falling": text(T_US, np.where(P == 1, "rising", "falling"), head="t,type"),
+    "with an index": text(ROWS, T_US, P, head=",t,p"),
     "polarity first, no heading": text(SIGNS, T_S, mark=" ", form="%.6f"),
     "floats throughout": text(T_US * 1.0, P * 1.0, form="%.1f"),
     "comments": "# a beacon, 30 m\n% t p\n\n" + text(T_US, P, mark="  ") + "// end\n",
     "savetxt": "# t,p\n" + text(T_US * 1.0, SIGNS * 1.0, form="%.18e"),
     "decimal comma": text(T_S, P, head="t;p", mark=";", form="%.6f").replace(".", ","),
     "decimal comma and blanks": text(T_S, P, mark=" ", form="%.6f").replace(".", ","),
+    "decimal commas in quotes": text(T_S, P, head="t,p", form='"%.6f"').replace(".", ","),
     "blanks around": text(T_US, P, head="t , p", mark=" , "),
     "right-aligned": "".join(f"{t:>12d} {p:>3d}\n" for t, p in zip(T_US, SIGNS, strict=True)),
-    "minutes of nanoseconds": text(T_US * 1000 + 7, P, head="t,p"),
-}
-
-
-@pytest.mark.parametrize("name", ODD)
-def test_lists_as_people_write_them(name: str, tmp_path: Path) -> None:
-    for suffix in (".csv", ".txt"):
-        (tmp_path / f"a{suffix}").write_text(ODD[name])
-        with open_source(tmp_path / f"a{suffix}") as source:
-            events, _ = source.read()
-            assert source.counts["events"] == 3000
-            assert not source.losses
-        np.testing.assert_array_equal(events.t_us, T_US)
-        np.testing.assert_array_equal(events.p, P)
-
-
-MORE = {
     "ts is a time, and no seconds": text(T_US, P, head="ts,p"),
     "unit in words": text(T_US, P, head="time in microseconds,polarity"),
     "a unit for a name": text(T_S, P, head="seconds,pol", form="%.6f"),
@@ -156,117 +89,133 @@ MORE = {
     "t of events": text(T_US, P, head="t_event,p_event"),
     "a state": text(T_US, P, head="t,is_on"),
     "elapsed": text(T_US * 1e-3, P, head="elapsed_ms,event_type", form="%.3f"),
-    "numbers of rows, no heading": text(np.arange(3000), T_US, P),
-    "numbers of rows from 1": text(np.arange(1, 3001), T_S, SIGNS, mark=" ", form="%.6f"),
-    "the same throughout, no heading": text(T_US, P, np.full(3000, 7)),
-    "as R writes it": text(np.arange(1, 3001), T_US, P, head='"t" "p"', mark=" "),
-    "commas in quoted names": text(T_US, P, head='"time, us","polarity, 0 or 1"').replace("time, us", "t_us"),
-    "decimal commas in quotes": "t,p\n"
-    + "".join(f'"{t:.6f}",{p}\n'.replace(".", ",") for t, p in zip(T_S, P, strict=True)),
+    "numbers of rows, no heading": text(ROWS, T_US, P),
+    "numbers of rows from 1": text(ROWS + 1, T_S, SIGNS, mark=" ", form="%.6f"),
+    "the same throughout, no heading": text(T_US, P, np.full(N, 7)),
+    "as R writes it": text(ROWS + 1, T_US, P, head='"t" "p"', mark=" "),
+    "commas in quoted names": text(T_US, P, head='"t_us","polarity, 0 or 1"'),
     "bars": text(T_US, P, head="t|p", mark="|"),
     "a spreadsheet's hint": "sep=;\n" + text(T_US, P, head="t;p", mark=";"),
     "a title": "LED 1, 30 m\n\n" + text(T_US, P, head="t,p"),
     "a title and no names": "LED 1\n" + text(T_US, P),
-    "the sensor's size": "1280 720\n" + text(T_US, X, Y, P, mark=" "),
     "a line of units": text(T_US * 1e-3, P, head="time,polarity\n[ms],[0/1]", form="%.3f"),
-    "rising and falling": text(T_US, np.where(P == 1, "rising", "falling"), head="t,edge type").replace(
-        "edge ", ""
-    ),
+}
+PLACED = {
+    "x,y,p,t without a header": text(X, Y, P, T_US),
+    "behind %geometry": "%geometry:1280,720\n" + text(X, Y, P, T_US),
+    "the sensor's size": "1280 720\n" + text(T_US, X, Y, P, mark=" "),
+    "a quoted header": text(T_US, X, Y, P, head='"t_us","x","y","p"'),
+    "blanks after commas": text(T_US, X, Y, P, head="t_us,x,y,p", mark=", "),
+    "times with a fraction": text(T_US * 1.0, X, Y, P, head="t_us,x,y,p"),
 }
 
 
-@pytest.mark.parametrize("name", MORE)
-@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
-def test_headings_of_many_kinds(name: str, encoding: str, tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(MORE[name], encoding)
-    with open_source(tmp_path / "a.csv") as source:
-        events, _ = source.read()
-    np.testing.assert_array_equal(events.t_us, T_US)
-    np.testing.assert_array_equal(events.p, P)
+@pytest.mark.parametrize("name", LISTS | PLACED)
+def test_text(name: str, tmp_path: Path) -> None:
+    """The name of the file does not say that it is a table."""
+    (tmp_path / "a.txt").write_text((LISTS | PLACED)[name])
+    expect(tmp_path / "a.txt", placed=name in PLACED)
 
 
-@pytest.mark.parametrize("many", [1, 40])
-@pytest.mark.parametrize("form", ["%.3f s", "%.6f s", "%.0f ms", "%.1f ms", "%.0f us", "%.0f ns"])
-@pytest.mark.parametrize("first_us", [0, 37_123_000, 259_200_012_000])
-def test_times_to_the_millisecond_say_their_unit(many: int, form: str, first_us: int, tmp_path: Path) -> None:
-    """Characters of eleven bits at 504 bit/s, a few events or many an edge: 4 s that would be 4 ms."""
-    rng = np.random.default_rng(0)
-    edges = np.cumsum(rng.integers(1, 4, 1000)) * 1e6 / 504
-    rounded = (
-        np.sort(np.rint((edges[:, None] + rng.exponential(200, (1000, many + 1))) / 1000).ravel()) * 1000
+@pytest.mark.parametrize("name", ["windows", "a line of units", "a title", "x,y,p,t without a header"])
+def test_files_of_text(name: str, tmp_path: Path) -> None:
+    content = (LISTS | PLACED)[name]
+    for file, data in (
+        ("a.csv", b"\xef\xbb\xbf" + content.encode()),
+        ("a.csv.gz", gzip.compress(content.encode())),
+        ("16.csv", content.encode("utf-16")),
+        ("16", content.encode("utf-16")),
+    ):
+        (tmp_path / file).write_bytes(data)
+        expect(tmp_path / file, placed=name in PLACED)
+
+
+def table(order: str, kind: Any = np.int64) -> np.ndarray:
+    columns = {"t": T_US, "x": X, "y": Y, "p": P, "s": T_S, "±": SIGNS}
+    return np.stack([columns[name] for name in order], 1).astype(kind)
+
+
+LIST, ALL = {"t": T_US, "p": P}, {"t": T_US, "x": X, "y": Y, "p": P}
+ARRAYS: dict[str, Arrays] = {
+    "a list": LIST,
+    "a list of smaller types": {"t": T_US.astype(np.uint32), "p": P > 0},
+    "a list in seconds": {"event_t": T_S, "event": P * 2.0 - 1.0},
+    "a list in nanoseconds": {"t_ns": T_US * 1000, "p": SIGNS.astype(np.int8)},
+    "a list in milliseconds": {"time": T_US * 1e-3, "polarity": P},
+    "where the pixels are": {**LIST, "x": np.array(5), "y": np.array(6)},
+    "arrays": ALL,
+    "as floats": {"timestamp": T_US * 1.0, "polarity": P * 1.0, "x": X, "y": Y},
+    "big-endian": {name: column.astype(">i8") for name, column in ALL.items()},
+    "seconds": {**ALL, "t": T_S},
+    "nanoseconds": {**ALL, "t": T_US * 1000},
+    "polarity 1 and 2": {**ALL, "p": P + 1},
+    "polarity 255 for -1": {**ALL, "p": SIGNS.astype(np.uint8)},
+    "polarity 0 and 255": {**ALL, "p": 255 * P},
+    "our names": {"t_us": T_US * 1.0, "x": X, "y": Y, "p": SIGNS},
+    "our names, polarity 1 and 2": {"t_us": T_US, "x": X, "y": Y, "p": P + 1.0},
+}
+LIST_TABLES = {
+    "t p": table("sp", float),
+    "t p on its side": table("tp").T,
+    "p t, columns on end": np.asfortranarray(table("ps", float)),
+    "records": records(t=T_US, p=P),
+}
+PLACED_TABLES = {
+    "t x y p": table("txyp"),
+    "x y t p": table("xyt±", float),
+    "t x y p, columns on end": np.asfortranarray(table("txyp")),
+    "records with places": records(x=X.astype(np.int16), y=Y.astype(np.int16), p=P, t=T_US),
+}
+TABLES = LIST_TABLES | PLACED_TABLES
+
+
+COLUMNS = [name for name in ARRAYS if name != "where the pixels are"]
+WRITTEN = [
+    *(("a.npz", write_npz, name) for name in (*ARRAYS, *TABLES)),
+    *(("a.npy", write_npy, name) for name in TABLES),
+    *(("a.mat", write_mat, name) for name in (*TABLES, "a list in seconds", "polarity 1 and 2")),
+    *(("a.mat", write_mat_73, name) for name in ("arrays", "a list in seconds", "polarity 1 and 2")),
+    *(("a.h5", write_hdf5, name) for name in (*COLUMNS, "t p", "t x y p", "x y t p", "records with places")),
+    *(("a.hdf5", write_records, name) for name in ("arrays", "big-endian", "our names", "a list")),
+]
+
+
+@pytest.mark.parametrize(("file", "write", "name"), WRITTEN)
+def test_arrays(file: str, write: Callable[[Path, Arrays], None], name: str, tmp_path: Path) -> None:
+    arrays = {"events": TABLES[name]} if name in TABLES else ARRAYS[name]
+    write(tmp_path / file, arrays)
+    source = expect(
+        tmp_path / file, placed=name in PLACED_TABLES or ("x" in arrays and arrays["x"].size == N)
     )
-    rounded = rounded.astype(np.int64) + first_us
-    shape, unit = form.split()
-    factor = {"s": 1e-6, "ms": 1e-3, "us": 1.0, "ns": 1e3}[unit]
-    rows = "".join(f"{shape % (t * factor)},{k % 2}\n" for k, t in enumerate(rounded.tolist()))
-    (tmp_path / "a.csv").write_text("t,p\n" + rows)
-    with open_source(tmp_path / "a.csv") as source:
-        np.testing.assert_array_equal(source.read()[0].t_us, rounded)
-        assert "guessed" in source.header["time"]
+    assert source.position_bytes == source.size_bytes
+    assert source.width == (640 if write in (write_hdf5, write_records) else None)
 
 
-def test_two_arrays_without_names_and_where_the_pixels_are(tmp_path: Path) -> None:
+def test_two_arrays_without_names(tmp_path: Path) -> None:
     np.savez(tmp_path / "a.npz", P, T_S)
-    np.savez(tmp_path / "b.npz", t=T_US, p=P, x=5, y=6)
-    np.save(tmp_path / "c.npy", np.rec.fromarrays([P, T_US]))
-    for name in ("a.npz", "b.npz", "c.npy"):
-        with open_source(tmp_path / name) as source:
-            events, _ = source.read()
-        np.testing.assert_array_equal(events.t_us, T_US)
-        np.testing.assert_array_equal(events.p, P)
-
-
-def records(names: list[str], *columns: np.ndarray) -> np.ndarray:
-    out = np.empty(3000, [(name, c.dtype) for name, c in zip(names, columns, strict=True)])
-    for name, column in zip(names, columns, strict=True):
-        out[name] = column
-    return out
-
-
-ARRAYS = {
-    "records": records(["t", "p"], T_US, P),
-    "records with places": records(["x", "y", "p", "t"], X.astype(np.int16), Y.astype(np.int16), P, T_US),
-    "n by 2": np.stack([T_S, SIGNS], 1),
-    "2 by n": np.stack([T_US, P.astype(np.int64)]),
-    "columns on end": np.asfortranarray(np.stack([P * 1.0, T_S], 1)),
-    "n by 4": np.stack([T_US, X, Y, P], 1),
-    "x y t p": np.stack([X, Y, T_US, SIGNS], 1) * 1.0,
-}
-
-
-@pytest.mark.parametrize("name", ARRAYS)
-@pytest.mark.parametrize("kind", ["npy", "npz", "mat"])
-def test_an_array_is_a_list(name: str, kind: str, tmp_path: Path) -> None:
-    path = tmp_path / f"a.{kind}"
-    if kind == "npy":
-        np.save(path, ARRAYS[name])
-    elif kind == "npz":
-        np.savez(path, events=ARRAYS[name])
-    else:
-        from scipy.io import savemat
-
-        array = ARRAYS[name]
-        named = {key: array[key] for key in array.dtype.names} if array.dtype.names else array
-        savemat(path, {"beacon": named, "note": "30 m"})
-    events = read_events(path)
-    np.testing.assert_array_equal(events.t_us, T_US)
-    np.testing.assert_array_equal(events.p, P)
-    if name in ("records with places", "n by 4", "x y t p"):
-        np.testing.assert_array_equal(events.x, X)
-
-
-def test_arrays_of_a_matlab_file_by_name(tmp_path: Path) -> None:
-    from scipy.io import savemat
-
-    savemat(tmp_path / "a.mat", {"event_t": T_S, "event": SIGNS * 1.0})
-    with open_source(tmp_path / "a.mat") as source:
-        assert source.header["time"].startswith("in s,")
-        events, _ = source.read()
-    np.testing.assert_array_equal(events.t_us, T_US)
-    np.testing.assert_array_equal(events.p, P)
-    # And what scipy makes of it, saved by NumPy: rows of one.
+    expect(tmp_path / "a.npz", placed=False)
+    # As SciPy gives those of MATLAB: rows and columns of one.
     np.savez(tmp_path / "b.npz", allow_pickle=False, event_t=T_S[:, None], event=SIGNS[None])
-    np.testing.assert_array_equal(read_events(tmp_path / "b.npz").p, P)
+    expect(tmp_path / "b.npz", placed=False)
+
+
+def test_beside_a_table_stands_what_is_none(tmp_path: Path) -> None:
+    info, wide = np.array({"a": 1}, dtype=object), np.zeros((100, 4000), np.uint8)
+    for other in (info, wide, np.zeros((90, 60), order="F")):
+        np.savez(tmp_path / "a.npz", events=table("txyp"), img=other)
+        expect(tmp_path / "a.npz", placed=True)
+
+
+@pytest.mark.parametrize("on_its_side", [False, True])
+@pytest.mark.parametrize("order", ["txyp", "xypt", "ptyx"])
+def test_columns_of_an_hdf5_table_are_told(order: str, on_its_side: bool, tmp_path: Path) -> None:
+    path = tmp_path / "a.h5"
+    write_hdf5(path, {"events": table(order).T if on_its_side else table(order)})
+    expect(f"hdf5:{path}?columns={order}", placed=True)
+    with open_source(f"hdf5:{path}?columns={order}&swapped=1") as source:
+        got, _ = source.read()
+    np.testing.assert_array_equal(got.x, Y)
+    np.testing.assert_array_equal(got.y, X)
 
 
 @pytest.mark.parametrize(
@@ -274,58 +223,145 @@ def test_arrays_of_a_matlab_file_by_name(tmp_path: Path) -> None:
     [(1e-6, "s", "%.6f"), (1e-3, "ms", "%.3f"), (1, "us", "%d"), (1000, "ns", "%d")],
 )
 def test_times_since_1970_say_their_unit(factor: float, unit: str, form: str, tmp_path: Path) -> None:
-    rows = [f"{form % ((EPOCH_US + int(t)) * factor)},{p}" for t, p in zip(T_US, P, strict=True)]
+    since_us = 1_600_000_000_000_000
+    rows = [f"{form % ((since_us + int(t)) * factor)},{p}" for t, p in zip(T_US, P, strict=True)]
     (tmp_path / "a.csv").write_text("\n".join(["t,p", *rows]))
     with open_source(tmp_path / "a.csv") as source:
         assert source.header["time"].startswith(f"in {unit}, guessed: times since 1970")
         events, _ = source.read()
-    np.testing.assert_allclose(events.t_us - EPOCH_US, T_US, atol=1)
+    np.testing.assert_allclose(events.t_us - since_us, T_US, atol=1)
+
+
+@pytest.mark.parametrize(("many", "first_us"), [(1, 0), (40, 37_123_000), (1, 259_200_012_000)])
+@pytest.mark.parametrize("form", ["%.3f s", "%.6f s", "%.0f ms", "%.1f ms", "%.0f us", "%.0f ns"])
+def test_times_to_the_millisecond_say_their_unit(form: str, many: int, first_us: int, tmp_path: Path) -> None:
+    """Characters of eleven bits at 504 bit/s, a few events or many an edge: 4 s that would be 4 ms."""
+    rng = np.random.default_rng(0)
+    edges_us = np.cumsum(rng.integers(1, 4, 1000)) * 1e6 / 504
+    t_ms = np.rint((edges_us[:, None] + rng.exponential(200, (1000, many + 1))) / 1000)
+    t_us = np.sort(t_ms.ravel()).astype(np.int64) * 1000 + first_us
+    shape, unit = form.split()
+    factor = {"s": 1e-6, "ms": 1e-3, "us": 1.0, "ns": 1e3}[unit]
+    rows = "".join(f"{shape % (t * factor)},{k % 2}\n" for k, t in enumerate(t_us.tolist()))
+    (tmp_path / "a.csv").write_text("t,p\n" + rows)
+    with open_source(tmp_path / "a.csv") as source:
+        np.testing.assert_array_equal(source.read()[0].t_us, t_us)
+        assert "guessed" in source.header["time"]
+
+
+@pytest.mark.parametrize(("digits", "words"), [(3, "1 ms"), (4, "100 us")])
+def test_rounded_times_are_said(digits: int, words: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(text(T_S, P, head="t,p", form=f"%.{digits}f"))
+    with open_source(f"list:{tmp_path / 'a.csv'}?unit=s") as source:
+        assert source.header["step"] == f"times are rounded to {words}"
+        assert source.header["step"] in source.guessed
+        assert source.step_us == 10 ** (6 - digits)
+
+
+@pytest.mark.parametrize("suffix", ["csv", "npz"])
+def test_whole_milliseconds_of_many_pixels(suffix: str, tmp_path: Path) -> None:
+    """More a second than any sensor gives, if they were microseconds."""
+    t_ms, columns = np.sort(RNG.integers(0, 8, 80_000)), {"x": X, "y": Y, "p": P}
+    columns = {"t": t_ms} | {name: np.resize(column, 80_000) for name, column in columns.items()}
+    if suffix == "csv":
+        (tmp_path / "a.csv").write_text(text(*columns.values(), head="t,x,y,p"))
+    else:
+        write_npz(tmp_path / "a.npz", columns)
+    with open_source(tmp_path / f"a.{suffix}") as source:
+        assert source.header["step"] == "times are rounded to 1 ms"
+        assert "in ms, guessed" in source.header["time"]
+
+
+def test_times_coarser_than_a_chip_are_warned_of(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    (tmp_path / "a.csv").write_text(text(T_S, X, Y, P, head="t_s,x,y,p", form="%.3f"))
+    done = evlcp("receive", tmp_path / "a.csv", "-o", tmp_path / "out")
+    assert "times are rounded to 1 ms; a chip is 0.1 ms" in " ".join(done.out.split())
+
+
+@pytest.mark.parametrize("before_us", [200, 7000])
+@pytest.mark.parametrize("end", [1 << 32, 1 << 31, 1 << 24], ids=["uint32", "int32", "24 bits"])
+def test_counters_go_round(end: int, before_us: int, tmp_path: Path) -> None:
+    """Within the rows by which the unit is known, and beyond."""
+    n = 80_000
+    # A light that blinks at 10 kHz, as the unit is by that.
+    t_us = np.arange(n) // 1000 * 100 + np.arange(n) % 1000 // 50 + end - before_us
+    counted = t_us.astype(np.uint32)
+    columns = {
+        "t": {1 << 32: counted, 1 << 31: counted.view(np.int32), 1 << 24: counted % (1 << 24)}[end],
+        **{name: np.resize(column, n) for name, column in {"x": X, "y": Y, "p": P}.items()},
+    }
+    write_npz(tmp_path / "a.npz", columns)
+    write_npz(tmp_path / "ours.npz", {name.replace("t", "t_us"): column for name, column in columns.items()})
+    write_hdf5(tmp_path / "a.h5", columns)
+    for name in ("a.npz", "ours.npz", "a.h5"):
+        with open_source(tmp_path / name) as source:
+            got, _ = source.read()
+        np.testing.assert_array_equal(got.t_us, t_us)
+        np.testing.assert_array_equal(got.x, columns["x"])
+        assert source.counts["times_gone_round"] == 1
+        assert source.guessed.endswith("the counter of times went round")
+
+
+def test_a_clock_that_restarts_at_a_piece_has_not_gone_round(tmp_path: Path) -> None:
+    """However much was counted before: a counter of 24 bits never had that."""
+    n = PIECE_ROWS
+    t = np.concatenate([3_000_000_000 + 100 * np.arange(n), 100 * np.arange(n)])
+    np.savez(tmp_path / "a.npz", t_us=t, x=t % 640, y=t % 480, p=np.arange(2 * n) & 1)
+    with open_source(tmp_path / "a.npz") as source:
+        np.testing.assert_array_equal(source.read()[0].t_us, t)
+    assert "times_gone_round" not in source.counts
+
+
+def test_late_rows_are_sorted_in(tmp_path: Path) -> None:
+    order = np.argsort(T_US + RNG.integers(0, 5000, N), kind="stable")
+    late = {"t_us": T_US[order], "x": X[order], "y": Y[order], "p": P[order]}
+    write_npz(tmp_path / "a.npz", late)
+    write_hdf5(tmp_path / "a.h5", late)
+    (tmp_path / "a.csv").write_text(text(*late.values(), head="t_us,x,y,p"))
+    for name in ("a.npz", "a.h5", "a.csv"):
+        assert expect(tmp_path / name, placed=True).counts["rows_out_of_order"] > 1000
+
+
+def test_rows_that_are_no_number_are_dropped_and_counted(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    """Some of a long table; and where they are more than a hundredth, the result is no whole one."""
+    t_us = np.arange(50_000) * 7001
+    rows = text(t_us * 1.0, t_us % 640, t_us % 480, t_us % 2, head="t_us,x,y,p").splitlines()
+    for number, row in ((30_000, "nan,1,2,1"), (49_000, "343000000,,2,1"), (49_999, "350000000,1,2,NaN")):
+        rows.insert(number, row)
+    (tmp_path / "a.csv").write_text("\n".join(rows) + "\n")
+    with open_source(tmp_path / "a.csv") as source:
+        np.testing.assert_array_equal(source.read()[0].t_us, t_us)
+    lost = source.losses["rows_dropped"]
+    assert (lost.count, lost.first, lost.unit) == (3, 30_001, "line")
+
+    rows = text(T_US, X, Y, P).splitlines()
+    rows[::20] = [",1,1,1"] * len(rows[::20])
+    (tmp_path / "a.csv").write_text("t_us,x,y,p\n" + "\n".join(rows) + "\n")
+    done = evlcp("receive", tmp_path / "a.csv", "-o", tmp_path / "out")
+    assert done.code == 4
+    assert "150 events or words, 5.0%, were dropped" in " ".join((done.out + done.err).split())
 
 
 def test_what_a_list_does_not_say_is_told(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(text(np.arange(3000) % 7, SIGNS, T_US))
-    with pytest.raises(
-        InputError, match=r"expected the columns t and p \(or say which they are, as by list:"
-    ):
-        read_events(f"list:{tmp_path / 'a.csv'}")
+    (tmp_path / "a.csv").write_text(text(ROWS % 7, SIGNS, T_US))
     events = read_events(f"list:{tmp_path / 'a.csv'}?columns=-,p,t&unit=ms&inverted=1")
     np.testing.assert_array_equal(events.t_us, T_US * 1000)
     np.testing.assert_array_equal(events.p, 1 - P)
-    with pytest.raises(InputError, match="unit = 'hours': expected s, ms, us, ns"):
-        read_events(f"list:{tmp_path / 'a.csv'}?unit=hours")
-    with pytest.raises(InputError, match="columns = 't,q': expected t and p, or t, x, y and p"):
-        read_events(f"list:{tmp_path / 'a.csv'}?columns=t,q")
+    for options, message in (
+        ("", r"expected the columns t and p \(or say which they are, as by list:"),
+        ("?unit=hours", "unit = 'hours': expected s, ms, us, ns"),
+        ("?columns=t,q", "columns = 't,q': expected t and p, or t, x, y and p"),
+    ):
+        with pytest.raises(InputError, match=message):
+            read_events(f"list:{tmp_path / 'a.csv'}{options}")
 
 
 def test_a_last_line_that_is_cut_is_left_out_and_counted(tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(text(T_US, P, head="t,p") + "413")
-    with open_source(tmp_path / "a.csv") as source:
-        assert len(source.read()[0]) == 3000
-        assert source.counts["rows_cut"] == 1
-
-
-@pytest.mark.parametrize(
-    ("rows", "message"),
-    [
-        (
-            "t,p\n1,1\n2,up\n3,sideways\n4,1\n",
-            "line 4: polarity 'sideways', expected 0 or 1, or -1 or 1, or ON or OFF",
-        ),
-        ("t,x,y,p\n1,1,1,1\n2,99999,1,0\n", "place 99999, expected whole numbers from 0 to 65535"),
-        (
-            "t,x,y,p\n1,1,1,1\n2,1,0\n3,1,1,1\n",
-            "line 3: found '2,1,0', expected a time and a polarity, x and y",
-        ),
-    ],
-)
-def test_faults_of_words_and_places(rows: str, message: str, tmp_path: Path) -> None:
-    (tmp_path / "a.csv").write_text(rows)
-    with pytest.raises(InputError, match=message):
-        read_events(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text(LISTS["us"] + "413")
+    assert expect(tmp_path / "a.csv", placed=False).counts["rows_cut"] == 1
 
 
 def test_names_that_do_not_tell() -> None:
-    assert fields_of(["a", "b"]) is None
     assert fields_of(["t", "x", "y"]) is None
     fields = fields_of(["timestamp_ms", "t", "sign", "p"])
     assert fields is not None

@@ -4,14 +4,15 @@ import os
 import socket
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io import LoopSource, open_source, write_events
+from evlcp_sdk.io import LoopSource, StreamSource, open_source, write_events
+from evlcp_sdk.io.streams import SocketBytes
 from evlcp_sdk.values import Events, Triggers
 
 EVENTS = Events.of(np.arange(3000) * 7, np.arange(3000) % 640, np.arange(3000) % 480, np.arange(3000) % 2)
@@ -76,51 +77,46 @@ def test_datagrams_are_read_as_they_come(recording: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
-        ready = threading.Event()
 
-        def send() -> None:
+    def send() -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+            sender.connect(("localhost", port))
+            # The second is refused as long as nobody listened for the first.
+            greeted = False
+            while not greeted:
+                with suppress(ConnectionRefusedError):
+                    sender.send(header + b"% end\n")
+                    greeted = sender.send(header + b"% end\n") > 0
             # A header before every second piece, for whoever begins to listen later.
-            ready.wait(5)
             for n, at in enumerate(range(0, len(words), 1400)):
                 if n % 2 == 0:
-                    sender.sendto(header + b"% end\n", ("localhost", port))
-                sender.sendto(words[at : at + 1400], ("localhost", port))
+                    sender.send(header + b"% end\n")
+                sender.send(words[at : at + 1400])
 
-        thread = threading.Thread(target=send, daemon=True)
-        thread.start()
-        # The socket is bound before the first datagram is waited for.
-        threading.Timer(0.2, ready.set).start()
-        with open_source(f"udp://localhost:{port}") as source:
-            assert source.format == recording.stem
-            got = Events.empty()
-            for events, _ in source.stream():
-                got = Events.concat([got, events])
-                if len(got) == len(EVENTS):
-                    break
-        thread.join(5)
+    thread = threading.Thread(target=send, daemon=True)
+    thread.start()
+    with open_source(f"udp://localhost:{port}") as source:
+        assert source.format == recording.stem
+        got = Events.empty()
+        for events, _ in source.stream():
+            got = Events.concat([got, events])
+            if len(got) == len(EVENTS):
+                break
+    thread.join(5)
     assert same(got)
 
 
 def test_a_read_ends_when_the_source_is_closed(recording: Path) -> None:
-    listening = socket.create_server(("localhost", 0))
-    url = f"tcp://localhost:{listening.getsockname()[1]}"
-    ended = threading.Event()
-
-    def send() -> None:
-        connection, _ = listening.accept()
-        with connection:
-            connection.sendall(recording.read_bytes())
-            ended.wait(9)
-
-    thread = threading.Thread(target=send, daemon=True)
-    thread.start()
-    with listening:
-        source = open_source(url)
-        threading.Timer(0.2, source.close).start()
-        assert same(Events.concat(source.chunks()))
-        ended.set()
-        thread.join(5)
+    ours, theirs = socket.socketpair()
+    theirs.sendall(recording.read_bytes())
+    with ours, theirs, StreamSource("a", file=SocketBytes(ours, "a", None)) as source:
+        got = []
+        for events in source.chunks():
+            got.append(events)
+            if sum(map(len, got)) == len(EVENTS):
+                # Of a read that waits for more.
+                threading.Timer(0.2, source.close).start()
+    assert same(Events.concat(got))
 
 
 @pytest.mark.parametrize(

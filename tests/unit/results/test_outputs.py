@@ -6,78 +6,55 @@ import json
 import math
 import subprocess
 import sys
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from evlcp_kalman.tracking import NoTracking
-from evlcp_wh.modulation import Wh8
-from evlcp_wh.pilots import WhPilots
 
-from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.air.frames import PacketFormat, symbols_of_bits
+from evlcp_sdk.air.frames import symbols_of_bits
 from evlcp_sdk.diagnosis.tallies import TransmitterTally
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.link.sections import AirSpec, MessageSpec, PositionSpec, RegionSpec
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
-from evlcp_sdk.scene.bar import BarLayout
-from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
+from tests.conftest import ROOT
 
-BOOK = Codebook("wh8", WhPilots().preamble(), WhPilots().codes(16), Wh8().codewords())
-LINK = Link(
-    camera=CameraModel(),
-    camera_sigma=CameraSigma(),
-    bar=BarLayout(),
-    air=AirSpec(frames_per_packet=3),
-    regions=RegionSpec(),
-    messages=MessageSpec(decode=False),
-    position=PositionSpec(),
-    algorithms={"tracking": NoTracking(), "ranging": load_link().algorithm("ranging")},
-    revisions={"ranging": 1},
-    codebook=BOOK,
-    packet=PacketFormat.of(BOOK, 3),
-    table={"air": {"chip_rate_hz": 10_000.0, "frames_per_packet": 3}, "tracking": {"id": "none"}},
-    digest="0" * 64,
-)
+LINK = load_link(overrides=["modulation.id=wh8", "air.frames_per_packet=3", "messages.decode=false"])
 
 
 def frame(packet: int, number: int, distance_m: float = 50.0, transmitter: int = 0) -> Frame:
-    symbols = (np.arange(16) + number) % 16
-    soft = SoftSymbols(symbols, np.zeros((16, 4), np.float32), 0.875)
-    sigma = 0.05 if math.isfinite(distance_m) else math.nan
-    return Frame(
-        transmitter,
-        packet,
-        number,
-        12_345.678 + 3200 * number,
-        soft,
-        Range(distance_m, sigma, 20),
-        Range(distance_m + 1, sigma / 2, 20) if math.isfinite(distance_m) else None,
-        640.1234,
-        360.5,
-    )
+    soft = SoftSymbols((np.arange(16) + number) % 16, np.zeros((16, 4), np.float32), 0.875)
+    sigma_m = 0.05 if math.isfinite(distance_m) else math.nan
+    filtered = Range(distance_m + 1, sigma_m / 2, 20) if math.isfinite(distance_m) else None
+    found, t_us = Range(distance_m, sigma_m, 20), 12_345.678 + 3200 * number
+    return Frame(transmitter, packet, number, t_us, soft, found, filtered, 640.1234, 360.5)
 
 
-def packet(number: int, frames: tuple[Frame, ...], transmitter: int = 0, chip_us: float = 99.999) -> Packet:
-    return Packet(transmitter, number, 9_745.678 + 12_200 * number * chip_us / 100, chip_us, frames, sent=3)
+def packet(number: int, *frames: Frame, transmitter: int = 0) -> Packet:
+    return Packet(transmitter, number, 9_745.678 + 12_200 * number * 0.99999, 99.999, frames, sent=3)
 
 
-def finish(writer: ResultWriter, **kw: Any) -> dict[str, Any]:
-    given: dict[str, Any] = {
-        "status": "complete",
-        "recording": {"path": "a.raw"},
-        "processing": {"elapsed_s": 1.0},
-        "counts": {"events": 3},
-        "losses": {"odd_byte": {"count": 1, "first": 7}},
-    }
-    return writer.finish(RunEnd(**(given | kw)))
+END = RunEnd(
+    "complete", {"path": "a.raw"}, {"elapsed_s": 1.0}, {"events": 3}, {"odd_byte": {"count": 1, "first": 7}}
+)
+
+
+def result(
+    folder: Path, *packets: Packet, end: RunEnd = END, link: Any = LINK, sinks: Sequence[str] = ()
+) -> dict[str, Any]:
+    with ResultWriter(folder, link, sinks=sinks) as writer:
+        writer.write(packets)
+        return writer.finish(end)
+
+
+def lines_of(folder: Path) -> list[dict[str, Any]]:
+    return [json.loads(line) for line in (folder / "packets.jsonl").read_text().splitlines()]
 
 
 def rows_of(folder: Path) -> list[dict[str, str]]:
@@ -86,11 +63,9 @@ def rows_of(folder: Path) -> list[dict[str, str]]:
 
 
 def test_the_files_of_a_result(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path / "out", LINK) as writer:
-        writer.write([packet(0, (frame(0, 0), frame(0, 2, math.nan)))])
-        writer.write([packet(2, (frame(2, 1, 51.0),)), packet(0, (), transmitter=1)])
-        table = finish(writer)
     out = tmp_path / "out"
+    first, later = packet(0, frame(0, 0), frame(0, 2, math.nan)), packet(2, frame(2, 1, 51.0))
+    table = result(out, first, later, packet(0, transmitter=1))
     assert sorted(p.name for p in out.iterdir()) == ["frames.csv", "packets.jsonl", "summary.json"]
 
     rows = rows_of(out)
@@ -101,21 +76,20 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
     ]
     assert (rows[1]["distance_m"], rows[1]["distance_sigma_m"]) == ("", "")
 
-    lines = [json.loads(line) for line in (out / "packets.jsonl").read_text().splitlines()]
-    first = lines[0]
-    assert {line["kind"] for line in lines} == {"packet"}
-    assert (first["transmitter"], first["packet"], first["t_us"]) == (0, 0, 9745.68)
-    assert (first["frames_sent"], first["frames_received"]) == (3, 2)
-    assert first["symbols"][1] is None
-    assert first["bits"][64:128] == "?" * 64
-    heard = [int(b) for b in first["bits"][:64]]
-    assert symbols_of_bits(heard, 4, 16).tolist() == [first["symbols"][0]]
+    line, *others = lines_of(out)
+    assert {one["kind"] for one in (line, *others)} == {"packet"}
+    assert (line["transmitter"], line["packet"], line["t_us"]) == (0, 0, 9745.68)
+    assert (line["frames_sent"], line["frames_received"]) == (3, 2)
+    assert line["symbols"][1] is None
+    assert line["bits"][64:128] == "?" * 64
+    bits = [int(b) for b in line["bits"][:64]]
+    assert symbols_of_bits(bits, 4, 16).tolist() == [line["symbols"][0]]
 
     assert table == json.loads((out / "summary.json").read_text())
     assert table["result"] == "2 transmitters, 3 frames"
     assert table["messages_off"] == "messages.decode = false"
     assert table["digest"] == LINK.digest
-    assert table["codebook"] == {"digest": BOOK.digest, "profile": "wh8"}
+    assert table["codebook"] == {"digest": LINK.codebook.digest, "profile": "wh8"}
     assert table["losses"] == {"odd_byte": {"count": 1, "first": 7}}
     assert table["transmitters"][0] == {
         "transmitter": 0,
@@ -139,49 +113,33 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
 
 
 def test_packets_too_short_for_messages_are_said(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, load_link(overrides=["air.frames_per_packet=2"])) as writer:
-        assert "expected at least 18" in finish(writer)["messages_off"]
+    table = result(tmp_path, link=load_link(overrides=["air.frames_per_packet=2"]))
+    assert "expected at least 18" in table["messages_off"]
 
 
 def test_a_symbol_that_is_not_given_is_a_dash_and_null(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
     one = frame(0, 0)
     symbols = one.soft.symbols.copy()
     symbols[[0, 5]] = -1
     hidden = replace(one, soft=replace(one.soft, symbols=symbols))
-    with ResultWriter(tmp_path, LINK) as writer:
-        writer.write([packet(0, (hidden,))])
-        finish(writer)
-    (row,) = rows_of(tmp_path)
+    result(tmp_path, packet(0, hidden), sinks=["parquet"])
+    (row,), (line,) = rows_of(tmp_path), lines_of(tmp_path)
     assert row["symbols"] == "- 1 2 3 4 - 6 7 8 9 10 11 12 13 14 15"
-    (line,) = [json.loads(text) for text in (tmp_path / "packets.jsonl").read_text().splitlines()]
     assert line["symbols"][0] == [None, 1, 2, 3, 4, None, *range(6, 16)]
     assert line["bits"][:24] == "????" + "0001" + "0010" + "0011" + "0100" + "????"
     assert line["bits"][24:64] == "".join(f"{symbol:04b}" for symbol in range(6, 16))
-
-
-def test_parquet_has_null_for_a_symbol_that_is_not_given(tmp_path: Path) -> None:
-    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
-    one = frame(0, 0)
-    hidden = replace(one, soft=replace(one.soft, symbols=np.where(np.arange(16) == 3, -1, 7)))
-    with ResultWriter(tmp_path, LINK, sinks=["parquet"]) as writer:
-        writer.write([packet(0, (hidden,))])
-        finish(writer)
     (row,) = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
-    assert row["symbols"] == [7, 7, 7, None, *[7] * 12]
+    assert row["symbols"] == line["symbols"][0]
 
 
 def test_a_reflection_is_named_as_one(tmp_path: Path) -> None:
-    pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
-    import pyarrow.parquet
-
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
     own, echo = frame(0, 0), replace(frame(0, 0, transmitter=1), echo_of=0)
-    with ResultWriter(tmp_path, LINK, sinks=["parquet"]) as writer:
-        writer.write([packet(0, (own,)), packet(0, (echo,), transmitter=1)])
-        table = finish(writer)
+    table = result(tmp_path, packet(0, own), packet(0, echo, transmitter=1), sinks=["parquet"])
     assert [row["echo_of"] for row in rows_of(tmp_path)] == ["", "0"]
-    lines = [json.loads(text) for text in (tmp_path / "packets.jsonl").read_text().splitlines()]
-    assert [line["echo_of"] for line in lines] == [None, 0]
-    column = pyarrow.parquet.read_table(tmp_path / "frames.parquet")["echo_of"]
+    assert [line["echo_of"] for line in lines_of(tmp_path)] == [None, 0]
+    column = parquet.read_table(tmp_path / "frames.parquet")["echo_of"]
     assert (str(column.type), column.to_pylist()) == ("int64", [None, 0])
     assert table["result"] == "1 transmitter, 1 frame; 1 reflection, 1 frame"
     told = [(t["transmitter"], t["echo_of"], t["frames_echo"]) for t in table["transmitters"]]
@@ -193,27 +151,24 @@ def test_a_new_result_replaces_all_of_the_old_one_and_only_at_the_end(tmp_path: 
     for name in ("regions.png", "track.png", "frames.parquet", "frames.csv", "notes.txt"):
         (tmp_path / name).write_text("old")
     with ResultWriter(tmp_path, LINK) as writer:
-        writer.write([packet(0, (frame(0, 0),))])
+        writer.write([packet(0, frame(0, 0))])
         assert (tmp_path / "frames.csv").read_text() == "old"
-        finish(writer)
+        writer.finish(END)
     names = sorted(p.name for p in tmp_path.iterdir())
     assert names == ["frames.csv", "notes.txt", "packets.jsonl", "summary.json"]
     assert len(rows_of(tmp_path)) == 1
 
 
 def test_a_failed_run_says_so_and_keeps_what_was_decoded(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, LINK) as writer:
-        writer.write([packet(0, (frame(0, 0),))])
-        finish(writer, status="failed", error="a.raw: at byte 9: found x, expected y")
+    failed = replace(END, status="failed", error="a.raw: at byte 9: found x, expected y")
+    result(tmp_path, packet(0, frame(0, 0)), end=failed)
     table = json.loads((tmp_path / "summary.json").read_text())
     assert (table["status"], table["error"]) == ("failed", "a.raw: at byte 9: found x, expected y")
     assert len(rows_of(tmp_path)) == 1
 
 
 def test_the_summary_names_every_file_by_its_digest(tmp_path: Path) -> None:
-    with ResultWriter(tmp_path, LINK, sinks=["figures"]) as writer:
-        writer.write([packet(0, (frame(0, 0),))])
-        table = finish(writer)
+    table = result(tmp_path, packet(0, frame(0, 0)), sinks=["figures"])
     names = {p.name for p in tmp_path.iterdir()} - {"summary.json"}
     assert set(table["files"]) == names > {"frames.csv", "packets.jsonl"}
     for name, told in table["files"].items():
@@ -237,49 +192,35 @@ def test_parquet_without_the_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert not (tmp_path / "out").exists()
 
 
-def test_parquet_imports_no_pandas(demo_raw: Path, tmp_path: Path) -> None:
+def test_parquet_imports_no_pandas(tmp_path: Path) -> None:
     """Which takes 50 MB, and a second."""
     pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
     pytest.importorskip("pandas", reason="pandas is not installed, so that nothing could import it")
     code = (
-        "import sys, pyarrow.parquet\n"
-        "from evlcp_sdk.cli.main import main\n"
-        "sys.argv = ['evlcp', 'receive', *sys.argv[1:], '--sink', 'parquet']\n"
-        "try: main()\n"
-        "except SystemExit: pass\n"
-        "rows = pyarrow.parquet.ParquetFile(sys.argv[4] + '/frames.parquet').read().to_pylist()\n"
-        "print(len(rows), sum(len(row['symbols']) for row in rows), 'pandas' in sys.modules)\n"
+        "import sys; from pathlib import Path; from tests.unit.results.test_outputs import *\n"
+        "result(Path(sys.argv[1]), packet(0, frame(0, 0)), sinks=['parquet'])\n"
+        "print('pyarrow' in sys.modules, 'pandas' in sys.modules)"
     )
-    arguments = [sys.executable, "-c", code, demo_raw, "-o", tmp_path]
-    done = subprocess.run(arguments, capture_output=True, text=True, check=True)
-    frames = (tmp_path / "frames.csv").read_text().splitlines()[1:]
-    assert done.stdout.splitlines()[-1] == f"{len(frames)} {16 * len(frames)} False"
+    command = [sys.executable, "-c", code, tmp_path]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert done.stdout.split() == ["True", "False"]
 
 
 def test_the_median_needs_no_memory_of_every_frame() -> None:
     tally = TransmitterTally(3, 100.0)
     distances = np.random.default_rng(1).normal(60.0, 2.0, 999)
     for i in range(0, 999, 3):
-        tally.add(packet(i // 3, tuple(frame(i // 3, k, float(distances[i + k])) for k in range(3))))
+        tally.add(packet(i // 3, *(frame(i // 3, k, float(distances[i + k])) for k in range(3))))
     assert tally.median_m() == pytest.approx(np.median(distances), abs=0.006)
-    tally.add(packet(333, (frame(333, 0, 1e300),)))
+    tally.add(packet(333, frame(333, 0, 1e300)))
     assert max(tally.cells) == 100_000
 
 
-@pytest.mark.parametrize("parquet", [False, True])
-def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path, parquet: bool) -> None:
-    if parquet:
-        pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
+def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path) -> None:
+    parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
     link = load_link(overrides=["tracking.id=kalman"])
-    with ResultWriter(tmp_path, link, sinks=["parquet"] * parquet) as writer:
-        writer.write([packet(0, (frame(0, 0), frame(0, 1, math.nan)))])
-        finish(writer)
-    with (tmp_path / "frames.csv").open() as file:
-        first, second = csv.DictReader(file)
-    assert (first["distance_filtered_m"], first["distance_filtered_sigma_m"]) == ("51.0000", "0.0250")
-    assert (second["distance_filtered_m"], second["distance_filtered_sigma_m"]) == ("", "")
-    if parquet:
-        import pyarrow.parquet
-
-        table = pyarrow.parquet.read_table(tmp_path / "frames.parquet").to_pylist()
-        assert [row["distance_filtered_m"] for row in table] == [51.0, None]
+    result(tmp_path, packet(0, frame(0, 0), frame(0, 1, math.nan)), link=link, sinks=["parquet"])
+    told = [(row["distance_filtered_m"], row["distance_filtered_sigma_m"]) for row in rows_of(tmp_path)]
+    assert told == [("51.0000", "0.0250"), ("", "")]
+    table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
+    assert [row["distance_filtered_m"] for row in table] == [51.0, None]
