@@ -333,7 +333,7 @@ class _Text:
             more = ", x and y" if self.fields.places else ""
             raise _LineError(number, f"found {_show(line)}, expected a time and a polarity{more}")
         cells = self.cells(line)
-        return [cells[k] or "nan" for k in self.fields.which]
+        return [cells[k] for k in self.fields.which]
 
     def number(self, lines: list[bytes], first: int, row: int) -> int:
         """In which line the row stands, of these from `first` on, the row from 0."""
@@ -366,7 +366,7 @@ class _Text:
         try:
             Polarities().of(np.array([cells[self.fields.polarity] or "nan"]))
         except ValueError:
-            return _is_number(cells[self.fields.polarity])
+            return _is_number(cells[self.fields.polarity] or "nan")
         return True
 
 
@@ -377,6 +377,7 @@ def _split(cells: NDArray[np.str_]) -> tuple[NDArray[Any], NDArray[Any], NDArray
         ValueError: A time or a place is no number.
     """
     cells = np.char.strip(cells, " \t\"'")
+    cells[cells == ""] = "nan"
     try:
         times: NDArray[Any] = cells[:, 0].astype(np.int64)
     except (ValueError, OverflowError):
