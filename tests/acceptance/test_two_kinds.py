@@ -17,7 +17,7 @@ from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.run import film, receive, receive_to_folder
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes, load_sites
-from evlcp_sdk.sim.truth import read_truth
+from evlcp_sdk.sim.truth import read_truth, truth_path
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.compare import compare_recording
 from evlcp_sdk.study.frames import frames_of, read_frames
@@ -56,37 +56,49 @@ def compare_and_film(folder: Path, links: list[Path], score: dict[str, Any]) -> 
     assert len(told["transmitters"]) == 2
 
 
-def test_bars_of_two_links_give_one_position(tmp_path: Path) -> None:
-    """A bar and a shorter one of another alphabet: positions by gravity alone need both."""
-    (tmp_path / "bar.toml").write_text("")
-    (tmp_path / "short.toml").write_text('[modulation]\nid = "wh8"\n[bar]\nrows = 60\n')
-    (tmp_path / "scene.toml").write_text(
-        "duration_s = 0.2\n[background]\nlight_w_m2 = 1e-3\n[motion]\ndistance_m = 45.0\npitch_deg = 4.0\n"
+@pytest.fixture(scope="module")
+def two_links(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path]]:
+    """A recording of a bar and a shorter one of another alphabet, and their links."""
+    folder = tmp_path_factory.mktemp("two")
+    links = [folder / "bar.toml", folder / "short.toml"]
+    links[0].write_text("")
+    links[1].write_text('[modulation]\nid = "wh8"\n[bar]\nrows = 60\ncluster_rows = 6\n')
+    (folder / "scene.toml").write_text(
+        "duration_s = 0.24\n[background]\nlight_w_m2 = 1e-3\n[motion]\ndistance_m = 45.0\npitch_deg = 4.0\n"
         "[world]\nlatitude_deg = 35.1\nlongitude_deg = 137.0\nheight_m = 50.0\nheading_deg = 30.0\n"
-        '[[bars]]\nx_m = -3.0\ny_m = -3.5\nlink = "bar.toml"\n'
-        '[[bars]]\nx_m = 3.0\ny_m = -4.0\nlink = "short.toml"\n'
+        '[[bars]]\nx_m = -3.0\ny_m = -3.5\npayload = "messages"\nlink = "bar.toml"\n'
+        '[[bars]]\nx_m = 3.0\ny_m = -4.0\npayload = "messages"\nlink = "short.toml"\n'
     )
-    source = simulate(tmp_path / "scene.toml", 3)
-    source.save(tmp_path / "two.raw")
-    links = [tmp_path / "bar.toml", tmp_path / "short.toml"]
-    named = zip(load_sites(tmp_path / "two.site.toml"), ("bar", "short"), strict=True)
+    simulate(folder / "scene.toml", 3).save(folder / "two.raw")
+    return folder / "two.raw", links
+
+
+def fixes_in(folder: Path) -> list[dict[str, str]]:
+    """Rows of positions, each by bars of both links."""
+    with (folder / "fixes.csv").open(newline="") as file:
+        fixes = [row for row in csv.DictReader(file) if not row["refusal"]]
+    assert {" ".join(sorted(row["link"].split())) for row in fixes} == {"bar short"}
+    return fixes
+
+
+def test_bars_of_two_links_give_one_position(two_links: tuple[Path, list[Path]], tmp_path: Path) -> None:
+    """Positions by gravity alone need both."""
+    recording, links = two_links
+    named = zip(load_sites(recording.with_suffix(".site.toml")), ("bar", "short"), strict=True)
     sites = tuple(replace(site, link=name, transmitter=None) for site, name in named)
-    truth = read_truth(tmp_path / "two.truth.json")
+    truth = read_truth(truth_path(recording))
     pitch, roll = (float(np.mean(truth.camera_path[name])) for name in ("pitch_deg", "roll_deg"))
-    attitude = Attitude(pitch, roll, None, 0.3)
     lines: list[str] = []
     receive_to_folder(
-        tmp_path / "two.raw",
-        tmp_path / "out",
+        recording,
+        tmp_path,
         links,
         plan=PositionPlan(sites),
-        attitude=attitude,
+        attitude=Attitude(pitch, roll, None, 0.3),
         lines=lines.append,
     )
-    with (tmp_path / "out" / "fixes.csv").open(newline="") as file:
-        fixes = [row for row in csv.DictReader(file) if not row["refusal"]]
+    fixes = fixes_in(tmp_path)
     assert len(fixes) >= 3
-    assert {" ".join(sorted(row["link"].split())) for row in fixes} == {"bar short"}
     said = {told["link"] for told in map(json.loads, lines) if told["line"] == "fix"}
     assert said == {row["link"] for row in fixes}
     keys = ("latitude_deg", "longitude_deg", "height_m")
@@ -98,27 +110,21 @@ def test_bars_of_two_links_give_one_position(tmp_path: Path) -> None:
         assert np.linalg.norm(off) < 1.5
 
 
-def test_bars_of_two_links_are_surveyed(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+def test_bars_of_two_links_are_surveyed(
+    two_links: tuple[Path, list[Path]], tmp_path: Path, evlcp: Callable[..., Any]
+) -> None:
     """From sites to sites: what a survey of two links says, positions by it, and names that no link has."""
-    (tmp_path / "bar.toml").write_text("")
-    (tmp_path / "short.toml").write_text('[modulation]\nid = "wh8"\n[bar]\nrows = 60\ncluster_rows = 6\n')
-    (tmp_path / "scene.toml").write_text(
-        "duration_s = 0.24\n[background]\nlight_w_m2 = 1e-3\n[motion]\ndistance_m = 45.0\npitch_deg = 4.0\n"
-        "[world]\nlatitude_deg = 35.1\nlongitude_deg = 137.0\nheight_m = 50.0\nheading_deg = 30.0\n"
-        '[[bars]]\nx_m = -3.0\ny_m = -3.5\npayload = "messages"\nlink = "bar.toml"\n'
-        '[[bars]]\nx_m = 3.0\ny_m = -4.0\npayload = "messages"\nlink = "short.toml"\n'
-    )
-    recording, poses, out = tmp_path / "two.raw", tmp_path / "poses.csv", tmp_path / "new.toml"
-    simulate(tmp_path / "scene.toml", 3).save(recording)
-    path = read_truth(tmp_path / "two.truth.json").camera_path
+    recording, (bar, short) = two_links
+    poses, out = tmp_path / "poses.csv", tmp_path / "new.toml"
+    path = read_truth(truth_path(recording)).camera_path
     names = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "pitch_deg", "roll_deg")
     lines = [",".join(("t_us", *names, "attitude_sigma_deg"))]
     lines += [f"{ms}000," + ",".join(str(path[n][ms]) for n in names) + ",0.01" for ms in (90, 130, 180)]
     poses.write_text("\n".join(lines) + "\n")
-    links = ("-c", tmp_path / "bar.toml", "-c", tmp_path / "short.toml")
+    links = ("-c", bar, "-c", short)
     done = evlcp("survey", recording, "--poses", poses, "-o", out, *links, "--json")
     assert done.code == 0, done.err
-    true = {site.transmitter_id: site for site in load_sites(tmp_path / "two.site.toml")}
+    true = {site.transmitter_id: site for site in load_sites(recording.with_suffix(".site.toml"))}
     found = load_sites(out)
     assert [(site.link, site.length_m) for site in found] == [("bar", 0.96), ("short", 0.6)]
     for site, told in zip(found, json.loads(done.out)["bars"], strict=True):
@@ -131,9 +137,7 @@ def test_bars_of_two_links_are_surveyed(tmp_path: Path, evlcp: Callable[..., Any
     angles = ("--pitch-deg", "4", "--roll-deg", "0", "--gravity-sigma-deg", "0.3", "--heading-deg", "30")
     receive_it = ("receive", recording, *links, *angles, "-o", tmp_path / "out")
     assert evlcp(*receive_it, "--sites", out).code == 0
-    with (tmp_path / "out" / "fixes.csv").open(newline="") as file:
-        fixes = [row for row in csv.DictReader(file) if not row["refusal"]]
-    assert {" ".join(sorted(row["link"].split())) for row in fixes} == {"bar short"}
+    assert fixes_in(tmp_path / "out")
 
     out.write_text(out.read_text().replace('"short"', '"shrot"'))
     told = "link = 'shrot': no link is named so; did you mean 'short'? (links: bar, short)"

@@ -24,8 +24,7 @@ from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.sim.scene import resolve_scene
-from evlcp_sdk.testing import check, laws_of
-from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
+from evlcp_sdk.testing import check
 
 ROOT = Path(__file__).parents[2]
 PAGES = (
@@ -232,15 +231,6 @@ def test_the_examples_of_every_role_keep_its_laws(role: str, workplace: Path) ->
                 assert outcome.status == "ok", f"{outcome.law.name}: {outcome.detail}"
         finally:
             sys.modules.pop(first[1], None)
-
-
-def test_a_law_of_form_is_of_every_role_but_two() -> None:
-    without = {role for role in ROLES if not {law.name for law in FUNCTION} & {r.name for r in laws_of(role)}}
-    assert without == {"pilots", "modulation"}
-    for role in ROLES:
-        names = [law.name for law in laws_of(role)]
-        assert {law.name for law in DESCRIPTION + RESULT} <= set(names)
-        assert len(names) == len(set(names))
 
 
 def test_the_quickstart_is_the_example(capsys: pytest.CaptureFixture[str], workplace: Path) -> None:

@@ -22,50 +22,48 @@ def bound(**how: float) -> float:
     return bar_bound(LINK, symbols=np.arange(K), **given).distance_m
 
 
-def test_the_bound_follows_noise_and_distance() -> None:
-    assert bound(noise=0.6) == pytest.approx(2 * bound())
-    assert bound(columns=20.0) == pytest.approx(bound() / 2)
-    # A boundary is as sure at any distance: the error grows with its square.
-    assert bound(distance_m=100.0) == pytest.approx(4 * bound(), rel=0.2)
-    with pytest.raises(ConfigError, match="noise = 0"):
-        bound(noise=0)
-
-
-@pytest.mark.parametrize("blur_px", [0.6, 0.9])
-def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
-    # Where blur smooths the pixel grid, a boundary with a step of 2 has the information
-    # sum of (2 gain pdf)^2 = 2 gain^2 / (sqrt(pi) blur) a column and value, wherever it lies.
-    codes = np.concatenate([LINK.codebook.pilot_edges, LINK.codebook.codeword_edges[np.arange(K)]], axis=1)
-    steps = np.diff(codes.astype(float), axis=0)
-    values = codes.shape[1]
-    each = 0.8**2 * steps**2 / (2 * np.sqrt(np.pi) * blur_px) * 5 / 0.3**2
-    apart = np.arange(1, K) - K / 2
-    when = np.arange(values) / values - 0.5
-    slopes = np.stack([np.repeat(apart[:, None], values, 1), np.ones_like(each), np.tile(when, (K - 1, 1))])
-    information = np.einsum("aki,bki,ki->ab", slopes, slopes, each)
-    spacing_px = LINK.camera.focal_px * 0.06 / 50
-    want = 50 / spacing_px * np.sqrt(np.linalg.inv(information)[0, 0])
-    assert bound(blur_px=blur_px) == pytest.approx(want, rel=0.02)
-
-
 def lean_bound(**how: float) -> float:
     given = {"distance_m": 50.0, "blur_px": 0.45, "noise": 0.3} | how
     return bar_bound(LINK, symbols=np.arange(K), **given).lean_deg
 
 
-def test_the_bound_of_the_lean_follows_noise_and_distance() -> None:
-    assert lean_bound(noise=0.6) == pytest.approx(2 * lean_bound())
-    assert lean_bound(distance_m=100.0) == pytest.approx(4 * lean_bound(), rel=0.2)
-    with pytest.raises(ConfigError, match="distance_m = -1"):
-        lean_bound(distance_m=-1)
+def test_the_bound_follows_noise_and_distance() -> None:
+    for one in (bound, lean_bound):
+        assert one(noise=0.6) == pytest.approx(2 * one())
+        assert one(columns=20.0) == pytest.approx(one() / 2)
+        # A boundary is as sure at any distance: the error grows with its square.
+        assert one(distance_m=100.0) == pytest.approx(4 * one(), rel=0.2)
+    for name in ("noise", "distance_m"):
+        with pytest.raises(ConfigError, match=f"{name} = -1"):
+            bound(**{name: -1})
 
 
-@pytest.mark.parametrize("distance_m", [15.0, 50.0, 90.0])
-def test_the_bound_of_the_lean_is_that_of_boundaries_by_themselves(distance_m: float) -> None:
-    """Boundaries of a leaning bar where a pinhole sees them, derived numerically; each as sure as above."""
+def sigma_of_first(*by_boundary: np.ndarray, blur_px: float) -> float:
+    """Standard deviation of the first of parameters that move boundaries by so much, beside drift.
+
+    Where blur smooths the pixel grid, a boundary with a step of 2 has the information
+    sum of (2 gain pdf)^2 = 2 gain^2 / (sqrt(pi) blur) a column and value, wherever it lies.
+    """
     codes = np.concatenate([LINK.codebook.pilot_edges, LINK.codebook.codeword_edges[np.arange(K)]], axis=1)
     steps = np.diff(codes.astype(float), axis=0)
-    each = 0.8**2 * steps**2 / (2 * np.sqrt(np.pi) * 0.9) * 5 / 0.3**2
+    values = codes.shape[1]
+    each = 0.8**2 * steps**2 / (2 * np.sqrt(np.pi) * blur_px) * 5 / 0.3**2
+    when = np.tile(np.arange(values) / values - 0.5, (K - 1, 1))
+    slopes = np.stack([*(np.repeat(column[:, None], values, 1) for column in by_boundary), when])
+    information = np.einsum("aki,bki,ki->ab", slopes, slopes, each)
+    return float(np.sqrt(np.linalg.inv(information)[0, 0]))
+
+
+@pytest.mark.parametrize("blur_px", [0.6, 0.9])
+def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
+    want = sigma_of_first(np.arange(1, K) - K / 2, np.ones(K - 1), blur_px=blur_px)
+    spacing_px = LINK.camera.focal_px * 0.06 / 50
+    assert bound(blur_px=blur_px) == pytest.approx(50 / spacing_px * want, rel=0.02)
+
+
+@pytest.mark.parametrize("distance_m", [15.0, 90.0])
+def test_the_bound_of_the_lean_is_that_of_boundaries_by_themselves(distance_m: float) -> None:
+    """Boundaries of a leaning bar where a pinhole sees them, derived numerically."""
     along_m = 0.06 * (np.arange(1, K) - K / 2)
 
     def rows(sine: float, scale: float) -> np.ndarray:
@@ -74,11 +72,7 @@ def test_the_bound_of_the_lean_is_that_of_boundaries_by_themselves(distance_m: f
 
     lean = (rows(1e-4, 1.0) - rows(-1e-4, 1.0)) / 2e-4
     scale = (rows(0.0, 1 + 1e-4) - rows(0.0, 1 - 1e-4)) / 2e-4
-    when = np.arange(codes.shape[1]) / codes.shape[1] - 0.5
-    by_boundary = [np.repeat(column[:, None], len(when), 1) for column in (lean, scale, np.ones(K - 1))]
-    slopes = np.stack([*by_boundary, np.tile(when, (K - 1, 1))])
-    information = np.einsum("aki,bki,ki->ab", slopes, slopes, each)
-    want = np.degrees(np.sqrt(np.linalg.inv(information)[0, 0]))
+    want = np.degrees(sigma_of_first(lean, scale, np.ones(K - 1), blur_px=0.9))
     assert lean_bound(distance_m=distance_m, blur_px=0.9) == pytest.approx(want, rel=0.03)
 
 

@@ -1,4 +1,4 @@
-"""Statistics of decoded frames, and of positions beside the camera's path."""
+"""Positions beside the camera's path."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -15,78 +15,13 @@ from evlcp_sdk.sim import (
     Truth,
     resolve_scene,
     sites_of,
-    truth_from_table,
     truth_of,
 )
 from evlcp_sdk.sim.scene import WorldSpec
 from evlcp_sdk.sim.world import attitude_log, sites_said
-from evlcp_sdk.study.frames import row_of_frame
-from evlcp_sdk.study.measure import position_tallies, statistics_of
-from evlcp_sdk.study.tally import Statistics, Tally
+from evlcp_sdk.study.measure import position_tallies
+from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
-
-CHIPS = 26 + 32 * 2
-TRUTH = truth_from_table(
-    {
-        "scene": {"duration_s": 0.02, "t0_us": 1000},
-        "t_s": [0.0, 0.02],
-        "distance_m": [[40.002, 39.998]],
-        "bar_centre_px": [[[600.0, 600.0], [300.0, 300.0]]],
-        "bars": [
-            {
-                "profile": "wh4x2",
-                "frames": 2,
-                "packet_chips": CHIPS,
-                "ppm": 0.0,
-                "start_chip": 26.0,
-                "symbols": [[[1, 2], [3, 4]], [[5, 6], [7, 8]]],
-                "clusters": 2,
-            }
-        ],
-    }
-)
-
-
-def frame(t_us: float, symbols: list[int], distance_m: float, x_px: float = 601.0) -> Frame:
-    soft = SoftSymbols(np.array(symbols), np.zeros((len(symbols), 6), np.float32), 1.0)
-    return Frame(
-        transmitter=0,
-        packet=0,
-        frame=0,
-        t_us=t_us + 1000,
-        soft=soft,
-        range=Range(distance_m, 0.1, 3),
-        filtered=None,
-        x_px=x_px,
-        y_px=301.0,
-    )
-
-
-def test_each_frame_is_held_beside_the_sent_one() -> None:
-    frames = [
-        frame(20, [1, 2], 40.5),
-        frame(3200, [3, 5], float("nan")),
-        frame(3300, [3, 4], 40.0),
-        frame(9050, [5, 6], 39.9, x_px=700.0),
-        frame(9050, [5, 7], 39.9),
-    ]
-    found = statistics_of(map(row_of_frame, frames), TRUTH, events=123, packets=4)
-    assert (found.tasks, found.events, found.duration_us, found.unmatched) == (1, 123, 20_000, 2)
-    assert (found.rows, found.packets, found.stated) == (5, 4, 4)
-    assert found.sigma_m == pytest.approx(0.1)
-    (near, at_30), (far, at_40) = found.segments.items()
-    assert (near, far) == (30, 40)
-    # Frames begin at 0, 3.2, 9 and 12.2 ms; the bar is 40 m away at 10 ms.
-    assert (at_40.frames_sent, at_40.frames_found, at_40.bits, at_40.bit_errors) == (3, 3, 36, 2)
-    assert (at_40.ranged, at_40.gross) == (2, 0)
-    assert (at_30.frames_sent, at_30.frames_found) == (1, 0)
-    assert at_40.bias_m == pytest.approx(((40.5 - 40.00184) + (39.9 - 40.00004)) / 2, abs=1e-4)
-
-
-def test_a_scene_without_bars_has_only_ghosts() -> None:
-    found = statistics_of([row_of_frame(frame(20, [1, 2], float("nan")))], replace(TRUTH, bars=()))
-    assert found == Statistics(tasks=1, duration_us=20_000, rows=1, unmatched=1)
-
 
 GATE = {
     "duration_s": 0.12,

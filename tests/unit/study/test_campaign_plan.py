@@ -7,14 +7,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import given, settings, strategies as st
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.study.plan import (
     Case,
     Plan,
     StopRule,
-    digest_of,
     load_plan,
     make_plan,
     plan_from_dict,
@@ -99,12 +97,6 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
     assert shared(environment={"evlcp-sdk": "2"}) == 0
 
 
-@settings(max_examples=20)
-@given(st.dictionaries(st.text(max_size=4), st.one_of(st.integers(), st.text(max_size=4), st.booleans())))
-def test_a_digest_knows_no_order(table: dict[str, Any]) -> None:
-    assert digest_of(table) == digest_of(dict(reversed(table.items())))
-
-
 def test_links_that_differ_in_name_only_are_one_task() -> None:
     links = [Case({"variant": name}, 0, 0) for name in "ab"]
     plan = make_plan("x", [Case({}, 0, 0)], links, [0])
@@ -140,27 +132,18 @@ def test_an_override_takes_the_place_of_an_axis(tmp_path: Path) -> None:
         ("seeds = 3", "sedes = 3", "c.toml: campaign.sedes = 3: unknown key; did you mean 'seeds'?"),
         ('name = "try"', "", "c.toml: campaign.name: missing"),
         ('name = "try"', 'name = "a/b"', 'campaign.name = "a/b": expected to match pattern'),
-        ('name = "try"', 'name = "a "', 'campaign.name = "a ": expected to match pattern'),
         ("[20, 30]", "20", "c.toml: scene.grid.speed_kmh = 20: expected a list of values"),
         ("[20, 30]", "[20, 20]", "c.toml: scene.grid.speed_kmh: a value stands there twice"),
-        ("[20, 30]", "[]", "expected a list of values"),
         ("speed_kmh", "wrong", "c.toml: scene: wrong: unknown key"),
         ("seeds = 3", 'seeds = 3\nmerge = ["scene.speed"]', "campaign.merge: 'scene.speed' is not varied"),
         ("[campaign]", "[campaign", "c.toml: not TOML: "),
         ("[scene.grid]", "[sceen.grid]", "c.toml: sceen: unknown table; did you mean 'scene'?"),
     ],
 )
-def test_faults_are_told_with_their_path(tmp_path: Path, old: str, new: str, told: str) -> None:
+def test_faults_are_reported_with_their_path(tmp_path: Path, old: str, new: str, told: str) -> None:
     with pytest.raises(ConfigError) as fault:
         plan_of(tmp_path, TEXT.replace(old, new))
     assert told in str(fault.value)
-
-
-def test_overrides_that_name_nothing(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"--set seeds=3: expected campaign\.KEY="):
-        plan_of(tmp_path, overrides=["seeds=3"])
-    with pytest.raises(ConfigError, match=r"none\.toml: cannot be read"):
-        load_plan(tmp_path / "none.toml", made, made, {})
 
 
 def test_a_grid_of_too_many_points_is_refused_at_once(tmp_path: Path) -> None:

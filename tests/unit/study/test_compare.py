@@ -5,14 +5,13 @@ import io
 import json
 import math
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import pytest
+from markupsafe import Markup, escape
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.sim.truth import truth_path
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.compare import _Watch
 from evlcp_sdk.study.comparison import (
@@ -79,35 +78,6 @@ def comparison(*tables: Table) -> Comparison:
     return Comparison(about, tables, ("a note, with <brackets>",), {"python": "3"})
 
 
-class Cells(HTMLParser):
-    """The tables of a page: (text, is bold) a cell."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.tables: list[list[list[tuple[str, bool]]]] = []
-        self.asks: list[str] = []
-        self._inside = self._bold = False
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.asks += [str(v) for k, v in attrs if k in ("src", "href") and not str(v).startswith("data:")]
-        if tag == "table":
-            self.tables.append([])
-        elif tag == "tr":
-            self.tables[-1].append([])
-        elif tag in ("td", "th"):
-            self._inside, self._bold = True, False
-            self.tables[-1][-1].append(("", False))
-        elif tag == "b":
-            self._bold = True
-
-    def handle_endtag(self, tag: str) -> None:
-        self._inside = self._inside and tag not in ("td", "th")
-
-    def handle_data(self, data: str) -> None:
-        if self._inside:
-            self.tables[-1][-1][-1] = (data, self._bold)
-
-
 def test_figures_by_hand() -> None:
     m = measured()
     assert m.tally.ber == 3 / 8448
@@ -165,13 +135,12 @@ def test_cells() -> None:
         assert all(best == text.endswith("*") for text, best in line)
     head, lines = table(BLIND, bound=None).cells()
     assert head == ["variant", "frames", "packets", "sigma, m", "x real time"]
+    assert [text for text, _ in lines[0]] == ["v0", "5", "1", "0.2000", "1.00"]
     head, lines = table(
         measured(visible=200, erased=1, hidden=50, claimed=20), measured(), bound=None
     ).cells()
     rows = [dict(zip(head, (text for text, _ in line), strict=True)) for line in lines]
     assert [(row["erased"], row["claimed"]) for row in rows] == [("0.5%", "40.0%"), ("-", "-")]
-    head, lines = table(BLIND, bound=None).cells()
-    assert [text for text, _ in lines[0]] == ["v0", "5", "1", "0.2000", "1.00"]
 
 
 def test_total_adds_recordings() -> None:
@@ -211,15 +180,12 @@ def test_json_csv_and_html_parse_back() -> None:
                 assert float(line[key]) == value, key
             elif value is None:
                 assert line[key] == "", key
-    page = Cells()
-    page.feed(whole.to_html())
-    assert page.asks == []
-    assert "<h1>Variants compared: v0 and v1 on 2 recordings</h1>" in whole.to_html()
-    for found, one in zip(page.tables, whole.tables, strict=True):
-        head, lines = one.cells()
-        assert [text for text, _ in found[0]] == head
-        assert found[1:] == lines
-    assert "&lt;brackets&gt;" in whole.to_html()
+    page = whole.to_html()
+    assert "<h1>Variants compared: v0 and v1 on 2 recordings</h1>" in page
+    assert "&lt;brackets&gt;" in page
+    for one in whole.tables:
+        for text, best in (cell for line in one.cells()[1] for cell in line):
+            assert (Markup("<b>{}</b>").format(text) if best else escape(text)) in page
 
 
 def test_figures_in_which_rows_differ_are_drawn() -> None:
@@ -255,20 +221,12 @@ def test_of_five_recordings_a_bar_has_its_interval() -> None:
     assert page.count("as bars") == 5
 
 
-def test_the_legend_speaks_of_the_columns_that_are_there() -> None:
-    assert "x real time" in comparison(table(measured(), measured())).legend
-    plain = comparison(table(measured(times={})))
-    assert "BER is of" in plain.legend
-    assert "best of its column" not in plain.legend
-
-
 @pytest.mark.parametrize(
     ("text", "told"),
     [
         ("joint", "--variant joint: expected NAME:TABLE.KEY=VALUE"),
         (":ranging.id=poc", "expected NAME:"),
         ("a:ranging", "('ranging'): expected NAME:"),
-        ("a:ranging.id=pco", "--variant a: no ranging algorithm named 'pco'; did you mean 'poc'?"),
         ("a:ranging.foo=1", "--variant a: ranging.foo = 1: unknown key"),
         ("base:ranging.id=centroid", "the name 'base' is taken"),
     ],
@@ -293,11 +251,6 @@ def test_variants_share_what_is_set_for_all() -> None:
     with pytest.raises(ConfigError) as fault:
         load_variants(["a:", "b:ranging.id=poc"], overrides=["bar.rows=x"])
     assert str(fault.value).startswith('--set: bar.rows = "x": expected')
-
-
-@pytest.mark.parametrize("name", ["night.raw", "night.csv.gz", "night.npz", "night"])
-def test_truth_lies_beside(name: str) -> None:
-    assert truth_path(f"folder/{name}").as_posix() == "folder/night.truth.json"
 
 
 def test_time_counts_of_frames_only() -> None:
@@ -326,7 +279,4 @@ def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
     assert "x real time" not in whole.legend
     # Twice the error in every frame.
     assert "rmse_m" in whole.tables[2].best()[0]
-    head, lines = whole.tables[0].cells()
-    assert "us/frame" not in head
-    assert "packets" in head
-    assert len(lines) == 2
+    assert "packets" in whole.tables[0].cells()[0]

@@ -87,10 +87,8 @@ def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) ->
     ("overrides", "told"),
     [
         (["scene.motion.distence_m=3"], "motion.distence_m = 3: unknown key; did you mean 'distance_m'?"),
-        (["scene.motion.distance_m=-5"], "motion.distance_m = -5: expected greater than 0"),
         (["scene.bars.z_m=-100"], "the bar is behind the camera"),
         (["link.ranging.id=pco"], "no ranging algorithm named 'pco'; did you mean 'poc'?"),
-        (["campaign.seeds=0"], "campaign.seeds = 0: expected greater than or equal to 1"),
         (["seeds=0"], "--set seeds=0: expected campaign.KEY="),
     ],
 )
@@ -103,14 +101,6 @@ def test_bad_campaigns_are_one_line(
     assert told in done.err
     assert len(done.err.splitlines()) <= 2
     assert not (tmp_path / "r.sqlite").exists()
-
-
-def test_a_bar_that_the_link_does_not_speak_to(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
-    options = ("--set", "scene.bars.link.modulation.id=wh4x2", "--set", "link.modulation.id=wh8")
-    done = evlcp("sweep", campaign, "-o", tmp_path / "r.sqlite", *options, "--workers", "0")
-    assert done.code == 2
-    assert "the scene: bar 0 was sent with another link: modulation.id: sent with" in done.err
-    assert len(done.err.splitlines()) == 1
 
 
 def test_other_code_is_refused(campaign: Path) -> None:
