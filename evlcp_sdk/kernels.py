@@ -103,7 +103,9 @@ class _Kernel:
             if self._made is None:
                 self._made = _compiled(self._function, self._options)
                 names = self._function.__globals__
-                names |= {n: one.made() for n, one in names.items() if isinstance(one, _Kernel)}
+                for name in [name for name, one in names.items() if isinstance(one, _Kernel)]:
+                    if isinstance(one := names[name], _Kernel):
+                        names[name] = one.made()
         return self._made
 
 

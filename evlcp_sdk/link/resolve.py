@@ -71,6 +71,7 @@ class Link:
         digest: SHA-256 of table, codebook digest and revisions, 64 hex digits.
         kinds: The kinds of messages that are understood, by number; those that are installed.
         name: What a receiver of several links calls it: its file's without `.toml`; empty without a file.
+        built_in: Roles whose algorithm comes with the SDK: what it gives is checked by tests alone.
 
     Two links are equal when their digests are.
     """
@@ -90,6 +91,7 @@ class Link:
     digest: str
     kinds: Mapping[int, MessageKind] = field(default_factory=lambda: BUILT_IN_KINDS)
     name: str = ""
+    built_in: frozenset[str] = frozenset()
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Link) and self.digest == other.digest
@@ -178,13 +180,15 @@ class Link:
                 {name: value for name, value in each.items() if name not in unused}
                 for each in (parts, table, revisions)
             )
-        return _assembled(parts, table, revisions, self.kinds, self.name)
+        link = _assembled(parts, table, revisions, self.kinds, self.name)
+        return replace(link, built_in=self.built_in - {role})
 
     def with_air(self, **changes: Any) -> "Link":
         """The same link with other values on air, e.g. `link.with_air(pilot_every=4)`."""
         air = replace(self.air, **changes)
         parts, table = self._parts() | {"air": air}, {**self.table, "air": asdict(air)}
-        return _assembled(parts, table, self.revisions, self.kinds, self.name)
+        link = _assembled(parts, table, self.revisions, self.kinds, self.name)
+        return replace(link, built_in=self.built_in)
 
     def block_coder(self) -> BlockCoder:
         """How packets carry blocks of messages.
@@ -270,7 +274,8 @@ def resolve(
     if faults:
         raise ConfigError("\n".join(str(f) for f in faults))
     resolved = {section: resolver.resolved[section] for section in _KNOWN if section in resolver.resolved}
-    return _assembled(resolver.built, resolved, resolver.revisions, message_kinds(registry))
+    link = _assembled(resolver.built, resolved, resolver.revisions, message_kinds(registry))
+    return replace(link, built_in=frozenset(resolver.built_in))
 
 
 _KNOWN = [*_SPECS, *ROLES]
@@ -291,6 +296,7 @@ class _Resolver:
         built: What each section describes.
         resolved: Each section with all its defaults, plain values.
         revisions: Of the algorithms, by role.
+        built_in: Roles whose algorithm comes with the SDK.
     """
 
     def __init__(
@@ -307,6 +313,7 @@ class _Resolver:
         self.built: dict[str, Any] = {}
         self.resolved: dict[str, dict[str, Any]] = {}
         self.revisions: dict[str, int] = {}
+        self.built_in: set[str] = set()
 
     def check_sections(self) -> None:
         """Find sections that there are not, or that are no tables."""
@@ -358,6 +365,7 @@ class _Resolver:
             return None
         self.revisions[section] = installed.algorithm.revision
         cls, ours = self._registry.load_class(section, name), installed.distribution == "evlcp-sdk"
+        self.built_in |= {section} if ours else set()
         with _named(section, {section: {"id": name}}):
             self.built[section] = _built(cls, keys, ours=ours)
             return {"id": name} | asdict(self.built[section])

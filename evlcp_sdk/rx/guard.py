@@ -38,6 +38,9 @@ class Guard:
         role: Its role.
         may_refuse: Whether it is compiled there: a stream is no place to refuse a configuration.
 
+    Attributes:
+        checks: Whether what it gives is to be checked: not what comes with the SDK, whose tests do.
+
     >>> from evlcp_sdk.link.resolve import load_link
     >>> with Guard(load_link(), "ranging"):
     ...     {}["boom"]
@@ -51,6 +54,7 @@ class Guard:
         passes: list[type[BaseException]] = [PluginError, KeyboardInterrupt]
         self._passes = (*passes, ConfigError) if may_refuse else tuple(passes)
         self._role, self._id = role, id
+        self.checks = role not in link.built_in
 
     def __enter__(self) -> None:
         return None
@@ -140,33 +144,28 @@ class Guard:
                 f"{name} = {_shown(repr, found):.40}", expected or f"a number from {least:g} to {most:g}"
             )
 
-    def expect_locks(self, locks: object) -> None:
-        """Check that a synchronization found no more packets in a step than there is time for.
+    def expect_locks(self, locks: object, until_us: float, packet: PacketFormat) -> None:
+        """Check the packets that a synchronization found in a step, until a time, us.
 
         Raises:
-            PluginError: It is no list, or a longer one.
+            PluginError: They are no list, more than there is time for, or no `SyncLock` with times of such
+                packets.
         """
         self.expect(locks, list)
         assert isinstance(locks, list)
         if len(locks) > _MOST_LOCKS:
             self.refuse(f"{len(locks)} locks in a step", f"at most {_MOST_LOCKS}")
-
-    def expect_lock(self, lock: SyncLock, until_us: float, packet: PacketFormat) -> None:
-        """Check what a synchronization found until a time, us.
-
-        Raises:
-            PluginError: It is no `SyncLock`, or its times are not those of such packets.
-        """
-        self.expect(lock, SyncLock)
         chip_us, whole_us = packet.chip_us, packet.packet_chips * packet.chip_us
         far_us = _FAR_PACKETS * whole_us
-        self.expect_number(lock.chip_us, "chip_us", chip_us / 2, chip_us * 2)
-        self.expect_number(lock.packet_t_us, "packet_t_us", until_us - far_us, until_us + far_us)
-        self.expect_number(lock.delay_on_us, "delay_on_us", -whole_us, whole_us)
-        self.expect_number(lock.delay_off_us, "delay_off_us", -whole_us, whole_us)
-        self.expect_number(lock.quality, "quality", 0.0, _ONE)
-        self.expect_number(lock.row_us, "row_us", -chip_us, chip_us)
-        self.expect_number(lock.last_row_us, "last_row_us", -whole_us, whole_us)
+        for lock in locks:
+            self.expect(lock, SyncLock)
+            self.expect_number(lock.chip_us, "chip_us", chip_us / 2, chip_us * 2)
+            self.expect_number(lock.packet_t_us, "packet_t_us", until_us - far_us, until_us + far_us)
+            self.expect_number(lock.delay_on_us, "delay_on_us", -whole_us, whole_us)
+            self.expect_number(lock.delay_off_us, "delay_off_us", -whole_us, whole_us)
+            self.expect_number(lock.quality, "quality", 0.0, _ONE)
+            self.expect_number(lock.row_us, "row_us", -chip_us, chip_us)
+            self.expect_number(lock.last_row_us, "last_row_us", -whole_us, whole_us)
 
     def expect_presence(self, found: PresenceMap, clusters: int, height: int, width: int) -> None:
         """Check what a separation gave of an image.

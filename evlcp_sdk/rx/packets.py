@@ -30,7 +30,7 @@ class PacketAssembler:
         if not self._frames:
             return []
         first, echo_of = self._frames[0], self._frames[-1].echo_of
-        frames = tuple(f if f.echo_of == echo_of else changed(f, echo_of=echo_of) for f in self._frames)
-        packet = Packet(first.transmitter, first.packet, *self._start, frames, self._sent)
+        frames = [f if f.echo_of == echo_of else changed(f, echo_of=echo_of) for f in self._frames]
+        packet = Packet(first.transmitter, first.packet, *self._start, tuple(frames), self._sent)
         self._frames = []
         return [packet]

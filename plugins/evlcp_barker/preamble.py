@@ -47,7 +47,7 @@ def time_preamble(
     values = np.array([[[-1.0]], [[1.0]]]) * chips[:, None] * (windows[:, 1:] - windows[:, :-1])
     if pair > 1:
         values = values.reshape(2, -1, pair, last - first).sum(2)
-    (off, off_noise), (on, on_noise) = (_jackknife(_middles(_without_each(one))) for one in values)
+    (off, off_noise), (on, on_noise) = [_jackknife(_middles(_without_each(one))) for one in values]
     at = lag + steps * rising[:, None] + np.arange(-steps, steps)
     response = counts[1, np.clip(at, 0, counts.shape[1] - 1)]
     onset, onset_noise = _jackknife(_onsets(_without_each(response)))
@@ -92,5 +92,5 @@ def _jackknife(found: Floats) -> tuple[float, float]:
     whole, *without = found.tolist()
     without = [value for value in without if value == value]
     mean = sum(without) / max(len(without), 1)
-    squares = sum((value - mean) ** 2 for value in without)
+    squares = sum([(value - mean) ** 2 for value in without])
     return whole, (len(without) - 1) * squares / max(len(without), 1) if without else 0.0

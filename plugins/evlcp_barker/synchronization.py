@@ -229,8 +229,8 @@ class BarkerSynchronizer:
         times, variances = time_preamble(counts, lag, self._chips, _STEPS, self._pair, self._rising)
         if math.isnan(times[0]):
             times[0], variances[0] = times[1], variances[1]
-        on_us, off_us, onset_us = ((first_bin + v) * self._bin_us for v in times)
-        noises = (_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in variances)
+        on_us, off_us, onset_us = [(first_bin + v) * self._bin_us for v in times]
+        noises = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in variances]
         return _Preamble(on_us, off_us, onset_us, quality, *noises)
 
     def _accept(

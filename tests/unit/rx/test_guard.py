@@ -54,6 +54,17 @@ def received(link: Link) -> None:
     receiver.close()
 
 
+@pytest.mark.parametrize(
+    "overrides",
+    [["tracking.id=kalman"], ["decoding.id=wh-transform", "ranging.id=poc", "tracking.id=kalman"]],
+)
+def test_what_comes_with_the_sdk_gives_what_is_expected(overrides: list[str]) -> None:
+    link = load_link(overrides=overrides)
+    assert set(ROLES) < link.built_in
+    assert link.with_algorithm("ranging", link.algorithm("ranging")).built_in == link.built_in - {"ranging"}
+    received(replace(link, built_in=frozenset()))
+
+
 @pytest.mark.parametrize("role", ROLES)
 def test_what_fails_in_a_frame_is_named(role: str) -> None:
     with pytest.raises(PluginError) as told:
