@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.air.codebook import Codebook as Codebook
     from evlcp_sdk.air.frames import PacketFormat as PacketFormat
     from evlcp_sdk.air.kinds import MessageKind as MessageKind
+    from evlcp_sdk.diagnosis.diagnose import diagnose as diagnose
     from evlcp_sdk.errors import (
         ConfigError as ConfigError,
         EvlcpError as EvlcpError,
@@ -66,7 +67,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.results.tables import frames_table as frames_table
     from evlcp_sdk.run import (
         Reception as Reception,
-        diagnose as diagnose,
         receive as receive,
         receive_to_folder as receive_to_folder,
     )
@@ -109,6 +109,7 @@ _HOMES = {
     "air.codebook": "Codebook",
     "air.frames": "PacketFormat",
     "air.kinds": "MessageKind",
+    "diagnosis.diagnose": "diagnose",
     "errors": (
         "ConfigError EvlcpError InputError InterruptedRunError OutputError "
         "PluginError PluginWarning RawFormatError StreamError UnknownAlgorithmError UnpluggedError"
@@ -130,7 +131,7 @@ _HOMES = {
     "results.folder": "ResultFolder",
     "results.sink": "Run Sink",
     "results.tables": "frames_table",
-    "run": "Reception diagnose receive receive_to_folder",
+    "run": "Reception receive receive_to_folder",
     "rx.receiver": "Receiver",
     "scene.attitude": "Attitude AttitudeLog",
     "scene.bar": "BarLayout LedColumns LedGrid LedRing LedTable",

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     import pandas
     import pyarrow
 
-    from evlcp_sdk.diagnosis.diagnose import Diagnosis
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.place.bar_registry import BarRegistry
@@ -554,35 +553,6 @@ def _much_dropped(source: EventSource, receiver: Receiver) -> str | None:
     if dropped < DEGRADED_LEAST or share <= DEGRADED_SHARE:
         return None
     return f"{dropped} events or words, {share:.1%}, were dropped: losses and counts in summary.json say why"
-
-
-def diagnose(
-    source: EventSource | str | Path,
-    link: Link | Path | str | None = None,
-    *,
-    registry: Registry | None = None,
-    advance: Advance = lambda _done, _of: None,
-) -> Diagnosis:
-    """Say why a recording is read, or is not: what blinks in it, and which stage of the receiver stops it.
-
-    Args:
-        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
-        link: The link that it is expected to have been sent with, or a `link.toml`; None for all defaults.
-        registry: The plugins; None for all that are installed.
-        advance: Says how far the reading is.
-
-    Raises:
-        InputError: The source cannot be opened, or read on.
-        ConfigError: The file does not describe a link, or the recording's sensor is not the link's.
-    """
-    # What it needs of SciPy takes long to import, and no other use case needs it.
-    from evlcp_sdk.diagnosis.diagnose import diagnosis_of
-
-    registry = Registry.load() if registry is None else registry
-    link = link if isinstance(link, Link) else load_link(link, registry=registry)
-    url = str(source.path if isinstance(source, EventSource) else source)
-    with source if isinstance(source, EventSource) else open_source(source, registry) as opened:
-        return diagnosis_of(opened, link, registry, name=url, advance=advance)
 
 
 def film(

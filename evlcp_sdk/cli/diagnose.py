@@ -38,10 +38,10 @@ def diagnose(
     """
     import json
 
+    from evlcp_sdk.diagnosis.diagnose import diagnose as run
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.run import diagnose as run
 
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,8 +15,9 @@ from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
 from evlcp_sdk.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
 from evlcp_sdk.diagnosis.tallies import RunTally
 from evlcp_sdk.diagnosis.warnings import find_warnings
+from evlcp_sdk.io.open import open_source
 from evlcp_sdk.io.sensor import check_sensor
-from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.rx.receiver import Receiver
@@ -91,38 +93,38 @@ class Diagnosis:
         }
 
 
-def diagnosis_of(
-    source: EventSource,
-    link: Link,
-    registry: Registry | None = None,
+def diagnose(
+    source: EventSource | str | Path,
+    link: Link | Path | str | None = None,
     *,
-    name: str | None = None,
+    registry: Registry | None = None,
     advance: Callable[[int, int | None], None] = lambda _done, _of: None,
 ) -> Diagnosis:
-    """Say why a recording is read, or is not.
+    """Say why a recording is read, or is not: what blinks in it, and which stage of the receiver stops it.
 
     Args:
-        source: What is read, to its end; not closed.
-        link: The link that it is expected to have been sent with.
-        registry: Where other modulations are found; None for all that are installed.
-        name: What the recording is called; None for its path.
+        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
+        link: The link that it is expected to have been sent with, or a `link.toml`; None for all defaults.
+        registry: The plugins; None for all that are installed.
         advance: Says how far the reading is.
 
     Raises:
-        InputError: The source cannot be read on.
-        ConfigError: It is of another sensor than the link's camera.
+        InputError: The source cannot be opened, or read on.
+        ConfigError: The file does not describe a link, or the recording's sensor is not the link's.
     """
     registry = Registry.load() if registry is None else registry
-    name = str(source.path) if name is None else name
-    check_sensor(source, name, link.camera)
+    link = link if isinstance(link, Link) else load_link(link, registry=registry)
+    name = str(source.path if isinstance(source, EventSource) else source)
     survey, receiver, sample = LightSurvey(link.camera.width, link.camera.height), Receiver(link), _Sample()
     tally = RunTally(link.packet)
-    for events in source.chunks():
-        for packet in receiver.feed(events):
-            tally.add(packet)
-        survey.feed(events)
-        sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
-        advance(source.position_bytes, source.size_bytes)
+    with source if isinstance(source, EventSource) else open_source(source, registry) as source:
+        check_sensor(source, name, link.camera)
+        for events in source.chunks():
+            for packet in receiver.feed(events):
+                tally.add(packet)
+            survey.feed(events)
+            sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
+            advance(source.position_bytes, source.size_bytes)
     for packet in receiver.close():
         tally.add(packet)
     sources, frequency_hz = survey.found()

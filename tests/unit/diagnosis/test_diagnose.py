@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from evlcp_sdk.cli._app import make_app
 from evlcp_sdk.diagnosis import _kernels
 from evlcp_sdk.diagnosis.checks import checks_of
-from evlcp_sdk.diagnosis.diagnose import Diagnosis, diagnosis_of, infer_link
+from evlcp_sdk.diagnosis.diagnose import Diagnosis, diagnose, infer_link
 from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey, comb
 from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
@@ -41,7 +41,7 @@ def rendered(
 
 def found(link: tuple[str, ...] = (), duration_s: float = 0.12, **changes: Any) -> Diagnosis:
     with rendered(link, duration_s, **changes) as source:
-        return diagnosis_of(source, LINK)
+        return diagnose(source, LINK)
 
 
 def code_of(diagnosis: Diagnosis) -> str:
@@ -221,7 +221,7 @@ def test_a_framing_without_a_preamble_is_judged_by_its_frames(code: str) -> None
     dark = {"bars.0.led_w_m2": 0.0} if code else {}
     link = load_link(overrides=LAMP)
     with rendered(LAMP, 0.08, **{"motion.distance_m": 30.0, **dark}) as source:
-        diagnosis = diagnosis_of(source, link)
+        diagnosis = diagnose(source, link)
     verdicts = {one.stage: one.verdict for one in diagnosis.checks}
     assert (code_of(diagnosis), verdicts["preamble"]) == (code, "skip")
     assert (diagnosis.counts["frames"] > 10, diagnosis.trials) == (not code, ())
@@ -279,7 +279,7 @@ def test_picture_upside_down_is_noticed(tmp_path: Path) -> None:
     turned = Events(events.t_us, 1279 - events.x, 719 - events.y, events.p)
     write_events(tmp_path / "turned.raw", turned, 1280, 720)
     with open_source(tmp_path / "turned.raw") as source:
-        diagnosis = diagnosis_of(source, LINK)
+        diagnosis = diagnose(source, LINK)
     assert code_of(diagnosis) == "upside-down"
     assert diagnosis.counts["frames_rejected"] == 0
 
@@ -310,7 +310,7 @@ def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
 def test_page_is_read_on_a_phone_and_in_the_dark(tmp_path: Path) -> None:
     with rendered(**{"bars.0.led_w_m2": 0.0, "flicker_lamps": 2, "duration_s": 0.05}) as source:
-        diagnosis = diagnosis_of(source, LINK, name="lamps.raw")
+        diagnosis = diagnose(source, LINK)
     (tmp_path / "page.html").write_text(page(diagnosis), encoding="utf-8")
     with Browser(tmp_path / "profile") as browser:
         browser.open(tmp_path / "page.html")
