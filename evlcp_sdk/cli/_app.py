@@ -1,6 +1,7 @@
 """What the `evlcp` command line consists of, plugins' commands included."""
 
 import importlib
+import re
 import sys
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -56,6 +57,10 @@ _OWN = (
 _SOON = frozenset({"receive", "live"})
 """Commands that need neither others nor a plugin's, and would wait for these a tenth of their start; they say
 themselves when they are loaded."""
+
+
+_EXAMPLE = re.compile(r"\n+(?= *[A-Z][^\n:\[]+:\s+\[bold\])")
+"""Before an example in a command's help: Typer takes lines for one that no empty one parts."""
 
 
 class _Commands(TyperGroup):
@@ -179,7 +184,7 @@ def make_app(*modules: str) -> typer.Typer:
     app.callback()(_root)
     for module in modules or _OWN:
         command = getattr(importlib.import_module(f"evlcp_sdk.cli.{module}"), module)
-        app.command(module.replace("_", "-"))(command)
+        app.command(module.replace("_", "-"), help=_EXAMPLE.sub("\n\n", command.__doc__))(command)
     return app
 
 

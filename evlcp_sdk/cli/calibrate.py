@@ -34,7 +34,6 @@ def calibrate(
     """Estimate focal length, principal point and distortion; print them, with covariance, as a link.toml.
 
     One recording:  [bold]evlcp calibrate REC.raw --sites site.toml --poses poses.csv[/]
-
     Keep the table: [bold]evlcp calibrate REC.raw --sites site.toml --poses poses.csv > camera.toml[/]
 
     poses.csv: t_us, latitude_deg, longitude_deg, height_m; optional recording (the file's name),

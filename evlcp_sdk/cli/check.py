@@ -49,13 +49,9 @@ def check(
     """Hold an installed algorithm, yours or ours, against the laws of its role; or all algorithms of a link.
 
     A built-in one:      [bold]evlcp check ranging poc[/]
-
     With a parameter:    [bold]evlcp check ranging poc --set min_pixels=6[/]
-
     On another link:     [bold]evlcp check ranging poc -c link.toml --set bar.rows=24[/]
-
     A whole link:        [bold]evlcp check -c link.toml[/]
-
     For a script:        [bold]evlcp check decoding ml-soft --json[/]
 
     `-c` and `--set TABLE.KEY` say what the rest of the link is; without them it is the default.

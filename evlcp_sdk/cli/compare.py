@@ -51,11 +51,8 @@ def compare(
     """Run variants of the receiver on the same recordings; one table each, and one over all.
 
     Two rangings:     [bold]evlcp compare REC.raw --variant paper: --variant joint:ranging.id=joint-scale[/]
-
     Several settings: [bold]--variant best:ranging.id=joint-scale,decoding.id=ml-soft,tracking.id=kalman[/]
-
     As a page:        [bold]evlcp compare *.raw --variant a: --variant b:ranging.id=centroid -o table.html[/]
-
     A campaign:       [bold]evlcp compare paper.sqlite[/] compares its links, a table per scene
 
     Truth is taken from REC.truth.json beside REC.raw; without it there is no BER and no distance error. -c

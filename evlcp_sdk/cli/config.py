@@ -30,9 +30,7 @@ def config(
     """Print the resolved link: every parameter with its meaning, unit, bounds and default.
 
     Start your own:            [bold]evlcp config > link.toml[/]
-
     See what a change does:    [bold]evlcp config -c link.toml --set modulation.id=wh8 --digest[/]
-
     Codes for the transmitter: [bold]evlcp config --codebook c > codebook.h[/]
     """
     import json

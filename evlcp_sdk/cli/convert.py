@@ -37,11 +37,8 @@ def convert(
     """Write the events and triggers of any source into a recording of another format.
 
     A bag of ROS 2:           [bold]evlcp convert REC.raw -o drive.mcap[/]
-
     From one:                 [bold]evlcp convert bag:drive -o drive.raw[/]
-
     From HDF5:                [bold]evlcp convert REC.hdf5 --size 1280x720 -o REC.raw[/]
-
     A camera, until Ctrl-C:   [bold]evlcp convert camera: -o REC.raw[/]
     """
     import json

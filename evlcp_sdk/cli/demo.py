@@ -50,7 +50,6 @@ def demo(
     """Drive towards a bar of LEDs, simulated; receive it, and compare with the paper.
 
     Four stretches at 30 km/h:            [bold]evlcp demo[/] or [bold]evlcp demo -o somewhere[/]
-
     A shipped recording, frame by frame:  [bold]evlcp demo --recording[/]
     """
     if recording:

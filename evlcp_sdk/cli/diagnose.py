@@ -28,9 +28,7 @@ def diagnose(
     """Say why a recording is read, or is not: what blinks, and each stage of the receiver.
 
     In words:       [bold]evlcp diagnose REC.raw[/]
-
     With pictures:  [bold]evlcp diagnose REC.raw -o REC.html[/]
-
     Against a link: [bold]evlcp diagnose REC.raw -c link.toml[/]
 
     Sources of light are found without a link, too: what blinks at which rate, lamps and all. Where a stage

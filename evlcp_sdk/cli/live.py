@@ -123,30 +123,18 @@ def live(
     """Receive in real time: results as they come, delays measured.
 
     A recording, at its own pace:   [bold]evlcp live replay:REC.raw[/]
-
     Again and again, twice as fast: [bold]evlcp live 'replay:REC.raw?loop=1&speed=2'[/]
-
     From another machine:           [bold]evlcp live tcp://192.168.1.7:5600[/]
-
     A camera:                       [bold]evlcp live camera:[/]
-
     Some rows of it, its biases:    [bold]evlcp live 'camera:?diff_on=20&area=0,200,1280,240'[/]
-
     From another program:           [bold]CAMERA | evlcp live - --json-lines -[/]
-
     Several kinds of transmitters:  [bold]evlcp live URL -c bar.toml -c beacon.toml[/]
-
     With positions:                 [bold]evlcp live URL --sites site.toml --pitch-deg 0 --roll-deg 0[/]
-
     For Foxglove, written as it comes: [bold]evlcp live URL -o out --sites site.toml --attitude imu.csv
     --mcap[/]
-
     In a browser:                   [bold]evlcp live URL --view[/]
-
     On a phone in this network:     [bold]evlcp live URL --view --view-host 0.0.0.0 --view-port 8080[/]
-
     With UTC by a pulse each second: [bold]evlcp live camera: --sites site.toml --pps 0 --nmea-port 10110[/]
-
     For programs that read gpsd:    [bold]evlcp live URL --sites site.toml --gpsd-port 2947[/], then
     [bold]cgps[/] or [bold]gpspipe -w[/]
 

@@ -77,32 +77,19 @@ def receive(
     """Decode recordings: symbols and distances into OUT.
 
     One recording:       [bold]evlcp receive REC.raw -o out[/]
-
     With figures:        [bold]evlcp receive REC.raw -o out --figures[/]
-
     A page to look at:   [bold]evlcp receive REC.raw -o out --report[/] writes out/report.html
-
     Another profile:     [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
-
     Settings unknown:    [bold]evlcp receive REC.raw -o out --link auto[/]
-
     Your own link:       [bold]evlcp receive REC.raw -o out -c link.toml[/]
-
     Several at once:     [bold]evlcp receive REC.raw -o out -c bar.toml -c beacon.toml[/]
-
     As it comes:         [bold]CAMERA | evlcp receive - --json-lines -[/]
-
     Several recordings:  [bold]evlcp receive a.raw b.raw -o out[/] writes out/a and out/b
-
     Two at a time:       [bold]evlcp receive *.raw -o out --workers 2[/]
-
     Positions, with the camera level and looking north: [bold]evlcp receive REC.raw -o out --sites site.toml
     --heading-deg 0 --pitch-deg 0 --roll-deg 0[/]
-
     Distances, with the camera pitched up: [bold]evlcp receive REC.raw -o out --pitch-deg 4 --roll-deg 0[/]
-
     Positions, with an IMU's log: [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv[/]
-
     A track between bars, too:    [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv
     --gnss gnss.csv[/]
 

@@ -36,7 +36,6 @@ def report(
     """Show what a campaign found: tables here, one self-contained page and figures for others.
 
     Tables only:        [bold]evlcp report paper.sqlite[/]
-
     Page and figures:   [bold]evlcp report paper.sqlite -o report.html[/]
 
     The page needs no network. A campaign that still runs can be looked at, too.

@@ -25,11 +25,8 @@ def serve(
     """Send a recording or a camera to other programs, as EVT3 words over TCP or a Unix socket.
 
     A recording, at its own pace:  [bold]evlcp serve REC.raw --tcp 5600[/]
-
     The other end:                 [bold]evlcp live tcp://localhost:5600[/]
-
     To other machines, too:        [bold]evlcp serve URL --tcp 0.0.0.0:5600[/]
-
     Again and again:               [bold]evlcp serve 'replay:REC.raw?loop=1' --tcp 5600[/]
 
     A recording begins when somebody has connected. Nothing is encrypted, and whoever can connect gets all.

@@ -47,15 +47,10 @@ def simulate(
     REC.attitude.csv, what an IMU measures, for [bold]evlcp receive --sites[/].
 
     A scene of yours:      [bold]evlcp simulate scene.toml -o REC.raw[/]
-
     A preset, varied:      [bold]evlcp simulate --preset night -o REC.raw --set motion.distance_m=70[/]
-
     Your link on air:      [bold]evlcp simulate --preset night -c link.toml -o REC.raw[/]
-
     Slower chips:          [bold]evlcp simulate --preset night -o REC.raw --set link.air.chip_rate_hz=5e3[/]
-
     What presets there are: [bold]evlcp simulate --presets[/]
-
     A scene to start from:  [bold]evlcp simulate --preset night --show > scene.toml[/]
     """
     if presets:

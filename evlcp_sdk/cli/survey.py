@@ -39,12 +39,9 @@ def survey(
     """Estimate where bars stand, from a calibrated camera at known places; write site.toml.
 
     One recording:            [bold]evlcp survey REC.raw --poses poses.csv -o site.toml[/]
-
     By a calibrated camera:   [bold]evlcp survey REC.raw --poses poses.csv -c camera.toml -o site.toml[/]
-
     By its own track past known bars: [bold]evlcp survey REC.raw --sites known.toml --attitude imu.csv
     -c camera.toml -o new.toml[/]
-
     Bars of two kinds:        [bold]evlcp survey REC.raw --poses poses.csv -c a.toml -c b.toml -o site.toml[/]
 
     poses.csv is that of `evlcp calibrate`, with heading_deg, pitch_deg and roll_deg. What all poses may have

@@ -39,11 +39,8 @@ def sweep(
     """Simulate, receive and score every point of a campaign; go on where an earlier run stopped.
 
     A campaign:            [bold]evlcp sweep examples/campaigns/paper.toml -o paper.sqlite[/]
-
     A quick look at it:    [bold]evlcp sweep examples/campaigns/paper.toml --set campaign.seeds=1[/]
-
     On a Dask cluster:     [bold]evlcp sweep examples/campaigns/paper.toml --dask tcp://host:8786[/]
-
     What came out:         [bold]evlcp report paper.sqlite -o report.html[/]
 
     A result is kept as soon as it is there: stopped or killed at any moment, the same command goes on.

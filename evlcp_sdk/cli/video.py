@@ -45,11 +45,8 @@ def video(
     """Film the events in slow motion, with regions, symbols and distances drawn in.
 
     The first frames:     [bold]evlcp video REC.raw -o REC.webp[/]
-
     More, and faster:     [bold]evlcp video REC.raw -o REC.webp --for-ms 100 --slow 100[/]
-
     A second later:       [bold]evlcp video REC.raw -o REC.webp --from-ms 1000[/]
-
     All that is in view:  [bold]evlcp video REC.raw -o REC.gif --whole --size 1280[/]
 
     Yellow is where it gets brighter, blue where darker, at 1/400 chip by chip; in faster films a picture
