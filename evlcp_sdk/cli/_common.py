@@ -60,9 +60,6 @@ Dask = Annotated[
 ]
 
 
-_DRAWN_EVERY_S = 0.1
-
-
 def echo(text: str, *, nl: bool = True) -> None:
     """Print a text on stdout; what it has of names and texts from outside moves no cursor."""
     typer.echo(printable(text), nl=nl)

@@ -1,7 +1,7 @@
 """The loop of a live run: slices in, packets out, results to listeners, in bounded time."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -87,7 +87,6 @@ class LiveLoop:
         links: What it decodes.
         publisher: Where results and pictures go.
         budget: When what is shed.
-        clock: Gives the time, s.
         pulses: Is told of triggers, which say the UTC of the camera's clock; None for nobody.
 
     Attributes:
@@ -102,7 +101,6 @@ class LiveLoop:
         links: Sequence[Link],
         publisher: Publisher,
         budget: Budget | None = None,
-        clock: Callable[[], float] = time.monotonic,
         pulses: PulseClock | None = None,
     ) -> None:
         self._pulses = pulses
@@ -110,8 +108,7 @@ class LiveLoop:
         self._forms = {name: link.packet for name, link in named_links(links).items()}
         self._publisher = publisher
         self._budget = Budget() if budget is None else budget
-        self._clock = clock
-        self._reader = Reader(source, clock)
+        self._reader = Reader(source)
         self._size = source.width or 1280, source.height or 720
         self._shedder = Shedder(*self._size)
         self.delays = {stage: DelayTally() for stage in (*STAGES, _END_TO_END)}
@@ -120,7 +117,7 @@ class LiveLoop:
         self._levels_s = [0.0] * len(LEVELS)
         self._events = 0
         self._last_us = 0.0
-        self._arrived_s = self._taken_s = self._start_s = self._status_s = clock()
+        self._arrived_s = self._taken_s = self._start_s = self._status_s = time.monotonic()
         self._status_events = 0
 
     def run(self, stopped: Stopped) -> Iterator[tuple[Events, list[Packet]]]:
@@ -132,7 +129,7 @@ class LiveLoop:
         Raises:
             InputError: The source cannot be read on.
         """
-        self._start_s = self._status_s = self._taken_s = self._clock()
+        self._start_s = self._status_s = self._taken_s = time.monotonic()
         self._reader.start()
         held: list[Events] = []
         many = 0
@@ -167,7 +164,7 @@ class LiveLoop:
 
     def frame(self, frame: Frame) -> None:
         """Tell listeners of a frame, and count how long it took."""
-        now = self._clock()
+        now = time.monotonic()
         form = self._forms[frame.link]
         chips = form.frame_chips if form.has_pilot(frame.frame) else form.info_chips
         last_us = frame.t_us + chips * form.chip_us
@@ -209,7 +206,7 @@ class LiveLoop:
 
     def _turn(self, piece: Slice) -> tuple[Events, list[Packet]]:
         """Take a slice, and those that wait behind it, as far as they are few."""
-        taken_s = self._clock()
+        taken_s = time.monotonic()
         self._levels_s[self._level] += taken_s - self._taken_s
         self._level = self._budget.level((taken_s - piece.arrived_s) * 1e3, self._level)
         pieces = [piece]
@@ -248,7 +245,7 @@ class LiveLoop:
         if self._pulses is not None:
             columns = [column for column in (piece.events.t_us, piece.triggers.t_us) if len(column)]
             if columns:
-                came_s = time.time() - (self._clock() - piece.arrived_s)
+                came_s = time.time() - (time.monotonic() - piece.arrived_s)
                 self._pulses.add(piece.triggers, came_s, max(float(column[-1]) for column in columns))
         self._events += len(piece.events)
         if len(piece.triggers):
@@ -270,7 +267,7 @@ class LiveLoop:
         if message.message.kind != Kind.TIME or self._arrived_s != self._arrived_s:
             return None
         if message.age_s is not None:
-            late_ms = (message.age_s + self._clock() - self._shone_s(message.t_us)) * 1e3
+            late_ms = (message.age_s + time.monotonic() - self._shone_s(message.t_us)) * 1e3
         elif self._source.clock_s(message.t_us) is None and self._source.live:
             late_ms = (time.time() - message.value) * 1e3
         else:
@@ -281,7 +278,7 @@ class LiveLoop:
 
     def _tell_status(self, *, now: bool = False) -> None:
         """Say how it goes, where it is time for that."""
-        at_s = self._clock()
+        at_s = time.monotonic()
         since_s = at_s - self._status_s
         if since_s < _STATUS_EVERY_S and not now:
             return

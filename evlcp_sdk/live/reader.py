@@ -3,7 +3,6 @@
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -73,7 +72,6 @@ class Reader:
 
     Args:
         source: What is read; not closed.
-        clock: Gives the time, s.
         most_events: Events that wait at the most.
 
     Attributes:
@@ -82,14 +80,8 @@ class Reader:
         ended: Nothing more will come, and nothing waits.
     """
 
-    def __init__(
-        self,
-        source: EventSource,
-        clock: Callable[[], float] = time.monotonic,
-        most_events: int = _MOST_EVENTS,
-    ) -> None:
+    def __init__(self, source: EventSource, most_events: int = _MOST_EVENTS) -> None:
         self._source = source
-        self._clock = clock
         self._most = most_events
         self._waiting: deque[Slice] = deque()
         self._events = 0
@@ -113,7 +105,7 @@ class Reader:
     def waiting(self) -> tuple[int, float]:
         """How many events wait, and since when the oldest does, s; now where nothing waits."""
         with self._changed:
-            return self._events, self._waiting[0].arrived_s if self._waiting else self._clock()
+            return self._events, self._waiting[0].arrived_s if self._waiting else time.monotonic()
 
     def take(self, timeout_s: float) -> Slice | None:
         """The next slice; None after the time-out, or at the end."""
@@ -132,18 +124,17 @@ class Reader:
         """The next slice if one waits."""
         return self.take(0.0) if self._waiting else None
 
-    def stop(self, timeout_s: float = 1.0) -> bool:
-        """Read no more; whether the thread has ended: a source that waits for a camera may not."""
+    def stop(self) -> None:
+        """Read no more; the thread of a source that waits for a camera may go on."""
         with self._changed:
             self._left = True
             self._changed.notify_all()
-        self._thread.join(timeout_s)
-        return not self._thread.is_alive()
+        self._thread.join(1.0)
 
     def _read(self) -> None:
         try:
             for events, triggers in self._source.stream():
-                if not self._put(Slice(events, triggers, self._clock())):
+                if not self._put(Slice(events, triggers, time.monotonic())):
                     break
         except BaseException as fault:
             self.fault = fault

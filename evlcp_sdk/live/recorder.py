@@ -62,11 +62,11 @@ class Recorder:
         )
         self._thread.start()
 
-    def stop(self, timeout_s: float = 30.0) -> None:
+    def stop(self) -> None:
         """End the file: all that has come is in it."""
         if self._mine is not None and self._thread is not None:
             self._publisher.leave(self._mine)
-            self._thread.join(timeout_s)
+            self._thread.join(30.0)
 
     def _write(self, path: Path, mine: Subscription) -> None:
         try:

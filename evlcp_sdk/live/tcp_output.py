@@ -12,6 +12,7 @@ from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
 from evlcp_sdk.results.nmea import sentences
 from evlcp_sdk.utc import ClockZero, zero_at
 
+_HOST: Final = "127.0.0.1"
 _MOST_WAITING: Final = 1000
 """Fixes that wait to be told; the oldest go."""
 _MOST_BYTES: Final = 1 << 18
@@ -32,8 +33,7 @@ class TcpOutput:
     Args:
         publisher: Where fixes come from.
         gpsd: As gpsd's JSON, to clients that say `?WATCH`; or else NMEA, to whoever connects.
-        host: Where to listen.
-        port: The same; 0 for any that is free.
+        port: Where to listen, on this machine only; 0 for any that is free.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
 
     Attributes:
@@ -42,16 +42,9 @@ class TcpOutput:
     """
 
     def __init__(
-        self,
-        publisher: Publisher,
-        *,
-        gpsd: bool,
-        host: str = "127.0.0.1",
-        port: int = 0,
-        clock_zero: ClockZero = None,
+        self, publisher: Publisher, *, gpsd: bool, port: int = 0, clock_zero: ClockZero = None
     ) -> None:
-        self._publisher, self._gpsd = publisher, gpsd
-        self._host, self.port = host, port
+        self._publisher, self._gpsd, self.port = publisher, gpsd, port
         self._zero = clock_zero
         self._clients: dict[asyncio.StreamWriter, dict[str, Any]] = {}
         self._newest: dict[str, dict[str, Any]] = {}
@@ -81,10 +74,10 @@ class TcpOutput:
 
         mine = self._mine = self._publisher.subscribe({"fix", "status"}, most=_MOST_WAITING, wake=wake)
         try:
-            server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MOST_LINE)
+            server = await asyncio.start_server(self._serve, _HOST, self.port, limit=_MOST_LINE)
         except OSError as fault:
             self._publisher.leave(mine)
-            raise cannot_listen(self._host, self.port, fault) from fault
+            raise cannot_listen(_HOST, self.port, fault) from fault
         self.port = server.sockets[0].getsockname()[1]
 
         async def pump() -> None:
