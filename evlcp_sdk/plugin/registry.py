@@ -13,7 +13,6 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import Distribution, EntryPoint, entry_points, version
-from pathlib import Path
 from typing import Any
 
 import pluggy
@@ -55,20 +54,9 @@ class Broken:
         return f"plugin {self.plugin}{owner} is broken and left out: {self.reason}"
 
 
-def _stamp(folder: str) -> tuple[str, int, int]:
-    """What tells whether packages came into a folder of `sys.path`, or left it."""
-    try:
-        status = Path(folder).stat()
-    except OSError:
-        return folder, 0, 0
-    return folder, status.st_ino, status.st_mtime_ns
-
-
 @lru_cache(maxsize=1)
-def _found(
-    find: Callable[..., Iterable[EntryPoint]], folders: tuple[tuple[str, int, int], ...]
-) -> tuple[EntryPoint, ...]:
-    """The installed plugins, as long as `folders` are the same: a file of every package is read for them."""
+def _found(find: Callable[..., Iterable[EntryPoint]], folders: tuple[str, ...]) -> tuple[EntryPoint, ...]:
+    """The plugins installed in `folders`, found once: a file of every package is read for them."""
     del folders
     return tuple(find(group=ENTRY_POINT_GROUP))
 
@@ -112,13 +100,13 @@ class Registry:
     def load(cls, *plugins: object) -> "Registry":
         """Find all installed plugins; `plugins` are objects with hooks to add, e.g. a probe.
 
-        What is installed is read once, and again when a folder of `sys.path` has changed.
+        What is installed is read once in a process, and again when `sys.path` has changed.
 
         Raises:
             PluginError: Such an object has a hook that the SDK does not have.
         """
         registry = cls(*plugins)
-        for entry in _found(entry_points, tuple(map(_stamp, sys.path))):
+        for entry in _found(entry_points, tuple(sys.path)):
             registry._load(entry)
         return registry
 

@@ -1,13 +1,10 @@
 """Plugins found by name: what is refused and how it is said, and what listing them must not import."""
 
 import json
-import os
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from importlib.metadata import entry_points
-from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, NamedTuple
 
@@ -64,25 +61,6 @@ def install(
         for name, owner, load in found
     ]
     monkeypatch.setattr("evlcp_sdk.plugin.registry.entry_points", lambda group: points)
-
-
-def test_what_is_installed_is_read_again_when_packages_come_or_go(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
-    monkeypatch.syspath_prepend(str(tmp_path))
-    before = Registry.load().plugins("evlcp_algorithms")
-    (tmp_path / "evlcp_arrives.py").write_text(
-        "import evlcp_sdk\n\n\n@evlcp_sdk.hookimpl\ndef evlcp_algorithms():\n    return []\n"
-    )
-    info = tmp_path / "evlcp_arrives-1.0.dist-info"
-    info.mkdir()
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: evlcp-arrives\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[evlcp]\narrives = evlcp_arrives\n")
-    os.utime(tmp_path, ns=(0, 1))
-    assert set(Registry.load().plugins("evlcp_algorithms")) == {*before, "arrives"}
-    shutil.rmtree(info)
-    os.utime(tmp_path, ns=(0, 2))
-    assert Registry.load().plugins("evlcp_algorithms") == before
 
 
 def test_two_algorithms_with_one_name_are_told_when_asked_for(monkeypatch: pytest.MonkeyPatch) -> None:
