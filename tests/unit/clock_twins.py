@@ -1,11 +1,5 @@
 """The clock that is believed, event by event in plain Python."""
 
-import numpy as np
-
-
-def ordered(t_us, x, y, width, height):
-    return bool(np.all(np.diff(t_us) >= 0) and np.all(x < width) and np.all(y < height))
-
 
 def clock(rows, width, height):
     """What `CameraClock` keeps of events (t, x, y, p): rows with times inside, and its counts."""

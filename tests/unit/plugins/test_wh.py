@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import wh_twins as twins
 from evlcp_wh import _kernels, ml_soft
-from evlcp_wh.decoding import WhTransform
+from evlcp_wh.decoding import WhTransform, match_words
 from evlcp_wh.ml_soft import INDEPENDENT_PIXELS, LearnedDecoder, MlSoft
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts, smooth_path
@@ -96,6 +96,24 @@ def test_weighted_values(seed, grid):
     _kernels.weighted_values(sums, presence.probability, grid, 0.2, out)
     assert_allclose(out, twins.weighted_values(sums, presence.probability, grid, 0.2), rtol=1e-6)
     assert out.any()
+
+
+@pytest.mark.parametrize(
+    ("clusters", "bits", "length", "more"),
+    [(16, 6, 8, 0), (1, 1, 2, 0), (3, 8, 16, 0), (5, 2, 8, 2), (5, 2, 8, 3)],
+)
+def test_words_are_matched(clusters, bits, length, more):
+    """Words beyond the 2^bits first carry no bits."""
+    rng = np.random.default_rng(bits)
+    words = rng.choice([-1.0, 1.0], (2**bits + more, length))
+    for values in (rng.normal(size=(clusters, length)), np.zeros((clusters, length))):
+        found = match_words(values, np.ascontiguousarray(words.T), bits)
+        symbols, best, margins, agreement = twins.match_words(values, words)
+        assert_array_equal(found.symbols, symbols)
+        assert_allclose(found.best, best, rtol=1e-9, atol=1e-12)
+        assert_allclose(found.margins, margins, rtol=1e-9, atol=1e-12)
+        assert found.agreement == pytest.approx(agreement)
+        assert found.least == np.abs(found.margins).min()
 
 
 def signs_of(codes):

@@ -156,3 +156,15 @@ def log_ratio(counts, prior):
     more = counts + prior * (seen / seen.mean() if seen.min() > 0 else 1.0)
     share = more / more.sum((1, 2), keepdims=True)
     return np.log(share[1] / share[0])
+
+
+def match_words(values, words):
+    """Nearest words, by how much those with a bit 0 fit better than those with 1, and what agrees."""
+    fit, bits = values @ words.T, len(words).bit_length() - 1
+    zero = np.array([[f"{s:0{bits}b}"[b] == "0" for b in range(bits)] for s in range(2**bits)])
+    carrying = fit[:, : 2**bits, None]
+    margins = np.where(zero, carrying, -np.inf).max(1) - np.where(zero, -np.inf, carrying).max(1)
+    symbols = fit.argmax(1)
+    agrees = np.sign(values) * words[symbols] > 0
+    agreement = np.abs(values)[agrees].sum() / max(np.abs(values).sum(), 1e-9)
+    return symbols, fit.max(1), margins, agreement
