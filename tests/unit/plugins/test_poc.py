@@ -12,6 +12,7 @@ from evlcp_poc.correlation import (
     pair_shifts,
     phase_only_correlation,
 )
+from evlcp_poc.pairs import robust_mean
 from evlcp_poc.ranging import PocRanging
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -260,3 +261,13 @@ def test_clusters_that_the_bar_has_not_are_refused(clusters):
 def test_too_few_clusters_are_refused(bar, skip, said):
     with pytest.raises(ConfigError, match=said):
         PocRanging(skip_outer=skip).compile(CAMERA, bar, LINK.codebook)
+
+
+def test_extremes_of_both_sides_and_outliers_are_left_out():
+    first, second = np.triu_indices(6, 1)
+    values, weights = 50 + 0.01 * np.arange(15), (second - first) ** 2.0
+    values[[0, 5, 9]] = 40, 70, 51
+    mean, _, kept = robust_mean(values, weights, first, second, 1, 1.5)
+    rest = np.delete(np.arange(15), [0, 5, 9])
+    assert kept == len(rest)
+    assert mean == pytest.approx(np.average(values[rest], weights=weights[rest]))
