@@ -120,11 +120,9 @@ def test_values_reach_the_objects(registry: Registry) -> None:
     ("override", "section", "key", "value"),
     [
         ("ranging.id=centroid", "ranging", "id", "centroid"),
-        ("ranging.window_px=2.5", "ranging", "window_px", 2.5),
         ("ranging.trim = false", "ranging", "trim", False),
         ("ranging.drop=[0, 1]", "ranging", "drop", [0, 1]),
         ('ranging.kernel="gauss"', "ranging", "kernel", "gauss"),
-        ("air.frames_per_packet=4", "air", "frames_per_packet", 4),
     ],
 )
 def test_overrides(registry: Registry, override: str, section: str, key: str, value: Any) -> None:

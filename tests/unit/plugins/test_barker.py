@@ -127,9 +127,8 @@ def test_noise_that_ends_at_once_is_no_preamble(rate_hz):
             assert not locks
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_mean_square_of_the_positive(seed):
-    rng = np.random.default_rng(seed)
+def test_mean_square_of_the_positive():
+    rng = np.random.default_rng(0)
     rho = np.maximum(rng.normal(0, 0.1, 300), 0)
     out, parts, crowd = np.empty(300), np.empty(300), np.full((2, 340), 1e9)
     power, known = _kernels.mean_squares(rho, crowd, 40, 0, (0.0, 0, 100), out)
