@@ -1,7 +1,7 @@
 """The layers of the SDK, read from the imports."""
 
 import ast
-from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -37,19 +37,26 @@ def layer_of(module: str) -> int:
     raise AssertionError(f"evlcp_sdk.{module}: put it in a layer")
 
 
-def imports_of(path: Path) -> Iterator[str]:
+@cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@cache
+def imports_of(path: Path) -> frozenset[str]:
     """Every absolute module name that a file imports, also inside functions and for typing only."""
-    tree = ast.parse(path.read_text())
-    for node in ast.walk(tree):
+    found: set[str] = set()
+    for node in ast.walk(tree_of(path)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{path}: relative import"
             assert node.module
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
                 own = SDK.parent / inner.replace(".", "/")
-                yield inner if own.is_dir() or own.with_suffix(".py").exists() else node.module
+                found.add(inner if own.is_dir() or own.with_suffix(".py").exists() else node.module)
+    return frozenset(found)
 
 
 def modules(folder: Path) -> dict[str, Path]:
@@ -65,19 +72,14 @@ def modules(folder: Path) -> dict[str, Path]:
 MODULES = modules(SDK)
 
 
-@pytest.mark.parametrize("module", MODULES)
-def test_imports_go_down(module: str) -> None:
-    mine = layer_of(module)
-    for name in imports_of(MODULES[module]):
-        if name.startswith("evlcp_sdk."):
-            other = name.removeprefix("evlcp_sdk.")
-            assert layer_of(other) <= mine, f"evlcp_sdk.{module} imports {name}, which stands above it"
-
-
-@pytest.mark.parametrize("module", MODULES)
-def test_the_sdk_imports_no_plugin(module: str) -> None:
+def test_imports_go_down_and_none_is_of_a_plugin() -> None:
     plugins = {p.name for p in (SDK.parent / "plugins").iterdir()} | {"firmware_host"}
-    assert not {name.split(".")[0] for name in imports_of(MODULES[module])} & plugins
+    for module, path in MODULES.items():
+        for name in imports_of(path):
+            assert name.split(".")[0] not in plugins, f"evlcp_sdk.{module} imports the plugin {name}"
+            if name.startswith("evlcp_sdk."):
+                above = layer_of(name.removeprefix("evlcp_sdk.")) > layer_of(module)
+                assert not above, f"evlcp_sdk.{module} imports {name}, which stands above it"
 
 
 @pytest.mark.parametrize("package", ["io", "rx", "place", "sim"])
@@ -151,7 +153,7 @@ def test_no_two_public_classes_have_one_name() -> None:
     for path in (
         p for room in ("evlcp_sdk", "firmware_host", "plugins") for p in (root / room).rglob("*.py")
     ):
-        for node in ast.parse(path.read_text()).body:
+        for node in tree_of(path).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
                 homes.setdefault(node.name, []).append(path)
     assert {name: paths for name, paths in homes.items() if len(paths) > 1} == {}
