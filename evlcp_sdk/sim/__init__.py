@@ -21,11 +21,7 @@ if TYPE_CHECKING:
         preset_text as preset_text,
         resolve_scene as resolve_scene,
     )
-    from evlcp_sdk.sim.simulation import (
-        Simulation as Simulation,
-        scene_table as scene_table,
-        simulate as simulate,
-    )
+    from evlcp_sdk.sim.simulation import Simulation as Simulation
     from evlcp_sdk.sim.truth import (
         SentBar as SentBar,
         Truth as Truth,
@@ -41,7 +37,7 @@ _HOMES = {
         "BackgroundSpec BarSpec LampSpec LensSpec MotionSpec ReflectionSpec Scene SensorSpec WiperSpec "
         "WorldSpec load_scene preset_names preset_text resolve_scene"
     ),
-    "simulation": "Simulation scene_table simulate",
+    "simulation": "Simulation",
     "truth": "SentBar Truth read_truth truth_from_table truth_path",
     "world": "sites_of",
 }

@@ -15,7 +15,7 @@ from evlcp_sdk.sim.light import BarLight, reflections_of
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_sigma_px
 from evlcp_sdk.sim.scene import Scene, resolve_scene
-from evlcp_sdk.sim.simulation import Simulation, scene_table
+from evlcp_sdk.sim.simulation import Simulation
 from evlcp_sdk.sim.truth import Truth, link_table_of, truth_from_table
 from evlcp_sdk.sim.world import camera_on_earth, sites_of
 
@@ -80,7 +80,7 @@ def truth_of(
         },
         "psf_sigma_px": [blur_sigma_px(float(d), scene.lens, camera) for d in depth[0]],
         "e_led": [light.light_w_m2 for light in simulation.bars],
-        "simulator": scene_table(scene),
+        "simulator": asdict(scene),
     }
     if scene.world is not None:
         found["sites"] = [asdict(site) for site in sites_of(scene, registry)]

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any, cast
@@ -772,34 +772,3 @@ class _Served:
         if simulation.scene.t0_us:
             columns[0][:written] += simulation.scene.t0_us
         return Events(columns[0][:written], columns[1][:written], columns[2][:written], columns[3][:written])
-
-
-def simulate(
-    scene: Scene,
-    seed: int | None = None,
-    *,
-    threads: int = 1,
-    max_events: int = 1 << 16,
-    registry: Registry | None = None,
-) -> Iterator[Events]:
-    """Yield a scene's events in order of time, in pieces of at most `max_events`.
-
-    Args:
-        scene: What to render.
-        seed: Instead of the scene's.
-        threads: Threads that share the pixels; the events do not depend on it.
-        max_events: Length of a piece; the events do not depend on it.
-        registry: Where the algorithms of its links are found; None for all that are installed.
-
-    Raises:
-        ConfigError: The scene cannot be rendered.
-        InputError: One of its files cannot be read.
-    """
-    for events in Simulation(scene, seed, threads, registry).stream():
-        for begin in range(0, len(events), max_events):
-            yield events[begin : begin + max_events]
-
-
-def scene_table(scene: Scene) -> dict[str, Any]:
-    """The scene as plain values, every default written out; `resolve_scene` takes it back."""
-    return asdict(scene)

@@ -7,7 +7,7 @@ import pytest
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import Truth, load_scene, simulate, truth_of
+from evlcp_sdk.sim import Simulation, Truth, load_scene, truth_of
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
@@ -22,7 +22,7 @@ BEST = ("decoding.id=motion-feedback", "ranging.id=joint-scale", "tracking.id=ka
 @cache
 def rendered(scene: str, seed: int, settings: tuple[str, ...]) -> tuple[Events, Truth]:
     cut = load_scene(scene if scene.startswith("drive") else SCENES / f"{scene}.toml", settings)
-    return Events.concat(simulate(cut, seed=seed)), truth_of(cut, seed=seed)
+    return Events.concat(Simulation(cut, seed).stream()), truth_of(cut, seed=seed)
 
 
 def received(scene: str, seeds: Iterable[int], settings: tuple[str, ...], link: tuple[str, ...]) -> Tally:

@@ -9,18 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import BackgroundSpec, Scene, SensorSpec, Simulation, _kernels
 from evlcp_sdk.sim.simulation import request_words
-
-__all__ = [
-    "MEASURED_AREA",
-    "MEASURED_LATENCY",
-    "PixelEvents",
-    "crossing_by_steps",
-    "events_per_edge",
-    "latency_us",
-    "latency_with_readout_us",
-    "pixel_events",
-    "step_response",
-]
+from evlcp_sdk.values import Events
 
 Floats = NDArray[np.float64]
 
@@ -124,15 +113,35 @@ def latency_with_readout_us(sensor: SensorSpec, light_w_m2: float, side_px: int,
         sensor, [-1e5, 0.0], [1e-4, light_w_m2], sensor.refr_us / 2 + 1000, pixels=side_px**2, seed=seed
     )
     first = np.flatnonzero(np.append(True, np.diff(one.pixel) > 0))
-    code = ((one.pixel[first] // side_px) << _kernels.COLUMN_BITS | one.pixel[first] % side_px) << 1 | 1
-    n = len(first)
-    words = np.sort(request_words(one.request_us[first], code.astype(np.int32), 0.0))
+    words = np.sort(words_of(one.request_us[first], *np.divmod(one.pixel[first], side_px)))
+    return float(served(words, side_px, sensor.t_row_us)[0].t_us.mean() + 0.5)
+
+
+def words_of(t_us: ArrayLike, row: ArrayLike, column: ArrayLike) -> NDArray[np.int64]:
+    """Requests of ON events, as the readout takes them."""
+    code = (np.asarray(row) << _kernels.COLUMN_BITS | np.asarray(column)) << 1 | 1
+    return request_words(np.asarray(t_us, np.float64), code.astype(np.int32), 0.0)
+
+
+def served(
+    words: NDArray[np.int64],
+    height: int,
+    row_us: float,
+    *,
+    until_us: float = np.inf,
+    limit: tuple[int, int] = (0, 200),
+    memory: Floats | None = None,
+    pending: NDArray[np.bool_] | None = None,
+) -> tuple[Events, int, int, int]:
+    """What the readout makes of sorted requests: events, and `read_out`'s counts of others."""
+    n = len(words)
     out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
-    memory = np.array([-1e18, -1.0, -1.0, 0.0])
-    _kernels.read_out(
-        words, (0.0, sensor.t_row_us, np.inf), side_px, (0, 200), memory, np.zeros((0, 0), np.bool_), out
+    memory = np.array([-1e18, -1.0, -1.0, 0.0]) if memory is None else memory
+    pending = np.zeros((0, 0), np.bool_) if pending is None else pending
+    written, dropped, held, left = _kernels.read_out(
+        words, (0.0, row_us, until_us), height, limit, memory, pending, out
     )
-    return float(out[0].mean() + 0.5)
+    return Events(*(column[:written] for column in out)), dropped, held, left
 
 
 def crossing_by_steps(

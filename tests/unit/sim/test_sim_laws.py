@@ -9,8 +9,6 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import read_events
-from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BackgroundSpec,
@@ -18,46 +16,17 @@ from evlcp_sdk.sim import (
     LampSpec,
     MotionSpec,
     Scene,
-    SensorSpec,
     Simulation,
     load_scene,
     scene_of_truth,
-    simulate,
     simulation,
     truth_of,
 )
-from evlcp_sdk.study.frames import frames_of
-from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.values import Events
+from tests.unit.sim.scenes import alike, every, rows, still
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 SHORT = replace(load_scene("two-bars"), duration_s=0.03, lamps=(LampSpec(x_m=-1.4, y_m=-0.6, z_m=3.0),))
-QUIET = SensorSpec(noise_hz=0.0, hot_share=0.0)
-
-
-def every(scene: Scene, seed: int | None = None, threads: int = 1) -> Events:
-    return Events.concat(Simulation(scene, seed, threads).stream())
-
-
-def same(a: Events, b: Events) -> bool:
-    return all(np.array_equal(getattr(a, c), getattr(b, c)) for c in ("t_us", "x", "y", "p"))
-
-
-def shape(events: Events) -> set[tuple[int, int, int, int]]:
-    columns = (events.t_us, events.x, events.y, events.p)
-    return set(zip(*(c.tolist() for c in columns), strict=True))
-
-
-def test_threads_pieces_and_runs_do_not_matter() -> None:
-    events = every(SHORT)
-    assert len(events) > 50_000
-    assert (np.diff(events.t_us) >= 0).all()
-    assert same(events, every(SHORT))
-    assert same(events, every(SHORT, threads=3))
-    pieces = list(simulate(SHORT, max_events=777))
-    assert max(map(len, pieces)) == 777
-    assert same(events, Events.concat(pieces))
-    assert not same(events, every(SHORT, seed=1))
 
 
 def test_what_is_worked_out_anew_less_often_changes_next_to_no_event(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -79,34 +48,27 @@ def test_what_is_worked_out_anew_less_often_changes_next_to_no_event(monkeypatch
 
 def test_the_clock_shifts_all_stamps() -> None:
     a, b = every(SHORT), every(replace(SHORT, t0_us=16_770_000))
-    assert (b.t_us - 16_770_000 == a.t_us).all()
-    assert np.array_equal(a.x, b.x)
+    assert (np.diff(a.t_us) >= 0).all()
+    assert rows(Events(b.t_us - 16_770_000, b.x, b.y, b.p)) == rows(a)
+    assert rows(every(SHORT, seed=1)) != rows(a)
 
 
 def test_the_mirrored_scene_is_the_mirrored_recording() -> None:
     # One column more to the left than to the right of the axis: mirror about it, with an odd width.
     camera = replace(Scene().camera, width=1279)
-    sensor = replace(QUIET, th_spread=0.0, noise_ln=0.0, p_on_miss=0.0, p_off_miss=0.0, t_row_us=0.0)
-    motion = MotionSpec(vib_rate_rad_s=0.0)
     bar = BarSpec(start_chip=10.0, seed=1)
-    scene = Scene(
-        duration_s=0.01, camera=camera, sensor=sensor, motion=motion, background=BackgroundSpec(texture=0.0)
-    )
+    scene = still(0.01, camera=camera, background=BackgroundSpec(texture=0.0))
     left = every(replace(scene, bars=(bar,)))
     # The axis meets the image at width / 2 = 639.5, between the columns 639 and 640.
     right = every(replace(scene, bars=(replace(bar, x_m=-bar.x_m),)))
-    assert len(left) == len(right) > 10_000
-    # A crossing at the turn of a microsecond may be stamped on either side: rounding of sums.
-    mirrored = {(t, 1279 - x, y, p) for t, x, y, p in shape(left)}
-    assert len(mirrored & shape(right)) > 0.999 * len(right)
+    alike(Events(left.t_us, (1279 - left.x).astype(np.uint16), left.y, left.p), right)
 
 
 def test_dark_and_passed_bars_give_nothing() -> None:
-    dark = Scene(duration_s=0.02, sensor=QUIET, bars=(BarSpec(led_w_m2=1e-9),))
+    dark = still(0.02, bars=(BarSpec(led_w_m2=1e-9),))
     assert len(every(dark)) == 0
-    passing = Scene(
-        duration_s=0.1,
-        sensor=QUIET,
+    passing = still(
+        0.1,
         camera=CameraModel(width=160, height=120, focal_mm=1.0),
         motion=MotionSpec(distance_m=1.2, speed_mps=30.0, yaw_deg=-50.0, vib_rate_rad_s=0.0),
     )
@@ -114,18 +76,6 @@ def test_dark_and_passed_bars_give_nothing() -> None:
     assert len(events) > 0
     # 74 ms on it is nearer than 50 cm, and behind the camera soon after; it leaves the image before.
     assert events.t_us[-1] < 74_000
-
-
-def test_the_receiver_hears_the_simulated_bar() -> None:
-    simulation = Simulation(load_scene("drive-30kmh", ["motion.distance_m=50.0", "duration_s=0.1"]))
-    receiver = Receiver(load_link())
-    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
-    found = statistics_of(frames_of(packets), truth_of(simulation))
-    bar = found.total()
-    assert found.unmatched == 0
-    assert bar.frames_found == bar.frames_sent > 20
-    assert bar.bit_errors == bar.erased == 0
-    assert 0.01 < bar.rmse_m < 0.2
 
 
 def test_the_truth_counts_what_was_rendered() -> None:
@@ -172,7 +122,7 @@ def test_the_truth_has_the_schema_of_the_recordings() -> None:
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
-@pytest.mark.parametrize("name", ["night-50m-30kmh", "day-35m-20kmh", "tunnel-90m-30kmh"])
+@pytest.mark.parametrize("name", ["night-50m-30kmh", "tunnel-90m-30kmh"])
 def test_statistics_are_near_those_of_the_independent_recording(name: str) -> None:
     theirs = read_events(SHARED / f"{name}.raw")
     told = json.loads((SHARED / f"{name}.truth.json").read_text())

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings, strategies as st
 from scipy.stats import binomtest, chisquare, kstest, norm
 
-from evlcp_sdk.sim import BarSpec, MotionSpec, Scene, SensorSpec, Simulation, _kernels
+from evlcp_sdk.sim import Scene, SensorSpec, _kernels
 from evlcp_sdk.sim.simulation import quantile_table, request_words, seed_key
 from evlcp_sdk.values import Events
 from tests.models.pixels import (
@@ -19,8 +19,11 @@ from tests.models.pixels import (
     latency_us,
     latency_with_readout_us,
     pixel_events,
+    served,
     step_response,
+    words_of,
 )
+from tests.unit.sim.scenes import every
 
 SENSOR = SensorSpec()
 IDEAL = replace(SENSOR, noise_ln=0.0, th_spread=0.0, p_on_miss=0.0, p_off_miss=0.0)
@@ -117,7 +120,7 @@ def test_pixels_do_not_depend_on_those_beside_them(tau_us: float) -> None:
     edges, light = np.arange(40) * 100.0, rng.uniform(0.02, 50.0, 40)
     sensor = replace(SENSOR, tau_sf_us=tau_us, jitter_us=2.0)
     together = pixel_events(sensor, edges, light, 4e3, pixels=_kernels.LANES + 3)
-    for pixels in (1, 2, 5, _kernels.LANES):
+    for pixels in (1, 5, _kernels.LANES):
         fewer = pixel_events(sensor, edges, light, 4e3, pixels=pixels)
         n = len(fewer.pixel)
         assert n == np.searchsorted(together.pixel, pixels)
@@ -136,18 +139,13 @@ def test_missing_events_are_missing_in_the_share_asked_for() -> None:
         assert interval.low <= p <= interval.high
 
 
-def background_only(seconds: float, **sensor: float) -> tuple[Scene, Events]:
-    scene = Scene(
-        duration_s=seconds,
-        bars=(),
-        motion=MotionSpec(vib_rate_rad_s=0.0),
-        sensor=replace(SENSOR, t_row_us=0.0, cap_mev_s=0.0, **sensor),
-    )
-    return scene, Events.concat(list(Simulation(scene).stream()))
+def background_only(**sensor: float) -> Events:
+    noisy = replace(SENSOR, t_row_us=0.0, cap_mev_s=0.0, **sensor)
+    return every(Scene(duration_s=1.0, bars=(), sensor=noisy))
 
 
 def test_background_activity_is_poisson() -> None:
-    scene, events = background_only(1.0, noise_hz=0.1, hot_share=0.0)
+    events = background_only(noise_hz=0.1, hot_share=0.0)
     expected = 2 * 0.1 * 1280 * 720
     assert abs(len(events) - expected) < 4 * math.sqrt(expected)
     assert abs(int(events.p.sum()) - len(events) / 2) < 4 * math.sqrt(len(events) / 4)
@@ -158,11 +156,10 @@ def test_background_activity_is_poisson() -> None:
     assert counts.var(ddof=1) / counts.mean() == pytest.approx(1, abs=0.3)
     tiles = np.histogram2d(events.x, events.y, (16, 9), ((0, 1280), (0, 720)))[0]
     assert chisquare(tiles.ravel()).pvalue > 1e-3
-    assert scene.bars == ()
 
 
 def test_hot_pixels_fire_at_their_rate() -> None:
-    _, events = background_only(1.0, noise_hz=0.0, hot_share=1e-4, hot_hz=100.0)
+    events = background_only(noise_hz=0.0, hot_share=1e-4, hot_hz=100.0)
     counts = np.bincount(events.y.astype(int) * 1280 + events.x)
     counts = counts[counts > 0]
     assert 50 < len(counts) < 140
@@ -174,53 +171,27 @@ def test_latency_grows_with_the_lit_area(side: int) -> None:
     assert latency_with_readout_us(SENSOR, 0.277, side) == pytest.approx(MEASURED_AREA[side], rel=0.1)
 
 
-def read_out(
-    t: np.ndarray, y: np.ndarray, x: np.ndarray, row_us: float, cap: int = 0, window: int = 200
-) -> tuple[Events, int]:
-    code = (((y << _kernels.COLUMN_BITS) | x) << 1 | 1).astype(np.int32)
-    n = len(t)
-    words = request_words(t.astype(float), code, 0.0)
-    out = np.empty(n, np.int64), np.empty(n, np.uint16), np.empty(n, np.uint16), np.empty(n, np.uint8)
-    memory = np.array([-1e18, -1.0, -1.0, 0.0])
-    written, dropped, _, left = _kernels.read_out(
-        words, (0.0, row_us, math.inf), 720, (cap, window), memory, np.zeros((0, 0), bool), out
-    )
-    assert left == 0
-    return Events(*(c[:written] for c in out)), dropped
-
-
 def test_rows_are_read_one_after_another() -> None:
     y = np.repeat(np.arange(100), 5)
-    events, _ = read_out(np.full(500, 10.0), y, np.tile(np.arange(5), 100), 1.0)
+    events, *_ = served(words_of(np.full(500, 10.0), y, np.tile(np.arange(5), 100)), 720, 1.0)
     # The row of the first request begins; each row takes all its requests along, a row a us.
     assert events.t_us.tolist() == (11 + y).tolist()
     assert events.y.tolist() == y.tolist()
     assert events.x.tolist() == np.tile(np.arange(5), 100).tolist()
-
-
-def test_columns_of_the_widest_sensor_are_told_apart() -> None:
-    x = np.array([8191, 0, 4096, 1])
-    events, _ = read_out(np.full(4, 10.0), np.array([719, 718, 718, 719]), x, 1.0)
+    # Columns of the widest sensor are told apart.
+    words = words_of(np.full(4, 10.0), [719, 718, 718, 719], [8191, 0, 4096, 1])
+    events, *_ = served(words, 720, 1.0)
     assert events.x.tolist() == [0, 4096, 1, 8191]
     assert events.y.tolist() == [718, 718, 719, 719]
 
 
 def test_more_than_the_event_rate_limit_is_dropped() -> None:
     t = np.sort(np.random.default_rng(0).uniform(0, 1000, 5000))
-    events, dropped = read_out(t, np.arange(5000) % 700, np.arange(5000) // 700, 0.0, cap=300)
+    words = words_of(t, np.arange(5000) % 700, np.arange(5000) // 700)
+    events, dropped, *_ = served(words, 720, 0.0, limit=(300, 200))
     assert len(events) + dropped == 5000
     assert np.bincount(events.t_us // 200).max() == 300
     assert dropped == 5000 - 5 * 300
-
-
-def test_sorting_is_by_time_and_pixel() -> None:
-    rng = np.random.default_rng(1)
-    t = np.round(rng.uniform(0, 50, 3000), 1)
-    code = rng.integers(0, 1000, 3000).astype(np.int32)
-    out = np.sort(request_words(t, code, 20.0))
-    order = np.lexsort((code, t))
-    np.testing.assert_allclose((out >> _kernels.CODE_BITS) / _kernels.TICKS, t[order] - 20.0, atol=1e-6)
-    assert np.array_equal(out & ((1 << _kernels.CODE_BITS) - 1), code[order])
 
 
 def test_a_pixel_is_blind_after_an_event_in_any_block() -> None:
@@ -256,4 +227,3 @@ def test_random_numbers_are_those_of_a_normal_distribution() -> None:
     assert kstest(numbers, "norm").pvalue > 1e-3
     again = [_kernels.hash_normal(seed_key(3), k, d, 0, table) for k in range(2) for d in range(50)]
     assert numbers[:100] == again
-    assert Scene().bars == (BarSpec(),)

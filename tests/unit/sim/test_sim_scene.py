@@ -8,18 +8,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy.stats import norm
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import resolve
-from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BarSpec,
     LampSpec,
     LensSpec,
-    Scene,
     Simulation,
     load_scene,
     preset_names,
@@ -27,8 +23,7 @@ from evlcp_sdk.sim import (
     truth_of,
 )
 from evlcp_sdk.sim.light import BarLight, lamp_source
-from evlcp_sdk.sim.motion import CameraPath, Vibration, project
-from evlcp_sdk.sim.optics import blur_sigma_px, step_table
+from evlcp_sdk.sim.motion import CameraPath, Vibration
 
 LINK = resolve({})
 EXAMPLES = Path(__file__).parents[3] / "examples" / "scenes"
@@ -45,28 +40,36 @@ def test_examples_can_be_rendered(path: Path) -> None:
     [
         ({"motion": {"distance_m": -3.0}}, "motion.distance_m = -3.0: expected greater than 0"),
         ({"motion": {"distnce_m": 3.0}}, "motion.distnce_m = 3.0: unknown key; did you mean 'distance_m'?"),
-        ({"bars": [{}, {"ppm": "fast"}]}, 'bars.1.ppm = "fast": expected a valid number'),
         ({"bars": [{"z_m": -60.0}]}, "bars.0.z_m = -60.0: the bar is behind the camera"),
-        ({"lamps": [{"waveform": "saw"}]}, "lamps.0.waveform = \"saw\": expected 'square' or 'sine'"),
         ({"camra": {}}, "camra: unknown table; did you mean 'camera'?"),
-        ({"sensor": {"refr_us": 0}}, "sensor.refr_us = 0: expected greater than or equal to 1"),
         ({"lens": {"focus_m": 0.01}}, "lens.focus_m = 0.01: expected beyond the focal length"),
+        ({"lens": {"bloom": 0.99}}, "lens.bloom = 0.99: expected less than 1 together with lens.halo = 0.02"),
         ({"camera": {"width": 5000}}, "camera: expected at most 4096"),
         ({"bars": [{}] * 65}, "bars and lamps: expected at most 64"),
-        ({"duration_s": float("inf")}, "duration_s"),
+        ({"bars": [{"cover_s": [[0.1, 0.2, 3]]}]}, "bars.0.cover_s.0"),
+        ({"reflections": [{"bar": 1}]}, "reflections.0.bar = 1: there are 1 bars, counted from 0"),
+        ({"wiper": {"edge_s": 0.02}}, "wiper.edge_s = 0.02: expected at most half of lasts_s"),
+        ({"wiper": {"every_s": 0.01}}, "wiper.every_s = 0.01: expected at least lasts_s"),
+        ({"link": 3}, "link = 3: expected a link.toml, or tables as in one"),
+        ({"link": {"air": 3}}, "link: air = 3: expected a table"),
+        ({"link": {"air": {"chip_rate": 1.0}}}, "link: air.chip_rate = 1.0: unknown key; did you"),
+        ({"bars": [{"link": "no.toml"}]}, "bars.0.link: no.toml: cannot be read"),
+        (
+            {"bars": [{}, {"link": {"modulation": {"id": "wh9"}}}]},
+            "bars.1.link: no modulation algorithm named 'wh9'",
+        ),
+        ({"bars": [{"link": {"bar": {"rows": 7}}}]}, "bars.0.link: bar.cluster_rows = 6: expected"),
+        (
+            {"bars": [{"profile": "wh8"}]},
+            'bars.0.profile = "wh8": unknown key; its link says it: bars.link.m',
+        ),
     ],
 )
 def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> None:
     with pytest.raises(ConfigError) as fault:
-        resolve_scene(table, source="scene.toml")
-    assert says in str(fault.value)
-    assert "scene.toml: " in str(fault.value)
-
-
-def test_every_fault_is_told() -> None:
-    with pytest.raises(ConfigError) as fault:
-        resolve_scene({"motion": {"distance_m": 0.0}, "sensor": {"th_on": -1.0}})
-    assert len(str(fault.value).splitlines()) == 2
+        resolve_scene(table, source="s.toml")
+    (line,) = str(fault.value).splitlines()
+    assert line.startswith(f"s.toml: {says}")
 
 
 @pytest.mark.parametrize(
@@ -84,19 +87,11 @@ def test_wrong_overrides_are_told(override: str, says: str) -> None:
     assert says in str(fault.value)
 
 
-def test_files_that_are_no_scenes_are_told(tmp_path: Path) -> None:
+def test_a_name_that_is_no_scene_is_told() -> None:
     with pytest.raises(
         ConfigError, match=r"nigt: no such file, and no preset of that name; did you .*'night'"
     ):
         load_scene("nigt")
-    with pytest.raises(ConfigError, match="cannot be read"):
-        load_scene(tmp_path / "missing.toml")
-    (tmp_path / "a.toml").write_text("x = ")
-    with pytest.raises(ConfigError, match="not TOML"):
-        load_scene(tmp_path / "a.toml")
-    (tmp_path / "b.toml").write_bytes(b"\xff")
-    with pytest.raises(ConfigError, match="not UTF-8"):
-        load_scene(tmp_path / "b.toml")
 
 
 def test_a_bar_sends_what_the_air_interface_says() -> None:
@@ -159,44 +154,6 @@ def test_lamps_keep_their_period_and_duty() -> None:
     assert levels.min() < 0.01
 
 
-def lit_share(z: NDArray[np.float64], width_px: float, sigma_px: float) -> NDArray[np.float64]:
-    """Share of a pixel at `z` from a strip's middle that the strip, blurred, lights: its light, summed."""
-    at, weights = np.polynomial.legendre.leggauss(40)
-    x = z[:, None] + at / 2
-    light = norm.cdf(x + width_px / 2, scale=sigma_px) - norm.cdf(x - width_px / 2, scale=sigma_px)
-    share: NDArray[np.float64] = light @ weights / 2
-    return share
-
-
-def test_the_step_table_is_the_formula() -> None:
-    sigma, width = 0.4, 0.7
-    reach = 5 * sigma + 0.5
-    table = step_table(sigma, reach, 513)
-    z = np.linspace(-2, 2, 41)
-    nodes = np.linspace(-reach, reach, 513)
-    found = np.interp(z + width / 2, nodes, table) - np.interp(z - width / 2, nodes, table)
-    np.testing.assert_allclose(found, lit_share(z, width, sigma), atol=1e-4)
-    # All the strip's light arrives.
-    many = np.arange(-20, 21, dtype=float)
-    assert lit_share(many, width, sigma).sum() == pytest.approx(width)
-    assert blur_sigma_px(20.0, Scene().lens, CameraModel()) > blur_sigma_px(50.0, Scene().lens, CameraModel())
-
-
-def test_projection_is_the_pinhole() -> None:
-    camera = CameraModel()
-    point = np.array([[-1.5, 0.48, 0.0]])
-    still = np.array([[0.0, 0.0, -50.0]])
-    place, depth = project(point, still, np.zeros((1, 3)), camera)
-    assert depth[0, 0] == 50
-    f = camera.focal_px
-    assert place[0, 0] == pytest.approx([640 - 1.5 / 50 * f, 360 + 0.48 / 50 * f])
-    for attitude, sign in (((1e-4, 0, 0), (-1, 0)), ((0, 1e-4, 0), (0, 1))):
-        moved, _ = project(point, still, np.array([attitude]), camera)
-        assert (moved - place)[0, 0] == pytest.approx(np.array(sign) * 1e-4 * f, abs=1e-2)
-    upper, _ = project(np.array([[0, -1.0, 0]]), still, np.array([[0, 0, 0.1]]), camera)
-    assert upper[0, 0, 0] < 640, "a camera that leans right sees the world lean left"
-
-
 def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     t = np.linspace(0, 0.2, 9)
     lines = ["t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg"]
@@ -226,7 +183,7 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
 
 def test_the_vibration_has_its_rate_and_its_spectrum() -> None:
     vibration = Vibration.of(0.06, 3)
-    t_us = np.arange(0, 60e6, 1000.0)
+    t_us = np.arange(0, 30e6, 1000.0)
     rate = vibration.rate_rad_s(t_us)
     assert rate.std(1) == pytest.approx(0.06, rel=0.1)
     assert 0.13 < np.abs(rate).max() < 0.4
