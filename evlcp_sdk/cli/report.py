@@ -12,7 +12,6 @@ from evlcp_sdk.cli._tables import print_table
 
 if TYPE_CHECKING:
     from evlcp_sdk.study.summary import Summary
-    from evlcp_sdk.study.tally import Tally
 
 
 def report(
@@ -106,43 +105,16 @@ def as_markdown(summary: Summary) -> str:
     return "\n\n".join(parts)
 
 
+_WIDE = ("bit errors", "bias, m", "RMSE in space, m")
+"""Columns of the page for which a terminal has no room."""
+
+
 def _series_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
-    from evlcp_sdk.study.intervals import Figure, measure
-    from evlcp_sdk.study.tally import SEGMENT_M, Tally
+    from evlcp_sdk.study.campaign.report import figure_rows
 
-    def shown(figure: Figure, form: str) -> str:
-        return f"{figure.value:{form}} {figure.interval(form)}".rstrip() if figure.count else "-"
-
-    tallies = [t for one in summary.series for t in one.statistics.segments.values()]
-    messages = any(t.messages_sent for t in tallies)
-    positions = any(t.fixes or t.fixes_refused for t in tallies)
-    rows = []
-    for one in summary.series:
-        for begin, recordings in reversed(one.segments):
-            tally = Tally.together(recordings)
-            ber, rmse, gross = (measure(recordings, kind) for kind in ("ber", "rmse_m", "gross_share"))
-            rows.append(
-                [
-                    one.name,
-                    f"{begin} to {begin + SEGMENT_M} m",
-                    f"{tally.frames_found} of {tally.frames_sent}",
-                    shown(ber, ".1e"),
-                    shown(rmse, ".3f"),
-                    f"{gross.value:.2%}" if gross.count else "-",
-                    *([f"{tally.messages_found} of {tally.messages_sent}"] if messages else []),
-                    *([f"{tally.messages_wrong}"] if messages else []),
-                    *([f"{tally.fixes} of {tally.fixes + tally.fixes_refused}"] if positions else []),
-                    *([_within(tally)] if positions else []),
-                    *([f"{tally.position_nees:.1f}" if tally.fixes else "-"] if positions else []),
-                ]
-            )
-    head = ["series", "distance", "frames", "BER [95 %]", "RMSE, m [95 %]", "0.5 m or more"]
-    head += ["messages", "wrong"] if messages else []
-    return head + (["positions", "half, 95 % within, m", "NEES of 3"] if positions else []), rows
-
-
-def _within(tally: Tally) -> str:
-    return f"{tally.position_median_m:.3f}, {tally.position_95_m:.3f}" if tally.fixes else "-"
+    head, rows = figure_rows(summary)
+    kept = [i for i, name in enumerate(head) if name not in _WIDE]
+    return [head[i] for i in kept], [[row[i] for i in kept] for row in rows]
 
 
 def _positions_table(summary: Summary) -> tuple[list[str], list[list[str]]]:

@@ -40,7 +40,7 @@ def page(summary: Summary) -> str:
         positions=position_rows(summary),
         position_head=POSITION_HEAD,
         intervals=INTERVALS,
-        all_figures=_all_figures(summary),
+        all_figures=figure_rows(summary),
         ends=(_limit(rule.max_bits, "bits"), _limit(rule.max_errors, "wrong bits")),
         cases=_cases(summary),
     )
@@ -196,12 +196,11 @@ def position_rows(summary: Summary) -> list[tuple[str, ...]]:
     return rows
 
 
-def _all_figures(summary: Summary) -> tuple[Sequence[str], list[tuple[str, ...]]]:
-    """Head and rows of the table of each series and segment."""
-    messages = any(t.messages_sent for one in summary.series for t in one.statistics.segments.values())
-    positions = any(
-        t.fixes or t.fixes_refused for one in summary.series for t in one.statistics.segments.values()
-    )
+def figure_rows(summary: Summary) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+    """Head and rows of the table of each series and segment, as text."""
+    tallies = [t for one in summary.series for t in one.statistics.segments.values()]
+    messages = any(t.messages_sent for t in tallies)
+    positions = any(t.fixes or t.fixes_refused for t in tallies)
     rows = []
     for one in summary.series:
         for begin, recordings in one.segments:
@@ -247,9 +246,7 @@ def _positions(recordings: Sequence[Tally]) -> tuple[str, ...]:
 
 
 def _shown(figure: Figure, form: str) -> str:
-    if not figure.count:
-        return "-"
-    return Markup('{} <span class="note">{}</span>').format(f"{figure.value:{form}}", figure.interval(form))
+    return f"{figure.value:{form}} {figure.interval(form)}".rstrip() if figure.count else "-"
 
 
 def _cases(summary: Summary) -> Iterator[tuple[str, Any]]:
