@@ -2,10 +2,12 @@
 
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
 import sysconfig
+import tomllib
 import venv
 from collections.abc import Iterator
 from pathlib import Path
@@ -86,11 +88,24 @@ class Environment:
         return {(r["role"], r["id"]): (r["distribution"], r["version"]) for r in rows}
 
 
+def released(folder: Path) -> Path:
+    """The SDK's wheel; that from its sdist is the same."""
+    folder.mkdir()
+    release = runpy.run_path(str(ROOT / ".ci" / "release.py"))
+    sdist, wheel = release["built"](folder)
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert sdist.name == f"evlcp_sdk-{version}.tar.gz"
+    inside = release["contents"](wheel)
+    assert {"evlcp_sdk/py.typed", "evlcp_sdk/data/demo.toml", "evlcp_uart/framing.py"} <= inside.keys()
+    assert not [name for name in inside if name.startswith(("tests/", "docs/", "examples/"))]
+    return Path(wheel)
+
+
 @pytest.fixture
 def environment(tmp_path: Path) -> Iterator[Environment]:
     """The environment with both wheels."""
     made = Environment(tmp_path)
-    made.pip("install", made.build(ROOT), made.build(EXAMPLE), made.build(FORMATS))
+    made.pip("install", released(tmp_path / "dist"), made.build(EXAMPLE), made.build(FORMATS))
     made.lend_kernels()
     yield made
     # Borrowed packages are links: only these go.

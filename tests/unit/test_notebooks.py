@@ -19,6 +19,7 @@ def test_a_notebook_prints_what_it_shows(
 ) -> None:
     """In this process: to start a kernel takes longer than most of them."""
     pyplot = pytest.importorskip("matplotlib.pyplot", reason="the extra notebook is not installed")
+    pyplot.switch_backend("agg")
     main = ModuleType("__main__")
     monkeypatch.setitem(sys.modules, "__main__", main)
     monkeypatch.chdir(path.parent)

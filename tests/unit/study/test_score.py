@@ -202,65 +202,49 @@ GOOD = ",".join(COLUMNS[:6]) + "\n"
 TRUE = '{"scene": {}, "bars": 3, "t_s": [], "distance_m": [], "bar_centre_px": []}'
 
 
+SCENE = json.dumps(truth_of(Scene(duration_s=0.05)).to_table())
+
+
 @pytest.mark.parametrize(
-    ("frames", "truth", "says"),
+    ("frames", "truth", "summary", "code", "says"),
     [
-        (None, "{}", "frames.csv: cannot be read"),
-        ("", "{}", "frames.csv: without the columns transmitter, t_us"),
-        ("t_us,symbols\n", "{}", "frames.csv: without the columns transmitter, distance_m, x_px, y_px"),
-        (GOOD + "0,soon,1,,0,0\n", "{}", "frames.csv: line 2: t_us = 'soon': expected a number"),
-        (
-            GOOD + "0,1,1,,0,0\n0,1,1 x,,0,0\n",
-            "{}",
-            "frames.csv: line 3: symbols = 'x': expected a whole",
-        ),
-        (GOOD + "0,1,1,inf,0,0\n", "{}", "frames.csv: line 2: distance_m = 'inf': expected a number"),
-        (
-            GOOD + "0,1,1,-1e308,0,0\n",
-            "{}",
-            "frames.csv: line 2: distance_m = '-1e308': expected at most",
-        ),
-        (GOOD, "{}", "not a scene's truth: bar_centre_px, bars, distance_m, scene, t_s"),
-        (GOOD, "[]", "not a scene's truth"),
-        (GOOD, TRUE, "t.json: not a scene's truth: bars = 3: expected a list"),
-        (GOOD, "{", "not JSON"),
-        (GOOD, None, "cannot be read"),
+        (None, "{}", None, 3, "frames.csv: cannot be read"),
+        ("", "{}", None, 3, "frames.csv: without the columns transmitter, t_us"),
+        ("t_us,symbols\n", "{}", None, 3, "without the columns transmitter, distance_m, x_px, y_px"),
+        (f"{GOOD}0,soon,1,,0,0\n", "{}", None, 3, "frames.csv: line 2: t_us = 'soon': expected a number"),
+        (f"{GOOD}0,1,1 x,,0,0\n", "{}", None, 3, "frames.csv: line 2: symbols = 'x': expected a whole"),
+        (f"{GOOD}0,1,1,inf,0,0\n", "{}", None, 3, "line 2: distance_m = 'inf': expected a number"),
+        (f"{GOOD}0,1,1,-1e308,0,0\n", "{}", None, 3, "distance_m = '-1e308': expected at most"),
+        (GOOD, "{}", None, 3, "not a scene's truth: bar_centre_px, bars, distance_m, scene, t_s"),
+        (GOOD, "[]", None, 3, "not a scene's truth"),
+        (GOOD, TRUE, None, 3, "t.json: not a scene's truth: bars = 3: expected a list"),
+        (GOOD, "{", None, 3, "not JSON"),
+        (GOOD, None, None, 3, "cannot be read"),
+        (GOOD, SCENE, "{", 3, "summary.json: not JSON"),
+        (GOOD, SCENE, "[]", 3, "summary.json: expected an object"),
+        (GOOD, SCENE, '{"status": "complete"}', 3, "summary.json: configuration: expected a table"),
+        (GOOD, SCENE, '{"configuration": {}}', 3, "summary.json: files.frames.csv.sha256 = None: expected"),
+        (GOOD, SCENE, '{"configuration": {"modulation": {"id": "gone"}}}', 2, "algorithm named 'gone'"),
+        (GOOD, SCENE, '{"configuration": {"air": {"frames": 3}}}', 2, "air.frames = 3: unknown key"),
     ],
-)
-def test_what_cannot_be_scored_is_told(
-    frames: str | None, truth: str | None, says: str, tmp_path: Path, evlcp: Callable[..., Any]
+)  # fmt: skip
+def test_what_cannot_be_scored_is_reported_in_one_line(
+    frames: str | None,
+    truth: str | None,
+    summary: str | None,
+    code: int,
+    says: str,
+    tmp_path: Path,
+    evlcp: Callable[..., Any],
 ) -> None:
-    if frames is not None:
-        (tmp_path / "frames.csv").write_text(frames)
-    if truth is not None:
-        (tmp_path / "t.json").write_text(truth)
+    for name, text in (("frames.csv", frames), ("t.json", truth), ("summary.json", summary)):
+        if text is not None:
+            (tmp_path / name).write_text(text)
     done = evlcp("score", tmp_path, tmp_path / "t.json")
-    assert done.code == 3
-    assert says in done.err
-    assert len(done.err.splitlines()) == 1
-
-
-@pytest.mark.parametrize(
-    ("summary", "code", "says"),
-    [
-        ("{", 3, "summary.json: not JSON"),
-        ("[]", 3, "summary.json: expected an object"),
-        ('{"status": "complete"}', 3, "summary.json: configuration: expected a table"),
-        ('{"configuration": {}}', 3, "summary.json: files.frames.csv.sha256 = None: expected"),
-        ('{"configuration": {"modulation": {"id": "gone"}}}', 2, "no modulation algorithm named 'gone'"),
-        ('{"configuration": {"air": {"frames": 3}}}', 2, "summary.json: air.frames = 3: unknown key"),
-    ],
-)
-def test_a_summary_that_says_no_link_is_told(
-    summary: str, code: int, says: str, tmp_path: Path, evlcp: Callable[..., Any]
-) -> None:
-    folder, path = write(tmp_path, GOOD, plain(truth_of(Scene(duration_s=0.05)).to_table()))
-    (folder / "summary.json").write_text(summary)
-    done = evlcp("score", folder, path)
     assert done.code == code
     assert says in done.err
-    assert done.err.startswith(f"evlcp: {folder}/summary.json: ")
     assert len(done.err.splitlines()) == 1
+    assert summary is None or done.err.startswith(f"evlcp: {tmp_path}/summary.json: ")
 
 
 def test_a_dark_bar_and_one_of_chips_need_no_link(tmp_path: Path) -> None:
