@@ -16,6 +16,7 @@ from evlcp_sdk.link.resolve import Link
 from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, queue_of, rest_content, word_limits
 from firmware_host.board.session import Session
 from firmware_host.board.stream import AHEAD, Stream
+from firmware_host.board.tables import name_of
 from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.generated.profiles import DIGESTS
@@ -536,7 +537,7 @@ class Board:
         """
         missing = self._missing(bank, content)
         total = sum(n for _, n in missing)
-        advance = progress or _silent
+        advance = progress or (lambda _done, _total: None)
         advance(len(content) - total, len(content))
         piece = self.session.max_payload - _WRITE_OVERHEAD
         left = deque((at, at + n) for at, n in missing)
@@ -617,17 +618,11 @@ class Board:
         end = self.session.transport.now() + timeout_s + _packet_s(status)
         while status.state not in (State.DARK, State.FAULT):
             if self.session.transport.now() > end:
-                raise LineError(f"{self.session.name}: still {_state(status.state)}; try 'evlcp board blank'")
+                state = name_of(State, status.state).upper()
+                raise LineError(f"{self.session.name}: still {state}; try 'evlcp board blank'")
             self.session.transport.read(0.005)
             status = self.status()
         return status
-
-
-def _state(value: int) -> str:
-    try:
-        return State(value).name
-    except ValueError:
-        return f"state {value}"
 
 
 def provision(
@@ -724,10 +719,6 @@ def _most(bank: Bank, room: int) -> str:
         return replace(bank, packet=replace(bank.packet, frames=frames)).packet_bytes
 
     return f"{bisect_right(range(1, bank.packet.frames + 1), room, key=size)} frames"
-
-
-def _silent(done: int, total: int) -> None:
-    del done, total
 
 
 def profile_number(bank: Bank) -> int:

@@ -4,7 +4,7 @@ import base64
 import binascii
 import json
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Self
@@ -12,7 +12,8 @@ from typing import Any, Self
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import read_json
 from firmware_host import build
-from firmware_host.board.board import Board
+from firmware_host.board.board import Board, Progress
+from firmware_host.board.tables import about_table
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.images import FlashImage
 from firmware_host.protocol.client import RequestOutcome
@@ -27,8 +28,6 @@ from firmware_host.protocol.generated.requests import (
     UpdateStatusRequest,
     UpdateWriteRequest,
 )
-
-Progress = Callable[[int, int], None]
 
 _NO_UPDATE = (
     "not a firmware update, or damaged; expected TARGET.update.json, as 'evlcp board build' makes it"
@@ -206,9 +205,7 @@ def update(
         )
     if keep:
         confirm(board)
-    about = board.about
-    version = f"{about.version_major}.{about.version_minor}.{about.version_patch}"
-    return Updated(after.running, len(data), sequence, version)
+    return Updated(after.running, len(data), sequence, about_table(board.about)["firmware"])
 
 
 def _restart(board: Board, wait_s: float) -> None:

@@ -657,7 +657,6 @@ def emulate(
         Path | None, typer.Option(metavar="FILE", help="(native) keep SAVE slots here; (rom) the flash.")
     ] = None,
     link: Annotated[Path | None, typer.Option(metavar="PATH", help="(native) name for the pty.")] = None,
-    baud: Annotated[int, typer.Option(help="(native) keep to a line rate; 0 as fast as it goes.", min=0)] = 0,
     unique_id: Annotated[int, typer.Option(help="(native) the board's number.", min=0, max=2**64 - 1)] = 0,
 ) -> None:
     """Run an emulated board in the foreground; end with Ctrl-C.
@@ -688,7 +687,7 @@ def emulate(
         check_output(leds, regular=False)
     if emulator is Emulator.NATIVE:
         with contextlib.ExitStack() as stack:
-            board = stack.enter_context(contextlib.closing(NativeBoard(leds, flash, baud, unique_id)))
+            board = stack.enter_context(contextlib.closing(NativeBoard(leds, flash, unique_id)))
             line = stack.enter_context(contextlib.closing(HostLine(listen, link)))
             stopped = stack.enter_context(stop_on_request())
             echo(f"listening on {line.place}")

@@ -4,7 +4,6 @@ import os
 import stat
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from pathlib import Path
 
 from evlcp_sdk.errors import InputError
@@ -19,36 +18,12 @@ _PIECE = 2048
 _STEP_S = 0.005
 
 
-@dataclass
-class _Rated:
-    """One direction of a line; room that is not used is lost, as on a line."""
-
-    baud: int
-    waiting: bytes = b""
-    room: float = 0.0
-    at_s: float = field(default_factory=time.monotonic)
-
-    def pass_on(self, data: bytes) -> bytes:
-        """What has passed the line by now."""
-        now_s = time.monotonic()
-        self.room += (now_s - self.at_s) * self.baud / 10
-        self.at_s = now_s
-        if not self.waiting:
-            self.room = min(self.room, 2.0)
-        self.waiting += data
-        count = min(len(self.waiting), int(self.room)) if self.baud else len(self.waiting)
-        self.room -= count
-        passed, self.waiting = self.waiting[:count], self.waiting[count:]
-        return passed
-
-
 class NativeBoard:
     """A board of its own time, which follows the clock whenever something is exchanged with it.
 
     Args:
         leds: File for the LED records.
         flash: File that keeps what SAVE writes, new or there.
-        baud: Line rate to keep to, bit/s; 0 for as fast as it goes.
         unique_id: The board's number, 64 bits.
 
     Raises:
@@ -57,9 +32,7 @@ class NativeBoard:
         ToolchainError: The board cannot be built.
     """
 
-    def __init__(
-        self, leds: Path | None = None, flash: Path | None = None, baud: int = 0, unique_id: int = 0
-    ) -> None:
+    def __init__(self, leds: Path | None = None, flash: Path | None = None, unique_id: int = 0) -> None:
         self._device = SimulatedBoard(bytes(4) + unique_id.to_bytes(8, "big"))
         self._held = self._device.flash()
         self._flash = None if flash is None else flash.resolve()
@@ -75,14 +48,11 @@ class NativeBoard:
             self._leds = None if leds is None else leds.open("wb")
         except OSError as fault:
             raise output_fault(leds or "", fault) from fault
-        self._to_board, self._to_host = _Rated(baud), _Rated(baud)
         self._begun_s = time.monotonic()
-        self.wait_s = _STEP_S / 10 if baud else _STEP_S
 
     def exchange(self, data: bytes) -> bytes:
         """Let time pass until now, give the board what a host has sent, and take what it sends."""
         self._device.run(int((time.monotonic() - self._begun_s) * 1e6) - self._device.now_us)
-        data = self._to_board.pass_on(data)
         for at in range(0, len(data), _PIECE):
             self._device.receive(data[at : at + _PIECE])
             self._device.run(0)
@@ -96,7 +66,7 @@ class NativeBoard:
                 self._leds.flush()
             except OSError as fault:
                 raise output_fault(self._leds.name, fault) from fault
-        return self._to_host.pass_on(self._device.sent())
+        return self._device.sent()
 
     def close(self) -> None:
         """Switch it off: its files are whole."""
@@ -153,4 +123,4 @@ def serve(board: NativeBoard, line: HostLine, stopped: Callable[[], bool]) -> No
     """Let hosts talk to a board, one at a time, until it is stopped."""
     data = b""
     while not stopped():
-        data = line.exchange(board.exchange(data), board.wait_s)
+        data = line.exchange(board.exchange(data), _STEP_S)

@@ -32,8 +32,8 @@ def bound(command: Sequence[str]) -> list[str]:
     return [sys.executable, "-IS", "-c", _DIES_WITH_PARENT, str(os.getpid()), *command]
 
 
-def _model(name: str, *options: str) -> list[str]:
-    """Command line of a model; it ends with the process that starts it.
+def _model(*options: str) -> list[str]:
+    """Command line of the model; it ends with the process that starts it.
 
     Raises:
         ToolchainError: This is no checkout.
@@ -43,7 +43,7 @@ def _model(name: str, *options: str) -> list[str]:
         raise ToolchainError("this emulator comes with a checkout of the sources, not with a package")
     code = (
         f"import runpy, sys; sys.path.insert(0, {str(root)!r});"
-        f" runpy.run_module('tests.models.{name}', run_name='__main__', alter_sys=True)"
+        " runpy.run_module('tests.models.server', run_name='__main__', alter_sys=True)"
     )
     return bound([sys.executable, "-c", code, *options])
 
@@ -61,7 +61,7 @@ def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
     if importlib.util.find_spec("unicorn") is None:
         raise ToolchainError("unicorn, the model's core, is missing: pip install unicorn")
     record = () if leds is None else ("--leds", str(leds))
-    return _model("stm32_server", str(build.arm_image("stm32f405")), "--listen", listen, *record)
+    return _model("--image", str(build.arm_image("stm32f405")), "--listen", listen, *record)
 
 
 def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None) -> list[str]:
@@ -83,7 +83,7 @@ def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None
                 f"{flash}: {flash.stat().st_size} bytes, expected {FLASH_BYTES}, the flash of the part"
             )
     files = [(name, str(path)) for name, path in (("--flash", flash), ("--leds", leds)) if path is not None]
-    return _model("rom_server", "--listen", listen, *(part for option in files for part in option))
+    return _model("--listen", listen, *(part for option in files for part in option))
 
 
 def wait_for(

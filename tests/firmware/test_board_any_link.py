@@ -431,6 +431,9 @@ def test_the_commands(evlcp, tmp_path: Path, device: SimulatedBoard, board: Boar
     assert evlcp("board", "leds", record, "--chips", out, *OPTIONS).code == 0
     chips, whole = np.load(out), symbol_chips(symbols, link.codebook)
     assert (chips == np.resize(whole, chips.shape)).all()
+    assert len(np.load(tmp_path / "chips.ticks.npy")) == len(chips)
+    assert evlcp("board", "leds", record, "--chips", out, "--per-led").code == 0
+    assert (np.load(out)[:, :90] == np.repeat(chips, 9, axis=1)).all()
     # those chips are what a board is sent for the same link, column by column
     np.save(out, whole)
     for options in (("--masks", out), ("--random", 2, "--seed", 3)):
@@ -551,13 +554,8 @@ def test_the_image_of_the_part_plays_them_too(kind: str, stm32) -> None:
     assert chip.longest[16 + Dma.IRQ] < 12 * US
 
 
-@pytest.mark.parametrize(
-    "settings",
-    [[*SERIAL, "air.frames_per_packet=80"], [*PULSES, "air.frames_per_packet=20"]],
-    ids=["7E2", "4-PPM"],
-)
-def test_a_text_by_a_board_and_a_camera(settings: list[str], evlcp, tmp_path: Path) -> None:
-    options = [part for one in settings for part in ("--set", one)]
+def test_a_text_by_a_board_and_a_camera(evlcp, tmp_path: Path) -> None:
+    options = [part for one in (*SERIAL, "air.frames_per_packet=80") for part in ("--set", one)]
     done = evlcp("loop", "--text", "Tempo 30!", "--seed", 2, "--json", "-o", tmp_path, *options)
     assert (done.code, done.err) == (0, ""), done.err
     said = {step.pop("step"): step for step in map(json.loads, done.out.splitlines())}

@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 import tty
 from collections.abc import Iterator
 from pathlib import Path
@@ -218,20 +217,6 @@ def test_a_fault_of_usage(evlcp, arguments: tuple[str, ...], as_json: bool, says
     assert "Traceback" not in done.err
     if as_json:
         assert json.loads(evlcp(*arguments, "--json").out)["error"]["kind"] == "UsageError"
-
-
-def test_masks_and_leds(evlcp, native: str, tmp_path: Path) -> None:
-    chips, out = tmp_path / "chips.npy", tmp_path / "out.npy"
-    evlcp("tx", "frames", "--random", 3, "--seed", 1, "--chips", chips)
-    done = evlcp("board", "program", "--masks", chips, "--port", native)
-    assert done.code == 0, done.err
-    time.sleep(0.3)
-    evlcp("board", "stop", "--port", native)
-    assert evlcp("board", "leds", tmp_path / "leds.bin", "--chips", out).code == 0
-    assert (np.load(out)[: 3 * 346] == np.load(chips)).all()
-    assert len(np.load(tmp_path / "out.ticks.npy")) == len(np.load(out))
-    assert evlcp("board", "leds", tmp_path / "leds.bin", "--chips", out, "--per-led").code == 0
-    assert np.load(out).shape[1] == 96
 
 
 def test_wrong_records_are_told(evlcp, tmp_path: Path) -> None:

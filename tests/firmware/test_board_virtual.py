@@ -29,7 +29,6 @@ from firmware_host.errors import (
     LineError,
     NoBoardError,
     RefusedError,
-    VerifyError,
 )
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import (
@@ -37,12 +36,8 @@ from firmware_host.protocol.generated.requests import (
     MINOR,
     NO_BANK,
     BoardFault,
-    CodebookRequest,
-    CommitRequest,
-    ConfigureRequest,
     CrcRequest,
     LevelRequest,
-    Profile,
     ReadRequest,
     State,
     StatusRequest,
@@ -102,36 +97,6 @@ def test_hitless_swaps(device: SimulatedBoard, board: Board) -> None:
     sequence = packet_sequence(played, payloads)
     assert len(sequence) > 80
     assert check_order(sequence, {n: len(s) for n, s in payloads.items()}) == list(payloads)
-
-
-def test_wrong_crc_or_codebook_never_plays(device: SimulatedBoard, board: Board) -> None:
-    old = symbols_of(2, 1)
-    provision(board, bank_of(old, LINK), Settings())
-    payload = some_bank(2, 2)
-    board.prepare(payload)
-    board.fill(1, payload.content)
-    length, digest = len(payload.content), bytes.fromhex(LINK.codebook.digest)
-    foreign = bytes.fromhex(board_link("modulation.id=wh8").codebook.digest)
-    for commit, error in (
-        (CommitRequest(1, 0, 2, length, payload.crc ^ 1, digest), VerifyError),
-        (CommitRequest(1, 0, 2, length, payload.crc, foreign), IncompatibleError),
-        (CommitRequest(1, 0, 2, length, payload.crc, bytes(32)), IncompatibleError),
-        (CommitRequest(1, 0, 3, length, payload.crc, digest), RefusedError),
-        (CommitRequest(1, 1, 2, length, payload.crc, digest), RefusedError),
-        (CommitRequest(2, 0, 2, length, payload.crc, digest), RefusedError),
-    ):
-        with pytest.raises(error):
-            board.session.call(commit)
-        device.run(100_000)
-        status = board.status()
-        assert (status.active_bank, status.pending_bank, status.commits) == (0, NO_BANK, 1)
-    with pytest.raises(IncompatibleError, match="built with another codebook"):
-        board.session.call(CodebookRequest(26, 0, tuple(range(16)), digest))
-    board.session.call(ConfigureRequest(10_000, Profile.WH8, 10, 1, 0, 0))
-    with pytest.raises(IncompatibleError):
-        board.session.call(CommitRequest(1, 0, 2, length, payload.crc, digest))
-    device.run(500_000)
-    assert len(packet_sequence(device.records().played(), {"old": old})) > 20
 
 
 def test_a_thousand_requests_over_a_noisy_line(device: SimulatedBoard) -> None:

@@ -3,7 +3,6 @@
 #include "evlcp.h"
 
 #define MAGIC 0x45564c33u
-#define CHUNK 256u
 
 /* False if the slot is empty, torn, or of a board with another tick rate. */
 static bool get_slot(struct evlcp *e, uint8_t index, struct evlcp_saved *s)
@@ -80,16 +79,10 @@ enum evlcp_status evlcp_settings_save(struct evlcp *e, bool autostart, struct ev
         !hal_flash_write(to, 0u, header, sizeof header))
         return EVLCP_STATUS_FLASH_FAULT;
     /* Read back what the flash took. */
-    uint32_t crc = 0u;
-    for (uint32_t at = 0; at < slot.length; at += CHUNK) {
-        uint8_t bytes[CHUNK];
-        uint32_t count = slot.length - at < CHUNK ? slot.length - at : CHUNK;
-        if (!hal_flash_read(to, EVLCP_SAVED_BYTES + at, bytes, count))
-            return EVLCP_STATUS_FLASH_FAULT;
-        crc = evlcp_crc32(crc, bytes, count);
-    }
+    uint32_t crc;
     struct evlcp_saved back;
-    if (crc != slot.crc || !get_slot(e, to, &back) || back.sequence != sequence)
+    if (!evlcp_flash_crc(to, EVLCP_SAVED_BYTES, slot.length, &crc) || crc != slot.crc || !get_slot(e, to, &back) ||
+        back.sequence != sequence)
         return EVLCP_STATUS_FLASH_FAULT;
     reply->slot = to;
     reply->save_sequence = sequence;

@@ -24,17 +24,22 @@ static bool clear(uint8_t image, uint32_t offset)
     return hal_flash_write((uint8_t)(EVLCP_IMAGE_SLOT + image), offset, zero, 4u) && word(image, offset) == 0u;
 }
 
-static bool crc_of(uint8_t image, uint32_t length, uint32_t *crc)
+bool evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length, uint32_t *crc)
 {
     *crc = 0u;
     for (uint32_t at = 0; at < length; at += CHUNK) {
         uint8_t bytes[CHUNK];
         uint32_t count = length - at < CHUNK ? length - at : CHUNK;
-        if (!hal_flash_read((uint8_t)(EVLCP_IMAGE_SLOT + image), at, bytes, count))
+        if (!hal_flash_read(slot, offset + at, bytes, count))
             return false;
         *crc = evlcp_crc32(*crc, bytes, count);
     }
     return true;
+}
+
+static bool crc_of(uint8_t image, uint32_t length, uint32_t *crc)
+{
+    return evlcp_flash_crc((uint8_t)(EVLCP_IMAGE_SLOT + image), 0u, length, crc);
 }
 
 /* Whether a whole image stands in a place. */

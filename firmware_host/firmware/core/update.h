@@ -23,6 +23,9 @@ struct evlcp_update {
     uint32_t restart_ms;
 };
 
+/* CRC-32 of a part of a flash slot. False if it cannot be read. */
+bool evlcp_flash_crc(uint8_t slot, uint32_t offset, uint32_t length, uint32_t *crc);
+
 /* Which image to run after a reset, 1 or 2, or 0 for the one that was flashed; a trial's count goes down. Called
    once, before anything else, by the image that was flashed. */
 uint8_t evlcp_update_pick(void);
