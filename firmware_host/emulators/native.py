@@ -91,8 +91,9 @@ class NativeBoard:
 class NativeLine:
     """A native board in this process, as a `Transport`; it ends with the line."""
 
-    def __init__(self, board: NativeBoard, name: str = "native:") -> None:
-        self.name = name
+    name = "native:"
+
+    def __init__(self, board: NativeBoard) -> None:
         self._board = board
         self._came = b""
 

@@ -18,6 +18,8 @@ SECTORS = (*[16 << 10] * 4, 64 << 10, *[128 << 10] * 7)
 
 _ACK, _NACK, _SYNC = 0x79, 0x1F, 0x7F
 _GET_ID, _READ, _GO, _WRITE, _ERASE = 0x02, 0x11, 0x21, 0x31, 0x44
+_TRIES = 3
+_ANSWER_S = 1.0  # an erase takes up to 2 s a sector more
 _PIECE = 256
 _OPTIONS = 0x1FFF_C000
 _BROWN_OUT = 0x0C
@@ -30,21 +32,17 @@ class RomLoader:
 
     Args:
         transport: The line, with even parity.
-        tries: How often a command is sent before it is given up.
-        answer_s: How long an answer may take, s; an erase takes up to 2 s a sector more.
 
     Raises:
         NoBoardError: Nobody answers.
     """
 
-    def __init__(self, transport: Transport, tries: int = 3, answer_s: float = 1.0) -> None:
+    def __init__(self, transport: Transport) -> None:
         self.line = transport
-        self.tries = tries
-        self.answer_s = answer_s
         self._got = bytearray()
-        for _ in range(tries):
+        for _ in range(_TRIES):
             self.line.write(bytes([_SYNC]))
-            if self._byte(answer_s) in (_ACK, _NACK):  # NACK: it was in step already
+            if self._byte(_ANSWER_S) in (_ACK, _NACK):  # NACK: it was in step already
                 break
             if self._in_step():  # it waited for the rest of another run's command
                 break
@@ -69,7 +67,7 @@ class RomLoader:
     def _bytes(self, count: int) -> bytes:
         found = bytearray()
         while len(found) < count:
-            byte = self._byte(self.answer_s)
+            byte = self._byte(_ANSWER_S)
             if byte is None:
                 raise _SilenceError
             found.append(byte)
@@ -81,8 +79,8 @@ class RomLoader:
         while self.line.read(0.02):
             pass
 
-    def _acknowledged(self, timeout_s: float | None = None) -> None:
-        byte = self._byte(self.answer_s if timeout_s is None else timeout_s)
+    def _acknowledged(self, timeout_s: float = _ANSWER_S) -> None:
+        byte = self._byte(timeout_s)
         if byte is None:
             raise _SilenceError
         if byte != _ACK:
@@ -102,7 +100,7 @@ class RomLoader:
 
     def _command(self, code: int, work: Callable[[], bytes], what: str) -> bytes:
         silent = False
-        for _ in range(self.tries):
+        for _ in range(_TRIES):
             try:
                 self.line.write(bytes([code, code ^ 0xFF]))
                 self._acknowledged()
@@ -113,7 +111,7 @@ class RomLoader:
                 silent = False
             self._in_step()
         if silent:
-            raise LineError(f"{self.line.name}: no answer to {what} after {self.tries} tries; check the line")
+            raise LineError(f"{self.line.name}: no answer to {what} after {_TRIES} tries; check the line")
         raise RefusedError(
             f"{self.line.name}: the boot loader refuses {what}; a part whose read-out is protected takes no"
             " image by this way",
@@ -167,7 +165,7 @@ class RomLoader:
 
         def work() -> bytes:
             self.line.write(body + bytes([_xor(body)]))
-            self._acknowledged(self.answer_s + 2.0 * len(sectors))
+            self._acknowledged(_ANSWER_S + 2.0 * len(sectors))
             return b""
 
         self._command(_ERASE, work, f"ERASE of sectors {', '.join(map(str, sectors))}")
@@ -253,7 +251,7 @@ def flash_image(
         advance(done, total)
     for at in pieces if verify else ():
         piece = data[at : at + _PIECE]
-        for _ in range(loader.tries):  # what is read has no check sum
+        for _ in range(_TRIES):  # what is read has no check sum
             found = loader.read(image.address + at, len(piece))
             if found == piece:
                 break

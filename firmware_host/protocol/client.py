@@ -29,6 +29,9 @@ TRIES = 5
 """How often a request is sent before it is given up, unless the caller says otherwise."""
 
 
+BACKOFF = 2.0
+"""Factor by which each further try waits longer."""
+
 MOST_LATENCY_S = 10.0
 """The most that a measured latency makes a request wait for its first answer, s."""
 
@@ -46,7 +49,6 @@ class Timing:
     Attributes:
         baud: Line rate, bit/s; a byte takes ten bits.
         latency_s: What board and host operating system add, s.
-        backoff: Factor by which each further try waits longer.
 
     >>> round(Timing(1_000_000, 0.05).timeout_s(100, 100, 0), 3)
     0.054
@@ -54,7 +56,6 @@ class Timing:
 
     baud: int = 1_000_000
     latency_s: float = 0.1
-    backoff: float = 2.0
 
     def wire_s(self, count: int) -> float:
         """Time that `count` bytes take on the line, s."""
@@ -68,7 +69,7 @@ class Timing:
             reply: Bytes of the longest answer to it and to those before.
             tries: How often it was sent before.
         """
-        return (2 * self.wire_s(queued + reply) + self.latency_s) * self.backoff**tries
+        return (2 * self.wire_s(queued + reply) + self.latency_s) * BACKOFF**tries
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +169,7 @@ class Client:
         """Take in how long an answer took; if its request was sent again, it may be to any of these."""
         if waiting.tries > 1:
             # until one is answered at its first try, as long as this one needed
-            self._patience = min(self._patience * self.timing.backoff ** (waiting.tries - 1), MOST_PATIENCE)
+            self._patience = min(self._patience * BACKOFF ** (waiting.tries - 1), MOST_PATIENCE)
             return
         self._patience = 1.0
         self._largest = max(self._largest, len(waiting.wire))
@@ -179,25 +180,19 @@ class Client:
             self._spread_s += (abs(late_s - self._mean_s) - self._spread_s) / 4
             self._mean_s += (late_s - self._mean_s) / 8
 
-    def submit(self, request: WireRequest[Any], session: int | None = None) -> int:
+    def submit(self, request: WireRequest[Any]) -> int:
         """Queue a request; returns the token its outcome will carry."""
         sequence = (self.first + self._tokens) & 0xFFFF
-        chosen = self.session if session is None else session
         token, payload, status = self._tokens, request.pack(self.minor), 0
-        if self.sealer is not None and chosen != NO_SESSION:
-            payload += self.sealer.seal(request.TYPE, chosen, token, payload)
+        if self.sealer is not None and self.session != NO_SESSION:
+            payload += self.sealer.seal(request.TYPE, self.session, token, payload)
             status = SEALED
-        wire = Datagram(request.TYPE, status, sequence, chosen, payload).encode()
+        wire = Datagram(request.TYPE, status, sequence, self.session, payload).encode()
         reply = REPLIES[request.TYPE]
         longest = MAX_PAYLOAD if reply.takes_more() else max(4, reply.fixed_bytes())
         self._tokens += 1
         self._queue.append(_Waiting(token, request.TYPE, wire, longest + HEADER_BYTES + CRC_BYTES + 4))
         return token
-
-    @property
-    def idle(self) -> bool:
-        """Whether nothing is queued or under way."""
-        return not self._queue and not self._flight
 
     @property
     def room(self) -> bool:
@@ -252,7 +247,7 @@ class Client:
         queued = sum(len(w.wire) for w in self._flight.values())
         replies = sum(w.reply_bytes for w in self._flight.values())
         waiting.wire_s = self.timing.timeout_s(queued, replies, 0) - self.timing.latency_s
-        waiting.due = now + (waiting.wire_s + self.latency_s) * self.timing.backoff**waiting.tries
+        waiting.due = now + (waiting.wire_s + self.latency_s) * BACKOFF**waiting.tries
         waiting.sent = now
         waiting.tries += 1
         return waiting.wire

@@ -48,8 +48,6 @@ class Field:
     def parse(cls, table: dict[str, Any]) -> "Field":
         """Read one field of the definition."""
         base, bracket, count = table["type"].partition("[")
-        if base not in _SIZES and base != "bytes":
-            raise ValueError(f"field {table['name']}: type {table['type']} is unknown")
         n = int(count[:-1]) if bracket else (0 if base == "bytes" else 1)
         return cls(table["name"], base, n, table["doc"], table.get("since", 0))
 

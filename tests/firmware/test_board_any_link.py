@@ -92,11 +92,11 @@ def case_of_own_codes() -> Case:
     return Case(bank, np.repeat(symbol_chips(symbols, book), 6, axis=1))
 
 
-def case_of_rows(book: Codebook, packet: PacketFormat, *led_clusters: NDArray[np.int64]) -> Case:
-    leds = len(led_clusters[0]) if led_clusters else 96
-    rows = np.random.default_rng(2).integers(0, 2, (2 * packet.packet_chips, 96), dtype=np.uint8)
-    rows[:, leds:] = 0
-    return Case(Bank.of_chips(rows[:, :leds], book, packet, *led_clusters), rows)
+def case_of_rows() -> Case:
+    rows = np.random.default_rng(2).integers(0, 2, (400, 96), dtype=np.uint8)
+    rows[:, 87:] = 0
+    packet = PacketFormat.of(BOOK, 3, 20_000.0, pilot_every=2)
+    return Case(Bank.of_chips(rows[:, :87], BOOK, packet, LED_CLUSTERS), rows)
 
 
 def case_of_drawn_clusters() -> Case:
@@ -107,37 +107,21 @@ def case_of_drawn_clusters() -> Case:
 
 
 EDGES = ("separation.id=edges", "decoding.id=edges")
+DIMMED = ("modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed")
+ONE_LED = ("bar.rows=1", "bar.cluster_rows=1", "ranging.id=none")
 CASES: dict[str, tuple[Format, Callable[[], Case]]] = {
     "wh4x2": (Format.WORDS, case_of_link),
     "wh8": (Format.WORDS, lambda: case_of_link("modulation.id=wh8")),
     "raw8": (Format.WORDS, lambda: case_of_link("modulation.id=raw8")),
     "a pilot in every fourth frame": (Format.WORDS, lambda: case_of_link("air.pilot_every=4")),
-    "one pilot": (
-        Format.WORDS,
-        lambda: case_of_link("air.frames_per_packet=3", "air.pilot_every=64"),
-    ),
+    "one pilot": (Format.WORDS, lambda: case_of_link("air.frames_per_packet=3", "air.pilot_every=64")),
     "own codes": (Format.WORDS, case_of_own_codes),
     "nrz": (Format.CLUSTERS, lambda: case_of_link(*EDGES, "modulation.id=nrz")),
     "ppm": (Format.CLUSTERS, lambda: case_of_link(*EDGES, "modulation.id=ppm")),
-    "dimmed": (
-        Format.CLUSTERS,
-        lambda: case_of_link(*EDGES, "modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed"),
-    ),
-    "one LED": (
-        Format.CLUSTERS,
-        lambda: case_of_link(
-            *(*EDGES, "bar.rows=1", "bar.cluster_rows=1", "ranging.id=none", "modulation.id=nrz")
-        ),
-    ),
+    "dimmed": (Format.CLUSTERS, lambda: case_of_link(*EDGES, *DIMMED)),
+    "one LED": (Format.CLUSTERS, lambda: case_of_link(*EDGES, *ONE_LED, "modulation.id=nrz")),
     "ten clusters": (Format.CLUSTERS, case_of_drawn_clusters),
-    "rows": (
-        Format.MASKS,
-        lambda: case_of_rows(LINK.codebook, PacketFormat.of(LINK.codebook, 10, 20_000.0)),
-    ),
-    "rows of 87 LEDs": (
-        Format.MASKS,
-        lambda: case_of_rows(BOOK, PacketFormat.of(BOOK, 3, pilot_every=2), LED_CLUSTERS),
-    ),
+    "rows": (Format.MASKS, case_of_rows),
 }
 
 
@@ -164,12 +148,14 @@ def test_every_led_does_what_it_is_sent(name: str, device: SimulatedBoard, board
     assert provision(board, bank, Settings()).written == 0
     if case.link is None or case.symbols is None:
         return
-    # a stream, whose idle pattern is no brighter, keeps to the same limit
+    # a stream, whose idle pattern is no brighter and of the bar's LEDs alone, keeps to the same limit
     with board.stream(case.link) as stream:
         stream.wait(0.1)
         for packet in case.symbols:
             stream.send(packet)
-    assert (shown(device)[-len(leds) :] == leds).all()
+    rows = shown(device)
+    assert (rows[-len(leds) :] == leds).all()
+    assert not rows[:, len(bank.led_clusters) :].any()
     assert board.status().faults == 0
 
 
@@ -195,32 +181,6 @@ def test_any_clusters_of_any_leds(data: st.DataObject) -> None:
     rows = shown(device)
     assert (rows == np.resize(leds_of(chips, which), rows.shape)).all()
     assert board.status().duty == bank.duty == np.ceil(1000 * chips.mean(0).max() - 1e-9)
-
-
-def test_packets_that_come_one_by_one(device: SimulatedBoard, board: Board) -> None:
-    link = board_link("bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13")
-    packets = symbols_of(8, 0, link)
-    with board.stream(link, 4) as stream:
-        for packet in packets:
-            stream.send(packet)
-        stream.wait(1.0)
-        for packet in packets[:2]:
-            stream.send(packet)
-        with pytest.raises(ConfigError, match=r"shape \(9, 10\), expected \(10, 10\)"):
-            stream.send(packets[0][:9])
-    rows = shown(device)
-    # the idle pattern is of the bar's LEDs alone, and stands between packets
-    assert not rows[:, 90:].any()
-    chips = rows[:, :90:9]
-    assert (rows[:, :90] == np.repeat(chips, 9, axis=1)).all()
-    length = link.packet.packet_chips
-    told = symbol_chips(np.concatenate([packets, packets[:2]]), link.codebook, link.packet.pilot_every)
-    start = next(n for n in range(0, 1000, 2) if (chips[n : n + 8 * length] == told[: 8 * length]).all())
-    assert (chips[-2 * length :] == told[-2 * length :]).all()
-    between = chips[start + 8 * length : -2 * length]
-    assert (between == np.arange(len(between))[:, None] % 2).all()
-    assert stream.underruns == 1
-    assert not device.shown().any()
 
 
 def test_a_bank_is_full_to_the_last_byte(device: SimulatedBoard, board: Board) -> None:
@@ -397,15 +357,13 @@ def test_chips_that_the_board_has_none_as_long_as(device: SimulatedBoard, board:
     # so is what a board would compose
     link = board_link("air.chip_rate_hz=1000.0", "air.pilot_every=4")
     symbols = symbols_of(2, 6, link)
-    chips = symbol_chips(symbols, link.codebook, 4)
     bank = bank_of(symbols, link)
-    assert bank.format == Format.WORDS
-    assert bank.chip_by_chip().duty == bank.duty
+    assert (bank.format, bank.chip_by_chip().duty) == (Format.WORDS, bank.duty)
     device.records()
     provision(board, bank, Settings(duty_limit=0.6))
     device.run(800_000)
     rows = shown(device)
-    wanted = np.repeat(np.repeat(chips, 6, axis=1), 2, axis=0)  # 2000 chips/s
+    wanted = symbol_chips(symbols, link.codebook, 4).repeat(6, axis=1).repeat(2, axis=0)  # 2000 chips/s
     assert (rows == np.resize(wanted, rows.shape)).all()
     assert board.verify(bank) == 0
     assert not board.program(bank).swapped
@@ -413,7 +371,7 @@ def test_chips_that_the_board_has_none_as_long_as(device: SimulatedBoard, board:
         stream.send(symbols[0])
     packet = 2 * link.packet.packet_chips
     assert (shown(device)[-packet:] == wanted[:packet]).all()
-    provision(board, Bank.of_chips(chips, link.codebook, link.packet), Settings())
+    provision(board, Bank.of_chips(bank.chips, link.codebook, link.packet), Settings())
     assert board.status().hold == 2
 
 
@@ -446,25 +404,6 @@ def test_the_commands(evlcp, tmp_path: Path, device: SimulatedBoard, board: Boar
     ):
         other = ("--set", f"bar.rows={rows}", "--set", f"bar.cluster_rows={cluster_rows}")
         check_fault(evlcp("board", "leds", record, "--chips", out, *OPTIONS[4:], *other), 3, says)
-
-
-def test_a_fleet_of_several_links(evlcp, tmp_path: Path) -> None:
-    head = "[[board]]\nport = 'native:'\nposition_m = [0, 0, 0]\nrandom = 2\n"
-    links = {
-        "a": "{}",
-        "b": "{bar = {rows = 90, cluster_rows = 9}, pilots = {id = 'barker13'}}",
-        "c": "{bar = {rows = 16, columns = 16, cluster_rows = 4, cluster_columns = 4}}",
-        "d": "{bar = {rows = 24, cluster_rows = 3}}",
-    }
-    file = tmp_path / "tunnel.toml"
-    file.write_text("".join(f"{head}id = '{name}'\nlink = {link}\n" for name, link in links.items()))
-    done = evlcp("board", "program", "--inventory", file)
-    lines = dict(line.split("  ", 1) for line in sorted(done.out.splitlines()))
-    assert done.code == 2
-    assert "programmed 640 of 640 bytes" in lines["a"]
-    assert "programmed" in lines["b"]
-    assert "FAILED (2): a link of 256 LEDs, native: has 96: HELLO says so" in lines["c"]
-    assert "programmed 788 of 788 bytes" in lines["d"]  # 8 clusters, 692 chips
 
 
 # -- characters and 4-PPM, by the test's own encoders
