@@ -3,24 +3,20 @@
 import math
 import re
 from pathlib import Path
-from types import ModuleType
 
 import numpy as np
 import pytest
 
+from docs.figures import hardware as bar
+
 ROOT = Path(__file__).parents[2]
 PAGE = (ROOT / "docs" / "hardware.md").read_text()
+PARTS = bar.parts()
+NETS = bar.nets(PARTS)
 
 
-@pytest.fixture(scope="module")
-def bar() -> ModuleType:
-    from docs.figures import hardware
-
-    return hardware
-
-
-def test_what_is_written_is_fresh(bar: ModuleType) -> None:
-    made = bar.files(bar.parts())
+def test_what_is_written_is_fresh() -> None:
+    made = bar.files(PARTS)
     assert sorted(made) == sorted(p.name for p in (ROOT / "docs" / "hardware").iterdir())
     for name, text in made.items():
         assert (ROOT / "docs" / "hardware" / name).read_text() == text, (
@@ -28,10 +24,9 @@ def test_what_is_written_is_fresh(bar: ModuleType) -> None:
         )
 
 
-def test_the_page_has_the_figures_and_the_parts(bar: ModuleType) -> None:
-    found = bar.parts()
-    assert [row for row in bar.figures(found) if f"| {row[0]} | {row[1]} |" not in PAGE] == []
-    for value, _, count, price, refs in bar.bill(found):
+def test_the_page_has_the_figures_and_the_parts() -> None:
+    assert [row for row in bar.figures(PARTS) if f"| {row[0]} | {row[1]} |" not in PAGE] == []
+    for value, _, count, price, refs in bar.bill(PARTS):
         if price >= 0.4:
             assert re.search(
                 rf"\| {re.escape(refs)} \| {re.escape(value)} \|.*\| {count} \| {price:.2f} \|", PAGE
@@ -39,28 +34,26 @@ def test_the_page_has_the_figures_and_the_parts(bar: ModuleType) -> None:
     assert "Only modelled" in PAGE.splitlines()[2]
 
 
-def test_the_netlist_is_whole(bar: ModuleType) -> None:
-    found = bar.parts()
-    refs = [p.ref for p in found]
+def test_the_netlist_is_whole() -> None:
+    refs = [p.ref for p in PARTS]
     assert len(refs) == len(set(refs))
-    alone = [net for net, pins in bar.nets(found).items() if len(pins) < 2]
+    alone = [net for net, pins in NETS.items() if len(pins) < 2]
     assert alone == []
     outputs = {"OUT", "VOUT", "SDO", "PA4", "PA5", "PA6", "PA7", "PA9", "PB0", "TXD"}
-    names = {p.ref: p.pins for p in found}
-    for net, pins in bar.nets(found).items():
+    names = {p.ref: p.pins for p in PARTS}
+    for net, pins in NETS.items():
         driving = [(r, n) for r, n in pins if re.sub(r"(OUT)[AB]$", r"\1", names[r][n][0]) in outputs]
         assert len(driving) <= 1, f"{net}: {driving}"
     # what reaches the host crosses the isolation only
-    host = {net for net in bar.nets(found) if net.endswith("HOST") or net.startswith("HOST")}
-    across = {r for net in host for r, _ in bar.nets(found)[net]} & {
-        r for net in set(bar.nets(found)) - host for r, _ in bar.nets(found)[net]
-    }
+    host = {net for net in NETS if net.endswith("HOST") or net.startswith("HOST")}
+    inside = set(NETS) - host
+    across = {r for net in host for r, _ in NETS[net]} & {r for net in inside for r, _ in NETS[net]}
     assert across == {"U10"}
 
 
-def test_the_chain_lights_the_led_of_the_row(bar: ModuleType) -> None:
+def test_the_chain_lights_the_led_of_the_row() -> None:
     """Shift 96 bits through the netlist, LED 0 first, as the firmware does."""
-    parts = {p.ref: dict(p.pins.values()) for p in bar.parts()}
+    parts = {p.ref: dict(p.pins.values()) for p in PARTS}
     drivers = {ref: pins for ref, pins in parts.items() if "SDI" in pins and "LE" in pins and "OUT0" in pins}
     order, net = [], "SDI"
     while (ref := next((r for r, p in drivers.items() if p["SDI"] == net), None)) is not None:
@@ -80,8 +73,8 @@ def test_the_chain_lights_the_led_of_the_row(bar: ModuleType) -> None:
         assert parts[f"D{led + 1}"]["A"] == "+3V3_LED"
 
 
-def test_pins_are_those_of_the_firmware(bar: ModuleType) -> None:
-    (chip,) = (p for p in bar.parts() if p.ref == "U7")
+def test_pins_are_those_of_the_firmware() -> None:
+    (chip,) = (p for p in PARTS if p.ref == "U7")
     nets = dict(chip.pins.values())
     hal = (ROOT / "firmware_host" / "firmware" / "hal" / "stm32f405" / "hal.c").read_text()
     said = dict(re.findall(r"^   \| (P[AB]\d+(?: P[AB]\d+)?) +\| (.*?) +\|$", hal, re.MULTILINE))
@@ -98,10 +91,10 @@ def test_pins_are_those_of_the_firmware(bar: ModuleType) -> None:
         assert tuple(nets[pin] for pin in pins.split()) == wanted
 
 
-def test_dark_without_the_firmware(bar: ModuleType) -> None:
+def test_dark_without_the_firmware() -> None:
     """Each line that could light an LED is pulled to where it does not."""
     pulls = {}
-    for part in bar.parts():
+    for part in PARTS:
         nets = [net for _, net in part.pins.values()]
         if part.ref.startswith("R") and len(nets) == 2 and {"+3V3", "GND"} & set(nets):
             rail = "GND" if "GND" in nets else "+3V3"
@@ -112,7 +105,7 @@ def test_dark_without_the_firmware(bar: ModuleType) -> None:
     assert bar.led_ma(0) == 0.0
 
 
-def test_currents_and_light_by_formula(bar: ModuleType) -> None:
+def test_currents_and_light_by_formula() -> None:
     assert bar.led_ma(60) == pytest.approx(1e3 * 15 * 1.25 / 316, rel=1e-3)
     levels = [bar.led_ma(n) for n in range(61)]
     assert levels == sorted(levels)

@@ -4,7 +4,8 @@ It knows nothing of the firmware but the wiring of the board (the table in hal.c
 models: what they do between two instructions is worked out from how they were set up. Time is in units of
 1/336 MHz. Timers, DMA, SPI and the latch are exact to the clock against each other; an instruction counts as
 one clock of the core, so its speed is an estimate. The timers, the stream, SPI, USART and SysTick raise at a
-setting that they do not know; ports, PWR, DAC and EXTI keep what is written.
+setting that they do not know; ports, PWR, DAC and EXTI keep what is written. A peripheral's `read`
+and `write` are what the core does to a register.
 """
 
 import copy
@@ -84,7 +85,6 @@ class Timer:
         self.held, self.since = value, self.chip.now
 
     def read(self, offset: int) -> int:
-        """What the core reads of a register."""
         if offset == self.CCR1 and self.r[self.CCMR1] & 3 == 1:
             self.r[self.SR] &= ~2  # a capture that is read
         return self.counter() if offset == self.CNT else self.r[offset]
@@ -96,7 +96,6 @@ class Timer:
             self.r[self.SR] |= 2
 
     def write(self, offset: int, value: int) -> None:
-        """What a write of the core does."""
         self.hold(self.counter())
         if offset == self.EGR:
             assert value == 1, value
@@ -187,7 +186,6 @@ class Dma:
         self.dead = False
 
     def read(self, offset: int) -> int:
-        """What the core reads of a register."""
         return {
             0x04: self.flags,
             0x0C: 0,
@@ -199,7 +197,6 @@ class Dma:
         }[offset]
 
     def write(self, offset: int, value: int) -> None:
-        """What a write of the core does."""
         on = self.cr & 1
         if offset == 0x0C:
             self.flags &= ~value
@@ -300,13 +297,11 @@ class Spi:
         return (self.chain << done | (self.word or 0) >> (16 - done)) & (1 << LEDS) - 1
 
     def read(self, offset: int) -> int:
-        """What the core reads of a register."""
         if offset == 0x08:
             return (self.buffer is None) << 1 | (self.word is not None) << 7
         return {0x00: self.cr1, 0x04: self.cr2, 0x0C: 0}[offset]
 
     def write(self, offset: int, value: int) -> None:
-        """What a write of the core does."""
         if offset == 0x0C:
             self.send(value)
         elif offset == 0x00:
@@ -420,7 +415,6 @@ class Usart:
         self.line()
 
     def read(self, offset: int) -> int:
-        """What the core reads of a register."""
         if offset == 0x00:
             return self.sr & ~0x80 | (self.chip.now >= self.free_at) << 7
         if offset == 0x04:
@@ -430,7 +424,6 @@ class Usart:
         return {0x08: self.brr, 0x0C: self.cr1}[offset]
 
     def write(self, offset: int, value: int) -> None:
-        """What a write of the core does."""
         if offset == 0x04:
             if self.cr1 & 0x2008 == 0x2008:
                 leaves = max(self.chip.now, self.free_at) + self.BYTE
@@ -459,11 +452,9 @@ class SysTick:
         self.generation = 0
 
     def read(self, offset: int) -> int:
-        """What the core reads of a register."""
         return {0x10: self.csr, 0x14: self.rvr, 0x18: 0}[offset]
 
     def write(self, offset: int, value: int) -> None:
-        """What a write of the core does."""
         if offset == 0x10:
             assert not value & ~7
             assert value in (0, 5, 7), "on the core's clock"
@@ -505,12 +496,10 @@ class Iwdg:
         return (self.rlr + 1) * (4 << self.pr) * UNIT_HZ // LSI_HZ
 
     def read(self, offset: int) -> int:
-        """What the core reads of a register."""
         busy = 3 if self.chip.now < self.busy_until else 0
         return {0x0: 0, 0x4: self.pr, 0x8: self.rlr, 0xC: busy}[offset]
 
     def write(self, offset: int, value: int) -> None:
-        """What a write of the core does."""
         if offset == 0x0:
             self.open = value == 0x5555
             self.on |= value == 0xCCCC
@@ -555,11 +544,9 @@ class Flash:
         self.stale = False  # the caches may hold what was erased
 
     def read(self, offset: int) -> int:
-        """What the core reads of a register."""
         return {0x00: self.acr, 0x0C: 0, 0x10: self.cr}[offset]
 
     def write(self, offset: int, value: int) -> None:
-        """What a write of the core does."""
         if offset == 0x00:
             # a cache is reset only while it is off
             assert not (value & 0x1800 and value & 0x600), hex(value)
@@ -592,7 +579,6 @@ class Rng:
         self.ready = 0
 
     def read(self, offset: int) -> int:
-        """A register."""
         clocked = self.chip.plain.get(0x40023834, 0) >> 6 & 1 and self.chip.plain[0x40023800] >> 25 & 1
         on = clocked and self.control >> 2 & 1
         if offset == 0x4:
@@ -603,7 +589,6 @@ class Rng:
         return self.control if offset == 0x0 else 0
 
     def write(self, offset: int, value: int) -> None:
-        """A register."""
         if offset == 0x0:
             self.control = value
             self.ready = self.chip.now + self.WORD
