@@ -318,6 +318,8 @@ def test_what_hello_says_decides(board: Board) -> None:
         for name, value in changes.items():
             object.__setattr__(board.about, name, value)
 
+    with pytest.raises(RefusedError, match=r"no chip rate of 7777 Hz: must divide 10000000 Hz, at least 1,"):
+        board.program(a_bank(chip_rate_hz=7777))
     requests = board.status().requests
     panel = board_link("bar.rows=16", "bar.columns=16", "bar.cluster_rows=4", "bar.cluster_columns=4")
     with pytest.raises(ConfigError, match=r"a link of 256 LEDs, simulated: has 96: HELLO says so"):

@@ -244,6 +244,15 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
     board.start()
     model = Queue(slots, 10_240)
     begun = 0
+
+    def push(number: int, offset: int, payload: bytes, last: bool = False) -> None:
+        nonlocal begun
+        reply = board.session.call(PushRequest(0, number, offset, int(last), payload))
+        # the model knows when packets begin only from the board; they never go back
+        assert begun <= reply.begun <= len(model.packets)
+        begun = reply.begun
+        assert (reply.number, reply.offset) == model.push(number, offset, payload, last, begun)
+
     for _ in range(data.draw(st.integers(1, 60))):
         if data.draw(st.booleans()):
             number, offset = len(model.packets), len(model.part)
@@ -254,13 +263,12 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
         count = data.draw(st.sampled_from([0, 1, 490, 490, 490]))
         count = min(count, left) if data.draw(st.booleans()) else count
         payload = bytes([data.draw(st.integers(0, 255))]) * count
-        last = data.draw(st.integers(0, 20)) == 0
-        reply = board.session.call(PushRequest(0, number, offset, int(last), payload))
-        # the model knows when packets begin only from the board; they never go back
-        assert begun <= reply.begun <= len(model.packets)
-        begun = reply.begun
-        assert (reply.number, reply.offset) == model.push(number, offset, payload, last, begun)
+        push(number, offset, payload, last=data.draw(st.integers(0, 20)) == 0)
         device.run(data.draw(st.sampled_from([0, 100, 2_000_000])))
+    # until it is full
+    for _ in range(4 * 21):
+        offset = len(model.part)
+        push(len(model.packets), offset, bytes(min(490, 10_240 - offset)))
     held = board.read(0, 0, 4 * 10_240)
     for n in range(max(0, len(model.packets) - 2), len(model.packets)):
         at = n % 4 * 10_240
