@@ -130,10 +130,8 @@ class ColumnSource(EventSource):
         """Read the first piece, and see in which unit its times are."""
         self._pieces, self._position, self._end = table.pieces, 0, size_bytes
         self._counts = {"rows_out_of_order": 0, "rows_cut": 0, "times_gone_round": 0}
-        where, self._inverted, self._window_us = table.where, inverted, table.window_us
-        self._where = where
-        self._dropped = Loss(0, 0, where, "rows whose time, polarity or place is no number; dropped")
-        self._position = 0
+        self._where, self._inverted, self._window_us = table.where, inverted, table.window_us
+        self._dropped = Loss(0, 0, table.where, "rows whose time, polarity or place is no number; dropped")
         first = self._next_piece()
         times = np.empty(0, np.int64) if first is None else _unwrap(first.times, None, 0)[0]
         if first is not None:
@@ -142,17 +140,10 @@ class ColumnSource(EventSource):
         placed = first is not None and first.places is not None
         self._unit = TimeUnit(unit, "as told") if unit else time_unit(times, table.unit, share, placed=placed)
         self._polarities = Polarities()
-        self._sieve = Sieve(where, *table.size)
-        self._waiting: list[Events] = []
+        self._sieve = Sieve(table.where, *table.size)
         self._row = first.number(0) if first is not None and len(times) else 1
-        self._wrong: InputError | None = None
         self._fault: InputError | None = None
-        self._closed: InputError | None = None
-        self._latest_us: int | None = None
-        self._before: int | None = None
-        self._gone_round = 0
-        self._open = True
-        self._merged = _with_triggers(iter(self._take_events, None), table.triggers or iter(()))
+        self._merged = _with_triggers(self._sorted(), table.triggers or iter(()))
         header = {
             "pixels": "as its columns x and y say" if placed else "none given: x = y = 0",
             "time": f"in {self._unit.name}, {self._unit.why}",
@@ -169,43 +160,34 @@ class ColumnSource(EventSource):
         Raises:
             InputError: The file cannot be read on, or a row is none of a time and a polarity.
         """
-        if self._closed is not None:
-            raise self._closed
+        if self._fault is not None:
+            raise self._fault
         try:
             return next(self._merged, None)
         except InputError as fault:
-            self._closed = fault
+            self._fault = fault
             raise
 
-    def _take_events(self) -> Events | None:
-        """The next ones by time; None at the end."""
-        if self._fault is not None:
-            raise self._fault
-        if not self._open:
-            return None
-        while sum(map(len, self._waiting)) < MOST_WAITING:
+    def _sorted(self) -> Iterator[Events]:
+        """All events by time. What comes before a fault is given first."""
+        pieces, waiting, fault, more = self._events(), list[Events](), None, True
+        while more:
             try:
-                events = self._next()
-            except InputError as fault:
-                # What came before it is given first.
-                self._fault, events = fault, None
-            if events is None:
-                self._open = False
-                break
-            self._waiting.append(events)
-        events = _in_order(Events.concat(self._waiting), self._window_us)
-        # What may still be earlier waits, unless all is read.
-        due = len(events) if not self._open else len(events) // 2
-        self._waiting = [events[due:]] if self._open else []
-        given = self._sieve.sift(events[:due], self._row)
-        self._row += due
-        if not self._open:
-            given = Events.concat([given, self._sieve.close()])
-            if not len(given) and self._fault is not None:
-                raise self._fault
-            if not len(given):
-                return None
-        return given
+                while more and sum(map(len, waiting)) < MOST_WAITING:
+                    events = next(pieces, None)
+                    more = events is not None
+                    waiting += [] if events is None else [events]
+            except InputError as wrong:
+                fault, more = wrong, False
+            events = _in_order(Events.concat(waiting), self._window_us)
+            # What may still be earlier waits, unless all is read.
+            due = len(events) // 2 if more else len(events)
+            waiting = [events[due:]]
+            yield self._sieve.sift(events[:due], self._row)
+            self._row += due
+        yield self._sieve.close()
+        if fault is not None:
+            raise fault
 
     def _damaged(self, error: Exception) -> InputError:
         what = error.strerror if isinstance(error, OSError) else None
@@ -219,38 +201,37 @@ class ColumnSource(EventSource):
         self._position = self._end if piece is None else piece.done
         return piece
 
-    def _next(self) -> Events | None:
-        """The events of the next piece, in its order; None at the end."""
-        if self._wrong is not None:
-            raise self._wrong
-        found = self._next_piece()
-        if found is None:
-            return None
-        self._counts["rows_cut"] += found.cut
-        piece = self._numbers_of(found)
-        times = piece.times
-        before = self._before
-        self._before = int(times[-1]) if len(times) and math.isfinite(times[-1]) else before
-        rows, good = len(times), False
-        times, turns, self._gone_round = _unwrap(times, before, self._gone_round)
-        if turns > 0 and not self._counts["times_gone_round"]:
-            self.guessed = "; ".join(filter(None, (self.guessed, "the counter of times went round")))
-        self._counts["times_gone_round"] += max(turns, 0)
-        while not good:
-            try:
-                t_us, p = self._unit.us(times[:rows]), self._polarities.of(piece.polarities[:rows])
-                x, y = _places(None if piece.places is None else piece.places[:rows], rows)
-                good = True
-            except RowError as error:
-                # What stands before it is given.
-                rows = error.row
-                self._wrong = InputError(f"{self.path}: {self._where} {piece.number(rows)}: {error}")
-        if len(t_us):
-            start_us = t_us[0] if self._latest_us is None else np.int64(self._latest_us)
-            latest = np.maximum.accumulate(np.concatenate([[start_us], t_us]))
-            self._counts["rows_out_of_order"] += int((t_us < latest[:-1]).sum())
-            self._latest_us = int(latest[-1])
-        return Events(t_us, x, y, 1 - p if self._inverted else p)
+    def _events(self) -> Iterator[Events]:
+        """The events of each piece, in its order; those before a row that is wrong, too."""
+        before: int | None = None
+        latest_us: int | None = None
+        gone_round = 0
+        while (found := self._next_piece()) is not None:
+            self._counts["rows_cut"] += found.cut
+            piece = self._numbers_of(found)
+            last = float(piece.times[-1]) if len(piece.times) else math.nan
+            times, turns, gone_round = _unwrap(piece.times, before, gone_round)
+            before = int(piece.times[-1]) if math.isfinite(last) else before
+            if turns > 0 and not self._counts["times_gone_round"]:
+                self.guessed = "; ".join(filter(None, (self.guessed, "the counter of times went round")))
+            self._counts["times_gone_round"] += max(turns, 0)
+            rows, wrong = len(times), None
+            while True:
+                try:
+                    t_us, p = self._unit.us(times[:rows]), self._polarities.of(piece.polarities[:rows])
+                    x, y = _places(None if piece.places is None else piece.places[:rows], rows)
+                    break
+                except RowError as error:
+                    rows = error.row
+                    wrong = InputError(f"{self.path}: {self._where} {piece.number(rows)}: {error}")
+            if len(t_us):
+                start_us = t_us[0] if latest_us is None else np.int64(latest_us)
+                latest = np.maximum.accumulate(np.concatenate([[start_us], t_us]))
+                self._counts["rows_out_of_order"] += int((t_us < latest[:-1]).sum())
+                latest_us = int(latest[-1])
+            yield Events(t_us, x, y, 1 - p if self._inverted else p)
+            if wrong is not None:
+                raise wrong
 
     def _numbers_of(self, piece: Piece) -> Piece:
         """A piece without the rows in which something is no number; they are counted."""
@@ -291,7 +272,7 @@ class ColumnSource(EventSource):
 
     def close(self) -> None:
         """Close the file."""
-        self._closed = self._closed or InputError(f"{self.path}: closed file")
+        self._fault = self._fault or InputError(f"{self.path}: closed file")
         self._stack.close()
 
 

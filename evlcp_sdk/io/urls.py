@@ -1,6 +1,7 @@
 """What stands behind the `?` of a source's name, checked."""
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from typing import Any
 from urllib.parse import parse_qsl
 
@@ -44,14 +45,10 @@ def positive(text: str) -> float:
     Raises:
         ValueError: It is none; says what is expected.
     """
-    expected = "a number above 0"
-    try:
-        value = float(text)
-    except ValueError as fault:
-        raise ValueError(expected) from fault
-    if not 0 < value < 1e9:
-        raise ValueError(expected)
-    return value
+    with suppress(ValueError):
+        if 0 < float(text) < 1e9:
+            return float(text)
+    raise ValueError("a number above 0")
 
 
 def flag(text: str) -> bool:

@@ -243,7 +243,7 @@ def _messages(path: Path, topic: str | None, stack: ExitStack) -> Iterator[Event
             raise InputError(
                 f"{file}: starts with {start[:8].hex(' ')}, expected a bag of ROS 1, SQLite or MCAP"
             )
-        parts.append({"ROS 1": _ros1, "SQLite": _sqlite, "MCAP": _mcap}[kind](file, topic, stack))
+        parts.append(_read(file, kind, topic, stack))
     return (packet for part in parts for packet in part)
 
 
@@ -262,29 +262,30 @@ def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
     return fitting[0]
 
 
-def _sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+def _read(path: Path, kind: str, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    """The packets of a file."""
     try:
-        # A live run reads in a thread of its own, what it opens in another.
-        base = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
-        stack.enter_context(closing(base))
-        _limit(base, path)
-        rows = base.execute("SELECT name, id, type FROM topics").fetchall()
-        number = {name: number for name, number, _ in rows}
-        chosen = _chosen(path, {name: kind for name, _, kind in rows}, topic)
-        found = base.execute("SELECT data FROM messages WHERE topic_id = ? ORDER BY rowid", (number[chosen],))
-    except sqlite3.Error as fault:
-        raise InputError(f"{path}: {fault}") from fault
+        yield from {"ROS 1": _ros1, "SQLite": _sqlite, "MCAP": _mcap}[kind](path, topic, stack)
+    except InputError:
+        raise
+    except Exception as fault:
+        # A damaged bag makes a reader fail in any way.
+        raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
 
-    def packets() -> Iterator[EventPacket]:
-        try:
-            for (data,) in found:
-                if not isinstance(data, bytes):
-                    raise InputError(f"{path}: a message of type {type(data).__name__}, expected bytes")
-                yield _of_cdr(path, data)
-        except sqlite3.Error as fault:
-            raise InputError(f"{path}: {fault}") from fault
 
-    return packets()
+def _sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    # A live run reads in a thread of its own, what it opens in another.
+    base = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, check_same_thread=False)
+    stack.enter_context(closing(base))
+    _limit(base, path)
+    rows = base.execute("SELECT name, id, type FROM topics").fetchall()
+    number = {name: number for name, number, _ in rows}
+    chosen = _chosen(path, {name: kind for name, _, kind in rows}, topic)
+    found = base.execute("SELECT data FROM messages WHERE topic_id = ? ORDER BY rowid", (number[chosen],))
+    for (data,) in found:
+        if not isinstance(data, bytes):
+            raise InputError(f"{path}: a message of type {type(data).__name__}, expected bytes")
+        yield _of_cdr(path, data)
 
 
 def _limit(base: sqlite3.Connection, path: Path) -> None:
@@ -312,43 +313,20 @@ def _limit(base: sqlite3.Connection, path: Path) -> None:
 
 
 def _mcap(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    reader = _needed(path, "mcap.reader")
-    file = stack.enter_context(path.open("rb"))
-
-    def packets() -> Iterator[EventPacket]:
-        try:
-            made = reader.make_reader(file)
-            summary = made.get_summary()
-            schemas = summary.schemas if summary is not None else {}
-            channels = summary.channels.values() if summary is not None else ()
-            topics = {one.topic: schemas[one.schema_id].name for one in channels if one.schema_id in schemas}
-            chosen = _chosen(path, topics, topic)
-            for _, _, message in made.iter_messages([chosen], log_time_order=False):
-                yield _of_cdr(path, message.data)
-        except InputError:
-            raise
-        except Exception as fault:
-            raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
-
-    return packets()
+    made = _needed(path, "mcap.reader").make_reader(stack.enter_context(path.open("rb")))
+    summary = made.get_summary()
+    schemas = summary.schemas if summary is not None else {}
+    channels = summary.channels.values() if summary is not None else ()
+    topics = {one.topic: schemas[one.schema_id].name for one in channels if one.schema_id in schemas}
+    for _, _, message in made.iter_messages([_chosen(path, topics, topic)], log_time_order=False):
+        yield _of_cdr(path, message.data)
 
 
 def _ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    rosbag1 = _needed(path, "rosbags.rosbag1")
-
-    def packets() -> Iterator[EventPacket]:
-        try:
-            made = stack.enter_context(rosbag1.Reader(path))
-            chosen = _chosen(path, {one.topic: one.msgtype for one in made.connections}, topic)
-            wanted = [one for one in made.connections if one.topic == chosen]
-            for _, _, data in made.messages(wanted):
-                yield _of_ros1(path, data)
-        except InputError:
-            raise
-        except Exception as fault:
-            raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
-
-    return packets()
+    made = stack.enter_context(_needed(path, "rosbags.rosbag1").Reader(path))
+    chosen = _chosen(path, {one.topic: one.msgtype for one in made.connections}, topic)
+    for _, _, data in made.messages([one for one in made.connections if one.topic == chosen]):
+        yield _of_ros1(path, data)
 
 
 def _needed(path: Path, module: str) -> Any:
