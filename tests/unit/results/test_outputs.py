@@ -148,7 +148,7 @@ def test_a_reflection_is_named_as_one(tmp_path: Path) -> None:
 
 
 def test_a_new_result_replaces_all_of_the_old_one_and_only_at_the_end(tmp_path: Path) -> None:
-    for name in ("regions.png", "track.png", "frames.parquet", "frames.csv", "notes.txt"):
+    for name in ("regions.png", "track.png", "fixes.csv", "frames.parquet", "frames.csv", "notes.txt"):
         (tmp_path / name).write_text("old")
     with ResultWriter(tmp_path, LINK) as writer:
         writer.write([packet(0, frame(0, 0))])

@@ -371,14 +371,6 @@ def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.
         assert before[-1] == after[0]
 
 
-def test_a_run_without_sites_drops_an_earlier_ones_positions(tmp_path: Path) -> None:
-    write(tmp_path, packets(3), PositionPlan((SITE,)))
-    assert (tmp_path / "fixes.csv").exists()
-    with ResultWriter(tmp_path, LINK) as results:
-        results.finish(RunEnd("complete"))
-    assert {p.name for p in tmp_path.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
-
-
 def test_kml_is_read_back(tmp_path: Path) -> None:
     write(tmp_path, packets(6), PositionPlan((SITE,)), ["kml"], zero=ZERO)
     names = {"k": "http://www.opengis.net/kml/2.2"}
@@ -432,15 +424,8 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
 
     stream, zero_ns = packets(6), int(ZERO.timestamp()) * 10**9
     registry = Registry.load()
-    with ResultWriter(
-        tmp_path,
-        LINK,
-        registry,
-        plan=PositionPlan((SITE,)),
-        attitude=ATTITUDE,
-        clock_zero=ZERO,
-        sinks=["mcap"],
-    ) as results:
+    known = {"plan": PositionPlan((SITE,)), "attitude": ATTITUDE, "clock_zero": ZERO}
+    with ResultWriter(tmp_path, LINK, registry, sinks=["mcap"], **known) as results:  # type: ignore[arg-type]
         t_us = [5_000, 29_999, 30_000, 40_000, 110_000, 110_001, 110_002]
         for one in (slice(0, 4), slice(4, 5), slice(5, 7)):
             x, y, p = [8, 8, 7, 4, 9, 9, 1], [8, 8, 3, 4, 5, 5, 2], [1, 1, 0, 1, 1, 0, 1]
@@ -450,7 +435,7 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         results.write(stream)
         results.finish(RunEnd("complete"))
     fixes = rows(tmp_path / "fixes.csv")
-    found: dict[str, list[tuple[str, int, object]]] = {}
+    found: dict[str, list[tuple[str, int, Any]]] = {}
     with (tmp_path / "fixes.mcap").open("rb") as file:
         source = reader.make_reader(file, decoder_factories=[DecoderFactory(), JsonDecoderFactory()])
         for schema, channel, message, decoded in source.iter_decoded_messages():
@@ -461,38 +446,38 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
     # Two pictures of 40 ms, of which the last 10 ms are shown: a pixel OFF, then one ON and one of both.
     shots = []
     for _, at_ns, image in found["/image"]:
-        with Image.open(io.BytesIO(image.data)) as picture:  # type: ignore[attr-defined]
+        with Image.open(io.BytesIO(image.data)) as picture:
             cells = np.array(picture)
         shots.append((at_ns - zero_ns, {(y, x): cells[y, x] for y, x in np.argwhere(cells).tolist()}))
     assert shots == [(40_000_000, {(3, 7): 1}), (120_000_000, {(2, 1): 2, (5, 9): 3})]
     (_, at_ns, boxes) = found["/regions"][0]
     assert at_ns - zero_ns == 40_000_000
-    (box,) = boxes.points  # type: ignore[attr-defined]
+    (box,) = boxes.points
     assert [(point.x, point.y) for point in box.points] == [(93, 188), (107, 188), (107, 212), (93, 212)]
     told_frames = [frame for packet in stream for frame in packet.frames]
-    assert [line["t_us"] for _, _, line in found["/frames"]] == [  # type: ignore[index]
+    assert [line["t_us"] for _, _, line in found["/frames"]] == [
         pytest.approx(frame.t_us, abs=0.01) for frame in told_frames
     ]
     ((_, _, scene),) = found["/scene"]
-    (bar,) = scene.entities  # type: ignore[attr-defined]
+    (bar,) = scene.entities
     low, high = bar.lines[0].points
     # 0.96 m of a bar that stands, in axes that begin at its centre.
     assert (low.x, low.y, low.z, high.z) == pytest.approx((0, 0, -0.48, 0.48), abs=1e-6)
     assert bar.texts[0].text == "bar 0, id 7"
     for row, (_, _, told) in zip(fixes, found["/integrity"], strict=True):
-        assert told["misfit"] == pytest.approx(float(row["misfit"]), abs=1e-4)  # type: ignore[index]
-        assert list(told["alarms"]) == ["unavailable"]  # type: ignore[index]
-        assert told["hpl_m"] is None  # type: ignore[index]
+        assert told["misfit"] == pytest.approx(float(row["misfit"]), abs=1e-4)
+        assert list(told["alarms"]) == ["unavailable"]
+        assert told["hpl_m"] is None
     for row, (_, at_ns, fix), (_, _, pose) in zip(fixes, found["/fix"], found["/pose"], strict=True):
         assert at_ns == int(ZERO.timestamp()) * 10**9 + round(float(row["t_us"]) * 1000)
-        assert fix.timestamp.ToNanoseconds() == at_ns  # type: ignore[attr-defined]
-        assert fix.latitude == pytest.approx(float(row["latitude_deg"]), abs=1e-10)  # type: ignore[attr-defined]
-        assert math.sqrt(fix.position_covariance[0]) == pytest.approx(float(row["sigma_east_m"]), abs=6e-5)  # type: ignore[attr-defined]
-        q = pose.pose.orientation  # type: ignore[attr-defined]
+        assert fix.timestamp.ToNanoseconds() == at_ns
+        assert fix.latitude == pytest.approx(float(row["latitude_deg"]), abs=1e-10)
+        assert math.sqrt(fix.position_covariance[0]) == pytest.approx(float(row["sigma_east_m"]), abs=6e-5)
+        q = pose.pose.orientation
         forward = Rotation.from_quat([q.x, q.y, q.z, q.w]).as_matrix()[:, 2]
         heading = math.degrees(math.atan2(forward[0], forward[1])) % 360
         assert abs((heading - float(row["heading_deg"]) + 180) % 360 - 180) < 1e-3
-        assert pose.pose.position.z == pytest.approx(float(row["height_m"]) - 54, abs=2e-3)  # type: ignore[attr-defined]
+        assert pose.pose.position.z == pytest.approx(float(row["height_m"]) - 54, abs=2e-3)
 
 
 def leaves(node: Any) -> list[str]:
