@@ -5,7 +5,7 @@ import dataclasses
 import importlib
 import threading
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import numpy as np
@@ -77,22 +77,26 @@ def open_camera(url: str) -> "CameraSource":
         raise ConfigError(
             f"{url}: needs the driver, which comes with the extra: pip install 'evlcp-sdk[camera]'"
         ) from fault
-    named, options = split_options(url, _OptionKinds())
+    biases = [
+        field.name for kind in _KINDS.values() for field in dataclasses.fields(getattr(driver, kind).Biases)
+    ]
+    kinds = {"events_per_s": _rate, "area": _areas, "trigger": flag} | dict.fromkeys(biases, _whole)
+    named, options = split_options(url, kinds)
     serial = named.partition(":")[2].removeprefix("//") or None
-    with _explained(url, InputError):
+    with _explained(url):
         listed = [one for one in driver.list_devices() if serial in (None, one.serial)]
     known = [one for one in listed if one.name.name in _KINDS]
     for one in listed:
         if one.error is not None and not any(other.error is None for other in known):
-            raise _fault(url, str(one.error), InputError)
+            raise _fault(url, str(one.error))
     if not known:
         others = ", ".join(one.name.value for one in listed)
         if others:
             raise InputError(f"{url}: found {others}, expected an EVK4, or another camera with EVT3 words")
-        raise _fault(url, "with serial" if serial else "no device found", InputError)
+        raise _fault(url, "with serial" if serial else "no device found")
     kind = getattr(driver, _KINDS[known[0].name.name])
     configuration = _configured(url, kind, options)
-    with _explained(url, InputError):
+    with _explained(url):
         plain = dataclasses.replace(configuration, biases=kind.Biases())
         device = driver.open(
             plain,
@@ -184,7 +188,7 @@ class _CameraBytes:
                         continue
                     status = data = None
                 if data is None and self._faults:
-                    raise _fault(self._url, str(self._faults[0]), UnpluggedError) from self._faults[0]
+                    raise _fault(self._url, str(self._faults[0]), gone=True) from self._faults[0]
                 self._look(status)
             self._ready = memoryview(data or b"")
         size = min(len(room), len(self._ready))
@@ -226,19 +230,6 @@ class _CameraBytes:
             time.sleep(_SETTLE_S)
         with self._lock, contextlib.suppress(RuntimeError):
             self._device.close()
-
-
-class _OptionKinds(dict[str, Any]):
-    """What makes the values of options: those here; any other is taken for a bias, and checked later."""
-
-    def __init__(self) -> None:
-        super().__init__(events_per_s=_rate, area=_areas, trigger=flag)
-
-    def __contains__(self, name: object) -> bool:
-        return isinstance(name, str) and name != ""
-
-    def __missing__(self, name: str) -> Any:
-        return _whole
 
 
 def _whole(text: str) -> int:
@@ -304,7 +295,7 @@ def _set_biases(url: str, kind: Any, device: Any, configuration: Any) -> None:
     """Set biases after they are found within the camera's bounds: the driver takes any."""
     if configuration.biases == kind.Biases():
         return
-    with _explained(url, InputError):
+    with _explained(url):
         bounds = device.biases_bounds()
     for field in dataclasses.fields(configuration.biases):
         value, default = (getattr(some, field.name) for some in (configuration.biases, kind.Biases()))
@@ -314,25 +305,25 @@ def _set_biases(url: str, kind: Any, device: Any, configuration: Any) -> None:
                 f"{url}: {field.name} = {value}: expected {int(limits.minimum)} to {int(limits.maximum)}"
             )
     whole = {f.name: np.int16(getattr(configuration.biases, f.name)) for f in dataclasses.fields(kind.Biases)}
-    with _explained(url, InputError):
+    with _explained(url):
         device.update_configuration(dataclasses.replace(configuration, biases=kind.Biases(**whole)))
 
 
 @contextlib.contextmanager
-def _explained(url: str, otherwise: type[InputError]) -> Any:
+def _explained(url: str) -> Iterator[None]:
     """Turn the driver's faults, plain RuntimeErrors, into one line with the next step."""
     try:
         yield
     except RuntimeError as fault:
-        raise _fault(url, str(fault), otherwise) from fault
+        raise _fault(url, str(fault)) from fault
 
 
-def _fault(url: str, said: str, otherwise: type[InputError]) -> InputError:
-    if otherwise is UnpluggedError or any(word in said for word in _UNPLUGGED):
+def _fault(url: str, said: str, gone: bool = False) -> InputError:
+    if gone or any(word in said for word in _UNPLUGGED):
         return UnpluggedError(
             f"{url}: the camera is gone ({said}): see its cable and port; --reconnect goes on when it is back"
         )
     for words, step in _NEXT_STEPS:
         if any(word in said for word in words):
-            return otherwise(f"{url}: {step}")
-    return otherwise(f"{url}: the driver says: {said}")
+            return InputError(f"{url}: {step}")
+    return InputError(f"{url}: the driver says: {said}")

@@ -133,27 +133,23 @@ def _interpret(
     fields: Mapping[str, str], offsets: Mapping[str, int], path: Path | str
 ) -> tuple[Codec, int | None, int | None]:
     """Return the encoding and the size of the sensor that header lines give."""
-    known = " or ".join(CODECS)
-    by_version = {codec.version: codec for codec in CODECS.values()}
     name, *options = fields.get("format", "").split(";")
-    codec = None
-    if "format" in fields:
-        codec = CODECS.get(name)
-        if codec is None:
-            raise RawFormatError(path, offsets["format"], f"encoding {name!r}", known)
-    if "evt" in fields:
-        versioned = by_version.get(fields["evt"])
-        if versioned is None:
-            expected = " or ".join(by_version)
-            raise RawFormatError(path, offsets["evt"], f"EVT version {fields['evt']!r}", expected)
-        if codec is not None and versioned is not codec:
-            found = f"'% evt {fields['evt']}' beside '% format {fields['format']}'"
-            raise RawFormatError(path, offsets["evt"], found, "one encoding")
-        codec = versioned
-    if codec is None:
+    version, by_version = fields.get("evt", ""), {codec.version: codec for codec in CODECS.values()}
+    codecs = []
+    for key, value, known, what in (
+        ("format", name, CODECS, "encoding"),
+        ("evt", version, by_version, "EVT version"),
+    ):
+        if key in fields and value not in known:
+            raise RawFormatError(path, offsets[key], f"{what} {value!r}", " or ".join(known))
+        codecs += [known[value]] if key in fields else []
+    if not codecs:
         raise RawFormatError(
             path, 0, f"a header without encoding ({', '.join(fields)})", "a line '% evt 3.0'"
         )
+    if codecs[0] is not codecs[-1]:
+        found = f"'% evt {version}' beside '% format {fields['format']}'"
+        raise RawFormatError(path, offsets["evt"], found, "one encoding")
 
     sizes: dict[str, set[int]] = {"width": set(), "height": set()}
     for option in options:
@@ -168,7 +164,7 @@ def _interpret(
         if len(values) > 1:
             found = f"'% geometry {fields['geometry']}' beside '% format {fields['format']}'"
             raise RawFormatError(path, offsets["geometry"], found, f"one {key}")
-    return codec, next(iter(sizes["width"]), None), next(iter(sizes["height"]), None)
+    return codecs[0], next(iter(sizes["width"]), None), next(iter(sizes["height"]), None)
 
 
 def _side(text: str, at: int, line: str, path: Path | str) -> int:

@@ -27,6 +27,9 @@ from evlcp_sdk.values import FailedBar, Fix
 
 _KNOTS_PER_M_S = 3600 / 1852
 
+Clock = tuple[str, str]
+"""Time of day to a millisecond, and the date, which is empty where UTC is not known."""
+
 
 class Nmea(Sink):
     """Writes `fixes.nmea`: place, speed and course are the filter's."""
@@ -48,18 +51,19 @@ def sentences(fix: Fix, filtered: Place | None, zero: datetime | None) -> str:
         filtered: The filtered place at its time; None for a refused one.
         zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
     """
+    clock = clock_of(fix.t_us, zero)
     alarms = [txt(len(fix.alarms), n, _in_words(fix, alarm)) for n, alarm in enumerate(fix.alarms, 1)]
     if filtered is None:
-        return "".join([*alarms, gga(fix.t_us, zero, None, 0), rmc(fix.t_us, zero, None, None)])
+        return "".join([*alarms, gga(clock, None, 0), rmc(clock, None, None)])
     place = (filtered.latitude_deg, filtered.longitude_deg, filtered.height_m)
     way = None if filtered.starts else (filtered.speed_m_s, filtered.course_deg)
     return "".join(
         [
             *alarms,
-            gga(fix.t_us, zero, place, len(fix.transmitters)),
-            rmc(fix.t_us, zero, place, way),
-            gst(fix.t_us, zero, math.sqrt(fix.misfit), filtered.covariance_m2),
-            gbs(fix.t_us, zero, fix.hidden_m, fix.failed) if fix.source == "bars" else "",
+            gga(clock, place, len(fix.transmitters)),
+            rmc(clock, place, way),
+            gst(clock, math.sqrt(fix.misfit), filtered.covariance_m2),
+            gbs(clock, fix.hidden_m, fix.failed) if fix.source == "bars" else "",
         ]
     )
 
@@ -72,90 +76,76 @@ def _in_words(fix: Fix, alarm: str) -> str:
     return "NO PROTECTION LEVEL" if alarm == "unavailable" else alarm.upper()
 
 
-def gga(t_us: float, zero: datetime | None, place: tuple[float, float, float] | None, bars: int) -> str:
+def gga(clock: Clock, place: tuple[float, float, float] | None, bars: int) -> str:
     """A GGA sentence, with its line end.
 
     Args:
-        t_us: Camera clock, us.
-        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
+        clock: When.
         place: Latitude and longitude, degrees, and height above the ellipsoid, m; None where there is no fix.
         bars: Bars that count.
     """
-    clock, _ = _time(t_us, zero)
     if place is None:
-        return _sentence(f"INGGA,{clock},,,,,0,{bars:02d},,,M,,M,,")
+        return _sentence(f"INGGA,{clock[0]},,,,,0,{bars:02d},,,M,,M,,")
     latitude, longitude, height = place
     where = f"{_angle(latitude, 2, 'NS')},{_angle(longitude, 3, 'EW')}"
     sea = geoid_m(latitude, longitude)
-    return _sentence(f"INGGA,{clock},{where},6,{bars:02d},,{height - sea:.3f},M,{sea:.1f},M,,")
+    return _sentence(f"INGGA,{clock[0]},{where},6,{bars:02d},,{height - sea:.3f},M,{sea:.1f},M,,")
 
 
-def rmc(
-    t_us: float,
-    zero: datetime | None,
-    place: tuple[float, float, float] | None,
-    way: tuple[float, float] | None,
-) -> str:
-    """An RMC sentence, with its line end; the date is empty where `zero` is None.
+def rmc(clock: Clock, place: tuple[float, float, float] | None, way: tuple[float, float] | None) -> str:
+    """An RMC sentence, with its line end.
 
     Args:
-        t_us: Camera clock, us.
-        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
-        place: Latitude and longitude, degrees, and height, m; None where there is no fix.
+        clock: When.
+        place: As `gga`.
         way: Speed over ground, m/s, and course, degrees clockwise from north; None where not known.
     """
-    clock, date = _time(t_us, zero)
+    time, date = clock
     if place is None:
-        return _sentence(f"INRMC,{clock},V,,,,,,,{date},,,N")
+        return _sentence(f"INRMC,{time},V,,,,,,,{date},,,N")
     latitude, longitude, _ = place
     where = f"{_angle(latitude, 2, 'NS')},{_angle(longitude, 3, 'EW')}"
     knots, course = (
         ("", "") if way is None else (f"{way[0] * _KNOTS_PER_M_S:.3f}", f"{round(way[1], 2) % 360:.2f}")
     )
-    return _sentence(f"INRMC,{clock},A,{where},{knots},{course},{date},,,E")
+    return _sentence(f"INRMC,{time},A,{where},{knots},{course},{date},,,E")
 
 
-def gst(t_us: float, zero: datetime | None, misfit: float, covariance_m2: NDArray[np.float64]) -> str:
+def gst(clock: Clock, misfit: float, covariance_m2: NDArray[np.float64]) -> str:
     """A GST sentence, with its line end: the error's ellipse and sigmas.
 
     Args:
-        t_us: Camera clock, us.
-        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
+        clock: When.
         misfit: Root mean square of the misses, in sigmas; NaN where there are none.
         covariance_m2: Of east, north and up, m2, float64 (3, 3).
     """
-    clock, _ = _time(t_us, zero)
     values, axes = np.linalg.eigh(covariance_m2[:2, :2])
     minor, major = np.sqrt(np.maximum(values, 0)).tolist()
     turned = math.degrees(math.atan2(axes[0, 1], axes[1, 1])) % 180
     east, north, up = sigmas(covariance_m2)
     missed = f"{misfit:.2f}" if math.isfinite(misfit) else ""
     return _sentence(
-        f"INGST,{clock},{missed},{major:.3f},{minor:.3f},{turned:.1f},{north:.3f},{east:.3f},{up:.3f}"
+        f"INGST,{clock[0]},{missed},{major:.3f},{minor:.3f},{turned:.1f},{north:.3f},{east:.3f},{up:.3f}"
     )
 
 
-def gbs(
-    t_us: float, zero: datetime | None, hidden_m: NDArray[np.float64], failed: FailedBar | None = None
-) -> str:
+def gbs(clock: Clock, hidden_m: NDArray[np.float64], failed: FailedBar | None = None) -> str:
     """A GBS sentence, with its line end: what a fault may hide, and the bar that failed.
 
     Args:
-        t_us: Camera clock, us.
-        zero: UTC of the camera clock's 0; None: the clock itself is written as time of day.
+        clock: When.
         hidden_m: By how much a fault that is not found moves the fix at the most: east, north, up, m, float64
             (3,); what is not finite is empty.
         failed: The bar that was left out.
 
-    >>> gbs(1e6, None, np.array([0.5, 0.25, 0.125])).strip()
+    >>> gbs(clock_of(1e6, None), np.array([0.5, 0.25, 0.125])).strip()
     '$INGBS,000001.000,0.250,0.500,0.125,,,,*64'
     """
-    clock, _ = _time(t_us, zero)
     east, north, up = (f"{m:.3f}" if math.isfinite(m) else "" for m in hidden_m.tolist())
     bar = ",,,"
     if failed is not None:
         bar = f"{failed.transmitter:02d},{failed.missed:.4f},{failed.bias_m:.3f},{failed.sigma_m:.3f}"
-    return _sentence(f"INGBS,{clock},{north},{east},{up},{bar}")
+    return _sentence(f"INGBS,{clock[0]},{north},{east},{up},{bar}")
 
 
 def txt(count: int, number: int, text: str) -> str:
@@ -178,8 +168,8 @@ def _angle(degrees: float, digits: int, signs: str) -> str:
     return f"{whole:0{digits}d}{minutes // 10**7:02d}.{minutes % 10**7:07d},{signs[degrees < 0]}"
 
 
-def _time(t_us: float, zero: datetime | None) -> tuple[str, str]:
-    """Time of day to a millisecond, and the date."""
+def clock_of(t_us: float, zero: datetime | None) -> Clock:
+    """When a time of the camera's clock was; its own time of day where `zero`, UTC of its 0, is not known."""
     begin = zero if zero is not None else datetime(1970, 1, 1, tzinfo=UTC)
     at = begin.astimezone(UTC) + timedelta(milliseconds=math.floor(t_us / 1000 + 0.5))
     date = at.strftime("%d%m%y") if zero is not None else ""

@@ -9,7 +9,7 @@ import pytest
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.place.gnss import GnssLog
 from evlcp_sdk.place.nmea import checksum, read_nmea
-from evlcp_sdk.results.nmea import gst
+from evlcp_sdk.results.nmea import clock_of, gst
 
 GGA = "$GPGGA,172814.0,3723.46587704,N,12202.26957864,W,2,6,1.2,18.893,M,-25.669,M,2.0,0031*4F"
 GST = "$GPGST,172814.0,0.006,0.023,0.020,273.6,0.023,0.020,0.031*6A"
@@ -43,7 +43,7 @@ def test_a_place_with_its_sigmas(tmp_path: Path) -> None:
 
 def test_an_ellipse_is_that_of_the_covariance(tmp_path: Path) -> None:
     covariance = np.array([[4.0, -1.5, 0.0], [-1.5, 1.0, 0.0], [0.0, 0.0, 9.0]])
-    told = gst(0.0, NOON, 1.0, covariance).strip()
+    told = gst(clock_of(0.0, NOON), 1.0, covariance).strip()
     (found,) = read_nmea(write(tmp_path, told, at("120000.00")), NOON, 0.0)
     np.testing.assert_allclose(found.covariance_m2, covariance, atol=0.01)
 

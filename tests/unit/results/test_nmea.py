@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, strategies as st
 
 from evlcp_sdk.place.nmea import checksum
-from evlcp_sdk.results.nmea import gga, rmc
+from evlcp_sdk.results.nmea import clock_of, gga, rmc
 
 ZERO = datetime(2026, 3, 1, 23, 59, 58, tzinfo=UTC)
 
@@ -20,7 +20,7 @@ def test_sentences_read_back(
     lat: float, lon: float, height: float, t_us: float, bars: int, speed: float, course: float
 ) -> None:
     place = (lat, lon, height)
-    seen = pynmea2.parse(gga(t_us, ZERO, place, bars).strip(), check=True)
+    seen = pynmea2.parse(gga(clock_of(t_us, ZERO), place, bars).strip(), check=True)
     assert seen.talker == "IN"
     # 1e-7 minutes, rounded.
     assert seen.latitude == pytest.approx(lat, abs=1e-9)
@@ -30,7 +30,7 @@ def test_sentences_read_back(
     assert (seen.altitude_units, seen.geo_sep_units) == ("M", "M")
     assert (seen.gps_qual, int(seen.num_sats)) == (6, bars)
     assert seen.horizontal_dil == ""
-    moved = pynmea2.parse(rmc(t_us, ZERO, place, (speed, course)).strip(), check=True)
+    moved = pynmea2.parse(rmc(clock_of(t_us, ZERO), place, (speed, course)).strip(), check=True)
     assert moved.is_valid
     assert moved.latitude == pytest.approx(lat, abs=1e-9)
     assert moved.spd_over_grnd == pytest.approx(speed * 3600 / 1852, abs=6e-4)
@@ -41,16 +41,17 @@ def test_sentences_read_back(
 
 
 def test_no_fix_says_so() -> None:
-    seen = pynmea2.parse(gga(1e6, None, None, 0).strip(), check=True)
+    begun = clock_of(1e6, None)
+    seen = pynmea2.parse(gga(begun, None, 0).strip(), check=True)
     assert seen.gps_qual == 0
     assert seen.lat == ""
     assert str(seen.timestamp)[:8] == "00:00:01"
-    lost = pynmea2.parse(rmc(1e6, None, None, None).strip(), check=True)
+    lost = pynmea2.parse(rmc(begun, None, None).strip(), check=True)
     assert not lost.is_valid
     assert lost.datestamp is None
-    begun = pynmea2.parse(rmc(1e6, None, (0.0, 0.0, 0.0), None).strip(), check=True)
-    assert begun.is_valid
-    assert begun.spd_over_grnd is None
+    still = pynmea2.parse(rmc(begun, (0.0, 0.0, 0.0), None).strip(), check=True)
+    assert still.is_valid
+    assert still.spd_over_grnd is None
 
 
 def test_the_standards_own_sum() -> None:
@@ -59,5 +60,5 @@ def test_the_standards_own_sum() -> None:
 
 
 def test_sixty_minutes_carry() -> None:
-    assert ",0.00,010326," in rmc(0, ZERO, (0.0, 0.0, 0.0), (0.0, 359.999))
-    assert ",3600.0000000,N," in gga(0, None, (35.9999999999, 0.0, 0.0), 1)
+    assert ",0.00,010326," in rmc(clock_of(0, ZERO), (0.0, 0.0, 0.0), (0.0, 359.999))
+    assert ",3600.0000000,N," in gga(clock_of(0, None), (35.9999999999, 0.0, 0.0), 1)
