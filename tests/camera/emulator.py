@@ -51,27 +51,23 @@ def descriptors():
     return device + config + interface + ends
 
 
-def description():
-    attributes = {
-        "busnum": 1,
-        "devnum": 2,
-        "bConfigurationValue": 1,
-        "speed": 5000,
-        "idVendor": "04b4",
-        "idProduct": "00f5",
-    }
-    lines = [
-        "P: /devices/pci0000:00/usb1/1-1",
-        f"N: {NODE.removeprefix('/dev/')}",
-        f"E: DEVNAME={NODE}",
-        "E: DEVTYPE=usb_device",
-        "E: SUBSYSTEM=usb",
-        "E: BUSNUM=001",
-        "E: DEVNUM=002",
-        *(f"A: {name}={value}\\n" for name, value in attributes.items()),
-        f"H: descriptors={descriptors().hex().upper()}",
-    ]
-    return "\n".join(lines) + "\n\n"
+DESCRIPTION = f"""\
+P: /devices/pci0000:00/usb1/1-1
+N: {NODE.removeprefix("/dev/")}
+E: DEVNAME={NODE}
+E: DEVTYPE=usb_device
+E: SUBSYSTEM=usb
+E: BUSNUM=001
+E: DEVNUM=002
+A: busnum=1\\n
+A: devnum=2\\n
+A: bConfigurationValue=1\\n
+A: speed=5000\\n
+A: idVendor=04b4\\n
+A: idProduct=00f5\\n
+H: descriptors={descriptors().hex().upper()}
+
+"""
 
 
 class Camera:
@@ -259,7 +255,7 @@ def main():
     words = Path(given.words).read_bytes()
     tell = {int(address, 16) for address in given.tell.split(",") if address}
     testbed = UMockdev.Testbed.new()
-    testbed.add_from_string(description())
+    testbed.add_from_string(DESCRIPTION)
     port = Port(lambda: Camera(words, given.rate, given.chunk, tell, given.then))
     handler = UMockdev.IoctlBase()
     handler.connect("handle-ioctl", port.handle)
