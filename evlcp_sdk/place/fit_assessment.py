@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.error_model import ErrorModel, chi_square
+from evlcp_sdk.place.fit import usual_cost
 from evlcp_sdk.place.model import (
     FAULT,
     FOCAL_UNIT,
@@ -137,9 +138,8 @@ class _Solution:
     equations: Equations
 
 
-def _solve(problem: Problem, fit: Fit) -> _Solution | None:
+def _solve(problem: Problem, equations: Equations | None) -> _Solution | None:
     """The equations at a fit, solved; None where they are singular or the fit is behind a bar."""
-    equations = linearize(problem, fit, problem.spec.huber_sigmas)
     if equations is None:
         return None
     free = np.ix_(problem.free, problem.free)
@@ -164,19 +164,19 @@ def _inverted(matrix: Floats) -> Floats | None:
     return inverse
 
 
-def assess_fit(problem: Problem, fit: Fit) -> AssessedPose | Rejection:
+def assess_fit(problem: Problem, fit: Equations) -> AssessedPose | Rejection:
     """The pose with its covariance and tests, or why it cannot be trusted."""
     spec, freedom = problem.spec, problem.freedom
     solution = _solve(problem, fit)
     if solution is None:
         return Rejection("not-determined", "the equations are singular")
-    if (end_on := _end_on(problem, fit)) is not None:
+    if (end_on := _end_on(problem, fit.at)) is not None:
         return end_on
     size, axes = np.linalg.eigh(solution.spread[:3, :3])
     wide = math.sqrt(max(size[-1], 0.0))
     if wide > spec.max_sigma_m:
         return Rejection("uncertain", f"by {wide:.1f} m, more than {spec.max_sigma_m:g} m")
-    bent, slopes = _bend(problem, fit, solution, size, axes)
+    bent, slopes = _bend(problem, solution, size, axes)
     amiss = misfits(problem, fit)
     # A fit of what does not fit need not be at the least cost.
     if bent > _MOST_BEND and not amiss:
@@ -187,8 +187,8 @@ def assess_fit(problem: Problem, fit: Fit) -> AssessedPose | Rejection:
     noise, slow = _rest(problem, solution, moves)
     doubted = _doubted(problem, solution)
     pose = Pose(
-        fit.position,
-        fit.rotation,
+        fit.at.position,
+        fit.at.rotation,
         solution.spread[:6, :6] + doubted,
         noise,
         slow,
@@ -231,7 +231,7 @@ def _moves_by_errors(problem: Problem, solution: _Solution) -> Moves:
     return -place[:, LENS:], by_attitude if len(angles) else np.zeros((3, 4)), by_bars
 
 
-def _bend(problem: Problem, fit: Fit, solution: _Solution, size: Floats, axes: Floats) -> tuple[float, Moves]:
+def _bend(problem: Problem, solution: _Solution, size: Floats, axes: Floats) -> tuple[float, Moves]:
     """How far the cost is from its parabola two sigmas away, and how the moves by errors change there.
 
     Returns:
@@ -239,18 +239,18 @@ def _bend(problem: Problem, fit: Fit, solution: _Solution, size: Floats, axes: F
         the expected growth of the cost, and of one and the square of how far the way there, an arc about the
         bars, is from that axis, in sigmas; and the mean slopes of the moves, a metre.
     """
-    wide = math.sqrt(max(size[-1], 0.0))
+    wide, fit, huber = math.sqrt(max(size[-1], 0.0)), solution.equations, problem.spec.huber_sigmas
     bent, slopes = 1.0, tuple(np.zeros_like(part) for part in _moves_by_errors(problem, solution))
     for way in (-2 / wide, 2 / wide):
         shared = way * solution.spread[:, :3] @ axes[:, -1]
-        there = move(problem, fit, solution.equations.step(shared))
-        again = _solve(problem, there)
+        there = move(problem, fit.at, fit.step(shared))
+        again = _solve(problem, linearize(problem, there, huber))
         if again is not None and again.equations.cost - fit.cost > _FAR_COST:
             # Errors of sites take up what is left of second order.
             there = move(problem, there, again.equations.step(np.zeros(SHARED)))
-            again = _solve(problem, there)
+            again = _solve(problem, linearize(problem, there, huber))
         growth = 1e-9 if again is None else max((again.equations.cost - fit.cost) / 4, 1e-9)
-        off = axes.T @ (there.position - fit.position - shared[:3])
+        off = axes.T @ (there.position - fit.at.position - shared[:3])
         square = float((off**2 / np.maximum(size, 1e-15 * size[-1])).sum())
         bent = max(bent, growth, 1 / growth, 1 + square)
         if again is not None:
@@ -445,9 +445,9 @@ def _level(level_m: float, spec: ErrorModel) -> float:
     return level_m if level_m <= spec.max_protection_m else math.inf
 
 
-def misfits(problem: Problem, fit: Fit) -> bool:
+def misfits(problem: Problem, fit: Equations) -> bool:
     """Whether the sum of the squared misses is more than chance makes it."""
-    return fit.cost > chi_square(problem.spec.false_alarm / 2, problem.freedom)
+    return fit.cost > usual_cost(problem)
 
 
 def _doubt(doubted: Floats) -> dict[str, Floats]:

@@ -29,7 +29,7 @@ FOCAL_UNIT = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """One point of the fit.
+    """All unknowns at one point of the fit.
 
     Attributes:
         position: m, float64 (3,).
@@ -37,20 +37,16 @@ class Fit:
         local: Each bar's own errors in their sigmas: shift of the image, length, place, turn, float64 (bars,
             9).
         lens: The camera's errors, by the root of their covariance, float64 (7,).
-        cost: Twice the cost.
-        settled: Whether a fit ended here.
     """
 
     position: Floats
     rotation: Floats
     local: Floats
     lens: Floats
-    cost: float = math.nan
-    settled: bool = False
 
     @classmethod
     def at(cls, problem: Problem, position: Floats, rotation: Floats) -> "Fit":
-        """A place and axes, and no other error; what it costs is not known."""
+        """A place and axes, and no other error."""
         return cls(position, rotation, np.zeros((len(problem.transmitters), LOCAL)), np.zeros(7))
 
 
@@ -136,7 +132,7 @@ def linearize(problem: Problem, at: Fit, huber: float) -> Equations | None:
     expected = camera.distort(direction)
     miss = _by((points[:, 6:8] - expected - _by(own[:, :2], known.root)) * points[:, 8:9], known.even)
     size = np.hypot(miss[:, 0], miss[:, 1])
-    weight = huber / np.maximum(size, huber) if huber < math.inf else np.ones(len(size))
+    weight = huber / np.maximum(size, huber)
     cost = float((np.where(size > huber, huber * (2 * size - huber), size**2)).sum())
     white = known.even * (np.sqrt(weight) * points[:, 8])[:, None, None]
     by_point = _by_point(white @ camera.distort_slope(direction), direction, seen[:, 2], at.rotation)

@@ -252,18 +252,6 @@ class Problem:
         free[7:] = sigma.known
         return replace(self, lens_root=sigma.root(self.camera), free=free)
 
-    def halved(self) -> "Problem":
-        """The same by the means of the halves of each bar: a few points that say nearly as much."""
-        points, bar = [], []
-        for number in range(len(self.transmitters)):
-            mine = self.points[self.bar == number]
-            for half in (mine[: len(mine) // 2], mine[len(mine) // 2 :]):
-                if len(half):
-                    weight = half[:, 8] ** 2
-                    points.append([*(weight @ half[:, :8] / weight.sum()), math.sqrt(weight.sum()), 0.0])
-                    bar.append(number)
-        return replace(self, points=np.array(points), bar=np.array(bar))
-
     @cached_property
     def centre(self) -> Floats:
         """The mean of the points' places, float64 (3,)."""

@@ -15,12 +15,11 @@ from itertools import combinations
 import numpy as np
 
 from evlcp_sdk.place.error_model import ErrorModel, chi_square
-from evlcp_sdk.place.fit import fit_pose
+from evlcp_sdk.place.fit import ODDS, fit_pose, likely_fits
 from evlcp_sdk.place.fit_assessment import FOCAL, AssessedPose, Pose, assess_fit, covering, misfits
-from evlcp_sdk.place.model import Fit
+from evlcp_sdk.place.model import Equations
 from evlcp_sdk.place.observations import BarView, Problem, project_bars
 from evlcp_sdk.place.rejections import Candidate, Rejection
-from evlcp_sdk.place.starts import ODDS, is_hopeless, likely_starts
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.values import FailedBar
@@ -213,11 +212,10 @@ def fitting_focal_mm(
 
     def misfit(focal_mm: float, free: float) -> float:
         problem = tried(focal_mm, free)
-        starts = () if isinstance(problem, Rejection) else likely_starts(problem)
-        if isinstance(problem, Rejection) or not starts:
+        fits = problem if isinstance(problem, Rejection) else likely_fits(problem)
+        if isinstance(problem, Rejection) or isinstance(fits, Rejection):
             return math.inf
-        tries = starts[:1] if is_hopeless(problem, starts[0]) else starts
-        return min(fit_pose(problem, start).cost for start in tries)
+        return fits[0].cost
 
     around = camera.focal_mm
     # Free within a step, so that none is stepped over.
@@ -272,67 +270,55 @@ def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Proble
 
 def _plain(problem: Problem) -> AssessedPose | Rejection:
     """The pose by all that is given, whether it is to be believed or not."""
-    starts = likely_starts(problem)
-    if not starts:
-        return Rejection("not-determined", "no place from which the bars would be seen so")
-    first = fit_pose(problem, starts[0])
-    if is_hopeless(problem, starts[0]) and misfits(problem, first):
-        # What is off matters, not where exactly the fit would end, nor how surely it is there.
-        found = assess_fit(problem, first)
-        if isinstance(found, AssessedPose):
-            return found
-        return Rejection("not-determined", "nothing explains what is seen")
-    fits = [fit for fit in (first, *(fit_pose(problem, start) for start in starts[1:])) if fit.settled]
-    if not fits:
-        return Rejection("not-determined", "the fit does not settle: the bars do not determine a position")
-    return _settled(problem, fits)
+    fits = likely_fits(problem)
+    if isinstance(fits, Rejection) or not misfits(problem, fits[0]):
+        return fits if isinstance(fits, Rejection) else _settled(problem, fits)
+    # What is off matters, not whether it is as much off from elsewhere, nor how surely it is there.
+    fitted, _ = fit_pose(problem, fits[0].at)
+    found = assess_fit(problem, fitted or fits[0])
+    if isinstance(found, AssessedPose):
+        return found
+    return Rejection("not-determined", "nothing explains what is seen")
 
 
 def _explained(problem: Problem) -> Pose | Rejection | None:
     """The pose by all that is given; None where that does not fit together; a refusal: it may do."""
-    starts = likely_starts(problem)
-    if not starts:
-        return Rejection("not-determined", "no place from which the bars would be seen so")
-    if is_hopeless(problem, starts[0]):
-        return None if starts[0].settled else Rejection("not-determined", "the fit does not settle")
-    fits = [fit for start in starts if (fit := fit_pose(problem, start)).settled]
-    if not fits:
-        return Rejection("not-determined", "the fit does not settle")
-    if all(misfits(problem, fit) for fit in fits):
-        return None
-    found = _settled(problem, fits)
-    if isinstance(found, Rejection):
-        return found
-    return None if found.doubt else found.pose
+    fits = likely_fits(problem)
+    if isinstance(fits, Rejection):
+        return fits
+    found = None if misfits(problem, fits[0]) else _settled(problem, fits)
+    if isinstance(found, AssessedPose):
+        return None if found.doubt else found.pose
+    return found
 
 
-def _settled(problem: Problem, fits: Sequence[Fit]) -> AssessedPose | Rejection:
-    """The likeliest of some fits, assessed; refused where another one is as likely."""
-    best = min(fits, key=lambda fit: fit.cost)
+def _settled(problem: Problem, fits: Sequence[Equations]) -> AssessedPose | Rejection:
+    """The likeliest of some fits, which is the first, assessed; refused where another one is as likely."""
+    best = fits[0]
     found = assess_fit(problem, best)
     if isinstance(found, Rejection):
         return found
     known = [best]
-    for other in sorted(fits, key=lambda fit: fit.cost):
+    for other in fits:
         if other.cost - best.cost < ODDS and _apart(other, known, found.pose):
             known.append(other)
     if len(known) > 1:
-        apart_m = float(np.linalg.norm(known[1].position - best.position))
+        apart_m = float(np.linalg.norm(known[1].at.position - best.at.position))
         detail = f"two positions {apart_m:.2f} m apart fit the image alike"
         return Rejection("two-solutions", detail, tuple(_candidate(problem, fit, best) for fit in known))
     return found
 
 
-def _apart(fit: Fit, others: Sequence[Fit], pose: Pose) -> bool:
+def _apart(fit: Equations, others: Sequence[Equations], pose: Pose) -> bool:
     """Whether a fit is another solution than these, by the covariance of the likeliest one."""
     for other in others:
-        apart = fit.position - other.position
+        apart = fit.at.position - other.at.position
         if fit is other or not apart @ np.linalg.pinv(pose.covariance[:3, :3]) @ apart > _APART_SIGMAS**2:
             return False
     return True
 
 
-def _candidate(problem: Problem, fit: Fit, best: Fit) -> Candidate:
+def _candidate(problem: Problem, fit: Equations, best: Equations) -> Candidate:
     found = assess_fit(problem, fit)
     spread = found.pose.covariance[:3, :3] if isinstance(found, AssessedPose) else np.full((3, 3), math.nan)
-    return Candidate(fit.position, fit.rotation, spread, math.exp((best.cost - fit.cost) / 2))
+    return Candidate(fit.at.position, fit.at.rotation, spread, math.exp((best.cost - fit.cost) / 2))

@@ -1,4 +1,4 @@
-"""Positions and attitudes to fit from: in closed form, then fitted to a few points."""
+"""Positions and attitudes to fit from, in closed form."""
 
 import math
 from itertools import combinations
@@ -6,15 +6,9 @@ from itertools import combinations
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.error_model import chi_square
-from evlcp_sdk.place.fit import STEPS, fit_pose
-from evlcp_sdk.place.model import Fit
 from evlcp_sdk.place.observations import Problem
 
 Floats = NDArray[np.float64]
-
-ODDS = 18.4
-"""Square sums that differ by less are not told apart: beyond, one solution is 10 000 times likelier."""
 
 _HEADINGS = 72
 """Tried at first where none is known: 5 degrees apart, a fraction of the basin of the fit."""
@@ -25,66 +19,12 @@ _FINER = 25
 _MOST = 4
 """Starts of one problem."""
 
-_OTHER_STEPS = 15
-"""Steps of a fit from another start, once there is one."""
-
-_ROUGHLY = 40.0
-"""What a square sum of the means may be off the one of all points, between two starts."""
-
 _FALSE, _FALSE_PX = 10.0, 0.5
 """By all of Grunert's solutions three bars are seen where they stand. By false ones, their ends are off
 by ten times as much as by the likeliest one, and by ten times this much."""
 
-_SAME = 1e-3
-"""Starts that are nearer to each other than this share of the distance, and fit alike, are one."""
 
-
-def likely_starts(problem: Problem) -> list[Fit]:
-    """Where to fit from, the likeliest first.
-
-    Starts in closed form are fitted to the means of the halves of each bar, by plain least squares, which is
-    much faster than to all points and as robust against a poor start. What ends at the same place counts
-    once; what fits far worse than another is left out.
-    """
-    few, limit, usual = problem.halved(), _hopeless(problem), _usual(problem)
-    fits: list[Fit] = []
-    unsettled: list[Fit] = []
-    for position, rotation in _closed_form_starts(problem):
-        steps = STEPS if all(fit.cost > usual for fit in fits) else _OTHER_STEPS
-        start = Fit.at(problem, position, rotation)
-        fit = fit_pose(few, start, steps, robust=False, hopeless=limit)
-        if not fit.settled and not math.isnan(fit.cost):
-            unsettled.append(fit)
-        elif fit.settled and not any(_same(problem, fit, other) for other in fits):
-            fits.append(fit)
-    if all(fit.cost > usual for fit in fits):
-        fits += unsettled
-    fits.sort(key=lambda fit: fit.cost)
-    return [fit for fit in fits if fit.cost < fits[0].cost + ODDS + _ROUGHLY]
-
-
-def is_hopeless(problem: Problem, start: Fit) -> bool:
-    """Whether the fit to all points, as robust as it is, misses them by more than chance from this start."""
-    return start.cost > _hopeless(problem)
-
-
-def _hopeless(problem: Problem) -> float:
-    """A robust square sum within its limit holds that of the means to about the same, and never to this."""
-    return 100 + 4 * _usual(problem)
-
-
-def _usual(problem: Problem) -> float:
-    """What a square sum is not above where all is as said."""
-    return chi_square(problem.spec.false_alarm / 2, problem.freedom)
-
-
-def _same(problem: Problem, one: Fit, two: Fit) -> bool:
-    away, far = one.position - two.position, one.position - problem.points[0, :3]
-    alike = abs(one.cost - two.cost) < 1e-3 * (1 + two.cost)
-    return bool(alike and away @ away < _SAME**2 * (far @ far))
-
-
-def _closed_form_starts(problem: Problem) -> list[tuple[Floats, Floats]]:
+def closed_form_starts(problem: Problem) -> list[tuple[Floats, Floats]]:
     """Pairs of position, m, float64 (3,), and camera axes as columns in ENU, float64 (3, 3).
 
     The likeliest comes first. With the heading known, the point nearest to all lines of sight; with gravity

@@ -10,33 +10,28 @@ from scipy import stats
 from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.place.calibration import (
     PARAMETERS,
     CalibrationView,
     _turn_slope,
     calibrate,
 )
-from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.poses import read_poses
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel
+from tests.unit.place.scenes import POINTS_ONLY, bar
 
 TRUE = CameraModel(focal_mm=8.2, centre_x_px=652.0, centre_y_px=351.0, k1=-0.12, k2=0.05, p1=8e-4, p2=-5e-4)
 NOMINAL = CameraModel(focal_mm=8.0)
-SPEC = ErrorModel(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0)
-ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
 
 
 def views(
     rng: np.random.Generator, count: int, known: bool, noise_px: float = 0.1, bars: int = 6
 ) -> list[CalibrationView]:
     """A camera among poles 8 to 20 m away, that looks about and is rolled."""
-    poles = [
-        np.array([rng.uniform(-9, 9), rng.uniform(8, 20), rng.uniform(-4, 4)]) + ALONG[:, None] * [0, 0, 1]
-        for _ in range(bars)
-    ]
+    poles = [bar([rng.uniform(-9, 9), rng.uniform(8, 20), rng.uniform(-4, 4)]) for _ in range(bars)]
     found = []
     while len(found) < count:
         attitude = Attitude(rng.uniform(-10, 10), rng.choice([0, 90, -90, 180]) + rng.uniform(-5, 5), 0.0)
@@ -61,7 +56,7 @@ def test_the_camera_comes_back_within_its_sigmas(known: bool) -> None:
     rng = np.random.default_rng(6)
     squares = []
     for _ in range(4):
-        found = calibrate(views(rng, 12, known), NOMINAL, SPEC)
+        found = calibrate(views(rng, 12, known), NOMINAL, POINTS_ONLY)
         assert set(found.sigma) >= {"focal_mm", "k1"}
         assert set(found.sigma) | set(found.refused) == set(PARAMETERS)
         if known:
@@ -80,19 +75,19 @@ def test_sites_that_are_not_exact_are_in_the_covariance() -> None:
     survey, squares, spreads = (0.03, 0.002, 0.003), [], []
     for _ in range(6):
         seen = views(rng, 10, True)
-        off = {bar.transmitter: rng.normal(size=7) for view in seen for bar in view.bars}
+        off = {one.transmitter: rng.normal(size=7) for view in seen for one in view.bars}
         told = []
         for view in seen:
             bars = []
-            for bar in view.bars:
-                z, arm = off[bar.transmitter], bar.enu_m - bar.enu_m.mean(0)
+            for one in view.bars:
+                z, arm = off[one.transmitter], one.enu_m - one.enu_m.mean(0)
                 said = (
-                    bar.enu_m + survey[0] * z[:3] + np.cross(survey[1] * z[3:6], arm) + survey[2] * z[6] * arm
+                    one.enu_m + survey[0] * z[:3] + np.cross(survey[1] * z[3:6], arm) + survey[2] * z[6] * arm
                 )
-                bars.append(dataclasses.replace(bar, enu_m=said, survey=survey))
+                bars.append(dataclasses.replace(one, enu_m=said, survey=survey))
             told.append(dataclasses.replace(view, bars=tuple(bars)))
-        found = calibrate(told, NOMINAL, SPEC)
-        exact = calibrate(seen, NOMINAL, SPEC)
+        found = calibrate(told, NOMINAL, POINTS_ONLY)
+        exact = calibrate(seen, NOMINAL, POINTS_ONLY)
         spreads.append(found.sigma["focal_mm"] / exact.sigma["focal_mm"])
         squares += [(getattr(found.camera, n) - getattr(TRUE, n)) ** 2 / s**2 for n, s in found.sigma.items()]
         # The whole covariance, as a link has it.
@@ -110,14 +105,14 @@ def test_sites_that_are_not_exact_are_in_the_covariance() -> None:
 
 def test_what_one_bar_does_not_determine_is_refused() -> None:
     rng = np.random.default_rng(2)
-    pole = np.array([0.5, 12.0, 0.2]) + ALONG[:, None] * [0, 0, 1]
+    pole = bar([0.5, 12.0, 0.2])
     rotation, seen = Attitude(0.0, 0.0, 0.0).rotation(), []
     for n in range(3):
         place = np.array([0.0, 2.0 * n, 0.0])
         points, _ = project_bars(pole, place, rotation, NOMINAL)
-        bar = BarView(0, pole, points + rng.normal(0, 0.02, points.shape), np.full(16, 0.02))
-        seen.append(CalibrationView((bar,), place, 0.002, None, 0.1))
-    found = calibrate(seen, dataclasses.replace(NOMINAL, focal_mm=8.3), SPEC)
+        view = BarView(0, pole, points + rng.normal(0, 0.02, points.shape), np.full(16, 0.02))
+        seen.append(CalibrationView((view,), place, 0.002, None, 0.1))
+    found = calibrate(seen, dataclasses.replace(NOMINAL, focal_mm=8.3), POINTS_ONLY)
     assert "focal_mm" in found.sigma
     assert not {"centre_x_px", "centre_y_px", "p1", "p2"} & set(found.sigma)
     assert abs(found.camera.focal_mm - 8.0) < 5 * found.sigma["focal_mm"]
@@ -126,9 +121,9 @@ def test_what_one_bar_does_not_determine_is_refused() -> None:
     assert set(found.refused) == set(PARAMETERS) - set(found.sigma)
     blurred = [dataclasses.replace(v, position_sigma_m=5.0) for v in seen]
     with pytest.raises(ConfigError, match="do not determine the focal length"):
-        calibrate(blurred, NOMINAL, SPEC)
+        calibrate(blurred, NOMINAL, POINTS_ONLY)
     with pytest.raises(ConfigError, match="nothing to calibrate from"):
-        calibrate([dataclasses.replace(seen[0], bars=())], NOMINAL, SPEC)
+        calibrate([dataclasses.replace(seen[0], bars=())], NOMINAL, POINTS_ONLY)
 
 
 def test_a_site_that_is_not_right_is_told() -> None:
@@ -136,14 +131,14 @@ def test_a_site_that_is_not_right_is_told() -> None:
     seen = views(rng, 8, True)
     wrong = dataclasses.replace(seen[2], enu_m=seen[2].enu_m + np.array([0.5, 0, 0]))
     with pytest.raises(ConfigError, match="not as was said"):
-        calibrate([*seen[:2], wrong, *seen[3:]], NOMINAL, SPEC)
+        calibrate([*seen[:2], wrong, *seen[3:]], NOMINAL, POINTS_ONLY)
 
 
 def test_a_pose_in_another_town_is_told_and_not_the_lens() -> None:
     seen = views(np.random.default_rng(3), 4, True)
     away = [dataclasses.replace(v, enu_m=v.enu_m + np.array([0, 111e3, 0])) for v in seen]
     with pytest.raises(ConfigError, match=r"bar \d is 11\d{4} m from .*in the image it is \d\d m away"):
-        calibrate(away, NOMINAL, SPEC)
+        calibrate(away, NOMINAL, POINTS_ONLY)
 
 
 def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
@@ -153,7 +148,7 @@ def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
     for n in range(8):
         place, bars = np.array([0.0, 0.5 * n, 0.0]), []
         for i, east in enumerate((-3.0, 3.0)):
-            pole = np.array([east, 45.0 + 5 * i, 3.5]) + ALONG[:, None] * [0, 0, 1]
+            pole = bar([east, 45.0 + 5 * i, 3.5])
             points, _ = project_bars(pole, place, Attitude(4.0, 0.0, 0.0).rotation(), camera)
             bars.append(BarView(i, pole, points + rng.normal(0, 0.05, points.shape), np.full(16, 0.05)))
         seen.append(CalibrationView(tuple(bars), place, 0.01, Attitude(4.0, 0.0, 0.0).rotation(), 0.1))
@@ -186,8 +181,6 @@ def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
         (head, "one line of values or more"),
         (head + "a.raw,,35,137,5,,,\n", r"line 2: t_us = '': expected a number"),
         (head + "a.raw,1,35,137,5,3,,\n", r"line 2: pitch_deg = '': expected a number"),
-        ("t_us,latitude_deg\n1,2\n", r"line 1: no column longitude_deg \(columns: t_us"),
-        (head.replace("heading_deg", "heading"), r"line 1: column 'heading': expected heading_deg"),
         (head + "\na.raw,1,95,137,5,,,\n", r"line 3: latitude_deg = '95': expected -90 to 90"),
         (f"attitude_sigma_deg,{head}0,a.raw,1,35,137,5,1,1,1\n", r"line 2: attitude_sigma_deg = '0'"),
         (
@@ -198,5 +191,3 @@ def test_poses_are_read_and_their_faults_told(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(ConfigError, match=says):
             read_poses(path)
-    with pytest.raises(InputError, match="cannot be read"):
-        read_poses(tmp_path / "none.csv")

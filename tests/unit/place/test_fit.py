@@ -23,10 +23,11 @@ from evlcp_sdk.place.observations import (
     shared_sigmas,
     whole_clusters,
 )
-from evlcp_sdk.place.starts import _level_starts, likely_starts, nearest_to_sights
+from evlcp_sdk.place.starts import nearest_to_sights
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
+from tests.unit.place.scenes import bar
 
 Floats = NDArray[np.float64]
 
@@ -35,7 +36,6 @@ CORRELATED = tuple(tuple(0.4 if i != j else 1.0 for j in range(7)) for i in rang
 LENS = CameraSigma(0.1, 3.0, 2.0, 0.05, 0.05, 1e-4, 1e-4, correlation=CORRELATED)
 SURVEY = (0.05, 0.01, 0.01)
 SPEC = ErrorModel(huber_sigmas=3.0)
-ALONG = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
 
 
 def problem(rng: np.random.Generator, bars: int = 2, noise: float = 3.0) -> tuple[Problem, Floats, Floats]:
@@ -45,7 +45,7 @@ def problem(rng: np.random.Generator, bars: int = 2, noise: float = 3.0) -> tupl
     views = []
     for number in range(bars):
         sight = np.array([0.05 * (number - 0.5), 0.02 * number, 1.0]) * (40 + 8 * number)
-        stands = position + rotation @ sight + ALONG[:, None] * np.array([0.1, 0.05, 0.99])
+        stands = bar(position + rotation @ sight, (0.1, 0.05, 0.99))
         points, _ = project_bars(stands, position, rotation, BENT)
         points = points + noise * rng.normal(0, 0.1, points.shape)
         sigma_px = rng.uniform(0.08, 0.15, 16)
@@ -143,10 +143,16 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     assert linearize(p, behind, 100.0) is None
 
 
-def sigmas_of(p: Problem, fit: Fit) -> Floats:
+def fitted(p: Problem, position: Floats, rotation: Floats) -> Equations:
+    """Where the fit ends."""
+    found, settled = fit_pose(p, Fit.at(p, position, rotation))
+    assert settled
+    assert found is not None
+    return found
+
+
+def sigmas_of(p: Problem, equations: Equations) -> Floats:
     """Of the position, by the whole matrix."""
-    equations = linearize(p, fit, SPEC.huber_sigmas)
-    assert equations is not None
     matrix = whole(p, equations)[1][np.ix_(free_of(p), free_of(p))]
     sigma: Floats = np.sqrt(np.diag(np.linalg.inv(matrix))[:3])
     return sigma
@@ -159,8 +165,8 @@ def test_the_fit_is_that_of_scipy() -> None:
     far = p.points.copy()
     far[4, 6] += 4.0
     p = dataclasses.replace(p, points=far)
-    fit = fit_pose(p, Fit.at(p, position + np.array([0.5, -0.4, 0.2]), rotation))
-    assert fit.settled
+    found = fitted(p, position + np.array([0.5, -0.4, 0.2]), rotation)
+    fit = found.at
     start = Fit.at(p, position, rotation)
 
     def cost(x: Floats) -> Floats:
@@ -178,8 +184,8 @@ def test_the_fit_is_that_of_scipy() -> None:
 
     scipy = least_squares(cost, np.zeros(31), x_scale="jac", xtol=1e-14, ftol=1e-14, gtol=1e-14)
     # The roll is about the level forward axis, not the pitched one.
-    assert fit.cost == pytest.approx(2 * scipy.cost, rel=5e-5)
-    sigma = sigmas_of(p, fit)
+    assert found.cost == pytest.approx(2 * scipy.cost, rel=5e-5)
+    sigma = sigmas_of(p, found)
     np.testing.assert_allclose(fit.position / sigma, (position + scipy.x[:3]) / sigma, atol=0.03)
     np.testing.assert_allclose(fit.lens, scipy.x[6:13], atol=0.03)
     np.testing.assert_allclose(fit.local.ravel(), scipy.x[13:], atol=0.03)
@@ -265,11 +271,9 @@ def test_clusters_that_count() -> None:
 def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     """Covariance, its causes and what errors of sites do, by the inverse of the whole matrix."""
     p, position, rotation = problem(np.random.default_rng(12), bars, noise=1.0)
-    fit = fit_pose(p, Fit.at(p, position, rotation))
-    assert fit.settled
-    found, equations = assess_fit(p, fit), linearize(p, fit, SPEC.huber_sigmas)
+    equations = fitted(p, position, rotation)
+    found = assess_fit(p, equations)
     assert isinstance(found, AssessedPose)
-    assert equations is not None
     pose, keep = found.pose, free_of(p)
     rows, matrix, _ = whole(p, equations)
     spread = np.zeros((14 + 9 * bars, 14 + 9 * bars))
@@ -294,7 +298,7 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
     """The widest of what a bar that stands anywhere may hide, each told by its own test."""
     p, position, rotation = problem(np.random.default_rng(12), 3, noise=1.0)
     p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=0.0))
-    fit = fit_pose(p, Fit.at(p, position, rotation))
+    fit = fitted(p, position, rotation)
     found, solution = assess_fit(p, fit), _solve(p, fit)
     assert isinstance(found, AssessedPose)
     assert solution is not None
@@ -339,57 +343,18 @@ def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
     assert (np.trace(out) > 0.1 * np.trace(spread[:6, :6])) == (off > 5)
 
 
-def test_halves_are_weighted_means() -> None:
-    p, _, _ = problem(np.random.default_rng(14), bars=3)
-    few = p.halved()
-    assert few.bar.tolist() == [0, 0, 1, 1, 2, 2]
-    for i in range(6):
-        rows = p.points[8 * i : 8 * i + 8]
-        weight = rows[:, 8] ** 2
-        np.testing.assert_allclose(few.points[i, :8], weight @ rows[:, :8] / weight.sum())
-        assert few.points[i, 8] == pytest.approx(math.sqrt(weight.sum()))
-
-
-def test_headings_are_tried_to_a_fraction_of_a_degree() -> None:
-    rng = np.random.default_rng(16)
-    level = Attitude(5.0, -3.0, 0.0).rotation()
-    true = Rotation.from_rotvec([0, 0, 0.777]).as_matrix() @ level
-    enu = true @ (rng.uniform(-1, 1, (3, 4)) * [[4], [2], [5]] + [[0], [0], [40]])
-    sights = (enu / np.linalg.norm(enu, axis=0)).T @ true
-    found = _level_starts(enu.T.copy(), sights, level)
-    assert 1 <= len(found) <= 4
-    place, turned = found[0]
-    assert Rotation.from_matrix(turned.T @ true).magnitude() < math.radians(0.5)
-    assert np.linalg.norm(place) < 0.5
-    for _, axes in found:
-        np.testing.assert_allclose(axes[2], level[2], atol=1e-12)
-
-
-@pytest.mark.parametrize("seed", range(4))
-def test_starts_lead_to_where_all_points_do(seed: int) -> None:
-    """The fit to a few points is within what noise makes of the one to all; nothing far off is hidden."""
-    p, position, _ = problem(np.random.default_rng(20 + seed), bars=3, noise=1.0)
-    for told in (p, p.told(dataclasses.replace(p.attitude, heading_deg=None)), p.told(None)):
-        assert isinstance(told, Problem)
-        starts = likely_starts(told)
-        fit = fit_pose(told, starts[0])
-        sigma = sigmas_of(told, fit)
-        assert fit.settled
-        assert np.abs((starts[0].position - fit.position) / sigma).max() < 1.0
-        assert np.abs((position - fit.position) / sigma).max() < 5
-
-
 def test_a_fit_that_stalls_far_off_ends() -> None:
     """A site that is metres off: hopeless from the start of the search, and after few steps."""
     p, position, rotation = problem(np.random.default_rng(30), bars=2, noise=1.0)
     wrong = p.points.copy()
     wrong[p.bar == 1, 0] += 30.0
     p = dataclasses.replace(p, points=wrong)
-    start = Fit.at(p, position, rotation)
-    whole, short = fit_pose(p, start, robust=False), fit_pose(p, start, robust=False, hopeless=1000.0)
-    assert short.settled
+    whole = fitted(p, position, rotation)
+    short, settled = fit_pose(p, Fit.at(p, position, rotation), hopeless=1000.0)
+    assert settled
+    assert short is not None
     assert short.cost > 1000
-    assert whole.cost <= short.cost < 3 * whole.cost
+    assert whole.cost <= short.cost
 
 
 @pytest.mark.parametrize(

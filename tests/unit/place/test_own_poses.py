@@ -1,10 +1,7 @@
 """Poses by a track of its own, and what is surveyed by them, against the truth of simulated drives."""
 
-import math
-
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
 from evlcp_sdk.link.resolve import load_link
@@ -18,24 +15,24 @@ from evlcp_sdk.place.poses import KnownPose
 from evlcp_sdk.place.survey import survey
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Packet
+from tests.unit.place.scenes import Floats, frame, square
 
 LINK = load_link()
 PACKET_US = LINK.packet.packet_chips * LINK.packet.chip_us
 AXES = LocalAxes(35.0, 137.0, 50.0)
-SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 TRUE = Attitude(2.0, 0.5, 3.0)
 BIAS_DEG, SITE_M = 0.1, 0.02
 SPOTS = {0: (-4.0, 60.0, 3.0), 1: (4.0, 66.0, 4.0), 2: (1.0, 75.0, 5.0)}
 
 
-def site_of(number: int, off: NDArray[np.float64] | None = None) -> BarSite:
+def site_of(number: int, off: Floats | None = None) -> BarSite:
     enu = np.array(SPOTS[number]) + (0.0 if off is None else off)
     latitude, longitude, height = (float(v) for v in AXES.to_geodetic(enu))
     return BarSite(number, latitude, longitude, height, transmitter=number, position_sigma_m=SITE_M)
 
 
-def where(t_us: float) -> NDArray[np.float64]:
+def where(t_us: float) -> Floats:
     return np.array([0.5, 10e-6 * t_us, 0.0])
 
 
@@ -52,10 +49,7 @@ def packets(rng: np.random.Generator, first: int = 15, last: int = 45) -> list[P
                 t_us = n * PACKET_US + 2600 + k * 11_000
                 points, _ = project_bars(enu, where(t_us), TRUE.rotation(), LINK.camera)
                 points = points + rng.normal(0, 0.07, points.shape) + rng.normal(0, 0.05, 2)
-                frames.append(
-                    Frame(number, n, k, t_us, SOFT, Range(math.nan, math.nan, 0), None, 0.0, 0.0,
-                          points, np.full(16, 0.0707), t_us)
-                )  # fmt: skip
+                frames.append(frame(points, 0.0707, t_us, number, n, k))
             found.append(Packet(number, n, n * PACKET_US, 100.0, tuple(frames), 10))
     return found
 
@@ -92,7 +86,7 @@ def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:
             views.append(CalibrationView(seen, here, *sigmas))
         (bar,) = survey(views, AXES, 0.96, LINK.camera, None, ErrorModel())
         place = AXES.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
-        squares.append((place - SPOTS[2]) @ np.linalg.solve(bar.covariance_m2, place - SPOTS[2]))
+        squares.append(square(place - SPOTS[2], bar.covariance_m2))
         assert np.linalg.norm(place - SPOTS[2]) < 0.4
     # Errors of place and of attitude, which belong together, count one by one: never too sure.
     assert sum(squares) < stats.chi2.isf(1e-3, 9)

@@ -5,35 +5,38 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at, unseen_px
-from evlcp_sdk.values import Frame, Range, SoftSymbols
+from tests.unit.place.scenes import Floats, frame
 
 SPEC = ErrorModel(pixel_sigma_px=0.08)
 EXACT = replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
-SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 T_US = (np.arange(9) - 4.3) * 3600.0
 BAR_PX = np.stack([np.full(16, 300.0), 200.0 + 8.0 * np.arange(16)], 1)
 LINE_M = np.stack([np.zeros(16), 0.06 * np.arange(16), np.zeros(16)], 1)
 LEVER = (np.arange(16) - 7.5) / 7.5
 
 
-def frames(points_px: NDArray[np.float64], sigma_px: float) -> list[Frame]:
-    """As many frames of one bar, float64 (n, 16, 2)."""
-    return [
-        Frame(0, 0, k, t_us, SOFT, Range(math.nan, math.nan, 0), None, 0.0, 0.0, points,
-              np.full(16, sigma_px), t_us)
-        for k, (t_us, points) in enumerate(zip(T_US.tolist(), points_px, strict=True))
-    ]  # fmt: skip
+def seen(
+    points_px: Floats, sigma_px: float, spec: ErrorModel = SPEC, layout_m: Floats = LINE_M,
+    flank_px: float = math.nan, t_us: Floats = T_US,
+) -> BarView:  # fmt: skip
+    """A bar at 0 by its frames, float64 (9, 16, 2)."""
+    frames = [
+        replace(frame(points, sigma_px, t), points_flank_px=flank_px)
+        for t, points in zip(t_us.tolist(), points_px, strict=True)
+    ]
+    found = points_at(7, frames, 0.0, 40_000.0, layout_m, spec)
+    assert found is not None
+    return found
 
 
 def trials(
     step_px: float, white_px: float, lean: float, stated_px: float, pixel_px: float, seed: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+) -> tuple[Floats, Floats, Floats, Floats]:
     """Errors of the shape, float64 (trials, 16, 2), and what is said of them.
 
     Sigmas, that of pixels, and how much it is across.
@@ -50,8 +53,7 @@ def trials(
         pixel = np.einsum("ij,jkl->ikl", root, rng.normal(0, pixel_px, (9, 16, 2)))
         points = BAR_PX + course + pixel + rng.normal(0, white_px, (9, 16, 2))
         points[:, :, 0] += 60.0 * LEVER * rng.normal(0, lean, 9)[:, None]
-        found = points_at(7, frames(points, stated_px), 0.0, 36_000.0, LINE_M, SPEC)
-        assert found is not None
+        found = seen(points, stated_px)
         error = found.points_px - BAR_PX
         errors.append(error - error.mean(0))
         sigmas.append(found.sigma_px)
@@ -73,7 +75,7 @@ def test_an_error_within_pixels_stays_as_long_as_the_image_does(step_px: float) 
         assert pixels == pytest.approx(0.08, abs=0.003)
 
 
-def weights() -> NDArray[np.float64]:
+def weights() -> Floats:
     """Of frames in a straight line's value at 0, by its normal equations."""
     line = np.stack([np.ones(9), T_US / 1e4], 1)
     return np.asarray(np.linalg.solve(line.T @ line, line.T)[0])
@@ -109,8 +111,7 @@ def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None
     errors, said = [], []
     for _ in range(300):
         points = BAR_PX + rng.normal(0, [across_px, 0.06], (9, 16, 2))
-        found = points_at(7, frames(points, 0.06), 0.0, 36_000.0, LINE_M, EXACT)
-        assert found is not None
+        found = seen(points, 0.06, EXACT)
         error = found.points_px - BAR_PX
         errors.append((error - error.mean(0)).T)
         said.append([found.across * found.sigma_px.mean(), found.sigma_px.mean()])
@@ -120,15 +121,13 @@ def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None
     assert 1.0 < said_px2[1] / there[1] < 1.5
 
 
-def seen_as(layout_m: NDArray[np.float64], noise_px: float, seed: int) -> BarView:
+def seen_as(layout_m: Floats, noise_px: float, seed: int) -> BarView:
     """A layout some 50 m ahead, turned and leaning, with errors that all frames share."""
     rng = np.random.default_rng(seed)
     turned = layout_m @ Rotation.from_euler("xyz", [25.0, 20.0, 10.0], degrees=True).as_matrix().T
     image = 640.0 + 7000.0 * turned[:, :2] / (50.0 + turned[:, 2:])
     points = image + rng.normal(0, noise_px, image.shape)
-    found = points_at(7, frames(np.repeat(points[None], 9, 0), 0.06), 0.0, 36_000.0, layout_m, EXACT)
-    assert found is not None
-    return found
+    return seen(np.repeat(points[None], 9, 0), 0.06, EXACT, layout_m)
 
 
 @pytest.mark.parametrize("shape", ["line", "columns", "ring"])
@@ -153,18 +152,12 @@ def test_a_layouts_own_form_and_its_perspective_are_no_errors(shape: str) -> Non
 
 
 def test_too_few_clusters_show_nothing_of_their_errors() -> None:
-    few = replace(EXACT, min_points=2)
-    seen = [replace(frame, points_px=frame.points_px[:4], points_sigma_px=frame.points_sigma_px[:4])
-            for frame in frames(np.repeat(BAR_PX[None], 9, 0), 0.1)]  # fmt: skip
-    found = points_at(7, seen, 0.0, 36_000.0, LINE_M[:4], few)
-    assert found is not None
-    assert found.across == 1.0
+    few = np.repeat(BAR_PX[None, :4], 9, 0)
+    assert seen(few, 0.1, replace(EXACT, min_points=2), LINE_M[:4]).across == 1.0
 
 
 def test_points_without_an_error_are_not_exact_across() -> None:
-    found = points_at(7, frames(np.repeat(BAR_PX[None], 9, 0), 0.1), 0.0, 36_000.0, LINE_M, EXACT)
-    assert found is not None
-    assert found.across == pytest.approx(0.1)
+    assert seen(np.repeat(BAR_PX[None], 9, 0), 0.1, EXACT).across == pytest.approx(0.1)
 
 
 def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
@@ -184,20 +177,14 @@ def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
 @pytest.mark.parametrize(("step_px", "least", "most"), [(0.0, 1.0, 1.0), (0.2, 0.9, 1.0), (5.0, 0.7, 0.85)])
 def test_what_is_not_shown_averages_as_the_image_moves(step_px: float, least: float, most: float) -> None:
     points = BAR_PX + T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
-    seen = [replace(frame, points_flank_px=0.6) for frame in frames(points, 0.1)]
-    found = points_at(7, seen, 0.0, 36_000.0, LINE_M, SPEC)
-    assert found is not None
-    assert least - 1e-9 <= found.shift_px / unseen_px(0.6) <= most + 1e-9
-    unknown = points_at(7, frames(points, 0.1), 0.0, 36_000.0, LINE_M, SPEC)
-    assert unknown is not None
-    assert unknown.shift_px == 0.0
+    assert least - 1e-9 <= seen(points, 0.1, flank_px=0.6).shift_px / unseen_px(0.6) <= most + 1e-9
+    assert seen(points, 0.1).shift_px == 0.0
 
 
 def test_a_moving_image_is_seen_early_or_late_by_its_speed() -> None:
     for px_per_ms in (0.0, 2.0, 6.0):
         points = BAR_PX + T_US[:, None, None] / 1000.0 * np.array([0.6, -0.8]) * px_per_ms
-        found = points_at(7, frames(points, 0.1), 0.0, 36_000.0, LINE_M, replace(SPEC, early_sigma_us=15.0))
-        assert found is not None
+        found = seen(points, 0.1, replace(SPEC, early_sigma_us=15.0))
         assert found.early_px == pytest.approx(0.015 * px_per_ms, abs=1e-12)
 
 
@@ -206,12 +193,7 @@ def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> Non
     for t_us in (T_US, np.where(T_US > 0, T_US + 2600.0, T_US)):
         quartic = 1e-16 * t_us**4
         points = BAR_PX + quartic[:, None, None] * np.array([1.0, 0.0])
-        seen = [
-            replace(frame, points_t_us=t, points_px=at)
-            for frame, t, at in zip(frames(points, 0.1), t_us.tolist(), points, strict=True)
-        ]
-        found = points_at(7, seen, 0.0, 40_000.0, LINE_M, SPEC)
-        assert found is not None
+        found = seen(points, 0.1, t_us=t_us)
         midway = 1e-16 * 0.5625 * 3600.0**4
         off = abs(found.points_px[:, 0].mean() - 300.0)
         assert found.between == pytest.approx(off / midway, rel=1e-6)

@@ -1,8 +1,9 @@
-"""Fixes from packets: in time, with sites, beacons and attitudes; and from a simulated drive."""
+"""Fixes from packets: in time, with sites, beacons and attitudes."""
 
 import dataclasses
 import math
 from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -11,27 +12,23 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.kinds import BeaconKind
-from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.positioner import BarKind, Positioner, _alternatives
 from evlcp_sdk.place.rejections import Candidate, Rejection
-from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.sim import Simulation
-from evlcp_sdk.sim.scene import resolve_scene
-from evlcp_sdk.sim.world import scene_to_enu, sites_of
-from evlcp_sdk.values import Fix, Frame, Packet, Range, ReceivedMessage, SoftSymbols, Trust
+from evlcp_sdk.values import Fix, Packet, ReceivedMessage, Trust
+from tests.unit.place.scenes import frame
 
 CAMERA = CameraModel()
 PACKET_US, FRAME_US = 34_600.0, 3200.0
 ORIGIN = LocalAxes(35.0, 137.0, 40.0)
 EXACT = Attitude(4.0, 1.0, 0.0, 0.0, 0.0)
-SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
+BAR, RING = BarLayout(), BarLayout(LedRing(leds=16, radius_m=0.45))
 
 
 def site(number: int, enu_m: tuple[float, float, float], transmitter: int | None = None) -> BarSite:
@@ -56,10 +53,7 @@ def packets_of(bar: BarSite, transmitter: int, count: int, start_us: float = 500
             t_us = start + 2600 + k * FRAME_US
             points, _ = project_bars(enu, camera_at(t_us + 800), attitude.rotation(), CAMERA)
             points[list(dark)] = np.nan
-            frames.append(
-                Frame(transmitter, n, k, t_us, SOFT, Range(math.nan, math.nan, 0), None, 0.0, 0.0,
-                      points, np.full(len(points), 0.1), t_us + 800)
-            )  # fmt: skip
+            frames.append(frame(points, 0.1, t_us + 800, transmitter, n, k))
         heard = (messages or {}).get(n, ())
         found.append(Packet(transmitter, n, start, 100.0, tuple(frames), 10, messages=heard))
     return found
@@ -69,13 +63,16 @@ def merged(*streams: list[Packet]) -> list[Packet]:
     return sorted((p for s in streams for p in s), key=lambda p: p.t_us)
 
 
-def positioner(sites: list[BarSite], attitude: Attitude | None = EXACT, **spec: object) -> Positioner:
-    return Positioner(
-        CAMERA, {"": BarKind(BarLayout(), PACKET_US)}, sites, lambda _t: attitude, ErrorModel(**spec)
-    )  # type: ignore[arg-type]
+def positioner(
+    sites: list[BarSite], attitude: Attitude | None = EXACT, layout: BarLayout = BAR, link: str = "",
+    **spec: Any,
+) -> Positioner:  # fmt: skip
+    kinds = {"": BarKind(layout, PACKET_US, link)}
+    return Positioner(CAMERA, kinds, sites, lambda _t: attitude, ErrorModel(**spec))
 
 
-RING = BarLayout(LedRing(leds=16, radius_m=0.45))
+def fixes_of(p: Positioner, packets: list[Packet]) -> list[Fix]:
+    return p.feed(packets) + p.close()
 
 
 def test_a_ring_gives_a_fix_where_its_site_says_how_it_faces() -> None:
@@ -85,16 +82,8 @@ def test_a_ring_gives_a_fix_where_its_site_says_how_it_faces() -> None:
     assert enu[4] - enu[12] == pytest.approx([0.9, 0, 0], abs=1e-6)
     assert enu[0] - enu[8] == pytest.approx([0, 0, 0.9], abs=1e-6)
     packets = packets_of(ring, 0, 8, enu=enu)
-    whole = Positioner(CAMERA, {"": BarKind(RING, PACKET_US)}, [ring], lambda _t: EXACT, ErrorModel())
-    assert_right(whole.feed(packets) + whole.close(), 5e-3)
-    unknown = Positioner(
-        CAMERA,
-        {"": BarKind(RING, PACKET_US)},
-        [dataclasses.replace(ring, facing_deg=None)],
-        lambda _t: EXACT,
-        ErrorModel(),
-    )
-    fixes = unknown.feed(packets) + unknown.close()
+    assert_right(fixes_of(positioner([ring], layout=RING), packets), 5e-3)
+    fixes = fixes_of(positioner([dataclasses.replace(ring, facing_deg=None)], layout=RING), packets)
     assert {f.refusal for f in fixes} == {"no-facing"}
     assert fixes[0].detail == "site of id 7: facing_deg: missing; expected where the LEDs shine to"
 
@@ -133,11 +122,8 @@ def test_bars_of_two_links_give_one_fix() -> None:
     other = with_link(packets_of(right, 1, 8, enu=right.cluster_positions_m(8, ORIGIN)), "short")
     lamp = with_link(packets_of(LEFT, 2, 8), "lamp")
 
-    def fixes_of(sites: list[BarSite], *streams: list[Packet]) -> tuple[Positioner, list[Fix]]:
-        p = Positioner(CAMERA, kinds, sites, lambda _t: gravity)
-        return p, p.feed(merged(*streams)) + p.close()
-
-    p, fixes = fixes_of([right, left], one, other, lamp)
+    p = Positioner(CAMERA, kinds, [right, left], lambda _t: gravity)
+    fixes = fixes_of(p, merged(one, other, lamp))
     assert_right(fixes)
     assert [fix.transmitters for fix in fixes] == [(0, 1)] * len(fixes)
     assert p.links_of(fixes[0]) == "long short"
@@ -149,25 +135,24 @@ def test_bars_of_two_links_give_one_fix() -> None:
     pieces = [fix for packet in merged(one, other, lamp) for fix in again.feed([packet])] + again.close()
     assert [fix.enu_m.tolist() for fix in pieces] == [fix.enu_m.tolist() for fix in fixes]
     # Both have the number of the site, which names neither: each bar is where its own link stands.
-    _, alone = fixes_of([dataclasses.replace(left, link="short", transmitter=0)], one)
+    elsewhere = dataclasses.replace(left, link="short", transmitter=0)
+    alone = fixes_of(Positioner(CAMERA, kinds, [elsewhere], lambda _t: gravity), one)
     assert {fix.refusal for fix in alone} == {"no-site"}
 
 
 def test_a_site_of_another_link_is_named() -> None:
     told = dataclasses.replace(LEFT, link="beacon", transmitter=None)
-    p = Positioner(CAMERA, {"": BarKind(BarLayout(), PACKET_US, "bar")}, [told], lambda _t: EXACT)
     packets = packets_of(LEFT, 0, 4, messages={0: (heard(LEFT, "unverified", 0),)})
-    fixes = p.feed(packets) + p.close()
+    fixes = fixes_of(positioner([told], link="bar"), packets)
     assert {fix.refusal for fix in fixes} == {"no-site"}
     assert fixes[0].detail.endswith("0 (id 7, whose site is of link 'beacon')")
     for link in ("", "beacon"):
-        p = Positioner(CAMERA, {"": BarKind(BarLayout(), PACKET_US, link)}, [told], lambda _t: EXACT)
-        assert_right(p.feed(packets) + p.close())
+        assert_right(fixes_of(positioner([told], link=link), packets))
 
 
 def test_one_bar_gives_a_fix_a_packet_time() -> None:
     p = positioner([LEFT])
-    fixes = p.feed(packets_of(LEFT, 0, 8)) + p.close()
+    fixes = fixes_of(p, packets_of(LEFT, 0, 8))
     assert_right(fixes)
     assert [f.t_us for f in fixes] == [PACKET_US * n for n in range(1, 9)]
     assert p.counts == {"fixes": 8, "refused": 0, "frames_late": 0, "beacons_forged": 0}
@@ -180,10 +165,11 @@ def test_one_bar_gives_a_fix_a_packet_time() -> None:
 def test_two_bars_of_other_phases_give_the_heading() -> None:
     turned = Attitude(4.0, 1.0, 359.0, 0.0, 0.0)
     p = positioner([LEFT, RIGHT], Attitude(4.0, 1.0, None, 0.0))
-    fixes = p.feed(
-        merged(packets_of(LEFT, 0, 8, attitude=turned), packets_of(RIGHT, 1, 8, 21_000.0, attitude=turned))
+    left, right = (
+        packets_of(bar, number, 8, start_us, attitude=turned)
+        for bar, number, start_us in ((LEFT, 0, 5000.0), (RIGHT, 1, 21_000.0))
     )
-    fixes += p.close()
+    fixes = fixes_of(p, merged(left, right))
     both = [f for f in fixes if f.transmitters == (0, 1) and not f.refusal]
     assert len(both) >= 6
     assert_right(both, 5e-3)
@@ -197,26 +183,16 @@ def test_gravity_and_north_are_those_of_the_place_not_of_the_first_site() -> Non
     # 30 km away, the vertical leans by 0.27 degrees and north by 0.2.
     far = site(99, (-30_000.0, 10_000.0, 0.0))
     p = positioner([far, LEFT])
-    fixes = p.feed(packets_of(LEFT, 0, 6)) + p.close()
+    fixes = fixes_of(p, packets_of(LEFT, 0, 6))
     assert_right(fixes)
     assert p.axes == LocalAxes.of([far])
     heading = fixes[0].heading_deg
     assert min(heading, 360 - heading) < 1e-3
     # The covariance turns along: its size stays, its axes are those of the track's frame.
-    near = positioner([LEFT])
-    plain = near.feed(packets_of(LEFT, 0, 6)) + near.close()
+    plain = fixes_of(positioner([LEFT]), packets_of(LEFT, 0, 6))
     here = LocalAxes.of([LEFT])
     turn = LocalAxes.of([far]).turn_from(here)
     np.testing.assert_allclose(fixes[1].covariance_m2, turn @ plain[1].covariance_m2 @ turn.T, atol=1e-9)
-
-
-def test_feeding_by_packets_or_all_at_once_is_the_same() -> None:
-    stream = merged(packets_of(LEFT, 0, 8), packets_of(RIGHT, 1, 8, 21_000.0))
-    one, many = positioner([LEFT, RIGHT]), positioner([LEFT, RIGHT])
-    whole = one.feed(stream) + one.close()
-    parts = [f for packet in stream for f in many.feed([packet])] + many.close()
-    assert [f.t_us for f in whole] == [f.t_us for f in parts]
-    np.testing.assert_array_equal([f.enu_m for f in whole], [f.enu_m for f in parts])
 
 
 @pytest.mark.parametrize("known_from", [0, 2])
@@ -233,9 +209,8 @@ def test_a_mirror_image_is_no_bar(known_from: int) -> None:
         )
         image.append(dataclasses.replace(packet, frames=frames, messages=() if echo_of == 0 else told[0]))
     # No site names a transmitter, so that only a bar that is alone stands there by its number.
-    alone, both = positioner([LEFT]), positioner([LEFT])
-    want = alone.feed(own) + alone.close()
-    fixes = both.feed(merged(own, image)) + both.close()
+    want, both = fixes_of(positioner([LEFT]), own), positioner([LEFT])
+    fixes = fixes_of(both, merged(own, image))
     # A fix waits for half a packet on both sides.
     late = [f for f in fixes if f.t_us > known_from * PACKET_US]
     assert_right(late)
@@ -245,16 +220,15 @@ def test_a_mirror_image_is_no_bar(known_from: int) -> None:
 
 
 def test_dark_clusters_and_a_gap_in_time() -> None:
-    p = positioner([LEFT])
-    fixes = p.feed(packets_of(LEFT, 0, 4, dark=(2, 9)))
-    fixes += p.feed(packets_of(LEFT, 0, 4, 1e6)) + p.close()
+    stream = packets_of(LEFT, 0, 4, dark=(2, 9)) + packets_of(LEFT, 0, 4, 1e6)
+    fixes = fixes_of(positioner([LEFT]), stream)
     assert len(fixes) == 8
     assert_right(fixes)
 
 
 def test_an_unknown_site_is_refused() -> None:
     p = positioner([LEFT])
-    fixes = p.feed(packets_of(RIGHT, 3, 4)) + p.close()
+    fixes = fixes_of(p, packets_of(RIGHT, 3, 4))
     assert {f.refusal for f in fixes} == {"no-site"}
     assert fixes[0].transmitters == (3,)
     assert fixes[0].detail == "no site is known of transmitter 3 (no id heard)"
@@ -273,17 +247,16 @@ def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
 def test_beacons_tell_who_and_where() -> None:
     told = {0: (heard(RIGHT, "unverified", 0),)}
     # The id decides, not the receiver's number, which is the other bar's here.
-    p = positioner([LEFT, RIGHT])
-    fixes = p.feed(packets_of(RIGHT, 0, 6, messages=told)) + p.close()
+    fixes = fixes_of(positioner([LEFT, RIGHT]), packets_of(RIGHT, 0, 6, messages=told))
     assert_right(fixes)
     assert not any(f.verified for f in fixes)
     # Without a file, a verified beacon's own place is believed; an unverified one's only if so configured.
-    for trust, calibrate_llr, given in (
+    for trust, believed, given in (
         ("verified", "verified", True), ("unverified", "verified", False),
         ("unverified", "any", True), ("verified", "none", False),
     ):  # fmt: skip
-        p = positioner([], beacons=calibrate_llr)
-        fixes = p.feed(packets_of(RIGHT, 0, 6, messages={0: (heard(RIGHT, trust, 0),)})) + p.close()  # type: ignore[arg-type]
+        told = {0: (heard(RIGHT, cast(Trust, trust), 0),)}
+        fixes = fixes_of(positioner([], beacons=believed), packets_of(RIGHT, 0, 6, messages=told))
         if given:
             assert_right(fixes)
             assert all(f.verified == (trust == "verified") for f in fixes)
@@ -299,7 +272,7 @@ def test_a_forged_beacon_cannot_move_the_camera() -> None:
         4: (heard(liar, "forged", 4),),
     }
     p = positioner([])
-    fixes = p.feed(packets_of(LEFT, 0, 9, messages=told)) + p.close()
+    fixes = fixes_of(p, packets_of(LEFT, 0, 9, messages=told))
     given = [f for f in fixes if not f.refusal]
     assert_right(given)
     assert all(f.verified for f in given)
@@ -322,8 +295,8 @@ def test_a_beacon_whose_key_runs_out_is_believed_no_longer() -> None:
         9: (heard(liar, "unverified", 9),),
         13: (heard(RIGHT, "verified", 13),),
     }
-    p = positioner([])
-    fixes = p.feed(packets_of(RIGHT, 0, 18, messages=told)) + p.close()
+    packets = packets_of(RIGHT, 0, 18, messages=told)
+    fixes = fixes_of(positioner([]), packets)
     given = [not f.refusal for f in fixes]
     assert_right([f for f in fixes if not f.refusal])
     assert all(f.verified for f in fixes if not f.refusal)
@@ -331,8 +304,7 @@ def test_a_beacon_whose_key_runs_out_is_believed_no_longer() -> None:
     assert given[-1]
     assert given.count(False) >= 3
     # Whoever believes any beacon goes on, and is told that it is not verified; the liar never counts.
-    p = positioner([], beacons="any")
-    fixes = p.feed(packets_of(RIGHT, 0, 18, messages=told)) + p.close()
+    fixes = fixes_of(positioner([], beacons="any"), packets)
     assert_right(fixes)
     assert [f.verified for f in fixes] == given
 
@@ -349,17 +321,17 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
         packets_of(RIGHT, 1, 6, messages={0: (heard(RIGHT, "unverified", 0),)}),
     )
     right = positioner([LEFT, RIGHT], gravity)
-    assert_right(right.feed(stream) + right.close())
+    assert_right(fixes_of(right, stream))
     assert right.bars.contradicted == {}
     wrong = positioner(swapped, gravity)
-    fixes = wrong.feed(stream) + wrong.close()
+    fixes = fixes_of(wrong, stream)
     assert {f.refusal for f in fixes} == {"site-contradicted"}
     assert "transmitter 0 says that it is 7.2 m from the site of its id" in fixes[0].detail
     assert wrong.bars.stands_at == {}
     assert set(wrong.bars.contradicted) == {0, 1}
     # Whoever knows better than the beacons says so; nothing in the image could.
     alone = positioner(swapped, gravity, beacons="none")
-    assert not any(f.refusal for f in alone.feed(stream) + alone.close())
+    assert not any(f.refusal for f in fixes_of(alone, stream))
 
 
 @pytest.mark.parametrize(
@@ -375,8 +347,8 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
 )
 def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) -> None:
     """A lone bar of the wrong length or place fits the image as well as the right one."""
-    p = positioner([dataclasses.replace(LEFT, **change)])  # type: ignore[arg-type]
-    fixes = p.feed(packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)})) + p.close()
+    packets = packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)})
+    fixes = fixes_of(positioner([dataclasses.replace(LEFT, **change)]), packets)  # type: ignore[arg-type]
     assert {f.refusal for f in fixes} == ({"site-contradicted"} if told else {""})
     if told:
         assert told in fixes[0].detail
@@ -412,12 +384,10 @@ def test_an_attitude_file(tmp_path: Path) -> None:
         ("t_us,roll_deg\n0,1\n", r"line 1: no column pitch_deg"),
         ("t_us,pitch_deg,roll_deg\n0,1,2\n", r"two lines or more with rising t_us"),
         ("t_us,pitch_deg,roll_deg\n0,1,2\n\n5,1,2\n3,1,2\n", r"line 5: t_us = 3: expected more than .* 5"),
-        ("t_us,pitch_deg,roll_deg\n\n0,1,2\n1,x,2\n", r"line 4: pitch_deg = 'x': expected a number"),
         (
             "t_us,pitch_deg,roll_deg,gravity_sigma_deg\n0,1,2,1\n1,1,2,-1\n",
-            r"line 3: gravity_sigma_deg = '-1'",
+            "line 3: gravity_sigma_deg = '-1'",
         ),
-        ("t_us,pitch_deg,roll_deg\n0,1\n1,1,2\n", r"line 2: 2 fields, expected 3, as line 1 has"),
     ],
 )
 def test_faults_of_an_attitude_file(tmp_path: Path, text: str, message: str) -> None:
@@ -425,48 +395,6 @@ def test_faults_of_an_attitude_file(tmp_path: Path, text: str, message: str) -> 
     path.write_text(text)
     with pytest.raises(ConfigError, match=message):
         AttitudeLog.read(path)
-    with pytest.raises(InputError, match="cannot be read"):
-        AttitudeLog.read(tmp_path / "none.csv")
-
-
-def test_a_simulated_drive_past_two_bars() -> None:
-    """From events to fixes: two bars 45 and 50 m ahead, gravity known, as vehicles vibrate."""
-    bars = [{"x_m": -3.0, "y_m": -3.5}, {"x_m": 3.0, "y_m": -4.0, "z_m": -5.0, "ppm": 20.0}]
-    scene = resolve_scene(
-        {
-            "duration_s": 0.2,
-            "seed": 2,
-            "world": {"latitude_deg": 35.1, "longitude_deg": 137.0, "height_m": 50.0, "heading_deg": 30.0},
-            "motion": {"distance_m": 50.0, "pitch_deg": 4.0},
-            "bars": bars,
-        }
-    )
-    simulation, link = Simulation(scene), load_link()
-    receiver = Receiver(link)
-    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
-    first = {p.transmitter: p.frames[0].x_px for p in reversed(packets)}
-    numbers = sorted(first, key=lambda n: first[n])
-    sites = [dataclasses.replace(s, transmitter=n) for s, n in zip(sites_of(scene), numbers, strict=True)]
-
-    def attitude_at(t_us: float) -> Attitude:
-        _, ((_yaw, pitch, roll),) = simulation.path.at([t_us])
-        return Attitude(math.degrees(pitch), math.degrees(roll), None, 0.0)
-
-    p = Positioner(link.camera, {"": BarKind.of(link)}, sites, attitude_at)
-    fixes = p.feed(packets) + p.close()
-    given = [f for f in fixes if not f.refusal]
-    assert len(given) >= 4
-    world = LocalAxes(35.1, 137.0, 50.0)
-    error = []
-    for fix in given:
-        place, ((yaw, _pitch, _roll),) = simulation.path.at([fix.t_us])
-        true = scene_to_enu(place, 30.0)[0]
-        found = world.to_enu(fix.latitude_deg, fix.longitude_deg, fix.height_m)
-        error.append(np.linalg.norm(found - true))
-        assert abs(fix.heading_deg - 30 - math.degrees(yaw)) < 5 * fix.heading_sigma_deg
-        assert error[-1] < 5 * math.sqrt(np.trace(fix.covariance_m2))
-    assert np.median(error) < 0.06
-    assert max(error) < 0.15
 
 
 def test_poses_that_are_left_open_are_told_on_earth() -> None:

@@ -17,12 +17,11 @@ from evlcp_sdk.place.survey import survey
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
+from tests.unit.place.scenes import POINTS_ONLY, square
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
 CAMERA = CameraModel(focal_mm=16.0)
-SPEC = ErrorModel(
-    shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0, stretch_share=0, bend_sigma_px=0
-)
+SPEC = dataclasses.replace(POINTS_ONLY, bend_sigma_px=0)
 ROTATION = Attitude(3.0, 1.0, 2.0).rotation()
 
 
@@ -77,7 +76,7 @@ def test_bars_come_back_within_their_sigmas() -> None:
         for bar, true in zip(found, BARS, strict=True):
             place = LocalAxes.of([true])
             error = place.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
-            squares.append(error @ np.linalg.solve(bar.covariance_m2, error))
+            squares.append(square(error, bar.covariance_m2))
             wide.append(bar.site.position_sigma_m)
             assert bar.views == 7
             assert bar.site.length_m == 0.96

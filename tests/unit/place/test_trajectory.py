@@ -1,32 +1,31 @@
-"""The trajectory against a batch solution of the same model, and its consistency."""
+"""The trajectory against a dense solution of the same model, and its consistency."""
 
 import dataclasses
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory, trajectory_step
 from evlcp_sdk.values import Fix
+from tests.unit.place.scenes import Floats, by_chance, square
 
 SPEC = ErrorModel(acceleration_m2_s3=2.0)
 SIGMA_M = np.array([0.3, 0.1, 0.05])
 
 
-def fix(t_us: float, enu_m: NDArray[np.float64], standing_m: float = 0.0) -> Fix:
+def fix(t_us: float, enu_m: Floats) -> Fix:
     noise = np.diag(SIGMA_M**2)
     return dataclasses.replace(
         Fix.refused(t_us, (0,), "", ""),
         enu_m=enu_m,
         noise_m2=noise,
-        covariance_m2=noise + standing_m**2 * np.eye(3),
-        standing={"attitude": standing_m * np.eye(3)} if standing_m else {},
+        covariance_m2=noise,
     )
 
 
-def drive(rng: np.random.Generator, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def drive(rng: np.random.Generator, n: int) -> tuple[Floats, Floats]:
     """Times, us, at uneven steps, and states (n, 6) of white acceleration from a likely start."""
     t_s = np.cumsum(rng.uniform(0.01, 0.2, n))
     states = np.empty((n, 6))
@@ -38,68 +37,6 @@ def drive(rng: np.random.Generator, n: int) -> tuple[NDArray[np.float64], NDArra
         states[i, :3] = states[i - 1, :3] + dt * states[i - 1, 3:] + kick[0]
         states[i, 3:] = states[i - 1, 3:] + kick[1]
     return t_s * 1e6, states
-
-
-def batch(t_us: NDArray[np.float64], seen: NDArray[np.float64], axis: int) -> tuple[NDArray[np.float64], ...]:
-    """Means (n, 2) and covariances of one axis by one dense least-squares problem over all times."""
-    n = len(t_us)
-    rows, right = [], []
-
-    def add(row: NDArray[np.float64], value: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
-        white = np.linalg.inv(np.linalg.cholesky(covariance))
-        rows.append(white @ row)
-        right.append(white @ value)
-
-    first = np.zeros((1, 2 * n))
-    first[0, 1] = 1
-    add(first, np.zeros(1), np.array([[30.0**2]]))
-    for i in range(n):
-        at = np.zeros((1, 2 * n))
-        at[0, 2 * i] = 1
-        add(at, seen[i : i + 1, axis], np.array([[SIGMA_M[axis] ** 2]]))
-        if i:
-            dt = (t_us[i] - t_us[i - 1]) * 1e-6
-            step = np.zeros((2, 2 * n))
-            step[:, 2 * i : 2 * i + 2] = np.eye(2)
-            step[:, 2 * i - 2 : 2 * i] = -np.array([[1, dt], [0, 1]])
-            power = SPEC.acceleration_m2_s3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-            add(step, np.zeros(2), power)
-    a, b = np.concatenate(rows), np.concatenate(right)
-    covariance = np.linalg.inv(a.T @ a)
-    return (covariance @ (a.T @ b)).reshape(n, 2), np.diag(covariance).reshape(n, 2)
-
-
-def test_filter_and_smoother_are_the_batch_solution() -> None:
-    rng = np.random.default_rng(4)
-    t_us, states = drive(rng, 12)
-    seen = states[:, :3] + rng.normal(size=(12, 3)) * SIGMA_M
-    spec = dataclasses.replace(SPEC, gate_sigmas=50.0)
-    points = filter_fixes([fix(t, p) for t, p in zip(t_us, seen, strict=True)], spec)
-    smooth = smooth_trajectory(points, spec)
-    for axis in range(3):
-        mean, variance = batch(t_us, seen, axis)
-        np.testing.assert_allclose([p.mean[axis:6:3] for p in smooth], mean, atol=1e-6)
-        np.testing.assert_allclose([np.diag(p.covariance)[axis:6:3] for p in smooth], variance, rtol=1e-6)
-        np.testing.assert_allclose(points[-1].mean[axis:6:3], mean[-1], atol=1e-6)
-        np.testing.assert_allclose(points[-1].mean, smooth[-1].mean)
-
-
-def test_both_are_consistent() -> None:
-    rng = np.random.default_rng(8)
-    forward, backward, count = [], [], 60
-    for _ in range(count):
-        t_us, states = drive(rng, 20)
-        seen = states[:, :3] + rng.normal(size=(20, 3)) * SIGMA_M
-        standing = rng.normal(0, 0.5, 3)
-        fixes = [fix(t, p + standing, 0.5) for t, p in zip(t_us, seen, strict=True)]
-        points = filter_fixes(fixes, SPEC)
-        for found, kept in ((points, forward), (smooth_trajectory(points, SPEC), backward)):
-            # One time a trajectory: errors at its other times are not independent.
-            error = found[10].mean[:3] - states[10, :3]
-            kept.append(error @ np.linalg.solve(found[10].covariance_m2, error))
-    low, high = stats.chi2.interval(0.95, 3 * count)
-    assert low / count < np.mean(forward) < high / count
-    assert low / count < np.mean(backward) < high / count
 
 
 def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
@@ -126,7 +63,7 @@ def test_refused_fixes_have_no_point_and_the_state_is_not_changed() -> None:
     np.testing.assert_array_equal(before[1], points[0].covariance)
 
 
-def moves_at(t_us: float, name: str) -> NDArray[np.float64]:
+def moves_at(t_us: float, name: str) -> Floats:
     """How a part's standing errors move a fix: more and less along a drive, as with the distance."""
     share = 1 + 0.5 * np.sin(t_us * 1e-6 + len(name))
     return np.array([[0.4, 0.1], [0.0, 0.3], [0.2, -0.1]]) * share
@@ -139,8 +76,8 @@ def seen_by(t_us: float) -> list[str]:
 
 
 def disturbed(
-    rng: np.random.Generator, t_us: NDArray[np.float64], states: NDArray[np.float64], slow_m: float
-) -> tuple[list[Fix], dict[str, NDArray[np.float64]]]:
+    rng: np.random.Generator, t_us: Floats, states: Floats, slow_m: float
+) -> tuple[list[Fix], dict[str, Floats]]:
     """Fixes with noise, with errors of a memory, and with standing errors."""
     standing = {name: rng.normal(size=2) for name in ("camera", "bar 0", "bar 1", "bar 2")}
     slow, fixes, last = rng.normal(size=3), [], t_us[0]
@@ -160,9 +97,7 @@ def disturbed(
     return fixes, standing
 
 
-def dense(
-    fixes: list[Fix], names: list[str]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+def dense(fixes: list[Fix], names: list[str]) -> tuple[Floats, Floats, Floats]:
     """All states of all times, and all standing errors, by one weighted least-squares problem.
 
     Means (n, 9), covariances of the positions (n, 3, 3), and the standing errors' means.
@@ -171,12 +106,12 @@ def dense(
     size = 9 * n + 2 * len(names)
     rows, right = [], []
 
-    def add(row: NDArray[np.float64], value: NDArray[np.float64], covariance: NDArray[np.float64]) -> None:
+    def add(row: Floats, value: Floats, covariance: Floats) -> None:
         white = np.linalg.inv(np.linalg.cholesky(covariance))
         rows.append(white @ row)
         right.append(white @ value)
 
-    def block(height: int, *parts: tuple[int, NDArray[np.float64]]) -> NDArray[np.float64]:
+    def block(height: int, *parts: tuple[int, Floats]) -> Floats:
         row = np.zeros((height, size))
         for at, part in parts:
             row[:, at : at + part.shape[1]] = part
@@ -219,7 +154,7 @@ def test_standing_and_slow_errors_are_those_of_the_dense_problem() -> None:
     mean, places, standing = dense(fixes, names)
     np.testing.assert_allclose([p.mean[:9] for p in smooth], mean, atol=1e-5)
     np.testing.assert_allclose([p.covariance_m2 for p in smooth], places, atol=1e-6)
-    np.testing.assert_allclose(points[-1].mean[9:], standing, atol=1e-5)
+    np.testing.assert_allclose(points[-1].mean, np.append(mean[-1], standing), atol=1e-5)
     for i, name in enumerate(names):
         found = points[-1].standing(name)
         assert found is not None
@@ -239,25 +174,20 @@ def test_errors_that_stay_are_not_averaged_away() -> None:
         states = np.concatenate([states[0, :3] + 0 * t_us[:, None], np.zeros((30, 3))], 1)
         points = filter_fixes(fixes, spec)
         for found, kept in ((points, forward), (smooth_trajectory(points, spec), backward)):
-            error = found[20].mean[:3] - states[20, :3]
-            kept.append(error @ np.linalg.solve(found[20].covariance_m2, error))
+            kept.append(square(found[20].mean[:3] - states[20, :3], found[20].covariance_m2))
         white = [
             dataclasses.replace(f, standing={}, noise_m2=f.covariance_m2, slow_m2=0 * f.slow_m2)
             for f in fixes
         ]
         point = smooth_trajectory(filter_fixes(white, spec), spec)[20]
-        error = point.mean[:3] - states[20, :3]
-        naive.append(error @ np.linalg.solve(point.covariance_m2, error))
+        naive.append(square(point.mean[:3] - states[20, :3], point.covariance_m2))
         camera = points[-1].standing("camera")
         assert camera is not None
-        off = camera[0] - standing["camera"]
-        estimates.append(off @ np.linalg.solve(camera[1], off))
-    low, high = stats.chi2.interval(0.999, 3 * 80) / np.array(80)
-    assert low < np.mean(forward) < high
-    assert low < np.mean(backward) < high
+        estimates.append(square(camera[0] - standing["camera"], camera[1]))
+    assert by_chance(forward, 3, 0.999)
+    assert by_chance(backward, 3, 0.999)
     assert np.mean(naive) > 10
-    low, high = stats.chi2.interval(0.999, 2 * 80) / np.array(80)
-    assert low < np.mean(estimates) < high
+    assert by_chance(estimates, 2, 0.999)
 
 
 @pytest.mark.parametrize("rate_deg_s", [45.0, -45.0, 5.0])
@@ -284,8 +214,7 @@ def test_a_car_that_turns_stays_on_its_track(rate_deg_s: float) -> None:
         assert not any(p.misses for p in points)
         at = 20 + trial % 30
         for found in (points, smooth_trajectory(points, ErrorModel(acceleration_m2_s3=0.01))):
-            error = found[at].mean[:3] - truth[at]
-            squares.append(error @ np.linalg.solve(found[at].covariance_m2, error))
+            squares.append(square(found[at].mean[:3] - truth[at], found[at].covariance_m2))
     assert np.mean(squares) < stats.chi2.isf(1e-4, 120) / 40
 
 
@@ -308,7 +237,7 @@ def test_a_bar_long_out_of_sight_is_forgotten() -> None:
     assert max(abs(p.mean[0] - i) for i, p in enumerate(smooth)) < 1e-3
 
 
-def swayed(rng: np.random.Generator, fixes: int) -> tuple[list[Fix], NDArray[np.float64]]:
+def swayed(rng: np.random.Generator, fixes: int) -> tuple[list[Fix], Floats]:
     """Fixes of a drive, whose standing errors of a metre move them by what depends on the place, and places.
 
     What a fix says of that is as of where it is, noise included.
@@ -349,8 +278,7 @@ def test_noise_does_not_show_errors_that_stay() -> None:
         forward, naive = filter_fixes(fixes, spec), filter_fixes(plain, spec)
         tracks = forward, smooth_trajectory(forward, spec), naive, smooth_trajectory(naive, spec)
         for squares, points, at in zip(kept.values(), tracks, (-1, 12, -1, 12), strict=True):
-            error = points[at].mean[:3] - place[at]
-            squares.append(float(error @ np.linalg.solve(points[at].covariance_m2, error)))
+            squares.append(square(points[at].mean[:3] - place[at], points[at].covariance_m2))
     # By chance alone the mean of 60 is below 4.4 but for one in a thousand.
     assert max(np.mean(kept["forward"]), np.mean(kept["smoothed"])) < 4.4
     assert min(np.mean(kept["as they are"]), np.mean(kept["smoothed so"])) > 8
