@@ -32,7 +32,7 @@ class _Said:
         trust: How far that is believed; `forged` shuts it out until a verified one comes; `lapsed`: it was
             verified, and its key or its age has run out since.
         verified: The beacon that was verified last, None before.
-        link: Name of the link that it sends with.
+        link: Name of the link that its packets have.
     """
 
     transmitter_id: int | None = None
@@ -97,7 +97,7 @@ class BarRegistry:
             self._said.pop(packet.transmitter, None)
             return
         said = self._said[packet.transmitter] = self._said.pop(packet.transmitter, _Said())
-        said.link = packet.link or self._alone
+        said.link = packet.link
         if len(self._said) > _MOST_TRANSMITTERS:
             del self._said[next(iter(self._said))]
         for heard in packet.messages:
@@ -155,7 +155,8 @@ class BarRegistry:
     def _listed(self, number: int) -> BarSite | None:
         """The site of the list that a transmitter stands at."""
         said = self._said[number]
-        sites = [site for site in self._sites if not said.link or site.link in (None, said.link)]
+        link = said.link or self._alone
+        sites = [site for site in self._sites if not link or site.link in (None, link)]
         # Of several links, one may be the only one of its own.
         rivals = list(self._said.values())
         if all(site.link is not None for site in sites):
@@ -167,4 +168,9 @@ class BarRegistry:
         """Name of another link that has a site of a transmitter's id; empty where none has."""
         said = self._said[number]
         others = (s.link for s in self._sites if s.transmitter_id == said.transmitter_id and s.link)
-        return next((link for link in others if link != said.link), "")
+        return next((link for link in others if link != (said.link or self._alone)), "")
+
+    def link_of(self, number: int) -> str:
+        """Name of the link that a transmitter's packets have; empty if none was received."""
+        said = self._said.get(number)
+        return "" if said is None else said.link

@@ -22,9 +22,6 @@ from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
 Floats = NDArray[np.float64]
 
-PARAMETERS = CAMERA_PARAMETERS
-"""What can be estimated, in the order of the fit's columns."""
-
 _USUAL = {
     "focal_mm": 0.2,
     "centre_x_px": 0.02,
@@ -136,12 +133,12 @@ def calibrate(
     start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
     loose = np.diag([1 / sigma for sigma in _usual_sigma(start).values()])
     solved = solve_views(seen, start, loose)
-    found, misfit, covariance = solved.camera, solved.misfit, solved.covariance[: len(PARAMETERS)]
-    covariance = covariance[:, : len(PARAMETERS)]
-    sigma = dict(zip(PARAMETERS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    corner = {name: _at_corner(start, name) * sigma[name] for name in PARAMETERS}
+    found, misfit, covariance = solved.camera, solved.misfit, solved.covariance[: len(CAMERA_PARAMETERS)]
+    covariance = covariance[:, : len(CAMERA_PARAMETERS)]
+    sigma = dict(zip(CAMERA_PARAMETERS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+    corner = {name: _at_corner(start, name) * sigma[name] for name in CAMERA_PARAMETERS}
     usual = _usual_sigma(start)
-    sure = [n for n in PARAMETERS if corner[n] <= limit_px and sigma[n] <= _LEARNT * usual[n]]
+    sure = [n for n in CAMERA_PARAMETERS if corner[n] <= limit_px and sigma[n] <= _LEARNT * usual[n]]
     if "focal_mm" not in sure:
         raise ConfigError(
             "the views do not determine the focal length: the image's corners stay uncertain by"
@@ -152,7 +149,7 @@ def calibrate(
             f"the views miss their places by {math.sqrt(misfit):.1f} sigmas (rms):"
             " a site or pose is not as was said"
         )
-    for name in PARAMETERS[1:]:
+    for name in CAMERA_PARAMETERS[1:]:
         value, said = getattr(found, name), getattr(start, name)
         if abs(value - said) > _MOST_USUAL * usual[name]:
             raise ConfigError(
@@ -161,11 +158,11 @@ def calibrate(
             )
     kept = replace(start, **{name: getattr(found, name) for name in sure})
     # What keeps its configured value is off by as much as the fit has it elsewhere, too.
-    off = np.array([getattr(kept, name) - getattr(found, name) for name in PARAMETERS])
+    off = np.array([getattr(kept, name) - getattr(found, name) for name in CAMERA_PARAMETERS])
     return Calibrated(
         replace(camera, **{name: getattr(found, name) for name in sure}),
         {name: sigma[name] for name in sure},
-        {name: corner[name] for name in PARAMETERS if name not in sure},
+        {name: corner[name] for name in CAMERA_PARAMETERS if name not in sure},
         len(seen),
         sum(len(v.points_px) for v in seen),
         misfit,
@@ -197,7 +194,7 @@ def _camera_sigma(covariance: Floats) -> CameraSigma:
     sigma = np.sqrt(np.diag(covariance))
     rows = np.round(covariance / sigma / sigma[:, None], 6)
     np.fill_diagonal(rows, 1.0)
-    values = {name: float(f"{value:.6g}") for name, value in zip(PARAMETERS, sigma, strict=True)}
+    values = {name: float(f"{value:.6g}") for name, value in zip(CAMERA_PARAMETERS, sigma, strict=True)}
     return CameraSigma(**values, correlation=tuple(tuple(row) for row in rows.tolist()))
 
 
@@ -303,7 +300,7 @@ def _at_corner(camera: CameraModel, name: str) -> float:
     """How far the image's farthest corner moves by a parameter's unit, px."""
     corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
     direction = (corners - camera.centre_px) / camera.focal_px
-    moved = _slopes(camera, direction)[:, :, PARAMETERS.index(name)]
+    moved = _slopes(camera, direction)[:, :, CAMERA_PARAMETERS.index(name)]
     return float(np.linalg.norm(moved, axis=1).max())
 
 
@@ -355,31 +352,31 @@ class _Model:
     @cached_property
     def start(self) -> Floats:
         """The unknowns before anything is seen."""
-        first = [float(getattr(self.camera, name)) for name in PARAMETERS]
+        first = [float(getattr(self.camera, name)) for name in CAMERA_PARAMETERS]
         size = self.last.stop if self.common is not None else self.last.start
         return np.concatenate([first, np.zeros(size - len(first))])
 
     @property
     def bars(self) -> dict[int, int]:
         """Where a bar's unknowns begin: errors of its site, in sigmas, behind the views."""
-        begin = len(PARAMETERS) + 6 * len(self.views)
+        begin = len(CAMERA_PARAMETERS) + 6 * len(self.views)
         return {number: begin + _OF_BAR * i for i, number in enumerate(sorted(self.surveys))}
 
     @property
     def last(self) -> slice:
         """The errors that all views share, where there are such."""
-        begin = len(PARAMETERS) + 6 * len(self.views) + _OF_BAR * len(self.surveys)
+        begin = len(CAMERA_PARAMETERS) + 6 * len(self.views) + _OF_BAR * len(self.surveys)
         return slice(begin, begin + 6)
 
     def camera_of(self, x: Floats) -> CameraModel:
         """The camera by the unknowns."""
-        values = dict(zip(PARAMETERS, x[: len(PARAMETERS)].tolist(), strict=True))
+        values = dict(zip(CAMERA_PARAMETERS, x[: len(CAMERA_PARAMETERS)].tolist(), strict=True))
         values["focal_mm"] = max(values["focal_mm"], 1e-3)
         return replace(self.camera, **values)
 
     def parts(self, x: Floats) -> tuple[Floats, Floats]:
         """Misses in sigmas, float64 (m,), and their slopes, float64 (m, n)."""
-        shared, last = len(PARAMETERS), self.last
+        shared, last = len(CAMERA_PARAMETERS), self.last
         misses, rows = [self.prior @ (x - self.start)], [self.prior]
         drift = x[last] if self.common is not None else np.zeros(6)
         now = self.camera_of(x)
@@ -410,7 +407,7 @@ class _Model:
             place[mine] += x[column + 7] * view.bend_px[mine]
         seen = (stands - position) @ rotation
         block = np.zeros((len(place), 2, len(x)))
-        block[:, :, : len(PARAMETERS)] = _slopes(now, seen[:, :2] / seen[:, 2:])
+        block[:, :, : len(CAMERA_PARAMETERS)] = _slopes(now, seen[:, :2] / seen[:, 2:])
         block[:, :, at : at + 3] = slope[:, :, :3]
         block[:, :, at + 3 : at + 6] = slope[:, :, 3:] @ _turn_slope(turn)
         if self.common is not None:
@@ -455,7 +452,7 @@ def solve_views(
     half = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
     covariance = (half @ half.T) * scale * scale[:, None]
     points = 2 * sum(len(v.points_px) for v in views)
-    freedom = max(points - len(PARAMETERS) - 3 * len(views), 1)
+    freedom = max(points - len(CAMERA_PARAMETERS) - 3 * len(views), 1)
     where = {number: slice(column, column + _OF_BAR) for number, column in model.bars.items()}
     return SolvedViews(model.camera_of(fit.x), fit.x, covariance, where, float(misses @ misses) / freedom)
 

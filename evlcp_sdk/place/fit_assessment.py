@@ -7,6 +7,7 @@ length - a test of whether the rest contradicts it, and how far the position may
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -56,6 +57,9 @@ _FLAT = 1e-9
 
 _FAR_COST = 12.0
 """Growth of the cost two sigmas away, where 4 is expected, beyond which errors of sites are fitted anew."""
+
+_ANYWHERE_M2 = 1e24
+"""Variance of a position that a fault may move anywhere."""
 
 _REDUNDANT = 1e-6
 """Share of what a part says that others must say, too, for it to be tested: a heading that is known to 0.1
@@ -260,59 +264,64 @@ def _bend(problem: Problem, solution: _Solution, size: Floats, axes: Floats) -> 
     return bent, (slopes[0], slopes[1], slopes[2])
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class _Levels:
-    """Protection levels, as wide as the parts so far ask for, m, and what one fault may hide, (3,)."""
+    """Protection levels, m, and what one fault may hide to the east, north and up, float64 (3,)."""
 
-    spread: Floats
-    horizontal_sigmas: float
-    vertical_sigmas: float
-    horizontal_m: float = 0.0
-    vertical_m: float = 0.0
-    hidden_m: Floats = field(default_factory=lambda: np.zeros(3))
-
-    def widen(self, added: Floats, unseen: Floats, limit: float) -> None:
-        """Hold with one fault more, whose test just passed."""
-        hidden = np.sqrt(limit * np.maximum(np.diag(unseen), 0.0))
-        self.hidden_m = np.maximum(self.hidden_m, hidden)
-        whole = self.spread + added
-        level_m = math.sqrt(limit) * _widest(unseen) + self.horizontal_sigmas * _widest(whole)
-        height_m = hidden[2] + self.vertical_sigmas * math.sqrt(max(whole[2, 2], 0.0))
-        self.horizontal_m, self.vertical_m = max(self.horizontal_m, level_m), max(self.vertical_m, height_m)
+    horizontal_m: float
+    vertical_m: float
+    hidden_m: Floats
 
 
-def _widest(covariance: Floats) -> float:
-    """Sigma of the horizontal direction that is the least certain."""
-    (a, b), (_, c) = covariance[:2, :2].tolist()
-    return math.sqrt(max((a + c) / 2 + math.hypot((a - c) / 2, b), 0.0))
+def _widest(covariances: Floats) -> Floats:
+    """Sigmas of the horizontal direction that is the least certain, of (n, 3, 3)."""
+    a, b, c = covariances[:, 0, 0], covariances[:, 0, 1], covariances[:, 1, 1]
+    return np.sqrt(np.maximum((a + c) / 2 + np.hypot((a - c) / 2, b), 0.0))
+
+
+class _Tested(NamedTuple):
+    """A test of whether a part is at fault.
+
+    Attributes:
+        value: How much smaller the cost is without the part.
+        freedom: Degrees of freedom; 0: it cannot be tested.
+        added: What the fault adds to the position's covariance once it is free, float64 (3, 3).
+        unseen: The covariance by which the position may have moved unnoticed, in units of the test value,
+            float64 (3, 3).
+    """
+
+    value: float
+    freedom: int
+    added: Floats
+    unseen: Floats
 
 
 def _test_parts(problem: Problem, solution: _Solution) -> tuple[_Levels, dict[str, float], str]:
     """Protection levels, each part's test value, and the part that fits the rest the least, if any fails."""
-    spec, spread = problem.spec, solution.spread
+    spec = problem.spec
     tested = list(_tested_parts(problem, solution))
     chance = spec.false_alarm / 2 / len(tested)
+    limits = {name: chi_square(chance, one.freedom) for name, one in tested if one.freedom}
+    tests = {name: one.value for name, one in tested if one.freedom}
+    worst = max(tests, key=lambda name: tests[name] / limits[name], default="")
+    doubt = ""
+    if worst and tests[worst] > limits[worst]:
+        doubt = f"{worst} does not fit the rest: {math.sqrt(tests[worst]):.1f} sigmas"
+    # Without a fault, and with one whose test just passes. A heading that is off is an attitude that is.
+    nothing = np.zeros((3, 3))
+    faults = [(name, one) for name, one in tested if name != "heading"]
+    limit = np.array([0.0, *(limits.get(name, 0.0) for name, _ in faults)])
+    added = np.array([nothing, *(one.added for _, one in faults)])
+    unseen = np.array([nothing, *(one.unseen for _, one in faults)])
+    hidden_m = np.sqrt(limit[:, None] * np.maximum(np.diagonal(unseen, axis1=1, axis2=2), 0.0))
+    whole = solution.spread[:3, :3] + added
     flat, high = (math.sqrt(chi_square(spec.risk, freedom)) for freedom in (2, 1))
-    levels = _Levels(spread[:3, :3], flat, high)
-    levels.widen(np.zeros((3, 3)), np.zeros((3, 3)), 0.0)
-    tests, worst, doubt = {}, 1.0, ""
-    for name, (value, freedom, added, unseen) in tested:
-        limit = chi_square(chance, freedom) if freedom else 0.0
-        if freedom:
-            tests[name] = value
-            if value / limit > worst:
-                worst = value / limit
-                doubt = f"{name} does not fit the rest: {math.sqrt(value):.1f} sigmas"
-        if name != "heading":
-            # A heading that is off is an attitude that is.
-            levels.widen(added, unseen, limit)
-    return levels, tests, doubt
+    level_m = np.sqrt(limit) * _widest(unseen) + flat * _widest(whole)
+    height_m = hidden_m[:, 2] + high * np.sqrt(np.maximum(whole[:, 2, 2], 0.0))
+    return _Levels(level_m.max(), height_m.max(), hidden_m.max(0)), tests, doubt
 
 
-Tested = tuple[float, int, Floats, Floats]
-
-
-def _tested_parts(problem: Problem, solution: _Solution) -> Iterator[tuple[str, Tested]]:
+def _tested_parts(problem: Problem, solution: _Solution) -> Iterator[tuple[str, _Tested]]:
     """Names and `_test` of each bar, the focal length, the attitude and the heading, as far as there are."""
     spec, free = problem.spec, problem.free[:, None]
     for bar, number in enumerate(problem.transmitters):
@@ -338,7 +347,7 @@ def _tested_parts(problem: Problem, solution: _Solution) -> Iterator[tuple[str, 
 
 def _test(
     information: Floats, column: Floats, side: Floats, spread: Floats, bound: NDArray[np.floating]
-) -> Tested:
+) -> _Tested:
     """What a fault that shifts some observations would do: a mean-shift test, and the position without them.
 
     Args:
@@ -347,11 +356,6 @@ def _test(
         side: Right-hand side of these parameters at the solution, float64 (m,).
         spread: Covariance of the unknowns, float64 (14, 14).
         bound: Inverse covariance of how large such a fault may be, float64 (m, m); 0: any size.
-
-    Returns:
-        Test value, its degrees of freedom, what the fault adds to the position's covariance once it is free,
-        float64 (3, 3), and the covariance by which the position may have moved unnoticed, in units of the
-        test value, float64 (3, 3).
     """
     diagonal = np.diag(information)
     scale = np.where(diagonal > 0, 1 / np.sqrt(np.maximum(diagonal, 1e-300)), 0.0)
@@ -371,11 +375,11 @@ def _test(
     if bound.any() and len(share):
         inverse = _inverted(turned.T @ bound @ turned + np.diag(share))
         if inverse is None:
-            return 0.0, 0, np.full((3, 3), math.inf), np.full((3, 3), math.inf)
+            return _Tested(0.0, 0, _ANYWHERE_M2 * np.eye(3), np.zeros((3, 3)))
         moves = moved @ inverse
     else:
         moves = moved / share
-    return value, int(redundant.sum()), moves @ moved.T, (moves * share) @ moves.T
+    return _Tested(value, int(redundant.sum()), moves @ moved.T, (moves * share) @ moves.T)
 
 
 def _bar_bound(problem: Problem, solution: _Solution, bar: int) -> Floats:

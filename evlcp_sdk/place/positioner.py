@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Alternative, FailedBar, Fix, Frame, Packet
+
+Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -40,10 +43,6 @@ class BarKind:
     def of(cls, link: Link) -> "BarKind":
         """The bars of a link."""
         return cls(link.bar, link.packet.packet_chips * link.packet.chip_us, link.name)
-
-
-_MOST_TRANSMITTERS = 1024
-"""Transmitters whose links are remembered; the one not received for longest makes way."""
 
 
 class Positioner:
@@ -85,7 +84,6 @@ class Positioner:
         self._packet_us = max(kind.packet_us for kind in self._kinds.values())
         self._attitude_at = attitude_at
         self._spec = ErrorModel() if spec is None else spec
-        self._links: dict[int, str] = {}
         only = next(iter(self._kinds.values())).link if len(self._kinds) == 1 else ""
         self.bars = BarRegistry(sites, self._spec, only)
         self._frames: dict[int, list[Frame]] = {}
@@ -125,13 +123,9 @@ class Positioner:
 
     def links_of(self, fix: Fix) -> str:
         """Names of the links of a fix's transmitters, each once."""
-        return " ".join(dict.fromkeys(self._links.get(number, "") for number in fix.transmitters))
+        return " ".join(dict.fromkeys(self.bars.link_of(number) for number in fix.transmitters))
 
     def _take(self, packet: Packet) -> None:
-        self._links.pop(packet.transmitter, None)
-        self._links[packet.transmitter] = packet.link
-        if len(self._links) > _MOST_TRANSMITTERS:
-            del self._links[next(iter(self._links))]
         clusters = self._kinds[packet.link].bar.clusters
         for frame in packet.frames:
             if len(frame.points_px) == clusters and np.isfinite(frame.points_t_us):
@@ -177,7 +171,7 @@ class Positioner:
         views, sited, unplaced = [], [], []
         here: LocalAxes | None = None
         for number, frames in sorted(self._frames.items()):
-            kind = self._kinds[self._links[number]]
+            kind = self._kinds[self.bars.link_of(number)]
             view = points_at(number, frames, t_us, kind.packet_us, kind.bar.cluster_positions_m(), self._spec)
             if view is None:
                 continue
@@ -222,21 +216,12 @@ class Positioner:
             others = _alternatives(pose, here, axes)
             return replace(refused, alternatives=others, suspects=pose.suspects)
         verified = all(self.bars.verified(n) for n in pose.transmitters)
-        attitude = Attitude.of_rotation(pose.rotation)
-        latitude, longitude, height = (float(v) for v in here.to_geodetic(pose.enu_m))
         turn = axes.turn_from(here)
-        assert attitude.heading_deg is not None
         return Fix(
             t_us=t_us,
-            latitude_deg=latitude,
-            longitude_deg=longitude,
-            height_m=height,
-            enu_m=axes.to_enu(latitude, longitude, height),
+            **_on_earth(pose.enu_m, pose.rotation, here, axes),
             covariance_m2=turn @ pose.covariance[:3, :3] @ turn.T,
             noise_m2=turn @ pose.noise @ turn.T,
-            heading_deg=attitude.heading_deg,
-            pitch_deg=attitude.pitch_deg,
-            roll_deg=attitude.roll_deg,
             heading_sigma_deg=math.degrees(math.sqrt(pose.covariance[5, 5])),
             transmitters=pose.transmitters,
             verified=verified,
@@ -255,32 +240,36 @@ class Positioner:
         )
 
 
-def _turned(failed: FailedBar | None, turn: NDArray[np.float64]) -> FailedBar | None:
+def _turned(failed: FailedBar | None, turn: Floats) -> FailedBar | None:
     """A bar that was left out, in other axes."""
     if failed is None:
         return None
     return replace(failed, off_m=turn @ failed.off_m, covariance_m2=turn @ failed.covariance_m2 @ turn.T)
 
 
+def _on_earth(enu_m: Floats, rotation: Floats, here: LocalAxes, axes: LocalAxes) -> dict[str, Any]:
+    """Place and angles of a camera as fixes have them, by its pose in the axes of here."""
+    angles = Attitude.of_rotation(rotation)
+    latitude, longitude, height = (float(v) for v in here.to_geodetic(enu_m))
+    return {
+        "latitude_deg": latitude,
+        "longitude_deg": longitude,
+        "height_m": height,
+        "enu_m": axes.to_enu(latitude, longitude, height),
+        "heading_deg": angles.heading_deg,
+        "pitch_deg": angles.pitch_deg,
+        "roll_deg": angles.roll_deg,
+    }
+
+
 def _alternatives(refusal: Rejection, here: LocalAxes, axes: LocalAxes) -> tuple[Alternative, ...]:
     """The poses that a refusal leaves open, on earth."""
     turn = axes.turn_from(here)
-    found = []
-    for one in refusal.candidates:
-        attitude = Attitude.of_rotation(one.rotation)
-        latitude, longitude, height = (float(v) for v in here.to_geodetic(one.enu_m))
-        assert attitude.heading_deg is not None
-        found.append(
-            Alternative(
-                latitude,
-                longitude,
-                height,
-                axes.to_enu(latitude, longitude, height),
-                turn @ one.covariance_m2 @ turn.T,
-                attitude.heading_deg,
-                attitude.pitch_deg,
-                attitude.roll_deg,
-                one.likelihood,
-            )
+    return tuple(
+        Alternative(
+            **_on_earth(one.enu_m, one.rotation, here, axes),
+            covariance_m2=turn @ one.covariance_m2 @ turn.T,
+            likelihood=one.likelihood,
         )
-    return tuple(found)
+        for one in refusal.candidates
+    )

@@ -2,13 +2,15 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.values import Frame, Range, SoftSymbols
+from evlcp_sdk.values import Fix, Frame, Range, SoftSymbols
 
 Floats = NDArray[np.float64]
 
@@ -32,6 +34,12 @@ def frame(
     nothing = Range(math.nan, math.nan, 0)
     sigmas = np.full(len(points_px), sigma_px)
     return Frame(transmitter, packet, number, t_us, soft, nothing, None, 0.0, 0.0, points_px, sigmas, t_us)
+
+
+def fix(t_us: float, enu_m: Floats, noise_m2: Floats, **more: Any) -> Fix:
+    """A fix of one bar whose errors are new each time; `more` of it."""
+    given = {"enu_m": enu_m, "noise_m2": noise_m2, "covariance_m2": noise_m2, **more}
+    return replace(Fix.refused(t_us, (0,), "", ""), **given)
 
 
 def square(error: Floats, covariance: Floats) -> float:

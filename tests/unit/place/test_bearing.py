@@ -5,12 +5,12 @@ import math
 
 import numpy as np
 import pytest
-from scipy import stats
 
 from evlcp_sdk.place.bearing import bar_point
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.values import Frame, Range, SoftSymbols
+from tests.unit.place.scenes import POINTS_ONLY, by_chance, square
 
 BENT = CameraModel(focal_mm=8.0, k1=-0.2, k2=0.05, p1=1e-3, p2=-1e-3, centre_x_px=650.0, centre_y_px=350.0)
 LENS = CameraSigma(0.04, 2.0, 2.0, 0.01, 0.01, 1e-4, 1e-4)
@@ -30,15 +30,10 @@ def test_the_point_is_the_one_that_is_seen() -> None:
     np.testing.assert_allclose(found.point_m, true, atol=1e-6)
     # The sigma of the distance is along the line of sight, not along the axis.
     along = true / 40.0
-    exact = bar_point(
-        frame(x, y, 40.0, 0.1),
-        0.96,
-        BENT,
-        None,
-        ErrorModel(shaken_sigma_px=0, shared_sigma_px=0, shared_along_px=0, shared_share=0),
-    )
+    spec = dataclasses.replace(POINTS_ONLY, stretch_share=0.001)
+    exact = bar_point(frame(x, y, 40.0, 0.1), 0.96, BENT, None, spec)
     assert exact is not None
-    stretched = 0.1**2 + (40 * ErrorModel().stretch_share) ** 2
+    stretched = 0.1**2 + (40 * 0.001) ** 2
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
 
 
@@ -58,10 +53,8 @@ def test_every_error_is_in_its_covariance() -> None:
         distance = 25 * BENT.focal_px / lens.focal_px * (1 + 0.004 * rng.normal()) + 0.15 * rng.normal()
         found = bar_point(frame(x, y, distance, 0.15), 0.96, BENT, LENS, SPEC)
         assert found is not None
-        error = found.point_m - true
-        squares.append(error @ np.linalg.solve(found.covariance_m2, error))
-    low, high = stats.chi2.interval(0.999, 3 * len(squares)) / np.array(len(squares))
-    assert low < np.mean(squares) < high
+        squares.append(square(found.point_m - true, found.covariance_m2))
+    assert by_chance(squares, 3, 0.999)
     assert np.linalg.eigvalsh(found.covariance_m2 - found.standing @ found.standing.T)[0] > 0
 
 

@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.place.calibration import (
-    PARAMETERS,
     CalibrationView,
     _turn_slope,
     calibrate,
@@ -20,7 +19,7 @@ from evlcp_sdk.place.calibration import (
 from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.poses import read_poses
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel
 from tests.unit.place.scenes import POINTS_ONLY, bar
 
 TRUE = CameraModel(focal_mm=8.2, centre_x_px=652.0, centre_y_px=351.0, k1=-0.12, k2=0.05, p1=8e-4, p2=-5e-4)
@@ -58,7 +57,7 @@ def test_the_camera_comes_back_within_its_sigmas(known: bool) -> None:
     for _ in range(4):
         found = calibrate(views(rng, 12, known), NOMINAL, POINTS_ONLY)
         assert set(found.sigma) >= {"focal_mm", "k1"}
-        assert set(found.sigma) | set(found.refused) == set(PARAMETERS)
+        assert set(found.sigma) | set(found.refused) == set(CAMERA_PARAMETERS)
         if known:
             assert set(found.sigma) >= {"centre_x_px", "centre_y_px", "p1", "p2"}
         assert 0.7 < found.misfit < 1.3
@@ -93,10 +92,10 @@ def test_sites_that_are_not_exact_are_in_the_covariance() -> None:
         # The whole covariance, as a link has it.
         sigma = found.camera_sigma
         assert sigma.focal_mm == pytest.approx(found.sigma["focal_mm"], rel=1e-3)
-        off_now = np.array([getattr(found.camera, n) or 0 for n in PARAMETERS]) - [
-            getattr(TRUE, n) for n in PARAMETERS
+        off_now = np.array([getattr(found.camera, n) or 0 for n in CAMERA_PARAMETERS]) - [
+            getattr(TRUE, n) for n in CAMERA_PARAMETERS
         ]
-        assert (np.abs(off_now[3:]) < 5 * np.array([getattr(sigma, n) for n in PARAMETERS[3:]])).all()
+        assert (np.abs(off_now[3:]) < 5 * np.array([getattr(sigma, n) for n in CAMERA_PARAMETERS[3:]])).all()
         root = sigma.root(found.camera)
         assert root[0, 0] == pytest.approx(sigma.focal_mm * 1e3 / TRUE.pitch_um, rel=1e-3)
     assert min(spreads) > 1.2
@@ -118,7 +117,7 @@ def test_what_one_bar_does_not_determine_is_refused() -> None:
     assert abs(found.camera.focal_mm - 8.0) < 5 * found.sigma["focal_mm"]
     assert found.camera.centre_x_px is None
     assert found.camera.p1 == 0
-    assert set(found.refused) == set(PARAMETERS) - set(found.sigma)
+    assert set(found.refused) == set(CAMERA_PARAMETERS) - set(found.sigma)
     blurred = [dataclasses.replace(v, position_sigma_m=5.0) for v in seen]
     with pytest.raises(ConfigError, match="do not determine the focal length"):
         calibrate(blurred, NOMINAL, POINTS_ONLY)

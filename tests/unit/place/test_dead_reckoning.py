@@ -4,8 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
-from scipy import stats
 
 from evlcp_sdk.place.dead_reckoning import imu_sigmas, reckon
 from evlcp_sdk.place.error_model import ErrorModel
@@ -13,8 +11,7 @@ from evlcp_sdk.place.trajectory import IMU, filter_fixes, smooth_trajectory
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.swing import Swing
 from evlcp_sdk.values import Fix
-
-Floats = NDArray[np.float64]
+from tests.unit.place.scenes import Floats, by_chance, fix, square
 
 SPEC = ErrorModel(acceleration_m2_s3=0.7, rate_white_deg_rts=2.0, push_white_m2_s3=0.3)
 VELOCITY = np.array([8.0, 5.0, -1.0])
@@ -148,13 +145,8 @@ def drive(
     fixes = []
     at = [i for i in range(0, steps + 1, 4) if not 150 < i < 300]
     for i in at:
-        fixes.append(
-            dataclasses.replace(
-                Fix.refused(t[i] * 1e6, (0,), "", ""),
-                enu_m=place[i] + rng.normal(0, 0.02, 3), noise_m2=noise, covariance_m2=noise,
-                heading_deg=np.degrees(heading[i]), heading_sigma_deg=0.01,
-            )
-        )  # fmt: skip
+        facing = {"heading_deg": np.degrees(heading[i]), "heading_sigma_deg": 0.01}
+        fixes.append(fix(t[i] * 1e6, place[i] + rng.normal(0, 0.02, 3), noise, **facing))
     return fixes, log, place[at], biases
 
 
@@ -165,8 +157,7 @@ def test_a_turning_car_is_followed_through_a_gap(push: bool) -> None:
     spec = ErrorModel(acceleration_m2_s3=0.01, rate_sigma_deg_s=0.5, rate_white_deg_rts=0.1)
     squares: dict[tuple[str, int], list[float]] = {}
     estimates, sigmas = [], []
-    trials = 9
-    for _ in range(trials):
+    for _ in range(9):
         fixes, log, truth, biases = drive(rng, spec, push=push, rate_deg_s=45.0)
         points = filter_fixes(fixes, spec, log.between)
         assert not any(p.misses for p in points)
@@ -174,31 +165,12 @@ def test_a_turning_car_is_followed_through_a_gap(push: bool) -> None:
         # 37 is the last fix before the gap, 38 the first one behind it.
         for name, found in (("forward", points), ("smoothed", smooth)):
             for at in (20, 37, 38, 55):
-                error = found[at].mean[:3] - truth[at]
-                squares.setdefault((name, at), []).append(
-                    float(error @ np.linalg.solve(found[at].covariance_m2, error))
-                )
+                off = square(found[at].mean[:3] - truth[at], found[at].covariance_m2)
+                squares.setdefault((name, at), []).append(off)
         told = points[-1].standing(IMU)
         assert told is not None
-        off = told[0] - biases
-        estimates.append(off @ np.linalg.solve(told[1], off))
+        estimates.append(square(told[0] - biases, told[1]))
         sigmas.append(np.sqrt(np.diag(told[1])))
-    low, high = stats.chi2.interval(0.9999, 3 * trials)
-    for values in squares.values():
-        assert low < sum(values) < high
-    size = 4 if push else 1
-    low, high = stats.chi2.interval(0.9999, size * trials)
-    assert low < sum(estimates) < high
+    assert all(by_chance(values, 3, 0.9999) for values in squares.values())
+    assert by_chance(estimates, 4 if push else 1, 0.9999)
     assert np.mean(sigmas, 0)[0] < 0.5
-
-
-def test_without_an_imu_a_gap_is_lost() -> None:
-    """What the IMU is for: the same drive goes astray by metres, and says so."""
-    spec = ErrorModel(acceleration_m2_s3=0.01, rate_sigma_deg_s=0.5, rate_white_deg_rts=0.1)
-    fixes, log, truth, _ = drive(np.random.default_rng(6), spec, push=False, rate_deg_s=45.0)
-    wide = dataclasses.replace(spec, gate_sigmas=1e6)
-    assert filter_fixes(fixes, spec)[38].misses
-    with_imu, without = (filter_fixes(fixes, wide, imu)[38] for imu in (log.between, None))
-    assert np.linalg.norm(with_imu.mean[:3] - truth[38]) < 0.1
-    assert without.swing is not None
-    assert not without.swing.gyro

@@ -5,7 +5,6 @@ import math
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy import stats
 
 from evlcp_sdk.place.error_model import ErrorModel
@@ -18,13 +17,14 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.values import Fix
+from tests.unit.place.scenes import Floats, bar, fix
 
 SPEC = ErrorModel(stretch_share=0.0, shared_sigma_px=0.05, shared_along_px=0.05, shared_share=0.0)
 CAMERA, LENS = CameraModel(), CameraSigma(focal_mm=0.005 * CameraModel().focal_mm)
 SITE_M, BIAS_DEG, TIME_US = 0.1, 0.1, 8000.0
 
 
-def angles_deg(t_s: float) -> NDArray[np.float64]:
+def angles_deg(t_s: float) -> Floats:
     """Pitch, roll and heading of a car that sways, and drives straight on."""
     return np.array([2 + np.sin(6 * t_s), 0.5 * np.cos(5 * t_s), 1.0])
 
@@ -53,24 +53,19 @@ def drive(rng: np.random.Generator) -> tuple[list[Fix], dict[tuple[str, str], fl
         for b in range(8):
             centre = np.array([(-1) ** b * 4.0, 60 + 25.0 * b, 0.5 * (b % 3)])
             if 28 < centre[1] - place[1] < 90:
-                along = (0.5 - (np.arange(16) + 0.5) / 16) * 0.96
-                said = centre + along[:, None] * np.array([0, 0, 1.0])
+                said = bar(centre)
                 points, _ = project_bars(said + off[b], place, turned, lens)
                 points += rng.normal(0, 0.07, points.shape) + rng.normal(0, SPEC.shared_sigma_px, 2)
                 views.append(BarView(b, said, points, np.full(16, 0.0707), (SITE_M, 0.0, 0.0)))
         pose = solve_pose(views, CAMERA, attitude, SPEC, LENS)
         if not isinstance(pose, Rejection):
-            fixes.append(
-                dataclasses.replace(
-                    Fix.refused(t * 1e6, pose.transmitters, "", ""),
-                    enu_m=pose.enu_m, noise_m2=pose.noise, slow_m2=pose.slow, standing=pose.standing,
-                    heading_deg=Attitude.of_rotation(pose.rotation).heading_deg,
-                )
-            )  # fmt: skip
+            heading = Attitude.of_rotation(pose.rotation).heading_deg
+            known = {"slow_m2": pose.slow, "standing": pose.standing, "heading_deg": heading}
+            fixes.append(fix(t * 1e6, pose.enu_m, pose.noise, **known))
     return fixes, truth
 
 
-def states_of(point: TrajectoryPoint) -> dict[str, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+def states_of(point: TrajectoryPoint) -> dict[str, tuple[Floats, Floats]]:
     found = {cause.name: point.standing(cause.name) for cause in point.causes}
     return {name: state for name, state in found.items() if state is not None}
 
@@ -98,13 +93,9 @@ def test_a_drive_past_bars_tells_their_errors_and_its_own() -> None:
 
 
 def test_what_a_drive_does_not_tell_keeps_its_sigma() -> None:
-    fix = dataclasses.replace(
-        Fix.refused(0, (0,), "", ""),
-        enu_m=np.zeros(3),
-        noise_m2=np.eye(3),
-        standing={"camera": np.zeros((3, 7)), "attitude": np.zeros((3, 4)), "bar 3": np.zeros((3, 1))},
-    )
-    points = filter_fixes([dataclasses.replace(fix, t_us=t) for t in (0.0, 1e5, 2e5)], SPEC)
+    stays = {"camera": np.zeros((3, 7)), "attitude": np.zeros((3, 4)), "bar 3": np.zeros((3, 1))}
+    fixes = [fix(t, np.zeros(3), np.eye(3), standing=stays) for t in (0.0, 1e5, 2e5)]
+    points = filter_fixes(fixes, SPEC)
     rows = estimate_biases(states_of(points[-1]), CAMERA, LENS, Attitude(0, 0, 0, 0.2, 0.3), {}, SPEC)
     found = {(row.part, row.what): row for row in rows}
     # Nothing was stated of the clock, nor of the principal point, nor of the site.

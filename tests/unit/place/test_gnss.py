@@ -15,6 +15,7 @@ from evlcp_sdk.place.trajectory import GNSS, filter_fixes, smooth_trajectory, tr
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Fix
+from tests.unit.place.scenes import fix
 
 Floats = NDArray[np.float64]
 
@@ -22,17 +23,11 @@ SPEC = ErrorModel(acceleration_m2_s3=0.5, gnss_s=4.0, gate_sigmas=50.0)
 SIGMA_M = {"bars": np.array([0.03, 0.05, 0.02]), GNSS: np.array([0.8, 0.6, 1.5])}
 
 
-def fix(t_s: float, enu_m: Floats, source: str) -> Fix:
+def fix_of(t_s: float, enu_m: Floats, source: str) -> Fix:
     spread = np.diag(SIGMA_M[source] ** 2)
     share = SPEC.gnss_white_share if source == GNSS else 1.0
-    return dataclasses.replace(
-        Fix.refused(t_s * 1e6, (), "", ""),
-        enu_m=enu_m,
-        covariance_m2=spread,
-        noise_m2=share * spread,
-        standing={GNSS: np.sqrt((1 - share) * spread)} if source == GNSS else {},
-        source=source,
-    )
+    lasts = {GNSS: np.sqrt((1 - share) * spread)} if source == GNSS else {}
+    return fix(t_s * 1e6, enu_m, share * spread, covariance_m2=spread, standing=lasts, source=source)
 
 
 def mixed() -> list[tuple[float, str]]:
@@ -44,7 +39,7 @@ def mixed() -> list[tuple[float, str]]:
 
 def drive(rng: np.random.Generator) -> list[Fix]:
     return [
-        fix(t, np.array([3.0, 20.0, 0.1]) * t + 0.3 * SIGMA_M[source] * rng.normal(size=3), source)
+        fix_of(t, np.array([3.0, 20.0, 0.1]) * t + 0.3 * SIGMA_M[source] * rng.normal(size=3), source)
         for t, source in mixed()
     ]
 

@@ -9,20 +9,11 @@ from scipy import stats
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory, trajectory_step
 from evlcp_sdk.values import Fix
-from tests.unit.place.scenes import Floats, by_chance, square
+from tests.unit.place.scenes import Floats, by_chance, fix, square
 
 SPEC = ErrorModel(acceleration_m2_s3=2.0)
 SIGMA_M = np.array([0.3, 0.1, 0.05])
-
-
-def fix(t_us: float, enu_m: Floats) -> Fix:
-    noise = np.diag(SIGMA_M**2)
-    return dataclasses.replace(
-        Fix.refused(t_us, (0,), "", ""),
-        enu_m=enu_m,
-        noise_m2=noise,
-        covariance_m2=noise,
-    )
+NOISE_M2 = np.diag(SIGMA_M**2)
 
 
 def drive(rng: np.random.Generator, n: int) -> tuple[Floats, Floats]:
@@ -40,12 +31,12 @@ def drive(rng: np.random.Generator, n: int) -> tuple[Floats, Floats]:
 
 
 def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
-    fixes = [fix(i * 1e5, np.array([float(i), 0, 0])) for i in range(10)]
-    fixes[5] = fix(5e5, np.array([50.0, 0, 0]))
+    fixes = [fix(i * 1e5, np.array([float(i), 0, 0]), NOISE_M2) for i in range(10)]
+    fixes[5] = fix(5e5, np.array([50.0, 0, 0]), NOISE_M2)
     points = filter_fixes(fixes, SPEC)
     assert [p.misses for p in points] == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0]
     assert abs(points[5].mean[0] - 5) < 0.5
-    jumped = fixes[:5] + [fix((5 + i) * 1e5, np.array([1000.0 + i, 0, 0])) for i in range(15)]
+    jumped = fixes[:5] + [fix((5 + i) * 1e5, np.array([1000.0 + i, 0, 0]), NOISE_M2) for i in range(15)]
     points = filter_fixes(jumped, SPEC)
     # As many as it had taken are left out.
     assert [i for i, p in enumerate(points) if p.starts] == [0, 10]
@@ -55,10 +46,11 @@ def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
 
 def test_refused_fixes_have_no_point_and_the_state_is_not_changed() -> None:
     refused = Fix.refused(1e5, (0,), "misfit", "far off")
-    points = filter_fixes([fix(0, np.zeros(3)), refused, fix(2e5, np.ones(3) * 0.1)], SPEC)
+    one, two, three = (fix(t, 1e-6 * t * np.ones(3), NOISE_M2) for t in (0.0, 2e5, 3e5))
+    points = filter_fixes([one, refused, two], SPEC)
     assert [p.t_us for p in points] == [0, 2e5]
     before = points[0].mean.copy(), points[0].covariance.copy()
-    trajectory_step(points[0], fix(3e5, np.ones(3)), SPEC)
+    trajectory_step(points[0], three, SPEC)
     np.testing.assert_array_equal(before[0], points[0].mean)
     np.testing.assert_array_equal(before[1], points[0].covariance)
 
@@ -88,12 +80,9 @@ def disturbed(
         moves = {name: moves_at(t, name) for name in seen_by(t)}
         place = state[:3] + rng.normal(size=3) * SIGMA_M + slow_m * slow
         place = place + sum((m @ standing[n] for n, m in moves.items()), np.zeros(3))
-        spread = np.diag(SIGMA_M**2) + slow_m**2 * np.eye(3) + sum(m @ m.T for m in moves.values())
-        fixes.append(
-            dataclasses.replace(
-                fix(t, place), covariance_m2=spread, slow_m2=slow_m**2 * np.eye(3), standing=moves
-            )
-        )
+        slow_m2 = slow_m**2 * np.eye(3)
+        spread = NOISE_M2 + slow_m2 + sum(m @ m.T for m in moves.values())
+        fixes.append(fix(t, place, NOISE_M2, covariance_m2=spread, slow_m2=slow_m2, standing=moves))
     return fixes, standing
 
 
@@ -203,13 +192,8 @@ def test_a_car_that_turns_stays_on_its_track(rate_deg_s: float) -> None:
             radius = 10.0 / rate
             place = np.array([radius * (1 - np.cos(heading)), radius * np.sin(heading), 0.0])
             truth.append(place)
-            fixes.append(
-                dataclasses.replace(
-                    fix(t * 1e6, place + rng.normal(0, 0.02, 3)),
-                    noise_m2=noise, covariance_m2=noise,
-                    heading_deg=np.degrees(heading) + rng.normal(0, 0.02),
-                )
-            )  # fmt: skip
+            facing = np.degrees(heading) + rng.normal(0, 0.02)
+            fixes.append(fix(t * 1e6, place + rng.normal(0, 0.02, 3), noise, heading_deg=facing))
         points = filter_fixes(fixes, ErrorModel(acceleration_m2_s3=0.01))
         assert not any(p.misses for p in points)
         at = 20 + trial % 30
@@ -220,15 +204,10 @@ def test_a_car_that_turns_stays_on_its_track(rate_deg_s: float) -> None:
 
 def test_a_bar_long_out_of_sight_is_forgotten() -> None:
     """The states of a drive past many bars stay few; what is left is the dense problem without the rest."""
-    fixes = []
-    for i in range(200):
-        name = f"bar {i // 5}"
-        noise = np.diag(SIGMA_M**2)
-        fixes.append(
-            dataclasses.replace(
-                fix(i * 1e6, np.array([float(i), 0, 0])), noise_m2=noise, standing={name: 0.1 * np.eye(3)}
-            )
-        )
+    fixes = [
+        fix(i * 1e6, np.array([float(i), 0, 0]), NOISE_M2, standing={f"bar {i // 5}": 0.1 * np.eye(3)})
+        for i in range(200)
+    ]
     points = filter_fixes(fixes, SPEC)
     assert max(len(p.mean) for p in points) <= 9 + 3 * 4
     smooth = smooth_trajectory(points, SPEC)
@@ -253,17 +232,9 @@ def swayed(rng: np.random.Generator, fixes: int) -> tuple[list[Fix], Floats]:
             seen = stands + (base + slope * (along @ seen)) @ errors
         given = seen + rng.normal(0, noise_m, 3)
         moves = base + slope * (along @ given)
-        found.append(
-            dataclasses.replace(
-                Fix.refused(t * 1e6, (0,), "", ""),
-                enu_m=given,
-                noise_m2=noise_m**2 * np.eye(3),
-                covariance_m2=noise_m**2 * np.eye(3) + moves @ moves.T,
-                standing={"bar 0": moves},
-                along=along,
-                standing_slope={"bar 0": slope},
-            )
-        )
+        noise_m2, stays = noise_m**2 * np.eye(3), {"bar 0": moves}
+        whole = {"covariance_m2": noise_m2 + moves @ moves.T, "standing": stays, "along": along}
+        found.append(fix(t * 1e6, given, noise_m2, standing_slope={"bar 0": slope}, **whole))
     return found, place
 
 
@@ -289,12 +260,12 @@ def test_a_young_track_is_not_believed_against_more_fixes_than_it_has() -> None:
     t_us = np.arange(12) * 35e3
     seen = np.outer(t_us * 1e-6, [10.0, 0.0, 0.0])
     seen[1] += 12 * SIGMA_M
-    points = filter_fixes([fix(t, p) for t, p in zip(t_us, seen, strict=True)], SPEC)
+    points = filter_fixes([fix(t, p, NOISE_M2) for t, p in zip(t_us, seen, strict=True)], SPEC)
     assert [p.starts for p in points].index(True, 1) <= 5
     assert points[-1].misses == 0
     assert (abs(points[-1].mean[:3] - seen[-1]) < 5 * np.sqrt(np.diag(points[-1].covariance_m2))).all()
     # One that has taken many is left by as many as ever.
     seen = np.outer(np.arange(40) * 35e-3, [10.0, 0.0, 0.0])
     seen[25:] += 20 * SIGMA_M
-    points = filter_fixes([fix(t * 35e3, p) for t, p in enumerate(seen)], SPEC)
+    points = filter_fixes([fix(t * 35e3, p, NOISE_M2) for t, p in enumerate(seen)], SPEC)
     assert [p.starts for p in points].index(True, 1) == 35
