@@ -1,12 +1,8 @@
 """Chip-aligned polarity sums: the laws of the public function."""
 
-from dataclasses import replace
-from itertools import pairwise
-
 import numpy as np
 import pytest
 import rx_twins as twins
-from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.rx.alignment import polarity_sums
@@ -44,28 +40,6 @@ def test_a_moving_bar_is_held_in_the_middle(seed):
     assert sums.dtype == np.int16
 
 
-def test_a_blob_that_moves_stays_where_it_is():
-    x = 50 + 3 * np.arange(CHIPS)
-    t = 1000 + 100 * np.arange(CHIPS) + 50
-    lock = SyncLock(0, 100.0, 0.0, 0.0, 1)
-    sums, offset = polarity_sums(
-        [Events.of(t, x + 2, x - 3, x > 0)], lock, 1000.0, np.stack([x, x]) + 0.5, SIZE
-    )
-    # The middle of the image is between its pixels 3 and 4, 6 and 7.
-    assert_array_equal(np.argwhere(sums), [[c, 6 - 3, 3 + 2] for c in range(CHIPS)])
-    assert_array_equal(offset, np.zeros((2, CHIPS)))
-
-
-@settings(max_examples=40)
-@given(st.lists(st.integers(0, 4000), max_size=12))
-def test_any_split_of_the_stream_gives_the_same(cuts):
-    events = stream(0)
-    whole, _ = polarity_sums([events], LOCK, 1000.0, STILL, SIZE)
-    bounds = [0, *sorted(cuts), len(events)]
-    pieces = [events[a:b] for a, b in pairwise(bounds)]
-    assert_array_equal(polarity_sums(iter(pieces), LOCK, 1000.0, STILL, SIZE)[0], whole)
-
-
 @pytest.mark.parametrize(("p", "delay_us"), [(1, -20.5), (0, 33.75)])
 def test_each_polarity_has_its_own_first_and_last_chip(p, delay_us):
     first = 1000 + delay_us
@@ -82,37 +56,9 @@ def test_each_polarity_has_its_own_first_and_last_chip(p, delay_us):
         assert sums.sum() == (0 if chip is None else 2 * p - 1)
 
 
-@pytest.mark.parametrize("row_us", [-2.0, 2.0])
-def test_rows_further_down_are_read_later(row_us):
-    lock = replace(LOCK, row_us=row_us)
-    for y in (200, 206, 213):
-        edge = 1000 + LOCK.delay_on_us + row_us * (y - 206.5) + 3 * LOCK.chip_us
-        for t, chip in [(np.ceil(edge) - 1, 2), (np.ceil(edge), 3)]:
-            sums, _ = polarity_sums([one(int(t), 1, y=y)], lock, 1000.0, STILL, SIZE)
-            assert np.argwhere(sums).tolist() == [[chip, y - 200, 3]]
-
-
-@pytest.mark.parametrize(
-    ("x", "y", "inside"),
-    [(100, 200, 1), (107, 213, 1), (99, 205, 0), (108, 205, 0), (103, 199, 0), (103, 214, 0)],
-)
-def test_events_beyond_the_image_are_left_out(x, y, inside):
-    assert polarity_sums([one(1200, 1, x, y)], LOCK, 1000.0, STILL, SIZE)[0].sum() == inside
-
-
 def test_no_events_are_no_sums():
     for pieces in ([], [Events.empty()], [Events.empty(), one(10**9, 1), one(10**9, 0)]):
         sums, offset = polarity_sums(pieces, LOCK, 1000.0, STILL, SIZE)
         assert sums.shape == (CHIPS, SIZE[1], SIZE[0])
         assert offset.shape == (2, CHIPS)
         assert not sums.any()
-
-
-def test_strided_and_read_only_events_are_taken():
-    events = stream(1)
-    columns = [np.repeat(c, 3) for c in (events.t_us, events.x, events.y, events.p)]
-    for c in columns:
-        c.setflags(write=False)
-    want, _ = polarity_sums([events], LOCK, 1000.0, STILL, SIZE)
-    got, _ = polarity_sums([Events(*columns)[::3]], LOCK, 1000.0, STILL, SIZE)
-    assert_array_equal(got, want)

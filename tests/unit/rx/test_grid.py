@@ -69,61 +69,41 @@ def test_frames_are_due_as_they_are_on_air(
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat) -> None:
-    grid = PacketGrid(form)
+@pytest.mark.parametrize("after", [0, 1])
+def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat, after: int) -> None:
+    """And the chips after it that are read with it."""
+    grid = PacketGrid(form, chips_after=after)
+    assert (grid.due(math.inf), grid.due_us) == (None, math.inf)
     grid.restart(lock_of(form, 0, delay_us=35.0), ZERO_US)
-    end_us = on_air(form, 1)[0][3]
-    assert grid.due(end_us + 34) is None
-    due = grid.due(end_us + 36)
+    _, _, start_us, end_us = on_air(form, 1)[0]
+    read_us = end_us + 35 + after * CHIP_US
+    assert grid.due_us == pytest.approx(read_us)
+    assert grid.due(read_us - 1) is None
+    due = grid.due(read_us + 1)
     assert due is not None
-    assert due.end_us == pytest.approx(end_us + 35)
+    assert (due.start_us, due.end_us) == pytest.approx((start_us, end_us + 35))
 
 
 @pytest.mark.parametrize("form", FORMATS)
-def test_a_frame_is_read_with_the_chip_after_it(form: PacketFormat) -> None:
-    plain, longer = PacketGrid(form), PacketGrid(form, chips_after=1)
-    for grid in (plain, longer):
-        grid.restart(lock_of(form, 0, delay_us=35.0), ZERO_US)
-    due = plain.due(math.inf)
-    assert due is not None
-    assert (plain.due_us, longer.due_us) == pytest.approx((due.end_us, due.end_us + CHIP_US))
-    assert longer.due(due.end_us + CHIP_US - 1) is None
-    late = longer.due(due.end_us + CHIP_US + 1)
-    assert late is not None
-    assert (late.start_us, late.end_us, late.chips) == (due.start_us, due.end_us, due.chips)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("late_us", [-90.0, 0.0, 90.0])
-def test_a_lock_near_the_grid_moves_it_and_keeps_the_numbers(form: PacketFormat, late_us: float) -> None:
-    grid = PacketGrid(form)
-    grid.restart(lock_of(form, 0), ZERO_US)
-    done = due_until(grid, on_air(form, 1)[-1][3] + 1)
-    assert grid.follow(lock_of(form, 3, late_us))
-    due = grid.due(math.inf)
-    assert due is not None
-    assert due.number == done[-1].number + 1
-    assert due.start_us == pytest.approx(on_air(form, 2)[form.frames][2] + late_us)
-
-
-@pytest.mark.parametrize("form", FORMATS)
-@pytest.mark.parametrize("late_us", [-110.0, 110.0, 1500.0])
-def test_a_lock_off_the_grid_begins_another_under_new_numbers(form: PacketFormat, late_us: float) -> None:
-    grid = PacketGrid(form)
-    assert not grid.follow(lock_of(form, 0))
-    grid.restart(lock_of(form, 0), ZERO_US)
-    done = due_until(grid, on_air(form, 1)[-1][3] + 1)
-    before = grid.start_us(grid.frame)
-    lock = lock_of(form, 3, late_us)
+@pytest.mark.parametrize("late_us", [-90.0, 0.0, 90.0, -110.0, 110.0, 1500.0])
+def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form: PacketFormat, late_us: float) -> None:
+    """A lock off the grid begins another, under new numbers."""
+    grid, lock = PacketGrid(form), lock_of(form, 3, late_us)
     assert not grid.follow(lock)
-    assert grid.start_us(grid.frame) == before
-    grid.restart(lock, 0.0)
+    grid.restart(lock_of(form, 0), ZERO_US)
+    done = due_until(grid, on_air(form, 1)[-1][3] + 1)
+    before_us = grid.start_us(grid.frame)
+    near = abs(late_us) < CHIP_US
+    assert grid.follow(lock) == near
+    if not near:
+        assert grid.start_us(grid.frame) == before_us
+        grid.restart(lock, 0.0)
     after = due_until(grid, on_air(form, 6)[-1][3])
-    assert after[0].start_us >= before - 1e-6
-    assert after[0].packet > done[-1].packet
-    want = [f[2] + late_us for f in on_air(form, 7)]
-    assert all(min(abs(d.start_us - w) for w in want) < 1e-6 for d in after)
-
-
-def test_without_a_lock_nothing_is_due() -> None:
-    assert PacketGrid(FORMATS[0]).due(math.inf) is None
+    sent_us = [f[2] + late_us for f in on_air(form, 7)]
+    assert all(min(abs(due.start_us - us) for us in sent_us) < 1e-6 for due in after)
+    if near:
+        assert after[0].number == done[-1].number + 1
+        assert after[0].start_us == pytest.approx(sent_us[form.frames])
+    else:
+        assert after[0].start_us >= before_us - 1e-6
+        assert after[0].packet > done[-1].packet

@@ -1,60 +1,26 @@
-"""Packets to messages: parts in any order, repetitions added, beacons verified or found out."""
+"""Packets to messages: parts in any order, repetitions added, beacons with their signatures."""
 
 from collections.abc import Iterable
 from dataclasses import replace
-from pathlib import Path
+from datetime import UTC, datetime, timedelta
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from rx_messages import CODER, PLACE, Operator, blocks_of, noisy, operator, packet_of
 
-from evlcp_sdk.air import signing
-from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message, split
-from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.inbox import MessageAssembler
-from evlcp_sdk.values import Frame, Packet, Range, ReceivedMessage, SoftSymbols
-
-CODER = load_link().block_coder()
-PLACE = Beacon(35.1, 136.9, 52.0, 10.0, 0.0, 0.96, b"lane 2")
-
-
-def packet_of(llr: np.ndarray, number: int, transmitter: int = 0, lost: Iterable[int] = ()) -> Packet:
-    """A packet whose frames have these LLRs, float (960,); lost frames are missing."""
-    frames = tuple(
-        Frame(
-            transmitter=transmitter,
-            packet=number,
-            frame=f,
-            t_us=34600.0 * number + 3200.0 * f,
-            soft=SoftSymbols(np.zeros(16, np.int64), part.astype(np.float32), 1.0),
-            range=Range(float("nan"), float("nan"), 0),
-            filtered=None,
-            x_px=0.0,
-            y_px=0.0,
-        )
-        for f, part in enumerate(llr.reshape(10, 16, 6))
-        if f not in set(lost)
-    )
-    return Packet(transmitter, number, 34600.0 * number, 100.0, frames, 10)
-
-
-def noisy(block: bytes, ber: float, rng: np.random.Generator) -> np.ndarray:
-    sigma = 1 / norm.isf(ber)
-    air = CODER.air_bits(block)
-    return 2 * (1 - 2.0 * air + rng.normal(0, sigma, air.size)) / sigma**2
-
-
-def blocks_of(*messages: Message, digest: bytes = CODER.digest) -> list[bytes]:
-    return [b.pack(CODER.block_bytes) for m in messages for b in split(m, digest, CODER.block_bytes)]
+from evlcp_sdk.utc import ClockZero
+from evlcp_sdk.values import Packet, ReceivedMessage
 
 
 class Feed:
     """An assembler that is fed with blocks."""
 
-    def __init__(self, **spec: object) -> None:
-        self.assembler = MessageAssembler(CODER, replace(MessageSpec(), **spec))  # type: ignore[arg-type]
+    def __init__(self, zero: ClockZero = None, **spec: object) -> None:
+        told = replace(MessageSpec(), **spec)  # type: ignore[arg-type]
+        self.assembler = MessageAssembler(CODER, told, clock_zero=zero)
         self.number = 0
         self.rng = np.random.default_rng(5)
 
@@ -170,24 +136,16 @@ def test_different_blocks_are_not_added() -> None:
     assert {s.packets for s in sums} == {1}
 
 
-@pytest.mark.parametrize("lost", [range(3), range(4, 7), range(7, 10)])
-def test_lost_frames_count_as_unknown(lost: range) -> None:
-    block = blocks_of(Message(Kind.TEXT, 1, 0, b"Hello"))[0]
-    assembler = MessageAssembler(CODER, MessageSpec())
-    packet = assembler.add(packet_of(noisy(block, 0.01, np.random.default_rng(3)), 0, lost=lost))
-    assert [m.message.text for m in packet.messages] == ["Hello"]
-    assert packet.block == Block.unpack(block)
-    assert packet.block_packets == 1
-
-
-@pytest.mark.parametrize("hidden", [[4, 5, 6, 12], range(10, 16), [0, 1, 7, 8, 14, 15]])
-def test_hidden_clusters_count_as_unknown(hidden: Iterable[int]) -> None:
+@pytest.mark.parametrize(
+    ("lost", "hidden"),
+    [(range(3), []), (range(4, 7), []), (range(7, 10), []), ([], [4, 5, 6, 12]), ([], [0, 1, 7, 8, 14, 15])],
+)
+def test_lost_frames_and_hidden_clusters_count_as_unknown(lost: Iterable[int], hidden: list[int]) -> None:
     """Clusters that are not given have LLR 0, and the error correction carries the message over them."""
     block = blocks_of(Message(Kind.TEXT, 1, 0, b"Hello"))[0]
     llr = noisy(block, 0.01, np.random.default_rng(3)).reshape(10, 16, 6)
-    llr[:, list(hidden)] = 0
-    assembler = MessageAssembler(CODER, MessageSpec())
-    packet = assembler.add(packet_of(llr, 0))
+    llr[:, hidden] = 0
+    packet = Feed().assembler.add(packet_of(llr, 0, lost=lost))
     assert [m.message.text for m in packet.messages] == ["Hello"]
     assert (packet.block, packet.block_packets) == (Block.unpack(block), 1)
 
@@ -196,7 +154,7 @@ def test_a_reflection_says_nothing_new() -> None:
     blocks = blocks_of(Message(Kind.TEXT, 1, 0, b"Hello"))
     packet = packet_of(noisy(blocks[0], 0.01, np.random.default_rng(3)), 0, transmitter=1)
     echo = replace(packet, frames=tuple(replace(f, echo_of=0) for f in packet.frames))
-    assembler = MessageAssembler(CODER, MessageSpec())
+    assembler = Feed().assembler
     assert assembler.add(echo) is echo
     assert {k: n for k, n in assembler.counts.items() if n} == {"blocks_reflected": 1}
     assert assembler.add(packet).messages
@@ -218,120 +176,94 @@ def test_bytes_that_mean_nothing_are_counted() -> None:
     assert "messages" not in feed.counts
 
 
-class Signed:
-    """An operator's key and what it signs."""
-
-    def __init__(self, folder: Path) -> None:
-        pytest.importorskip("cryptography", reason="the extra sign is not installed")
-        self.public = signing.make_key(folder / "k.pem")
-        self.trusted = (signing.TrustedKey(self.public),)
-        self.key = signing.read_key(folder / "k.pem")
-
-    def __call__(self, sequence: int, beacon: Beacon = PLACE, transmitter_id: int = 7) -> list[Message]:
-        message = Message(Kind.BEACON, transmitter_id, sequence, beacon.pack())
-        return [message, signing.sign(message, CODER.digest, self.key)]
-
-
-@pytest.fixture(scope="module")
-def signed(tmp_path_factory: pytest.TempPathFactory) -> Signed:
-    return Signed(tmp_path_factory.mktemp("keys"))
-
-
 def trusts(found: list[ReceivedMessage]) -> list[str]:
     return [m.trust for m in found]
 
 
-def test_a_signed_beacon_is_verified_once_its_signature_is_there(signed: Signed) -> None:
-    feed = Feed(trusted_keys=signed.trusted)
-    blocks = blocks_of(*signed(5))
+def test_a_signed_beacon_is_verified_once_its_signature_is_there() -> None:
+    feed = Feed(trusted_keys=operator().trusted)
+    blocks = blocks_of(*operator().beacon(5))
     assert len(blocks) == 3
     found = feed(blocks * 3)
     assert trusts(found) == ["unverified", "verified"]
-    unknown = "signed 1970-01-01 00:00:05 UTC; when it was received is not known"
-    assert (found[0].reason, found[1].reason) == ("no signature yet", unknown)
+    assert found[0].reason == "no signature yet"
     assert found[1].beacon == PLACE
     # The signature may come first.
-    assert trusts(Feed(trusted_keys=signed.trusted)(blocks[1:] + blocks[:1])) == ["verified"]
+    assert trusts(Feed(trusted_keys=operator().trusted)(blocks[1:] + blocks[:1])) == ["verified"]
     # A newer beacon of another place is believed with its signature only.
-    moved = replace(PLACE, latitude_deg=35.2)
-    found = feed(blocks_of(*signed(6, moved)))
+    found = feed(blocks_of(*operator().beacon(6, replace(PLACE, latitude_deg=35.2))))
     assert trusts(found) == ["forged", "verified"]
     assert "another place than the verified beacon of sequence 5" in found[0].reason
     assert feed.counts["beacons_verified"] == 2
-
-
-def test_without_a_trusted_key_nothing_is_verified(signed: Signed) -> None:
-    blocks = blocks_of(*signed(5))
     found = Feed()(blocks)
     assert trusts(found) == ["unverified", "unverified"]
     assert found[1].reason == "signed by a key that is not trusted"
 
 
-def test_an_old_beacon_is_replayed(signed: Signed) -> None:
-    feed = Feed(trusted_keys=signed.trusted, oldest_sequence=3)
-    assert trusts(feed(blocks_of(*signed(2)))) == ["unverified", "forged"]
-    feed = Feed(trusted_keys=signed.trusted)
-    assert trusts(feed(blocks_of(*signed(9)))) == ["unverified", "verified"]
-    found = feed(blocks_of(*signed(8, replace(PLACE, latitude_deg=35.3))), transmitter=1)
-    assert trusts(found) == ["forged"]
-    assert found[0].reason == "replayed: sequence 8 is older than verified 9"
-    found = feed(blocks_of(*signed(9, replace(PLACE, height_m=53.0))), transmitter=2)
-    assert trusts(found) == ["forged"]
-    assert found[0].reason == "differs from the verified beacon of sequence 9"
-    # Another transmitter's number is its own.
-    other = signed(1, replace(PLACE, latitude_deg=35.4), transmitter_id=8)
-    assert trusts(feed(blocks_of(*other))) == ["unverified", "verified"]
+SIGNED = datetime(2026, 3, 1, 12, tzinfo=UTC)
 
 
-def test_every_forgery_of_ten_thousand_is_found_out(signed: Signed, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("later", "reason", "age_s"),
+    [
+        (None, "; when it was received is not known", None),
+        (timedelta(days=265), ", 265 days before it was received", 265 * 86400 + 69e-3),
+        (timedelta(seconds=40), ", 40.1 s before", 40.0692),
+    ],
+)
+def test_a_fresh_receiver_says_how_old_an_old_recording_is(
+    later: timedelta | None, reason: str, age_s: float | None
+) -> None:
+    """A recording of March, received in whatever way: never just `verified`."""
+    feed = Feed(None if later is None else SIGNED + later, trusted_keys=operator().trusted)
+    found = feed(blocks_of(*operator().beacon(int(SIGNED.timestamp()))))
+    assert trusts(found) == ["unverified", "verified"]
+    assert found[1].reason.startswith(f"signed 2026-03-01 12:00:00 UTC{reason}")
+    assert found[1].age_s == (None if age_s is None else pytest.approx(age_s, abs=1e-3))
+    assert feed.assembler.counts["beacons_undated"] == (later is None)
+
+
+def test_every_forgery_of_two_thousand_is_found_out() -> None:
     """A lamp beside the honest one shows tampered, unsigned, replayed or wrongly signed beacons."""
-    rng = np.random.default_rng(11)
-    other = Signed(tmp_path)
-    assembler = MessageAssembler(CODER, replace(MessageSpec(), trusted_keys=signed.trusted))
+    rng, other = np.random.default_rng(11), Operator()
+    feed = Feed(trusted_keys=operator().trusted)
+    assembler = feed.assembler
 
-    def show(messages: list[Message], transmitter: int) -> list[ReceivedMessage]:
+    def show(messages: list[Message]) -> list[ReceivedMessage]:
         """Hand blocks over as if decoded: forgery is of bytes, not of light."""
-        found: list[ReceivedMessage] = []
-        inbox = assembler._inboxes.setdefault(transmitter, type(assembler._inboxes[0])())
-        packet = Packet(transmitter, 0, 0.0, 100.0, (), 10)
-        for message in messages:
-            for block in split(message, CODER.digest, CODER.block_bytes):
-                found += assembler._take(inbox, block, packet)
-        return found
+        inbox = type(assembler._inboxes[0])()
+        packet = Packet(1, 0, 0.0, 100.0, (), 10)
+        blocks = [block for message in messages for block in split(message, CODER.digest, CODER.block_bytes)]
+        return [found for block in blocks for found in assembler._take(inbox, block, packet)]
 
-    assembler.add(packet_of(np.zeros(960), 0))
-    assert trusts(show(signed(1000), 0)) == ["unverified", "verified"]
+    def tampered(message: Message, first_bit: int) -> Message:
+        payload = bytearray(message.payload)
+        at = int(rng.integers(first_bit, 8 * len(payload)))
+        payload[at // 8] ^= 1 << at % 8
+        return replace(message, payload=bytes(payload))
+
+    assert trusts(feed(blocks_of(*operator().beacon(1000)))) == ["unverified", "verified"]
     flagged = 0
-    for trial in range(10_000):
-        assembler._inboxes.pop(1, None)
-        way = trial % 5
+    for trial in range(2000):
         sequence = 1000 + int(rng.integers(0, 5))
-        beacon, signature = honest = signed(sequence if way != 3 else int(rng.integers(0, 1000)))
-        if way == 0:  # a bit of the beacon
-            payload = bytearray(beacon.payload)
-            at = int(rng.integers(0, 8 * len(payload)))
-            payload[at // 8] ^= 1 << at % 8
-            shown = [replace(beacon, payload=bytes(payload)), signature]
-        elif way == 1:  # a newer number for the beacon and its signature
-            newer = sequence + 1 + int(rng.integers(0, 100))
-            shown = [replace(m, sequence=newer) for m in honest]
-        elif way == 2:  # a bit of the signature, of a beacon that moved
-            moved = signed(sequence + 1, replace(PLACE, latitude_deg=35.1 + float(rng.uniform(1e-6, 1))))
-            payload = bytearray(moved[1].payload)
-            at = 64 + int(rng.integers(0, 512))
-            payload[at // 8] ^= 1 << at % 8
-            shown = [moved[0], replace(moved[1], payload=bytes(payload))]
-        elif way == 3:  # an old one of another place, rightly signed
-            shown = signed(
-                int(rng.integers(0, 1000)), replace(PLACE, longitude_deg=float(rng.uniform(-180, 180)))
-            )
-        else:  # a moved one, signed by another key
-            moved_beacon = Message(Kind.BEACON, 7, sequence + 1, replace(PLACE, height_m=0.0).pack())
-            shown = [moved_beacon, signing.sign(moved_beacon, CODER.digest, other.key)]
-        told = show(shown, 1)
-        calibrate_llr = [m for m in told if m.trust == "verified"]
-        flagged += bool(told) and told[-1].trust == "forged" and not calibrate_llr
+        beacon, signature = honest = operator().beacon(sequence)
+        elsewhere = replace(PLACE, longitude_deg=float(rng.uniform(-180, 180)))
+        match trial % 5:
+            case 0:
+                shown = [tampered(beacon, 0), signature]
+            case 1:  # a newer number for the beacon and its signature
+                newer = sequence + 1 + int(rng.integers(0, 100))
+                shown = [replace(m, sequence=newer) for m in honest]
+            case 2:  # a bit of the signature, of a beacon that moved
+                beacon, signature = operator().beacon(sequence + 1, elsewhere)
+                shown = [beacon, tampered(signature, 64)]
+            case 3:  # an old one of another place, rightly signed
+                shown = operator().beacon(int(rng.integers(0, 1000)), elsewhere)
+            case _:  # a moved one, signed by another key
+                shown = other.beacon(sequence + 1, replace(PLACE, height_m=0.0))
+        told = trusts(show(shown))
+        flagged += told[-1:] == ["forged"] and "verified" not in told
     # Some tampered bytes are a place that cannot be: counted, and never handed on.
-    assert flagged + assembler.counts["messages_undecodable"] == 10_000
-    assert flagged > 9_000
+    assert flagged + assembler.counts["messages_undecodable"] == 2000
+    assert flagged > 1800
     assert assembler._beacons._verified[7].message.sequence == 1000

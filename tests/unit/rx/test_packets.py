@@ -3,7 +3,6 @@
 from itertools import chain, pairwise
 
 import numpy as np
-import pytest
 from hypothesis import given, strategies as st
 
 from evlcp_sdk.rx.packets import PacketAssembler
@@ -58,18 +57,3 @@ def test_a_packet_comes_out_as_soon_as_it_is_over(numbers):
         whole = now[1] == SENT - 1
         assert [p.packet for p in packets] == [before[0]] * cut_short + [now[0]] * whole
     assert bool(last) == (numbers[-1][1] != SENT - 1)
-
-
-@pytest.mark.parametrize("missing", range(SENT))
-def test_a_missing_frame_is_missing_only_itself(missing):
-    numbers = [(p, f) for p in (0, 1) for f in range(SENT) if (p, f) != (0, missing)]
-    given_out, last = fed(numbers)
-    first, second = [*chain(*given_out), *last]
-    assert [f.frame for f in first.frames] == [f for f in range(SENT) if f != missing]
-    assert len(second.frames) == second.sent == SENT
-
-
-def test_a_packet_may_be_one_frame():
-    assembler = PacketAssembler(1)
-    assert [numbers_of(assembler.add(frame(n, 0), 0.0, 100.0)) for n in (3, 4)] == [[(3, 0)], [(4, 0)]]
-    assert assembler.flush() == []

@@ -120,19 +120,6 @@ def test_a_halo_is_not_in_the_footprints() -> None:
     assert only.informed().probability.sum() < 1.1 * presence.selected.sum()
 
 
-def test_where_the_place_is_known_presence_is_that_of_bayes() -> None:
-    """Of two clusters and none: likelihoods 8, 2 and 1; then one of which nothing was seen."""
-    probability = np.array([[[8 / 12, 0]], [[2 / 12, 0]]], np.float32)
-    prior = np.array([[[0.3, 0.6]], [[0.5, 0.2]]], np.float32)
-    nothing = np.zeros((2, 1, 2), bool)
-    presence = PresenceMap(probability, 2, nothing, np.zeros((2, 2, 4), np.float32), prior)
-    placed = presence.informed()
-    want = np.array([0.3 * 8, 0.5 * 2])
-    # Of twelve parts two are for none: one for it, by as many chances as there are clusters.
-    np.testing.assert_allclose(placed.probability[:, 0, 0], want / (want.sum() + 0.2), rtol=1e-5)
-    np.testing.assert_allclose(placed.probability[:, 0, 1], prior[:, 0, 1], rtol=1e-5)
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_bayes_cell_by_cell(seed: int) -> None:
     rng = np.random.default_rng(seed)

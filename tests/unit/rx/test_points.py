@@ -1,24 +1,23 @@
 """Cluster points: on drawn bars, and on a simulated drive with its truth, and on a recording."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
-import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
+from rx_streams import LINK, frames_of, received
 
-from evlcp_sdk.io import open_source
-from evlcp_sdk.link.resolve import load_link, resolve
+from evlcp_sdk.files import shipped
+from evlcp_sdk.io import read_events
+from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.rx.placement import layout_of, placements
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.sim import Simulation, load_scene
 from evlcp_sdk.sim.motion import project
-from evlcp_sdk.values import Frame, PresenceMap, changed
+from evlcp_sdk.values import PresenceMap, changed
 
-RECORDING = Path(__file__).parents[3] / "examples" / "recordings" / "night-50m-30kmh-cut.raw"
 BAR = BarLayout()
 CENTRES = BAR.cluster_centres_m()
 FINE = 8
@@ -135,57 +134,50 @@ def test_cells_that_hold_more_of_one_side_do_not_shift_a_bar(dx: float) -> None:
     assert np.abs(points[:, 0] - shift.real).max() <= 0.5 / FINE
 
 
-def test_the_image_of_a_still_bar_is_found_at_any_place_within_pixels() -> None:
-    scene = load_scene(
-        "drive-30kmh",
-        ["duration_s=0.1", "motion.distance_m=30", "motion.speed_mps=0", "motion.vib_rate_rad_s=0",
-         "motion.lateral_mps=0.15", "motion.yaw_deg=0.4"],
-    )  # fmt: skip
-    simulation = Simulation(scene)
-    receiver = Receiver(load_link())
+def lies(points: NDArray[np.float64]) -> bool:
+    """Whether a bar is wider than it is high."""
+    return bool(np.ptp(points[:, 0]) > np.ptp(points[:, 1]))
+
+
+def simulated(
+    scene: str, sets: list[str], seed: int | None = None, lying: bool = False, **link: dict[str, float]
+) -> NDArray[np.float64]:
+    """By how much points of a scene's upright or lying bar are off its truth, px, (frames, K, 2)."""
+    simulation = Simulation(load_scene(scene, sets), seed)
+    receiver = Receiver(resolve(link))
     packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
-    cuts = simulation.bars[0].strips[0].strip.cuts_m()
-    off = []
-    for frame in (f for p in packets for f in p.frames if np.isfinite(f.points_px).all()):
-        seen = project((cuts[1:] + cuts[:-1]) / 2, *simulation.path.at([frame.points_t_us]), scene.camera)[0][
-            0
-        ]
-        off.append((frame.points_px - seen).mean(0))
+    points = [f.points_px for p in packets for f in p.frames]
+    t_us = np.array([f.points_t_us for p in packets for f in p.frames])
+    mine = [np.isfinite(seen).all() and lies(seen) == lying for seen in points]
+    bars = [bar.strips[0].strip.cuts_m() for bar in simulation.bars]
+    cuts = next(cuts for cuts in bars if lies(cuts) == lying)
+    at = simulation.path.at(t_us[mine] - simulation.scene.t0_us)
+    want, _ = project((cuts[1:] + cuts[:-1]) / 2, *at, simulation.scene.camera)
+    return np.array(points)[mine] - want
+
+
+def test_the_image_of_a_still_bar_is_found_at_any_place_within_pixels() -> None:
+    sets = ["motion.distance_m=30", "motion.speed_mps=0", "motion.vib_rate_rad_s=0"]
+    off = simulated("drive-30kmh", ["duration_s=0.1", "motion.lateral_mps=0.15", "motion.yaw_deg=0.4", *sets])
     assert len(off) > 15
     # By cells of 2 px alone, a bar here is off by up to a quarter of a pixel.
-    assert np.abs(np.array(off)[:, 0]).max() < 0.12
+    assert np.abs(off.mean(1)[:, 0]).max() < 0.12
 
 
 def test_a_track_that_trembles_does_not_move_the_points_along_a_bar() -> None:
     """Of a lying bar, whose columns its region knows by which LEDs happen to blink."""
     sets = ["duration_s=0.15", "motion.distance_m=43.0", 'world.attitude="none"']
-    simulation = Simulation(load_scene("examples/scenes/portal.toml", sets), 301)
-    receiver = Receiver(load_link())
-    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
-    lying = next(bar for bar in simulation.bars if abs(np.diff(bar.strips[0].strip.cuts_m()[:, 0])).max() > 0)
-    cuts, off = lying.strips[0].strip.cuts_m(), []
-    for frame in (f for p in packets for f in p.frames if np.isfinite(f.points_px).all()):
-        if np.ptp(frame.points_px[:, 0]) > np.ptp(frame.points_px[:, 1]):
-            at = simulation.path.at([frame.points_t_us - simulation.scene.t0_us])
-            seen = project((cuts[1:] + cuts[:-1]) / 2, *at, simulation.scene.camera)[0][0]
-            off.append((frame.points_px - seen).mean(0))
+    off = simulated("examples/scenes/portal.toml", sets, 301, lying=True).mean(1)
     assert len(off) > 25
     # Where the region's track is in one chip, points were off by .15 px along the bar and .09 across.
-    assert (np.array(off).std(0) < (0.1, 0.05)).all()
+    assert (off.std(0) < (0.1, 0.05)).all()
 
 
 def test_points_of_a_turning_camera_lie_where_they_are() -> None:
     """At 45 degrees a second the image moves by half a pixel in a chip."""
     sets = ["duration_s=0.1", 'motion.path_file="turning.csv"', "motion.vib_rate_rad_s=0.02"]
-    simulation = Simulation(load_scene("examples/scenes/one-bar.toml", sets), 5)
-    receiver = Receiver(load_link())
-    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
-    cuts = simulation.bars[0].strips[0].strip.cuts_m()
-    found = [f for p in packets for f in p.frames if np.isfinite(f.points_px).all()]
-    assert len(found) > 12
-    at = simulation.path.at([f.points_t_us - simulation.scene.t0_us for f in found])
-    want = project((cuts[1:] + cuts[:-1]) / 2, *at, simulation.scene.camera)[0]
-    off = np.array([f.points_px for f in found]) - want
+    off = simulated("examples/scenes/one-bar.toml", sets, 5)
+    assert len(off) > 12
     # All are early alike, by a share of a chip.
     assert np.abs(off.mean((0, 1))).max() < 0.3
     shape = off - off.mean(1, keepdims=True)
@@ -193,38 +185,18 @@ def test_points_of_a_turning_camera_lie_where_they_are() -> None:
     assert shape.std() < 0.2
 
 
-@pytest.fixture(scope="module")
-def frames() -> list[Frame]:
-    link = load_link()
-    receiver = Receiver(link)
-    packets = []
-    with open_source(str(RECORDING)) as source:
-        for events in source.chunks():
-            packets += receiver.feed(events)
-    return [f for p in packets + receiver.close() for f in p.frames]
-
-
 def test_points_of_a_simulated_drive_lie_where_its_truth_has_them() -> None:
-    scene = load_scene("night", ["duration_s=0.1", "motion.roll_deg=3.0", "camera.centre_x_px=620.0"])
-    simulation = Simulation(scene)
-    receiver = Receiver(resolve({"camera": {"centre_x_px": 620.0}}))
-    packets = [p for events in simulation.stream() for p in receiver.feed(events)] + receiver.close()
-    found = [f for p in packets for f in p.frames]
-    assert len(found) > 20
-    (bar,) = simulation.bars
-    cuts = bar.strips[0].strip.cuts_m()
-    position, attitude = simulation.path.at([f.points_t_us for f in found])
-    want, _ = project((cuts[1:] + cuts[:-1]) / 2, position, attitude, scene.camera)
-    error = np.array([f.points_px for f in found]) - want
-    assert np.isfinite(error).mean() > 0.98
+    sets = ["duration_s=0.1", "motion.roll_deg=3.0", "camera.centre_x_px=620.0"]
+    off = simulated("night", sets, camera={"centre_x_px": 620.0})
+    assert len(off) > 20
     # 0.17 px is an error of 1.2 mm at 50 m.
-    assert np.sqrt(np.nanmean(error**2)) < 0.17
-    assert np.abs(np.nanmean(error, (0, 1))).max() < 0.1
+    assert np.sqrt(np.mean(off**2)) < 0.17
+    assert np.abs(off.mean((0, 1))).max() < 0.1
 
 
-def test_sigma_is_the_scatter_about_the_similarity(frames: list[Frame]) -> None:
+def test_sigma_is_the_scatter_about_the_similarity() -> None:
     squares, freedom = 0.0, 0
-    for frame in frames:
+    for frame in frames_of(received(LINK, read_events(shipped("recordings", "night-50m-30kmh-cut.raw")))[1]):
         seen = np.isfinite(frame.points_px[:, 0])
         z = frame.points_px[seen] @ [1, 1j]
         c = CENTRES[seen] @ [1, 1j]

@@ -1,28 +1,19 @@
 """Which transmitter is the reflection of which: the evidence, the decision, and the receiver."""
 
 import math
+from collections.abc import Iterable
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise, permutations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
+from rx_streams import LINK, frames_of, received
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.packets import PacketAssembler
-from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.rx.reflections import (
-    FrameDetection,
-    ReflectionQueue,
-    Reflections,
-    brighter,
-    originals,
-    repeats,
-)
+from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue, Reflections, repeats
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols, SyncLock
 
@@ -80,32 +71,33 @@ def test_evidence_is_the_likelihood_ratio_of_the_two_models(codewords: int, clus
         assert repeats(one, other, codewords) == pytest.approx(ratio, abs=1e-9)
 
 
+def judged(*steps: Iterable[FrameDetection], echoes: Reflections | None = None) -> dict[int, int]:
+    """What is a reflection of what, after these time steps."""
+    echoes = Reflections(FORMAT, CODEWORDS) if echoes is None else echoes
+    for step in steps:
+        echoes.judge(step)
+    return {k: of for k in range(50) if (of := echoes.echo_of(k)) is not None}
+
+
 def test_independent_payloads_are_never_taken_for_one() -> None:
-    """Two transmitters on one clock with other data: 2,000 pairs of 100 frames, none is a reflection."""
+    """Two transmitters on one clock with other data: 500 pairs of 100 frames, none is a reflection."""
     rng = np.random.default_rng(2)
-    for _ in range(200):
+    for _ in range(50):
         echoes = Reflections(FORMAT, CODEWORDS)
         for n in range(100):
             symbols = rng.integers(0, CODEWORDS, (5, 16))
-            echoes.judge(sighting(k, n, s, late_us=k) for k, s in enumerate(symbols))
-            assert not any(echoes.echo_of(k) is not None for k in range(5))
+            assert judged([sighting(k, n, s, late_us=k) for k, s in enumerate(symbols)], echoes=echoes) == {}
 
 
-@pytest.mark.parametrize("right", [16, 12, 8])
-def test_the_first_frame_is_enough(right: int) -> None:
+@pytest.mark.parametrize(("right", "frames"), [(16, 1), (12, 1), (8, 1), (4, 10)])
+def test_the_first_frame_is_enough_where_half_of_it_is_right(right: int, frames: int) -> None:
     rng = np.random.default_rng(3)
-    echoes = Reflections(FORMAT, CODEWORDS)
-    echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, misread(said(0), right, rng), light=70)])
-    assert (echoes.echo_of(0), echoes.echo_of(1)) == (None, 0)
-
-
-def test_a_reflection_of_which_most_is_misread_is_found_within_a_packet() -> None:
-    rng = np.random.default_rng(4)
-    for _ in range(50):
-        echoes = Reflections(FORMAT, CODEWORDS)
-        for n in range(10):
-            echoes.judge([sighting(0, n, said(n)), sighting(1, n, misread(said(n), 4, rng), light=70)])
-        assert echoes.echo_of(1) == 0
+    for _ in range(20):
+        steps = [
+            [sighting(0, n, said(n)), sighting(1, n, misread(said(n), right, rng), light=70)]
+            for n in range(frames)
+        ]
+        assert judged(*steps) == {1: 0}
 
 
 @pytest.mark.parametrize("clusters", [8, 6])
@@ -113,112 +105,97 @@ def test_a_partial_reflection(clusters: int) -> None:
     """Only some clusters of the mirror image are seen: those are compared."""
     part = said(0)
     part[: 16 - clusters] = -1
-    echoes = Reflections(FORMAT, CODEWORDS)
-    echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, part, light=70)])
-    assert echoes.echo_of(1) == 0
+    assert judged([sighting(0, 0, said(0)), sighting(1, 0, part, light=70)]) == {1: 0}
     # As bright as the bar, whichever is first.
-    echoes = Reflections(FORMAT, CODEWORDS)
-    echoes.judge([sighting(0, 0, part), sighting(1, 0, said(0))])
-    assert echoes.echo_of(0) == 1
+    assert judged([sighting(0, 0, part), sighting(1, 0, said(0))]) == {0: 1}
     # What is hidden of the one is all that is seen of the other: nothing is known.
     rest = np.where(part < 0, said(0), -1)
-    echoes = Reflections(FORMAT, CODEWORDS)
-    echoes.judge([sighting(0, 0, rest), sighting(1, 0, part, light=70)])
-    assert echoes.echo_of(1) is None
+    assert judged([sighting(0, 0, rest), sighting(1, 0, part, light=70)]) == {}
 
 
 def test_frames_at_other_times_are_not_compared() -> None:
     echoes = Reflections(FORMAT, CODEWORDS)
-    for n in range(20):
-        echoes.judge([sighting(0, n, said(n)), sighting(1, n, said(n), late_us=60)])
-    assert echoes.echo_of(0) is echoes.echo_of(1) is None
+    steps = [[sighting(0, n, said(n)), sighting(1, n, said(n), late_us=60)] for n in range(20)]
+    assert judged(*steps, echoes=echoes) == {}
     # The lower of two images is read later: 150 rows of 0.2 us are 30 us.
-    echoes.judge([sighting(0, 20, said(20)), sighting(2, 20, said(20), late_us=75, y_px=450, light=70)])
-    assert echoes.echo_of(2) == 0
+    lower = sighting(2, 20, said(20), late_us=75, y_px=450, light=70)
+    assert judged([sighting(0, 20, said(20)), lower], echoes=echoes) == {2: 0}
 
 
 @pytest.mark.parametrize("order", list(permutations(range(3))))
 def test_a_bar_with_two_reflections(order: tuple[int, ...]) -> None:
-    """In whatever order they were numbered: both are reflections of the bar, none of a reflection."""
+    """In whatever order they are numbered and come: both are reflections of the bar, none of the other."""
     bar, road, rail = order
     echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(3):
-        echoes.judge(
-            [
-                sighting(road, n, said(n), late_us=30, y_px=450, light=130, mirrored=True),
-                sighting(bar, n, said(n)),
-                sighting(rail, n, said(n), late_us=4, light=72),
-            ]
-        )
-        assert [echoes.echo_of(k) for k in (bar, road, rail)] == [None, bar, bar]
+        seen = [
+            sighting(road, n, said(n), late_us=30, y_px=450, light=130, mirrored=True),
+            sighting(bar, n, said(n)),
+            sighting(rail, n, said(n), late_us=4, light=72),
+        ]
+        assert judged(seen[::-1] if n == 1 else seen, echoes=echoes) == {road: bar, rail: bar}
+
+
+def test_two_bars_with_a_reflection_each() -> None:
+    seen = [sighting(k, 0, said(0, seed=k // 2), light=100 - 30 * (k % 2)) for k in range(4)]
+    assert judged(seen) == {1: 0, 3: 2}
 
 
 def test_what_comes_late_is_judged_by_what_was_before() -> None:
     """A reflection is heard two packets late: it starts with the frames before its lock."""
-    echoes = Reflections(FORMAT, CODEWORDS)
-    for n in range(25):
-        echoes.judge([sighting(0, n, said(n))])
-    echoes.judge([sighting(1, n, said(n), light=70) for n in range(5, 25)])
-    assert echoes.echo_of(1) == 0
+    own = [[sighting(0, n, said(n))] for n in range(25)]
+    assert judged(*own, [sighting(1, n, said(n), light=70) for n in range(5, 25)]) == {1: 0}
 
 
-def test_one_image_seen_by_two_regions_is_no_reflection() -> None:
-    for off_px, echo_of in ((0.0, None), (4.0, None), (6.0, 0)):
-        echoes = Reflections(FORMAT, CODEWORDS)
-        for n in range(10):
-            echoes.judge([sighting(0, n, said(n), x_px=400.0), sighting(1, n, said(n), x_px=400.0 + off_px)])
-        assert echoes.echo_of(1) == echo_of
+@pytest.mark.parametrize(("off_px", "found"), [(0.0, {}), (4.0, {}), (6.0, {1: 0})])
+def test_one_image_seen_by_two_regions_is_no_reflection(off_px: float, found: dict[int, int]) -> None:
+    assert found == judged(
+        *(
+            [sighting(0, n, said(n), x_px=400.0), sighting(1, n, said(n), x_px=400.0 + off_px)]
+            for n in range(10)
+        )
+    )
 
 
-def test_the_verdict_is_stable() -> None:
-    rng = np.random.default_rng(5)
-    for light in (100.0, 85.0, 50.0, 30.0):
-        echoes, verdicts = Reflections(FORMAT, CODEWORDS), []
-        for n in range(200):
-            # Frame by frame, now the one has more light, now the other.
-            now = light * math.exp(rng.normal(0, 0.15))
-            echoes.judge([sighting(0, n, said(n)), sighting(1, n, said(n), light=now)])
-            verdicts.append((echoes.echo_of(0), echoes.echo_of(1)))
-        assert sum(a != b for a, b in pairwise(verdicts)) <= 1
-        assert len(set(verdicts[10:])) == 1
-        if light != 100:
-            assert verdicts[-1] == (None, 0)
+@pytest.mark.parametrize("light", [100.0, 85.0, 50.0, 30.0])
+def test_the_verdict_is_stable(light: float) -> None:
+    """Frame by frame, now the one has more light, now the other."""
+    rng, echoes = np.random.default_rng(5), Reflections(FORMAT, CODEWORDS)
+    verdicts = []
+    for n in range(200):
+        other = sighting(1, n, said(n), light=light * math.exp(rng.normal(0, 0.15)))
+        verdicts.append(judged([sighting(0, n, said(n)), other], echoes=echoes))
+    assert sum(a != b for a, b in pairwise(verdicts)) <= 1
+    assert all(verdict == verdicts[10] for verdict in verdicts[10:])
+    assert len(verdicts[10]) == 1
+    assert light == 100 or verdicts[-1] == {1: 0}
 
 
-def test_light_tells_the_bar_unless_one_stands_upside_down() -> None:
-    for light in (0.05, 0.3, 3.0):
-        assert brighter(light) == -brighter(-light) > 0
-    for light in (70, 150, 500):
-        echoes = Reflections(FORMAT, CODEWORDS)
-        for n in range(5):
-            image = sighting(0, n, said(n), light=light, mirrored=True)
-            echoes.judge([image, sighting(1, n, said(n))])
-            assert (echoes.echo_of(0), echoes.echo_of(1)) == (1, None)
+@pytest.mark.parametrize("light", [70, 150, 500])
+def test_light_tells_the_bar_unless_one_stands_upside_down(light: float) -> None:
+    assert judged(
+        *([sighting(0, n, said(n), light=light, mirrored=True), sighting(1, n, said(n))] for n in range(5))
+    ) == {0: 1}
 
 
 def test_a_bar_that_appears_after_its_reflection_takes_its_place() -> None:
     echoes = Reflections(FORMAT, CODEWORDS)
-    for n in range(10):
-        echoes.judge([sighting(0, n, said(n), light=60, mirrored=True)])
-        assert echoes.echo_of(0) is None
-    for n in range(10, 12):
-        echoes.judge([sighting(0, n, said(n), light=60, mirrored=True), sighting(1, n, said(n), light=100)])
-        assert (echoes.echo_of(0), echoes.echo_of(1)) == (1, None)
+    for n in range(12):
+        seen = [sighting(0, n, said(n), light=60, mirrored=True), sighting(1, n, said(n), light=100)]
+        assert judged(seen[:1] if n < 10 else seen, echoes=echoes) == ({} if n < 10 else {0: 1})
     # A weaker reflection that comes later changes nothing.
-    echoes.judge([sighting(k, 12, said(12), light=light) for k, light in ((0, 60), (1, 100), (2, 65))])
-    assert [echoes.echo_of(k) for k in range(3)] == [1, None, 1]
+    last = [sighting(k, 12, said(12), light=light) for k, light in ((0, 60), (1, 100), (2, 65))]
+    assert judged(last, echoes=echoes) == {0: 1, 2: 1}
 
 
 def test_a_reflection_outlives_its_bar_by_a_second() -> None:
     echoes = Reflections(FORMAT, CODEWORDS)
-    echoes.judge([sighting(0, 0, said(0)), sighting(1, 0, said(0), light=70)])
-    for n in range(1, 400):
-        echoes.judge([sighting(1, n, said(n), light=70)])
-        t_us = sighting(1, n, said(n)).frame.t_us - sighting(1, 0, said(0)).frame.t_us
-        assert echoes.echo_of(1) == (0 if t_us <= 1e6 else None)
-    # It is in sight again.
-    echoes.judge([sighting(0, 400, said(400)), sighting(1, 400, said(400), light=70)])
-    assert echoes.echo_of(1) == 0
+    for n in range(401):
+        image = sighting(1, n, said(n), light=70)
+        # The bar is in sight at first, and again at the end.
+        seen = [sighting(0, n, said(n)), image] if n in (0, 400) else [image]
+        t_us = image.t_us - sighting(1, 0, said(0)).t_us
+        assert judged(seen, echoes=echoes) == ({1: 0} if t_us <= 1e6 or n == 400 else {})
 
 
 def test_memory_is_bounded() -> None:
@@ -229,35 +206,13 @@ def test_memory_is_bounded() -> None:
         assert len(echoes._pairs) <= 3 + 2 * 8
 
 
-@given(st.permutations(range(4)), st.integers(0, 100))
-@settings(max_examples=40, deadline=None)
-def test_the_order_within_a_step_does_not_matter(order: list[int], seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    found = []
-    for way in (range(4), order):
-        echoes = Reflections(FORMAT, CODEWORDS)
-        rng = np.random.default_rng(seed)
-        for n in range(4):
-            every = [
-                sighting(k, n, misread(said(n), 8, rng), late_us=float(rng.integers(0, 5)), light=100 - k)
-                for k in range(4)
-            ]
-            echoes.judge([every[k] for k in way])
-        found.append([echoes.echo_of(k) for k in range(4)])
-    assert found[0] == found[1]
-
-
-def test_originals_against_every_choice() -> None:
-    """The one that the pairs favour most, by trying each; whoever was it before has a bonus."""
-    rng = np.random.default_rng(6)
-    for _ in range(200):
-        size = int(rng.integers(2, 5))
-        matrix = rng.normal(0, 4, (size, size))
-        matrix -= matrix.T
-        before = {int(rng.integers(0, size))} if rng.random() < 0.5 else set()
-        odds = {(i, j): float(matrix[i, j]) for i in range(size) for j in range(i + 1, size)}
-        score = [matrix[i].sum() / 2 + 1.0 * (i in before) for i in range(size)]
-        assert originals(range(size), odds, before) == int(np.argmax(score))
+def test_what_was_shown_then_and_there_is_known() -> None:
+    echoes = Reflections(FORMAT, CODEWORDS)
+    one = sighting(0, 3, said(3), x_px=300.0, y_px=350.0)
+    echoes.judge([one])
+    assert echoes.shown(one.t_us + 40, (304.0, 350.0))
+    assert not echoes.shown(one.t_us + 60, (304.0, 350.0))
+    assert not echoes.shown(one.t_us + 40, (306.0, 350.0))
 
 
 def test_the_queue_marks_what_the_next_step_tells() -> None:
@@ -283,104 +238,58 @@ def test_the_queue_marks_what_the_next_step_tells() -> None:
     assert not queue
 
 
-LINK = load_link()
-
-
-def reflected(
-    link_events: Events, *, right_px: int, down_px: int, missing: float, late_us: int, seed: int = 1
-) -> Events:
-    """The same events at another place, later, with some of them missing."""
-    rng = np.random.default_rng(seed)
-    kept = link_events[rng.random(len(link_events)) >= missing]
-    return Events.of(kept.t_us + late_us, kept.x + right_px, kept.y + down_px, kept.p)
-
-
-def rows(packets: list[Packet]) -> list[tuple[int, int, int, int | None, bytes]]:
-    return [
-        (f.transmitter, f.packet, f.frame, f.echo_of, f.soft.llr.tobytes()) for p in packets for f in p.frames
-    ]
-
-
-def received(events: Events, cuts: list[int] | None = None) -> list[Packet]:
-    receiver = Receiver(LINK)
-    packets: list[Packet] = []
-    edges = [0, *sorted(cuts or []), len(events)]
-    for start, end in pairwise(edges):
-        packets += receiver.feed(events[start:end])
-    packets += receiver.close()
-    counts = receiver.counts
-    found = sum(len(p.frames) for p in packets)
-    assert counts["frames"] == found
-    assert counts["frames_reflected"] == sum(len(p.frames) for p in packets if p.echo_of is not None)
-    assert counts["packets"] == len(packets)
-    return packets
+def reflected(events: Events, *, missing: float) -> Events:
+    """The same events 80 columns to the right, a little later, with some of them missing."""
+    kept = events[np.random.default_rng(1).random(len(events)) >= missing]
+    return Events.of(kept.t_us + 7, kept.x + 80, kept.y, kept.p)
 
 
 BAR = IdealBar(random_symbols(LINK, 3), shake_px=2.0)
 OWN = ideal_events(LINK, BAR)
-# A rail is lower than the bar: its image is cut. Nothing else tells events from the same ones, some missing.
-SCENE = merged(OWN, reflected(OWN[OWN.y < 370], right_px=80, down_px=20, missing=0.4, late_us=7))
+
+
+def by_side(events: Events) -> tuple[list[Packet], list[Packet]]:
+    """Packets on the bar's side of column 440, and on the other."""
+    receiver, packets = received(LINK, events)
+    counts = receiver.counts
+    assert counts["frames"] == len(frames_of(packets))
+    assert counts["frames_reflected"] == sum(len(p.frames) for p in packets if p.echo_of is not None)
+    assert counts["packets"] == len(packets)
+    assert all(f.echo_of == p.echo_of for p in packets for f in p.frames)
+    return [p for p in packets if p.frames[0].x_px < 440], [p for p in packets if p.frames[0].x_px > 440]
 
 
 def test_a_rail_shows_the_bar_again() -> None:
-    packets = received(SCENE)
-    of_bar = [p for p in packets if p.frames[0].x_px < 440]
-    of_rail = [p for p in packets if p.frames[0].x_px > 440]
-    assert sum(len(p.frames) for p in of_bar) == sum(len(p.frames) for p in of_rail) == 30
+    """It is lower than the bar: its image is cut. Nothing else tells events from the same ones."""
+    of_bar, of_rail = by_side(merged(OWN, reflected(OWN[OWN.y < 370], missing=0.4)))
+    assert len(frames_of(of_bar)) == len(frames_of(of_rail)) == 30
     (bar,), (rail,) = ({p.transmitter for p in part} for part in (of_bar, of_rail))
+    assert bar != rail
     assert {p.echo_of for p in of_bar} == {None}
     assert {p.echo_of for p in of_rail} == {bar}
-    assert bar != rail
-    for packet in of_bar:
-        assert packet.messages == ()
-        assert all(f.echo_of is None for f in packet.frames)
-
-
-@cache
-def whole() -> list[tuple[int, int, int, int | None, bytes]]:
-    return rows(received(SCENE))
-
-
-@given(st.lists(st.integers(0, len(SCENE)), max_size=40))
-@settings(max_examples=5, deadline=None)
-def test_any_split_gives_the_same(cuts: list[int]) -> None:
-    assert rows(received(SCENE, cuts)) == whole()
+    assert {p.messages for p in of_rail} == {()}
 
 
 def test_a_reflection_that_comes_and_goes() -> None:
     """It locks now and then: each time it is a reflection from its first frame on."""
-    long = IdealBar(random_symbols(LINK, 7))
-    own = ideal_events(LINK, long)
-    image = reflected(own, right_px=80, down_px=0, missing=0.4, late_us=5)
-    lit = (image.t_us // 60_000) % 2 == 1
-    packets = received(merged(own, image[lit]))
-    beside = [p for p in packets if p.frames[0].x_px > 440]
-    assert sum(len(p.frames) for p in beside) > 20
+    own = ideal_events(LINK, IdealBar(random_symbols(LINK, 7)))
+    image = reflected(own, missing=0.4)
+    of_bar, beside = by_side(merged(own, image[(image.t_us // 60_000) % 2 == 1]))
+    assert len(frames_of(beside)) > 20
     assert all(p.echo_of is not None for p in beside)
-    assert all(p.echo_of is None for p in packets if p not in beside)
+    assert all(p.echo_of is None for p in of_bar)
 
 
 def test_half_a_reflection() -> None:
     """Eight of sixteen clusters are mirrored, weaker than the bar: it is a reflection, or nothing."""
     image = ideal_events(LINK, replace(BAR, x_px=480.3), seed=2, missing=0.2)
-    packets = received(merged(OWN, image[image.y > 350]))
-    own = [p for p in packets if p.echo_of is None]
-    assert {p.frames[0].x_px < 440 for p in own} == {True}
-    assert sum(len(p.frames) for p in own) == 30
+    of_bar, beside = by_side(merged(OWN, image[image.y > 350]))
+    assert {p.echo_of for p in of_bar} == {None}
+    assert len(frames_of(of_bar)) == 30
+    assert all(p.echo_of is not None for p in beside)
 
 
 def test_two_bars_on_one_clock_are_two() -> None:
     other = replace(BAR, symbols=random_symbols(LINK, 3, seed=9), x_px=500.0)
-    packets = received(merged(OWN, ideal_events(LINK, other, seed=2)))
-    assert len({p.transmitter for p in packets}) == 2
-    assert {p.echo_of for p in packets} == {None}
-
-
-def test_what_was_shown_then_and_there_is_known() -> None:
-    echoes = Reflections(FORMAT, CODEWORDS)
-    one = sighting(0, 3, said(3), x_px=300.0, y_px=350.0)
-    echoes.judge([one])
-    t_us = one.frame.t_us
-    assert echoes.shown(t_us + 40, (304.0, 350.0))
-    assert not echoes.shown(t_us + 60, (304.0, 350.0))
-    assert not echoes.shown(t_us + 40, (306.0, 350.0))
+    sides = by_side(merged(OWN, ideal_events(LINK, other, seed=2)))
+    assert [{p.echo_of for p in side} for side in sides] == [{None}, {None}]

@@ -2,12 +2,12 @@
 
 from collections import Counter
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings, strategies as st
+from rx_streams import frames_of, received, right_frames, said
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
@@ -18,7 +18,7 @@ from evlcp_sdk.rx.multi import explained_us
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
-from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols, changed
 
 
 def named(name: str, **sections: dict[str, object]) -> Link:
@@ -35,7 +35,6 @@ LAMP = named(
     framing={"id": "uart", "parity": "even"},
     air={"chip_rate_hz": 5000.0},
 )
-FAST_LAMP = LAMP.with_air(chip_rate_hz=10_000.0)
 LEFT, RIGHT = 300.3, 800.7
 
 
@@ -47,89 +46,42 @@ def at(link: Link, x_px: float, seconds: float = 0.12, start_us: float = 5000.0)
     return bar, ideal_events(link, bar, seed=int(x_px))
 
 
-def received(
-    links: list[Link], events: Events, cuts: list[int] | None = None
-) -> tuple[Receiver, list[Packet]]:
-    receiver, packets = Receiver(links), []
-    ends = [*sorted(cuts or []), len(events)]
-    for start, end in zip([0, *ends], ends, strict=False):
-        packets += receiver.feed(events[start:end])
-    return receiver, packets + receiver.close()
-
-
 def right(packets: list[Packet], link: Link, bar: IdealBar) -> int:
-    """Frames of a bar that say what it sent; all frames in its place must, and name its link."""
-    chip_us, found = link.packet.chip_us, 0
-    starts = [link.packet.frame_start_chip(index) for index in range(link.packet.frames)]
-    for frame in (f for p in packets for f in p.frames if abs(f.x_px - bar.x_px) < 50):
-        assert frame.link == link.name
-        chip = (frame.t_us - bar.start_us) / chip_us
-        packet = int((chip - starts[frame.frame] + 5) // link.packet.packet_chips)
-        assert abs(chip - packet * link.packet.packet_chips - starts[frame.frame]) < 2
-        assert frame.soft.symbols.tolist() == bar.symbols[packet, frame.frame].tolist()
-        found += 1
-    return found
+    """Frames in a bar's place: all say what it sent, and name its link."""
+    here = [p for p in packets if abs(p.frames[0].x_px - bar.x_px) < 50]
+    assert {f.link for f in frames_of(here)} == {link.name}
+    near_us = 2 * link.packet.chip_us
+    return right_frames(here, bar, link, late_us=(-near_us, near_us))
 
 
-@pytest.mark.parametrize("other", [HALF, SLOW, WH8, LAMP], ids=lambda link: link.name)
-def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(other: Link) -> None:
-    one, here = at(BAR, LEFT)
-    two, there = at(other, RIGHT)
-    receiver, packets = received([BAR, other], merged(here, there))
-    assert right(packets, BAR, one) == len(one.symbols) * 10
+@pytest.mark.parametrize(
+    "links",
+    [(BAR, HALF), (BAR, SLOW), (BAR, WH8), (WH8, BAR), (BAR, LAMP)],
+    ids=lambda links: links[-1].name,
+)
+def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links: tuple[Link, Link]) -> None:
+    (one, here), (two, there) = at(links[0], LEFT), at(links[1], RIGHT)
+    receiver, packets = received(list(links), merged(here, there))
+    assert right(packets, links[0], one) == len(one.symbols) * 10
     # Of a character that the stream's start cuts, or whose packet's place is not told, nothing is said.
-    assert right(packets, other, two) >= (
-        len(two.symbols) * 10 - 2 if other is LAMP else len(two.symbols) * 10
-    )
-    assert {p.link for p in packets} == {"bar", other.name}
+    assert right(packets, links[1], two) >= len(two.symbols) * 10 - 2 * (links[1] is LAMP)
     numbers = {p.transmitter: p.link for p in packets}
-    assert Counter(numbers.values()) == {"bar": 1, other.name: 1}
+    assert Counter(numbers.values()) == {link.name: 1 for link in links}
     counts = receiver.counts
-    assert counts["frames"] == sum(len(p.frames) for p in packets)
+    assert counts["frames"] == len(frames_of(packets))
     # Fewer than are told in a warning: before a place is held, other links reject frames there.
     assert counts["frames_rejected"] < 10
-    assert receiver.link_counts["bar"]["frames"] == 10 * len(one.symbols)
-
-
-def test_the_order_of_the_links_does_not_matter() -> None:
-    one, here = at(BAR, LEFT)
-    two, there = at(WH8, RIGHT)
-    packets = received([WH8, BAR], merged(here, there))[1]
-    assert right(packets, BAR, one) == len(one.symbols) * 10
-    assert right(packets, WH8, two) == len(two.symbols) * 10
+    assert receiver.link_counts[links[0].name]["frames"] == 10 * len(one.symbols)
 
 
 def test_what_is_heard_alone_is_the_same_with_another_link_beside() -> None:
     events = merged(at(BAR, LEFT)[1], at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
-    alone = Receiver(BAR)
-    single = alone.feed(events) + alone.close()
-    both = received([BAR, SLOW], events)[1]
-    assert [text(p) for p in single] == [text(p) for p in both]
+    alone, single = received(BAR, events)
+    _, both = received([BAR, SLOW], events)
+    assert [said(changed(f, link="bar")) for f in frames_of(single)] == [said(f) for f in frames_of(both)]
     assert {p.link for p in single} == {""}
     assert {p.link for p in both} == {"bar"}
     assert alone.link_counts == {}
-
-
-def text(packet: Packet) -> str:
-    said = [(f.t_us, f.x_px, f.soft.llr.tobytes(), repr(f.range)) for f in packet.frames]
-    return repr((packet.transmitter, packet.packet, packet.t_us, packet.chip_us, said))
-
-
-STREAM = merged(at(BAR, LEFT, 0.08)[1], at(FAST_LAMP, RIGHT, 0.08)[1])
-
-
-@cache
-def whole() -> tuple[Receiver, list[Packet]]:
-    return received([BAR, WH8, FAST_LAMP], STREAM)
-
-
-@settings(max_examples=2, deadline=None)
-@given(st.lists(st.integers(0, len(STREAM)), max_size=12))
-def test_any_split_gives_the_same_packets(cuts: list[int]) -> None:
-    receiver, packets = received([BAR, WH8, FAST_LAMP], STREAM, cuts)
-    assert [(p.link, text(p)) for p in whole()[1]] == [(p.link, text(p)) for p in packets]
-    assert whole()[0].counts == receiver.counts
-    assert {p.link for p in packets} == {"bar", "lamp"}
 
 
 def test_a_place_that_is_left_is_free_for_another_link() -> None:
@@ -199,20 +151,27 @@ def test_what_a_packet_explains_is_the_time_of_symbols_that_are_right() -> None:
 LAMP_TABLE = "[bar]\nrows = 1\ncolumns = 1\ncluster_rows = 1\ncluster_columns = 1\n[ranging]\nid = 'none'\n"
 
 
+def lamps_received(folder: Path, scene: str, *others: Link) -> dict[str, Any]:
+    """What is summed up of a simulated scene with a lamp, received by its link and by others."""
+    (folder / "lamp.toml").write_text(LAMP_TABLE)
+    (folder / "scene.toml").write_text(scene)
+    simulate(folder / "scene.toml").save(folder / "scene.raw")
+    lamp = replace(load_link(folder / "lamp.toml"), name="lamp")
+    return receive_to_folder(folder / "scene.raw", None, [*others, lamp])
+
+
 @pytest.mark.parametrize("seed", [0, 2])
 def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed: int, tmp_path: Path) -> None:
     """A link of one cluster reads each part of a bar as a lamp, until the bar holds its place.
 
     In the second scene a region's last frames show that it is a part of another.
     """
-    (tmp_path / "lamp.toml").write_text(LAMP_TABLE)
-    (tmp_path / "scene.toml").write_text(
+    summary = lamps_received(
+        tmp_path,
         f"name = 'two'\nduration_s = 0.15\nseed = {seed}\n[motion]\ndistance_m = 40.0\n"
-        "[[bars]]\nx_m = -1.0\n[[bars]]\nx_m = 1.5\nlink = 'lamp.toml'\n"
+        "[[bars]]\nx_m = -1.0\n[[bars]]\nx_m = 1.5\nlink = 'lamp.toml'\n",
+        BAR,
     )
-    simulate(tmp_path / "scene.toml").save(tmp_path / "two.raw")
-    lamp = replace(load_link(tmp_path / "lamp.toml"), name="lamp")
-    summary = receive_to_folder(tmp_path / "two.raw", None, [BAR, lamp])
     of_lamp = summary["links"]["lamp"]["counts"]
     assert of_lamp["frames"] > 30
     assert of_lamp["frames_of_others"] > 80
@@ -222,28 +181,11 @@ def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed: int, tmp_path:
 
 def test_parts_of_bars_on_two_sides_of_one_take_nothing_off_it(tmp_path: Path) -> None:
     """A link of one cluster takes each part of two bars for a lamp, some of them between others."""
-    (tmp_path / "lamp.toml").write_text(LAMP_TABLE)
-    (tmp_path / "scene.toml").write_text(
-        "name='r'\n"
-        "duration_s=0.12\n"
-        "seed=575705\n"
-        "[motion]\n"
-        "distance_m=40.1\n"
-        "speed_mps=12.4\n"
-        "[[bars]]\n"
-        "x_m=-0.40\n"
-        "y_m=0.89\n"
-        "start_chip=75\n"
-        "[[bars]]\n"
-        "x_m=0.34\n"
-        "y_m=-0.87\n"
-        "start_chip=61\n"
-        "covered=[0,1,2,3,8]\n"
-        "[[bars]]\n"
-        "x_m=2.42\n"
-        "y_m=-0.99\n"
-        "link='lamp.toml'\n"
+    summary = lamps_received(
+        tmp_path,
+        "name='r'\nduration_s=0.12\nseed=575705\n[motion]\ndistance_m=40.1\nspeed_mps=12.4\n"
+        "[[bars]]\nx_m=-0.40\ny_m=0.89\nstart_chip=75\n"
+        "[[bars]]\nx_m=0.34\ny_m=-0.87\nstart_chip=61\ncovered=[0,1,2,3,8]\n"
+        "[[bars]]\nx_m=2.42\ny_m=-0.99\nlink='lamp.toml'\n",
     )
-    simulate(tmp_path / "scene.toml").save(tmp_path / "lamps.raw")
-    lamp = replace(load_link(tmp_path / "lamp.toml"), name="lamp")
-    assert receive_to_folder(tmp_path / "lamps.raw", None, [lamp])["status"] == "complete"
+    assert summary["status"] == "complete"

@@ -1,6 +1,5 @@
 """Time steps of a stream: the laws of the grid, against a loop over single events."""
 
-import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -136,36 +135,8 @@ def test_a_part_of_a_step_comes_when_it_is_due(seed: int, cuts: list[int], dues:
     assert found == want
 
 
-def test_a_part_comes_with_the_event_behind_it() -> None:
-    timeline = Timeline(STEP_US, WIDTH, HEIGHT)
-    assert not list(
-        timeline.feed(Events.of([1000, 1029], [1] * 2, [1] * 2, [1] * 2), lambda: False, lambda: 30)
-    )
-    (part,) = timeline.feed(Events.of([1030], [1], [1], [1]), lambda: False, lambda: 30)
-    assert (part.start_us, part.end_us, part.events.t_us.tolist(), part.whole) == (0, 30, [0, 29], False)
-    (whole,) = timeline.close()
-    assert whole.events.t_us.tolist() == [0, 29, 30]
-
-
 def test_a_stream_without_events_has_no_steps() -> None:
     off = Events.of([5, 6], [WIDTH, 0], [0, HEIGHT], [1, 1])
     steps, timeline = steps_of(Events.concat([Events.empty(), off]), [0, 1], waits=1)
     assert steps == []
     assert timeline.clock.counts["events"] == timeline.clock.counts["dropped_off_sensor"] == 2
-
-
-def test_a_leap_of_a_month_between_two_pieces_costs_nothing() -> None:
-    timeline = Timeline(STEP_US, WIDTH, HEIGHT)
-    t_us = np.arange(0, 20_000, 10)
-    one = Events.of(t_us, t_us * 0, t_us * 0, t_us * 0)
-    month_us = 30 * 86_400 * 10**6
-    other = Events.of(t_us + month_us, one.x, one.y, one.p)
-    tracemalloc.start()
-    steps = [s for e in (one, other) for s in timeline.feed(e, lambda: False)] + list(timeline.close())
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert sum(len(s.events) for s in steps) == 2 * len(t_us)
-    assert len(steps) <= 401
-    assert peak < 2e6
-    assert timeline.clock.counts["clock_leaps"] == 1
-    assert timeline.clock.camera_us(timeline.clock.last_us) == month_us + t_us[-1]

@@ -1,0 +1,212 @@
+"""Any split of a stream gives the same, and a frame is told as soon as its light is there."""
+
+from collections import Counter
+from dataclasses import replace
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from rx_streams import LINK, frames_of, received, said
+
+from evlcp_sdk.files import shipped
+from evlcp_sdk.io import read_events
+from evlcp_sdk.link.resolve import Link, load_link, resolve
+from evlcp_sdk.rx.detection import RegionFollower
+from evlcp_sdk.rx.limits import Limits
+from evlcp_sdk.rx.multi import EarlyFrames
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.scene.attitude import AttitudeLog
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
+from evlcp_sdk.values import Events, Frame, Packet, changed
+
+FEW_PILOTS = load_link(overrides=["air.pilot_every=4"])
+BAR, WH8 = (replace(resolve({"modulation": {"id": id}}), name=id) for id in ("wh4x2", "wh8"))
+LAMP = replace(
+    resolve(
+        {
+            "bar": {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1},
+            "framing": {"id": "uart", "parity": "even"},
+        }
+    ),
+    name="lamp",
+)
+OWN = ideal_events(LINK, IdealBar(random_symbols(LINK, 3), ppm=50, shake_px=6, shake_hz=12))
+OTHER = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1), 900.7, 300.2, start_us=19_350))
+BOTH = merged(OWN, OTHER, noise_events(120_000, 200_000))
+
+
+def few_pilots() -> Events:
+    return ideal_events(FEW_PILOTS, IdealBar(random_symbols(FEW_PILOTS, 3)))
+
+
+def recording() -> Events:
+    return read_events(shipped("recordings", "night-50m-30kmh-cut.raw"))
+
+
+def growing_together() -> Events:
+    """A bar comes nearer to another by a column a step."""
+    near = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 2), x_px=440, start_us=10_000))
+    moved = Events.of(near.t_us, near.x - np.minimum(near.t_us // 1500, 40), near.y, near.p)
+    return merged(ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1))), moved)
+
+
+def a_rail() -> Events:
+    """It shows the bar again, cut and with events missing."""
+    part = OWN[(OWN.y < 370) & (np.random.default_rng(1).random(len(OWN)) >= 0.4)]
+    return merged(OWN, Events.of(part.t_us + 7, part.x + 80, part.y + 20, part.p))
+
+
+def two_links() -> Events:
+    lamp = IdealBar(random_symbols(LAMP, 6), 800.7, cluster_px=4.0, width_px=2)
+    return merged(ideal_events(BAR, IdealBar(random_symbols(BAR, 2), 300.3)), ideal_events(LAMP, lamp))
+
+
+def crowd() -> Events:
+    """Eight blinking blobs, a bar and noise: more than small limits let in."""
+    blobs = [
+        ideal_events(LINK, IdealBar(random_symbols(LINK, 3, n), 60.0 * n, 120, 0.6, 3, start_us=300 * n))
+        for n in range(1, 9)
+    ]
+    return merged(OWN, *blobs, noise_events(1_700_000, 120_000))
+
+
+T_US = np.linspace(0, 50_000, 50)
+LOG = AttitudeLog(T_US, 3 * np.sin(T_US / 15_000), 0 * T_US, None, np.full(50, 0.2), np.full(50, 0.5))
+
+LIMITED = ("dropped_crowded", "steps_forgotten", "dropped_no_room", "regions_gave_way", "areas_left_out")
+SCENES = {
+    "two bars": (LINK, lambda: BOTH, {}, {"frames": 60}),
+    "few pilots": (FEW_PILOTS, few_pilots, {}, {"frames": 30}),
+    "growing together": (LINK, growing_together, {}, {"regions_opened": 2, "regions_released": 1}),
+    "a rail": (LINK, a_rail, {}, {"frames_reflected": 30}),
+    "two links": ([BAR, WH8, LAMP], two_links, {}, {"packets": 7, "frames_of_others": 1}),
+    "small limits": (
+        LINK,
+        crowd,
+        {"limits": Limits(22_000, 1_500_000, 700_000, 6, 5, 4)},
+        dict.fromkeys(LIMITED, 1),
+    ),
+    "a recording": (LINK, recording, {}, {"frames": 20}),
+    "an attitude that ends": (LINK, lambda: BOTH, {"attitude": LOG}, {"frames": 60}),
+}
+"""Links, events, what the receiver is told beside, and what it counts at the least."""
+
+
+@pytest.mark.parametrize("scene", SCENES)
+def test_any_split_gives_the_same(scene: str) -> None:
+    """Each frame is told once and in order; it is that of its packet, but for what is known later."""
+    link, events, options, least = SCENES[scene]
+    events, found = events(), []
+    random = [np.random.default_rng(many).integers(0, len(events), many) for many in (3, 40)]
+    slices = events.t_us.searchsorted(np.arange(1000, int(events.t_us[-1]), 1000))
+    for cuts in ([], *random, slices):
+        told: list[Frame] = []
+        receiver, packets = received(link, events, cuts, on_frame=told.append, **options)
+        whole = [(p.t_us, p.chip_us, p.link, p.echo_of, [said(f) for f in p.frames]) for p in packets]
+        found.append(([said(frame) for frame in told], whole, receiver.counts))
+    assert found[1:] == found[:1] * 3
+    counts = receiver.counts
+    assert {name: counts[name] for name in least if counts[name] < least[name]} == {}
+    assert {said(f)[:-1] for f in frames_of(packets)} <= {said(f)[:-1] for f in told}
+    assert len(told) == counts["frames"] + counts["frames_at_end"] >= 10
+    for number in {f.transmitter for f in told}:
+        order = [(f.packet, f.frame) for f in told if f.transmitter == number]
+        assert order == sorted(set(order))
+
+
+def lateness(frames: list[tuple[Frame, int]], events: Events) -> list[float]:
+    """How long after the last edge of each frame the events reach that were fed when it was told, us."""
+    long_us = LINK.packet.frame_chips * LINK.packet.chip_us
+    return [float(events.t_us[fed - 1]) - frame.t_us - long_us for frame, fed in frames]
+
+
+def told_by_slices(
+    links: Link | list[Link], events: Events, slice_us: int
+) -> tuple[list[tuple[Frame, int]], list[Packet]]:
+    """Frames as they are told, each with how many events were fed by then; and the packets."""
+    cuts = events.t_us.searchsorted(np.arange(0, int(events.t_us[-1]), slice_us)).tolist()
+    frames: list[tuple[Frame, int]] = []
+    receiver, packets = Receiver(links, on_frame=lambda frame: frames.append((frame, fed))), []
+    for begin, fed in pairwise([*cuts, len(events)]):
+        packets += receiver.feed(events[begin:fed])
+    return frames, packets + receiver.close()
+
+
+def test_a_frame_is_told_with_the_slice_that_ends_it() -> None:
+    frames, _ = told_by_slices(LINK, BOTH, 250)
+    # Those before the first lock have been there for long. Events are 20 to 30 us late; it waits half a chip.
+    after = lateness([one for one in frames if one[0].packet > 0], BOTH)
+    assert len(after) >= 36
+    assert min(after) > 0
+    assert max(after) < 100 + 250
+
+
+def test_frames_from_before_the_first_lock_come_a_few_a_step() -> None:
+    """Each step gives one frame that ends in it and two older ones, until none is left."""
+    events = ideal_events(LINK, IdealBar(random_symbols(LINK, 2), start_us=-5_000))
+    frames, _ = told_by_slices(LINK, events, LINK.regions.step_us)
+    a_slice = list(Counter(fed for _, fed in frames).values())
+    assert a_slice[:3] == [3, 3, 3]
+    # A slice may hold the end of one step and what is due in the next.
+    assert max(a_slice[3:]) <= 2
+    assert [f.frame for f, _ in frames] == [*range(1, 10), *range(10)]
+
+
+def test_of_several_links_a_frame_comes_at_once_where_its_transmitter_holds_its_place() -> None:
+    left = ideal_events(BAR, IdealBar(random_symbols(BAR, 7), 300.3))
+    events = merged(left, ideal_events(WH8, IdealBar(random_symbols(WH8, 7), 800.7), seed=1))
+    frames, _ = told_by_slices([BAR, WH8], events, 250)
+    assert Counter(frame.link for frame, _ in frames) == {"wh4x2": 70, "wh8": 70}
+    late_us = [max(lateness([f for f in frames if f[0].packet == n], events)) for n in range(7)]
+    # The first packets wait for their judgement, the last ones for nothing.
+    assert late_us[0] > 60_000
+    assert max(late_us[4:6]) < 100 + 250
+
+
+def test_frames_that_another_link_takes_are_counted_where_they_were_told() -> None:
+    one = frames_of(received(LINK, OWN)[1])[0]
+    packets = [
+        Packet(5, n, 0.0, 100.0, tuple(changed(one, transmitter=5, packet=n, frame=k) for k in range(2)), 2)
+        for n in range(3)
+    ]
+    found: list[tuple[int, int]] = []
+    early = EarlyFrames(lambda frame: found.append((frame.packet, frame.frame)))
+    for frame in (*packets[0].frames, *packets[1].frames):
+        early.decoded(frame, owns=False)
+    early.refused(packets[0])
+    early.decoded(packets[2].frames[0], owns=False)
+    assert found == []
+    early.given(packets[1], owns=True)
+    assert found == [(1, 0), (1, 1), (2, 0)]
+    early.decoded(packets[2].frames[1], owns=True)
+    assert found == [(1, 0), (1, 1), (2, 0), (2, 1)]
+    assert early.withdrawn == 0
+    early.refused(packets[2])
+    assert (len(found), early.withdrawn) == (4, 2)
+
+
+def test_a_look_ahead_leaves_no_trace_in_the_regions() -> None:
+    """Regions that are shown parts of each step go on as those that are not."""
+    one, two = (RegionFollower(LINK.regions, LINK.camera, LINK.packet.chip_us) for _ in range(2))
+    step_us, ahead = LINK.regions.step_us, 0
+    bounds = np.searchsorted(BOTH.t_us, np.arange(0, 60_000, step_us))
+    for step, (a, b) in enumerate(pairwise(bounds.tolist())):
+        start_us, events = step * step_us, BOTH[a:b]
+        for until_us in (start_us + 400, start_us + 1300):
+            part = events[: np.searchsorted(events.t_us, until_us)]
+            places = [len(region.positions) for region in two.alive]
+            with two.ahead(start_us, until_us, part, {region.id for region in two.alive}):
+                for region, before in zip(two.alive, places, strict=True):
+                    # Soon after the start of a step its beginning says nothing new of the place.
+                    ahead += (moved := len(region.positions) - before)
+                    assert moved <= (until_us == start_us + 1300)
+                    assert region.pieces[-1][0] == start_us
+                    assert region.pieces[-1][1].t_us.max(initial=0) < until_us
+        for mine, other in zip(one.step(start_us, events), two.step(start_us, events), strict=True):
+            assert [vars(p) for p in mine.positions] == [vars(p) for p in other.positions]
+            assert (mine.latest, mine.heights) == (other.latest, other.heights)
+            assert [(t, e.t_us.tolist()) for t, e in mine.pieces] == [
+                (t, e.t_us.tolist()) for t, e in other.pieces
+            ]
+            assert mine.held_bytes == other.held_bytes
+    assert ahead > 40
