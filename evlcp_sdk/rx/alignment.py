@@ -54,23 +54,19 @@ class AlignedFrame:
     """A frame with the bar held still.
 
     Attributes:
+        pilot: The pilot that it goes by, its own if it has one.
         sums_and_next: Polarity sums of pilot and info segment, and of the chips after the frame
             (`Codebook.chips_after`), int16 (chips, height, width).
         offset_px: The rest of the motion in pilot and info segment, float64 (2, chips), px.
-        presence: Where the clusters are, in their footprints only.
-        placement: Where the image shows the layout.
-        others: Other instances of it in the image.
         corner_px: Column and row on the sensor of the image's pixel (0, 0) in the chip that starts at
             `middle_us`.
         middle_us: Middle of the pilot, or of the info segment of a frame without one, where a chip starts: a
             chip's events show the image at its first edge.
     """
 
+    pilot: Pilot
     sums_and_next: NDArray[np.int16]
     offset_px: NDArray[np.float64]
-    presence: PresenceMap
-    placement: Placement
-    others: tuple[Placement, ...]
     corner_px: tuple[float, float]
     middle_us: float
 
@@ -82,7 +78,7 @@ class AlignedFrame:
     @property
     def centre_px(self) -> tuple[float, float]:
         """Column and row on the sensor of the bar's centre at that time, whatever part of it is seen."""
-        centre = self.placement.shift + complex(*self.corner_px)
+        centre = self.pilot.placement.shift + complex(*self.corner_px)
         return centre.real, centre.imag
 
 
@@ -122,18 +118,13 @@ class FrameAligner:
             np.arange(packet.frame_chips + self._after, dtype=np.float64) + 0.5
         )
 
-    def align(
-        self, region: Followed, due: DueFrame, pilot: Pilot | None
-    ) -> tuple[AlignedFrame | None, Pilot | None]:
-        """Hold a frame's image still, and find its clusters.
+    def align(self, region: Followed, due: DueFrame, pilot: Pilot | None) -> AlignedFrame | None:
+        """Hold a frame's image still, and find its clusters; None if it does not show them.
 
         Args:
             region: The bar's.
             due: Which frame.
             pilot: The newest one of the bar that showed it.
-
-        Returns:
-            The frame, None if it does not show its clusters; and the newest pilot that showed the bar.
         """
         lock, packet = due.lock, self._packet
         middles: NDArray[np.float64] = due.start_us + self._halves[: due.chips + self._after] * lock.chip_us
@@ -143,7 +134,7 @@ class FrameAligner:
         if due.has_pilot:
             size = self._size(*region.positions.size_at(chip_us))
         elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
-            return None, pilot
+            return None
         else:
             size = pilot.size_px
         pieces = [e for t, e in region.pieces if t < due.read_us and t + self._spec.step_us > due.start_us]
@@ -154,11 +145,11 @@ class FrameAligner:
             before = pilot.placement if pilot is not None else None
             found = placements(presence, self._layout, before, _LEAST_CLUSTERS)
             if not found:
-                return None, pilot
+                return None
             presence = masked(presence, self._layout, found[0])
             presence, placement = lit(heard, self._edges, self._every, presence, found[0])
             if True not in placement.seen.tolist():
-                return None, pilot
+                return None
             pilot = Pilot(due.number, size, heard, moved, presence, placement, tuple(found[1:]))
         else:
             assert pilot is not None
@@ -180,23 +171,14 @@ class FrameAligner:
             centre_y - (size[1] - 1) / 2 - sum(rests_y) / many,
         )
         middle_us = chip_us - lock.chip_us / 2
-        aligned = AlignedFrame(
-            sums,
-            offset_px[:, :chips],
-            pilot.presence,
-            pilot.placement,
-            pilot.others,
-            corner_px,
-            middle_us,
-        )
-        return aligned, pilot
+        return AlignedFrame(pilot, sums, offset_px[:, :chips], corner_px, middle_us)
 
     def centre(self, aligned: AlignedFrame, points_px: NDArray[np.float64]) -> tuple[float, float]:
         """Column and row of the bar's centre on the sensor, px, by its clusters' points, float64 (K, 2).
 
         Points are finer than the cells that placed the layout; without any, those count.
         """
-        placed = aligned.placement
+        placed = aligned.pilot.placement
         places = placed.places(self._layout).tolist()
         off = [complex(*at) - place for at, place in zip(points_px.tolist(), places, strict=True)]
         off = [one for one in off if isfinite(one)]
@@ -227,15 +209,15 @@ class FrameAligner:
         They would be measured by what is left of them, nearer to the others than they are: those whose
         middle is nearer to it than half a spacing. A line of clusters stays as it is.
         """
-        if self._layout.line or aligned.placement.scale == 0:
-            return aligned.presence
-        places, right_px, down_px = self._spots(aligned, aligned.placement)
+        presence, placement = aligned.pilot.presence, aligned.pilot.placement
+        if self._layout.line or placement.scale == 0:
+            return presence
+        places, right_px, down_px = self._spots(aligned, placement)
         x, y = places.real + aligned.corner_px[0], places.imag + aligned.corner_px[1]
         width, height = self._sensor_px
         cut = (x < right_px) | (x > width - 1 - right_px) | (y < down_px) | (y > height - 1 - down_px)
         if not cut.any():
-            return aligned.presence
-        presence = aligned.presence
+            return presence
         images = {name: getattr(presence, name) for name in ("probability", "selected", "pixels", "prior")}
         kept = {name: image.copy() for name, image in images.items() if image is not None}
         for image in kept.values():
@@ -247,7 +229,7 @@ class FrameAligner:
 
         None where it shows both ends.
         """
-        placement = aligned.placement
+        placement = aligned.pilot.placement
         if placement.scale == 0 or False not in placement.seen.tolist():
             return None
         places, _, down_px = self._spots(aligned, placement)
@@ -265,9 +247,10 @@ class FrameAligner:
         float64 (n, 2); None where there is one strip, or none that is dark for as far as a bar may move in a
         step lies between two.
         """
-        if not self._apart or aligned.placement.scale == 0:
+        placement = aligned.pilot.placement
+        if not self._apart or placement.scale == 0:
             return None
-        places, right_px, _ = self._spots(aligned, aligned.placement)
+        places, right_px, _ = self._spots(aligned, placement)
         across = np.sort(places.real)
         ends = np.flatnonzero(np.diff(across) > 2 * (right_px + MARGIN_PX))
         if not len(ends):
@@ -280,8 +263,8 @@ class FrameAligner:
         self, aligned: AlignedFrame, placement: Placement
     ) -> tuple[NDArray[np.complex128], float, float]:
         """Where an instance's clusters are in the image, and how far each reaches to its sides, px."""
-        selected, grid = aligned.presence.selected, aligned.presence.grid_px
-        own, layout = aligned.placement, self._layout
+        selected, grid = aligned.pilot.presence.selected, aligned.pilot.presence.grid_px
+        own, layout = aligned.pilot.placement, self._layout
         if own.scale == 0:
             row, column = np.nonzero(selected.any(0))
             places = (column + 1j * row) * grid + (grid - 1) / 2 * (1 + 1j)

@@ -11,7 +11,7 @@ import numpy as np
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Detector
 from evlcp_sdk.rx.detection import BACKFILL_STEPS
-from evlcp_sdk.rx.followed import Followed, same_place
+from evlcp_sdk.rx.followed import Followed, make_room, same_place
 from evlcp_sdk.rx.framer import RegionTracker
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
@@ -81,7 +81,7 @@ class DetectedRegions(RegionTracker):
         for followed in self.alive:
             followed.add(start_us, _inside(events, followed.latest))
         self._remember(start_us, events)
-        self._make_room()
+        self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, self._step_us)
         seen = list(self.alive)
         self.alive = [followed for followed in self.alive if not followed.released]
         return seen
@@ -93,17 +93,6 @@ class DetectedRegions(RegionTracker):
         self._recent.append((start_us, events))
         while sum(held_bytes(held) for _, held in self._recent) > self._limits.recent_bytes:
             self._recent.popleft()
-
-    def _make_room(self) -> None:
-        """Forget the oldest events where all together take too much."""
-        while sum(f.held_bytes for f in self.alive) > self._limits.region_bytes:
-            held = [followed for followed in self.alive if len(followed.pieces) > 1]
-            if not held:
-                return
-            oldest = min(held, key=lambda followed: followed.pieces[0][0])
-            start_us, many = oldest.forget()
-            self.counts["dropped_no_room"] += many
-            oldest.cut_us = oldest.first_us = start_us + self._step_us
 
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.followed import SAME_PX, Followed, Piece, same_place
+from evlcp_sdk.rx.followed import SAME_PX, Followed, Piece, make_room, same_place
 from evlcp_sdk.rx.framer import RegionTracker
 from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
 from evlcp_sdk.rx.places import Places, region_of
@@ -126,14 +126,13 @@ class RegionFollower(RegionTracker):
         rises = self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
         end_us = start_us + spec.step_us
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
-        selected = self._select(events, boxes)
-        for followed, box, inside in zip(self.alive, self._own(boxes), selected, strict=True):
-            followed.add(start_us, inside)
-            rows = np.empty(box[3] - box[1], np.int64)
-            measured = self._measure(followed, box, end_us, rows)
-            if measured is not None:
-                measured = self._whole(followed, measured, box[1], rows)
-                followed.filter, place = self._filtered(followed, measured)
+        for followed, box, own in zip(self.alive, boxes, self._own(boxes), strict=True):
+            inside = select(events, box)
+            # Before a frame shows where in its box a bar is, panels and moving textures around it would drown
+            # it: only what blinks in rhythm counts.
+            followed.add(start_us, inside if followed.size_px else self._rhythm.of(inside))
+            if (found := self._locate(followed, own, end_us)) is not None:
+                followed.filter, place = found
                 followed.positions.append(place)
         if len(self.alive) > 1:
             self._merge()
@@ -174,8 +173,12 @@ class RegionFollower(RegionTracker):
             self._rhythm.step(start_us, events, self._hits, _CELL_SHIFT)
             boxes = self._boxes(start_us + self._spec.step_us / 2, ())
             for followed, own in zip(self.alive, self._own(boxes), strict=True):
-                if followed.id in meant and (place := self._glance(followed, own, until_us)):
-                    followed.positions.append(place)
+                if followed.id not in meant:
+                    continue
+                heights = followed.heights.copy()
+                if (found := self._locate(followed, own, until_us)) is not None:
+                    followed.positions.append(found[1])
+                followed.heights = heights
         self._recent.append((start_us, events))
         yield
         self._recent.pop()
@@ -187,17 +190,6 @@ class RegionFollower(RegionTracker):
             if followed.positions.latest.t_us == seen_us:
                 followed.positions.take_back()
 
-    def _glance(self, followed: Followed, box: Box, now_us: int) -> Region | None:
-        """Where a region of known size is in the middle of a step."""
-        rows = np.empty(box[3] - box[1], np.int64)
-        measured = self._measure(followed, box, now_us, rows)
-        if measured is None:
-            return None
-        heights = followed.heights.copy()
-        measured = self._whole(followed, measured, box[1], rows)
-        followed.heights = heights
-        return self._filtered(followed, measured)[1]
-
     def _boxes(self, t_us: float, taken: Sequence[Region]) -> list[Box]:
         """Where each region should be in the middle of a step; one of unknown size beside the others."""
         places = []
@@ -205,7 +197,7 @@ class RegionFollower(RegionTracker):
             last = followed.positions.latest
             places.append((*self._expected(followed, t_us), last.width_px, last.height_px))
         boxes = [self._reach(*place) for place in places]
-        if self._all_known():
+        if None not in [followed.size_px for followed in self.alive]:
             return boxes
         known = [_box_of(place) for place in taken]
         known += [_tight(*place) for place, one in zip(places, self.alive, strict=True) if one.size_px]
@@ -232,10 +224,6 @@ class RegionFollower(RegionTracker):
             box if bar is None else _cut_off(box, bar, bars) for box, bar in zip(boxes, tight, strict=True)
         ]
 
-    def _all_known(self) -> bool:
-        """Whether frames have shown the size of all."""
-        return None not in [followed.size_px for followed in self.alive]
-
     def _let_go(self) -> None:
         """Follow those no more that are released."""
         lost = [followed for followed in self.alive if followed.released and followed.size_px is not None]
@@ -244,14 +232,6 @@ class RegionFollower(RegionTracker):
             # A bar that was seen in what another was taken for is no halo when it is seen again.
             if any(_lies_in_outgrown(followed, gone.latest) for gone in lost):
                 followed.outgrown = None
-
-    def _select(self, events: Events, boxes: list[Box]) -> list[Events]:
-        """The events of a step inside the box of each region; those that it listens to."""
-        inside = (select(events, box) for box in boxes)
-        return [
-            part if one.size_px else self._rhythm.of(part)
-            for one, part in zip(self.alive, inside, strict=True)
-        ]
 
     def _remember(self, start_us: int, events: Events) -> None:
         """Keep a step's events of the whole image, and as many before it as there is room for."""
@@ -267,21 +247,8 @@ class RegionFollower(RegionTracker):
 
     def _make_room(self) -> None:
         """Forget the oldest events of regions where all together take too much."""
-        spare = self._limits.region_bytes
-        for followed in self.alive:
-            spare -= followed.held_bytes
-        while spare < 0:
-            held = [followed for followed in self.alive if len(followed.pieces) > 1]
-            if not held:
-                return
-            oldest_us = min(followed.pieces[0][0] for followed in held)
-            for followed in held:
-                if spare < 0 and followed.pieces[0][0] == oldest_us:
-                    before = followed.held_bytes
-                    _, many = followed.forget()
-                    spare += before - followed.held_bytes
-                    self.counts["dropped_no_room"] += many
-                    followed.cut_us = followed.first_us = oldest_us + self._spec.step_us
+        most_bytes, step_us = self._limits.region_bytes, self._spec.step_us
+        self.counts["dropped_no_room"] += make_room(self.alive, most_bytes, step_us)
 
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""
@@ -382,7 +349,7 @@ class RegionFollower(RegionTracker):
             followed.cut_us = followed.first_us = self._recent[0][0]
         followed.pieces = deque((start, events) for start, events in self._recent if start >= since_us)
         self.gather(followed)
-        followed.hold(deque((start, self._rhythmic(events)) for start, events in followed.pieces))
+        followed.hold(deque((start, self._rhythm.of(events)) for start, events in followed.pieces))
         self.drop(other)
 
     def beside(
@@ -408,13 +375,6 @@ class RegionFollower(RegionTracker):
         room = len(self.alive) < self._limits.regions
         self.counts["regions_left_out"] += not room
         return room
-
-    def _rhythmic(self, events: Events) -> Events:
-        """Those of pixels that blink in rhythm.
-
-        Before a frame shows where in its box a bar is, panels and moving textures around it would drown it.
-        """
-        return self._rhythm.of(events)
 
     def _expected(self, followed: Followed, t_us: float) -> tuple[float, float]:
         """Where a region's centre should be soon: by its filter, or else straight on."""
@@ -465,8 +425,13 @@ class RegionFollower(RegionTracker):
         size_px = known or (measured.width_px, height_px + min(max(excess_px, 0.0), _STRAY_PX))
         return region_of(measured.id, measured.t_us, measured.x_px, y_px - off_px, *size_px)
 
-    def _filtered(self, followed: Followed, measured: Region) -> tuple[Any, Region]:
-        """State of a region's filter after a measurement, and its place by it."""
+    def _locate(self, followed: Followed, box: Box, now_us: int) -> tuple[Any, Region] | None:
+        """State of a region's filter after it was measured in a box, and its place by it; None if unseen."""
+        rows = np.empty(box[3] - box[1], np.int64)
+        seen = self._measure(followed, box, now_us, rows)
+        if seen is None:
+            return None
+        measured = self._whole(followed, seen, box[1], rows)
         if self._position is None:
             return followed.filter, measured
         centre = np.array([measured.x_px, measured.y_px])
@@ -579,7 +544,7 @@ class RegionFollower(RegionTracker):
             return
         self._next_id += 1
         for like in self.alive:
-            if _left_by(like, region):
+            if like.outgrown and region.t_us <= like.outgrown[4] and _lies_in_outgrown(like, region):
                 # It was seen as long as the one that it was taken to be a part of.
                 right, down = region.x_px - like.latest.x_px, region.y_px - like.latest.y_px
                 size_px = region.width_px, region.height_px
@@ -591,7 +556,7 @@ class RegionFollower(RegionTracker):
                 self.alive.append(followed)
                 return
         recent = list(self._recent)[-BACKFILL_STEPS:]
-        pieces = deque((start, self._rhythmic(select(events, reach))) for start, events in recent)
+        pieces = deque((start, self._rhythm.of(select(events, reach))) for start, events in recent)
         state = self._position.init() if self._position else None
         self.alive.append(
             Followed(region.id, Places([region]), pieces[0][0], pieces, filter=state, opened_us=end_us)
@@ -675,13 +640,6 @@ def _outgrown(followed: Followed) -> tuple[float, float, float, float]:
     right, down, width, height, _ = followed.outgrown
     last = followed.latest
     return last.x_px + right, last.y_px + down, width, height
-
-
-def _left_by(like: Followed, region: Region) -> bool:
-    """Whether a region lies in what another was lately taken for, before a frame showed its size."""
-    if like.outgrown is None or region.t_us > like.outgrown[4]:
-        return False
-    return _lies_in_outgrown(like, region)
 
 
 def _lies_in_outgrown(like: Followed, region: Region) -> bool:

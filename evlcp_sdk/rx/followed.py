@@ -1,6 +1,7 @@
 """A region that is followed, with its events."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -74,11 +75,11 @@ class Followed:
         self.pieces.append((start_us, events))
         self.held_bytes += held_bytes(events)
 
-    def forget(self) -> tuple[int, int]:
-        """Drop the events of the oldest step; its start, us, and how many they were."""
-        start_us, events = self.pieces.popleft()
+    def forget(self) -> int:
+        """Drop the events of the oldest step; how many they were."""
+        _, events = self.pieces.popleft()
         self.held_bytes -= held_bytes(events)
-        return start_us, len(events)
+        return len(events)
 
     def take_back(self) -> None:
         """Drop the newest events, as if they had not been added."""
@@ -118,6 +119,25 @@ class Followed:
         while self.pieces and self.pieces[0][0] + step_us <= t_us:
             self.forget()
         self.positions.forget_before(places_us)
+
+
+def make_room(regions: Sequence[Followed], most_bytes: int, step_us: int) -> int:
+    """Forget the oldest events of regions where all together take too much; how many they were."""
+    spare, dropped = most_bytes, 0
+    for followed in regions:
+        spare -= followed.held_bytes
+    while spare < 0:
+        held = [followed for followed in regions if len(followed.pieces) > 1]
+        if not held:
+            break
+        oldest_us = min(followed.pieces[0][0] for followed in held)
+        for followed in held:
+            if spare < 0 and followed.pieces[0][0] == oldest_us:
+                spare += followed.held_bytes
+                dropped += followed.forget()
+                spare -= followed.held_bytes
+                followed.cut_us = followed.first_us = oldest_us + step_us
+    return dropped
 
 
 def same_place(one: Region, other: Region) -> bool:

@@ -2,7 +2,7 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count
 from typing import ClassVar
@@ -132,14 +132,13 @@ class Framer(ABC):
         """Decode the frames that are due in the part so far of a time step, if there can be any."""
         return
 
-    @property
     @abstractmethod
-    def places(self) -> dict[int, Region]:
-        """Where the transmitters are that have a number and are in sight, by number."""
+    def number_of(self, region: Followed) -> int | None:
+        """Number of a region's transmitter; None before its first frame."""
 
     @abstractmethod
-    def leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
-        """Let regions go in places that are others', but for those of transmitters that hold theirs."""
+    def let_go(self, region: Followed) -> None:
+        """Forget a region that is no more followed, as its place is another's."""
 
     def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
         """Count no frame that was not read where another link's packet was; return how many they were.

@@ -2,7 +2,6 @@
 
 import math
 from collections import Counter, deque
-from collections.abc import Collection, Sequence
 from enum import StrEnum
 
 import numpy as np
@@ -16,7 +15,7 @@ from evlcp_sdk.rx.detection import MARGIN_PX, RegionFollower
 from evlcp_sdk.rx.followed import SAME_PX, Followed, same_place
 from evlcp_sdk.rx.framer import Framer, LitTimes, RegionTracker, StreamContext
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.reading import FrameReader, ReadableFrame, Reading
+from evlcp_sdk.rx.reading import FrameReader
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer, Steps
 from evlcp_sdk.rx.timeline import TimeStep
@@ -185,20 +184,10 @@ class PacketFraming(Framer):
             for transmitter in due:
                 self._decode_ahead(transmitter, until_us)
 
-    @property
-    def places(self) -> dict[int, Region]:
-        """Where the transmitters are that have a number and are in sight, by number."""
-        return self._transmitters.places
-
-    def leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
-        """Let regions go in places that are others', but for those of transmitters that hold theirs."""
-        for region in list(self._regions.alive):
-            known = region in self._transmitters
-            if known and self._transmitters[region].number in owning:
-                continue
-            if any(same_place(region.latest, place) for place in taken):
-                self._regions.drop(region)
-                self._let_go(region)
+    def number_of(self, region: Followed) -> int | None:
+        """Number of a region's transmitter; None before its first frame."""
+        transmitter = self._transmitters.of(region)
+        return None if transmitter is None else transmitter.number
 
     def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
         """Count no frame that was not read where another link's packet was; return how many they were."""
@@ -229,12 +218,12 @@ class PacketFraming(Framer):
 
     def _hear(self, region: Followed, step: TimeStep) -> Transmitter:
         """Listen to a region's events of a time step, or to all that it has if it is new."""
-        new = region not in self._transmitters
-        if new:
+        transmitter, pieces = self._transmitters.of(region), [region.pieces[-1]]
+        if transmitter is None:
             self.counts["regions_opened"] += 1
-            self._transmitters.open(region, self._steps.sync_init(), self._steps.distance_init())
-        transmitter = self._transmitters[region]
-        for start_us, events in list(region.pieces) if new else [region.pieces[-1]]:
+            sync, distance = self._steps.sync_init(), self._steps.distance_init()
+            transmitter, pieces = self._transmitters.open(region, sync, distance), list(region.pieces)
+        for start_us, events in pieces:
             self.counts["events_in_regions"] += events.t_us.size
             until_us = min(start_us + self._step_us, step.end_us)
             transmitter.sync, locks = self._steps.synchronize(transmitter.sync, events, until_us)
@@ -297,7 +286,7 @@ class PacketFraming(Framer):
         transmitter.grid.frame += 1
         self._lit_in(transmitter, due)
         self.counts["frames"] += 1
-        self._queue.add(transmitter.packets, due, found)
+        self._queue.add(transmitter.packets, found)
 
     def _lit_in(self, transmitter: Transmitter, due: DueFrame) -> None:
         """Note that a transmitter's light is there in a frame that is due."""
@@ -308,13 +297,6 @@ class PacketFraming(Framer):
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> FrameDetection | Skipped:
         """Read a frame, or say why it is not given."""
-        shown = self._readable(transmitter, due)
-        if isinstance(shown, Skipped):
-            return shown
-        return self._frame_of(transmitter, due, shown, self._reader.read(shown))
-
-    def _readable(self, transmitter: Transmitter, due: DueFrame) -> ReadableFrame | Skipped:
-        """What is to be read of a frame, or why there is nothing."""
         self._announcer.start()
         aligned = self._align(transmitter, due)
         if aligned is None:
@@ -322,18 +304,12 @@ class PacketFraming(Framer):
         if transmitter.number is None and self._reflections.shown(due.start_us, aligned.centre_px):
             # The same bar once more: where the first region was then is not known as well as what it showed.
             self._regions.drop(transmitter.region)
-            self._let_go(transmitter.region)
+            self.let_go(transmitter.region)
             return Skipped.REJECTED
         ranged = due.has_pilot and self._is_ranged()
         attitude = self._attitude_at(self._clock.camera_us(aligned.middle_us)) if due.has_pilot else None
-        return ReadableFrame(
-            aligned, due.index, due.has_pilot, self._before(transmitter, due), ranged, attitude
-        )
-
-    def _frame_of(
-        self, transmitter: Transmitter, due: DueFrame, shown: ReadableFrame, reading: Reading
-    ) -> FrameDetection | Skipped:
-        """A frame by what was read of it, or why it is not given."""
+        before = self._before(transmitter, due)
+        reading = self._reader.read(aligned, due, before, attitude, ranged=ranged)
         transmitter.said = due.number, reading.symbols
         distance, soft = reading.distance, reading.soft
         self.counts["frames_askew"] += reading.sight.askew
@@ -363,12 +339,12 @@ class PacketFraming(Framer):
             points_px=reading.points_px,
             points_sigma_px=reading.sigma_px,
             points_flank_px=reading.flank_px,
-            points_t_us=self._clock.camera_us(shown.aligned.middle_us),
+            points_t_us=self._clock.camera_us(aligned.middle_us),
             echo_of=self._reflections.echo_of(number),
             link=self._name,
         )
         self._announcer.frame(frame)
-        return FrameDetection.of(frame, due.start_us, shown.aligned.placement, reading.spread)
+        return FrameDetection.of(frame, due, aligned.pilot.placement, reading.spread)
 
     def _is_ranged(self) -> bool:
         """Whether the turn of a frame with a pilot has come to be ranged."""
@@ -399,15 +375,16 @@ class PacketFraming(Framer):
         most_px = 0.0
         for _ in range(_LOOKS):
             whole = region.size_px is not None
-            aligned, transmitter.pilot = self._aligner.align(region, due, transmitter.pilot)
+            aligned = self._aligner.align(region, due, transmitter.pilot)
             if aligned is None or not due.has_pilot:
                 break
-            centre_px, size_px = self._aligner.box(aligned, aligned.placement)
+            transmitter.pilot = pilot = aligned.pilot
+            centre_px, size_px = self._aligner.box(aligned, pilot.placement)
             if follower is None:
                 region.size_px = size_px
                 break
             # What the first look shows beside the bar is out of the second one's sight.
-            others += [(aligned.middle_us, *self._aligner.box(aligned, other)) for other in aligned.others]
+            others += [(aligned.middle_us, *self._aligner.box(aligned, other)) for other in pilot.others]
             lit_px, strips_px = self._aligner.lit_rows(aligned), self._aligner.strips(aligned)
             off_px = follower.shape(region, aligned.middle_us, centre_px, size_px, lit_px, strips_px)
             most_px = max(most_px, off_px)
@@ -434,7 +411,7 @@ class PacketFraming(Framer):
                 continue
             gone = region if other.size_px is not None and other.id < region.id else other
             self._regions.drop(gone)
-            self._let_go(gone)
+            self.let_go(gone)
             if gone is region:
                 return False
         return True
@@ -446,17 +423,17 @@ class PacketFraming(Framer):
             return False
         for part in parts:
             self._follower.unite(transmitter.region, part.region)
-            self._let_go(part.region)
+            self.let_go(part.region)
         return True
 
-    def _let_go(self, region: Followed) -> None:
-        """Forget a region that has become a part of another."""
+    def let_go(self, region: Followed) -> None:
+        """Forget a region that has become a part of another, or whose place is another's."""
         self._joined.add(region.id)
-        if region in self._transmitters:
-            transmitter = self._transmitters[region]
+        transmitter = self._transmitters.of(region)
+        if transmitter is not None:
             self.counts["regions_released"] += 1
             self._was_part(transmitter.missed)
-            self._queue.end(transmitter.packets)
+            self._queue.add(transmitter.packets, None)
             self._transmitters.release(transmitter)
 
     def _was_part(self, missed: Counter[str]) -> None:
@@ -485,7 +462,7 @@ class PacketFraming(Framer):
                 self._was_part(missed)
             else:
                 self._ended.append((number, place_px, missed))
-        self._queue.end(transmitter.packets)
+        self._queue.add(transmitter.packets, None)
 
 
 def _in_time(transmitter: Transmitter) -> bool:

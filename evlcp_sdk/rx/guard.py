@@ -63,10 +63,7 @@ class Guard:
         self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
     ) -> None:
         if fault is not None and not isinstance(fault, self._passes):
-            last = traceback.extract_tb(trace)[-1]
-            what = f"{type(fault).__name__}: {_shown(str, fault)}".splitlines()[0]
-            where = f"{Path(last.filename).name}, line {last.lineno}"
-            raise PluginError(self._said(f": {what} ({where})")) from fault
+            raise PluginError(self._said(f": {fault_text(fault)}")) from fault
 
     def refuse(self, gave: str, expected: str) -> NoReturn:
         """Say what an algorithm gave, and what was expected.
@@ -144,15 +141,14 @@ class Guard:
                 f"{name} = {_shown(repr, found):.40}", expected or f"a number from {least:g} to {most:g}"
             )
 
-    def expect_locks(self, locks: object, until_us: float, packet: PacketFormat) -> None:
-        """Check the packets that a synchronization found in a step, until a time, us.
+    def expect_locks(self, locks: list[SyncLock], until_us: float, packet: PacketFormat) -> None:
+        """Check what a synchronization found in a step, until a time, us.
 
         Raises:
-            PluginError: They are no list, more than there is time for, or no `SyncLock` with times of such
-                packets.
+            PluginError: It is no list of `SyncLock`, or longer than there is time for, or their times are not
+                those of such packets.
         """
         self.expect(locks, list)
-        assert isinstance(locks, list)
         if len(locks) > _MOST_LOCKS:
             self.refuse(f"{len(locks)} locks in a step", f"at most {_MOST_LOCKS}")
         chip_us, whole_us = packet.chip_us, packet.packet_chips * packet.chip_us
@@ -244,6 +240,13 @@ class Guard:
             self.refuse(f"values {values.tolist()!r:.40}", "finite ones")
         if not _unknown(sigma):
             self.expect_number(sigma, "sigma", 0.0, math.inf)
+
+
+def fault_text(fault: BaseException) -> str:
+    """What was raised in the code of a plugin, in one line, and where."""
+    last = traceback.extract_tb(fault.__traceback__)[-1]
+    what = f"{type(fault).__name__}: {_shown(str, fault)}".splitlines()[0]
+    return f"{what} ({Path(last.filename).name}, line {last.lineno})"
 
 
 def compiled(link: Link, role: str, *given: object, methods: tuple[str, ...] = ()) -> Any:

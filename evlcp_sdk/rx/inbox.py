@@ -64,12 +64,6 @@ class _Parts:
     payload: bytes = b""
     given: Standing | None = None
 
-    def complete(self) -> bool:
-        return sum(map(len, self.parts.values())) == self.carried
-
-    def join(self) -> None:
-        self.payload = joined([self.parts[i] for i in sorted(self.parts)], self.length)
-
 
 @dataclass
 class _Inbox:
@@ -96,6 +90,9 @@ class MessageAssembler:
         guard: Names the error correction where it fails.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
 
+    Attributes:
+        counts: What was tried, found and given up so far.
+
     Raises:
         ConfigError: A trusted key is not valid, or there are keys and the extra `sign` is not installed.
     """
@@ -116,7 +113,7 @@ class MessageAssembler:
         self._beacons = BeaconJudge(spec, coder.digest)
         self._clock_zero = clock_zero
         self._inboxes: OrderedDict[int, _Inbox] = OrderedDict()
-        self._counts = dict.fromkeys(
+        self.counts = dict.fromkeys(
             (
                 "blocks_reflected",
                 "blocks_tried",
@@ -161,35 +158,30 @@ class MessageAssembler:
         guard = Guard(link, "error-correction")
         return cls(coder, link.messages, link.kinds, guard, clock_zero)
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """What was tried, found and given up so far."""
-        return dict(self._counts)
-
     def add(self, packet: Packet) -> Packet:
         """Read a packet; return it with its block and the messages that it completes.
 
         A reflection is left out: it repeats what its transmitter says, with more errors.
         """
         if packet.echo_of is not None:
-            self._counts["blocks_reflected"] += 1
+            self.counts["blocks_reflected"] += 1
             return packet
         inbox = _kept(self._inboxes, packet.transmitter, _Inbox)
         while len(self._inboxes) > _MOST_TRANSMITTERS:
             self._give_up(self._inboxes.popitem(last=False)[1])
-        self._counts["blocks_tried"] += 1
+        self.counts["blocks_tried"] += 1
         content, packets = self._content(inbox, self._llr(packet))
         if content is None:
-            self._counts["blocks_failed"] += 1
+            self.counts["blocks_failed"] += 1
             return packet
-        self._counts["blocks_decoded" if packets == 1 else "blocks_combined"] += 1
+        self.counts["blocks_decoded" if packets == 1 else "blocks_combined"] += 1
         try:
             block = Block.unpack(content, self._kinds)
         except BlockError:
-            self._counts["blocks_malformed"] += 1
+            self.counts["blocks_malformed"] += 1
             return packet
         if block.codebook != self._coder.digest:
-            self._counts["blocks_other_codebook"] += 1
+            self.counts["blocks_other_codebook"] += 1
             return packet
         messages = tuple(self._take(inbox, block, packet))
         return changed(packet, block=block, block_packets=packets, messages=messages)
@@ -220,7 +212,7 @@ class MessageAssembler:
         if best < 0 or alike[best] < _SAME_BLOCK_SIGMA:
             inbox.sums = [*inbox.sums, _Sum(llr, 1)][-self._spec.combine_packets :]
             return None, 0
-        self._counts["blocks_alike"] += 1
+        self.counts["blocks_alike"] += 1
         one = inbox.sums.pop(best)
         total = _Sum(one.llr + llr, one.packets + 1)
         with self._guard:
@@ -234,11 +226,11 @@ class MessageAssembler:
         key = (block.transmitter_id, block.kind, block.sequence)
         known = inbox.done.get(key) or inbox.open.get(key)
         if known and known.length == block.length and known.parts.get(block.index) == block.part:
-            self._counts["parts_repeated"] += 1
+            self.counts["parts_repeated"] += 1
             return self._hand_on(inbox, key, packet)
         if known and (known.length != block.length or block.index in known.parts):
             # Two messages under one number: the later one is collected anew.
-            self._counts["parts_conflicting"] += 1
+            self.counts["parts_conflicting"] += 1
             inbox.done.pop(key, None)
             self._missing(inbox.open.pop(key, None))
         carried = carried_bytes(block.length, self._room)
@@ -246,13 +238,13 @@ class MessageAssembler:
         parts.parts[block.index] = block.part
         while len(inbox.open) > _MOST_MESSAGES:
             self._missing(inbox.open.popitem(last=False)[1])
-        if not parts.complete():
+        if sum(map(len, parts.parts.values())) != parts.carried:
             return []
         try:
-            parts.join()
+            parts.payload = joined([parts.parts[i] for i in sorted(parts.parts)], parts.length)
         except BlockError:
             # Two messages under one number, mixed: the newest part is surely of the newest.
-            self._counts["messages_mixed"] += 1
+            self.counts["messages_mixed"] += 1
             parts.parts = {block.index: block.part}
             return []
         inbox.done[key] = inbox.open.pop(key)
@@ -289,10 +281,10 @@ class MessageAssembler:
             verdict = self._beacons.judge(message, beacon, signature, now_s)
         if verdict == parts.given:
             return []
-        self._counts["messages"] += parts.given is None
+        self.counts["messages"] += parts.given is None
         if beacon is not None and (parts.given is None or parts.given.trust != verdict.trust):
-            self._counts[f"beacons_{verdict.trust}"] += 1
-            self._counts["beacons_undated"] += verdict.trust == "verified" and now_s is None
+            self.counts[f"beacons_{verdict.trust}"] += 1
+            self.counts["beacons_undated"] += verdict.trust == "verified" and now_s is None
         parts.given = verdict
         where = (packet.transmitter, packet.packet, packet.t_us)
         reason, age_s = verdict.why, None
@@ -306,12 +298,12 @@ class MessageAssembler:
         """Count a message whose bytes mean nothing, once."""
         if parts.given is None:
             parts.given = Standing("unverified", "undecodable")
-            self._counts["messages_undecodable"] += 1
+            self.counts["messages_undecodable"] += 1
         return []
 
     def _missing(self, parts: _Parts | None) -> None:
         if parts is not None:
-            self._counts["parts_missing"] += -(-parts.carried // self._room) - len(parts.parts)
+            self.counts["parts_missing"] += -(-parts.carried // self._room) - len(parts.parts)
 
     def _give_up(self, inbox: _Inbox) -> None:
         for parts in inbox.open.values():

@@ -6,6 +6,7 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.detection import RegionFollower
+from evlcp_sdk.rx.followed import same_place
 from evlcp_sdk.rx.framer import Framer, RegionTracker, StreamContext
 from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.inbox import MessageAssembler
@@ -67,7 +68,7 @@ class LinkReceiver:
                 link, name, stream, steps, self._regions, follower, self._queue, self._announcer
             )
         else:
-            self.framing = PluginFraming(link, name, stream, self._regions, self._queue, self._announcer)
+            self.framing = PluginFraming(link, name, stream, self._queue, self._announcer)
         self._messages = MessageAssembler.of(link, stream.clock_zero)
         self._given = {"frames_reflected": 0, "packets": 0}
         self._of_others = self._rejected_of_others = 0
@@ -76,6 +77,12 @@ class LinkReceiver:
     def regions(self) -> list[Region]:
         """Where the regions that are followed were seen last, on the camera's clock."""
         return [on_camera(one.latest, self._clock.camera_us) for one in self._regions.alive]
+
+    @property
+    def places(self) -> dict[int, Region]:
+        """Where the transmitters are that have a number and are in sight, by number."""
+        numbers = ((self.framing.number_of(one), one.latest) for one in self._regions.alive)
+        return {number: place for number, place in numbers if number is not None}
 
     @property
     def counts(self) -> dict[str, int]:
@@ -106,13 +113,22 @@ class LinkReceiver:
         if step.after_gap:
             self._regions.skip()
         if taken:
-            self.framing.leave(taken, owning)
+            self._leave(taken, owning)
         self._announcer.start()
         regions = self._regions.step(step.start_us, step.events, taken)
         for region in regions:
             self._announcer.lap("regions", region.latest)
         self.framing.step(regions, step)
         return self._queue.step()
+
+    def _leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
+        """Let regions go in places that are others', but for those of transmitters that own theirs."""
+        for region in list(self._regions.alive):
+            if self.framing.number_of(region) in owning:
+                continue
+            if any(same_place(region.latest, place) for place in taken):
+                self._regions.drop(region)
+                self.framing.let_go(region)
 
     def end_at(self, end_us: float) -> None:
         """Let the stream end at a time, us: frames that are cut by it are not given."""

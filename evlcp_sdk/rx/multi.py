@@ -120,7 +120,7 @@ class SeveralLinks:
         """Give each link a time step; give the packets that have waited long enough and fit."""
         for number, one in enumerate(self.receivers):
             found = one.step(step, self._taken(number), self._owning)
-            self._see(number, one.framing.places)
+            self._see(number, one.places)
             self._add(number, found, step.end_us)
         return self._given(step.end_us)
 
@@ -267,8 +267,8 @@ class EarlyFrames:
 
     def __init__(self, tell: Callable[[Frame], None] | None) -> None:
         self._tell = tell
-        self._waiting: OrderedDict[int, deque[Frame]] = OrderedDict()
-        self._told: dict[int, deque[tuple[int, int]]] = {}
+        # By transmitter, by number of packet and frame; None for one that was told.
+        self._known: OrderedDict[int, OrderedDict[tuple[int, int], Frame | None]] = OrderedDict()
         self.withdrawn = 0
 
     def decoded(self, frame: Frame, *, owns: bool) -> None:
@@ -278,17 +278,15 @@ class EarlyFrames:
             frame: The frame, on the camera's clock.
             owns: Its transmitter owns its place now.
         """
-        number = frame.transmitter
-        if number not in self._waiting:
-            self._waiting[number] = deque(maxlen=_MOST_FRAMES)
-            self._told[number] = deque(maxlen=_MOST_FRAMES)
-        self._waiting.move_to_end(number)
-        while len(self._waiting) > _MOST_KNOWN:
-            gone, _ = self._waiting.popitem(last=False)
-            del self._told[gone]
-        self._waiting[number].append(frame)
+        known = self._known.setdefault(frame.transmitter, OrderedDict())
+        known[frame.packet, frame.frame] = frame
+        if len(known) > _MOST_FRAMES:
+            known.popitem(last=False)
+        self._known.move_to_end(frame.transmitter)
+        if len(self._known) > _MOST_KNOWN:
+            self._known.popitem(last=False)
         if owns:
-            self._tell_waiting(number)
+            self._tell_waiting(frame.transmitter)
 
     def given(self, packet: Packet, *, owns: bool) -> None:
         """Take a packet that is given: tell those of its frames that were not; all that wait if it holds."""
@@ -298,7 +296,7 @@ class EarlyFrames:
         for frame in packet.frames:
             if (frame.packet, frame.frame) not in told:
                 self._tell(frame)
-        if owns and packet.transmitter in self._waiting:
+        if owns:
             self._tell_waiting(packet.transmitter)
 
     def refused(self, packet: Packet) -> None:
@@ -307,26 +305,17 @@ class EarlyFrames:
 
     def _tell_waiting(self, number: int) -> None:
         assert self._tell is not None
-        waiting, told = self._waiting[number], self._told[number]
-        while waiting:
-            frame = waiting.popleft()
-            told.append((frame.packet, frame.frame))
-            self._tell(frame)
+        known = self._known.get(number, OrderedDict())
+        for key, frame in known.items():
+            if frame is not None:
+                known[key] = None
+                self._tell(frame)
 
     def _forget(self, packet: Packet) -> set[tuple[int, int]]:
         """Let go what is known of a packet's frames, and of earlier ones; give those of it that were told."""
-        number = packet.transmitter
-        if number not in self._waiting:
-            return set()
-        waiting, told = self._waiting[number], self._told[number]
-        while waiting and waiting[0].packet <= packet.packet:
-            waiting.popleft()
-        mine = set()
-        while told and told[0][0] <= packet.packet:
-            one = told.popleft()
-            if one[0] == packet.packet:
-                mine.add(one)
-        return mine
+        known = self._known.get(packet.transmitter, OrderedDict())
+        over = {key: known.pop(key) for key in list(known) if key[0] <= packet.packet}
+        return {key for key, frame in over.items() if key[0] == packet.packet and frame is None}
 
 
 def _rhythms(links: Mapping[str, Link]) -> dict[str, Rhythm]:

@@ -1,7 +1,7 @@
 """Frames of an algorithm of the role `framing`, from the events of regions to the frames of the receiver."""
 
 import math
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -9,15 +9,14 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
-from evlcp_sdk.rx.followed import Followed, same_place
-from evlcp_sdk.rx.framer import Framer, LitTimes, RegionTracker, StreamContext
-from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.rx.followed import Followed
+from evlcp_sdk.rx.framer import Framer, LitTimes, StreamContext
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.values import DecodedFrame, Frame, Range, Region, SyncLock
+from evlcp_sdk.values import DecodedFrame, Frame, Range
 
 _COUNTED = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
 
@@ -57,7 +56,6 @@ class PluginFraming(Framer):
         link: The resolved configuration.
         name: Name of the link, that its frames have; empty for none.
         stream: What it is a part of.
-        regions: The regions of the stream.
         queue: Where frames go.
         announcer: Gets every frame.
     """
@@ -69,7 +67,6 @@ class PluginFraming(Framer):
         link: Link,
         name: str,
         stream: StreamContext,
-        regions: RegionTracker,
         queue: ReflectionQueue,
         announcer: Announcer,
     ) -> None:
@@ -83,7 +80,6 @@ class PluginFraming(Framer):
         self._reflections = queue.reflections
         self._camera_us: Callable[[float], float] = stream.clock.camera_us
         self._announcer = announcer
-        self._regions = regions
         self._listeners: dict[int, _Listener] = {}
         self._name = name
         self._numbers = stream.numbers
@@ -119,23 +115,17 @@ class PluginFraming(Framer):
                 self._end(listener)
                 del self._listeners[region.id]
 
-    @property
-    def places(self) -> dict[int, Region]:
-        """Where the transmitters are that have a number and are in sight, by number."""
-        return {one.number: one.region.latest for one in self._listeners.values() if one.number is not None}
+    def number_of(self, region: Followed) -> int | None:
+        """Number of a region's transmitter; None before its first frame."""
+        listener = self._listeners.get(region.id)
+        return None if listener is None else listener.number
 
-    def leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
-        """Let regions go in places that are others', but for those of transmitters that hold theirs."""
-        for region in list(self._regions.alive):
-            listener = self._listeners.get(region.id)
-            if listener is not None and listener.number in owning:
-                continue
-            if any(same_place(region.latest, place) for place in taken):
-                self._regions.drop(region)
-                if listener is not None:
-                    self.counts["regions_released"] += 1
-                    self._queue.end(listener.packets)
-                    del self._listeners[region.id]
+    def let_go(self, region: Followed) -> None:
+        """Forget a region whose place is another's."""
+        listener = self._listeners.pop(region.id, None)
+        if listener is not None:
+            self.counts["regions_released"] += 1
+            self._queue.add(listener.packets, None)
 
     def close(self) -> None:
         """End the stream: give what the regions still say."""
@@ -148,7 +138,7 @@ class PluginFraming(Framer):
             given = self._deframer.close(listener.state)
         listener.state, heard = self._guard.expect_step(given, "close()")
         self._take(listener, heard)
-        self._queue.end(listener.packets)
+        self._queue.add(listener.packets, None)
 
     def _take(self, listener: _Listener, heard: list[DecodedFrame]) -> None:
         """Number a region's frames, say where they were seen, and hand them on."""
@@ -190,14 +180,9 @@ class PluginFraming(Framer):
             self.counts["frames"] += 1
             self._announcer.frame(frame)
             self.lit.note(listener.number, frame.t_us, frame.t_us)
-            lock = SyncLock(one.packet_t_us, one.chip_us, 0.0, 0.0, 1.0)
-            number = one.packet * self._packet.frames + one.frame
-            due = DueFrame(
-                number, one.packet, one.frame, chips, False, one.packet_t_us, one.t_us, end_us, lock, end_us
-            )
-            light = listener.events / len(heard)
+            times, light = (one.t_us, end_us, one.packet_t_us, one.chip_us), listener.events / len(heard)
             self._queue.add(
-                listener.packets, due, FrameDetection(frame, one.t_us, light, self._codebook.clusters, False)
+                listener.packets, FrameDetection(frame, *times, light, self._codebook.clusters, False)
             )
         if heard:
             listener.events = 0

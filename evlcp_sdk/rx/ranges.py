@@ -145,7 +145,11 @@ class RangeKeeper:
         past[n] = t_s, distance_m, sigma_m**2
         if past[0, 0] <= t_s - _MEMORY_S:
             past = past[past[:, 0] > t_s - _MEMORY_S]
-        speed_m_s, speed_variance, variance = _smooth(past)
+        # They follow a parabola whose speed and acceleration are likely as above; the squares of what is
+        # left, in those that the sigmas expect, scale the variances.
+        speed_m_s, speed_variance, variance = _kernels.newest_on_parabola(
+            past, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2, _SCATTER_WORTH, _OUTLIER**2
+        )
         distance_m -= speed_m_s * late_s
         # What is not known of the wave is alike in many frames: their scatter does not show it.
         variance += speed_variance * late_s**2 + unsure_m**2
@@ -164,30 +168,19 @@ class RangeKeeper:
             sine = np.sin(math.asin(told) + np.radians(self._lean_deg))
             sigma_deg = math.degrees(sight.sigma / math.sqrt(max(1 - told**2, sight.sigma**2)))
             likely = self._mixture(sigma_deg, _SLANTED_SHARE)
-        seen = None if newest is None else _parabola(newest, sums, wave)
-        off, sigma = seen or (math.nan, 1.0)
+        off, sigma = math.nan, 1.0
+        if newest is not None:
+            # What puts the boundaries of every frame off alike is in their scatter about a parabola, too.
+            off, variance = _kernels.bend_of(newest.place, sums, _LEAST_WEIGHT, *wave)
+            sigma = 1.0 if math.isnan(off) else math.sqrt(max(variance, 1e-12))
         return _kernels.mean_length(sine, likely, told + off, sigma, sight.along, sight.across)
 
     def _mixture(self, sigma_deg: float, share: float) -> Floats:
         """Chances of the leans of the grid: as surely as said, but for a share of which nothing is known."""
         # Half a step is as narrow as a grid shows it.
-        sure = _bell(self._lean_deg, max(sigma_deg, _STEP_DEG / 2)) / math.sqrt(2 * math.pi)
-        return np.asarray((1 - share) * sure + share / (2 * _LEANING_DEG))
-
-
-def _bell(off: Floats, sigma: float) -> Floats:
-    return np.asarray(np.exp(-0.5 * np.minimum((off / sigma) ** 2, 1400.0)) / sigma)
-
-
-def _smooth(past: Floats) -> tuple[float, float, float]:
-    """Speed (m/s) and its variance, and the variance (m2) of the newest distance, by all of them.
-
-    Distances follow a parabola whose speed and acceleration are likely as above; the squares of what is left,
-    in those that the sigmas expect, scale the variances.
-    """
-    return _kernels.newest_on_parabola(
-        past, _SPEED_M_S**-2, _ACCELERATION_M_S2**-2, _SCATTER_WORTH, _OUTLIER**2
-    )
+        sigma_deg = max(sigma_deg, _STEP_DEG / 2)
+        bell = np.exp(-0.5 * np.minimum((self._lean_deg / sigma_deg) ** 2, 1400.0)) / sigma_deg
+        return np.asarray((1 - share) * (bell / math.sqrt(2 * math.pi)) + share / (2 * _LEANING_DEG))
 
 
 def _weighed(bend: Bend, sine: float) -> Floats:
@@ -215,12 +208,3 @@ def _left_over(wave: Floats, height_px: float) -> float:
     if not left > 0:
         return 1.0
     return float(min(max(1 - height_px * (2 * products - height_px * squares) / left, 0.0), 1.0))
-
-
-def _parabola(bend: Bend, sums: Floats, wave: tuple[float, float]) -> tuple[float, float] | None:
-    """Sine of the lean and its sigma, from the scatter of the boundaries about a parabola; None of too few.
-
-    What puts the boundaries of every frame off alike is in the scatter, too.
-    """
-    sine, variance = _kernels.bend_of(bend.place, sums, _LEAST_WEIGHT, *wave)
-    return None if math.isnan(sine) else (sine, math.sqrt(max(variance, 1e-12)))

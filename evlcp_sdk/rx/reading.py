@@ -10,6 +10,7 @@ from evlcp_sdk.air.codebook import edges_of_chips
 from evlcp_sdk.air.frames import chips_behind
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.rx.alignment import AlignedFrame, FrameAligner
+from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.llr_calibration import calibrate_llr, still_lit
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
@@ -21,27 +22,6 @@ from evlcp_sdk.values import FrameView, Range, SoftSymbols
 
 _NO_RANGE = Range(math.nan, math.nan, 0)
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
-
-
-@dataclass(frozen=True, eq=False)
-class ReadableFrame:
-    """A frame that shows its clusters, and what its reading depends on beside.
-
-    Attributes:
-        aligned: What it shows.
-        index: Its number in the packet.
-        has_pilot: Whether it has one: only such a frame has a distance and points.
-        before: The chip that each cluster sent before its info segment, int8 (K,); -1 if not known.
-        ranged: Its distance is asked for.
-        attitude: The camera's, as far as it is known.
-    """
-
-    aligned: AlignedFrame
-    index: int
-    has_pilot: bool
-    before: NDArray[np.int8]
-    ranged: bool
-    attitude: Attitude | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +59,7 @@ class FrameReader:
     Args:
         link: The resolved configuration.
         steps: Its algorithms.
-        looker: What the frames were looked at with.
+        aligner: What the frames were aligned by.
     """
 
     def __init__(self, link: Link, steps: Steps, aligner: FrameAligner) -> None:
@@ -98,36 +78,48 @@ class FrameReader:
         for chips in self._behind:
             chips.setflags(write=False)
 
-    def read(self, shown: ReadableFrame) -> Reading:
-        """What a frame says.
+    def read(
+        self,
+        aligned: AlignedFrame,
+        due: DueFrame,
+        before: NDArray[np.int8],
+        attitude: Attitude | None,
+        *,
+        ranged: bool,
+    ) -> Reading:
+        """What a frame that shows its clusters says; one without a pilot has no distance and no points.
+
+        Args:
+            aligned: What it shows.
+            due: Which frame it is.
+            before: The chip that each cluster sent before its info segment, int8 (K,); -1 if not known.
+            attitude: The camera's, as far as it is known.
+            ranged: Its distance is asked for.
 
         Raises:
             PluginError: The decoding or the ranging fails, or gives what it may not.
         """
-        aligned = shown.aligned
-        sums = aligned.sums
-        soft = self._steps.decode(
-            aligned.presence, aligned.sums_and_next, shown.before, self._behind[shown.index]
-        )
-        lit = still_lit(sums, aligned.presence, self._pilot_chips, self._least_activity)
-        given = calibrate_llr(soft, aligned.placement.seen & lit)
-        if not shown.has_pilot:
+        sums, presence, placement = aligned.sums, aligned.pilot.presence, aligned.pilot.placement
+        soft = self._steps.decode(presence, aligned.sums_and_next, before, self._behind[due.index])
+        lit = still_lit(sums, presence, self._pilot_chips, self._least_activity)
+        given = calibrate_llr(soft, placement.seen & lit)
+        if not due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             return Reading(
                 soft.symbols, given, _NO_RANGE, *_NO_POINTS, aligned.centre_px, BarSight(), spread=None
             )
         distance = _NO_RANGE
-        if shown.ranged:
+        if ranged:
             whole = self._aligner.whole(aligned)
             distance = self._steps.measure(FrameView(sums, aligned.offset_px, whole, soft))
         heard = sums[: self._pilot_chips]
-        points_px, sigma_px, flank_px = self._find_points(aligned.presence, aligned.placement, heard)
+        points_px, sigma_px, flank_px = self._find_points(presence, placement, heard)
         points_px = points_px + aligned.corner_px
         centre_px = self._aligner.centre(aligned, points_px)
         sight = BarSight()
         if self._is_column:
-            sight = sight_of(self._camera, points_px, sigma_px, shown.attitude)
+            sight = sight_of(self._camera, points_px, sigma_px, attitude)
         elif not self._camera.is_pinhole:
             sight = BarSight(magnification=magnification_of(self._camera, points_px))
-        spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, aligned.placement)
+        spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, placement)
         return Reading(soft.symbols, given, distance, points_px, sigma_px, flank_px, centre_px, sight, spread)

@@ -77,6 +77,9 @@ class FrameDetection:
     Attributes:
         frame: The frame.
         t_us: Start of the frame inside, see `CameraClock`, us.
+        end_us: When the events of its last edge end, us.
+        packet_us: Start of its packet, us.
+        chip_us: Length of a chip, us.
         light: Grid cells that show a cluster, on average: what shines more shows in more of them.
         seen: Clusters that are seen.
         mirrored: The order of the clusters is the opposite of the layout's.
@@ -85,16 +88,20 @@ class FrameDetection:
 
     frame: Frame
     t_us: float
+    end_us: float
+    packet_us: float
+    chip_us: float
     light: float
     seen: int
     mirrored: bool
     spread: Spread | None = None
 
     @classmethod
-    def of(cls, frame: Frame, t_us: float, placed: Placement, spread: Spread | None) -> "FrameDetection":
+    def of(cls, frame: Frame, due: DueFrame, placed: Placement, spread: Spread | None) -> "FrameDetection":
         """What a frame's image shows, by where it shows the layout."""
         seen = max(sum(placed.seen.tolist()), 1)
-        return cls(frame, t_us, placed.cells / seen, seen, placed.mirrored, spread)
+        times = due.start_us, due.end_us, due.packet_us, due.lock.chip_us
+        return cls(frame, *times, placed.cells / seen, seen, placed.mirrored, spread)
 
 
 def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:
@@ -309,15 +316,6 @@ class Reflections:
 
 
 @dataclass
-class _Waiting:
-    """A frame that waits for its judgement, or, without one, the end of its transmitter's frames."""
-
-    packets: PacketAssembler
-    due: DueFrame | None = None
-    detection: FrameDetection | None = None
-
-
-@dataclass
 class ReflectionQueue:
     """Keeps decoded frames for one time step, so that a bar and its reflection are judged together.
 
@@ -326,7 +324,7 @@ class ReflectionQueue:
     after its own.
 
     Attributes:
-        echoes: The judge.
+        reflections: The judge.
         ends_us: When the stream ends, us: a frame is whole if it goes on for some chips after it.
         cut: Frames so near to the end of the stream that they were not given.
     """
@@ -334,40 +332,37 @@ class ReflectionQueue:
     reflections: Reflections
     ends_us: float = math.inf
     cut: int = 0
-    _old: list[_Waiting] = field(default_factory=list)
-    _new: list[_Waiting] = field(default_factory=list)
+    # A frame and where it goes, or, without one, the end of its transmitter's frames.
+    _old: list[tuple[PacketAssembler, FrameDetection | None]] = field(default_factory=list)
+    _new: list[tuple[PacketAssembler, FrameDetection | None]] = field(default_factory=list)
 
     def __bool__(self) -> bool:
         """Whether anything waits."""
         return bool(self._old or self._new)
 
-    def add(self, packets: PacketAssembler, due: DueFrame, detection: FrameDetection) -> None:
-        """Take a frame, and where it goes."""
-        self._new.append(_Waiting(packets, due, detection))
-
-    def end(self, packets: PacketAssembler) -> None:
-        """Take the end of a transmitter's frames, or of the stream."""
-        self._new.append(_Waiting(packets))
+    def add(self, packets: PacketAssembler, detection: FrameDetection | None) -> None:
+        """Take a frame, and where it goes; None for the end of a transmitter's frames."""
+        self._new.append((packets, detection))
 
     def step(self) -> list[Packet]:
         """End a time step; give the packets that are complete with the frames of the step before it."""
         if self._new:
-            self.reflections.judge(w.detection for w in self._new if w.detection is not None)
+            self.reflections.judge(one for _, one in self._new if one is not None)
         due, self._old, self._new = self._old, self._new, []
-        return [packet for waiting in due for packet in self._emit(waiting)]
+        return [packet for packets, one in due for packet in self._emit(packets, one)]
 
     def close(self) -> list[Packet]:
         """End the stream; give the packets of all frames that wait."""
         return self.step() + self.step()
 
-    def _emit(self, waiting: _Waiting) -> list[Packet]:
-        if waiting.detection is None or waiting.due is None:
-            return waiting.packets.flush()
-        due, frame = waiting.due, waiting.detection.frame
-        if due.end_us + FOLLOWED_CHIPS * due.lock.chip_us > self.ends_us:
+    def _emit(self, packets: PacketAssembler, one: FrameDetection | None) -> list[Packet]:
+        if one is None:
+            return packets.flush()
+        frame = one.frame
+        if one.end_us + FOLLOWED_CHIPS * one.chip_us > self.ends_us:
             self.cut += 1
             return []
         echo_of = self.reflections.echo_of(frame.transmitter)
         if echo_of != frame.echo_of:
             frame = changed(frame, echo_of=echo_of)
-        return waiting.packets.add(frame, due.packet_us, due.lock.chip_us)
+        return packets.add(frame, one.packet_us, one.chip_us)

@@ -169,20 +169,14 @@ def neighbours(layout: Layout) -> NDArray[np.int64]:
     return np.argwhere(beside).astype(np.int64)
 
 
-def length_errors(frames: int) -> Floats:
-    """Standard deviations of the three lengths after so many frames, px, float64 (3,)."""
-    error: Floats = np.hypot(_ERRORS_PX / math.sqrt(frames), _KEPT_PX)
-    return error
-
-
 def sharper(one: Spread, other: Spread) -> float | None:
     """Log odds of the first being sharper and brighter against the second being so; None if unknown."""
     here, there = one.lengths(), other.lengths()
     if here is None or there is None:
         return None
     spacing_px = (one.spacing_px + other.spacing_px) / (one.frames + other.frames)
-    expected = _expected(round(math.log(spacing_px) * _STEPS_PER_E))
-    error = length_errors(min(one.frames, other.frames))
+    expected = _expected_at(round(math.log(spacing_px) * _STEPS_PER_E))
+    error = np.hypot(_ERRORS_PX / math.sqrt(min(one.frames, other.frames)), _KEPT_PX)
     fits: Floats = np.zeros((len(expected), len(expected)))
     for k in np.flatnonzero(~np.isnan(here + there)):
         off_here, off_there = here[k] - expected[:, k], there[k] - expected[:, k]
@@ -190,21 +184,15 @@ def sharper(one: Spread, other: Spread) -> float | None:
         apart = (off_here[:, None] - off_there) ** 2 / (2 * error[k] ** 2)
         mean = ((off_here[:, None] + off_there) / 2) ** 2 / (_COMMON_PX[k] ** 2 + error[k] ** 2 / 2)
         fits -= (apart + mean) / 2
-    first = _no_sharper()
+    # Of two of what is expected, whether the second is no sharper than the first and no brighter.
+    blur, light = np.indices((len(_BLURS_PX), len(_BACKGROUNDS))).reshape(2, -1)
+    first = (blur >= blur[:, None]) & (light >= light[:, None])
     # What is clear is beyond the smallest number that is not 0.
     return float(np.logaddexp.reduce(fits[first]) - np.logaddexp.reduce(fits.T[first]))
 
 
-@lru_cache(maxsize=1)
-def _no_sharper() -> NDArray[np.bool_]:
-    """Whether of two of what is expected the second is no sharper than the first and no brighter."""
-    blur, light = np.indices((len(_BLURS_PX), len(_BACKGROUNDS))).reshape(2, -1)
-    second: NDArray[np.bool_] = (blur[None] >= blur[:, None]) & (light[None] >= light[:, None])
-    return second
-
-
 @lru_cache(maxsize=32)
-def _expected(steps: int) -> Floats:
+def _expected_at(steps: int) -> Floats:
     """The three lengths for each blur and each background, px, float64 (n, 3), at a spacing."""
     return expected_lengths(math.exp(steps / _STEPS_PER_E), _BLURS_PX, _BACKGROUNDS)
 

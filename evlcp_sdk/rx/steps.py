@@ -2,9 +2,7 @@
 
 import math
 import time
-import traceback
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +12,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import STEPS, Filter, Synchronizer, Tracker
-from evlcp_sdk.rx.guard import Guard, compiled
+from evlcp_sdk.rx.guard import Guard, compiled, fault_text
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import (
@@ -90,10 +88,7 @@ class Announcer:
         except EvlcpError:
             raise
         except (Exception, SystemExit) as fault:
-            last = traceback.extract_tb(fault.__traceback__)[-1]
-            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
-            where = f"{Path(last.filename).name}, line {last.lineno}"
-            raise PluginError(f"evlcp_stage_finished() of a plugin: {what} ({where})") from fault
+            raise PluginError(f"evlcp_stage_finished() of a plugin: {fault_text(fault)}") from fault
 
 
 def tracker_of(link: Link) -> Tracker:
@@ -106,7 +101,8 @@ def tracker_of(link: Link) -> Tracker:
             if filter_ is not None:
                 guard.expect_compiled(filter_, ("init", "step", "predict"))
     guard = Guard(link, "tracking")
-    return Tracker(_guarded(tracker.position, guard), _guarded(tracker.distance, guard))
+    filters = tracker.position, tracker.distance
+    return Tracker(*(None if one is None else _GuardedFilter(one, guard) for one in filters))
 
 
 class Steps:
@@ -245,7 +241,3 @@ class _GuardedFilter(Filter):
             state, values, sigma = self._filter.step(state, t_us, value, sigma)
             self._guard.expect_filtered(values, sigma, value.shape)
         return state, values, sigma
-
-
-def _guarded(filter_: Filter | None, guard: Guard) -> Filter | None:
-    return None if filter_ is None else _GuardedFilter(filter_, guard)

@@ -17,7 +17,7 @@ from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.places import Places
-from evlcp_sdk.values import Region, SyncLock
+from evlcp_sdk.values import SyncLock
 
 LOOKBACK_PACKETS = 2
 """Packets of events kept while there is no lock: one to find a preamble in, one to look back on."""
@@ -93,26 +93,21 @@ class Transmitters:
         self._released: list[Transmitter] = []
         self._numbers = count() if numbers is None else numbers
 
-    def __contains__(self, region: Followed) -> bool:
-        return region.id in self._alive
-
-    def __getitem__(self, region: Followed) -> Transmitter:
-        return self._alive[region.id]
+    def of(self, region: Followed) -> Transmitter | None:
+        """What is known of a region; None before it was opened."""
+        return self._alive.get(region.id)
 
     @property
     def alive(self) -> list[Transmitter]:
         """Those in sight."""
         return list(self._alive.values())
 
-    @property
-    def places(self) -> dict[int, Region]:
-        """Where those are that have a number and are in sight, by number."""
-        return {one.number: one.region.latest for one in self._alive.values() if one.number is not None}
-
-    def open(self, region: Followed, sync: Any, distance: Any) -> None:
+    def open(self, region: Followed, sync: Any, distance: Any) -> Transmitter:
         """Take a new region, with the first states of its synchronization and its distance filter."""
         packets, grid = PacketAssembler(self._packet.frames), self._grid()
-        self._alive[region.id] = Transmitter(region, sync, packets, grid, distance)
+        transmitter = Transmitter(region, sync, packets, grid, distance)
+        self._alive[region.id] = transmitter
+        return transmitter
 
     def adopt(self, transmitter: Transmitter, lock: SyncLock) -> bool:
         """Take a new lock; frames go on where they were, or start with the first whole one of the region.

@@ -11,11 +11,10 @@ from numpy.typing import NDArray
 from rx_streams import LINK, frames_of, received
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue, Reflections, repeats
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols, SyncLock
+from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
 
 FORMAT = PacketFormat()
 PERIOD_US = FORMAT.packet_chips * FORMAT.chip_us
@@ -41,7 +40,8 @@ def sighting(
     none = Range(math.nan, math.nan, 0)
     x_px = 400.0 + 40 * transmitter if x_px is None else x_px
     frame = Frame(transmitter, packet, index, t_us, soft, none, None, x_px, y_px)
-    return FrameDetection(frame, t_us, light, int((symbols >= 0).sum()), mirrored)
+    times = t_us, t_us + 3200, packet * PERIOD_US, FORMAT.chip_us
+    return FrameDetection(frame, *times, light, int((symbols >= 0).sum()), mirrored)
 
 
 def said(number: int, seed: int = 0) -> Symbols:
@@ -218,22 +218,18 @@ def test_what_was_shown_then_and_there_is_known() -> None:
 def test_the_queue_marks_what_the_next_step_tells() -> None:
     """A bar locks a step after its reflection: the reflection's frames have waited."""
     queue = ReflectionQueue(Reflections(FORMAT, CODEWORDS))
-    grid = PacketGrid(FORMAT)
-    grid.restart(SyncLock(0.0, FORMAT.chip_us, 0.0, 0.0, 1.0), 0.0)
-    due = grid.due(1e9)
-    assert due is not None
     bar, image = PacketAssembler(FORMAT.frames), PacketAssembler(FORMAT.frames)
     for n in range(10):
-        queue.add(image, due, sighting(0, n, said(n), light=70))
+        queue.add(image, sighting(0, n, said(n), light=70))
     assert queue.step() == []
     assert queue
     for n in range(10):
-        queue.add(bar, due, sighting(1, n, said(n)))
+        queue.add(bar, sighting(1, n, said(n)))
     (packet,) = queue.step()
     assert (packet.transmitter, packet.echo_of) == (0, 1)
     assert {f.echo_of for f in packet.frames} == {1}
-    queue.add(image, due, sighting(0, 10, said(10)))
-    queue.end(image)
+    queue.add(image, sighting(0, 10, said(10)))
+    queue.add(image, None)
     assert [(p.transmitter, p.echo_of, len(p.frames)) for p in queue.close()] == [(1, None, 10), (0, 1, 1)]
     assert not queue
 
