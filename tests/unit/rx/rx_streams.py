@@ -45,12 +45,19 @@ def right_frames(
     t0_us: int = 0,
     late_us: tuple[float, float] = (0, 60),
 ) -> int:
-    """How many frames there are, each of which says what was sent at its time; an edge's events come late."""
+    """How many frames there are, each of which says what was sent at its time; an edge's events come late.
+
+    Their packets begin when they were sent, and have each frame once.
+    """
     chip_us = link.packet.chip_us / (1 + bar.ppm * 1e-6)
-    frames = frames_of(packets)
-    for frame in frames:
-        after_us = frame.t_us - t0_us - bar.start_us - link.packet.frame_start_chip(frame.frame) * chip_us
-        packet = round(after_us / (link.packet.packet_chips * chip_us))
-        assert late_us[0] < after_us - packet * link.packet.packet_chips * chip_us < late_us[1]
-        assert frame.soft.symbols.tolist() == bar.symbols[packet, frame.frame].tolist()
-    return len(frames)
+    period_us = link.packet.packet_chips * chip_us
+    for packet in packets:
+        assert [f.frame for f in packet.frames] == sorted({f.frame for f in packet.frames})
+        number = round((packet.t_us - t0_us - bar.start_us) / period_us)
+        begin_us = t0_us + bar.start_us + number * period_us
+        assert late_us[0] < packet.t_us - begin_us < late_us[1]
+        for frame in packet.frames:
+            after_us = frame.t_us - begin_us - link.packet.frame_start_chip(frame.frame) * chip_us
+            assert late_us[0] < after_us < late_us[1]
+            assert frame.soft.symbols.tolist() == bar.symbols[number, frame.frame].tolist()
+    return len(frames_of(packets))

@@ -1,10 +1,11 @@
 """Distances together: drives whose truth is known, with errors drawn as the sigmas say, or not so."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -46,19 +47,27 @@ def drive(
 ) -> np.ndarray:
     """Errors and sigmas, float64 (frames, 2), of a drive whose distances err by `sigma_m`, said `said_m`."""
     rng = np.random.default_rng(seed)
-    keeper, state, out = RangeKeeper(), Ranges(), []
+    true, measured = [], []
     for i in range(frames):
-        t_us = 7e6 + i * FRAME_US
         true_m = start_m + speed_m_s * i * FRAME_US * 1e-6
         late_m = true_m + speed_m_s * late_chips * CHIP_US * 1e-6
         seen_m = late_m / math.cos(math.radians(lean_deg)) + sigma_m * rng.standard_normal()
         seen_m += 0.5 * (i in outliers)
         bend = None if bend_px is None else bend_of(lean_deg, true_m, bend_px, rng)
-        measured = Range(seen_m, said_m or sigma_m, 15, late_chips, bend)
-        state, found = keeper.step(state, t_us, CHIP_US, measured, AHEAD)
-        assert found.pairs == 15
-        out.append((found.distance_m - true_m, found.sigma_m))
-    return np.array(out)
+        measured.append(Range(seen_m, said_m or sigma_m, 15, late_chips, bend))
+        true.append(true_m)
+    _, found = kept(measured)
+    assert {one.pairs for one in found} == {15}
+    return np.array([(one.distance_m - true_m, one.sigma_m) for one, true_m in zip(found, true, strict=True)])
+
+
+def kept(measured: Iterable[Range], sight: BarSight = AHEAD) -> tuple[Ranges, list[Range]]:
+    """What is remembered after frames with these distances, and the distances as they should be."""
+    keeper, state, out = RangeKeeper(), Ranges(), []
+    for i, one in enumerate(measured):
+        state, found = keeper.step(state, i * FRAME_US, CHIP_US, one, sight)
+        out.append(found)
+    return state, out
 
 
 def nees(errors: np.ndarray) -> float:
@@ -91,7 +100,7 @@ def foreshortened(
 @pytest.mark.parametrize("along", [0.0, 0.05, -0.05])
 def test_a_first_distance_stays_but_for_the_lean_that_is_likely(along: float) -> None:
     """A bar 360 px off the middle looks shorter or longer by a twentieth of its lean, which is not known."""
-    _, found = RangeKeeper().step(Ranges(), 0.0, CHIP_US, Range(50.0, 0.02, 15), BarSight(along))
+    _, (found,) = kept([Range(50.0, 0.02, 15)], BarSight(along))
     mean, spread = foreshortened(along)
     assert found.distance_m == pytest.approx(50 * mean, abs=2e-4)
     assert found.sigma_m == pytest.approx(math.hypot(0.02 * mean, 50 * spread), rel=0.02)
@@ -101,7 +110,7 @@ def test_a_first_distance_stays_but_for_the_lean_that_is_likely(along: float) ->
 @pytest.mark.parametrize("lean_deg", [-4.0, 0.0, 12.0])
 def test_an_attitude_tells_the_lean(lean_deg: float, along: float) -> None:
     sight = BarSight(along, sine=math.sin(math.radians(lean_deg)), sigma=math.radians(0.3))
-    _, found = RangeKeeper().step(Ranges(), 0.0, CHIP_US, Range(50.0, 0.02, 15), sight)
+    _, (found,) = kept([Range(50.0, 0.02, 15)], sight)
     mean, spread = foreshortened(along, lean_deg, 0.3, 6e-5)
     assert found.distance_m == pytest.approx(50 * mean, abs=1e-3)
     assert found.sigma_m == pytest.approx(math.hypot(0.02 * mean, 50 * spread), rel=0.03)
@@ -127,16 +136,12 @@ def test_sigmas_become_true(truth: float) -> None:
 
 
 def test_braking_is_no_scatter() -> None:
-    rng = np.random.default_rng(3)
-    keeper, state, sigmas = RangeKeeper(), Ranges(), []
-    for i in range(150):
-        t_s = i * FRAME_US * 1e-6
-        true_m = 40 - 15 * t_s + 8 * t_s**2 / 2
-        measured = Range(true_m + 0.01 * rng.standard_normal(), 0.01, 15)
-        state, found = keeper.step(state, t_s * 1e6, CHIP_US, measured, AHEAD)
-        sigmas.append(found.sigma_m)
+    t_s = np.arange(150) * FRAME_US * 1e-6
+    true_m = 40 - 15 * t_s + 8 * t_s**2 / 2
+    noise_m = 0.01 * np.random.default_rng(3).standard_normal(150)
+    _, found = kept(Range(seen_m, 0.01, 15) for seen_m in (true_m + noise_m).tolist())
     plain = drive(frames=150, sigma_m=0.01, start_m=40.0, late_chips=0.0, seed=3)
-    assert np.mean(sigmas[60:]) < 1.15 * np.mean(plain[60:, 1])
+    assert np.mean([one.sigma_m for one in found[60:]]) < 1.15 * np.mean(plain[60:, 1])
 
 
 def test_an_outlier_says_so_and_leaves_the_others() -> None:
@@ -167,16 +172,15 @@ def test_a_level_bar_costs_nothing_to_speak_of() -> None:
 
 
 def test_a_distance_keeps_nothing_of_old_bends_and_distances() -> None:
-    keeper, state = RangeKeeper(), Ranges()
     rng = np.random.default_rng(5)
-    for i in range(400):
-        bend = bend_of(4.0, 45.0, 0.04, rng)
-        state, _ = keeper.step(state, i * FRAME_US, CHIP_US, Range(45.1, 0.01, 15, 8.0, bend), AHEAD)
+    measured = [Range(45.1, 0.01, 15, 8.0, bend_of(4.0, 45.0, 0.04, rng)) for _ in range(400)]
+    state, _ = kept(measured)
+    weight = measured[-1].bend.weight  # type: ignore[union-attr]
     assert len(state.past) <= 0.3 / (FRAME_US * 1e-6) + 1
-    assert state.bend[0].max() < 1.01 * bend.weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
-    new, _ = keeper.step(state, 400 * FRAME_US + 20e6, CHIP_US, Range(45.1, 0.01, 15, 8.0, bend), AHEAD)
+    assert state.bend[0].max() < 1.01 * weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
+    new, _ = RangeKeeper().step(state, 400 * FRAME_US + 20e6, CHIP_US, measured[-1], AHEAD)
     assert len(new.past) == 1
-    assert new.bend[0] == pytest.approx(bend.weight)
+    assert new.bend[0] == pytest.approx(weight)
 
 
 def wavy(spacing_px: float, start: float, height_px: float, rng: np.random.Generator) -> tuple[Range, float]:
@@ -199,20 +203,21 @@ def wavy(spacing_px: float, start: float, height_px: float, rng: np.random.Gener
     return Range(FOCAL_PX * SPACING_M / fitted, 0.02 / 16.7 / fitted * true_m, 15, 8.0, bend), true_m
 
 
+def waves(spacings_px: NDArray[np.float64], height_px: float, rng: np.random.Generator) -> list[float]:
+    """Error and sigma of the last of some distances, and what it was before."""
+    start = rng.uniform()
+    frames = [wavy(spacing_px, start, height_px, rng) for spacing_px in spacings_px.tolist()]
+    _, found = kept(measured for measured, _ in frames)
+    measured, true_m = frames[-1]
+    return [found[-1].distance_m - true_m, found[-1].sigma_m, measured.distance_m - true_m, measured.sigma_m]
+
+
 def test_a_wave_of_the_pixels_is_learnt_and_taken_out() -> None:
     """At a spacing of 8 px and a fifteenth a wave looks like a lean, and the same in every frame."""
-    rng, late = np.random.default_rng(9), []
-    for _ in range(20):
-        keeper, state = RangeKeeper(), Ranges()
-        start = rng.uniform()
-        for i in range(60):
-            # Farther away boundaries lie in many ways on the pixels; then the car stands.
-            measured, true_m = wavy(min(7.6 + 0.02 * i, 8 + 1 / 15), start, 0.1, rng)
-            state, found = keeper.step(state, i * FRAME_US, CHIP_US, measured, AHEAD)
-            if i == 59:
-                raw_m = measured.distance_m - true_m
-                late.append((found.distance_m - true_m, found.sigma_m, raw_m))
-    error, sigma, raw = np.array(late).T
+    # Farther away boundaries lie in many ways on the pixels; then the car stands.
+    spacings_px = np.minimum(7.6 + 0.02 * np.arange(60), 8 + 1 / 15)
+    rng = np.random.default_rng(9)
+    error, sigma, raw, _ = np.array([waves(spacings_px, 0.1, rng) for _ in range(20)]).T
     assert np.sqrt((raw**2).mean()) > 0.05
     assert np.sqrt((error**2).mean()) < 0.6 * np.sqrt((raw**2).mean())
     assert np.mean((error / sigma) ** 2) < 1.5
@@ -220,35 +225,26 @@ def test_a_wave_of_the_pixels_is_learnt_and_taken_out() -> None:
 
 def test_what_is_not_known_of_the_wave_is_in_the_sigma() -> None:
     """A camera that stands: all frames err alike, and their scatter says nothing of it."""
-    rng, errors = np.random.default_rng(10), []
-    for height_px in rng.normal(0, 0.07, 40):
-        keeper, state, start = RangeKeeper(), Ranges(), rng.uniform()
-        for i in range(60):
-            measured, true_m = wavy(8 + 1 / 15, start, height_px, rng)
-            state, found = keeper.step(state, i * FRAME_US, CHIP_US, measured, AHEAD)
-        errors.append((found.distance_m - true_m, found.sigma_m, measured.distance_m - true_m))
-    error, sigma, raw = np.array(errors).T
+    rng, still_px = np.random.default_rng(10), np.full(60, 8 + 1 / 15)
+    found = [waves(still_px, height_px, rng) for height_px in rng.normal(0, 0.07, 40)]
+    error, sigma, raw, raw_sigma = np.array(found).T
     assert np.mean((error / sigma) ** 2) < 2
     # A ranging alone says less than a third of it.
-    assert np.mean((raw / measured.sigma_m) ** 2) > 10
+    assert np.mean((raw / raw_sigma) ** 2) > 10
 
 
 def test_another_layout_s_bend_starts_anew() -> None:
-    keeper, rng = RangeKeeper(), np.random.default_rng(6)
-    bend = bend_of(0.0, 45.0, 0.04, rng)
-    state, _ = keeper.step(Ranges(), 0.0, CHIP_US, Range(45.0, 0.01, 15, 8.0, bend), AHEAD)
+    bend = bend_of(0.0, 45.0, 0.04, np.random.default_rng(6))
     few = Bend(bend.place[:4], bend.off[:4], bend.weight[:4])
-    state, found = keeper.step(state, FRAME_US, CHIP_US, Range(45.0, 0.01, 4, 8.0, few), AHEAD)
+    state, found = kept([Range(45.0, 0.01, 15, 8.0, bend), Range(45.0, 0.01, 4, 8.0, few)])
     assert state.bend.shape == (3, 4)
     # The scatter of four boundaries about a parabola says nothing of its sigma.
-    assert math.isfinite(found.sigma_m)
+    assert math.isfinite(found[-1].sigma_m)
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 1e-12])
 def test_ideal_distances_stay(sigma_m: float) -> None:
-    keeper, state = RangeKeeper(), Ranges()
-    for i in range(120):
-        state, found = keeper.step(state, i * FRAME_US, CHIP_US, Range(50.0, sigma_m, 15), AHEAD)
-        mean, spread = foreshortened()
+    mean, spread = foreshortened()
+    for found in kept([Range(50.0, sigma_m, 15)] * 120)[1]:
         assert found.distance_m == pytest.approx(50 * mean, abs=2e-4)
         assert found.sigma_m == pytest.approx(50 * spread, rel=0.02)
