@@ -499,8 +499,8 @@ class RegionFollower(RegionTracker):
             if rises:
                 hits[:] = 0
             return
-        lit = [self._lit(cells, end_us) for cells in self._areas(hits)]
-        joined = _joined([box for box in lit if box is not None], merge)
+        lit = [self._measure(None, area, end_us) for area in self._areas(hits)]
+        joined = _joined([_box_of(region) for region in lit if region is not None], merge)
         boxes = [box for box in joined if _inside(hits, box).sum() >= _LEAST_RISES]
         hits[:] = 0
         fresh, self._fresh = self._fresh, []
@@ -510,8 +510,8 @@ class RegionFollower(RegionTracker):
             else:
                 self._fresh.append(box)
 
-    def _areas(self, hits: NDArray[np.int32]) -> list[list[int]]:
-        """Rectangles (left, top, right, bottom) around connected cells with hits; as many as there may be."""
+    def _areas(self, hits: NDArray[np.int32]) -> list[Box]:
+        """Boxes around connected cells with hits; as many as there may be."""
         # Of 2 x 2 cells, one at the most begins an area.
         rows, columns = hits.shape
         most = ((rows + 1) // 2) * ((columns + 1) // 2)
@@ -522,16 +522,8 @@ class RegionFollower(RegionTracker):
             self.counts["areas_left_out"] += many - self._limits.areas
             best = np.sort(np.argsort(-total[:many], kind="stable")[: self._limits.areas])
             boxes = boxes[best]
-        found: list[list[int]] = boxes.tolist()
-        return found
-
-    def _lit(self, cells: Sequence[int], end_us: int) -> Box | None:
-        """The box around the pixels that blink in a rectangle of cells, None if there are none."""
-        left, top = cells[0] << _CELL_SHIFT, cells[1] << _CELL_SHIFT
-        right = min(cells[2] << _CELL_SHIFT, self._camera.width)
-        bottom = min(cells[3] << _CELL_SHIFT, self._camera.height)
-        region = self._measure(None, (left, top, right, bottom), end_us)
-        return None if region is None else _box_of(region)
+        size = self._camera.width, self._camera.height
+        return [tuple(box) for box in np.minimum(boxes << _CELL_SHIFT, size * 2).tolist()]
 
     def _start(self, box: Box, end_us: int) -> None:
         region = self._measure(None, box, end_us)

@@ -1,10 +1,10 @@
 """Packets to messages: soft bits to blocks, blocks to messages, signatures to trust."""
 
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
-from typing import Self, TypeVar
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +34,6 @@ _MOST_MESSAGES = 8
 """Messages of a transmitter that are collected at a time, and that are remembered when complete."""
 
 _Key = tuple[int, int, int]
-_K = TypeVar("_K")
-_V = TypeVar("_V")
 
 
 @dataclass
@@ -166,7 +164,8 @@ class MessageAssembler:
         if packet.echo_of is not None:
             self.counts["blocks_reflected"] += 1
             return packet
-        inbox = _kept(self._inboxes, packet.transmitter, _Inbox)
+        inbox = self._inboxes.setdefault(packet.transmitter, _Inbox())
+        self._inboxes.move_to_end(packet.transmitter)
         while len(self._inboxes) > _MOST_TRANSMITTERS:
             self._give_up(self._inboxes.popitem(last=False)[1])
         self.counts["blocks_tried"] += 1
@@ -234,7 +233,8 @@ class MessageAssembler:
             inbox.done.pop(key, None)
             self._missing(inbox.open.pop(key, None))
         carried = carried_bytes(block.length, self._room)
-        parts = _kept(inbox.open, key, lambda: _Parts(block.length, carried))
+        parts = inbox.open.setdefault(key, _Parts(block.length, carried))
+        inbox.open.move_to_end(key)
         parts.parts[block.index] = block.part
         while len(inbox.open) > _MOST_MESSAGES:
             self._missing(inbox.open.popitem(last=False)[1])
@@ -315,11 +315,3 @@ def _agreement(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     product = a.astype(np.float64) * b
     spread = float(np.vdot(product, product)) ** 0.5
     return float(product.sum()) / spread if spread else 0.0
-
-
-def _kept(table: OrderedDict[_K, _V], key: _K, make: Callable[[], _V]) -> _V:
-    """The entry of a table, made if need be; it is now the newest."""
-    if key not in table:
-        table[key] = make()
-    table.move_to_end(key)
-    return table[key]

@@ -32,8 +32,6 @@ class Places:
     def __init__(self, regions: Iterable[Region]) -> None:
         regions = list(regions)
         self.latest = regions[-1]
-        # Time, column and row of the second newest, asked for in every step; None where not looked up yet.
-        self._before: tuple[float, float, float] | None = None
         rows = [(p.t_us, p.x_px, p.y_px, p.width_px, p.height_px) for p in regions]
         self._columns = np.empty((5, max(2 * len(rows), _ROOM)))
         self._first, self._end = 0, len(rows)
@@ -58,13 +56,11 @@ class Places:
             self._first = 0
         columns[:, end] = region.t_us, region.x_px, region.y_px, region.width_px, region.height_px
         self._end = end + 1
-        last = self.latest
-        self._before, self.latest = (last.t_us, last.x_px, last.y_px), region
+        self.latest = region
 
     def take_back(self) -> None:
         """Drop the newest, as if it had not been taken."""
         self._end -= 1
-        self._before = None
         self.latest = region_of(self.latest.id, *self._columns[:, self._end - 1].tolist())
 
     def forget_before(self, t_us: float) -> None:
@@ -106,7 +102,6 @@ class Places:
             off_px = row_px - columns[2, :many]
             columns[2, :many] += np.minimum(np.maximum(off_px, -slack_px), slack_px)
         columns[3, :many], columns[4, :many] = size_px
-        other._before = None
         other.latest = region_of(id, *columns[:, many - 1].tolist())
         return other
 
@@ -115,7 +110,6 @@ class Places:
         other = object.__new__(Places)
         last = self.latest
         other._columns, other._first, other._end = self._columns.copy(), self._first, self._end
-        other._before = self._before
         other.latest = region_of(id, last.t_us, last.x_px, last.y_px, last.width_px, last.height_px)
         return other
 
@@ -124,10 +118,7 @@ class Places:
         last = self.latest
         if self._end - self._first < 2:
             return last.x_px, last.y_px
-        if self._before is None:
-            one_us, one_x, one_y = self._columns[:3, self._end - 2].tolist()
-            self._before = one_us, one_x, one_y
-        before_us, x_px, y_px = self._before
+        before_us, x_px, y_px = self._columns[:3, self._end - 2].tolist()
         # Further ahead than that, a shaking camera has turned back.
         ahead = min((t_us - last.t_us) / (last.t_us - before_us), 1.0)
         return last.x_px + ahead * (last.x_px - x_px), last.y_px + ahead * (last.y_px - y_px)

@@ -14,7 +14,7 @@ from evlcp_sdk.rx.alignment import Pilot
 from evlcp_sdk.rx.delays import LONGEST_ROW_US, RowDelay
 from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.grid import PacketGrid
-from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.packets import PacketAssembler
 from evlcp_sdk.rx.places import Places
 from evlcp_sdk.values import SyncLock
@@ -81,7 +81,7 @@ class Transmitters:
         self,
         packet: PacketFormat,
         step_us: int,
-        limits: Limits = LIMITS,
+        limits: Limits,
         numbers: Iterator[int] | None = None,
         chips_after: int = 0,
     ) -> None:
