@@ -17,7 +17,7 @@ from evlcp_sdk.scene.lean import BarSight, foreshortening
 from evlcp_sdk.values import Events, PresenceMap
 
 WIDTH, HEIGHT = 24, 16
-SEEDS = range(8)
+SEEDS = range(5)
 CHIP_US = 100.0
 
 
@@ -78,36 +78,6 @@ def test_scores_of_pixels(seed, freeze):
     assert 0 <= score.min() < score.max() <= 40
 
 
-@pytest.mark.parametrize(
-    ("run_us", "score"),
-    [
-        (149, None),
-        (150, -3),
-        (169, -3),
-        (170, 2),
-        (230, 2),
-        (231, -3),
-        (250, -3),
-        (400, 2),
-        (500, 1),
-        (700, -2),
-        (1200, 1),
-        (1251, -1),
-        (10**5, -1),
-    ],
-)
-def test_a_rise_counts_by_its_time_since_the_last(run_us, score):
-    """Seven chips, the ninth of the times that are told apart, lay between the two before."""
-    before = int(states(1000, 9, 10))
-    pixels = np.full((HEIGHT, WIDTH), before, np.uint32)
-    assert not scored(Events.of([1000 + run_us], [3], [2], [1]), pixels, min_score=13).any()
-    if score is None:
-        assert pixels[2, 3] == before
-    else:
-        assert pixels[2, 3] & _kernels.SCORES == 10 + score
-        assert pixels[2, 3] >> _kernels.CLOCK_AT == (1000 + run_us) % _kernels.CLOCK_ROUND
-
-
 @pytest.mark.parametrize("chip_us", [50.0, 100.0, 333.3, 1e5, 2e6])
 def test_times_count_alike_at_every_chip_rate(chip_us):
     """A clock of ticks longer than a microsecond serves slow chips."""
@@ -120,31 +90,6 @@ def test_times_count_alike_at_every_chip_rate(chip_us):
         rise = Events.of([start_us + round(chips * chip_us)], [3], [2], [1])
         rhythm.step(start_us, rise, np.zeros((4, 6), np.int32), 2)
         assert pixels[2, 3] & _kernels.SCORES == 10 + score, chips
-
-
-@pytest.mark.parametrize(
-    ("run_us", "hit"), [(300, True), (700, True), (1250, True), (1251, False), (9**5, False)]
-)
-def test_a_rise_long_after_the_last_is_no_hit(run_us, hit):
-    """Whatever a pixel's score is: that of one that a bar has left is high."""
-    pixels = np.full((HEIGHT, WIDTH), states(1000, 2, 40), np.uint32)
-    assert scored(Events.of([1000 + run_us], [3], [2], [1]), pixels).any() == hit
-
-
-def test_falls_are_not_looked_at():
-    pixels = np.full((HEIGHT, WIDTH), states(1000, 0, 0), np.uint32)
-    before = pixels.copy()
-    assert not scored(Events.of([1200, 1400], [3, 3], [2, 2], [0, 0]), pixels).any()
-    assert_array_equal(pixels, before)
-
-
-def test_scores_do_not_care_how_the_stream_is_cut():
-    events = random_events(np.random.default_rng(0), 1000, step_us=8, width=4, height=4)
-    whole, parts = (states(np.full((HEIGHT, WIDTH), -(2**16)), 0, 0) for _ in range(2))
-    want = scored(events, whole)
-    got = sum(scored(events[a:b], parts) for a, b in [(0, 0), (0, 1), (1, 700), (700, 1000)])
-    assert_array_equal(parts, whole)
-    assert_array_equal(got, want)
 
 
 @pytest.mark.parametrize("gap_us", [1500, 12_000, 35_000, 131_072, 10**10])
@@ -232,16 +177,6 @@ def test_strips_are_measured_whatever_each_has_awake():
     assert rows[8] == 3
     assert (upper, lower) == pytest.approx((3 + 1 / 6, 13 - 1 / 6))  # 36 pixels in ten rows
     assert abs(rhythm.measure(box, 1100, 200, 2, np.inf, rows)[1] - 11) > 3
-
-
-def test_an_edge_row_counts_by_its_share():
-    pixels = np.zeros((HEIGHT, WIDTH), np.uint32)
-    pixels[4:8, 2:10] = pixels[8, 2:4] = states(1000, 0, 40)
-    *_, upper, lower = _kernels.measure_box(
-        pixels, (0, 0, WIDTH, HEIGHT), (1000, 0, 5), 2, np.inf, np.empty(HEIGHT, np.int64)
-    )
-    # 34 pixels in five rows: a full row counts as 6.8.
-    assert (upper, lower) == pytest.approx((4, 8 + 2 / 6.8))
 
 
 @pytest.mark.parametrize("n", [0, 1, 500])
@@ -440,14 +375,6 @@ def test_answers_between_and_across_clusters(seed, turn, every):
     assert_array_equal(across, twins.spread_across(sums, codes, every, places, seen, turn, 1.3, 5))
 
 
-@pytest.mark.parametrize("apart", [0.0, 0.5, -0.9])
-def test_centres_in_one_pixel_have_no_boundary(apart):
-    """A reflection beside a bar may bring the centres of two neighbours together."""
-    mine = np.ones(9)
-    assert np.isnan(_kernels.boundary_between(mine, mine, 4.0, 4.0 + apart))
-    assert _kernels.boundary_between(mine, mine, 3.0, 5.0) == pytest.approx(0.5)
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 def test_boundaries_are_where_lines_balance(seed) -> None:
     rng = np.random.default_rng(seed)
@@ -456,6 +383,8 @@ def test_boundaries_are_where_lines_balance(seed) -> None:
         start, end = rng.uniform(-2, 13, 2)
         found, expected = (of.boundary_between(mine, its, start, end) for of in (_kernels, twins))
         assert found == pytest.approx(expected, nan_ok=True)
+    # A reflection beside a bar may bring the centres of two neighbours together.
+    assert all(np.isnan(_kernels.boundary_between(mine, its, 4.0, 4.0 + apart)) for apart in (0.0, 0.5, -0.9))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
