@@ -1,6 +1,5 @@
-"""Successive-cancellation list decoding and the plausibility of its result: compiled."""
+"""Successive-cancellation list decoding, compiled."""
 
-from math import exp, inf, log
 from typing import Any
 
 import numpy as np
@@ -12,48 +11,6 @@ Array = NDArray[Any]
 
 FROZEN, REPEATED, FREE = 0, 1, 2
 """Kinds of nodes: inputs that are all 0; all 0 but the last; all information."""
-
-
-@njit
-def discrepancy_limit(weight: Array, log_share: float) -> float:
-    """Largest total of flipped weights that is not an accident; negative if any total may be one.
-
-    A word of random signs lies within D of a given codeword with a probability of at most
-    exp(z D) prod((1 + exp(-z w)) / 2) for every z > 0 (Chernoff). The D is found at which the least of these
-    is exp(`log_share`), or a little less. The bound falls with z, and D is the mean of the tilted weights.
-    """
-    total, received = 0.0, 0
-    for w in weight:
-        if w > 0.0:
-            total += w
-            received += 1
-    if received * log(2.0) <= -log_share:
-        return -1.0
-    low, high = 0.0, inf
-    z = 2.0 * received / total
-    for _ in range(100):
-        d, bound, slope, product = 0.0, -received * log(2.0), 0.0, 1.0
-        for w in weight:
-            if w > 0.0:
-                e = exp(-z * w)
-                p = e / (1.0 + e)
-                d += w * p
-                slope += w * w * p * (1.0 - p)
-                product *= 1.0 + e
-                if product > 1e250:
-                    bound += log(product)
-                    product = 1.0
-        bound += log(product) + z * d
-        if bound > log_share:
-            low = z
-        elif bound > log_share - 0.05:
-            return d
-        else:
-            high = z
-        z += (bound - log_share + 0.02) / (z * slope) if slope > 0.0 else inf
-        if not low < z < high:
-            z = (low + high) / 2 if high < inf else 2.0 * low
-    return -1.0
 
 
 @njit

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import cached_property
-from math import ceil, floor, log
+from math import ceil, floor, inf, log
 from typing import Annotated
 
 import numpy as np
@@ -146,6 +146,33 @@ def information_set(length: int, information_bits: int) -> NDArray[np.bool_]:
     return information
 
 
+def discrepancy_limit(weight: NDArray[np.float64], log_share: float) -> float:
+    """Largest total of flipped weights that is not an accident; negative if any total may be one.
+
+    A word of random signs lies within D of a given codeword with a probability of at most
+    exp(z D) prod((1 + exp(-z w)) / 2) for every z > 0 (Chernoff). The D is found at which the least of these
+    is exp(`log_share`), or a little less. The bound falls with z, and D is the mean of the tilted weights.
+    """
+    weight = weight[weight > 0]
+    none = len(weight) * log(2)
+    if none <= -log_share:
+        return -1.0
+    low, high, z = 0.0, inf, 2 / float(weight.mean())
+    for _ in range(100):
+        tilted = np.exp(-z * weight)
+        share = tilted / (1 + tilted)
+        total = float(weight @ share)
+        bound = float(np.log1p(tilted).sum()) - none + z * total
+        if log_share - 0.05 < bound <= log_share:
+            return total
+        low, high = (z, high) if bound > log_share else (low, z)
+        slope = z * float(weight**2 @ (share * (1 - share)))
+        z += (bound - log_share + 0.02) / slope if slope > 0 else inf
+        if not low < z < high:
+            z = (low + high) / 2 if high < inf else 2 * low
+    return -1.0
+
+
 def transform(bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
     """Bits times the Kronecker power of [[1, 0], [1, 1]], uint8 (N,); its own inverse.
 
@@ -237,7 +264,7 @@ class _PolarCode:
         if mean > 0:
             weight /= mean
             llr = llr / mean
-        limit = _kernels.discrepancy_limit(weight, self.log_share)
+        limit = discrepancy_limit(weight, self.log_share)
         n = len(self.information)
         # A shortened bit is known to be 0: surer than all that is received.
         mother = np.full(n, 0.0 if self.punctured else 4.0 * n, np.float32)
