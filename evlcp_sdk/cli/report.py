@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -66,70 +67,37 @@ def report(
     else:
         if summary.done < summary.tasks:
             console().print(f"{summary.done} of {summary.tasks} tasks are done", style="yellow")
-        show_series(summary)
-        show_positions(summary)
-        show_paper(summary)
+        show_tables(summary)
         if out is not None:
             console().print(f"written: {out}, {folder}/*.png, *.svg", style="dim")
 
 
-def show_series(summary: Summary) -> None:
-    """Print BER, RMSE and gross errors of every series, a row a segment."""
-    _print(*_series_table(summary), names=2)
-
-
-def show_positions(summary: Summary) -> None:
-    """Print what became of positions, a row a series, where there are any."""
-    head, rows = _positions_table(summary)
-    if rows:
-        console().print()
-        _print(head, rows, names=1)
-
-
-def show_paper(summary: Summary) -> None:
-    """Print the paper's figures beside those of the campaign."""
-    head, rows = _paper_table(summary)
-    if rows:
-        console().print()
-        _print(head, rows, names=3)
+def show_tables(summary: Summary) -> None:
+    """Print every figure, what became of positions, and the paper's figures beside those of the campaign."""
+    for number, (head, rows, names) in enumerate(_tables(summary)):
+        if number:
+            console().print()
+        print_table(console(), head, [[(text, False) for text in row] for row in rows], names)
 
 
 def as_markdown(summary: Summary) -> str:
-    """The same tables as Markdown."""
+    """The same tables as Markdown, the paper's first."""
     parts = []
-    for head, rows in (_paper_table(summary), _positions_table(summary), _series_table(summary)):
-        if rows:
-            cells = [[cell.replace("\\", "\\\\").replace("|", "\\|") for cell in row] for row in rows]
-            lines = [head, ["---"] * len(head), *cells]
-            parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
+    for head, rows, _ in reversed(_tables(summary)):
+        cells = [[cell.replace("\\", "\\\\").replace("|", "\\|") for cell in row] for row in rows]
+        lines = [head, ["---"] * len(head), *cells]
+        parts.append("\n".join(f"| {' | '.join(line)} |" for line in lines))
     return "\n\n".join(parts)
 
 
-_WIDE = ("bit errors", "bias, m", "RMSE in space, m")
-"""Columns of the page for which a terminal has no room."""
-
-
-def _series_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
-    from evlcp_sdk.study.campaign.report import figure_rows
-
-    head, rows = figure_rows(summary)
-    kept = [i for i, name in enumerate(head) if name not in _WIDE]
-    return [head[i] for i in kept], [[row[i] for i in kept] for row in rows]
-
-
-def _positions_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
-    from evlcp_sdk.study.campaign.report import POSITION_HEAD, position_rows
-
-    return list(POSITION_HEAD), [list(row) for row in position_rows(summary)]
-
-
-def _paper_table(summary: Summary) -> tuple[list[str], list[list[str]]]:
-    from evlcp_sdk.study.campaign.report import comparison_rows
+def _tables(summary: Summary) -> list[tuple[Sequence[str], Sequence[Sequence[str]], int]]:
+    """Head and rows of each table that has rows, and how many of its columns say what a row is."""
+    from evlcp_sdk.study.campaign import report as of_campaign
     from evlcp_sdk.study.summary import beside_paper
 
-    rows = [list(row) for row in comparison_rows(beside_paper(summary.series))]
-    return ["figure", "distance", "series", "paper", "here", "95 %", "verdict"], rows
-
-
-def _print(head: list[str], rows: list[list[str]], names: int) -> None:
-    print_table(console(), head, [[(text, False) for text in row] for row in rows], names)
+    tables = [
+        (*of_campaign.figure_rows(summary), 2),
+        (of_campaign.POSITION_HEAD, of_campaign.position_rows(summary), 1),
+        (of_campaign.PAPER_HEAD, of_campaign.comparison_rows(beside_paper(summary.series)), 3),
+    ]
+    return [table for table in tables if table[1]]

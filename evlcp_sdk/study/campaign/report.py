@@ -35,6 +35,7 @@ def page(summary: Summary) -> str:
         charts=drawn,
         beside=_paper_rows(beside),
         paper=PAPER_NAME,
+        paper_head=PAPER_HEAD,
         agreement=AGREEMENT,
         segment_m=SEGMENT_M,
         positions=position_rows(summary),
@@ -135,8 +136,11 @@ _MARKED = {"better": "yes", "agrees": "", "worse": "no"}
 _MEASURES = {"ber": "bit error rate", "rmse_m": "distance RMSE, m", "gross_share": "errors of 0.5 m or more"}
 
 
+PAPER_HEAD = ("figure", "distance", "series", "paper", "here", "95 %", "verdict")
+
+
 def comparison_rows(comparisons: Iterable[PaperComparison]) -> list[tuple[str, ...]]:
-    """Figure, distance, series, paper, here, its interval, and the verdict, as text."""
+    """Rows of `PAPER_HEAD`, as text."""
     rows: list[tuple[str, ...]] = []
     for one in comparisons:
         r, percent = one.reference, one.reference.measure == "gross_share"

@@ -80,14 +80,9 @@ def comparison(*tables: Table) -> Comparison:
 
 def test_figures_by_hand() -> None:
     m = measured()
-    assert m.tally.ber == 3 / 8448
-    assert (m.ber.value, m.ber.recordings) == (m.tally.ber, 1)
+    assert (m.ber.value, m.ber.recordings) == (3 / 8448, 1)
     assert math.isnan(m.ber.high)
     assert m.tally.rmse_m == pytest.approx(math.sqrt((0.01 + 0.04 + 0.36) / 3))
-    assert m.tally.bias_m == pytest.approx(0.5 / 3)
-    assert m.tally.gross_share == pytest.approx(1 / 3)
-    assert m.tally.filtered_rmse_m == pytest.approx(math.sqrt((0.05**2 + 0.02**2) / 2))
-    assert m.statistics.sigma_m == pytest.approx(math.sqrt(0.05))
     assert (m.us_per_frame, m.times_real_time, m.tally.found_share) == (700, 2, 0.88)
     both = m + measured(bit_errors=5)
     assert (both.tally.bits, both.tally.bit_errors) == (16896, 8)

@@ -145,11 +145,10 @@ def test_a_folder_that_cannot_be_written_is_read(results: Path) -> None:
 
 def told(summary: Summary) -> Elements:
     """Everything that is told of a summary; its page."""
-    from evlcp_sdk.cli.report import as_markdown, show_paper, show_series
+    from evlcp_sdk.cli.report import as_markdown, show_tables
 
     json.dumps(summary.to_dict(), allow_nan=False)
-    show_series(summary)
-    show_paper(summary)
+    show_tables(summary)
     as_markdown(summary)
     charts_of(summary)
     compared: Comparison = of_campaign(summary)
