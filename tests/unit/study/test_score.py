@@ -117,7 +117,9 @@ def truth_with(table: Table, lengths: Lengths, seed: int = 1) -> Table:
     rng = np.random.default_rng(seed)
     frames, clusters = link.air.frames_per_packet, link.codebook.clusters
     assert link.packet.packet_chips == lengths.packet(frames)
-    duration_s = 4.4 * lengths.packet(frames) / lengths.rate_hz
+    first, chips = lengths.frames(frames)[5]
+    # A frame of the first bar ends a chip before the recording does, and so was not sent whole.
+    duration_s = (4 * lengths.packet(frames) + first + chips - 3.7 + 1) / lengths.rate_hz
     t_s = np.arange(0, duration_s, 1e-3)
     bars = []
     for start_chip, ppm in ((3.7, 40.0), (20.2, -25.0)):
