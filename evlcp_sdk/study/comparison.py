@@ -15,7 +15,7 @@ from markupsafe import Markup
 from evlcp_sdk.files import defused
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.stopwatch import times_real_time
-from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, Figure, measure
+from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, Figure, measure, number_text
 from evlcp_sdk.study.summary import Series, Summary
 from evlcp_sdk.study.tally import Statistics, Tally
 
@@ -142,17 +142,13 @@ class Column:
     rank: Callable[[Measured], float] | None
 
 
-def _text(value: float, form: str) -> str:
-    return "-" if math.isnan(value) else format(value, form)
-
-
 def _frames(m: Measured) -> str:
     tally = m.tally
     return f"{tally.frames_found}/{tally.frames_sent}" if tally.frames_sent else str(m.statistics.rows)
 
 
 def _ber(m: Measured) -> str:
-    return _text(m.tally.ber, ".1e") if m.tally.bit_errors else "-" if not m.tally.bits else "0"
+    return number_text(m.tally.ber, ".1e") if m.tally.bit_errors else "-" if not m.tally.bits else "0"
 
 
 def _interval(m: Measured) -> str:
@@ -186,21 +182,23 @@ COLUMNS = (
     Column("ber_interval", "95 %", _interval, None),
     Column("erased_share", "erased", lambda m: _some(m.tally.erased, m.tally.visible), None),
     Column("claimed_share", "claimed", lambda m: _some(m.tally.claimed, m.tally.hidden), None),
-    Column("rmse_m", "RMSE, m", lambda m: _text(m.tally.rmse_m, ".4f"), lambda m: m.tally.rmse_m),
-    Column("bias_m", "bias, m", lambda m: _text(m.tally.bias_m, "+.4f"), lambda m: abs(m.tally.bias_m)),
+    Column("rmse_m", "RMSE, m", lambda m: number_text(m.tally.rmse_m, ".4f"), lambda m: m.tally.rmse_m),
+    Column("bias_m", "bias, m", lambda m: number_text(m.tally.bias_m, "+.4f"), lambda m: abs(m.tally.bias_m)),
     Column("gross_share", ">= 0.5 m", _gross, lambda m: m.tally.gross_share),
     Column(
         "filtered_rmse_m",
         "filtered, m",
-        lambda m: _text(m.tally.filtered_rmse_m, ".4f"),
+        lambda m: number_text(m.tally.filtered_rmse_m, ".4f"),
         lambda m: m.tally.filtered_rmse_m,
     ),
-    Column("sigma_m", "sigma, m", lambda m: _text(m.statistics.sigma_m, ".4f"), None),
-    Column("us_per_frame", "us/frame", lambda m: _text(m.us_per_frame, ".0f"), lambda m: m.us_per_frame),
+    Column("sigma_m", "sigma, m", lambda m: number_text(m.statistics.sigma_m, ".4f"), None),
+    Column(
+        "us_per_frame", "us/frame", lambda m: number_text(m.us_per_frame, ".0f"), lambda m: m.us_per_frame
+    ),
     Column(
         "times_real_time",
         "x real time",
-        lambda m: _text(m.times_real_time, ".2f"),
+        lambda m: number_text(m.times_real_time, ".2f"),
         lambda m: -m.times_real_time,
     ),
 )
@@ -298,7 +296,7 @@ class Table:
                     bars.append(Bar(row.variant, abs(rank), text, low, high, best=column.key in keys))
             if column.key == "rmse_m" and self.bounds_m:
                 bound_m = rms(self.bounds_m)
-                bars.append(Bar(BOUND_NAME, bound_m, _text(bound_m, ".4f"), bound_m, bound_m, dim=True))
+                bars.append(Bar(BOUND_NAME, bound_m, number_text(bound_m, ".4f"), bound_m, bound_m, dim=True))
             found.append((column.title, bars))
         return found
 
@@ -316,7 +314,7 @@ class Table:
                 line.append((column.cell(row.measured) + (MARK if is_best else ""), is_best))
             lines.append(line)
         if self.bounds_m:
-            bound = [_text(rms(self.bounds_m), ".4f") if c.key == "rmse_m" else "" for c in columns]
+            bound = [number_text(rms(self.bounds_m), ".4f") if c.key == "rmse_m" else "" for c in columns]
             lines.append([(text, False) for text in (BOUND_NAME, *bound)])
         return ["variant", *(c.title for c in columns)], lines
 

@@ -66,6 +66,11 @@ class Figure:
         return f"{first}{self.low:{form}}, {self.high:{form}}{last}"
 
 
+def number_text(value: float, form: str) -> str:
+    """A number as text; `-` for NaN."""
+    return "-" if math.isnan(value) else format(value, form)
+
+
 def measure(recordings: Sequence[Tally], kind: str) -> Figure:
     """A figure of independent recordings, by its name in `Tally`.
 

@@ -1,6 +1,5 @@
 """One self-contained page of a campaign: charts that answer the pointer, tables, configuration, digests."""
 
-import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
@@ -11,7 +10,7 @@ from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import SCRIPT
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.study.campaign.charts import charts_of
-from evlcp_sdk.study.intervals import INTERVALS, Figure, measure
+from evlcp_sdk.study.intervals import INTERVALS, Figure, measure, number_text
 from evlcp_sdk.study.paper import PAPER_NAME
 from evlcp_sdk.study.plan import digest_of
 from evlcp_sdk.study.summary import AGREEMENT, PaperComparison, Series, Summary, beside_paper
@@ -176,26 +175,24 @@ def position_rows(summary: Summary) -> list[tuple[str, ...]]:
         t = one.statistics.total()
         if not t.fixes + t.fixes_refused:
             continue
-        given = (
+        rows.append(
             (
-                f"{t.kept_share:.1%}",
+                one.name,
+                f"{t.fixes} of {t.fixes + t.fixes_refused}",
+                f"{t.fixes_contradicted}",
+                number_text(t.kept_share, ".1%"),
                 f"{t.fixes_excluded}",
-                f"{t.position_median_m:.3f}, {t.position_95_m:.3f}",
-                f"{t.position_nees:.3g}",
+                ", ".join(number_text(m, ".3f") for m in (t.position_median_m, t.position_95_m)),
+                number_text(t.position_nees, ".3g"),
                 f"{t.fixes_silent}",
                 f"{t.fixes_uncovered}",
                 f"{t.fixes_protected}",
                 f"{t.fixes_beyond}",
-                f"{t.track_rmse_m:.3f}",
-                f"{t.track_nees:.3g}",
-                f"{t.smoothed_rmse_m:.3f}",
-                f"{t.smoothed_nees:.3g}",
+                number_text(t.track_rmse_m, ".3f"),
+                number_text(t.track_nees, ".3g"),
+                number_text(t.smoothed_rmse_m, ".3f"),
+                number_text(t.smoothed_nees, ".3g"),
             )
-            if t.fixes
-            else (f"{t.kept_share:.1%}" if t.fixes_contradicted else "-", "0", *10 * ("-",))
-        )
-        rows.append(
-            (one.name, f"{t.fixes} of {t.fixes + t.fixes_refused}", f"{t.fixes_contradicted}", *given)
         )
     return rows
 
@@ -217,7 +214,7 @@ def figure_rows(summary: Summary) -> tuple[tuple[str, ...], list[tuple[str, ...]
                     f"{tally.bit_errors} of {tally.bits}",
                     _shown(measure(recordings, "ber"), ".2g"),
                     _shown(measure(recordings, "rmse_m"), ".3f"),
-                    "-" if math.isnan(tally.bias_m) else f"{tally.bias_m:+.3f}",
+                    number_text(tally.bias_m, "+.3f"),
                     _shown(measure(recordings, "gross_share"), ".2%"),
                     *((f"{tally.messages_found} of {tally.messages_sent}",) if messages else ()),
                     *((f"{tally.messages_wrong}",) if messages else ()),
@@ -238,14 +235,12 @@ _POSITION_HEAD = ("positions", "RMSE in space, m", "half within, m", "95 % withi
 def _positions(recordings: Sequence[Tally]) -> tuple[str, ...]:
     """Positions given of those due, and their errors, as text."""
     tally = Tally.together(recordings)
-    if not tally.fixes:
-        return (f"0 of {tally.fixes_refused}", *4 * ("-",))
     return (
         f"{tally.fixes} of {tally.fixes + tally.fixes_refused}",
         _shown(measure(recordings, "position_rmse_m"), ".3f"),
-        f"{tally.position_median_m:.3f}",
-        f"{tally.position_95_m:.3f}",
-        f"{tally.position_nees:.2f}",
+        number_text(tally.position_median_m, ".3f"),
+        number_text(tally.position_95_m, ".3f"),
+        number_text(tally.position_nees, ".2f"),
     )
 
 
