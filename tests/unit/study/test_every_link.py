@@ -12,7 +12,10 @@ import pytest
 from evlcp_wh.pilots import WhPilots
 from numpy.typing import NDArray
 
+from evlcp_sdk.air.codebook import chips_of_values, hadamard
+from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import Modulation
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, Truth, load_scene, truth_of
 from evlcp_sdk.specs import toml_value
@@ -21,10 +24,25 @@ from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.study.task import plan_of
 from evlcp_sdk.values import Events
-from tests.unit.sim.test_sim_links import PANEL, Stranger
 
 Evlcp = Callable[..., Any]
 Settings = dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Four(Modulation):
+    """Two bits a symbol: a modulation of somebody else's."""
+
+    def codewords(self) -> NDArray[np.uint8]:
+        return chips_of_values(np.repeat(hadamard(4), 2, axis=1))
+
+
+class Stranger:
+    """A package with a modulation."""
+
+    @hookimpl
+    def evlcp_algorithms(self) -> list[Algorithm]:
+        return [Algorithm("modulation", "four", f"{__name__}:Four", 3, "two bits")]
 
 
 @pytest.fixture
@@ -38,6 +56,7 @@ def column(clusters: int, leds: int) -> Settings:
     return {"bar.rows": clusters * leds, "bar.cluster_rows": leds, "bar.led_pitch_m": 0.96 / clusters / leds}
 
 
+PANEL = {"rows": 16, "columns": 16, "led_pitch_m": 0.02, "cluster_rows": 4, "cluster_columns": 4}
 LAMP = {"bar.rows": 6, "bar.columns": 1, "bar.cluster_rows": 6, "bar.cluster_columns": 1}
 
 LINKS: dict[str, Settings] = {
