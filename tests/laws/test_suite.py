@@ -1,10 +1,8 @@
 """The suite as users meet it: `check`, excuses, the decorator, `evlcp check`."""
 
 import json
-import subprocess
-import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,73 +14,54 @@ from evlcp_sdk import simulate
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.roles import ROLES, Ranging
-from evlcp_sdk.testing import check, laws_of, suite
+from evlcp_sdk.testing import LawError, check, conformance, laws_of, suite
 from evlcp_sdk.testing.law import Law, Subject, Verdict
 from evlcp_sdk.testing.links import LINK
 from firmware_host.board.bank import random_symbols
 
 Evlcp = Callable[..., Any]
 
-AUTHOR = '''
-from dataclasses import dataclass, replace
-
-from evlcp_centroid.ranging import CentroidRanging
-from evlcp_sdk.testing import conformance
-
 
 @dataclass(frozen=True)
 class Biased(CentroidRanging):
     """One percent too far."""
 
-    def compile(self, camera, bar, codebook):
+    def compile(self, camera: Any, bar: Any, codebook: Any) -> Any:
         measure = super().compile(camera, bar, codebook)
 
-        def biased(view):
+        def biased(view: Any) -> Any:
             found = measure(view)
             return replace(found, distance_m=1.01 * found.distance_m)
 
         return biased
 
 
-@conformance("ranging", CentroidRanging())
-def test_good(check):
-    check()
+def exact(algorithm: Ranging, excuses: dict[str, str] | None = None) -> Callable[[], None]:
+    """The case of a law, of those that the decorator makes."""
+    name, cases = conformance("ranging", algorithm, excuses=excuses).mark.args  # type: ignore[attr-defined]
+    by_id = {case.id: case.values[0] for case in cases}
+    assert name == "check"
+    assert [*by_id] == [f"{type(algorithm).__name__}-{law.name}" for law in laws_of("ranging")]
+    held: Callable[[], None] = by_id[f"{type(algorithm).__name__}-exact"]
+    return held
 
 
-@conformance("ranging", Biased())
-def test_broken(check):
-    check()
-
-
-@conformance("ranging", Biased(), excuses={"exact": "the lens is not calibrated yet"})
-def test_excused(check):
-    check()
-
-
-@conformance("ranging", CentroidRanging(), excuses={"exact": "needless"})
-def test_needless(check):
-    check()
-'''
-
-
-def test_the_decorator_makes_one_test_a_law(tmp_path: Path) -> None:
-    (tmp_path / "test_author.py").write_text(AUTHOR)
-    (tmp_path / "pytest.ini").write_text("[pytest]\n")
-    run = subprocess.run(
-        [sys.executable, "-m", "pytest", "-q", "-rA", "-p", "no:cacheprovider", "test_author.py"],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=120,
-        check=False,
-    )
-    n = len(laws_of("ranging"))
-    assert f"2 failed, {4 * n - 3} passed, 1 xfailed" in run.stdout
-    assert "PASSED test_author.py::test_good[CentroidRanging-clean-link]" in run.stdout
-    assert "FAILED test_author.py::test_broken[Biased-exact]" in run.stdout
-    assert "expected 108.025 m within 0.1% for clusters exactly 4 px apart, got 109.105 m" in run.stdout
-    assert "XFAIL test_author.py::test_excused[Biased-exact] - the lens is not calibrated yet" in run.stdout
-    assert "excused (needless), but it holds: drop the excuse" in run.stdout
+def test_the_decorator_makes_one_test_a_law() -> None:
+    """As the tests of the packages in examples/ use it."""
+    exact(CentroidRanging())()
+    with pytest.raises(
+        LawError, match=r"108\.025 m within 0\.1% for clusters exactly 4 px apart, got 109\.105"
+    ):
+        exact(Biased())()
+    with pytest.raises(pytest.xfail.Exception, match="the lens is not calibrated yet"):
+        exact(Biased(), {"exact": "the lens is not calibrated yet"})()
+    with pytest.raises(LawError, match=r"excused \(needless\), but it holds: drop the excuse"):
+        exact(CentroidRanging(), {"exact": "needless"})()
+    nothing = load_link(overrides=["tracking.id=none"]).algorithm("tracking")
+    cases = conformance("tracking", nothing, nothing).mark.args[1]  # type: ignore[attr-defined]
+    (line,) = (case for case in cases if case.id.endswith("-1-straight-line"))
+    with pytest.raises(pytest.skip.Exception, match="leaves every quantity as measured"):
+        line.values[0]()
 
 
 def test_an_alphabet_may_be_no_power_of_two() -> None:
