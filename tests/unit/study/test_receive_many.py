@@ -43,7 +43,9 @@ def test_ctrl_c_and_its_like_end_all_of_them(
     demo_raw: Path, tmp_path: Path, number: int, tell: Callable[[int, int], None]
 ) -> None:
     """A terminal's Ctrl-C reaches workers, too: what they decoded is written, and nothing is begun."""
-    many = [Path(shutil.copy(demo_raw, tmp_path / f"r{n}.raw")) for n in range(8)]
+    many = [tmp_path / f"r{n}.raw" for n in range(40)]
+    for path in many:
+        path.symlink_to(demo_raw)
     out = tmp_path / "out"
     code = "from evlcp_sdk.cli.main import main; main()"
     command = [sys.executable, "-c", code, "receive", *many, "-o", out, "--workers", "2"]
@@ -64,7 +66,7 @@ def test_ctrl_c_and_its_like_end_all_of_them(
     assert err.startswith("evlcp: interrupted; what was decoded until then is in ")
     assert len(err.splitlines()) == 1
     folders = list(out.iterdir())
-    assert 2 <= len(folders) < 8
+    assert 2 <= len(folders) < 40
     for folder in folders:
         assert {p.name for p in folder.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
 
