@@ -54,24 +54,6 @@ def test_round_trip_is_the_identity(name, tmp_path_factory):
     check()
 
 
-@pytest.mark.parametrize("name", ["a.npz", "a.csv", "a.csv.gz"])
-def test_large_table_in_pieces(name, tmp_path):
-    rng = np.random.default_rng(4)
-    n = 90_000
-    events = Events.of(
-        np.cumsum(rng.integers(0, 1000, n)),
-        rng.integers(0, 1280, n),
-        rng.integers(0, 720, n),
-        rng.integers(0, 2, n),
-    )
-    write_events(tmp_path / name, events)
-    with open_source(tmp_path / name) as source:
-        half = next(source.chunks(20_000))
-        assert 0 < source.position_bytes <= source.size_bytes
-        rest, _ = source.read()
-    assert rows(Events.concat([half, rest])) == rows(events)
-
-
 def test_npz_keeps_size_and_triggers(tmp_path):
     events = Events.of([1, 5, 9], [1, 2, 3], [4, 5, 6], [1, 0, 1])
     triggers = Triggers.of([0, 5, 7, 11], [1, 1, 6, 6], [1, 0, 1, 0])
