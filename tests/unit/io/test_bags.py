@@ -111,6 +111,15 @@ def test_packets_that_are_there_twice_are_left_out(how: str, packets: list[Packe
     assert source.counts["packets_twice"] == len(packets)
 
 
+def test_packets_that_are_missing_are_counted(packets: list[Packet], tmp_path: Path) -> None:
+    there = [packed(packet) for packet in packets if packet[0] not in (20, 21, 40)]
+    with open_source(write_sqlite(tmp_path / "a.db3", there, range(99))) as source:
+        source.read()
+    lost = source.losses["packets_lost"]
+    assert (lost.count, lost.unit) == (3, "byte")
+    assert lost.first == pytest.approx(sum(len(words) for _, words in packets[:20]), abs=200)
+
+
 def test_a_driver_that_begins_anew(packets: list[Packet], tmp_path: Path) -> None:
     """Numbers from 0 again, other words: what came before is given first, and nothing is missing."""
     again = [(n - 40, words) for n, words in packets[40:]]

@@ -168,7 +168,7 @@ def test_a_failed_run_says_so_and_keeps_what_was_decoded(tmp_path: Path) -> None
 
 
 def test_the_summary_names_every_file_by_its_digest(tmp_path: Path) -> None:
-    table = result(tmp_path, packet(0, frame(0, 0)), sinks=["figures"])
+    table = result(tmp_path, packet(0, frame(0, 0)), sinks=["points"])
     names = {p.name for p in tmp_path.iterdir()} - {"summary.json"}
     assert set(table["files"]) == names > {"frames.csv", "packets.jsonl"}
     for name, told in table["files"].items():

@@ -355,9 +355,9 @@ def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
 
 
 def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    plan, stream = PositionPlan((SITE,)), packets(60)
+    plan, stream = PositionPlan((SITE,)), packets(40)
     write(tmp_path / "whole", stream, plan)
-    monkeypatch.setattr(navigator, "_BLOCK", 16)
+    monkeypatch.setattr(navigator, "_BLOCK", 12)
     write(tmp_path / "blocks", stream, plan)
     whole, blocks = (rows(tmp_path / name / "track.csv") for name in ("whole", "blocks"))
     assert [r["t_us"] for r in whole] == [r["t_us"] for r in blocks]
