@@ -103,6 +103,39 @@ class Codec:
         return np.asarray(self.types >> kinds.astype(np.int64) & 1 == 0)
 
 
+def encode_evt2(
+    words: NDArray[np.uint32],
+    _width: int,
+    state: NDArray[np.int64],
+    events: _kernels.EventColumns,
+    i: int,
+    triggers: _kernels.TriggerColumns,
+    j: int,
+) -> tuple[int, int, int]:
+    """Encode to EVT2 words; as `encode_evt3`, but the last TIME_HIGH is all the state."""
+    most = len(words) // 4
+    t, x, y, p = (column[i : i + most].astype(np.int64) for column in events)
+    trigger_t, channel, value = (column[j : j + most].astype(np.int64) for column in triggers)
+    kinds = np.concatenate([_kernels.EVT2_EXT_TRIGGER << 28 | channel << 8 | value, p << 28 | x << 11 | y])
+    times = np.concatenate([trigger_t, t])
+    order = np.argsort(times, kind="stable")[:most]
+    steps, low = np.divmod(times[order], 64)
+    before = np.concatenate([state[:1], steps[:-1]])
+    # Further on, a rollover would look like a glitch.
+    highs = np.where(before < 0, steps > before, -((before - steps) >> 26))
+    ends = np.cumsum(highs + 1)
+    rows = int(np.searchsorted(ends, len(words), "right"))
+    n = int(ends[rows - 1])
+    row = np.repeat(np.arange(rows), highs[:rows] + 1)
+    nth = np.arange(n) - (ends - highs - 1)[row] + 1
+    step = np.where(before[row] < 0, steps[row], np.minimum(before[row] + (nth << 26), steps[row]))
+    words[:n] = _kernels.EVT2_TIME_HIGH << 28 | step & 0xFFFFFFF
+    words[ends[:rows] - 1] = kinds[order[:rows]] | low[:rows] << 22
+    state[0] = steps[rows - 1]
+    done = int(np.count_nonzero(order[:rows] < len(trigger_t)))
+    return n, i + rows - done, j + done
+
+
 EVT2: Final = Codec(
     name="EVT2",
     version="2.0",
@@ -113,7 +146,7 @@ EVT2: Final = Codec(
     time_bits=(28, 6),
     rollover=(0x85555555, 0x8AAAAAAA, 0x8FFFFFFF, 0x80000000, 0x80000000),
     decoder=_kernels.decode_evt2,
-    encoder=_kernels.encode_evt2,
+    encoder=encode_evt2,
 )
 """t = rollovers * 2^34 + TIME_HIGH * 2^6 + the event's own 6 bits, us."""
 
