@@ -3,6 +3,7 @@
 import os
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -84,6 +85,7 @@ def test_datagrams_are_read_as_they_come(recording: Path) -> None:
             # The second is refused as long as nobody listened for the first.
             greeted = False
             while not greeted:
+                time.sleep(0.01)
                 with suppress(ConnectionRefusedError):
                     sender.send(header + b"% end\n")
                     greeted = sender.send(header + b"% end\n") > 0
