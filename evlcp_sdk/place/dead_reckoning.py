@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.scene.swing import Swing
+from evlcp_sdk.scene.attitude import Swing
 
 Floats = NDArray[np.float64]
 Complex = NDArray[np.complex128]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.place.dead_reckoning import imu_sigmas, reckon
 from evlcp_sdk.place.error_model import ErrorModel, chi_square
-from evlcp_sdk.scene.swing import Swing
+from evlcp_sdk.scene.attitude import Swing
 from evlcp_sdk.values import Fix
 
 Floats = NDArray[np.float64]

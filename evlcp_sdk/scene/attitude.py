@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import ANY_NUMBER, read_table
-from evlcp_sdk.scene.swing import Swing
 
 _AXES = ("right", "down", "forward")
 _RATES = tuple(f"rate_{axis}_deg_s" for axis in _AXES)
@@ -106,6 +105,29 @@ class Attitude:
         pitch = float(np.degrees(np.arcsin(np.clip(forward[2], -1, 1))))
         roll = float(np.degrees(np.arctan2(-up[0], -up[1])))
         return cls(pitch, roll, heading, 0.0, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Swing:
+    """Turn and push of a camera at times between two, straight lines between these.
+
+    Attributes:
+        t_s: Since the first time, s, rising from 0 to the last, float64 (k,), k >= 2.
+        turn_rad: By how much the heading has changed since the first time, clockwise, radians, float64 (k,).
+        gyro: The turn is that of a gyroscope, which has a bias and a noise that grows.
+        push_m_s2: Acceleration without gravity, to the camera's right, forward, both level, and up, m/s2,
+            float64 (k, 3); None without an accelerometer.
+    """
+
+    t_s: NDArray[np.float64]
+    turn_rad: NDArray[np.float64]
+    gyro: bool = False
+    push_m_s2: NDArray[np.float64] | None = None
+
+    @classmethod
+    def even(cls, dt_s: float, turn_rad: float) -> "Swing":
+        """A turn at one rate."""
+        return cls(np.array([0.0, dt_s]), np.array([0.0, turn_rad]))
 
 
 @dataclass(frozen=True, eq=False)

@@ -526,7 +526,7 @@ class Halos(NamedTuple):
         per_px: Its nodes in a px, (halos,).
         share: Of the light that is in each halo, (halos,).
         every: After how many poses it follows the strip; 0: it stands where that is in the middle, (halos,).
-        table: Each one's blurred edge, as of `step_table`, (halos, m).
+        table: Share of a pixel lit around each one's blurred edge, (halos, m).
         table_per_px: Nodes of that in a px, (halos,).
     """
 

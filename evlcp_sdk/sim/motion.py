@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.interpolate import CubicSpline
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import read_csv
+from evlcp_sdk.files import read_table
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.scene import NEAREST_M, MotionSpec
 
@@ -136,20 +136,8 @@ def pothole_angle_rad(motion: MotionSpec, t_us: ArrayLike) -> Floats:
 
 def _read_path(path: Path, duration_s: float) -> CubicSpline:
     names = ("t_s", "x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg")
-    _, rows = read_csv(path)
-    table = np.empty((len(rows), len(names)))
-    for i, (line, row) in enumerate(rows):
-        for j, name in enumerate(names):
-            try:
-                table[i, j] = float(row[name])
-            except (KeyError, TypeError, ValueError) as fault:
-                raise ConfigError(
-                    f"{path}: line {line}: no number in column {name} (columns: {', '.join(names)})"
-                ) from fault
-    for line, values in zip((line for line, _ in rows), table, strict=True):
-        for name, value in zip(names, values.tolist(), strict=True):
-            if not abs(value) <= _MOST:
-                raise ConfigError(f"{path}: line {line}: {name} = {value:g}: expected at most {_MOST:g}")
+    _, columns = read_table(path, dict.fromkeys(names, (-_MOST, _MOST)), {}, rising="t_s")
+    table = np.stack([columns[name] for name in names], 1)
     if len(table) < 2 or (np.diff(table[:, 0]) < _SHORTEST_S).any():
         raise ConfigError(f"{path}: expected two lines or more with rising t_s, {_SHORTEST_S:g} s apart")
     if table[0, 0] > 0 or table[-1, 0] < duration_s:

@@ -71,20 +71,6 @@ def led_light_w_m2(bar: BarSpec, strip: LitStrip, lens: LensSpec) -> float:
     return math.pi * radiance * lens.transmission / (4 * lens.f_number**2)
 
 
-def step_table(sigma_px: float, reach_px: float, nodes: int) -> Floats:
-    """Share of a pixel lit beyond an edge blurred by a Gaussian, sampled around the edge.
-
-    Args:
-        sigma_px: The Gaussian's sigma, px.
-        reach_px: How far before and behind the edge to sample, px.
-        nodes: How many samples.
-
-    Returns:
-        float64 (nodes,): shares at -reach_px to reach_px, from 0 to 1.
-    """
-    return step(np.linspace(-reach_px, reach_px, nodes), sigma_px)
-
-
 def strip_table(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> Floats:
     """Share of a pixel lit by a strip that begins at an edge across it and never ends.
 
@@ -101,23 +87,12 @@ def strip_table(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> Flo
         float64 (nodes + 1, 2 nodes + 1): by the distance from the strip's middle, 0 to infinity, and by that
         along it from its edge, minus to plus infinity.
     """
-    across, before = _strip_parts(blur, strip_px, scale_px, nodes)
-    along = np.concatenate([before, np.full((len(before), 1), 0.5), 1 - before[:, ::-1]], axis=1)
-    table: Floats = (across * blur.share[:, None]).T @ along
-    return table
-
-
-def _strip_parts(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> tuple[Floats, Floats]:
-    """Of each Gaussian, across float64 (n, nodes + 1), and along before an edge, far to near, (n, nodes)."""
     u = np.arange(nodes) / nodes
     # The last node is at infinity; any number stands for it beside which the blur is small.
     z = np.append(scale_px * u / (1 - u), 1e6 * scale_px)
-    sigma = blur.sigma_px[:, None]
-    half = strip_px / 2
-    steps = step(np.concatenate([z + half, z - half, -z[:0:-1]]), sigma)
-    right, left, before = (
-        steps[:, : nodes + 1],
-        steps[:, nodes + 1 : 2 * nodes + 2],
-        steps[:, 2 * nodes + 2 :],
-    )
-    return right - left, before
+    steps = step(np.concatenate([z + strip_px / 2, z - strip_px / 2, -z[:0:-1]]), blur.sigma_px[:, None])
+    right, left, before = np.split(steps, [nodes + 1, 2 * nodes + 2], axis=1)
+    across = right - left
+    along = np.concatenate([before, np.full((len(before), 1), 0.5), 1 - before[:, ::-1]], axis=1)
+    table: Floats = (across * blur.share[:, None]).T @ along
+    return table

@@ -8,8 +8,7 @@ import pytest
 from evlcp_sdk.place.dead_reckoning import imu_sigmas, reckon
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import IMU, filter_fixes, smooth_trajectory
-from evlcp_sdk.scene.attitude import AttitudeLog
-from evlcp_sdk.scene.swing import Swing
+from evlcp_sdk.scene.attitude import AttitudeLog, Swing
 from evlcp_sdk.values import Fix
 from tests.unit.place.scenes import Floats, by_chance, fix, square
 

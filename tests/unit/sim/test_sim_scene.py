@@ -171,7 +171,7 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"bars\.0: the bar is behind the camera .*depth -40\.00 m"):
         Simulation(scene)
     (tmp_path / "path.csv").write_text("\n".join([lines[0], "0,0,0,x,0,0,0"]))
-    with pytest.raises(ConfigError, match="line 2: no number in column z_m"):
+    with pytest.raises(ConfigError, match="line 2: z_m = 'x': expected a number"):
         Simulation(scene)
     (tmp_path / "path.csv").write_text("\n".join([lines[0], lines[2], lines[1]]))
     with pytest.raises(ConfigError, match="rising t_s"):
