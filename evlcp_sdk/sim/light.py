@@ -165,7 +165,7 @@ class BarLight:
             shown[:, lit.clusters < 0] = 0.0
             return when, shown
 
-        strip = Strip(centre_m, along_m, lit.width_m, len(lit.clusters), lit.cuts)
+        strip = Strip(centre_m, along_m, lit.width_m, lit.cuts)
         return Source(strip, self.light_w_m2 * share, self.longest_us, switches, image)
 
     def _checked_covers(self, source: str) -> tuple[tuple[float, float, int, int], ...]:
@@ -323,7 +323,7 @@ def lamp_source(lamp: LampSpec) -> Source:
         held = np.append(levels[-1], np.tile(levels, len(periods)))
         return cut_changes(when, held[:, None], begin_us, end_us)
 
-    strip = Strip((lamp.x_m, lamp.y_m, lamp.z_m), (0, lamp.height_m, 0), lamp.width_m, 1)
+    strip = Strip((lamp.x_m, lamp.y_m, lamp.z_m), (0, lamp.height_m, 0), lamp.width_m, (-0.5, 0.5))
     return Source(strip, lamp.light_w_m2, 1e6 / lamp.flicker_hz, switches)
 
 

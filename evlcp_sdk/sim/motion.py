@@ -42,13 +42,7 @@ class Vibration:
 
     @classmethod
     def of(cls, rate_rad_s: float, seed: int) -> "Vibration":
-        """A vibration whose rates have this rms over long times.
-
-        >>> v = Vibration.of(0.06, seed=1)
-        >>> rate = v.rate_rad_s(np.linspace(0, 1e8, 100_000))
-        >>> np.abs(rate.std(1) / 0.06 - 1).max() < 0.05
-        np.True_
-        """
+        """A vibration whose rates have this rms over long times."""
         rng = np.random.default_rng([seed, 0x71B])
         share = (np.arange(_SINES) + rng.random((2, _SINES))) / _SINES
         body, wheels, tail = share < 0.45, share < 0.85, share >= 0.85
@@ -61,24 +55,15 @@ class Vibration:
         phase = rng.random((2, _SINES)) * 2 * math.pi
         return cls(frequency, phase, rate_rad_s * math.sqrt(2 / _SINES))
 
-    def rate_rad_s(self, t_us: ArrayLike) -> Floats:
-        """Yaw and pitch rate at times (n,): float64 (2, n)."""
-        angle = self._angle(t_us)
-        rate: Floats = self.amplitude_rad_s * np.cos(angle).sum(1)
-        return rate
-
     def angle_rad(self, t_us: ArrayLike) -> Floats:
         """Yaw and pitch at times (n,): float64 (2, n)."""
         if self.amplitude_rad_s == 0:
             return np.zeros((2, np.size(t_us)))
         scale = self.amplitude_rad_s / (2 * math.pi * self.frequency_hz)
-        turned: Floats = (scale[:, :, None] * np.sin(self._angle(t_us))).sum(1)
-        return turned
-
-    def _angle(self, t_us: ArrayLike) -> Floats:
         t_s = np.asarray(t_us, np.float64) * 1e-6
-        angle: Floats = 2 * math.pi * self.frequency_hz[:, :, None] * t_s + self.phase[:, :, None]
-        return angle
+        phase = 2 * math.pi * self.frequency_hz[:, :, None] * t_s + self.phase[:, :, None]
+        turned: Floats = (scale[:, :, None] * np.sin(phase)).sum(1)
+        return turned
 
 
 class CameraPath:
@@ -155,20 +140,22 @@ class Strip:
         centre_m: x, y, z of its middle.
         along_m: From its first end to its last.
         width_m: Its width.
-        clusters: Its parts.
-        cuts: Where they start and end, shares of its length from -0.5 to 0.5; none: they are equal.
+        cuts: Where its clusters start and end, shares of its length from -0.5 to 0.5.
     """
 
     centre_m: ArrayLike
     along_m: ArrayLike
     width_m: float
-    clusters: int
-    cuts: tuple[float, ...] = ()
+    cuts: tuple[float, ...]
+
+    @property
+    def clusters(self) -> int:
+        """How many parts it has."""
+        return len(self.cuts) - 1
 
     def cuts_m(self) -> Floats:
         """Where its clusters start and end: float64 (clusters + 1, 3)."""
-        share = np.array(self.cuts) if self.cuts else np.linspace(-0.5, 0.5, self.clusters + 1)
-        cuts: Floats = np.asarray(self.centre_m) + share[:, None] * np.asarray(self.along_m)
+        cuts: Floats = np.asarray(self.centre_m) + np.array(self.cuts)[:, None] * np.asarray(self.along_m)
         return cuts
 
 
