@@ -13,6 +13,9 @@ __all__ = ["evlcp_register_commands"]
 @hookimpl
 def evlcp_register_commands(app: "typer.Typer") -> None:
     """Add `evlcp board`, `evlcp tx` and `evlcp loop`."""
-    from firmware_host.commands import register
+    from firmware_host.commands import board, loop, tx
+    from firmware_host.commands._json import JsonCommand
 
-    register(app)
+    app.add_typer(tx.app, name="tx")
+    app.add_typer(board.app, name="board")
+    app.command("loop", cls=JsonCommand)(loop.loop)

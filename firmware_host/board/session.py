@@ -29,14 +29,6 @@ from firmware_host.protocol.generated.requests import (
 from firmware_host.protocol.seal import Sealer, key_name
 from firmware_host.protocol.wire import WireMessage, WireRequest
 
-
-def _if_silent(port: str) -> str:
-    """What to do where nobody answers on a port that could be opened."""
-    if on_network(port):
-        return "another host may be connected to it: end that one; or the board behind it is off"
-    return "check power, cable and --baud, or find it with 'evlcp board ports'"
-
-
 Reply = TypeVar("Reply", bound=WireMessage)
 Request = TypeVar("Request", bound=WireRequest[Any])
 
@@ -164,7 +156,10 @@ class Session:
             ) from fault
         outcome = found[0]
         if outcome.status is None:
-            raise NoBoardError(f"{self.name}: no board answers; {_if_silent(self.name)}")
+            advice = "check power, cable and --baud, or find it with 'evlcp board ports'"
+            if on_network(self.name):
+                advice = "another host may be connected to it: end that one; or the board behind it is off"
+            raise NoBoardError(f"{self.name}: no board answers; {advice}")
         if not isinstance(outcome.reply, HelloReply):
             raise refusal(self.name, Type.HELLO, outcome.status, outcome.detail)
         self.client.session = outcome.reply.session

@@ -75,7 +75,7 @@ def bar(programmed: tuple[Bar, Callable[[], None]]) -> Bar:
 
 def test_every_start_shows_every_chip_on_every_led(bar: Bar) -> None:
     expected = bar.expected(200)
-    for _ in range(4):
+    for _ in range(3):
         begin = len(bar.log)
         bar.board.start()
         bar.chip.run(21_500)

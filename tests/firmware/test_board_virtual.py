@@ -319,7 +319,8 @@ def test_a_fault_that_comes_back_ends_the_led_test(device: SimulatedBoard, board
             assert device.shown().any()
 
 
-def test_a_packet_may_take_longer_than_ten_seconds(device: SimulatedBoard, board: Board) -> None:
+def test_a_packet_may_take_longer_than_ten_seconds(device: SimulatedBoard) -> None:
+    board = board_on(SimulatedLine(device, step_us=5_000))
     # 400 frames at 1000 chips/s: 12.8 s
     link = board_link("air.frames_per_packet=400", "air.chip_rate_hz=1000.0")
     provision(board, some_bank(link=link), Settings())
