@@ -43,9 +43,6 @@ _FREE_FOCAL = 0.02
 _FOCALS = np.geomspace(1 / 4.0, 4.0, 47)
 """Focal lengths that are tried, as a share: steps of 6 %."""
 
-_FINER_FOCALS = np.linspace(0.94, 1.06, 25)
-"""Those about the best of them."""
-
 _FAULT_STEPS = 4
 """Of Gauss and Newton; the image of a bar is nearly linear in where it stands."""
 
@@ -210,20 +207,16 @@ def fitting_focal_mm(
         step_mm = float(np.hypot(sigma.focal_mm, free * focal_mm))
         return Problem.of(views, other, attitude, spec, replace(sigma, focal_mm=step_mm, correlation=()))
 
-    def misfit(focal_mm: float, free: float) -> float:
-        problem = tried(focal_mm, free)
+    around, least = math.nan, math.inf
+    for share in _FOCALS.tolist():
+        # Free within a step, so that none is stepped over, and as the best fit has it.
+        problem = tried(share * camera.focal_mm, _FREE_FOCAL)
         fits = problem if isinstance(problem, Rejection) else likely_fits(problem)
-        if isinstance(problem, Rejection) or isinstance(fits, Rejection):
-            return math.inf
-        return fits[0].cost
-
-    around = camera.focal_mm
-    # Free within a step, so that none is stepped over.
-    for lengths, free in ((_FOCALS, _FREE_FOCAL), (_FINER_FOCALS, _FREE_FOCAL / 5)):
-        fit = {focal_mm: misfit(focal_mm, free) for focal_mm in (around * lengths).tolist()}
-        around = min(fit, key=lambda focal_mm: fit[focal_mm])
-        if math.isinf(fit[around]):
-            return math.nan
+        if isinstance(problem, Problem) and isinstance(fits, list) and fits[0].cost < least:
+            off_px = float(problem.lens_root[0] @ fits[0].at.lens)
+            around, least = problem.camera.focal_mm + off_px * camera.pitch_um / 1e3, fits[0].cost
+    if math.isinf(least):
+        return math.nan
     given = tried(around, _FREE_FOCAL / 5)
     found = given if isinstance(given, Rejection) else _plain(given)
     return around if isinstance(found, AssessedPose) and not found.doubt else math.nan

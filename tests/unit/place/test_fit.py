@@ -23,6 +23,7 @@ from evlcp_sdk.place.observations import (
     shared_sigmas,
     whole_clusters,
 )
+from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.place.starts import nearest_to_sights
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing
@@ -355,6 +356,17 @@ def test_a_fit_that_stalls_far_off_ends() -> None:
     assert short is not None
     assert short.cost > 1000
     assert whole.cost <= short.cost
+
+
+def test_points_that_say_nothing_determine_no_position() -> None:
+    p, position, rotation = problem(np.random.default_rng(31))
+    p.points[:, 8] = 0.0
+    found, settled = fit_pose(p, Fit.at(p, position, rotation))
+    assert not settled
+    assert found is not None
+    refusal = assess_fit(p, found)
+    assert isinstance(refusal, Rejection)
+    assert refusal.kind == "not-determined"
 
 
 @pytest.mark.parametrize(

@@ -70,19 +70,10 @@ def test_days_follow_one_another(tmp_path: Path) -> None:
         ([GGA, "noise"], "line 2: expected a sentence"),
         ([GGA], r"line 1: GGA without a GST of its time: expected one, or --set position.gnss_sigma_m"),
         ([at("120000", 0)], "expected a GGA with a fix or more"),
-        (
-            [gga("250000,3530")],
-            "line 1: GGA's time = '25': expected 0 to 23",
-        ),
-        (
-            [gga("120000,9530")],
-            "latitude_deg = '95': expected 0 to 90",
-        ),
+        ([gga("250000,3530")], "line 1: GGA's time = '25': expected 0 to 23"),
+        ([gga("120000,9530")], "latitude_deg = '95': expected 0 to 90"),
         ([gga("120000,")], "latitude_deg = '': expected a number"),
-        (
-            [gga("120000,3530", "")],
-            "line 1: GGA without the height of the geoid",
-        ),
+        ([gga("120000,3530", "")], "line 1: GGA without the height of the geoid"),
         ([gga("120000,-3530")], "latitude_deg = '-35': expected 0 to 90"),
         ([sentence("GPGGA,120000,3530,s,00015,E,1,9,1,50,M,40,M,,")], "GGA's field 3 = 's': expected N or S"),
         ([sentence("GPGGA,120000,3530,N,00015,N,1,9,1,50,M,40,M,,")], "GGA's field 5 = 'N': expected E or W"),
@@ -106,4 +97,4 @@ def test_utc_needs_the_clock(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="NMEA tells UTC: expected --clock-zero"):
         GnssLog.read(write(tmp_path, GGA, GST))
     with pytest.raises(InputError, match="cannot be read"):
-        GnssLog.read(tmp_path / "none.nmea", NOON)
+        GnssLog.read(tmp_path / "none.txt", NOON)
