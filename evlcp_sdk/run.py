@@ -910,7 +910,7 @@ def _own_poses(
     poses, ids = own.close(), navigator.positioner.bars.ids
     wrong = [n for n, site in taken.items() if ids.get(n, site.transmitter_id) != site.transmitter_id]
     if not wrong:
-        return poses, list(taken.values()), own.told
+        return poses, list(taken.values()), own.summary
     # A new bar was taken for a known one as long as it had not sent its id: its number is no site's.
     numbers = {said: number for number, said in ids.items()}
     none = max(ids) + 1

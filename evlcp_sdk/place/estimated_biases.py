@@ -15,7 +15,7 @@ from evlcp_sdk.scene.sites import BarSite
 
 Floats = NDArray[np.float64]
 
-_TOLD_SHARE = 0.9
+_DETERMINED_SHARE = 0.9
 """Share of its stated sigma below which an error counts as determined by the drive."""
 
 
@@ -40,7 +40,7 @@ class EstimatedBias:
     @property
     def determined(self) -> bool:
         """Whether the drive says anything of it; else it keeps the sigma that was stated."""
-        return self.sigma < _TOLD_SHARE * self.stated_sigma
+        return self.sigma < _DETERMINED_SHARE * self.stated_sigma
 
 
 def estimate_biases(

@@ -230,7 +230,7 @@ each bar's (bars, 3, 7)."""
 def _moves_by_errors(problem: Problem, solution: _Solution) -> Moves:
     place = solution.spread[:3]
     angles = solution.equations.angles
-    by_attitude = place @ angles.T @ problem.said[: len(angles)]
+    by_attitude = place @ angles.T @ problem.angles.causes[: len(angles)]
     by_bars = place @ solution.equations.bars.gain[:, 2:].swapaxes(1, 2)
     return -place[:, LENS:], by_attitude if len(angles) else np.zeros((3, 4)), by_bars
 
@@ -336,7 +336,7 @@ def _tested_parts(problem: Problem, solution: _Solution) -> Iterator[tuple[str, 
     angles, miss = solution.equations.angles, solution.equations.angles_miss
     bound: NDArray[np.floating] = np.zeros((len(angles), len(angles)))
     if spec.attitude_fault_deg and len(angles):
-        white = math.radians(spec.attitude_fault_deg) * problem.white[: len(angles), : len(angles)]
+        white = math.radians(spec.attitude_fault_deg) * problem.angles.white[: len(angles), : len(angles)]
         bound = np.linalg.inv(white @ white.T)
     for first, name in ((0, "attitude"), (2, "heading")):
         if len(angles) > first and problem.free[3:6].any():

@@ -205,13 +205,13 @@ def _by_point(slope: Floats, direction: Floats, ahead: Floats, rotation: Floats)
 
 def _attitude(problem: Problem, rotation: Floats) -> tuple[Floats, Floats]:
     """What the turns do to pitch, roll and heading as they are known, whitened, and by how much they miss."""
-    known = problem.angles
+    angles = problem.angles
     east, north, high = rotation[:, 2].tolist()
     level = max(east * east + north * north, 1e-12)
     fe, fn = east / math.sqrt(level), north / math.sqrt(level)
     # Up as the sensor felt it, turned as the camera is: level if the rotation is right.
-    x, y, z = (rotation @ problem.felt).tolist()
-    off = problem.heading_rad - math.atan2(east, north)
+    x, y, z = (rotation @ angles.level[2]).tolist()
+    off = angles.heading_rad - math.atan2(east, north)
     raw = np.array([x * fe + y * fn, y * fe - x * fn, math.remainder(off, 2 * math.pi)])
     by_turn = np.array(
         [
@@ -220,7 +220,7 @@ def _attitude(problem: Problem, rotation: Floats) -> tuple[Floats, Floats]:
             [east * high / level, north * high / level, -1.0],
         ]
     )
-    white = problem.white[:known, :known]
-    rows = np.zeros((known, SHARED))
-    rows[:, 3:6] = white @ by_turn[:known]
-    return rows, white @ raw[:known]
+    white = angles.white[: angles.known, : angles.known]
+    rows = np.zeros((angles.known, SHARED))
+    rows[:, 3:6] = white @ by_turn[: angles.known]
+    return rows, white @ raw[: angles.known]

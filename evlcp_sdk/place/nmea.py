@@ -115,8 +115,8 @@ def _sentences(path: Path | str) -> Iterator[tuple[int, str, list[str]]]:
     for line, text in enumerate(lines, 1):
         if not text.strip():
             continue
-        body, _, told = text.strip().removeprefix("$").partition("*")
-        if not text.startswith("$") or "\ufffd" in text or told.upper() != (due := checksum(body)):
+        body, _, given = text.strip().removeprefix("$").partition("*")
+        if not text.startswith("$") or "\ufffd" in text or given.upper() != (due := checksum(body)):
             expected = "" if "\ufffd" in text or not text.startswith("$") else f" with {due}"
             raise ConfigError(f"{path}: line {line}: expected a sentence, $...*, and its checksum{expected}")
         fields = body.split(",")
@@ -130,9 +130,9 @@ _LETTERS = {3: ("N", "S"), 5: ("E", "W"), 10: ("M", ""), 12: ("M", "")}
 def _check_letters(path: Path | str, line: int, fields: list[str]) -> None:
     for field, letters in _LETTERS.items():
         if fields[field] not in letters:
-            told = " or ".join(filter(None, letters))
+            expected = " or ".join(filter(None, letters))
             raise ConfigError(
-                f"{path}: line {line}: GGA's field {field} = {fields[field]!r:.40}: expected {told}"
+                f"{path}: line {line}: GGA's field {field} = {fields[field]!r:.40}: expected {expected}"
             )
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -109,6 +109,46 @@ class KnownSigmas:
     even: Floats
 
 
+class KnownAngles(NamedTuple):
+    """What an attitude says, or nothing.
+
+    Attributes:
+        level: The camera's axes as columns in ENU by it, north where no heading is known, float64 (3, 3).
+        heading_rad: By it; 0 where it is not known.
+        known: How many of pitch, roll and heading are known: 0, 2 or 3.
+        white: What whitens the errors of these, float64 (3, 3).
+        causes: What moves these by its sigmas, whitened, float64 (3, 4).
+        turns: Whether turns about east, north and up are unknowns.
+    """
+
+    level: Floats = np.eye(3)
+    heading_rad: float = 0.0
+    known: int = 0
+    white: Floats = np.eye(3)
+    causes: Floats = np.zeros((3, 4))
+    turns: tuple[bool, bool, bool] = (True, True, True)
+
+    @classmethod
+    def of(cls, attitude: Attitude | None, shaken_rad: float) -> Self:
+        """What is known, where what shifts the images of all bars alike is a turn by `shaken_rad`."""
+        if attitude is None:
+            return cls()
+        compass = attitude.heading_deg is not None
+        turns = (True, True, True)
+        if (
+            shaken_rad
+            == attitude.gravity_sigma_deg
+            == attitude.white_sigma_deg
+            == attitude.time_sigma_us
+            == 0
+        ):
+            turns = (False, False, not compass or attitude.heading_sigma_deg > 0)
+        causes, known = attitude.standing(), 3 if compass else 2
+        white = _whitening(attitude, causes, known, shaken_rad)
+        heading_rad = math.radians(attitude.heading_deg or 0.0)
+        return cls(attitude.rotation(), heading_rad, known, white, white @ causes, turns)
+
+
 @dataclass(frozen=True, eq=False)
 class Problem:
     """All points in one array, all sigmas, and which unknowns there are.
@@ -124,14 +164,6 @@ class Problem:
             errors of points even in all directions, float64 (bars, 9): see `_sigmas_of`.
         transmitters: Number of each bar.
         lens_root: A lower root of the covariance of the camera's `CAMERA_PARAMETERS`, float64 (7, 7).
-        level: The camera's axes as columns in ENU by the attitude, north where no heading is known, float64
-            (3, 3).
-        felt: Up in the camera's axes by that, float64 (3,).
-        heading_rad: By the attitude; 0 where it is not known.
-        angles: How many of pitch, roll and heading are known: 0, 2 or 3.
-        white: What whitens the errors of these, float64 (3, 3).
-        said: What moves these as they are said, whitened, by its sigmas, float64 (3, 4).
-        free: Which unknowns of the fit there are, bool (14,): see `model`.
         shaken_rad: Sigma of what shifts the images of all bars alike.
     """
 
@@ -143,14 +175,19 @@ class Problem:
     bar_sigma: Floats
     transmitters: tuple[int, ...]
     lens_root: Floats
-    level: Floats
-    felt: Floats
-    heading_rad: float
-    angles: int
-    white: Floats
-    said: Floats
-    free: NDArray[np.bool_]
     shaken_rad: float
+
+    @cached_property
+    def angles(self) -> KnownAngles:
+        """What the attitude says."""
+        return KnownAngles.of(self.attitude, self.shaken_rad)
+
+    @cached_property
+    def free(self) -> NDArray[np.bool_]:
+        """Which unknowns of the fit there are, bool (14,): see `model`."""
+        free = np.ones(14, np.bool_)
+        free[3:6], free[6], free[7:] = self.angles.turns, False, self.lens_root.any()
+        return free
 
     @cached_property
     def parts(self) -> list[slice]:
@@ -192,28 +229,18 @@ class Problem:
             return Rejection(
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
             )
-        points = np.concatenate(parts)
-        bar = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-        shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
-        told = _told(attitude, points, bar, len(kept), shaken_rad)
-        if isinstance(told, Rejection):
-            return told
-        known = sigma.known
-        free = np.empty(14, np.bool_)
-        free[3:6], free[:3], free[6], free[7:] = told.pop("turns"), True, False, known
-        return cls(
+        problem = cls(
             camera=camera,
             attitude=attitude,
             spec=spec,
-            points=points,
-            bar=bar,
+            points=np.concatenate(parts),
+            bar=np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
             bar_sigma=np.array(sigmas),
             transmitters=tuple(kept),
-            lens_root=sigma.root(camera) if known else np.zeros((7, 7)),
-            free=free,
-            shaken_rad=shaken_rad,
-            **told,
+            lens_root=sigma.root(camera),
+            shaken_rad=between * spec.shaken_sigma_px / camera.focal_px,
         )
+        return problem._determined()
 
     @property
     def freedom(self) -> int:
@@ -222,16 +249,11 @@ class Problem:
         Every shared error has an observation of its own, that it is about 0; an angle that is exact is no
         unknown.
         """
-        return max(2 * len(self.points) + self.angles - 6, 1)
+        return max(2 * len(self.points) + self.angles.known - 6, 1)
 
-    def told(self, attitude: Attitude | None) -> "Problem | Rejection":
+    def with_attitude(self, attitude: Attitude | None) -> "Problem | Rejection":
         """The same where this is known of the attitude, or why that is too little."""
-        told = _told(attitude, self.points, self.bar, len(self.transmitters), self.shaken_rad)
-        if isinstance(told, Rejection):
-            return told
-        free = self.free.copy()
-        free[3:6] = told.pop("turns")
-        return replace(self, attitude=attitude, free=free, **told)
+        return replace(self, attitude=attitude)._determined()
 
     def without(self, bar: int) -> "Problem | Rejection":
         """The same without a bar, by its place among `transmitters`, or why the others are too few."""
@@ -244,13 +266,22 @@ class Problem:
             bar_sigma=np.delete(self.bar_sigma, bar, 0),
             transmitters=self.transmitters[:bar] + self.transmitters[bar + 1 :],
         )
-        return fewer.told(self.attitude)
+        return fewer._determined()
 
     def seen_by(self, sigma: CameraSigma) -> "Problem":
         """The same through a camera that is so surely known."""
-        free = self.free.copy()
-        free[7:] = sigma.known
-        return replace(self, lens_root=sigma.root(self.camera), free=free)
+        return replace(self, lens_root=sigma.root(self.camera))
+
+    def _determined(self) -> "Problem | Rejection":
+        """The same, or why its attitude is too little for its bars."""
+        bars = len(self.transmitters)
+        if bars == 1 and self.angles.known < 3:
+            why = "one bar gives a position only with the camera's heading known"
+            return Rejection("heading-unknown", why)
+        if self.attitude is None and (bars < 3 or _flatness(self.points, self.bar, bars) < _INLINE):
+            many = "two bars give" if bars == 2 else "bars in line give"
+            return Rejection("gravity-unknown", f"{many} a position only with gravity known")
+        return self
 
     @cached_property
     def centre(self) -> Floats:
@@ -261,47 +292,6 @@ class Problem:
     def surveyed(self) -> bool:
         """Whether places or attitudes of bars are not exact."""
         return bool(self.bar_sigma[:, :2].any())
-
-
-def _told(
-    attitude: Attitude | None, points: Floats, bar: NDArray[np.int64], bars: int, shaken_rad: float
-) -> Any:
-    """What an attitude says to a `Problem`, and which of the turns are free; or why it is too little.
-
-    What shifts the images of all bars alike is to a position as if the camera were turned by `shaken_rad`.
-    """
-    compass = attitude is not None and attitude.heading_deg is not None
-    if not compass and bars == 1:
-        return Rejection("heading-unknown", "one bar gives a position only with the camera's heading known")
-    if attitude is None:
-        if bars < 3 or _flatness(points, bar, bars) < _INLINE:
-            many = "two bars give" if bars == 2 else "bars in line give"
-            return Rejection("gravity-unknown", f"{many} a position only with gravity known")
-        return {
-            "level": np.eye(3),
-            "felt": np.zeros(3),
-            "heading_rad": 0.0,
-            "angles": 0,
-            "white": np.eye(3),
-            "said": np.zeros((3, 4)),
-            "turns": True,
-        }
-    turns = (True, True, True)
-    if shaken_rad == attitude.gravity_sigma_deg == attitude.white_sigma_deg == attitude.time_sigma_us == 0:
-        turns = (False, False, not compass or attitude.heading_sigma_deg > 0)
-    angles = 3 if compass else 2
-    level = attitude.rotation()
-    causes = attitude.standing()
-    white = _whitening(attitude, causes, angles, shaken_rad)
-    return {
-        "level": level,
-        "felt": level[2],
-        "heading_rad": math.radians(attitude.heading_deg or 0.0),
-        "angles": angles,
-        "white": white,
-        "said": white @ causes,
-        "turns": turns,
-    }
 
 
 def between_of(views: Sequence[BarView]) -> float:

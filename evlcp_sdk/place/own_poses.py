@@ -65,7 +65,7 @@ class OwnPoses:
         return [self._found[t] for t in sorted(chosen)]
 
     @property
-    def told(self) -> str:
+    def summary(self) -> str:
         """How many positions and new bars there were, in one line."""
         refused = "".join(f", {count} refused ({why})" for why, count in self._refused.most_common())
         ids = self._navigator.positioner.bars.ids

@@ -128,18 +128,13 @@ def points_at(
     line = _line(dt)
     early_px = spec.early_sigma_us * float(np.linalg.norm(line[1] @ places))
     pixel_px = math.hypot(spec.pixel_sigma_px * _left(line[0], places), early_px)
-    clusters = len(layout_m)
-    found, drawn = np.full((clusters, 2), np.nan), np.full(clusters, np.nan)
-    lines: dict[bytes, Floats] = {}
-    for k in range(clusters):
-        seen = np.isfinite(shapes[:, k, 0])
-        if seen.sum() < 3:
-            continue
-        # Most clusters are seen in the same frames, and often in all.
-        if (inverse := lines.get(seen.tobytes())) is None:
-            inverse = lines[seen.tobytes()] = _line(dt[seen])
-        found[k] = place + (inverse @ shapes[seen, k])[0]
-        drawn[k] = math.sqrt(float((inverse[0] ** 2 * sigmas[seen, k] ** 2).sum()))
+    # A straight line in time through the frames that show a cluster, three or more: their weights in it now.
+    seen = np.isfinite(shapes[:, :, 0])
+    count, once, twice = seen.sum(0), dt @ seen, dt**2 @ seen
+    spread = np.where(count >= 3, count * twice - once**2, np.nan)
+    weights = np.where(seen, (twice - dt[:, None] * once) / spread, 0.0 * spread)
+    found = place + np.einsum("nk,nkj->kj", weights, np.where(seen[:, :, None], shapes, 0.0))
+    drawn = np.sqrt((weights**2 * np.where(seen, sigmas, 0.0) ** 2).sum(0))
     sigma = np.hypot(wider * drawn, pixel_px)
     usual = math.sqrt(float(np.nanmean(drawn**2))) if np.isfinite(drawn).any() else math.nan
     along, across = math.hypot(wider * usual, pixel_px), 1.0

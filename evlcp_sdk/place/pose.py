@@ -90,7 +90,7 @@ def solve_pose(
     else:
         pose = found.pose
         # Two bars on gravity do not show which is which.
-        if problem.angles == 2 == len(pose.transmitters) and math.isfinite(pose.hpl_m + pose.vpl_m):
+        if problem.angles.known == 2 == len(pose.transmitters) and math.isfinite(pose.hpl_m + pose.vpl_m):
             for _, behind in _mixed_up(views, camera, attitude, spec, sigma):
                 pose = covering(pose, behind, spec)
         return pose
@@ -254,9 +254,9 @@ def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Proble
         for i, number in enumerate(bars):
             yield f"bar {number}", problem.without(i)
         if attitude is not None and attitude.heading_deg is not None:
-            yield "heading", problem.told(replace(attitude, heading_deg=None))
+            yield "heading", problem.with_attitude(replace(attitude, heading_deg=None))
     if attitude is not None and len(bars) > 1:
-        yield "attitude", problem.told(None)
+        yield "attitude", problem.with_attitude(None)
     focal_mm = math.hypot(sigma.focal_mm, _FREE_FOCAL * problem.camera.focal_mm)
     yield FOCAL, problem.seen_by(replace(sigma, focal_mm=focal_mm, correlation=()))
 

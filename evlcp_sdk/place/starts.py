@@ -45,10 +45,10 @@ def closed_form_starts(problem: Problem) -> list[tuple[Floats, Floats]]:
         order = sorted(range(len(poses)), key=costs.__getitem__)
         return [poses[i] for i in order if costs[i] <= _FALSE**2 * likeliest]
     enu, mean = _halves(points, seen, bar)
-    if problem.angles == 3:
-        places, costs_of = nearest_to_sights(enu, mean, problem.level[None])
-        return [(places[0], problem.level)] if costs_of[0] < math.inf else []
-    return _level_starts(enu, mean, problem.level)
+    if problem.angles.known == 3:
+        places, costs_of = nearest_to_sights(enu, mean, problem.angles.level[None])
+        return [(places[0], problem.angles.level)] if costs_of[0] < math.inf else []
+    return _level_starts(enu, mean, problem.angles.level)
 
 
 def _halves(points: Floats, seen: Floats, bar: NDArray[np.int64]) -> tuple[Floats, Floats]:

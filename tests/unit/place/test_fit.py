@@ -285,7 +285,7 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     np.testing.assert_allclose(pose.slow, slow, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(pose.standing["camera"], -spread[:3, 7:14], rtol=1e-6, atol=1e-9)
     assert p.attitude is not None
-    angles = spread[:3, :14] @ equations.angles.T @ p.white @ p.attitude.standing()
+    angles = spread[:3, :14] @ equations.angles.T @ p.angles.white @ p.attitude.standing()
     np.testing.assert_allclose(pose.standing["attitude"], angles, rtol=1e-6, atol=1e-9)
     for b in range(bars):
         own = slice(14 + 9 * b + 2, 23 + 9 * b)

@@ -182,7 +182,6 @@ def test_without_noise_the_pose_is_exact(
     ("places", "known", "median_m", "most_m"),
     [
         (POLES, LEVEL, 0.06, 0.15),
-        ([(-4.0, 50.0, 4.5), (3.5, 45.0, 4.5)], LEVEL, 0.06, 0.15),
         (THREE, LEVEL, 0.02, 0.03),
         (THREE, None, 0.02, 0.03),
         (POLES[:1], Attitude(5.0, 0.0, 0.0, 0.0, 0.1), 0.2, 0.35),
@@ -247,8 +246,9 @@ def test_every_error_that_is_stated_is_in_the_covariance(
     assert by_chance(squares, 3, 0.999, 1.03)
 
 
-@pytest.mark.parametrize("known", [LEVEL, EXACT])
-@pytest.mark.parametrize("between", [(0.3, 5.3), (5.3, 5.3), (0.0, 1.0)])
+@pytest.mark.parametrize(
+    ("between", "known"), [((0.3, 5.3), LEVEL), ((5.3, 5.3), EXACT), ((0.0, 1.0), LEVEL), ((0.3, 5.3), EXACT)]
+)
 def test_bars_whose_frames_leave_gaps_at_other_times_err_apart(
     between: tuple[float, float], known: Attitude
 ) -> None:
@@ -410,9 +410,8 @@ def test_protection_levels_cover_what_no_test_finds() -> None:
 
 def test_a_lone_bar_is_protected_from_being_off_by_so_much() -> None:
     rng, spec = np.random.default_rng(18), ErrorModel(bar_fault_m=0.5)
-    level = COMPASS
     for _ in range(60):
-        (seen,), told, _ = drawn(rng, POLES[:1], level)
+        (seen,), told, _ = drawn(rng, POLES[:1], COMPASS)
         pose = solved(solve_pose([moved(seen, *rng.normal(0, 0.5, 3))], CAMERA, told, spec))
         assert math.hypot(*pose.enu_m[:2]) < pose.hpl_m < 6
         assert abs(pose.enu_m[2]) < pose.vpl_m < 6
