@@ -7,7 +7,6 @@ import sys
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 import evlcp_sdk as evlcp
@@ -119,41 +118,3 @@ def test_a_light_name_imports_no_kernels(name: str) -> None:
 def test_compose_refuses(arguments: dict[str, Any], message: str) -> None:
     with pytest.raises(evlcp.ConfigError, match=message):
         evlcp.compose(**arguments)
-
-
-def test_a_simulation_is_a_source_like_a_recording(tmp_path: Path, evlcp: Any) -> None:
-    import evlcp_sdk
-
-    settings = ["duration_s=0.05", "motion.distance_m=70"]
-    source = evlcp_sdk.simulate("night", seed=4, overrides=settings)
-    assert repr(source) == "SimulatedSource(night, 1 bar, 0.05 s, seed 4)"
-    events, triggers = source.read()
-    assert len(triggers) == 0
-    assert source.counts["events"] == source.counts["simulated_events"] == len(events)
-    source = evlcp_sdk.simulate("night", seed=4, overrides=settings)
-    written = source.save(tmp_path / "a.raw")
-    recorded = evlcp_sdk.read_events(tmp_path / "a.raw")
-    for column in ("t_us", "x", "y", "p"):
-        assert np.array_equal(getattr(events, column), getattr(recorded, column)), column
-    assert written == (tmp_path / "a.raw", tmp_path / "a.truth.json")
-    done = evlcp("simulate", "--preset", "night", "--seed", 4, "-o", tmp_path / "b.raw",
-                 *(word for s in settings for word in ("--set", s)))  # fmt: skip
-    assert done.code == 0
-    assert written[0].read_bytes() == (tmp_path / "b.raw").read_bytes()
-    assert written[1].read_text() == (tmp_path / "b.truth.json").read_text()
-    with pytest.raises(evlcp_sdk.StreamError, match="has been read already"):
-        source.save(tmp_path / "c.raw")
-    with pytest.raises(evlcp_sdk.ConfigError, match=r"a recording is written as NAME\.raw"):
-        evlcp_sdk.simulate("night").save(tmp_path / "c.csv")
-
-
-def test_a_simulation_sends_the_link_that_it_is_given() -> None:
-    link = evlcp.load_link(overrides=["air.chip_rate_hz=5000.0", "modulation.id=wh8"])
-    source = evlcp.simulate("night", seed=3, link=link, overrides=["duration_s=0.12"])
-    (bar,) = source.truth.bars
-    assert bar.link.codebook.digest == link.codebook.digest
-    assert bar.link.air == link.air
-    frames = list(evlcp.receive(source, link).frames())
-    sent = bar.symbols.reshape(-1, 16).tolist()
-    assert frames
-    assert all(frame.soft.symbols.tolist() in sent for frame in frames)
