@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from evlcp_polar import _kernels
-from evlcp_polar.correction import Polar, list_nodes
+from evlcp_polar.correction import Polar, discrepancy_limit, list_nodes
 from evlcp_reed_solomon.correction import ReedSolomon
 from numpy.typing import NDArray
 from scipy import stats
@@ -160,7 +160,7 @@ def wrong_paths(code: Any, llr: NDArray[np.float32], message: NDArray[np.uint8])
     n = len(code.information)
     weight = np.abs(llr).astype(float)
     scale = weight.mean()
-    limit = _kernels.discrepancy_limit(weight / scale, code.log_share)
+    limit = discrepancy_limit(weight / scale, code.log_share)
     mother = np.full(n, 4.0 * n, np.float32)
     mother[code.sent] = llr / scale
     right, tried = code.encode(message), set()
