@@ -171,10 +171,7 @@ CASES: dict[tuple[str, str], tuple[Any, str]] = {
         made(Uart, codebook=lambda *_: Codebook("one", LONE[0], np.empty((1, 0), np.uint8), LONE)),
         "ValueError: gave 1 codeword, expected two or more; ",
     ),
-    ("modulation", "words fail"): (made(Modulation, codewords=boom), "KeyError: 'boom'; "),
-    ("modulation", "words are none"): (words(None), CHIPS),
     ("modulation", "words are floats"): (words(np.eye(8) / 2), CHIPS),
-    ("modulation", "words are flat"): (words(np.zeros(8, np.uint8)), CHIPS),
     ("modulation", "words are alike"): (
         words(np.repeat(LONE, 2, 0)),
         "codebook codewords: rows 0 and 1 are equal",
