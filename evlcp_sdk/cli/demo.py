@@ -96,7 +96,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     if progress.faults:
         raise typer.Exit(max(fault.exit_code for _, fault in progress.faults))
     with Outputs() as outputs:
-        save_plots(charts_of(summary), summary.name, out, outputs)
+        save_plots(charts_of(summary), summary.plan.name, out, outputs)
         outputs.write_text(page(summary), out / "report.html")
         outputs.commit()
     if as_json:

@@ -56,7 +56,7 @@ def report(
     folder = figures or (out.parent / f"{out.stem}-figures" if out is not None else None)
     with Outputs() as outputs:
         if folder is not None:
-            save_plots(charts_of(summary), summary.name, folder, outputs)
+            save_plots(charts_of(summary), summary.plan.name, folder, outputs)
         if out is not None:
             outputs.write_text(page(summary), out)
         outputs.commit()

@@ -466,7 +466,7 @@ def of_campaign(summary: Summary) -> Comparison:
         recordings = {f"seed {i}": one for i, one in enumerate(series.recordings)}
         scenes.setdefault(scene, []).append(Row(link, Measured(recordings)))
     tables = [Table(name, tuple(rows)) for name, rows in scenes.items()]
-    notes = [f"campaign {summary.name}, {summary.digest}"]
+    notes = [f"campaign {summary.plan.name}, {summary.plan.digest}"]
     if len({tuple(row.variant for row in table.rows) for table in tables}) > 1:
         notes.append("not every link receives every scene, so that there is no table of all scenes")
     elif len(tables) > 1:

@@ -108,16 +108,12 @@ class Summary:
     """A campaign's outcome.
 
     Attributes:
-        name: The campaign.
-        digest: SHA-256 of all its tasks.
         tasks: Tasks that count or would.
         done: Those that are finished.
         series: In the order of the campaign.
         plan: The plan that the store keeps.
     """
 
-    name: str
-    digest: str
     tasks: int
     done: int
     series: tuple[Series, ...]
@@ -126,8 +122,8 @@ class Summary:
     def to_dict(self) -> dict[str, Any]:
         """Every figure as JSON values; what was not measured is null."""
         return {
-            "campaign": self.name,
-            "digest": self.digest,
+            "campaign": self.plan.name,
+            "digest": self.plan.digest,
             "environment": self.plan.environment,
             "tasks": self.tasks,
             "done": self.done,
@@ -205,7 +201,7 @@ def summarize(store: Store) -> Summary:
         else:
             pairs = zip_longest(before.recordings, counted.recordings, fillvalue=Statistics())
             found[key] = replace(before, recordings=tuple(a + b for a, b in pairs))
-    return Summary(plan.name, plan.digest, tasks, done, tuple(found.values()), plan)
+    return Summary(tasks, done, tuple(found.values()), plan)
 
 
 @dataclass(frozen=True)

@@ -51,12 +51,12 @@ def title_of(summary: Summary) -> str:
     tallies = [tally for one in summary.series for tally in one.statistics.segments.values()]
     begins = [begin for one in summary.series for begin in one.statistics.segments]
     if not begins:
-        return f"{summary.name}: nothing measured yet"
+        return f"{summary.plan.name}: nothing measured yet"
     what = ["bit errors", "distance errors"]
     what += ["messages"] * any(t.messages_sent for t in tallies)
     what += ["positions"] * any(t.fixes or t.fixes_refused for t in tallies)
     said = f"{', '.join(what[:-1])} and {what[-1]}"
-    return f"{summary.name}: {said}, {min(begins)} to {max(begins) + SEGMENT_M} m"
+    return f"{summary.plan.name}: {said}, {min(begins)} to {max(begins) + SEGMENT_M} m"
 
 
 def _about(summary: Summary) -> list[str]:

@@ -109,7 +109,7 @@ def test_json_has_every_figure(summary: Summary) -> None:
 
 def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> None:
     with Outputs() as outputs:
-        written = save_plots(charts_of(summary), summary.name, tmp_path / "figures", outputs)
+        written = save_plots(charts_of(summary), summary.plan.name, tmp_path / "figures", outputs)
         assert not any(path.exists() for path in written)
         outputs.commit()
     assert [p.name for p in written] == [f"{c}.{kind}" for c in CHARTS for kind in ("png", "svg")]
@@ -119,7 +119,7 @@ def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> No
 
 def test_the_page_tells_everything(summary: Summary) -> None:
     text = page(summary)
-    assert summary.digest in text
+    assert summary.plan.digest in text
     assert "<h1>two methods &lt;/script&gt;: bit errors and distance errors, 30 to 80 m</h1>" in text
     assert "4 series: 20 km/h or 30 km/h; 16 clusters or two clusters &lt;!--&lt;script&gt;." in text
     head = Elements(text.partition("<h2>")[0])
