@@ -72,13 +72,10 @@ def test_a_users_first_hour(evlcp, native: str, tmp_path: Path) -> None:
     ):
         for command in ("send", "verify"):
             check_fault(board(command, "--random", 8, "--seed", 3, "--set", other), 8, says)
-    lines = board("monitor", "--count", 2, "--interval", 0.05).out.splitlines()
-    assert len(lines) == 2
-    assert "playing" in lines[0]
+    assert "playing" in board("monitor", "--count", 1).out
     check_fault(board("level", 61), 5, "the nearest value the board can take is 60")
     says = "this payload has a LED on for 0.5 of the time, the duty limit is 0.3: give a limit of at least"
     check_fault(board("program", "--random", 8, "--duty-limit", 0.3), 5, says)
-    assert board("watchdog", "dark", "--after-ms", 60_000).code == 0
     check_fault(board("save"), 5)
     assert board("stop").code == 0
     assert board("save").out == "saved in slot 0, number 1\n"

@@ -332,7 +332,7 @@ def test_a_message_that_changes(evlcp, native: str, tmp_path: Path) -> None:
     )
     assert (done.code, done.err) == (0, "")
     packets = packets_on(tmp_path / "leds.bin")
-    assert len(packets) == json.loads(done.out)["packets"] >= 45
+    assert len(packets) == json.loads(done.out)["packets"] >= 20, "round and round for two seconds"
     first, last = (messages_of(some) for some in (packets[:3], packets[-3:]))
     assert [m[Kind.TEXT].sequence for m in (first, last)] == [40, 41]
     for n, found in enumerate((first, last)):
@@ -342,4 +342,4 @@ def test_a_message_that_changes(evlcp, native: str, tmp_path: Path) -> None:
         assert found[Kind.TEXT].text == f"{n}: {left.left_s:.0f} s left at {clock}"
         assert (left.signal, left.next_signal) == ("amber", "red")
         assert began + n <= time_s <= time.time()
-        assert time_s + left.left_s == pytest.approx(began + 100.0, abs=1.0)
+        assert began + 99.9 <= time_s + left.left_s <= time.time() + 100.1
