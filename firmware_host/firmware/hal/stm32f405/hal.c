@@ -35,13 +35,12 @@
    | SPI1 takes no word, TIM3 stands         | the main loop, after 1.5 chips, 5 ms more during a CRC  |
    | the crystal                             | clock security (NMI), at once; then 16 MHz, no chips    |
    | the supply is below 2.8 V               | PVD interrupt, at once; brown-out reset (option bytes)  |
-   | the core: an exception                  | hal_panic, at once; then the watchdog's reset           |
+   | the core: an exception                  | fault_handler, at once; then the watchdog's reset           |
    | the main loop hangs, the core stands    | independent watchdog on the LSI: reset in 70 to 190 ms  |
 
    Reset leaves PB0 an input: the pull-up on the board is what keeps the LEDs dark then. A board that comes from the
    watchdog's reset stays dark, with CHIP_LOST, until START, even if a slot says autostart. */
 #include "evlcp.h"
-#include "startup.h"
 
 #ifndef EVLCP_IMAGE
 #define EVLCP_IMAGE 0u /* the one that is flashed; 1 and 2 come by updates */
@@ -62,6 +61,12 @@
 #define LATCH_AT_US 4u
 #define LATCH_US 1u
 #define TIM3_PER_US 84u
+
+#define REGISTER(address) (*(volatile uint32_t *)(address))
+
+#define NVIC_ISER(n) REGISTER(0xe000e100u + 4u * (n))
+#define NVIC_ICPR(n) REGISTER(0xe000e280u + 4u * (n))
+#define NVIC_PRIORITY(irq) (*(volatile uint8_t *)(0xe000e400u + (irq)))
 
 #define RCC 0x40023800u
 #define RCC_CR REGISTER(RCC + 0x00u)
@@ -227,6 +232,13 @@
 #define LOOKS_MIN 16u        /* longer than a word is on its way to the chain */
 
 extern uint32_t link_stack[];
+extern uint32_t link_data_load[];
+extern uint32_t link_data_start[];
+extern uint32_t link_data_end[];
+extern uint32_t link_bss_start[];
+extern uint32_t link_bss_end[];
+
+void reset_handler(void); /* the linker script's entry */
 
 static struct evlcp board;
 static volatile uint16_t words[2][SLOTS_PER_CHIP]; /* two rows on their way to the chain */
@@ -273,6 +285,18 @@ void hal_info(struct evlcp_hal_info *info)
                                     .target = EVLCP_TARGET,
                                     .clock_hz = CORE_HZ / 2u};
     evlcp_copy(info->unique_id, (const uint8_t *)UNIQUE_ID, sizeof info->unique_id);
+}
+
+static void irq_enable(uint32_t irq, uint8_t priority)
+{
+    NVIC_PRIORITY(irq) = priority;
+    NVIC_ISER(irq / 32u) = 1u << irq % 32u;
+}
+
+static void irq_forget(uint32_t irq)
+{
+    NVIC_ICPR(irq / 32u) = 1u << irq % 32u;
+    __asm volatile("dsb\n isb" ::: "memory");
 }
 
 static void outputs_off(void)
@@ -729,9 +753,12 @@ static void hand_over(void)
     __asm volatile("dsb\n isb\n msr msp, %0\n bx %1" ::"r"(REGISTER(base)), "r"(REGISTER(base + 4u)));
 }
 
-void hal_panic(void)
+/* Every exception that should not happen: dark, then nothing more. */
+static void fault_handler(void)
 {
     chips_stop();
+    for (;;) {
+    }
 }
 
 static void silence_handler(void)
@@ -900,6 +927,21 @@ int main(void)
         }
         IWDG_KR = IWDG_FEED;
     }
+}
+
+/* The first instruction after reset: copy initialised data, clear the rest, go. */
+void reset_handler(void)
+{
+    const uint32_t *from = link_data_load;
+    /* The linker script makes each pair of symbols the ends of one region. */
+    // cppcheck-suppress comparePointers
+    for (uint32_t *to = link_data_start; to < link_data_end; to++)
+        *to = *from++;
+    // cppcheck-suppress comparePointers
+    for (uint32_t *to = link_bss_start; to < link_bss_end; to++)
+        *to = 0u;
+    (void)main();
+    fault_handler();
 }
 
 union vector {
