@@ -1,7 +1,9 @@
 """What a frame says: its symbols, its distance, its points. Nothing of it moves regions."""
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,7 +41,7 @@ class Reading:
         centre_px: Column and row of the bar's centre on the sensor, px.
         sight: Where its bar is seen, and what the attitude says of its lean; the default one of a panel,
             which has no direction.
-        spread: How light spreads in it; None of a frame without a pilot.
+        spread: Measures how light spreads in it; None of a frame without a pilot.
     """
 
     symbols: NDArray[np.int64]
@@ -50,7 +52,7 @@ class Reading:
     flank_px: float
     centre_px: tuple[float, float]
     sight: BarSight
-    spread: Spread | None
+    spread: Callable[[], Spread] | None
 
 
 class FrameReader:
@@ -121,5 +123,7 @@ class FrameReader:
             sight = sight_of(self._camera, points_px, sigma_px, attitude)
         elif not self._camera.is_pinhole:
             sight = BarSight(magnification=magnification_of(self._camera, points_px))
-        spread = Spread.of(heard, self._pilots, self._every, self._layout, self._pairs, placement)
+        # Only of two images at one time it is asked; the pilot alone is kept for that, not the whole frame.
+        how = heard.copy(), self._pilots, self._every, self._layout, self._pairs, placement
+        spread = cache(partial(Spread.of, *how))
         return Reading(soft.symbols, given, distance, points_px, sigma_px, flank_px, centre_px, sight, spread)

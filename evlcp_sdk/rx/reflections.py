@@ -8,7 +8,7 @@ one symbol of as many as there are codewords.
 
 import math
 from collections import deque
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -83,7 +83,7 @@ class FrameDetection:
         light: Grid cells that show a cluster, on average: what shines more shows in more of them.
         seen: Clusters that are seen.
         mirrored: The order of the clusters is the opposite of the layout's.
-        spread: How light spreads in it; None where that is not known.
+        spread: Measures how light spreads in it; None where nothing shows that.
     """
 
     frame: Frame
@@ -94,10 +94,12 @@ class FrameDetection:
     light: float
     seen: int
     mirrored: bool
-    spread: Spread | None = None
+    spread: Callable[[], Spread] | None = None
 
     @classmethod
-    def of(cls, frame: Frame, due: DueFrame, placed: Placement, spread: Spread | None) -> "FrameDetection":
+    def of(
+        cls, frame: Frame, due: DueFrame, placed: Placement, spread: Callable[[], Spread] | None
+    ) -> "FrameDetection":
         """What a frame's image shows, by where it shows the layout."""
         seen = max(sum(placed.seen.tolist()), 1)
         times = due.start_us, due.end_us, due.packet_us, due.lock.chip_us
@@ -206,7 +208,7 @@ class _Pair:
         self.mirrored += other.mirrored - one.mirrored
         if one.spread is not None and other.spread is not None:
             known = self.spread
-            both = one.spread, other.spread
+            both = one.spread(), other.spread()
             self.spread = both if known is None else (known[0] + both[0], known[1] + both[1])
         self.last_us = max(one.t_us, other.t_us, self.last_us)
 
