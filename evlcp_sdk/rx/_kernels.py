@@ -621,22 +621,26 @@ def _strip(unit: complex, along: float, across: float) -> tuple[float, float]:
 
 
 @njit
-def across_profile(
+def core_profile(
     probability: Array,
     seen: Array,
     places: Array,
     unit: complex,
     spacing: float,
     grid: int,
-    hits: Array,
-    cells: Array,
-) -> None:
-    """Presence of clusters in their place, less that of others, by distance from their line: sums and cells.
+    edge: float,
+    out: Array,
+) -> int:
+    """Presence of clusters in their place, less that of others, by distance off their line, 0 to 1; how many.
 
     A cell, in bins of 1 px, belongs to the seen cluster between whose ends, half a spacing on both sides, its
     middle lies; its two neighbours may show in it, too.
+    They reach to where, beyond their peak, they first fall below `edge` of it. Cells in rows with the axis
+    leave distances out between them: straight lines lead over those, and up to the first it
+    stays the same.
     """
     _, rows, columns = probability.shape
+    hits, cells = np.zeros(out.size), np.zeros(out.size)
     near, many = np.empty((places.size, places.size), np.int64), np.zeros(places.size, np.int64)
     for k in range(places.size):
         for other in range(places.size):
@@ -666,16 +670,6 @@ def across_profile(
                     for i_near in range(many[k]):
                         far -= probability[near[k, i_near], r, c]
                     hits[i] += share * probability[k, r, c] - share * share * far
-
-
-@njit
-def core_profile(hits: Array, cells: Array, edge: float, out: Array) -> int:
-    """Hits per cell by distance from an axis, 0 to 1; how many.
-
-    They reach to where, beyond their peak, they first fall below `edge` of it. Cells in rows with the axis
-    leave distances out between them: straight lines lead over those, and up to the first it
-    stays the same.
-    """
     before = -1
     out[:] = 0.0
     for i in range(cells.size):
@@ -909,10 +903,9 @@ def mask(
     (likely, selected, pixels), (prior, probability, chosen, near) = presence, out
     places, unit, spacing, grid = place
     across, wide = spacing, 0
-    hits, cells, profile = np.zeros(bins), np.zeros(bins), np.empty(bins)
+    profile = np.empty(bins)
     if bins:
-        across_profile(likely, seen, places, unit, spacing, grid, hits, cells)
-        wide = core_profile(hits, cells, edge, profile)
+        wide = core_profile(likely, seen, places, unit, spacing, grid, edge, profile)
         across = float(wide)
         if wide == 0:
             # A line that shows nowhere is still none of a panel, which is what no profile says.
@@ -1595,21 +1588,6 @@ def places_at(t_us: Array, places: Array, ahead: float, centre: Array) -> None:
             centre[a, i] = (
                 there if t == until_us else (there - here) / (until_us - from_us) * (t - from_us) + here
             )
-
-
-@njit
-def hold_still(centre: Array, width: int, height: int, shift: Array, rest: Array) -> float:
-    """Sensor pixel of an image's (0, 0) that holds a centre in its middle, and what is left of it.
-
-    `centre`, `shift` and `rest` are (2, chips); the mean row of the centre is given back.
-    """
-    total, chips = 0.0, len(centre[0])
-    for c in range(chips):
-        left, top = centre[0, c] - (width - 1) / 2, centre[1, c] - (height - 1) / 2
-        shift[0, c], shift[1, c] = int(np.rint(left)), int(np.rint(top))
-        rest[0, c], rest[1, c] = left - shift[0, c], top - shift[1, c]
-        total += centre[1, c]
-    return total / chips
 
 
 @njit

@@ -313,9 +313,12 @@ def polarity_sums(
     """
     width, height = size_px
     chips = centre_px.shape[1]
-    shift, rest_px = np.empty((2, chips), np.int64), np.empty((2, chips))
+    # The image's pixel (0, 0) on the sensor.
+    corner_px = centre_px - np.array([[width - 1], [height - 1]]) / 2
+    whole_px = np.rint(corner_px)
+    shift, rest_px = whole_px.astype(np.int64), corner_px - whole_px
     # Rows wait for the bar's own, wherever they are.
-    row_px = _kernels.hold_still(centre_px, width, height, shift, rest_px)
+    row_px = sum(centre_px[1].tolist()) / chips
     sums = np.zeros((chips, height, width), np.int16)
     # Whatever kinds of numbers a synchronization gives.
     on_us, off_us = float(start_us + lock.delay_on_us), float(start_us + lock.delay_off_us)

@@ -18,17 +18,6 @@ _AT_ONCE = 64
 
 
 @njit
-def _sum_gains(events: float, gains: Column, means: Column) -> float:
-    """Logarithm of the sum over gains of what they make of so many events; see `bit_evidence`."""
-    most, total = -np.inf, 0.0
-    for j in range(len(gains)):
-        most = max(most, events * gains[j] - means[j])
-    for j in range(len(gains)):
-        total += math.exp(events * gains[j] - means[j] - most)
-    return most + math.log(total)
-
-
-@njit
 def bit_evidence(
     counts: Column, logs: Column, gains: Column, means: Column, share: float, outlier: float, out: Column
 ) -> None:
@@ -61,7 +50,13 @@ def bit_evidence(
             out[s] = out[s - 1]
             continue
         for c in range(0 if is_known[events] else contexts):
-            of_gains[events, c] = _sum_gains(share * events, gains, means[c])
+            # The logarithm of the sum over gains of what they make of so many events.
+            most, total = -np.inf, 0.0
+            for j in range(len(gains)):
+                most = max(most, share * events * gains[j] - means[c, j])
+            for j in range(len(gains)):
+                total += math.exp(share * events * gains[j] - means[c, j] - most)
+            of_gains[events, c] = most + math.log(total)
         is_known[events] = True
         for c in range(contexts):
             worth[c] = of_gains[events, c]

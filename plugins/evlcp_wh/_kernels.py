@@ -218,21 +218,15 @@ def match_words(
 
 
 @njit
-def pair_up(sums: Array, most: int, out: Array) -> None:
-    """Which pair of sums, clipped to -most to most, each value has in each pixel, uint16 (values, pixels)."""
-    size = out.shape[1]
-    flat = sums.reshape(-1, size)
-    least, greatest, side = np.int16(-most), np.int16(most), np.int16(2 * most + 1)
-    for i in range(len(out)):
-        for j in range(size):
-            a = np.int16(min(max(flat[2 * i, j], least), greatest) - least)
-            b = np.int16(min(max(flat[2 * i + 1, j], least), greatest) - least)
-            out[i, j] = np.uint16(np.int16(a * side) + b)
-
-
-@njit
 def learn_worth(
-    pairs: Array, width: int, signs: Array, probability: Array, grid: int, prior: float, out: Array
+    sums: Array,
+    most: int,
+    signs: Array,
+    probability: Array,
+    grid: int,
+    prior: float,
+    pairs: Array,
+    out: Array,
 ) -> None:
     """Log ratio of how often each pair of sums comes with a value of +1 and with -1, `out` (pairs,).
 
@@ -242,16 +236,25 @@ def learn_worth(
     other: what comes with it is taken to be the same with all signs changed.
 
     Args:
-        pairs: Of all pixels, as `pair_up` gives them.
-        width: Of the image.
+        sums: Polarity sums, int16 (chips, height, width).
+        most: They are clipped to -most to most.
         signs: Whether the pilots' values are +1, uint64 (K, values).
         probability: Of each cluster in each cell, (K, rows, columns).
         grid: Side of a cell.
         prior: Observations added.
+        pairs: Takes the pair of each value in each pixel, uint16 (values, pixels).
         out: Takes the log ratios.
     """
     clusters, known = signs.shape
     _, rows, columns = probability.shape
+    width, size = sums.shape[2], pairs.shape[1]
+    flat = sums.reshape(-1, size)
+    low, high, side = np.int16(-most), np.int16(most), np.int16(2 * most + 1)
+    for i in range(len(pairs)):
+        for j in range(size):
+            a = np.int16(min(max(flat[2 * i, j], low), high) - low)
+            b = np.int16(min(max(flat[2 * i + 1, j], low), high) - low)
+            pairs[i, j] = np.uint16(np.int16(a * side) + b)
     counts, total, more = np.zeros((2, out.size)), np.zeros(2), np.empty(2)
     for k in range(clusters):
         for r in range(rows):

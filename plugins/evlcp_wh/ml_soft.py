@@ -74,10 +74,9 @@ class LearnedDecoder:
             its chips' polarity sums of -n to n events, float64 (2 n + 1, 2 n + 1), the first chip's first.
         """
         pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
-        _kernels.pair_up(plain(sums), MAX_EVENTS, pairs)
         seen, width, grid = plain(presence.probability), sums.shape[2], presence.grid_px
         worth = np.empty((2 * MAX_EVENTS + 1) ** 2)
-        _kernels.learn_worth(pairs, width, self._signs, seen, grid, _PRIOR_COUNT, worth)
+        _kernels.learn_worth(plain(sums), MAX_EVENTS, self._signs, seen, grid, _PRIOR_COUNT, pairs, worth)
         values = np.zeros((len(seen), len(pairs) - self._signs.shape[1]))
         odds = (1 - _PIXEL_SHARE) / _PIXEL_SHARE
         _kernels.sum_worth(pairs, width, self._signs, seen, grid, worth, (_MIN_WEIGHT, odds), values)

@@ -120,12 +120,6 @@ def signs_of(codes):
     return (codes > 0).astype(np.uint64)
 
 
-def pairs_of(sums, most):
-    pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
-    _kernels.pair_up(sums, most, pairs)
-    return pairs
-
-
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("grid", "most"), [(2, 1), (3, 2)])
 @pytest.mark.parametrize("prior", [0.5, 1.0])
@@ -136,8 +130,8 @@ def test_worth_is_learned_and_summed(seed, grid, most, prior):
     probability = rng.dirichlet(np.full(CLUSTERS + 1, 0.1), (13 // grid, 10 // grid)).T[:-1].swapaxes(1, 2)
     probability = np.ascontiguousarray(probability, np.float32)
     assert ((probability > 0.5).sum((1, 2)) > 0).any()
-    pairs, signs, worth = pairs_of(sums, most), signs_of(CODES), np.empty((2 * most + 1) ** 2)
-    _kernels.learn_worth(pairs, 10, signs, probability, grid, prior, worth)
+    pairs, signs, worth = np.empty((14, 130), np.uint16), signs_of(CODES), np.empty((2 * most + 1) ** 2)
+    _kernels.learn_worth(sums, most, signs, probability, grid, prior, pairs, worth)
     counts = twins.count_pairs(sums[:16], CODES, probability, grid, most, 0.0)
     worth = worth.reshape(counts.shape[1:])
     assert_allclose(worth, twins.log_ratio(counts, prior), rtol=1e-6, atol=1e-9)
@@ -156,7 +150,8 @@ def test_a_pilot_of_one_value_says_of_the_other_the_same_with_signs_changed(valu
     known = int(value > 0)
     assert not counts[1 - known].any()
     counts[1 - known] = counts[known, ::-1, ::-1]
-    _kernels.learn_worth(pairs_of(sums, 3), 8, signs_of(codes), cells, 2, 1.0, worth)
+    pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
+    _kernels.learn_worth(sums, 3, signs_of(codes), cells, 2, 1.0, pairs, worth)
     assert_allclose(worth.reshape(7, 7), twins.log_ratio(counts, 1.0), rtol=1e-9, atol=1e-12)
 
 

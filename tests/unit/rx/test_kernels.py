@@ -284,10 +284,11 @@ def test_footprints(seed, grid):
     places = 15.3 + 20.2j + unit * spacing * (np.arange(5) - rng.uniform(1, 3))
     probability = rng.random(shape).astype(np.float32)
     seen = rng.random(5) < 0.8
-    hits, cells = np.zeros((2, 7))
-    _kernels.across_profile(probability, seen, places, unit, spacing, grid, hits, cells)
-    want = twins.across_profile(probability, seen, places, unit, spacing, grid, 7)
-    assert_allclose([hits, cells], want, rtol=1e-9, atol=1e-9)
+    core = np.empty(7)
+    n = _kernels.core_profile(probability, seen, places, unit, spacing, grid, 0.5, core)
+    hits, cells = twins.across_profile(probability, seen, places, unit, spacing, grid, 7)
+    if cells.any():
+        assert_allclose(core[:n], twins.core_profile(hits, cells, 0.5), rtol=1e-9, atol=1e-9)
     profile, out = rng.random(7), np.zeros(shape, np.float32)
     _kernels.place_prior(places, unit, spacing, grid, profile, out)
     assert_allclose(out, twins.line_prior(shape, places, unit, spacing, grid, profile), rtol=1e-5, atol=1e-6)
@@ -494,26 +495,6 @@ def test_cells_in_and_out_of_place(seed, clusters):
     assert_array_equal(seen, right > wrong)
     left = np.abs(at[:, None] - places).min(1) > gap / 2 + 1
     assert found == (np.count_nonzero(right + wrong), seen.sum(), right[seen].sum(), cells[left].sum())
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_the_core_of_a_profile(seed):
-    rng = np.random.default_rng(seed)
-    cells = np.where(rng.random(12) < 0.6, rng.random(12), 0)
-    cells[rng.integers(12)] = 0.5
-    hits, out = cells * rng.uniform(-0.5, 1.5, 12), np.empty(12)
-    n = _kernels.core_profile(hits, cells, 0.5, out)
-    assert_allclose(out[:n], twins.core_profile(hits, cells, 0.5), atol=1e-12)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_a_centre_is_held_in_the_middle(seed):
-    x, y = np.random.default_rng(seed).uniform(-3, 1300, (2, 20))
-    shift, rest = np.empty((2, 20), np.int64), np.empty((2, 20))
-    assert _kernels.hold_still(np.stack([x, y]), 18, 101, shift, rest) == pytest.approx(y.mean())
-    corner = np.stack([x - 8.5, y - 50])
-    assert_array_equal(shift, np.rint(corner))
-    assert_allclose(rest, corner - np.rint(corner), atol=1e-12)
 
 
 @pytest.mark.parametrize("box", [(0, 0, 24, 16), (3, 5, 9, 6), (4, 4, 8, 8), (20, 8, 40, 30)])
