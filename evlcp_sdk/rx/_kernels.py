@@ -649,9 +649,7 @@ def core_profile(
                 many[k] += 1
     every = np.zeros((rows, columns))
     for k in range(places.size):
-        for r in range(rows):
-            for c in range(columns):
-                every[r, c] += probability[k, r, c]
+        every += probability[k]
     half = spacing / 2 + grid
     wide, high = _strip(unit, half, hits.size)
     for k in range(places.size):

@@ -37,9 +37,8 @@ def bit_evidence(
     _, width, contexts = logs.shape
     # What the gains make of a context depends on how many events there are, not on when they come.
     many = np.zeros(len(out), np.int64)
-    for s in range(len(out)):
-        for m in range(width):
-            many[s] += counts[0, s + m] + counts[1, s + m]
+    for m in range(width):
+        many += counts[0, m : m + len(out)] + counts[1, m : m + len(out)]
     of_gains = np.empty((many.max() + 1 if len(out) else 0, contexts))
     is_known = np.zeros(len(of_gains), np.bool_)
     worth = np.empty(contexts)
