@@ -80,7 +80,8 @@ LANES = 192
 """Most pixels that pass through time together: what is done for each is a loop of vector instructions."""
 
 _EVEN = 4
-"""Lanes are filled up to a multiple of this, the numbers in a vector, so that no loop has a rest."""
+"""Lanes are filled up to a multiple of this, the numbers in a vector, so that no loop has a rest: with the
+last of them again, of which nothing is taken."""
 
 # A batch's room: rows of LANES numbers, each of which begins here. Rows with constant places in one array are
 # what the compiler knows to be apart. Of every pixel, and with _M_ of those that may fire in a piece of time:
@@ -168,10 +169,28 @@ def _decay(age: float) -> float:
 
 
 @njit
-def _follow(y_from: float, y_to: float, z: float, whole: float, part: float, tau: float) -> float:
-    """Return a low-pass filter's output after `part` of a ramp of `whole` us from y_from to y_to."""
-    slope = (y_to - y_from) / whole
-    return y_from + slope * (part - tau) + (z - y_from + slope * tau) * math.exp(-part / tau)
+def _follow(
+    y_from: float, y_to: float, z: float, length: float, low: float, high: float, tau: float
+) -> tuple[float, float]:
+    """Let a low-pass filter follow a ramp of `length` us until its output is at one of two levels.
+
+    Returns:
+        After how long, to a millionth of the ramp, and its output.
+    """
+    slope = (y_to - y_from) / length
+    end = y_from + slope * (length - tau) + (z - y_from + slope * tau) * math.exp(-length / tau)
+    if low < end < high:
+        return length, end
+    level = high if end >= high else low
+    before, after = 0.0, length
+    for _ in range(20):
+        guess = 0.5 * (before + after)
+        there = y_from + slope * (guess - tau) + (z - y_from + slope * tau) * math.exp(-guess / tau)
+        if (there >= level) == (z < level):
+            after = guess
+        else:
+            before = guess
+    return after, level
 
 
 @njit
@@ -179,8 +198,8 @@ def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelM
     """Let a pixel see its light, as in `_run_piece`, with a low-pass filter between receptor and comparator.
 
     The receptor is exact; between its values, as near to one another as they must be for a ramp to hit the
-    middle between them to 0.002, the filter is solved for ramps, and when its output passes a level is found
-    to a millionth of a ramp. Its reference and its output are log signals.
+    middle between them to 0.002, the filter is solved for ramps. Its reference and its output are log
+    signals.
     """
     f, sensor, tau = batch.f, model.sensor, model.sensor[12]
     light, u_base = f[_NOW + i], f[_U + i]
@@ -199,14 +218,12 @@ def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelM
         low = f[_REFERENCE + i] - threshold_off - noise
         if f[_ARMED + i] > 0.0 and (z >= high or z <= low):
             on = z >= high
-            late = sensor[2] if on else sensor[3]
-            if sensor[4] > 0.0:
-                noisy = sensor[4] * hash_normal(batch.key[i], 0, drawn, 2, model.quantiles)
-                late = max(late + noisy, 0.0)
+            noisy = sensor[4] * hash_normal(batch.key[i], 0, drawn, 2, model.quantiles)
+            late = max(sensor[3 - int(on)] + noisy, 0.0)
             request = max(t + late, f[_LAST_OUT + i] + sensor[1])
             f[_ARMED + i], f[_READY + i], f[_LAST_OUT + i] = 0.0, t + sensor[1], request
-            if float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10 >= sensor[5 if on else 6]:
-                out.t_us[out.made[0]], out.code[out.made[0]] = request, batch.code[i] + (1 if on else 0)
+            if float(word & np.uint64(0xFFFFFFFF)) * 2.3283064365386963e-10 >= sensor[6 - int(on)]:
+                out.t_us[out.made[0]], out.code[out.made[0]] = request, batch.code[i] + int(on)
                 out.made[0] += 1
         elif f[_ARMED + i] == 0.0 and t >= f[_READY + i]:
             f[_REFERENCE + i], f[_ARMED + i] = z, 1.0
@@ -228,26 +245,18 @@ def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelM
             continue
         length = min(2.0 * whole, tau)
         half = 0.5 * whole
-        crossed = False
+        then = limit if last else t + whole
+        if not armed:
+            low, high = -math.inf, math.inf
         for k in range(2):
             y_to = middle if k == 0 else end
-            z_to = _follow(y, y_to, z, half, half, tau)
-            if armed and (z_to >= high or z_to <= low):
-                level = high if z_to >= high else low
-                before, after = 0.0, half
-                for _ in range(20):
-                    guess = 0.5 * (before + after)
-                    if (_follow(y, y_to, z, half, guess, tau) >= level) == (z < level):
-                        after = guess
-                    else:
-                        before = guess
-                t += k * half + after
-                y, z = -math.log(rest + (u_base - rest) * math.exp(-rate * (t - t_us))), level
-                crossed = True
+            part, z_to = _follow(y, y_to, z, half, low, high, tau)
+            if part < half:
+                then = t + (k * half + part)
+                y, z = -math.log(rest + (u_base - rest) * math.exp(-rate * (then - t_us))), z_to
                 break
             y, z = y_to, z_to
-        if not crossed:
-            t = limit if last else t + whole
+        t = then
     f[_U + i] = rest + (u_base - rest) * math.exp(-rate * (until - t_us))
     f[_FOLLOWER + i] = z
 
@@ -277,22 +286,6 @@ def _logarithm(of: float) -> float:
 
 
 @njit(inline="always")
-def _fill(which: Array, n: int) -> int:
-    """Repeat the first of `n` lanes until there are a multiple of `_EVEN`; return how many are then."""
-    even = (n + _EVEN - 1) // _EVEN * _EVEN
-    for a in range(n, even):
-        which[a] = which[0]
-    return even
-
-
-@njit(inline="always")
-def _take(f: Array, row: int, which: Array, n: int, out: int) -> None:
-    """Write the numbers of `n` lanes in a row side by side."""
-    for a in range(n):
-        f[out + a] = f[np.uint64(row + which[a])]
-
-
-@njit(inline="always")
 def _see_again(blind: int, m: int, t_us: float, batch: Batch, sensor: Array) -> int:
     """Take the light that `blind` lanes of `again` see as their reference; add those that may fire to `m` of
     `which`; how many these are then.
@@ -300,14 +293,13 @@ def _see_again(blind: int, m: int, t_us: float, batch: Batch, sensor: Array) -> 
     f, kind, which, again, draw = batch.f, batch.kind, batch.which, batch.again, batch.draw
     per_charge, widest = 1.0 / sensor[0], sensor[8]
     # Those that see again in this piece, and of them those that may fire.
-    even = _fill(again, blind)
-    _take(f, _U, again, even, _M_U)
-    _take(f, _REST, again, even, _M_REST)
-    _take(f, _END, again, even, _M_END)
-    _take(f, _ON, again, even, _M_ON)
-    _take(f, _OFF, again, even, _M_OFF)
-    _take(f, _READY, again, even, _M_READY)
-    _take(f, _NOW, again, even, _M_AGE)
+    even = (blind + _EVEN - 1) // _EVEN * _EVEN
+    for a in range(even):
+        i = again[min(a, blind - 1)]
+        f[_M_U + a], f[_M_REST + a] = f[np.uint64(_U + i)], f[np.uint64(_REST + i)]
+        f[_M_END + a], f[_M_READY + a] = f[np.uint64(_END + i)], f[np.uint64(_READY + i)]
+        f[_M_ON + a], f[_M_OFF + a] = f[np.uint64(_ON + i)], f[np.uint64(_OFF + i)]
+        f[_M_AGE + a] = f[np.uint64(_NOW + i)]
     for a in range(even):
         rest, end = f[_M_REST + a], f[_M_END + a]
         kept = _decay((f[_M_READY + a] - t_us) * per_charge * f[_M_AGE + a])
@@ -334,9 +326,9 @@ def _draw_fates(m: int, batch: Batch, shifts: Array) -> int:
     """
     f, kind, which, draw, key = batch.f, batch.kind, batch.which, batch.draw, batch.key
     bits = f.view(np.int64)
-    even = _fill(which, m)
+    even = (m + _EVEN - 1) // _EVEN * _EVEN
     for a in range(even):
-        k = np.uint64(which[a])
+        k = np.uint64(which[min(a, m - 1)])
         word = mix(key[k] + np.uint64(draw[k]) * np.uint64(DRAW_STEP))
         bits[_M_SPARE + a] = np.int64(word)
     # Half a word becomes the lowest bits of 2^52.
@@ -349,10 +341,10 @@ def _draw_fates(m: int, batch: Batch, shifts: Array) -> int:
     # By itself, so that many parts of the table are on their way at once.
     for a in range(even):
         f[_M_SHIFT + a] = _table_at(shifts, f[_M_SHIFT + a])
-    _take(f, _REFERENCE, which, even, _M_REFERENCE)
-    _take(f, _END, which, even, _M_END)
-    _take(f, _ON, which, even, _M_ON)
-    _take(f, _OFF, which, even, _M_OFF)
+    for a in range(even):
+        i = which[min(a, m - 1)]
+        f[_M_REFERENCE + a], f[_M_END + a] = f[np.uint64(_REFERENCE + i)], f[np.uint64(_END + i)]
+        f[_M_ON + a], f[_M_OFF + a] = f[np.uint64(_ON + i)], f[np.uint64(_OFF + i)]
     for a in range(even):
         end = f[_M_END + a]
         level = f[_M_REFERENCE + a] * f[_M_SHIFT + a]
@@ -383,11 +375,11 @@ def _fire_together(
     charge, refractory, delay_on, delay_off, jitter = sensor[0], sensor[1], sensor[2], sensor[3], sensor[4]
     miss_on, miss_off = sensor[5], sensor[6]
     out_t, out_code, n = out.t_us, out.code, out.made[0]
-    even = _fill(which, fires)
-    _take(f, _U, which, even, _M_U)
-    _take(f, _REST, which, even, _M_REST)
-    _take(f, _READY, which, even, _M_READY)
-    _take(f, _LAST_OUT, which, even, _M_LAST_OUT)
+    even = (fires + _EVEN - 1) // _EVEN * _EVEN
+    for a in range(even):
+        i = which[min(a, fires - 1)]
+        f[_M_U + a], f[_M_REST + a] = f[np.uint64(_U + i)], f[np.uint64(_REST + i)]
+        f[_M_READY + a], f[_M_LAST_OUT + a] = f[np.uint64(_READY + i)], f[np.uint64(_LAST_OUT + i)]
     if jitter > 0.0:
         for a in range(fires):
             k = np.uint64(which[a])
