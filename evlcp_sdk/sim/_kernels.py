@@ -262,30 +262,6 @@ def _run_filtered(i: int, t_us: float, until: float, batch: Batch, model: PixelM
 
 
 @njit(inline="always")
-def _logarithm(of: float) -> float:
-    """Natural logarithm, any value where `of` is not positive; without a branch or a call, as `_decay`."""
-    bits = np.float64(of).view(np.int64)
-    # The exponent as the lowest bits of 2^52.
-    raised = np.int64((bits >> 52) & 0x7FF | 0x4330000000000000).view(np.float64)
-    m = np.int64(bits & 0xFFFFFFFFFFFFF | 0x3FF0000000000000).view(np.float64)
-    k = raised - (4503599627370496.0 + 1023.0)
-    above = m > 1.4142135623730951
-    m = 0.5 * m if above else m
-    k = k + 1.0 if above else k
-    s = (m - 1.0) / (m + 1.0)
-    z = s * s
-    p = 2.0 / 15.0
-    p = p * z + 2.0 / 13.0
-    p = p * z + 2.0 / 11.0
-    p = p * z + 2.0 / 9.0
-    p = p * z + 2.0 / 7.0
-    p = p * z + 2.0 / 5.0
-    p = p * z + 2.0 / 3.0
-    p = p * z + 2.0
-    return k * 0.693147180369123816490 + (k * 1.90821492927058770002e-10 + p * s)
-
-
-@njit(inline="always")
 def _see_again(blind: int, m: int, t_us: float, batch: Batch, sensor: Array) -> int:
     """Take the light that `blind` lanes of `again` see as their reference; add those that may fire to `m` of
     `which`; how many these are then.
@@ -390,8 +366,27 @@ def _fire_together(
         # Where it is beyond the threshold from the first, there is no way to it.
         beyond = (u <= level) if on else (u >= level)
         tau = 0.0 if beyond else charge * rest
-        t = max(ready, t_us)
-        t = min(max(t_us + _logarithm((u - rest) / (level - rest)) * tau, t), until)
+        # The way's natural logarithm, any value where it is not positive, without a branch or a call, as
+        # `_decay`: the exponent as the lowest bits of 2^52, and a series of the mantissa.
+        way = np.float64((u - rest) / (level - rest)).view(np.int64)
+        raised = np.int64((way >> 52) & 0x7FF | 0x4330000000000000).view(np.float64)
+        mantissa = np.int64(way & 0xFFFFFFFFFFFFF | 0x3FF0000000000000).view(np.float64)
+        power = raised - (4503599627370496.0 + 1023.0)
+        above = mantissa > 1.4142135623730951
+        mantissa = 0.5 * mantissa if above else mantissa
+        power = power + 1.0 if above else power
+        s = (mantissa - 1.0) / (mantissa + 1.0)
+        z = s * s
+        p = 2.0 / 15.0
+        p = p * z + 2.0 / 13.0
+        p = p * z + 2.0 / 11.0
+        p = p * z + 2.0 / 9.0
+        p = p * z + 2.0 / 7.0
+        p = p * z + 2.0 / 5.0
+        p = p * z + 2.0 / 3.0
+        p = p * z + 2.0
+        log = power * 0.693147180369123816490 + (power * 1.90821492927058770002e-10 + p * s)
+        t = min(max(t_us + log * tau, max(ready, t_us)), until)
         late = max((delay_on if on else delay_off) + f[_M_LATER + a], 0.0)
         ready = t + refractory
         f[_M_REQUEST + a] = max(t + late, f[_M_LAST_OUT + a] + refractory)
