@@ -53,7 +53,7 @@ def test_the_image_counts_events_on_the_sensor() -> None:
     assert probe.image[6, 5] == probe.image.sum() == 2
 
 
-@pytest.mark.parametrize("transmitters", [0, 1, 7])
+@pytest.mark.parametrize("transmitters", [0, 7])
 def test_any_number_of_transmitters(transmitters: int, tmp_path: Path) -> None:
     names = ["regions.png", "presence.png", "distance.png"]
     with ResultFolder(tmp_path, names) as folder:

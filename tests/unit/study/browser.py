@@ -49,8 +49,8 @@ class Browser:
         self._number = self._width = 0
         self._session: str | None = None
         self.heard: list[dict[str, Any]] = []
-        targets = self.say("Target.getTargets")["targetInfos"]
-        target = next(t["targetId"] for t in targets if t["type"] == "page")
+        # One of its own may not be there yet.
+        target = self.say("Target.createTarget", url="about:blank")["targetId"]
         self._session = self.say("Target.attachToTarget", targetId=target, flatten=True)["sessionId"]
         for domain in ("Page", "Network", "Runtime", "Log"):
             self.say(f"{domain}.enable")
