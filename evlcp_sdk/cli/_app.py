@@ -3,14 +3,13 @@
 import importlib
 import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager
-from copy import copy
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from typer.core import TyperGroup
-from typer.models import CommandInfo, TyperInfo
+from typer.models import CommandInfo
 
 from evlcp_sdk.cli._common import echo, hush, loaded, log_on_stderr
 from evlcp_sdk.printable import printable
@@ -55,9 +54,7 @@ _OWN = (
 """Modules of our own commands, each of which has the one that it is named after."""
 
 _SOON = frozenset({"receive", "live"})
-"""Commands that need neither others nor a plugin's, and would wait for these a tenth of their start; they say
-themselves when they are loaded."""
-
+"""Commands that say themselves when they are loaded."""
 
 _EXAMPLE = re.compile(r"\n+(?= *[A-Z][^\n:\[]+:\s+\[bold\])")
 """Before an example in a command's help: Typer takes lines for one that no empty one parts."""
@@ -66,26 +63,12 @@ _EXAMPLE = re.compile(r"\n+(?= *[A-Z][^\n:\[]+:\s+\[bold\])")
 class _Commands(TyperGroup):
     """The commands; what Typer says of a wrong command line repeats it, and moves no cursor either."""
 
-    late: Mapping[str, CommandInfo | TyperInfo] = {}
-    """Those that are built when they are asked for, by name: to build all takes long."""
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        return list(self.late) or super().list_commands(ctx)
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        # Where there is none, Typer says which of all those built are like it.
-        for name in [cmd_name] if cmd_name in self.late else self.late:
-            if name not in self.commands:
-                self.commands[name] = _built(name, self.late[name])
-        return super().get_command(ctx, cmd_name)
-
     def make_context(self, *args: Any, **more: Any) -> Any:
         with _printable_faults():
             return super().make_context(*args, **more)
 
     def invoke(self, ctx: Any) -> Any:
-        # An app of one of these alone is loaded when it says so.
-        if self.late.keys() - _SOON:
+        if not self.commands.keys() <= _SOON:
             loaded()
         with _printable_faults():
             return super().invoke(ctx)
@@ -133,19 +116,6 @@ def _printable_faults() -> Iterator[None]:
         raise
 
 
-def _built(name: str, info: CommandInfo | TyperInfo) -> Any:
-    """A command or group, as Typer builds it."""
-    alone = typer.Typer(rich_markup_mode="rich", pretty_exceptions_enable=False)
-    if isinstance(info, CommandInfo):
-        alone.registered_commands.append(info)
-    else:
-        alone.registered_groups.append(info)
-    command = typer.main.get_group(alone).commands[name]
-    for parameter in command.params:
-        _leave_unset(parameter)
-    return command
-
-
 def _leave_unset(parameter: Any) -> None:
     """Spare a parameter that is not given what Typer makes to check it, an adapter of pydantic."""
     if parameter.required or parameter.callback is not None:
@@ -153,18 +123,6 @@ def _leave_unset(parameter: Any) -> None:
     process = parameter.process_value
     unset = () if parameter.multiple or parameter.nargs == -1 else None
     parameter.process_value = lambda ctx, value: unset if value is None else process(ctx, value)
-
-
-def _called_late(app: typer.Typer) -> Any:
-    """The command line to call, its commands built when they are asked for."""
-    bare = copy(app)
-    bare.registered_commands, bare.registered_groups = [], []
-    group = typer.main.get_command(bare)
-    assert isinstance(group, _Commands)
-    group.late = {_name(command): command for command in app.registered_commands} | {
-        group.name or "": group for group in app.registered_groups
-    }
-    return group
 
 
 def make_app(*modules: str) -> typer.Typer:
@@ -275,10 +233,17 @@ def run() -> None:
         warnings.simplefilter("always", PluginWarning)
         warnings.showwarning = show
         hush()
-        soon = _SOON & set(sys.argv[1:2])
-        app = make_app(*soon)
-        if not soon:
+        module = "".join(sys.argv[1:2]).replace("-", "_")
+        if module in _OWN and module != "plugins":
+            # It needs neither others nor a plugin's, and would wait for these a tenth of its start.
+            app = make_app(module)
+        else:
             from evlcp_sdk.plugin.registry import Registry
 
+            app = make_app()
             add_plugin_commands(app, Registry.load())
-        _called_late(app)()
+        group = typer.main.get_group(app)
+        for command in group.commands.values():
+            for parameter in command.params:
+                _leave_unset(parameter)
+        group()

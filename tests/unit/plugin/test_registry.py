@@ -215,7 +215,7 @@ def test_the_command_line_goes_on_without_a_broken_plugin(
     assert "mine" not in evlcp("--help").out
     asked = evlcp("config", "--set", "ranging.id=mine")
     assert asked.code == 2
-    fault = asked.err.splitlines()[1]
+    fault = asked.err.splitlines()[-1]
     assert "no ranging algorithm named 'mine'" in fault
     # A plugin whose commands alone are broken still brings its algorithms.
     assert ("is broken and left out" in fault) == (stranger is missing)
