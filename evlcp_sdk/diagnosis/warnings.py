@@ -218,21 +218,16 @@ def check_blinking(facts: Facts) -> Found:
     blinking = counts.get("events_in_regions", 0)
     if blinking < _MANY_EVENTS or counts.get("locks", counts.get("frames", 0)):
         return
-    blinks = f"something blinks, {blinking} events in {counted(counts.get('regions_opened', 0), 'region')}"
+    code, what, compare = "no-frames", "frame is read", "[framing] with the transmitter's"
     if "locks" in counts:
-        yield Diagnostic(
-            "no-preamble",
-            f"{blinks}, but no preamble is detected",
-            "compare air.chip_rate_hz and the preamble with the transmitter's; a panel or leaves behind a"
-            " bar may mask it; `evlcp diagnose` says what blinks, and how fast",
-        )
-    else:
-        yield Diagnostic(
-            "no-frames",
-            f"{blinks}, but no frame is read",
-            "compare air.chip_rate_hz and [framing] with the transmitter's; `evlcp diagnose` says what"
-            " blinks, and how fast",
-        )
+        code, what, compare = "no-preamble", "preamble is detected", "the preamble with the transmitter's"
+        compare += "; a panel or leaves behind a bar may mask it"
+    yield Diagnostic(
+        code,
+        f"something blinks, {blinking} events in {counted(counts.get('regions_opened', 0), 'region')}, but no"
+        f" {what}",
+        f"compare air.chip_rate_hz and {compare}; `evlcp diagnose` says what blinks, and how fast",
+    )
 
 
 def check_polarity(facts: Facts) -> Found:

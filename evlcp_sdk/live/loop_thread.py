@@ -11,6 +11,9 @@ from evlcp_sdk.errors import ConfigError
 
 _T = TypeVar("_T")
 
+FINISH_S = 1.0
+"""How long the end of a run waits for a server that has something to say still."""
+
 _LEAVE_S = 2.0
 """How long the end of a run waits for the servers: what a client has not taken by then is left."""
 
@@ -25,6 +28,14 @@ class LoopThread:
     def call(self, job: Coroutine[Any, Any, _T]) -> _T:
         """Run something in the loop; return what it returns, or raise what it raises."""
         return asyncio.run_coroutine_threadsafe(job, self.loop).result()
+
+    def finish(self, task: "asyncio.Task[None]") -> None:
+        """Wait until a task is done, a moment at the most."""
+
+        async def wait() -> None:
+            await asyncio.wait([task], timeout=FINISH_S)
+
+        self.call(wait())
 
     def _run(self) -> None:
         with asyncio.Runner(loop_factory=lambda: self.loop) as runner:

@@ -103,8 +103,7 @@ class Services:
             if servers:
                 loop_thread = stack.enter_context(LoopThread())
                 for server in servers:
-                    loop_thread.call(server.start())
-                    stack.callback(_finish, loop_thread, server)
+                    stack.callback(loop_thread.finish, loop_thread.call(server.start()))
             stack.callback(self._publisher.close)
             if self._recorder is not None:
                 stack.callback(self._recorder.stop)
@@ -116,7 +115,3 @@ class Services:
     ) -> None:
         """End the servers, once they have told what there is; a recording is completed."""
         self._stack.__exit__(kind, value, trace)
-
-
-def _finish(loop_thread: LoopThread, server: Viewer | TcpOutput) -> None:
-    loop_thread.call(server.finish())

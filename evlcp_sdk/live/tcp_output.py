@@ -21,7 +21,6 @@ _MOST_CLIENTS: Final = 32
 _MOST_LINE: Final = 4096
 _KERNEL_BYTES: Final = 1 << 16
 """What the kernel holds for a client: what waits there is old."""
-_FINISH_S: Final = 1.0
 
 
 class TcpOutput:
@@ -48,7 +47,6 @@ class TcpOutput:
         self._zero = clock_zero
         self._clients: dict[asyncio.StreamWriter, dict[str, Any]] = {}
         self._newest: dict[str, dict[str, Any]] = {}
-        self._pump: asyncio.Task[None] | None = None
         self._unsent = 0
         self._mine: Subscription | None = None
 
@@ -58,8 +56,8 @@ class TcpOutput:
         late = 0 if self._mine is None else self._mine.dropped
         return late + self._unsent
 
-    async def start(self) -> None:
-        """Listen.
+    async def start(self) -> "asyncio.Task[None]":
+        """Listen; the task that is done when all that was found is on its way.
 
         Raises:
             ConfigError: The port cannot be had.
@@ -91,12 +89,7 @@ class TcpOutput:
                 self._publisher.leave(mine)
                 await stop_listening(server)
 
-        self._pump = asyncio.create_task(pump())
-
-    async def finish(self) -> None:
-        """Wait until all that was found is on its way, a moment at the most."""
-        if self._pump is not None:
-            await asyncio.wait([self._pump], timeout=_FINISH_S)
+        return asyncio.create_task(pump())
 
     def _tell(self, news: News) -> None:
         if self._zero is None:

@@ -43,7 +43,6 @@ _PICTURES_PER_S: Final = 25
 _MOST_WAITING: Final = 4000
 """Results that wait for a browser, some seconds of two bars; the oldest go."""
 _MOST_BROWSERS: Final = 16
-_FINISH_S: Final = 1.0
 _MOST_SAID: Final = 4096
 """Bytes of what a browser says."""
 _KEPT: Final = {"message": 50, "fix": 500}
@@ -112,7 +111,6 @@ class Viewer:
         self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
         self._last: dict[str, str] = {}
         self._tasks: set[asyncio.Task[None]] = set()
-        self._pump: asyncio.Task[None] | None = None
         self._body = b""
         self._left = 0
 
@@ -135,8 +133,8 @@ class Viewer:
         many = counted(self._serializer.untold, "message")
         return f"{many} could not be shown on the page: {self._serializer.fault}"
 
-    async def start(self) -> None:
-        """Listen.
+    async def start(self) -> "asyncio.Task[None]":
+        """Listen; the task that is done when browsers have had the last words.
 
         Raises:
             ConfigError: The port cannot be had, or the package `websockets` is not installed.
@@ -171,21 +169,16 @@ class Viewer:
                             self._tell(kind, line)
                     self._send_all()
                 # The last words, once a browser has shown what it was sent before.
-                for _ in range(round(_FINISH_S * _PICTURES_PER_S / 2)):
-                    await asyncio.sleep(2 / _PICTURES_PER_S)
+                await asyncio.sleep(2 / _PICTURES_PER_S)
+                self._send_all()
+                while any(browser.waiting for browser in self._browsers):
+                    await asyncio.sleep(1 / _PICTURES_PER_S)
                     self._send_all()
-                    if not any(browser.waiting for browser in self._browsers):
-                        break
             finally:
                 self._publisher.leave(self._mine)
                 await stop_listening(server)
 
-        self._pump = asyncio.create_task(pump())
-
-    async def finish(self) -> None:
-        """Wait until browsers have had the last words, a moment at the most."""
-        if self._pump is not None:
-            await asyncio.wait([self._pump], timeout=_FINISH_S)
+        return asyncio.create_task(pump())
 
     def _keep(self, task: "asyncio.Task[None]") -> None:
         self._tasks.add(task)
