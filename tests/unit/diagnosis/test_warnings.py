@@ -124,7 +124,8 @@ INVERTED = "50 of 60 frames fit only a light that is on where the link says off"
         # Of a framing that has no preamble.
         (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 1, "frames": 0}, f"{BLINKS} frame is"),
         (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 1, "frames": 2}, ""),
-        (NOTHING, {"events": 1_000_000, "dropped_backward": 90}, ""),
+        (NOTHING, {"events": 1000, "dropped_backward": 90}, ""),
+        (NOTHING, {"events": 1_000_000, "dropped_backward": 900}, ""),
         (
             NOTHING,
             {"events": 50_000, "dropped_backward": 90, "dropped_off_sensor": 20},

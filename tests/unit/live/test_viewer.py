@@ -7,6 +7,7 @@ import json
 import math
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -168,6 +169,16 @@ def test_a_credit_a_bundle(stage: Stage) -> None:
             assert np.argwhere(np.array(shown)).tolist() == [[7, 5]]
         (bar,) = head["bars"]
         assert bar["points"][0] == pytest.approx(FRAMES[0].points_px[0].tolist(), abs=0.01)
+        # Nothing is sent twice; who is slow to ask still gets the last words.
+        link.send('{"next": true}')
+        with pytest.raises(TimeoutError):
+            link.recv(0.2)
+        stage.frame(1)
+        assert len(unpacked(link.recv(30))[0]["news"]) == 1
+        stage.frame(2)
+        stage.publisher.close()
+        time.sleep(0.3)
+        assert len(next_of(link)[0]["news"]) == 1
 
 
 def test_one_that_stalls_costs_the_others_nothing(stage: Stage) -> None:
