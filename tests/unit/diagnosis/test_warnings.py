@@ -59,10 +59,6 @@ def told(tally: RunTally, link: Link = LINK, **counts: int) -> list[str]:
     return [str(doubt) for doubt in find_warnings(Facts(link, tally, counts))]
 
 
-def facts_of(positions: dict[str, Any], link: Link = LINK) -> Facts:
-    return Facts(link, RunTally(link.packet), {}, positions=positions)
-
-
 RANDOM = np.random.default_rng(1).integers(0, 64, (6, 10, 16))
 FOUND, NOTHING = tally_of(RANDOM), RunTally(LINK.packet)
 READ = {"frames": 60, "blocks_tried": 6, "blocks_decoded": 4, "blocks_failed": 2}
@@ -301,37 +297,6 @@ def test_events_of_each_millisecond(steps: list[int], pieces: int) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("heard", "said"),
-    [({"0": 9, "1": 7, "2": 9}, "received: ids 7, 9: compare"), ({}, "received: no id: compare")],
-)
-def test_bars_at_no_known_place_are_named_by_their_ids(heard: dict[str, int], said: str) -> None:
-    positions = dict(NO_POSITIONS, refused={"no-site": 4}, heard=heard)
-    found = find_warnings(facts_of(positions))
-    assert [said in str(one) for one in found if one.code == "no-site"] == [True]
-    # A bar more beside those that are known is none.
-    assert all(one.code != "no-site" for one in find_warnings(facts_of(dict(positions, fixes=9))))
-
-
-@pytest.mark.parametrize(
-    ("heard", "unseen", "says"),
-    [
-        ({"0": 7, "1": 107}, [8], "without id 107, received and in no site; id 8 of the sites was not"),
-        ({"0": 7, "1": 9, "2": 4}, [1, 2], "without ids 4, 9, received and in no site; ids 1, 2 of the"),
-        ({"0": 7, "1": 9}, list(range(20, 40)), "ids 20, 21, 22, 23, 24 and 15 more of the sites were not"),
-        ({"0": 7, "1": 107}, [], None),
-        ({"0": 7}, [8], None),
-    ],
-)
-def test_a_bar_that_is_not_used_for_a_mistyped_id(
-    heard: dict[str, int], unseen: list[int], says: str | None
-) -> None:
-    positions = dict(NO_POSITIONS, fixes=9, heard=heard, bars={"0": 7}, sites_unseen=unseen)
-    doubts = find_warnings(facts_of(positions))
-    found = [str(one) for one in doubts if one.code == "unknown-id"]
-    assert [says in one for one in found] == [True] if says else not found
-
-
 def test_what_is_not_found_is_looked_for_elsewhere() -> None:
     (note,) = find_notes(Facts(LINK, RunTally(LINK.packet), {"events": 9}))
     assert (note.code, note.next_step) == (
@@ -341,49 +306,79 @@ def test_what_is_not_found_is_looked_for_elsewhere() -> None:
     assert find_notes(Facts(LINK, RunTally(LINK.packet), {"events": 0})) == []
 
 
+def learnt(part: str, what: str, off: float, sigma: float) -> dict[str, Any]:
+    """Positions of a drive that shows an error of something of which a sigma of 0.2 is stated."""
+    row = {"part": part, "what": what, "correction": off, "sigma": sigma, "stated_sigma": 0.2}
+    return {"fixes": 1, "learnt": [row | {"determined": sigma < 0.18}]}
+
+
+def misfit(suspects: dict[str, int], fits_mm: float | None = None) -> dict[str, Any]:
+    """Ten positions refused, with what would explain some of them."""
+    return {"refused": {"misfit": 10}, "suspects": suspects, "focal_mm_fits": fits_mm}
+
+
+NO_SITE = {"refused": {"no-site": 4}, "heard": {"0": 9, "1": 7, "2": 9}}
+KNOWN = {"fixes": 9, "bars": {"0": 7}}
+
+
 @pytest.mark.parametrize(
-    ("suspects", "fits_mm", "said"),
+    ("code", "positions", "said"),
     [
-        ({"heading": 9, "bar 1": 2}, None, "another heading would explain it: compare --heading-deg"),
+        ("no-site", NO_SITE, "received: ids 7, 9: compare"),
+        ("no-site", NO_SITE | {"heard": {}}, "received: no id: compare"),
+        # A bar more beside those that are known is none.
+        ("no-site", NO_SITE | {"fixes": 9}, ""),
         (
-            {"focal length": 10, "bar 0": 6},
-            34.6,
+            "unknown-id",
+            KNOWN | {"heard": {"0": 7, "1": 107}, "sites_unseen": [8]},
+            "without id 107, received and in no site; id 8 of the sites was not",
+        ),
+        (
+            "unknown-id",
+            KNOWN | {"heard": {"0": 7, "1": 9, "2": 4}, "sites_unseen": [1, 2]},
+            "without ids 4, 9, received and in no site; ids 1, 2 of the",
+        ),
+        (
+            "unknown-id",
+            KNOWN | {"heard": {"0": 7, "1": 9}, "sites_unseen": [*range(20, 40)]},
+            "ids 20, 21, 22, 23, 24 and 15 more of the sites were not",
+        ),
+        ("unknown-id", KNOWN | {"heard": {"0": 7, "1": 107}}, ""),
+        ("unknown-id", KNOWN | {"heard": {"0": 7}, "sites_unseen": [8]}, ""),
+        (
+            "misfit",
+            misfit({"heading": 9, "bar 1": 2}),
+            "another heading would explain it: compare --heading-deg",
+        ),
+        (
+            "misfit",
+            misfit({"focal length": 10, "bar 0": 6}, 34.6),
             "another focal length or another bar 0 would explain it: compare camera.",
         ),
-        ({"bar 0": 3}, None, "contradict one another: compare sites, angles and [camera], its focal_mm"),
         (
-            {"bar 0": 10},
-            51.2,
+            "misfit",
+            misfit({"bar 0": 3}),
+            "contradict one another: compare sites, angles and [camera], its focal",
+        ),
+        (
+            "misfit",
+            misfit({"bar 0": 10}, 51.2),
             "another focal length or another bar 0 would explain it: compare camera.focal_mm = 35: about 51.2"
             " would fit; place, angles and length of bar 0",
         ),
+        ("focal", learnt("camera", "focal_mm", 0.1, 0.02), "a focal length of 35.1 +- 0.02 mm, not 35"),
+        ("focal", learnt("camera", "focal_mm", 0.05, 0.02), ""),
+        ("focal", learnt("camera", "focal_mm", 0.1, 0.199), ""),
+        ("learnt", learnt("bar 2", "east_m", 0.1, 0.02), ""),
+        (
+            "learnt",
+            learnt("bar 2", "east_m", -0.9, 0.02),
+            "shows bar 2, east_m, -0.9 off what is stated, 0.2 (sigma): 4.5",
+        ),
     ],
 )
-def test_a_misfit_names_what_would_explain_it(
-    suspects: dict[str, int], fits_mm: float | None, said: str
-) -> None:
-    positions = dict(NO_POSITIONS, refused={"misfit": 10}, suspects=suspects, focal_mm_fits=fits_mm)
-    (doubt,) = [d for d in find_warnings(facts_of(positions)) if d.code == "misfit"]
-    assert said in str(doubt)
-
-
-@pytest.mark.parametrize(
-    ("part", "what", "off", "sigma", "hint"),
-    [
-        ("camera", "focal_mm", 0.1, 0.02, "a focal length of 35.1 +- 0.02 mm, not 35"),
-        ("camera", "focal_mm", 0.05, 0.02, None),
-        ("camera", "focal_mm", 0.1, 0.199, None),
-        ("bar 2", "east_m", 0.1, 0.02, None),
-        ("bar 2", "east_m", -0.9, 0.02, "shows bar 2, east_m, -0.9 off what is stated, 0.2 (sigma): 4.5"),
-    ],
-)
-def test_what_a_drive_tells_of_its_errors(
-    part: str, what: str, off: float, sigma: float, hint: str | None
-) -> None:
-    row = {"part": part, "what": what, "correction": off, "sigma": sigma, "stated_sigma": 0.2}
-    row["determined"] = sigma < 0.18
-    positions = dict(NO_POSITIONS, fixes=1, learnt=[row])
+def test_what_positions_say(code: str, positions: dict[str, Any], said: str) -> None:
     link = load_link(overrides=["camera_sigma.focal_mm=0.2"])
-    found = [str(doubt) for doubt in find_warnings(facts_of(positions, link))]
-    assert len(found) == (hint is not None)
-    assert hint is None or hint in found[0]
+    facts = Facts(link, RunTally(link.packet), {}, positions=NO_POSITIONS | positions)
+    found = find_warnings(facts)
+    assert [said in str(one) for one in found if one.code == code] == [True] * bool(said)
