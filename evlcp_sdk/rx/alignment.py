@@ -15,9 +15,9 @@ from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.detection import MARGIN_PX
 from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.grid import DueFrame
-from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements
+from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements, without
 from evlcp_sdk.rx.rhythm import columns_of
-from evlcp_sdk.values import Events, PresenceMap, SyncLock, changed
+from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 _LEAST_CLUSTERS = 0.5
 """Share of the clusters that must be in their place in a frame: fewer may be another bar's."""
@@ -216,13 +216,7 @@ class FrameAligner:
         x, y = places.real + aligned.corner_px[0], places.imag + aligned.corner_px[1]
         width, height = self._sensor_px
         cut = (x < right_px) | (x > width - 1 - right_px) | (y < down_px) | (y > height - 1 - down_px)
-        if not cut.any():
-            return presence
-        images = {name: getattr(presence, name) for name in ("probability", "selected", "pixels", "prior")}
-        kept = {name: image.copy() for name, image in images.items() if image is not None}
-        for image in kept.values():
-            image[cut] = 0
-        return changed(presence, **kept)
+        return without(presence, cut) if cut.any() else presence
 
     def lit_rows(self, aligned: AlignedFrame) -> tuple[float, float] | None:
         """Upper and lower edge of the clusters that a frame shows, from the whole bar's centre, px.

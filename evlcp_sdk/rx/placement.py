@@ -93,10 +93,6 @@ class Placement:
             vars(self)["_places"] = known
         return known[1]
 
-    def moved(self, by_px: complex) -> "Placement":
-        """The same in an image whose origin lies elsewhere."""
-        return Placement(self.scale, self.shift + by_px, self.mirrored, self.seen, self.cells, self.chance)
-
 
 @dataclass(frozen=True, eq=False)
 class _Blobs:
@@ -244,13 +240,16 @@ def lit(
     placement = changed(placement, seen=seen)
     if seen.all():
         return presence, placement
-    dark = ~seen
-    probability, prior = presence.probability.copy(), presence.prior.copy()
-    pixels, selected = presence.pixels.copy(), presence.selected.copy()
-    for image in (probability, prior, pixels, selected):
-        image[dark] = 0
-    only = changed(presence, probability=probability, prior=prior, pixels=pixels, selected=selected)
-    return only, placement
+    return without(presence, ~seen), placement
+
+
+def without(presence: PresenceMap, clusters: NDArray[np.bool_]) -> PresenceMap:
+    """Presence of the other clusters alone."""
+    images = {name: getattr(presence, name) for name in ("probability", "selected", "pixels", "prior")}
+    kept = {name: image.copy() for name, image in images.items() if image is not None}
+    for image in kept.values():
+        image[clusters] = 0
+    return changed(presence, **kept)
 
 
 def _turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:

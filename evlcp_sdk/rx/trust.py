@@ -2,7 +2,7 @@
 
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -38,7 +38,7 @@ class Standing(NamedTuple):
 class _Verified:
     message: Message
     beacon: Beacon
-    grants: tuple[TrustedKey, ...]
+    grants: Sequence[TrustedKey]
 
 
 class BeaconJudge:
@@ -97,15 +97,12 @@ class BeaconJudge:
             return Standing("forged", "the signature is not that of this beacon")
         if self._keys.revoked(signature):
             return Standing("forged", "signed by a key that is revoked")
-        grants = self._keys.grants(signature)
-        steps: Sequence[tuple[str, Callable[[TrustedKey], bool]]] = (
-            (f"transmitter {message.transmitter_id}", lambda grant: grant.for_id(message.transmitter_id)),
-            ("this place", lambda grant: _for_place(grant, beacon)),
-        )
-        for what, allowed in steps:
-            grants = tuple(filter(allowed, grants))
-            if not grants:
-                return Standing("forged", f"signed by a key that is not for {what}")
+        grants = [one for one in self._keys.grants(signature) if one.for_id(message.transmitter_id)]
+        if not grants:
+            return Standing("forged", f"signed by a key that is not for transmitter {message.transmitter_id}")
+        grants = [grant for grant in grants if _for_place(grant, beacon)]
+        if not grants:
+            return Standing("forged", "signed by a key that is not for this place")
         if message.sequence < self._spec.oldest_sequence:
             oldest = f"messages.oldest_sequence {self._spec.oldest_sequence}"
             return Standing("forged", f"replayed: sequence {message.sequence} is older than {oldest}")
