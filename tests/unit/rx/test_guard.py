@@ -36,19 +36,6 @@ def raises(fault: BaseException) -> Callable[..., Any]:
 fails = raises(KeyError("boom"))
 
 
-class FailingFilter(Filter):
-    def __init__(self, fault: BaseException) -> None:
-        self.fault = fault
-
-    def init(self) -> None:
-        return None
-
-    def predict(self, *_args: object) -> Any:
-        raise self.fault
-
-    step = predict  # type: ignore[assignment]
-
-
 class MuteError(Exception):
     def __str__(self) -> str:
         raise RuntimeError("no words")
@@ -62,84 +49,6 @@ def received(link: Link) -> None:
     receiver = Receiver(link)
     receiver.feed(EVENTS)
     receiver.close()
-
-
-@pytest.mark.parametrize(
-    "overrides",
-    [["tracking.id=kalman"], ["decoding.id=wh-transform", "ranging.id=poc", "tracking.id=kalman"]],
-)
-def test_what_comes_with_the_sdk_gives_what_is_expected(overrides: list[str]) -> None:
-    link = load_link(overrides=overrides)
-    assert set(ROLES) < link.built_in
-    assert link.with_algorithm("ranging", link.algorithm("ranging")).built_in == link.built_in - {"ranging"}
-    received(replace(link, built_in=frozenset()))
-
-
-BOOM = KeyError("boom")
-
-
-@pytest.mark.parametrize(
-    ("role", "fault", "says"),
-    [
-        *((role, BOOM, "KeyError: 'boom'") for role in (*ROLES, "tracking of places")),
-        *((role, SystemExit(0), "SystemExit: 0") for role in ROLES),
-        ("ranging", GeneratorExit(), "GeneratorExit: "),
-        ("ranging", MuteError(), "MuteError: a MuteError that cannot be shown"),
-        ("ranging", InputError("liar.raw: damaged"), "InputError: liar.raw: damaged"),
-        ("ranging", ConfigError("no such key"), "ConfigError: no such key"),
-    ],
-)
-def test_what_fails_in_a_frame_is_named(role: str, fault: BaseException, says: str) -> None:
-    gives = {
-        "synchronization": SimpleNamespace(init=lambda: None, step=raises(fault)),
-        "tracking": Tracker(None, FailingFilter(fault)),
-        "tracking of places": Tracker(FailingFilter(fault), None),
-    }.get(role, raises(fault))
-    role = role.split()[0]
-    with pytest.raises(PluginError) as told:
-        received(link_with(role, lambda *_: gives))
-    assert str(told.value).startswith(f"{role} algorithm 'mine': {says} (test_guard.py, line ")
-    assert str(told.value).endswith(f"; try: evlcp check {role} mine")
-    assert told.value.__cause__ is fault
-
-
-def test_an_interrupt_in_an_algorithm_is_the_user_s() -> None:
-    with pytest.raises(KeyboardInterrupt):
-        received(link_with("ranging", lambda *_: raises(KeyboardInterrupt())))
-
-
-@pytest.mark.parametrize("role", ROLES)
-def test_what_fails_to_compile_is_named_and_what_it_refuses_stays(role: str) -> None:
-    with pytest.raises(PluginError, match=f"{role} algorithm 'mine': KeyError"):
-        Receiver(link_with(role, fails))
-    with pytest.raises(ConfigError, match=r"^ranging\.clusters"):
-        Receiver(link_with(role, raises(ConfigError("ranging.clusters = [99]: expected 0 to 15"))))
-
-
-FUNCTION, METHODS = "a function", r"an object with init\(\) and step\(\)"
-
-
-@pytest.mark.parametrize(
-    ("role", "gives", "says"),
-    [
-        ("synchronization", None, rf"NoneType at compile\(\), expected {METHODS}"),
-        ("synchronization", SimpleNamespace(init=None, step=fails), f"SimpleNamespace at .*{METHODS}"),
-        ("separation", None, rf"NoneType at compile\(\), expected {FUNCTION}"),
-        ("decoding", 3, rf"int at compile\(\), expected {FUNCTION}"),
-        ("tracking", None, "NoneType, expected Tracker"),
-        ("tracking", Tracker(None, 5), r"int at compile\(\), .* init\(\) and step\(\) and predict\(\)"),  # type: ignore[arg-type]
-    ],
-)
-def test_what_compiles_to_nothing_that_runs_is_named(role: str, gives: object, says: str) -> None:
-    with pytest.raises(PluginError, match=f"^{role} algorithm 'mine': gave {says}; try: evlcp check"):
-        Receiver(link_with(role, lambda *_: gives))
-
-
-def test_more_locks_than_a_step_has_room_for_are_refused() -> None:
-    lock = SyncLock(0.0, 100.0, 10.0, 20.0, 1.0)
-    gives = SimpleNamespace(init=lambda: None, step=lambda *_: (None, [lock] * 1001))
-    with pytest.raises(PluginError, match=r"gave 1001 locks in a step, expected at most 1000"):
-        received(link_with("synchronization", lambda *_: gives))
 
 
 def changed(role: str, change: Callable[[Any], Any]) -> Link:
@@ -181,6 +90,75 @@ class Changed(Filter):
     def step(self, state: Any, t_us: float, value: Any, sigma: float) -> Any:
         state, values, sigma = self._filter.step(state, t_us, value, sigma)
         return state, *self._change((values, sigma))
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [["tracking.id=kalman"], ["decoding.id=wh-transform", "ranging.id=poc", "tracking.id=kalman"]],
+)
+def test_what_comes_with_the_sdk_gives_what_is_expected(overrides: list[str]) -> None:
+    link = load_link(overrides=overrides)
+    assert set(ROLES) < link.built_in
+    assert link.with_algorithm("ranging", link.algorithm("ranging")).built_in == link.built_in - {"ranging"}
+    received(replace(link, built_in=frozenset()))
+
+
+@pytest.mark.parametrize(
+    ("role", "fault", "says"),
+    [
+        *((role, KeyError("boom"), "KeyError: 'boom'") for role in ROLES),
+        *((role, SystemExit(0), "SystemExit: 0") for role in ROLES),
+        ("ranging", GeneratorExit(), "GeneratorExit: "),
+        ("ranging", MuteError(), "MuteError: a MuteError that cannot be shown"),
+        ("ranging", InputError("liar.raw: damaged"), "InputError: liar.raw: damaged"),
+        ("ranging", ConfigError("no such key"), "ConfigError: no such key"),
+    ],
+)
+def test_what_fails_in_a_frame_is_named(role: str, fault: BaseException, says: str) -> None:
+    with pytest.raises(PluginError) as told:
+        received(changed(role, raises(fault)))
+    assert str(told.value).startswith(f"{role} algorithm 'mine': {says} (test_guard.py, line ")
+    assert str(told.value).endswith(f"; try: evlcp check {role} mine")
+    assert told.value.__cause__ is fault
+
+
+def test_an_interrupt_in_an_algorithm_is_the_user_s() -> None:
+    with pytest.raises(KeyboardInterrupt):
+        received(changed("ranging", raises(KeyboardInterrupt())))
+
+
+@pytest.mark.parametrize("role", ROLES)
+def test_what_fails_to_compile_is_named_and_what_it_refuses_stays(role: str) -> None:
+    with pytest.raises(PluginError, match=f"{role} algorithm 'mine': KeyError"):
+        Receiver(link_with(role, fails))
+    with pytest.raises(ConfigError, match=r"^ranging\.clusters"):
+        Receiver(link_with(role, raises(ConfigError("ranging.clusters = [99]: expected 0 to 15"))))
+
+
+FUNCTION, METHODS = "a function", r"an object with init\(\) and step\(\)"
+
+
+@pytest.mark.parametrize(
+    ("role", "gives", "says"),
+    [
+        ("synchronization", None, rf"NoneType at compile\(\), expected {METHODS}"),
+        ("synchronization", SimpleNamespace(init=None, step=fails), f"SimpleNamespace at .*{METHODS}"),
+        ("separation", None, rf"NoneType at compile\(\), expected {FUNCTION}"),
+        ("decoding", 3, rf"int at compile\(\), expected {FUNCTION}"),
+        ("tracking", None, "NoneType, expected Tracker"),
+        ("tracking", Tracker(None, 5), r"int at compile\(\), .* init\(\) and step\(\) and predict\(\)"),  # type: ignore[arg-type]
+    ],
+)
+def test_what_compiles_to_nothing_that_runs_is_named(role: str, gives: object, says: str) -> None:
+    with pytest.raises(PluginError, match=f"^{role} algorithm 'mine': gave {says}; try: evlcp check"):
+        Receiver(link_with(role, lambda *_: gives))
+
+
+def test_more_locks_than_a_step_has_room_for_are_refused() -> None:
+    lock = SyncLock(0.0, 100.0, 10.0, 20.0, 1.0)
+    gives = SimpleNamespace(init=lambda: None, step=lambda *_: (None, [lock] * 1001))
+    with pytest.raises(PluginError, match=r"gave 1001 locks in a step, expected at most 1000"):
+        received(link_with("synchronization", lambda *_: gives))
 
 
 def but(**changes: Any) -> Callable[[Any], Any]:
