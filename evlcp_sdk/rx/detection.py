@@ -12,10 +12,18 @@ from numpy.typing import NDArray
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.plugin.roles import Filter
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.followed import SAME_PX, Followed, Piece, make_room, same_place
+from evlcp_sdk.rx.followed import (
+    SAME_PX,
+    Followed,
+    Piece,
+    Places,
+    held_bytes,
+    make_room,
+    region_of,
+    same_place,
+)
 from evlcp_sdk.rx.framer import RegionTracker
-from evlcp_sdk.rx.limits import LIMITS, Limits, held_bytes
-from evlcp_sdk.rx.places import Places, region_of
+from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.rhythm import Rhythm, select
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region

@@ -9,14 +9,6 @@ of them.
 from dataclasses import dataclass
 from typing import Final
 
-from evlcp_sdk.values import Events
-
-EVENT_BYTES: Final = 13
-"""Of an event: its time, column, row and polarity."""
-
-PIECE_BYTES: Final = 768
-"""Of four arrays and what holds them, however few events there are."""
-
 
 @dataclass(frozen=True)
 class Limits:
@@ -42,8 +34,3 @@ class Limits:
 
 
 LIMITS: Final = Limits()
-
-
-def held_bytes(events: Events) -> int:
-    """Bytes that some events take."""
-    return PIECE_BYTES + EVENT_BYTES * len(events.t_us)

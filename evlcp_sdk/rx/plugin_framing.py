@@ -12,8 +12,7 @@ from evlcp_sdk.plugin.roles import Deframer
 from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.framer import Framer, LitTimes, StreamContext
 from evlcp_sdk.rx.guard import Guard, compiled
-from evlcp_sdk.rx.packets import PacketAssembler
-from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
+from evlcp_sdk.rx.reflections import FrameDetection, PacketAssembler, ReflectionQueue
 from evlcp_sdk.rx.steps import Announcer
 from evlcp_sdk.rx.timeline import TimeStep
 from evlcp_sdk.values import DecodedFrame, Frame, Range

@@ -12,11 +12,10 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.alignment import Pilot
 from evlcp_sdk.rx.delays import LONGEST_ROW_US, RowDelay
-from evlcp_sdk.rx.followed import Followed
+from evlcp_sdk.rx.followed import Followed, Places
 from evlcp_sdk.rx.grid import PacketGrid
 from evlcp_sdk.rx.limits import Limits
-from evlcp_sdk.rx.packets import PacketAssembler
-from evlcp_sdk.rx.places import Places
+from evlcp_sdk.rx.reflections import PacketAssembler
 from evlcp_sdk.values import SyncLock
 
 LOOKBACK_PACKETS = 2

@@ -13,8 +13,7 @@ from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import RegionFollower, _clear, _cut_off
-from evlcp_sdk.rx.followed import Followed
-from evlcp_sdk.rx.places import Places
+from evlcp_sdk.rx.followed import Followed, Places
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import (

@@ -10,7 +10,8 @@ from rx_streams import LINK, frames_of
 
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.detection import RegionFollower
-from evlcp_sdk.rx.limits import EVENT_BYTES, LIMITS, PIECE_BYTES, Limits
+from evlcp_sdk.rx.followed import EVENT_BYTES, PIECE_BYTES
+from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.timeline import Timeline
 from evlcp_sdk.scene.camera import CameraModel

@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from rx_streams import LINK, frames_of, received
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.packets import PacketAssembler
-from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue, Reflections, repeats
+from evlcp_sdk.rx.reflections import FrameDetection, PacketAssembler, ReflectionQueue, Reflections, repeats
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
 
