@@ -133,7 +133,7 @@ class Receiver:
         """
         if self._closed:
             raise StreamError("the receiver is closed: make a new one for a new stream")
-        if len(events) and events.p.max() > 1:
+        if events.p.max(initial=0) > 1:
             raise StreamError(f"events with polarity {events.p.max()}, expected 0 or 1")
         self.left = []
         for step in self._timeline.feed(events, self._waits, self._due_us):

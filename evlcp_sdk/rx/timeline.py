@@ -77,7 +77,7 @@ class Timeline:
         self._most = limits.step_events
         self._waiting = 0
         self._step_us = step_us
-        self._start_us: int | None = None
+        self._start_us = 0
         self._pending: list[Events] = []
         self._after_gap = False
         self._part_us = 0
@@ -101,10 +101,8 @@ class Timeline:
         self, events: Events, waiting: Callable[[], bool], due_us: Callable[[], float]
     ) -> Iterator[TimeStep]:
         """Cut events that are in order and not none."""
-        if self._start_us is None:
-            self._start_us = 0
         done = 0
-        for end in self._bounds(events, self._start_us):
+        for end in self._bounds(events):
             yield from self._parts(events, done, end, due_us)
             self._keep(events[done:end])
             done = end
@@ -114,13 +112,11 @@ class Timeline:
                 yield self._next()
             if self._start_us < next_us:
                 self._start_us, self._after_gap = next_us, True
-        yield from self._parts(events, done, len(events), due_us)
-        if done < len(events):
-            self._keep(events[done:])
+        yield from self._parts(events, done, events.t_us.size, due_us)
+        self._keep(events[done:])
 
     def _parts(self, events: Events, begin: int, end: int, due_us: Callable[[], float]) -> Iterator[TimeStep]:
         """The parts of the open step that end among the next events of it, which are not kept yet."""
-        assert self._start_us is not None
         t_us = events.t_us[:end]
         while True:
             if self._due_us is None:
@@ -135,7 +131,6 @@ class Timeline:
 
     def _so_far(self, newest: Events) -> TimeStep:
         """The part of the open step whose end is due: what is kept of it, and what is not yet."""
-        assert self._start_us is not None
         if len(self._pending) > 1:
             self._pending = [Events.concat(self._pending)]
         # A view where it is all of one piece: the whole step is one, too.
@@ -167,16 +162,15 @@ class Timeline:
 
     def _next(self, end_us: int | None = None) -> TimeStep:
         """The step whose events are pending; `end_us` where the stream ends inside it."""
-        assert self._start_us is not None
         events = self._pending[0] if len(self._pending) == 1 else Events.concat(self._pending)
         start_us, after_gap = self._start_us, self._after_gap
         self._pending, self._waiting, self._after_gap, self._due_us = [], 0, False, None
         self._start_us += self._step_us
         return TimeStep(start_us, self._start_us if end_us is None else end_us, events, after_gap)
 
-    def _bounds(self, events: Events, start_us: int) -> list[int]:
+    def _bounds(self, events: Events) -> list[int]:
         """Where each new time step starts among the events."""
-        t_us, step_us = events.t_us, self._step_us
+        t_us, start_us, step_us = events.t_us, self._start_us, self._step_us
         first_us = max(self._grid_us(int(t_us[0])), start_us)
         if int(t_us[-1]) - first_us > step_us * t_us.size:
             # Sparse events: look at each instead of at each step.

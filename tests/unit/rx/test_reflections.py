@@ -11,7 +11,14 @@ from numpy.typing import NDArray
 from rx_streams import LINK, frames_of, received
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.reflections import FrameDetection, PacketAssembler, ReflectionQueue, Reflections, repeats
+from evlcp_sdk.rx.reflections import (
+    FrameDetection,
+    PacketAssembler,
+    ReflectionQueue,
+    Reflections,
+    originals,
+    repeats,
+)
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
 
@@ -203,6 +210,19 @@ def test_memory_is_bounded() -> None:
         echoes.judge([sighting(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
         assert sum(map(len, echoes._seen.values())) <= 4 * (3 * FORMAT.frames + 1)
         assert len(echoes._pairs) <= 3 + 2 * 8
+
+
+def test_originals_against_every_choice() -> None:
+    """The one that the pairs favour most, by trying each; whoever was it before has a bonus."""
+    rng = np.random.default_rng(6)
+    for _ in range(200):
+        size = int(rng.integers(2, 5))
+        matrix = rng.normal(0, 4, (size, size))
+        matrix -= matrix.T
+        before = {int(rng.integers(0, size))} if rng.random() < 0.5 else set()
+        odds = {(i, j): float(matrix[i, j]) for i in range(size) for j in range(i + 1, size)}
+        score = [matrix[i].sum() / 2 + 1.0 * (i in before) for i in range(size)]
+        assert originals(range(size), odds, before) == int(np.argmax(score))
 
 
 def test_what_was_shown_then_and_there_is_known() -> None:
