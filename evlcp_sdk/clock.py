@@ -189,7 +189,8 @@ class CameraClock:
     def _begin(self, camera_us: int, inside_us: int) -> None:
         """The camera's clock stands at `camera_us` and goes on from there."""
         self._offset_us = camera_us - inside_us
-        self._starts_us.append(inside_us)
+        # What lies in the gap nearer to what comes is of it: a packet begins before its first event.
+        self._starts_us.append(inside_us - _BREAK_US // 2)
         self._offsets_us.append(self._offset_us)
         self._state[0] = camera_us
 
