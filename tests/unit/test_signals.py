@@ -47,7 +47,8 @@ def test_a_run_that_is_told_to_end_keeps_what_it_has(
         with suppress(BrokenPipeError):
             file.write(data[len(data) // 2 :])
         _, said = process.communicate(timeout=60)
-    assert said == f"evlcp: interrupted; what was decoded until then is in {out}\n"
+    # Before it may stand that kernels were compiled.
+    assert said.splitlines()[-1] == f"evlcp: interrupted; what was decoded until then is in {out}"
     assert process.returncode == 130
     summary = json.loads((out / "summary.json").read_text())
     assert summary["status"] == "interrupted"
@@ -116,8 +117,8 @@ def test_a_stream_that_falls_silent_is_left_with_what_came(demo_raw: Path, tmp_p
     with pipe.open("wb", buffering=0) as file:
         file.write(demo_raw.read_bytes())
         # All is read, and there may be more.
-        time.sleep(3)
+        time.sleep(1)
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=20)
-    assert said == f"evlcp: interrupted; what was decoded until then is in {out}\n"
+    assert said.splitlines()[-1] == f"evlcp: interrupted; what was decoded until then is in {out}"
     assert json.loads((out / "summary.json").read_text())["transmitters"][0]["frames_found"] > 0
