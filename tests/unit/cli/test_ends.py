@@ -17,6 +17,20 @@ from evlcp_sdk.errors import OWN_FAULT
 
 Evlcp = Callable[..., Any]
 MAIN = "from evlcp_sdk.cli.main import main; main()"
+SAYS_WHEN_READY = """
+import sys
+from evlcp_sdk.cli.main import main
+
+class Ready:
+    def find_spec(self, name, *_):
+        # What main imports first, once it can be interrupted.
+        if name == "evlcp_sdk.signals":
+            sys.stderr.write("ready")
+            sys.stderr.flush()
+
+sys.meta_path.insert(0, Ready())
+main()
+"""
 
 
 @pytest.fixture(params=["buffered", "unbuffered"])
@@ -66,10 +80,9 @@ def test_a_reader_of_lines_who_leaves_ends_the_run(demo_raw: Path, environment: 
 
 
 def test_ctrl_c_during_imports_is_one_line(demo_raw: Path) -> None:
-    code = MAIN.replace("; ", "; import sys; sys.stderr.write('ready'); sys.stderr.flush(); ")
     for pause_s in (0.01, 0.03, 0.06, 0.1):
         process = subprocess.Popen(
-            [sys.executable, "-c", code, "info", demo_raw],
+            [sys.executable, "-c", SAYS_WHEN_READY, "info", demo_raw],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.PIPE,
             text=True,

@@ -10,7 +10,7 @@ from evlcp_sdk.place.bearing import bar_point
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.values import Frame, Range, SoftSymbols
-from tests.unit.place.scenes import POINTS_ONLY, by_chance, square
+from tests.unit.place.place_scenes import POINTS_ONLY, by_chance, square
 
 BENT = CameraModel(focal_mm=8.0, k1=-0.2, k2=0.05, p1=1e-3, p2=-1e-3, centre_x_px=650.0, centre_y_px=350.0)
 LENS = CameraSigma(0.04, 2.0, 2.0, 0.01, 0.01, 1e-4, 1e-4)

@@ -20,7 +20,7 @@ from evlcp_sdk.place.observations import BarView, project_bars
 from evlcp_sdk.place.poses import read_poses
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel
-from tests.unit.place.scenes import POINTS_ONLY, bar
+from tests.unit.place.place_scenes import POINTS_ONLY, bar
 
 TRUE = CameraModel(focal_mm=8.2, centre_x_px=652.0, centre_y_px=351.0, k1=-0.12, k2=0.05, p1=8e-4, p2=-5e-4)
 NOMINAL = CameraModel(focal_mm=8.0)

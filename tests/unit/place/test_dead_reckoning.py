@@ -10,7 +10,7 @@ from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import IMU, filter_fixes, smooth_trajectory
 from evlcp_sdk.scene.attitude import AttitudeLog, Swing
 from evlcp_sdk.values import Fix
-from tests.unit.place.scenes import Floats, by_chance, fix, square
+from tests.unit.place.place_scenes import Floats, by_chance, fix, square
 
 SPEC = ErrorModel(acceleration_m2_s3=0.7, rate_white_deg_rts=2.0, push_white_m2_s3=0.3)
 VELOCITY = np.array([8.0, 5.0, -1.0])

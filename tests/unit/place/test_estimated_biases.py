@@ -17,7 +17,7 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.values import Fix
-from tests.unit.place.scenes import Floats, bar, fix
+from tests.unit.place.place_scenes import Floats, bar, fix
 
 SPEC = ErrorModel(stretch_share=0.0, shared_sigma_px=0.05, shared_along_px=0.05, shared_share=0.0)
 CAMERA, LENS = CameraModel(), CameraSigma(focal_mm=0.005 * CameraModel().focal_mm)

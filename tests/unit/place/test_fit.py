@@ -28,7 +28,7 @@ from evlcp_sdk.place.starts import nearest_to_sights
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
-from tests.unit.place.scenes import bar
+from tests.unit.place.place_scenes import bar
 
 Floats = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from evlcp_sdk.place.trajectory import GNSS, filter_fixes, smooth_trajectory, tr
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Fix
-from tests.unit.place.scenes import fix
+from tests.unit.place.place_scenes import fix
 
 Floats = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ from evlcp_sdk.place.survey import survey
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Packet
-from tests.unit.place.scenes import Floats, frame, square
+from tests.unit.place.place_scenes import Floats, frame, square
 
 LINK = load_link()
 PACKET_US = LINK.packet.packet_chips * LINK.packet.chip_us

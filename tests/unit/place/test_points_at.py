@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.place.points import points_at, unseen_px
-from tests.unit.place.scenes import Floats, frame
+from tests.unit.place.place_scenes import Floats, frame
 
 SPEC = ErrorModel(pixel_sigma_px=0.08)
 EXACT = replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)

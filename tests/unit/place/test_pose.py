@@ -19,7 +19,7 @@ from evlcp_sdk.place.rejections import REJECTION_REASONS, Rejection
 from evlcp_sdk.place.starts import three_point_poses
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
-from tests.unit.place.scenes import POINTS_ONLY, Floats, bar, by_chance, square
+from tests.unit.place.place_scenes import POINTS_ONLY, Floats, bar, by_chance, square
 
 CAMERA, USUAL = CameraModel(), ErrorModel()
 BENT = CameraModel(k1=-0.3, k2=0.1, p1=1e-3, p2=-1e-3, centre_x_px=655.0, centre_y_px=350.0)

@@ -22,7 +22,7 @@ from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Packet, ReceivedMessage, Trust
-from tests.unit.place.scenes import frame
+from tests.unit.place.place_scenes import frame
 
 CAMERA = CameraModel()
 PACKET_US, FRAME_US = 34_600.0, 3200.0

@@ -17,7 +17,7 @@ from evlcp_sdk.place.survey import survey
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from tests.unit.place.scenes import POINTS_ONLY, square
+from tests.unit.place.place_scenes import POINTS_ONLY, square
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
 CAMERA = CameraModel(focal_mm=16.0)

@@ -9,7 +9,7 @@ from scipy import stats
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory, trajectory_step
 from evlcp_sdk.values import Fix
-from tests.unit.place.scenes import Floats, by_chance, fix, square
+from tests.unit.place.place_scenes import Floats, by_chance, fix, square
 
 SPEC = ErrorModel(acceleration_m2_s3=2.0)
 SIGMA_M = np.array([0.3, 0.1, 0.05])
