@@ -109,9 +109,8 @@ class CameraClock:
             and int(t_us[0]) - int(self._state[0]) >= 0
             and int(t_us[-1]) - int(self._state[0]) <= LEAP_US
         ):
-            width, height = self._size
-            if (t_us[1:] >= t_us[:-1]).all() and x.max() < width and y.max() < height:
-                inside_us = t_us - self._offset_us
+            inside_us = np.empty(len(t_us), np.int64)
+            if _kernels.all_ordered(t_us, x, y, *self._size, self._offset_us, inside_us):
                 self._state[0] = t_us[-1]
                 self.last_us = int(inside_us[-1])
                 return [Events.as_is(inside_us, x, y, p)]

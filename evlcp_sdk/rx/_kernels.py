@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import inverted
+from evlcp_sdk._kernels import _median, inverted
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -425,6 +425,42 @@ def _pixels_of(
         u, v = np.uint32(np.int32(x[i]) - left), np.uint32(np.int32(y[i]) - top)
         inside = (c < chips) & (u < columns) & (v < rows)
         out[i] = (c * rows + v) * columns + u if inside else _NOWHERE
+
+
+@njit
+def count_rows(
+    t_us: Array, y: Array, p: Array, start_us: Array, step_us: float, top: float, block: float, counts: Array
+) -> None:
+    """Add events to counts (polarity, blocks of rows, steps), from `start_us` (2,) and edge `top` on."""
+    _, blocks, steps = counts.shape
+    first = np.searchsorted(t_us, min(start_us[0], start_us[1]))
+    last = np.searchsorted(t_us, max(start_us[0], start_us[1]) + steps * step_us)
+    for i in range(first, last):
+        s = int(np.floor((t_us[i] - start_us[p[i]]) / step_us))
+        b = int(np.floor((y[i] - top) / block))
+        if 0 <= s < steps and 0 <= b < blocks:
+            counts[p[i], b, s] += 1
+
+
+@njit
+def fit_rows(counts: Array, chips: Array, chip_steps: int, fit: Array) -> None:
+    """How well each block's counts (polarity, blocks, steps) fit chips (-1, +1) at each lag: `fit`.
+
+    Positive events are where chips are +1, negative ones where they are -1.
+    """
+    steps = counts.shape[2]
+    running = np.empty(steps + 1)
+    for polarity in range(2):
+        for b in range(counts.shape[1]):
+            running[0] = 0.0
+            for s in range(steps):
+                running[s + 1] = running[s] + counts[polarity, b, s]
+            for lag in range(fit.shape[2]):
+                total = 0.0
+                for c in range(chips.size):
+                    at = lag + c * chip_steps
+                    total += chips[c] * (running[at + chip_steps] - running[at])
+                fit[polarity, b, lag] = total if polarity else -total
 
 
 @njit
@@ -1598,3 +1634,53 @@ def clear_cells(hits: Array, box: tuple[int, int, int, int], cell_shift: int) ->
             had += hits[v, u]
             hits[v, u] = 0
     return had
+
+
+@njit
+def slope_of_rows(
+    rows: Array, fit: Array, seen: Array, fewest: int, chance: float, least: float
+) -> tuple[float, float]:
+    """Lag from row to row at which blocks of rows fit best, and its sigma, lags; NaN of too few.
+
+    `rows` (blocks,) are their middles, `fit` (blocks, lags) how well each fits, `seen` its events. A block
+    beside the light, or hidden, has next to none of the events, or fits no better than by chance: less than a
+    quarter of the median, or than `chance` sigmas of its events. `least` is the least error of a place.
+    """
+    blocks, lags = fit.shape
+    top = np.empty(blocks)
+    for b in range(blocks):
+        top[b] = fit[b, 0]
+        for lag in range(1, lags):
+            top[b] = max(top[b], fit[b, lag])
+    middle = _median(top.copy(), blocks) if blocks else 0.0
+    at, place = np.empty(blocks), np.empty(blocks)
+    n = 0
+    for b in range(blocks):
+        if top[b] > max(middle / 4, chance * np.sqrt(seen[b])):
+            # The top is flat where a window holds all events of an edge: its middle is the best window.
+            weight, total = 0.0, 0.0
+            for lag in range(lags):
+                over = max(fit[b, lag] - 0.9 * top[b], 0.0)
+                weight += over
+                total += over * lag
+            at[n], place[n] = rows[b], total / weight
+            n += 1
+    if n < fewest:
+        return np.nan, np.nan
+    # A median of pairs: blocks with a part of the bar hidden, or another's light, are outliers.
+    slopes = np.empty(n * n)
+    # A literal 0 would make a median of its own.
+    pairs: Any = np.int64(0)
+    for i in range(n):
+        for j in range(i + 1, n):
+            if at[j] - at[i] > (at[n - 1] - at[0]) / 3:
+                slopes[pairs] = (place[j] - place[i]) / (at[j] - at[i])
+                pairs += 1
+    if not pairs:
+        return np.nan, np.nan
+    slope = _median(slopes, pairs)
+    rest = place[:n] - slope * at[:n]
+    rest = np.abs(rest - _median(rest, n))
+    spread = max(1.48 * _median(rest, n), least)
+    mean = at[:n].mean()
+    return slope, spread / np.sqrt(((at[:n] - mean) ** 2).sum())

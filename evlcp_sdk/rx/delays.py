@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.values import Events, SyncLock, changed
 
 _STEPS = 10
@@ -101,57 +102,22 @@ class RowDelays:
         step_us = float(lock.chip_us) / _STEPS
         top_px = centre_px - (height_px - 1) / 2
         start_us = np.array([lock.delay_off_us, lock.delay_on_us]) + lock.packet_t_us - reach * step_us
-        steps = len(self._chips) * _STEPS + 2 * reach
-        first_us, last_us = start_us.min(), start_us.max() + steps * step_us
-        counts = np.zeros((2, blocks, steps))
+        first_us = float(start_us.min())
+        counts = np.zeros((2, blocks, len(self._chips) * _STEPS + 2 * reach))
         for _, e in pieces:
-            some = slice(*np.searchsorted(e.t_us, (first_us, last_us)))
-            p = e.p[some].astype(np.int64)
-            step = np.floor((e.t_us[some] - start_us[p]) / step_us).astype(np.int64)
-            block = np.floor((e.y[some] - (top_px - 0.5)) / (height_px / blocks)).astype(np.int64)
-            inside = (step >= 0) & (step < steps) & (block >= 0) & (block < blocks)
-            at = (p[inside] * blocks + block[inside]) * steps + step[inside]
-            counts += np.bincount(at, minlength=counts.size).reshape(counts.shape)
-        # Positive events come where a chip is +1, negative ones where it is -1.
-        running = np.pad(counts.cumsum(2), ((0, 0), (0, 0), (1, 0)))
-        at_chips = _STEPS * np.arange(len(self._chips)) + np.arange(2 * reach + 1)[:, None]
-        fit = (running[..., at_chips + _STEPS] - running[..., at_chips]) @ self._chips
-        fit[0] *= -1
+            if len(e) and int(e.t_us[-1]) >= first_us:
+                _kernels.count_rows(
+                    e.t_us, e.y, e.p, start_us, step_us, top_px - 0.5, height_px / blocks, counts
+                )
+        fit = np.empty((2, blocks, 2 * reach + 1))
+        _kernels.fit_rows(counts, self._chips, _STEPS, fit)
         rows_px = (np.arange(blocks) + 0.5) * height_px / blocks
         total, weight = 0.0, 0.0
         for part, seen in zip(fit, counts.sum(2), strict=True):
-            lag, sigma = slope_of_rows(rows_px, part, seen, _PLACE_SIGMA_US / step_us)
+            lag, sigma = _kernels.slope_of_rows(
+                rows_px, part, seen, _FEWEST_BLOCKS, _CHANCE_SIGMAS, _PLACE_SIGMA_US / step_us
+            )
             if math.isfinite(lag):
                 total += lag * step_us / (sigma * step_us) ** 2
                 weight += 1 / (sigma * step_us) ** 2
         return (total / weight, 1 / math.sqrt(weight)) if weight else (math.nan, math.nan)
-
-
-def slope_of_rows(
-    rows: NDArray[np.float64], fit: NDArray[np.float64], seen: NDArray[np.float64], least: float
-) -> tuple[float, float]:
-    """Lag from row to row at which blocks of rows fit best, and its sigma, lags; NaN of too few.
-
-    A block beside the light, or hidden, has next to none of the events, or fits no better than by chance: it
-    is left out.
-
-    Args:
-        rows: Middles of the blocks, float64 (blocks,).
-        fit: How well each fits, float64 (blocks, lags).
-        seen: Its events, float64 (blocks,).
-        least: Least error of a place, lags.
-    """
-    top = fit.max(1)
-    lit = top > np.maximum(np.median(top) / 4, _CHANCE_SIGMAS * np.sqrt(seen))
-    if lit.sum() < _FEWEST_BLOCKS:
-        return math.nan, math.nan
-    rows, fit, top = rows[lit], fit[lit], top[lit]
-    # The top is flat where a window holds all events of an edge: its middle is the best window.
-    weight = np.maximum(fit - 0.9 * top[:, None], 0)
-    places = weight @ np.arange(fit.shape[1]) / weight.sum(1)
-    # A median of pairs: blocks with a part of the bar hidden, or another's light, are outliers.
-    i, j = np.nonzero(rows - rows[:, None] > (rows[-1] - rows[0]) / 3)
-    slope = float(np.median((places[j] - places[i]) / (rows[j] - rows[i])))
-    rest = places - slope * rows
-    spread = max(1.48 * float(np.median(np.abs(rest - np.median(rest)))), least)
-    return slope, spread / math.sqrt(((rows - rows.mean()) ** 2).sum())

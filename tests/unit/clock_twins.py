@@ -1,5 +1,7 @@
 """The clock that is believed, event by event in plain Python."""
 
+import numpy as np
+
 
 def clock(rows, width, height):
     """What `CameraClock` keeps of events (t, x, y, p): rows with times inside, and its counts."""
@@ -34,3 +36,7 @@ def clock(rows, width, height):
                 held, last = [], t
     counts["doubtful"] += len(held)
     return kept, counts
+
+
+def ordered(t_us, x, y, width, height):
+    return bool(np.all(np.diff(t_us) >= 0) and np.all(x < width) and np.all(y < height))

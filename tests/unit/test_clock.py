@@ -4,9 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from clock_twins import clock as twin
+from clock_twins import clock as twin, ordered
 from hypothesis import given, settings, strategies as st
 
+from evlcp_sdk import _kernels
 from evlcp_sdk.clock import LEAP_US, CameraClock
 from evlcp_sdk.values import Events
 
@@ -106,6 +107,17 @@ def clock_faults(rng: np.random.Generator, n: int) -> Events:
     """Events of which some run backward and some are off the sensor."""
     t = np.arange(n) + rng.integers(-2, 2, n)
     return Events.of(t, rng.integers(0, WIDTH + 2, n), rng.integers(0, HEIGHT + 2, n), np.ones(n))
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 3, 40])
+@pytest.mark.parametrize("seed", range(8))
+def test_order_is_checked_event_by_event(seed: int, n: int) -> None:
+    rng = np.random.default_rng(seed)
+    for e in (clock_faults(rng, n), random_events(rng, n)):
+        want = ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
+        since = np.empty(n, np.int64)
+        assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, -7, since) == want
+        assert np.array_equal(since, e.t_us + 7)
 
 
 @pytest.mark.parametrize("size", [1, 17, 400])

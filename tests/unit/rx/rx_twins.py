@@ -116,6 +116,22 @@ def polarity_sums(
     return sums
 
 
+def count_rows(t_us, y, p, start_us, step_us, top, block, shape):
+    counts = np.zeros(shape)
+    step = np.floor((t_us - start_us[p]) / step_us).astype(int)
+    row = np.floor((y - top) / block).astype(int)
+    inside = (step >= 0) & (step < shape[2]) & (row >= 0) & (row < shape[1])
+    np.add.at(counts, (p[inside], row[inside], step[inside]), 1)
+    return counts
+
+
+def fit_rows(counts, chips, chip_steps, lags):
+    """Each block's counts correlated with the chips laid out in steps."""
+    laid = np.repeat(chips, chip_steps)
+    signed = counts * np.array([-1, 1])[:, None, None]
+    return np.array([[np.correlate(block, laid)[:lags] for block in part] for part in signed])
+
+
 def blobs(selected):
     """By SciPy: (mean column + row * 1j, cluster, cells), clusters in order, each blob by its first cell."""
     found = []
@@ -313,6 +329,23 @@ def core_profile(hits, cells, edge):
     peak = int(profile.argmax())
     low = np.flatnonzero(profile[peak:] < edge * profile[peak])
     return np.clip(profile[: peak + low[0] if len(low) else None], 0, 1)
+
+
+def slope_of_rows(rows, fit, seen, fewest, chance, least):
+    top = fit.max(1)
+    lit = top > np.maximum(np.median(top) / 4, chance * np.sqrt(seen))
+    if lit.sum() < fewest:
+        return np.nan, np.nan
+    rows, fit, top = rows[lit], fit[lit], top[lit]
+    weight = np.maximum(fit - 0.9 * top[:, None], 0)
+    places = (weight @ np.arange(fit.shape[1])) / weight.sum(1)
+    i, j = np.triu_indices(len(rows), 1)
+    far = rows[j] - rows[i] > (rows[-1] - rows[0]) / 3
+    i, j = i[far], j[far]
+    slope = np.median((places[j] - places[i]) / (rows[j] - rows[i]))
+    rest = places - slope * rows
+    spread = max(1.48 * np.median(np.abs(rest - np.median(rest))), least)
+    return slope, spread / np.sqrt(((rows - rows.mean()) ** 2).sum())
 
 
 def spread_between(sums, codes, places, seen, pairs, half, first, last):

@@ -4,8 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import rx_twins as twins
+from numpy.testing import assert_allclose, assert_array_equal
 from rx_streams import LINK, frames_of, received
 
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.delays import RowDelay, RowDelays
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
 from evlcp_sdk.values import Events, SyncLock
@@ -73,6 +76,26 @@ def test_packets_are_averaged_and_changes_followed():
     for _ in range(30):
         known = known.measured(0.1 + rng.normal(0, 0.03), 0.03)
     assert known.row_us == pytest.approx(0.1, abs=0.04)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_counts_of_blocks(seed):
+    rng = np.random.default_rng(seed)
+    n = 3000
+    t = np.sort(rng.integers(0, 3000, n))
+    y, p = rng.integers(80, 200, n).astype(np.uint16), rng.integers(0, 2, n).astype(np.uint8)
+    start, counts = np.array([310.3, 420.7]), np.zeros((2, 9, 130))
+    _kernels.count_rows(t, y, p, start, 10.1, 90.5, 8.3, counts)
+    assert_array_equal(counts, twins.count_rows(t, y, p, start, 10.1, 90.5, 8.3, counts.shape))
+    assert counts.sum() > 100
+
+
+def test_fit_of_blocks():
+    rng = np.random.default_rng(4)
+    counts = rng.poisson(2.0, (2, 5, 26 * 10 + 30)).astype(float)
+    chips, fit = rng.choice([-1.0, 1.0], 26), np.empty((2, 5, 31))
+    _kernels.fit_rows(counts, chips, 10, fit)
+    assert_allclose(fit, twins.fit_rows(counts, chips, 10, 31))
 
 
 @pytest.mark.parametrize("row_us", [-0.25, 0.25])

@@ -508,6 +508,19 @@ def test_cells_that_a_box_touches_are_cleared(box):
     assert_array_equal(hits, want)
 
 
+@pytest.mark.parametrize("blocks", [4, 9, 20])
+@pytest.mark.parametrize("seed", SEEDS)
+def test_rows_are_read_one_after_another(seed, blocks):
+    rng = np.random.default_rng(seed)
+    rows, lags = (np.arange(blocks) + 0.5) * 8, np.arange(31)
+    middle = 15 + 0.03 * rows + rng.normal(0, 0.3, blocks)
+    fit = 50 * np.exp(-0.5 * ((lags - middle[:, None]) / 5) ** 2) + rng.normal(0, 1, (blocks, 31))
+    fit[rng.random(blocks) < 0.2] *= 0.05
+    seen = np.full(blocks, 100.0)
+    got = _kernels.slope_of_rows(rows, fit, seen, 4, 4.0, 0.2)
+    assert_allclose(got, twins.slope_of_rows(rows, fit, seen, 4, 4.0, 0.2), rtol=1e-9)
+
+
 @pytest.mark.parametrize("period_us", [200, 222, 300, 400, 500])
 def test_a_lamp_of_whole_chips_is_no_candidate(period_us):
     """Its rises are on the chips; but in a code the same time does not come again and again."""
