@@ -134,7 +134,7 @@ def sort_out(
 
 
 @njit
-def _median(values: Array, n: int) -> float:
+def median(values: Array, n: int) -> float:
     """Median of the first n values, which it reorders (Hoare's selection)."""
     middle = n // 2
     low, high = 0, n - 1

@@ -103,9 +103,10 @@ class _Kernel:
             if self._made is None:
                 self._made = _compiled(self._function, self._options)
                 names = self._function.__globals__
-                for name in [name for name, one in names.items() if isinstance(one, _Kernel)]:
-                    if isinstance(one := names[name], _Kernel):
-                        names[name] = one.made()
+                for name in list(names):
+                    # Making one makes others.
+                    if isinstance(names[name], _Kernel):
+                        names[name] = names[name].made()
         return self._made
 
 

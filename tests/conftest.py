@@ -37,7 +37,6 @@ LONG = (
     "tests/packaging",
     "tests/camera",
     "tests/unit/test_notebooks.py",
-    "tests/firmware/test_board_qemu.py",
     "tests/faults",
     "tests/acceptance",
     "tests/unit/plugins/test_uart.py",

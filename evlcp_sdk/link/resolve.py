@@ -180,15 +180,13 @@ class Link:
                 {name: value for name, value in each.items() if name not in unused}
                 for each in (parts, table, revisions)
             )
-        link = _assembled(parts, table, revisions, self.kinds, self.name)
-        return replace(link, built_in=self.built_in - {role})
+        return _assembled(parts, table, revisions, self.kinds, self.built_in - {role}, self.name)
 
     def with_air(self, **changes: Any) -> "Link":
         """The same link with other values on air, e.g. `link.with_air(pilot_every=4)`."""
         air = replace(self.air, **changes)
         parts, table = self._parts() | {"air": air}, {**self.table, "air": asdict(air)}
-        link = _assembled(parts, table, self.revisions, self.kinds, self.name)
-        return replace(link, built_in=self.built_in)
+        return _assembled(parts, table, self.revisions, self.kinds, self.built_in, self.name)
 
     def block_coder(self) -> BlockCoder:
         """How packets carry blocks of messages.
@@ -274,8 +272,8 @@ def resolve(
     if faults:
         raise ConfigError("\n".join(str(f) for f in faults))
     resolved = {section: resolver.resolved[section] for section in _KNOWN if section in resolver.resolved}
-    link = _assembled(resolver.built, resolved, resolver.revisions, message_kinds(registry))
-    return replace(link, built_in=frozenset(resolver.built_in))
+    kinds, built_in = message_kinds(registry), frozenset(resolver.built_in)
+    return _assembled(resolver.built, resolved, resolver.revisions, kinds, built_in)
 
 
 _KNOWN = [*_SPECS, *ROLES]
@@ -365,7 +363,8 @@ class _Resolver:
             return None
         self.revisions[section] = installed.algorithm.revision
         cls, ours = self._registry.load_class(section, name), installed.distribution == "evlcp-sdk"
-        self.built_in |= {section} if ours else set()
+        if ours:
+            self.built_in.add(section)
         with _named(section, {section: {"id": name}}):
             self.built[section] = _built(cls, keys, ours=ours)
             return {"id": name} | asdict(self.built[section])
@@ -428,6 +427,7 @@ def _assembled(
     table: Mapping[str, Mapping[str, Any]],
     revisions: Mapping[str, int],
     kinds: Mapping[int, MessageKind],
+    built_in: frozenset[str],
     name: str = "",
 ) -> Link:
     """The link of checked parts, and the table that describes them."""
@@ -452,6 +452,7 @@ def _assembled(
         digest=_digest(table, codebook, revisions),
         kinds=kinds,
         name=name,
+        built_in=built_in,
     )
 
 

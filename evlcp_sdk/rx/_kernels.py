@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import _median, inverted
+from evlcp_sdk._kernels import inverted, median
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -667,13 +667,15 @@ def core_profile(
     edge: float,
     out: Array,
 ) -> int:
-    """Presence of clusters in their place, less that of others, by distance off their line, 0 to 1; how many.
+    """Presence of clusters in their place, less that of others, by distance from their line: `out`, 0 to 1.
 
     A cell, in bins of 1 px, belongs to the seen cluster between whose ends, half a spacing on both sides, its
-    middle lies; its two neighbours may show in it, too.
-    They reach to where, beyond their peak, they first fall below `edge` of it. Cells in rows with the axis
-    leave distances out between them: straight lines lead over those, and up to the first it
-    stays the same.
+    middle lies; its two neighbours may show in it, too. Cells in rows with the line leave distances out
+    between them: straight lines lead over those, and up to the first it stays the same.
+
+    Returns:
+        How many distances belong to the line: to where presence, beyond its peak, first falls below `edge` of
+        that.
     """
     _, rows, columns = probability.shape
     hits, cells = np.zeros(out.size), np.zeros(out.size)
@@ -1652,7 +1654,7 @@ def slope_of_rows(
         top[b] = fit[b, 0]
         for lag in range(1, lags):
             top[b] = max(top[b], fit[b, lag])
-    middle = _median(top.copy(), blocks) if blocks else 0.0
+    middle = median(top.copy(), blocks) if blocks else 0.0
     at, place = np.empty(blocks), np.empty(blocks)
     n = 0
     for b in range(blocks):
@@ -1678,9 +1680,9 @@ def slope_of_rows(
                 pairs += 1
     if not pairs:
         return np.nan, np.nan
-    slope = _median(slopes, pairs)
+    slope = median(slopes, pairs)
     rest = place[:n] - slope * at[:n]
-    rest = np.abs(rest - _median(rest, n))
-    spread = max(1.48 * _median(rest, n), least)
+    rest = np.abs(rest - median(rest, n))
+    spread = max(1.48 * median(rest, n), least)
     mean = at[:n].mean()
     return slope, spread / np.sqrt(((at[:n] - mean) ** 2).sum())

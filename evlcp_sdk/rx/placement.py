@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk._kernels import median
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.values import PresenceMap, changed
 
@@ -233,9 +234,8 @@ def lit(
         return presence, placement
     light = np.empty(len(edges))
     _kernels.pilot_light(sums, edges, every, presence.prior, presence.grid_px, light)
-    in_place = np.sort(light[placement.seen])
-    middle = len(in_place) // 2
-    usual = (in_place[middle] + in_place[-1 - middle]) / 2 if len(in_place) else 0.0
+    in_place = light[placement.seen]
+    usual = median(in_place, len(in_place)) if len(in_place) else 0.0
     seen = light >= max(_LEAST_LIGHT * usual, 1e-9)
     placement = changed(placement, seen=seen)
     if seen.all():

@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import _median, rooted, substituted
+from evlcp_sdk._kernels import median, rooted, substituted
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
@@ -134,10 +134,10 @@ def fit_line(middles: Array, line: Array) -> bool:
                 if abs(apart) > 1e-9:
                     values[m] = (points[axis + 1, j] - points[axis + 1, i]) / apart
                     m += 1
-        slope = _median(values, m) if m else 0.0
+        slope = median(values, m) if m else 0.0
         for i in range(n):
             values[i] = points[axis + 1, i] - slope * points[axis, i]
-        line[2 * axis], line[2 * axis + 1] = _median(values, n), slope
+        line[2 * axis], line[2 * axis + 1] = median(values, n), slope
     return True
 
 
@@ -602,7 +602,7 @@ def fit_bar(
         if used < least:
             return False, by_boundary, scores, normal
         if left:
-            most = max(_OUTLIER * 1.4826 * _median(sizes, used), _LEAST_OUTLIER_PX)
+            most = max(_OUTLIER * 1.4826 * median(sizes, used), _LEAST_OUTLIER_PX)
             for b in range(clusters + 1):
                 if abs(by_boundary[0, b]) > most:
                     counted[b] = False

@@ -22,6 +22,14 @@ from tests.conftest import Run
 PACKET = 346
 LINK = load_link()
 
+SITE = """
+[[bar]]
+transmitter_id = 7
+latitude_deg = 35.156789
+longitude_deg = 136.965432
+height_m = 52.4
+"""
+
 
 def board_link(*overrides: str) -> Link:
     """The default link but for these values."""

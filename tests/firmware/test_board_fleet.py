@@ -8,18 +8,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from board_lines import Native, check_fault
+from board_lines import SITE, Native, check_fault
 
 from firmware_host.board.fleet import read_inventory
 from firmware_host.errors import IncompatibleError
-
-SITE = """
-[[bar]]
-transmitter_id = 7
-latitude_deg = 35.156789
-longitude_deg = 136.965432
-height_m = 52.4
-"""
 
 
 @pytest.fixture

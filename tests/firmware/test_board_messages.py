@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, Native, check_fault
+from board_lines import LINK, SITE, Native, check_fault
 from test_board_cli import EVLCP
 
 from evlcp_sdk.air.beacons import Beacon
@@ -18,21 +18,13 @@ from evlcp_sdk.air.signing import TrustedKey, TrustedKeys
 from evlcp_sdk.link.resolve import Link, load_link
 from firmware_host.emulators.led_record import RECORD, LedRecord
 
-SITE = """
-[[bar]]
-transmitter_id = 7
-latitude_deg = 35.156789
-longitude_deg = 136.965432
-height_m = 52.4
-heading_deg = 90.0
-tilt_deg = 1.5
-"""
+TILTED = f"{SITE}heading_deg = 90.0\ntilt_deg = 1.5\n"
 
 
 @pytest.fixture
 def site(tmp_path: Path) -> Path:
     path = tmp_path / "site.toml"
-    path.write_text(SITE)
+    path.write_text(TILTED)
     return path
 
 
@@ -173,7 +165,7 @@ def test_faults_are_one_line(
     evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], code: int, says: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("two.toml").write_text(SITE + SITE.replace("= 7", "= 8"))
+    Path("two.toml").write_text(TILTED + TILTED.replace("= 7", "= 8"))
     check_fault(evlcp("tx", "message", *options), code, says)
     assert evlcp("tx", "message", "--beacon", "two.toml", "--id", 8, "--json").code == 0
 

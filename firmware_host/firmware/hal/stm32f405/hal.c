@@ -35,7 +35,7 @@
    | SPI1 takes no word, TIM3 stands         | the main loop, after 1.5 chips, 5 ms more during a CRC  |
    | the crystal                             | clock security (NMI), at once; then 16 MHz, no chips    |
    | the supply is below 2.8 V               | PVD interrupt, at once; brown-out reset (option bytes)  |
-   | the core: an exception                  | fault_handler, at once; then the watchdog's reset           |
+   | the core: an exception                  | fault_handler, at once; then the watchdog's reset       |
    | the main loop hangs, the core stands    | independent watchdog on the LSI: reset in 70 to 190 ms  |
 
    Reset leaves PB0 an input: the pull-up on the board is what keeps the LEDs dark then. A board that comes from the
