@@ -1,11 +1,14 @@
-"""Banks for a simulated board, lines to it that go wrong, and what its LEDs may show all the same."""
+"""What the board's tests share: banks, boards and sessions, lines that go wrong, and what LEDs may show."""
 
+import shutil
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from itertools import pairwise
-from typing import Any
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.link.resolve import Link, load_link
@@ -17,6 +20,7 @@ from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.native import NativeBoard, serve
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol.client import Timing
+from firmware_host.protocol.datagram import Datagram
 from tests.conftest import Run
 
 PACKET = 346
@@ -31,9 +35,22 @@ height_m = 52.4
 """
 
 
+def needs(*tools: str) -> None:
+    """Skip, loudly, unless all these programs are there."""
+    missing = [name for name in tools if shutil.which(name) is None]
+    if missing:
+        install = "sh firmware_host/firmware/install-toolchain.sh installs it (as root)"
+        pytest.skip(f"{', '.join(missing)} missing: {install}")
+
+
 def board_link(*overrides: str) -> Link:
     """The default link but for these values."""
     return load_link(overrides=list(overrides))
+
+
+def options_of(*overrides: str) -> list[str]:
+    """The same on the command line."""
+    return [part for setting in overrides for part in ("--set", setting)]
 
 
 def symbols_of(packets: int, seed: int = 0, link: Link = LINK) -> NDArray[np.int64]:
@@ -44,6 +61,19 @@ def symbols_of(packets: int, seed: int = 0, link: Link = LINK) -> NDArray[np.int
 def some_bank(packets: int = 1, seed: int = 0, link: Link = LINK) -> Bank:
     """Random packets of a link."""
     return bank_of(symbols_of(packets, seed, link), link)
+
+
+def board_on(line: SimulatedLine | SimulatedBoard, nonce: int | None = None, **options: Any) -> Board:
+    """A session; with a nonce of one's own its bytes are the same each time."""
+    timing = Timing(latency_s=options.pop("latency_s", 0.02))
+    line = SimulatedLine(line) if isinstance(line, SimulatedBoard) else line
+    return Board(Session(line, timing, first=nonce, nonce=nonce, **options))
+
+
+def state_of(board: Board) -> tuple[int, int]:
+    """State and faults."""
+    status = board.status()
+    return status.state, status.faults
 
 
 def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
@@ -57,8 +87,22 @@ def check_fault(done: Run, code: int, *says: str) -> None:
     assert [words for words in says if words not in done.err] == [], done.err
 
 
-class HostDiedError(Exception):
-    """The host died here."""
+class Vector(NamedTuple):
+    """A golden vector: a datagram and its bytes on the wire."""
+
+    name: str
+    datagram: Datagram
+    wire: bytes
+
+
+def read_vectors() -> Iterator[Vector]:
+    """The golden vectors: `name type status sequence session payload wire` in hex, `-` for no payload."""
+    path = Path(__file__).parents[1] / "vectors" / "wire-vectors.txt"
+    for line in path.read_text(encoding="ascii").splitlines():
+        if line and not line.startswith("#"):
+            name, *numbers, payload, wire = line.split()
+            body = b"" if payload == "-" else bytes.fromhex(payload)
+            yield Vector(name, Datagram(*(int(n, 16) for n in numbers), body), bytes.fromhex(wire))
 
 
 class Native:
@@ -83,25 +127,34 @@ class Native:
 class FatalLine(SimulatedLine):
     """Calls `then` once `after` bytes have gone to the board; the bytes before have arrived."""
 
-    def __init__(self, board: SimulatedBoard, after: int, then: Callable[[], None]) -> None:
+    def __init__(self, board: SimulatedBoard, after: int, then: Callable[["FatalLine"], object]) -> None:
         super().__init__(board)
         self.left: int | None = after
         self.then = then
-        self.written = 0
+        self.written = b""
 
     def write(self, data: bytes) -> None:
-        self.written += len(data)
-        if self.left is None:
-            super().write(data)
-            return
-        now, later = data[: self.left], data[self.left :]
-        super().write(now)
-        self.left -= len(now)
-        if self.left == 0:
+        self.written += data
+        if self.left is not None:
+            now, data = data[: self.left], data[self.left :]
+            super().write(now)
+            self.left -= len(now)
+            if self.left:
+                return
             self.left = None
             self.board.run(100)
-            self.then()
-            super().write(later)
+            self.then(self)
+        super().write(data)
+
+
+def recording(board: SimulatedBoard) -> FatalLine:
+    """A line that keeps what was written, and never fails."""
+    return FatalLine(board, 1 << 30, lambda _: None)
+
+
+def deafen(line: SimulatedLine) -> None:
+    """Let nothing arrive at the board from now on."""
+    line.to_board = lambda _: b""  # type: ignore[method-assign]
 
 
 class NoisyLine(SimulatedLine):
@@ -139,34 +192,24 @@ class NoisyLine(SimulatedLine):
             return out + self.late.pop()
         return out
 
-    def to_board(self, data: bytes) -> bytes:
-        return self.spoil(data)
-
-    def to_host(self, data: bytes) -> bytes:
-        return self.spoil(data)
-
-
-def board_on(line: SimulatedLine, nonce: int | None = None, key: bytes | None = None) -> Board:
-    """A session; with a nonce of one's own its bytes are the same each time."""
-    return Board(Session(line, Timing(latency_s=0.02), first=nonce, nonce=nonce, key=key))
+    to_board = to_host = spoil
 
 
 def packet_sequence(played: LedRecord, payloads: dict[str, NDArray[np.int64]]) -> list[tuple[str, int]]:
     """Name and packet number of every whole packet that was played; fails on one that is none of them."""
     known = {}
     for name, symbols in payloads.items():
-        chips = symbol_chips(symbols, LINK.codebook)
-        for p in range(len(symbols)):
-            known[chips[p * PACKET : (p + 1) * PACKET].tobytes()] = (name, p)
+        for p, packet in enumerate(np.split(symbol_chips(symbols, LINK.codebook), len(symbols))):
+            known[packet.tobytes()] = (name, p)
     assert len(known) == sum(len(s) for s in payloads.values())
     chips = played.chips()
+    whole = len(chips) - len(chips) % PACKET
     sequence = []
-    for at in range(0, len(chips) - PACKET + 1, PACKET):
+    for at in range(0, whole, PACKET):
         packet = chips[at : at + PACKET].tobytes()
         assert packet in known, f"torn packet at chip {at}"
         sequence.append(known[packet])
-    rest = chips[len(chips) - len(chips) % PACKET :].tobytes()
-    assert any(k.startswith(rest) for k in known)
+    assert any(k.startswith(chips[whole:].tobytes()) for k in known)
     return sequence
 
 
@@ -175,9 +218,7 @@ def check_order(sequence: list[tuple[str, int]], counts: dict[str, int]) -> list
     order = [sequence[0][0]]
     assert sequence[0][1] == 0
     for (name, p), (next_name, q) in pairwise(sequence):
-        if next_name == name:
-            assert q == (p + 1) % counts[name]
-        else:
-            assert q == 0
+        assert q == ((p + 1) % counts[name] if next_name == name else 0)
+        if next_name != name:
             order.append(next_name)
     return order

@@ -1,18 +1,16 @@
-"""What the tests of the transmitter share: codebook, tools that may be missing, boards."""
+"""Boards for the tests of the transmitter, and what of a developer's environment they must not see."""
 
 import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import pytest
-from board_lines import LINK, Native, board_on
+from board_lines import Native, board_on, needs
 
-from evlcp_sdk.air.codebook import Codebook
 from firmware_host import build
 from firmware_host.board.board import Board
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.images import FlashImage
 
 if TYPE_CHECKING:
@@ -21,37 +19,17 @@ if TYPE_CHECKING:
 SANITIZED = "EVLCP_TEST_LIBRARY"
 """Names a library of the firmware, for tests that run in another process."""
 
-INSTALL = "sh firmware_host/firmware/install-toolchain.sh installs it (as root)"
-
-
-def tool(*names: str) -> None:
-    """Skip, loudly, unless all these programs are there."""
-    missing = [n for n in names if shutil.which(n) is None]
-    if missing:
-        pytest.skip(f"{', '.join(missing)} missing: {INSTALL}")
-
-
-@pytest.fixture(scope="session")
-def book() -> Codebook:
-    return LINK.codebook
-
 
 @pytest.fixture(scope="session", autouse=True)
 def _library() -> None:
     """Skip without what builds the native board; take the one under sanitizers, where that is named."""
-    tool("cc", "make")
+    needs("cc", "make")
     if path := os.environ.get(SANITIZED):
         build.native_library = lambda: Path(path)
 
 
-@pytest.fixture(scope="session")
-def needs() -> Callable[..., None]:
-    return tool
-
-
 @pytest.fixture(autouse=True)
 def _no_port_and_a_wide_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the command line must not find in a developer's environment, and how wide its lines may be."""
     monkeypatch.delenv("EVLCP_PORT", raising=False)
     monkeypatch.setenv("COLUMNS", "200")
 
@@ -64,7 +42,7 @@ def device() -> SimulatedBoard:
 @pytest.fixture
 def board(device: SimulatedBoard) -> Board:
     """A session with `device`."""
-    return board_on(SimulatedLine(device))
+    return board_on(device)
 
 
 @pytest.fixture
@@ -79,7 +57,7 @@ def native(tmp_path: Path) -> Iterator[str]:
 @pytest.fixture(scope="session")
 def stm32() -> "Callable[..., tuple[Stm32, Board]]":
     """What starts an image on the model of the part, and connects to it."""
-    tool("arm-none-eabi-gcc")
+    needs("arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     from tests.models.stm32 import Stm32, connect
 

@@ -7,7 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, board_link, board_on, check_fault, shown, some_bank, symbols_of
+from board_lines import (
+    LINK,
+    board_link,
+    board_on,
+    check_fault,
+    options_of,
+    shown,
+    some_bank,
+    symbols_of,
+)
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
@@ -17,19 +26,10 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from firmware_host.board.bank import Bank, bank_of, random_symbols, symbol_chips
 from firmware_host.board.board import Board, Settings, profile_number, provision
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import IncompatibleError, RefusedError
-from firmware_host.protocol.generated.requests import (
-    BoardFault,
-    ChipsRequest,
-    CommitRequest,
-    Format,
-    Profile,
-    State,
-    Status,
-    StreamRequest,
-    Watchdog,
-)
+from firmware_host.protocol.generated import requests as protocol
+from firmware_host.protocol.generated.requests import BoardFault, Format, Profile, State, Status, Watchdog
 
 SIZES = (3, 14, 1, 9, 9, 20, 6, 2, 12, 11)
 LED_CLUSTERS = np.random.default_rng(4).permutation(np.repeat(np.arange(10), SIZES))
@@ -59,6 +59,14 @@ def leds_of(chips: NDArray[np.uint8], led_clusters: NDArray[np.int64]) -> NDArra
     for led, cluster in enumerate(led_clusters):
         found[:, led] = chips[:, cluster]
     return found
+
+
+def check_round(rows: NDArray[np.uint8], expected: NDArray[np.uint8], least: int) -> None:
+    """Rows are these LEDs', round and round, and none beyond them is lit."""
+    assert len(rows) >= least
+    leds = expected.shape[1]
+    assert (rows[:, :leds] == np.resize(expected, (len(rows), leds))).all()
+    assert not rows[:, leds:].any()
 
 
 EXPECTED = leds_of(symbol_chips(SYMBOLS, BOOK, 2), LED_CLUSTERS)
@@ -136,9 +144,7 @@ def test_every_led_does_what_it_is_sent(name: str, device: SimulatedBoard, board
     assert (done.written, done.swapped) == (len(bank.content), True)
     device.run(400_000)
     record = device.records().played()
-    rows = record.chips(None)
-    assert len(rows) > len(leds)
-    assert (rows == np.resize(leds, rows.shape)).all()
+    check_round(record.chips(None), leds, len(leds) + 1)
     assert (record.numbers == np.arange(len(record))).all()
     assert (np.diff(record.ticks) == device.TICK_HZ // bank.chip_rate_hz).all()
     status = board.status()
@@ -164,12 +170,11 @@ def test_every_led_does_what_it_is_sent(name: str, device: SimulatedBoard, board
 def test_any_clusters_of_any_leds(data: st.DataObject) -> None:
     """Clusters of any number and order, chips of any kind and length: every LED against NumPy."""
     device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
+    board = board_on(device)
     rng = np.random.default_rng(data.draw(st.integers(0, 1000)))
     clusters = data.draw(st.sampled_from([1, 2, 7, 8, 9, 15, 16, 17, 31, 33, 64, 88, 89, 96]))
     leds = data.draw(st.integers(clusters, 96))
-    which = np.concatenate([np.arange(clusters), rng.integers(0, clusters, leds - clusters)])
-    which = rng.permutation(which)
+    which = rng.permutation([*range(clusters), *rng.integers(0, clusters, leds - clusters)])
     packet = replace(PacketFormat.of(book_of(clusters, 8), 1), preamble_chips=data.draw(st.integers(1, 40)))
     packets = data.draw(st.integers(1, 5))
     chips = rng.integers(0, 2, (packets * packet.packet_chips, clusters), dtype=np.uint8)
@@ -178,8 +183,7 @@ def test_any_clusters_of_any_leds(data: st.DataObject) -> None:
     provision(board, bank, Settings())
     device.run(data.draw(st.integers(1, 400)) * 100)
     assert board.verify(bank) == 0
-    rows = shown(device)
-    assert (rows == np.resize(leds_of(chips, which), rows.shape)).all()
+    check_round(shown(device), leds_of(chips, which), 1)
     assert board.status().duty == bank.duty == np.ceil(1000 * chips.mean(0).max() - 1e-9)
 
 
@@ -191,13 +195,10 @@ def test_a_bank_is_full_to_the_last_byte(device: SimulatedBoard, board: Board) -
     assert len(bank.content) == board.about.bank_bytes == 40_960
     provision(board, bank, Settings())
     device.run(2_050_000)
-    rows = shown(device)
-    assert len(rows) > len(chips)
-    assert (rows == np.resize(leds_of(chips, LED_CLUSTERS), rows.shape)).all()
+    check_round(shown(device), leds_of(chips, LED_CLUSTERS), len(chips) + 1)
     more = replace(packet, preamble_chips=packet.preamble_chips + 1)
-    with pytest.raises(
-        ConfigError, match=r"20421 chips takes 40842 bytes.*not one fits.*at most 20420 chips"
-    ):
+    says = r"20421 chips takes 40842 bytes.*not one fits.*at most 20420 chips"
+    with pytest.raises(ConfigError, match=says):
         board.program(Bank.of_chips(np.zeros((20_421, 10), np.uint8), BOOK, more, LED_CLUSTERS))
     link = board_link("bar.rows=90", "bar.cluster_rows=9", "air.frames_per_packet=700")
     with pytest.raises(ConfigError, match=r"a packet of 22426 chips takes 44852 bytes.*room for two.*10210"):
@@ -232,10 +233,8 @@ def test_it_is_kept_over_a_reset(device: SimulatedBoard, board: Board) -> None:
     device.reset()
     device.records()
     device.run(200_000)
-    rows = shown(device)
-    assert len(rows) > 900
-    assert (rows == np.resize(EXPECTED, rows.shape)).all()
-    again = board_on(SimulatedLine(device), nonce=9)
+    check_round(shown(device), EXPECTED, 900)
+    again = board_on(device, nonce=9)
     assert again.holds(bank, again.status())
     assert not again.program(bank).written
 
@@ -247,8 +246,7 @@ def test_the_idle_pattern_keeps_to_the_limits(
     """LEDs are on for no more of it than they may be, whatever the length of a packet."""
     packet = replace(PacketFormat.of(BOOK, 1), preamble_chips=103)
     bank = Bank.of_chips(np.zeros((151, 10), np.uint8), BOOK, packet, LED_CLUSTERS)
-    settings_ = Settings(watchdog=Watchdog.IDLE, watchdog_ms=100, duty_limit=limit)
-    provision(board, bank, settings_)
+    provision(board, bank, Settings(watchdog=Watchdog.IDLE, watchdog_ms=100, duty_limit=limit))
     device.run(700_000)
     on = np.flatnonzero(shown(device)[:, 0])
     assert (np.diff(on) == every).all()
@@ -258,35 +256,33 @@ def test_the_idle_pattern_keeps_to_the_limits(
 
 
 def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None:
-    good = ChipsRequest(200, 1, 10, bytes.fromhex(BOOK.digest))
-    for wrong, nearest in (
-        ({"packet_chips": 0}, 1),
-        ({"packet_chips": 40961}, 40960),
-        ({"packet_chips": 2**32 - 1}, 40960),
-        ({"hold": 0}, 1),
-        ({"clusters": 97}, 96),
+    good = protocol.ChipsRequest(200, 1, 10, bytes.fromhex(BOOK.digest))
+    for name, wrong, nearest in (
+        ("packet_chips", 0, 1),
+        ("packet_chips", 40961, 40960),
+        ("packet_chips", 2**32 - 1, 40960),
+        ("hold", 0, 1),
+        ("clusters", 97, 96),
     ):
         with pytest.raises(RefusedError) as told:
-            board.session.call(replace(good, **wrong))
+            board.session.call(replace(good, **{name: wrong}))
         assert (told.value.status, told.value.detail) == (Status.OUT_OF_RANGE, nearest)
     bank = a_bank()
-    commit = CommitRequest(0, bank.format, 2, len(bank.content), bank.crc, bytes.fromhex(bank.digest))
+    commit = protocol.CommitRequest(
+        0, bank.format, 2, len(bank.content), bank.crc, bytes.fromhex(bank.digest)
+    )
     with pytest.raises(RefusedError):
         board.session.call(commit)  # CLUSTERS with a codebook
     board.prepare(bank)
     board.fill(0, bank.content)
-    for wrong in (
-        {"format": Format.WORDS},
-        {"format": 3},
-        {"packets": 0},
-        {"packets": 3},
-        {"packets": 65535},
-        {"length": len(bank.content) - 2},
-        {"format": Format.MASKS},
-        {"digest": bytes(32)},
+    for name, wrong in (
+        *[("format", form) for form in (Format.WORDS, Format.MASKS, 3)],
+        *[("packets", count) for count in (0, 3, 65535)],
+        ("length", len(bank.content) - 2),
+        ("digest", bytes(32)),
     ):
         with pytest.raises((RefusedError, IncompatibleError)):
-            board.session.call(replace(commit, **wrong))
+            board.session.call(replace(commit, **{name: wrong}))
     # an LED of two clusters would be on for longer than either
     overlapping = bytearray(bank.content)
     overlapping[12] |= overlapping[0]
@@ -297,7 +293,7 @@ def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None
         board.session.call(replace(commit, crc=twice.crc))
     assert (told.value.status, told.value.detail) == (Status.OUT_OF_RANGE, 1)
     with pytest.raises(RefusedError):
-        board.session.call(StreamRequest(0, Format.CLUSTERS, commit.digest))
+        board.session.call(protocol.StreamRequest(0, Format.CLUSTERS, commit.digest))
     board.prepare(bank)
     device.run(10_000)
     assert not device.shown().any()
@@ -309,8 +305,7 @@ def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None
     board.session.call(replace(commit, crc=replace(bank, content=bytes(padded)).crc))
     board.start()
     device.run(50_000)
-    rows = shown(device)
-    assert (rows == np.resize(EXPECTED, rows.shape)).all()
+    check_round(shown(device), EXPECTED, 400)
 
 
 def test_what_hello_says_decides(board: Board) -> None:
@@ -348,8 +343,7 @@ def test_chips_that_the_board_has_none_as_long_as(device: SimulatedBoard, board:
     status = board.status()
     assert (status.chip_rate_hz, status.hold, status.packet_chips) == (2000, 4, 800)
     device.run(1_300_000)
-    rows = shown(device)
-    assert (rows == np.resize(np.repeat(EXPECTED, 4, axis=0), rows.shape)).all()
+    check_round(shown(device), np.repeat(EXPECTED, 4, axis=0), 2000)
     assert status.state == State.PLAYING
     assert board.holds(bank, status)
     board.check_same_air(bank, status)
@@ -364,9 +358,8 @@ def test_chips_that_the_board_has_none_as_long_as(device: SimulatedBoard, board:
     device.records()
     provision(board, bank, Settings(duty_limit=0.6))
     device.run(800_000)
-    rows = shown(device)
     wanted = symbol_chips(symbols, link.codebook, 4).repeat(6, axis=1).repeat(2, axis=0)  # 2000 chips/s
-    assert (rows == np.resize(wanted, rows.shape)).all()
+    check_round(shown(device), wanted, 1500)
     assert board.verify(bank) == 0
     assert not board.program(bank).swapped
     with board.stream(link) as stream:
@@ -378,7 +371,7 @@ def test_chips_that_the_board_has_none_as_long_as(device: SimulatedBoard, board:
 
 
 ANY = ("bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13")
-OPTIONS = [part for setting in ANY for part in ("--set", setting)]
+OPTIONS = options_of(*ANY)
 
 
 def test_the_commands(evlcp, tmp_path: Path, device: SimulatedBoard, board: Board) -> None:
@@ -404,7 +397,7 @@ def test_the_commands(evlcp, tmp_path: Path, device: SimulatedBoard, board: Boar
         (80, 8, "LED 80 is lit, the link's bar has 80"),
         (90, 6, "the LEDs of cluster 4 differ; take every LED for itself with --per-led"),
     ):
-        other = ("--set", f"bar.rows={rows}", "--set", f"bar.cluster_rows={cluster_rows}")
+        other = options_of(f"bar.rows={rows}", f"bar.cluster_rows={cluster_rows}")
         check_fault(evlcp("board", "leds", record, "--chips", out, *OPTIONS[4:], *other), 3, says)
 
 
@@ -448,14 +441,14 @@ def pulse_chips(symbols: NDArray[np.int64], link: Link) -> NDArray[np.uint8]:
 
 def packet_of(kind: str) -> tuple[Link, NDArray[np.int64], NDArray[np.uint8]]:
     """A link, a packet's symbols, and the chips of its LEDs, (chips, LEDs)."""
-    text = b"Tempo 30!"
     if kind == "4-PPM":
         link = board_link(*PULSES, "air.frames_per_packet=3")
         symbols = symbols_of(1, 2, link)[0]
         return link, symbols, np.repeat(pulse_chips(symbols, link), 6, axis=1)
-    chips = serial_chips(text) if kind == "7E2" else turned_chips(text)
-    link = board_link(*(SERIAL if kind == "7E2" else TURNED), f"air.frames_per_packet={len(text)}")
-    return link, np.array([[byte] for byte in text]), np.repeat(np.array(chips, np.uint8)[:, None], 6, axis=1)
+    text = b"Tempo 30!"
+    overrides, chips = {"7E2": (SERIAL, serial_chips), "8O1, turned": (TURNED, turned_chips)}[kind]
+    link = board_link(*overrides, f"air.frames_per_packet={len(text)}")
+    return link, np.array(list(text))[:, None], np.array([[chip] * 6 for chip in chips(text)], np.uint8)
 
 
 KINDS = ["7E2", "8O1, turned", "4-PPM"]
@@ -466,10 +459,7 @@ def test_characters_and_pulses_are_those_of_the_link(kind: str, device: Simulate
     link, symbols, told = packet_of(kind)
     provision(board, bank_of(symbols[None], link), Settings())
     device.run(100_000)
-    rows = shown(device)
-    assert len(rows) > len(told), "more than a packet"
-    assert (rows[:, : told.shape[1]] == np.resize(told, (len(rows), told.shape[1]))).all()
-    assert not rows[:, told.shape[1] :].any()
+    check_round(shown(device), told, len(told) + 1)
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "ten clusters"])
@@ -488,15 +478,12 @@ def test_the_image_of_the_part_plays_them_too(kind: str, stm32) -> None:
     board.start()
     chip.run(15_000)
     rows, _ = lit_rows(chip.drivers.log[begin:])
-    told = np.roll(told, -int(told.any(1).argmax()), axis=0)
-    assert len(rows) >= 100
-    assert (rows[:, : told.shape[1]] == np.resize(told, (len(rows), told.shape[1]))).all()
-    assert not rows[:, told.shape[1] :].any()
+    check_round(rows, np.roll(told, -int(told.any(1).argmax()), axis=0), 100)
     assert chip.longest[16 + Dma.IRQ] < 12 * US
 
 
 def test_a_text_by_a_board_and_a_camera(evlcp, tmp_path: Path) -> None:
-    options = [part for one in (*SERIAL, "air.frames_per_packet=80") for part in ("--set", one)]
+    options = options_of(*SERIAL, "air.frames_per_packet=80")
     done = evlcp("loop", "--text", "Tempo 30!", "--seed", 2, "--json", "-o", tmp_path, *options)
     assert done.code == 0, done.err
     said = {step.pop("step"): step for step in map(json.loads, done.out.splitlines())}
@@ -532,13 +519,8 @@ def test_a_stream_rests_while_there_is_nothing_to_send(
 def test_what_would_be_characters_is_refused(board: Board) -> None:
     link, symbols, _ = packet_of("7E2")
     bank = bank_of(symbols[None], link)
-    with pytest.raises(
-        ConfigError, match="watchdog = idle: LEDs that are on for a chip of two say something"
-    ):
+    with pytest.raises(ConfigError, match="watchdog = idle: LEDs that are on for a chip of two say"):
         provision(board, bank, Settings(watchdog=Watchdog.IDLE))
     provision(board, bank, Settings(watchdog=Watchdog.DARK, duty_limit=0.8, start=False))
     with pytest.raises(RefusedError, match="a pause of this link has a LED on for 1 of the time, the duty"):
         board.stream(link)
-    turned, symbols, _ = packet_of("8O1, turned")
-    with board.stream(turned) as stream:
-        stream.send(symbols)

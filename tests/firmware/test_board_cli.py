@@ -53,17 +53,30 @@ def test_a_users_first_hour(evlcp, native: str, tmp_path: Path) -> None:
     def board(*arguments: object) -> Run:
         return evlcp("board", *arguments, "--port", native)
 
+    def table(*arguments: object, **expected: object) -> None:
+        done = board(*arguments, "--json")
+        assert (done.code, done.err) == (0, ""), arguments
+        assert expected.items() <= json.loads(done.out).items(), arguments
+
     assert "native" in board("hello").out
+    table("hello", hal="native", clusters=16, leds=96)
     check_fault(board("send", "--random", 1), 5, "'evlcp board program' first")
-    done = board("program", "--random", 8, "--seed", 3, "--level", 25, "--watchdog", "idle")
+    eight = ("--random", 8, "--seed", 3)
+    done = board("program", *eight, "--level", 25, "--watchdog", "idle", "--watchdog-ms", 1500)
     assert done.code == 0
     sent, told = done.out.splitlines()
     assert sent == "sent 2560 of 2560 bytes; bank 0 is active"
-    assert told.startswith("watchdog: the board shows its idle pattern once no host has spoken for 5 s;")
-    status = json.loads(board("status", "--json").out)
-    assert (status["state"], status["level_ma"], status["watchdog"]) == ("playing", 25, "idle")
-    assert "was there already" in board("program", "--random", 8, "--seed", 3).out
-    assert board("verify", "--random", 8, "--seed", 3).code == 0
+    idle = "watchdog: the board shows its idle pattern once no host has spoken for 1.5 s;"
+    assert told.startswith(idle)
+    table("status", state="playing", level_ma=25, watchdog="idle", watchdog_ms=1500)
+    assert board("watchdog", "idle", "--after-ms", 1500).out.startswith(idle)
+    assert "the board goes dark" in board("watchdog", "dark").out
+    table("watchdog", "keep", "--after-ms", 700, watchdog="keep", watchdog_ms=700)
+    again = board("program", *eight).out
+    assert "was there already" in again
+    assert "watchdog" not in again
+    table("program", *eight, swapped=False, watchdog="keep", bank=0)
+    table("verify", *eight, bank=0, bytes=2560)
     check_fault(board("verify", "--random", 8, "--seed", 4), 7, "byte 0 of bank 0")
     check_fault(board("verify", "--random", 9, "--seed", 4), 7)
     for other, says in (
@@ -71,38 +84,24 @@ def test_a_users_first_hour(evlcp, native: str, tmp_path: Path) -> None:
         ("air.chip_rate_hz=5000.0", "plays 10000 chips per second, this payload's link has air.chip_rate_hz"),
     ):
         for command in ("send", "verify"):
-            check_fault(board(command, "--random", 8, "--seed", 3, "--set", other), 8, says)
+            check_fault(board(command, *eight, "--set", other), 8, says)
+    table("send", "--random", 2, "--seed", 9, bank=1)
     assert "playing" in board("monitor", "--count", 1).out
+    table("monitor", "--count", 1, port=native, state="playing")
+    table("level", 20, level_ma=20)
     check_fault(board("level", 61), 5, "the nearest value the board can take is 60")
     says = "this payload has a LED on for 0.5 of the time, the duty limit is 0.3: give a limit of at least"
     check_fault(board("program", "--random", 8, "--duty-limit", 0.3), 5, says)
     check_fault(board("save"), 5)
-    assert board("stop").code == 0
+    table("stop", state="dark")
     assert board("save").out == "saved in slot 0, number 1\n"
-    assert board("recall").out == "recalled slot 0, number 1\n"
+    table("save", "--autostart", slot=1, save_sequence=2, autostart=True)
+    assert board("recall").out == "recalled slot 1, number 2\n"
+    table("recall", slot=1, save_sequence=2)
+    table("test-leds", "--last", 1, "--dwell-ms", 1, first=0, last=1)
+    table("start", state="playing")
+    table("blank", state="dark")
     assert (tmp_path / "flash.bin").stat().st_size > 80_000
-
-
-def test_what_is_done_is_one_object(evlcp, native: str) -> None:
-    for arguments, expected in (
-        (("hello",), {"hal": "native", "clusters": 16, "leds": 96}),
-        (("program", "--random", 2), {"swapped": True, "watchdog": "keep"}),
-        (("verify", "--random", 2), {"bank": 0, "bytes": 640}),
-        (("send", "--random", 2, "--seed", 9), {"bank": 1}),
-        (("level", 20), {"level_ma": 20}),
-        (("watchdog", "idle", "--after-ms", 700), {"watchdog": "idle", "watchdog_ms": 700}),
-        (("stop",), {"state": "dark"}),
-        (("save", "--autostart"), {"slot": 0, "save_sequence": 1, "autostart": True}),
-        (("recall",), {"slot": 0, "save_sequence": 1}),
-        (("test-leds", "--last", 1, "--dwell-ms", 1), {"first": 0, "last": 1}),
-        (("start",), {"state": "playing"}),
-        (("status",), {"state": "playing"}),
-        (("blank",), {"state": "dark"}),
-        (("monitor", "--count", 1), {"port": native, "state": "dark"}),
-    ):
-        done = evlcp("board", *arguments, "--port", native, "--json")
-        assert (done.code, done.err) == (0, ""), arguments
-        assert expected.items() <= json.loads(done.out).items(), arguments
 
 
 def test_every_command_on_a_board_takes_json_and_a_line() -> None:
@@ -113,10 +112,8 @@ def test_every_command_on_a_board_takes_json_and_a_line() -> None:
             # frames says it by --format json; an emulator runs in the foreground
             options = {option for parameter in command.params for option in parameter.opts}
             assert "--json" in options or name in ("frames", "emulate"), name
-    for name in ("hello", "program", "start", "level", "test-leds", "recall"):
-        assert typer.main.get_command(board.app).commands[name].line == (  # type: ignore[attr-defined]
-            *("port", "baud", "trace", "replay", "key"),
-        )
+            if name in ("hello", "program", "start", "level", "test-leds", "recall"):
+                assert command.line == ("port", "baud", "trace", "replay", "key")
 
 
 HELLO = ("board", "hello", "--port")
@@ -132,13 +129,11 @@ EMULATE = ("board", "emulate", "native")
         ((*HELLO, "unix:"), 4, "NoBoardError", "expected unix:PATH"),
         ((*HELLO, "tcp:127.0.0.1:1"), 4, "NoBoardError", "no board listens there"),
         ((*HELLO, "tcp:what"), 4, "NoBoardError", "expected tcp:HOST:PORT with a port from 1 to 65535"),
-        ((*HELLO, "tcp:127.0.0.1:99999"), 4, "NoBoardError", "expected tcp:HOST:PORT"),
         ((*HELLO, "socket://localhost"), 4, "NoBoardError", "expected socket://HOST:PORT"),
         ((*HELLO, "rfc2217://:1"), 4, "NoBoardError", "expected rfc2217://HOST:PORT"),
         ((*HELLO, "socket://127.0.0.1:1"), 4, "NoBoardError", "start what listens there"),
         ((*HELLO, "/dev/nowhere"), 4, "NoBoardError", "cannot be opened"),
         ((*HELLO, "what://ever"), 4, "NoBoardError", "cannot be opened"),
-        ((*HELLO, "loop://"), 4, None, "no board answers; check power"),
         (("board", "start", "--port", "native:"), 5, "RefusedError", "NOTHING_COMMITTED"),
         (("board", "start", "--timeout", "1"), 2, "ConfigError", "--timeout belongs to --pulse-hz"),
         (
@@ -151,10 +146,7 @@ EMULATE = ("board", "emulate", "native")
         ((*PROGRAM, "--port", "native:"), 2, "ConfigError", "one of the two"),
         ((*PROGRAM, "--random", "1", "--masks", "x.npy"), 2, "ConfigError", "give one of them"),
         ((*PROGRAM, "--random", "129", "--port", "native:"), 2, "ConfigError", "send at most 128"),
-        ((*PROGRAM, "--inventory", "no.toml"), 2, "ConfigError", "no.toml"),
         ((*FLEET, "--random", "1"), 2, "ConfigError", "--random"),
-        ((*FLEET, "--no-start"), 2, "ConfigError", "--no-start"),
-        ((*FLEET, "--level", "30"), 2, "ConfigError", "--level"),
         ((*FLEET, "--seed", "1"), 2, "ConfigError", "--seed"),
         ((*FLEET, "--port", "native:"), 2, "ConfigError", "--port"),
         ((*FLEET, "--set", "air.pilot_every=2"), 2, "ConfigError", "--set"),
@@ -162,7 +154,6 @@ EMULATE = ("board", "emulate", "native")
         (("board", "leds", "no.bin", "--chips", "c.npy"), 3, "InputError", "no.bin"),
         (("board", "emulate", "stm32", "--listen", "pty"), 2, None, "expected unix or tcp for stm32"),
         ((*EMULATE, "--listen", "smoke:signals"), 2, None, "expected unix or tcp or pty for native"),
-        ((*EMULATE, "--listen", "tcp:127.0.0.1:999999"), 2, None, "expected tcp:HOST:PORT"),
         ((*EMULATE, "--listen", "tcp:127.0.0.1"), 2, None, "expected tcp:HOST:PORT"),
         ((*EMULATE, "--listen", "unix:"), 2, None, "expected unix:PATH"),
         ((*EMULATE, "--listen", "unix:" + "x" * 200), 1, None, "AF_UNIX path too long"),
@@ -187,33 +178,31 @@ def test_a_fault_is_one_line_and_json_too(
     says: str,
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    check_fault(evlcp(*arguments), code, says)
+    done = evlcp(*arguments, *["--json"] * (kind is not None))
+    check_fault(done, code, says)
     if kind is not None:
-        error = json.loads(evlcp(*arguments, "--json").out)["error"]
+        error = json.loads(done.out)["error"]
         assert (error["exit_code"], error["kind"]) == (code, kind)
         assert says in error["message"]
 
 
 @pytest.mark.parametrize(
-    ("arguments", "as_json", "says"),
+    ("arguments", "says"),
     [
-        (("board", "level", "much", "--port", "native:"), True, "MA"),
-        (("board", "status", "--no-such", "--port", "native:"), True, "--no-such"),
-        (("tx", "message", "--text", "hi", "--id", "-1"), True, "--id"),
-        (("tx", "frames", "--random", "1", "--seed", "-1"), False, "--seed"),
-        ((*EMULATE, "--unique-id", str(2**64)), False, "--unique-id"),
-        (("board", "--port", "x", "leds", "x", "--chips", "y"), False, "'leds' takes no --port"),
-        (("board", "--port", "x", "emulate", "native"), False, "'emulate' takes no --port"),
-        (("board", "--port", "x", "ports"), False, "'ports' takes no --port"),
+        (("board", "level", "much", "--port", "native:"), "MA"),
+        (("board", "status", "--no-such", "--port", "native:"), "--no-such"),
+        (("tx", "message", "--text", "hi", "--id", "-1"), "--id"),
+        (("board", "--port", "x", "leds", "x", "--chips", "y"), "'leds' takes no --port"),
+        (("board", "--port", "x", "ports"), "'ports' takes no --port"),
     ],
 )
-def test_a_fault_of_usage(evlcp, arguments: tuple[str, ...], as_json: bool, says: str) -> None:
-    done = evlcp(*arguments)
+def test_a_fault_of_usage(evlcp, arguments: tuple[str, ...], says: str) -> None:
+    done = evlcp(*arguments, "--json")
     assert done.code == 2
     assert says in done.err
     assert "Traceback" not in done.err
-    if as_json:
-        assert json.loads(evlcp(*arguments, "--json").out)["error"]["kind"] == "UsageError"
+    if "takes no" not in says:
+        assert json.loads(done.out)["error"]["kind"] == "UsageError"
 
 
 def test_wrong_records_are_told(evlcp, tmp_path: Path) -> None:

@@ -1,10 +1,11 @@
 """Streams: every packet once and in order over any line, underruns named, dark at the end."""
 
 from collections.abc import Iterator
+from contextlib import suppress
 
 import numpy as np
 import pytest
-from board_lines import LINK, NoisyLine, board_link, board_on, shown, some_bank, symbols_of
+from board_lines import LINK, NoisyLine, board_link, board_on, shown, some_bank, state_of, symbols_of
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 
@@ -13,29 +14,17 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from firmware_host.board.bank import bank_of, queue_of
 from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.session import Session
 from firmware_host.board.stream import Stream
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardResetError, IncompatibleError, RefusedError, VerifyError
-from firmware_host.protocol.client import Timing
-from firmware_host.protocol.generated.requests import (
-    BoardFault,
-    Capability,
-    Format,
-    PushRequest,
-    State,
-    Status,
-    StatusReply,
-    StatusRequest,
-    StreamRequest,
-    Watchdog,
-)
+from firmware_host.protocol.generated import requests as protocol
+from firmware_host.protocol.generated.requests import BoardFault, Capability, Format, State, Status, Watchdog
 from tests.models.usb import UsbLine
 
 LONG = board_link("air.frames_per_packet=40", "air.pilot_every=4")
 
 
-def played(device: SimulatedBoard, link: Link) -> tuple[list[bytes], int]:
+def played(device: SimulatedBoard, link: Link = LINK) -> tuple[list[bytes], int]:
     """The packets that were shown, as chips, and how many chips of the idle pattern stood between them."""
     chips = device.records().played().chips()
     preamble = link.codebook.preamble
@@ -52,13 +41,12 @@ def played(device: SimulatedBoard, link: Link) -> tuple[list[bytes], int]:
     return found, idle
 
 
-def expected(packets: np.ndarray, link: Link) -> list[bytes]:
-    every = link.packet.pilot_every
-    return [packet_chips(p, link.codebook, every).tobytes() for p in packets]
+def expected(packets: np.ndarray, link: Link = LINK) -> list[bytes]:
+    return [packet_chips(p, link.codebook, link.packet.pilot_every).tobytes() for p in packets]
 
 
 @pytest.mark.parametrize("link", [LINK, LONG], ids=["one piece a packet", "three pieces a packet"])
-@pytest.mark.parametrize(("latency_s", "ahead"), [(0.0, 5), (0.016, 2), (0.016, 3)])
+@pytest.mark.parametrize(("latency_s", "ahead"), [(0.0, 5), (0.016, 2)])
 def test_packets_follow_each_other_without_a_gap(
     device: SimulatedBoard, link: Link, latency_s: float, ahead: int
 ) -> None:
@@ -76,7 +64,7 @@ def test_packets_follow_each_other_without_a_gap(
     assert (chips.chips()[:at] == np.arange(at)[:, None] % 2).all()
     assert at % 2 == 0
     assert (stream.underruns, stream.sent) == (0, 30)
-    pieces = -(-link.packet.frames * 32 // (512 - PushRequest.fixed_bytes()))
+    pieces = -(-link.packet.frames * 32 // (512 - protocol.PushRequest.fixed_bytes()))
     assert stream.requests <= 30 * pieces + 3
     assert not device.shown().any()
 
@@ -91,31 +79,29 @@ def test_an_empty_queue_is_named_and_shows_the_idle_pattern(device: SimulatedBoa
             stream.send(packet)
         stream.wait(0.3)
         probe = status_of(stream)
-        assert probe.state == State.IDLE_PATTERN
-        assert probe.faults & BoardFault.UNDERRUN
-        assert probe.underruns == 1
+        assert (probe.state, probe.faults, probe.underruns) == (State.IDLE_PATTERN, BoardFault.UNDERRUN, 1)
         for packet in packets[2:]:
             stream.send(packet)
         stream.wait(0.01)
-        assert not status_of(stream).faults & BoardFault.UNDERRUN
-    found, idle = played(device, LINK)
-    assert found == expected(packets, LINK)
+        assert not status_of(stream).faults
+    found, idle = played(device)
+    assert found == expected(packets)
     assert idle > 2000
     assert stream.underruns == 1
     after = board.status()
     assert (after.state, after.faults, after.underruns) == (State.DARK, 0, 1)
 
 
-def status_of(stream: Stream) -> StatusReply:
+def status_of(stream: Stream) -> protocol.StatusReply:
     """STATUS in between; nothing of the stream is under way then."""
     assert not stream._flight
-    return stream._session.call(StatusRequest())
+    return stream._session.call(protocol.StatusRequest())
 
 
 @pytest.mark.parametrize("seed", range(2))
 def test_a_noisy_line_loses_and_doubles_nothing(device: SimulatedBoard, seed: int) -> None:
     line = NoisyLine(device, 0.0, 0.0, 0.0, seed)
-    board = Board(Session(line, Timing(latency_s=0.004), tries=12, first=1, nonce=1))
+    board = board_on(line, nonce=1, latency_s=0.004, tries=12)
     link = LONG if seed % 2 else LINK
     packets = symbols_of(25, seed, link)
     with board.stream(link, 6) as stream:
@@ -141,10 +127,8 @@ def test_from_a_bank_to_a_stream_and_back_without_a_torn_packet(device: Simulate
     stream.wait(0.3)
     provision(board, bank_of(last, LINK), Settings())
     device.run(200_000)
-    found, _ = played(device, LINK)
-    names = [
-        next(i for i, p in enumerate((first, second, last)) if chips in expected(p, LINK)) for chips in found
-    ]
+    found, _ = played(device)
+    names = [next(i for i, p in enumerate((first, second, last)) if chips in expected(p)) for chips in found]
     assert names == sorted(names)
     assert names.count(1) == 5
     assert names[-1] == 2
@@ -163,14 +147,10 @@ def test_the_watchdog_acts_on_a_stream_whose_host_is_gone(device: SimulatedBoard
 
 
 def test_a_raised_fault_ends_in_the_dark_and_a_reset_is_told(device: SimulatedBoard, board: Board) -> None:
-    def fails() -> None:
-        with board.stream(LINK, 8) as stream:
-            for packet in symbols_of(4):
-                stream.send(packet)
-            raise KeyError("x")
-
-    with pytest.raises(KeyError):
-        fails()
+    with suppress(KeyError), board.stream(LINK, 8) as stream:
+        for packet in symbols_of(4):
+            stream.send(packet)
+        raise KeyError("x")
     assert not device.shown().any()
     assert board.status().packets_sent < 4
     stream = board.stream(LINK)
@@ -199,9 +179,8 @@ def test_what_a_board_refuses(device: SimulatedBoard, board: Board) -> None:
     board.wait_dark()
     with board.stream(fast) as stream:
         stream.send(symbols_of(1, 0, fast)[0])
-    with pytest.raises(RefusedError) as told:
-        board.save()
-    assert told.value.status == Status.NOTHING_COMMITTED, "a stream is not saved"
+    with pytest.raises(RefusedError, match="NOTHING_COMMITTED"):
+        board.save()  # a stream is not
     object.__setattr__(board.about, "capabilities", board.about.capabilities & ~Capability.STREAM)
     with pytest.raises(IncompatibleError, match="has no streams"):
         board.stream(LINK)
@@ -235,10 +214,10 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
     """Pieces of any number, offset and length, and time between them, against a model."""
     link = board_link("air.frames_per_packet=320")  # 10 240 bytes a packet: 4 slots
     device = SimulatedBoard()
-    board = board_on(SimulatedLine(device))
+    board = board_on(device)
     like = queue_of(link)
     board.prepare(like)
-    request = StreamRequest(0, Format.WORDS, bytes.fromhex(link.codebook.digest))
+    request = protocol.StreamRequest(0, Format.WORDS, bytes.fromhex(link.codebook.digest))
     slots = board.session.call(request).slots
     assert slots == 4
     board.start()
@@ -247,7 +226,7 @@ def test_the_queue_takes_what_a_queue_should(data: st.DataObject) -> None:
 
     def push(number: int, offset: int, payload: bytes, last: bool = False) -> None:
         nonlocal begun
-        reply = board.session.call(PushRequest(0, number, offset, int(last), payload))
+        reply = board.session.call(protocol.PushRequest(0, number, offset, int(last), payload))
         # the model knows when packets begin only from the board; they never go back
         assert begun <= reply.begun <= len(model.packets)
         begun = reply.begun
@@ -279,20 +258,19 @@ def test_masks_may_be_streamed_too(device: SimulatedBoard, board: Board) -> None
     like = queue_of(LINK)
     board.prepare(like)
     digest = bytes.fromhex(LINK.codebook.digest)
-    assert board.session.call(StreamRequest(1, Format.MASKS, digest)).slots == 40960 // (346 * 12)
+    assert board.session.call(protocol.StreamRequest(1, Format.MASKS, digest)).slots == 40960 // (346 * 12)
     rows = np.random.default_rng(0).integers(0, 2, (346, 96), dtype=np.uint8)
     content = np.packbits(rows, axis=1).tobytes()
     for at in range(0, len(content), 480):
         piece = content[at : at + 480]
-        board.session.call(PushRequest(1, 0, at, int(at + 480 >= len(content)), piece))
+        board.session.call(protocol.PushRequest(1, 0, at, int(at + 480 >= len(content)), piece))
     board.start()
     device.run(60_000)
     assert shown(device).tobytes() == rows.tobytes()
     assert board.status().state == State.DARK
     for bank, status in ((0, Status.NOTHING_COMMITTED), (2, Status.OUT_OF_RANGE)):
-        with pytest.raises(RefusedError) as told:
-            board.session.call(PushRequest(bank, 0, 0, 0, b"x"))
-        assert told.value.status == status
+        with pytest.raises(RefusedError, match=status.name):
+            board.session.call(protocol.PushRequest(bank, 0, 0, 0, b"x"))
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 0.016])
@@ -351,31 +329,23 @@ def test_a_stream_that_is_stopped_is_empty(
         board.start()
     device.run(300_000)
     assert board.status().state == State.DARK
-    found, _ = played(device, LINK)
-    assert found[:begun] == expected(sent, LINK)[:begun]
+    found, _ = played(device)
+    assert found[:begun] == expected(sent)[:begun]
     assert len(found) <= begun + 1
+    with pytest.raises(VerifyError, match="the queue of a stream, which holds nothing to compare"):
+        board.verify(some_bank())
     provision(board, some_bank(), Settings())
-    assert board.status().state == State.PLAYING
+    assert state_of(board) == (State.PLAYING, 0)
+    board.verify(some_bank())
 
 
-def test_after_a_stream_nothing_can_be_started_or_compared(device: SimulatedBoard, board: Board) -> None:
+def test_messages_are_played_until_they_are_stopped(device: SimulatedBoard, board: Board) -> None:
     asked: list[int] = []
     with board.stream(LINK) as stream:
         stream.play(lambda _: symbols_of(3), 60.0, lambda: len(asked) > 20 or asked.append(0) is not None)
     assert stream.sent < 22
     status = board.status()
     assert (status.state, status.packets_sent) == (State.DARK, stream.sent)
-    with pytest.raises(RefusedError, match=r"NOTHING_COMMITTED.*a stream that has ended, say, is gone"):
-        board.start()
-    device.run(10_000)
-    assert board.status().state == State.DARK
-    with pytest.raises(
-        VerifyError, match="its bank is the queue of a stream, which holds nothing to compare"
-    ):
-        board.verify(some_bank())
-    provision(board, some_bank(), Settings())
-    assert board.status().state == State.PLAYING
-    board.verify(some_bank())
 
 
 def test_a_text_of_many_packets_leaves_no_gap(board: Board) -> None:

@@ -6,44 +6,41 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import board_link, board_on, some_bank, symbols_of
+from board_lines import (
+    FatalLine,
+    NoisyLine,
+    board_link,
+    board_on,
+    deafen,
+    some_bank,
+    state_of,
+    symbols_of,
+)
 
 from evlcp_sdk.errors import InputError
 from firmware_host.board.bank import bank_of, symbol_chips
 from firmware_host.board.board import Board, Settings, provision
-from firmware_host.board.session import Session
 from firmware_host.board.update import Package, confirm, update, update_status
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
-from firmware_host.errors import (
-    BoardError,
-    BoardResetError,
-    IncompatibleError,
-    LineError,
-    RefusedError,
-    VerifyError,
-)
-from firmware_host.protocol.client import Timing
-from firmware_host.protocol.generated.requests import (
-    BoardFault,
-    State,
-    Status,
-    UpdateBeginRequest,
-    UpdateCommitRequest,
-    UpdateWriteRequest,
-)
-
-
-def some(seed: int, count: int = 400) -> bytes:
-    return np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes()
+from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
+from firmware_host.protocol.generated import requests as protocol
+from firmware_host.protocol.generated.requests import BoardFault, State, Status
 
 
 def package(seed: int, count: int = 400) -> Package:
-    return Package("native", {1: some(seed, count), 2: some(seed + 100, count)})
+    def some(seed: int) -> bytes:
+        return np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes()
+
+    return Package("native", {1: some(seed), 2: some(seed + 100)})
 
 
-def fresh() -> tuple[SimulatedBoard, Board]:
-    device = SimulatedBoard()
-    return device, board_on(SimulatedLine(device))
+def resets(device: SimulatedBoard, count: int) -> list[int]:
+    """Which image runs after each of so many resets."""
+    found = []
+    for _ in range(count):
+        device.reset()
+        found.append(device.running())
+    return found
 
 
 def test_updates_take_turns_and_run_after_every_reset(device: SimulatedBoard, board: Board) -> None:
@@ -58,38 +55,26 @@ def test_updates_take_turns_and_run_after_every_reset(device: SimulatedBoard, bo
         assert device.running() == image
         assert device.image(image, 3_001) == new.images[image]
         assert update_status(board).trial == 0
-        for _ in range(4):
-            device.reset()
-            assert device.running() == image
-        board = board_on(SimulatedLine(device))
+        assert resets(device, 4) == [image] * 4
+        board = board_on(device)
 
 
 def test_what_is_not_kept_is_left_at_the_third_reset(device: SimulatedBoard, board: Board) -> None:
-    update(board, package(1))
+    # without one before, back to the one that was flashed
+    update(board, package(1), keep=False)
+    assert resets(device, 3)[-1] == 0
+    update(board_on(device), package(1))
+    board = board_on(device)
     update(board, package(2), keep=False)
     assert update_status(board).trial == 1
-    with pytest.raises(RefusedError, match="image 2 runs on trial; keep it first"):
+    with pytest.raises(RefusedError, match="image 1 runs on trial; keep it first"):
         update(board, package(3))
-    runs = []
-    for _ in range(4):
-        device.reset()
-        runs.append(device.running())
-    assert runs == [2, 2, 1, 1]
-    # and the place that it leaves takes the next one
-    board = board_on(SimulatedLine(device))
-    assert update(board, package(3)).image == 2
-    # without one before, back to the one that was flashed
-    device, board = fresh()
-    update(board, package(1), keep=False)
-    for _ in range(3):
-        device.reset()
-    assert device.running() == 0
-    device, board = fresh()
-    update(board, package(1), keep=False)
+    assert resets(device, 4) == [1, 1, 2, 2]
+    # and the place that it leaves takes the next one, which is confirmed by itself
+    board = board_on(device)
+    assert update(board, package(3), keep=False).image == 1
     confirm(board)
-    for _ in range(5):
-        device.reset()
-    assert device.running() == 1
+    assert resets(device, 5) == [1] * 5
 
 
 @pytest.mark.parametrize("before", [0, 1])
@@ -100,7 +85,8 @@ def test_power_that_fails_at_every_step_leaves_one_of_the_two(before: int) -> No
     ended = {"old": 0, "new": 0}
     moments = [*range(1, operations - 8, 6), *range(operations - 8, operations + 3)]
     for left in moments:
-        device, board = fresh()
+        device = SimulatedBoard()
+        board = board_on(device)
         if before:
             update(board, package(1))
         old = device.running()
@@ -119,7 +105,7 @@ def test_power_that_fails_at_every_step_leaves_one_of_the_two(before: int) -> No
             if old:
                 assert device.image(old, 400) == package(1).images[old]
         # the next run ends well, whatever was left
-        board = board_on(SimulatedLine(device))
+        board = board_on(device)
         if update_status(board).trial:
             confirm(board)
         done = update(board, package(9))
@@ -135,23 +121,23 @@ def test_what_cannot_be_is_refused(device: SimulatedBoard, board: Board) -> None
         update(board, Package("stm32f405-8mhz", {1: b"1234", 2: b"1234"}))
     with pytest.raises(RefusedError, match="65473 bytes of firmware, an image may have 65472"):
         update(board, package(1, 65_473))
+    begin, write = protocol.UpdateBeginRequest, protocol.UpdateWriteRequest
     for request, says in (
-        (UpdateWriteRequest(0, b"1234"), "NOTHING_COMMITTED"),
-        (UpdateBeginRequest(2, 4, 0), "nearest value the board can take is 1"),
-        (UpdateBeginRequest(1, 0, 0), "OUT_OF_RANGE"),
+        (write(0, b"1234"), "NOTHING_COMMITTED"),
+        (begin(2, 4, 0), "nearest value the board can take is 1"),
+        (begin(1, 0, 0), "OUT_OF_RANGE"),
+        (begin(1, 4, 5), None),
+        (write(2, b"12"), "OUT_OF_RANGE"),
+        (write(4, b"1"), "OUT_OF_RANGE"),
+        (write(0, b"12345"), "OUT_OF_RANGE"),
+        (write(8, b""), "OUT_OF_RANGE"),
+        (write(0, b"1234"), None),
+        (protocol.UpdateCommitRequest(), "BAD_CRC"),
     ):
-        with pytest.raises(RefusedError, match=says):
+        with pytest.raises(BoardError, match=says) if says else contextlib.nullcontext():
             board.session.call(request)
-    board.session.call(UpdateBeginRequest(1, 4, 5))
-    for offset, data in ((2, b"12"), (4, b"1"), (0, b"12345"), (8, b"")):
-        with pytest.raises(RefusedError, match="OUT_OF_RANGE"):
-            board.session.call(UpdateWriteRequest(offset, data))
-    board.session.call(UpdateWriteRequest(0, b"1234"))
-    with pytest.raises(VerifyError, match="BAD_CRC"):
-        board.session.call(UpdateCommitRequest())
-    device.reset()
-    assert device.running() == 0
-    board = board_on(SimulatedLine(device))
+    assert resets(device, 1) == [0]
+    board = board_on(device)
     provision(board, some_bank(), Settings())
     with pytest.raises(RefusedError, match="BUSY") as refused:
         update(board, package(1))
@@ -159,53 +145,20 @@ def test_what_cannot_be_is_refused(device: SimulatedBoard, board: Board) -> None
     assert board.status().state == State.PLAYING
 
 
-class Noisy(SimulatedLine):
-    """Flips a bit in every tenth portion."""
-
-    rng = np.random.default_rng(3)
-
-    def to_board(self, data: bytes) -> bytes:
-        out = bytearray(data)
-        if self.rng.random() < 0.1 and out:
-            out[int(self.rng.integers(len(out)))] ^= 0x20
-        return bytes(out)
-
-
-class Resets(SimulatedLine):
-    """Resets the board at the eighth portion."""
-
-    left = 8
-
-    def to_board(self, data: bytes) -> bytes:
-        self.left -= 1
-        if self.left == 0:
-            self.board.reset()
-        return data
-
-
-class Ends(SimulatedLine):
-    """Ends after 4000 bytes."""
-
-    left = 4_000
-
-    def to_board(self, data: bytes) -> bytes:
-        self.left -= len(data)
-        return data if self.left > 0 else b""
-
-
 def test_what_is_interrupted_keeps_the_old_one_and_ends_well_when_it_is_run_again(
     device: SimulatedBoard,
 ) -> None:
-    done = update(Board(Session(Noisy(device), Timing(latency_s=0.01))), package(4, 20_000))
+    noisy = NoisyLine(device, flips=2e-4, drops=0.0, doubles=0.0, seed=3)
+    assert update(board_on(noisy, latency_s=0.01), package(4, 20_000)).image == device.running() == 1
+    assert noisy.counts["flipped"] > 2
     assert device.image(1, 20_000) == package(4, 20_000).images[1]
-    assert done.image == device.running() == 1
     new = package(5, 20_000)
-    with pytest.raises((BoardResetError, LineError)):
-        update(Board(Session(Resets(device), Timing())), new)
+    with pytest.raises(LineError, match="was reset"):
+        update(board_on(FatalLine(device, 3_000, lambda line: line.board.reset())), new)
     assert device.running() == 1
     with pytest.raises(LineError, match="it begins anew, and the board keeps the firmware that it runs"):
-        update(Board(Session(Ends(device), Timing(latency_s=0.01))), new)
-    board = board_on(SimulatedLine(device))
+        update(board_on(FatalLine(device, 4_000, deafen), latency_s=0.01), new)
+    board = board_on(device)
     assert (update_status(board).running, update_status(board).trial) == (1, 0)
     assert update(board, new).image == 2
     assert device.image(2, 20_000) == new.images[2]
@@ -237,7 +190,7 @@ class SlowLine(SimulatedLine):
 
 
 def test_a_slow_board_is_waited_for(device: SimulatedBoard) -> None:
-    board = Board(Session(SlowLine(device), Timing()))
+    board = board_on(SlowLine(device), latency_s=0.1)
     done = update(board, package(3, 30_000))
     assert (done.image, device.running()) == (1, 1)
     # the first ones go out again; then it is known how long an answer takes
@@ -250,12 +203,9 @@ def test_a_board_with_a_key_takes_updates_from_its_host_alone(device: SimulatedB
     board.set_key(key)
     board.save()  # or the key is gone with the restart
     with pytest.raises(RefusedError, match="NEEDS_KEY"):
-        update(board_on(SimulatedLine(device)), package(1))
-    with pytest.raises(RefusedError, match="NEEDS_KEY"):
-        board_on(SimulatedLine(device)).session.call(UpdateWriteRequest(0, b"1234"))
+        update(board_on(device), package(1))
     assert device.running() == 0
-    done = update(Board(Session(SimulatedLine(device), Timing(latency_s=0.01), key=key)), package(1))
-    assert done.image == device.running() == 1
+    assert update(board_on(device, key=key), package(1)).image == device.running() == 1
 
 
 def test_a_file_of_an_update(tmp_path: Path) -> None:
@@ -263,27 +213,31 @@ def test_a_file_of_an_update(tmp_path: Path) -> None:
     path.write_text(package(1).to_json())
     assert Package.read(path) == package(1)
     table = json.loads(path.read_text())
-    for name, content in (("x.bin", b"\xff\xfe\x00\x20" * 100), ("x.json", b"{"), ("y.bin", b"")):
-        (tmp_path / name).write_bytes(content)
+    harms = ({"crc32": [1, 2]}, {"images": {"1": "AAAA"}}, {"evlcp_update": 2}, {"target": 5})
+    damaged = [json.dumps(table | harm).encode() for harm in harms]
+    for content in (b"\xff\xfe\x00\x20" * 100, b"{", b"", *damaged):
+        path.write_bytes(content)
         with pytest.raises(InputError) as told:
-            Package.read(tmp_path / name)
-        assert str(told.value).startswith(
-            f"{tmp_path / name}: not a firmware update, or damaged; expected TARGET."
-        )
+            Package.read(path)
+        assert str(told.value).startswith(f"{path}: not a firmware update, or damaged; expected TARGET.")
         assert "codec" not in str(told.value)
     with pytest.raises(InputError, match="cannot be read: No such file"):
         Package.read(tmp_path / "none.json")
-    for harm in ({"crc32": [1, 2]}, {"images": {"1": "AAAA"}}, {"evlcp_update": 2}, {"target": 5}):
-        path.write_text(json.dumps(table | harm))
-        with pytest.raises(InputError, match="not a firmware update, or damaged"):
-            Package.read(path)
 
 
 # -- the real images, on the model of the part
 
 
 def test_the_real_firmware_updates_itself(stm32, monkeypatch: pytest.MonkeyPatch) -> None:
-    from tests.models.stm32 import RESET_BY_IWDG, RESET_BY_PIN, RESET_BY_SOFTWARE, connect, lit_rows
+    from tests.models.stm32 import (
+        RESET_BY_IWDG,
+        RESET_BY_PIN,
+        RESET_BY_SOFTWARE,
+        US,
+        Usart,
+        connect,
+        lit_rows,
+    )
 
     new = Package.built("stm32f405-8mhz")
     chip, board = stm32()
@@ -291,7 +245,9 @@ def test_the_real_firmware_updates_itself(stm32, monkeypatch: pytest.MonkeyPatch
     symbols = symbols_of(1, 1, link)
     provision(board, bank_of(symbols, link), Settings(start=False, level_ma=13))
     board.save()
-    done = update(board, new)
+    with monkeypatch.context() as hurried:
+        hurried.setattr(Usart, "BYTE", 4 * US)  # for the time that it takes
+        done = update(board, new)
     assert (done.image, done.sequence) == (1, 1)
     assert chip.resets == [RESET_BY_PIN, RESET_BY_SOFTWARE]
     assert 0x08040000 <= chip.pc < 0x08060000
@@ -300,8 +256,8 @@ def test_the_real_firmware_updates_itself(stm32, monkeypatch: pytest.MonkeyPatch
     begin = len(chip.drivers.log)
     board.start()
     chip.run(12_000)
-    status = board.status()
-    assert (status.state, status.level_ma, status.faults) == (State.PLAYING, 13, 0)
+    assert state_of(board) == (State.PLAYING, 0)
+    assert board.status().level_ma == 13
     rows, _ = lit_rows(chip.drivers.log[begin:])
     chips = symbol_chips(symbols, link.codebook)
     expected = np.repeat(np.roll(chips, -int(chips.any(1).argmax()), axis=0), 6, axis=1)
@@ -317,21 +273,18 @@ def test_the_real_firmware_updates_itself(stm32, monkeypatch: pytest.MonkeyPatch
     assert chip.drivers.dark
     assert update_status(board).running == 1
     # power fails while it is written, and before it is sealed
-    board.session.call(UpdateBeginRequest(update_status(board).next, len(new.images[2]), 0))
-    board.session.call(UpdateWriteRequest(0, new.images[2][:400]))
-    chip.reset(RESET_BY_PIN)
-    chip.run(60_000)
-    assert update_status(connect(chip)).running == 1
+    call = board.session.call
+    call(protocol.UpdateBeginRequest(update_status(board).next, len(new.images[2]), 0))
+    call(protocol.UpdateWriteRequest(0, new.images[2][:400]))
 
     # without a crystal it answers and stays dark, at 16 MHz from power-up on; the watchdog's oscillator is as
     # fast as RM0090 allows: it bites soonest
     monkeypatch.setattr("tests.models.stm32.LSI_HZ", 47_000)
     chip.hse_works = False
     chip.reset(RESET_BY_PIN)
-    chip.run(800_000)
-    assert chip.resets[-1] == RESET_BY_PIN
+    chip.run(700_000)
+    assert chip.resets[-2:] == [RESET_BY_IWDG, RESET_BY_PIN]
     board = connect(chip)
     assert update_status(board).running == 1
-    status = board.status()
-    assert (status.state, status.faults) == (State.FAULT, BoardFault.CLOCK)
+    assert state_of(board) == (State.FAULT, BoardFault.CLOCK)
     assert chip.drivers.dark
