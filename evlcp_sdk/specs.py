@@ -15,6 +15,7 @@ from evlcp_sdk.files import read_whole
 from evlcp_sdk.spelling import nearest
 
 T = TypeVar("T")
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class SpecError(ConfigError):
@@ -53,25 +54,31 @@ def build(
     evlcp_sdk.specs.SpecError: width = 0: expected greater than 0
     hight = 3: unknown key; did you mean 'height'? (known: ...
     """
-    try:
-        values = spec_model(cls).model_validate_json(json.dumps(table, default=str))
-    except ValidationError as refused:
-        raise SpecError(_faults(cls, refused, hint)) from refused
+    values = checked(
+        spec_model(cls), table, lambda path: hint(path) or nearest(path[-1], _known_keys(cls, path[:-1]))
+    )
     return cls(**{name: getattr(values, name) for name in type(values).model_fields})
 
 
-def _faults(
-    cls: type[Any], refused: ValidationError, hint: Callable[[tuple[str, ...]], str | None]
-) -> list[tuple[tuple[str, ...], str]]:
-    """The faults of a table; of a value that may be one of several types, one for all of them."""
-    found: dict[tuple[str, ...], str] = {}
-    for error in refused.errors():
-        path, text = _fault(cls, dict(error), hint)
-        if path and _TYPE_TAG.fullmatch(path[-1]):
-            path = path[:-1]
-        text = f"{found[path]} or {text.partition(': expected ')[2]}" if path in found else text
-        found[path] = text
-    return list(found.items())
+def checked(
+    model: type[Model], table: Any, unknown: Callable[[tuple[str, ...]], str] = lambda _: ""
+) -> Model:
+    """The values of a table by a model of pydantic; `unknown` is what to say of an unknown key at a path.
+
+    Raises:
+        SpecError: Keys or values are wrong; of a value that may be one of several types, one fault for all.
+    """
+    try:
+        return model.model_validate_json(json.dumps(table, default=str))
+    except ValidationError as refused:
+        found: dict[tuple[str, ...], str] = {}
+        for error in refused.errors():
+            path, text = _fault(dict(error), unknown)
+            if path and _TYPE_TAG.fullmatch(path[-1]):
+                path = path[:-1]
+            text = f"{found[path]} or {text.partition(': expected ')[2]}" if path in found else text
+            found[path] = text
+        raise SpecError(list(found.items())) from refused
 
 
 _TYPE_TAG = re.compile(r"str|(dict|list|tuple)\[.*\]")
@@ -79,7 +86,7 @@ _TYPE_TAG = re.compile(r"str|(dict|list|tuple)\[.*\]")
 
 
 def _fault(
-    cls: type[Any], error: Mapping[str, Any], hint: Callable[[tuple[str, ...]], str | None]
+    error: Mapping[str, Any], unknown: Callable[[tuple[str, ...]], str]
 ) -> tuple[tuple[str, ...], str]:
     path, kind, value = tuple(map(str, error["loc"])), error["type"], error["input"]
     if kind == "missing":
@@ -88,8 +95,7 @@ def _fault(
     tables = all(isinstance(row, Mapping) for row in rows)
     given = "" if tables else f" = {shown(value)}"
     if kind in ("extra_forbidden", "unexpected_keyword_argument"):
-        near = hint(path) or nearest(path[-1], _known_keys(cls, path[:-1]))
-        return path, f"{given}: unknown {'table' if tables else 'key'}{near}"
+        return path, f"{given}: unknown {'table' if tables else 'key'}{unknown(path)}"
     if kind in ("dataclass_type", "model_type", "dict_type"):
         return path, f"{given}: expected a table"
     text = error["msg"].replace("Input should be", "expected", 1).replace("a valid array", "a list")

@@ -16,7 +16,7 @@ from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_sigma_px
 from evlcp_sdk.sim.scene import Scene, resolve_scene
 from evlcp_sdk.sim.simulation import Simulation
-from evlcp_sdk.sim.truth import Truth, link_table_of, truth_from_table
+from evlcp_sdk.sim.truth import SentBar, Truth, truth_from_table
 from evlcp_sdk.sim.world import camera_on_earth, sites_of
 
 Floats = NDArray[np.float64]
@@ -190,7 +190,7 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
     if "simulator" in truth:
         return resolve_scene(truth["simulator"], source="truth")
     try:
-        given, camera = truth["scene"], truth["camera"]
+        sent, given, camera = truth_from_table(truth).bars, truth["scene"], truth["camera"]
         if given["hpf_us"] != 0:
             raise ConfigError(f"truth: scene.hpf_us = {given['hpf_us']}: a high-pass filter is not modelled")
         optics = {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")}
@@ -212,7 +212,7 @@ def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
                 **_taken(given, _OF_SENSOR),
                 "hot_share": given["hot_pixels"] / (camera["width"] * camera["height"]),
             },
-            "bars": [_bar_spec_of(truth, bar, f"bars.{i}") for i, bar in enumerate(truth["bars"])],
+            "bars": [_bar_spec_of(*both, given) for both in zip(truth["bars"], sent, strict=True)],
             **_others_of(truth, given["distance_m"] / focal_px),
         }
         if given.get("wiper"):
@@ -229,17 +229,16 @@ def _taken(given: Mapping[str, Any], keys: Sequence[str], optional: Sequence[str
     return {key: given[key] for key in (*keys, *(key for key in optional if key in given))}
 
 
-def _bar_spec_of(truth: Mapping[str, Any], bar: Mapping[str, Any], where: str) -> dict[str, Any]:
-    """A bar's table of a scene; its link is what it names, or follows from what it says of its frames."""
+def _bar_spec_of(bar: Mapping[str, Any], sent: SentBar, given: Mapping[str, Any]) -> dict[str, Any]:
+    """A bar's table of a scene, from its row of the truth and what that means."""
     found = _taken(
         bar,
         ("x_m", "y_m", "z_m", "width_m", "ppm", "led_w_m2", "start_chip"),
         ("chips_file", "lean_deg", "tilt_deg", "covered", "cover_s", "pole_s"),
     )
-    link = bar.get("link")
-    found["link"] = link_table_of(bar, "truth", where) if link is None else truth["links"][link]["table"]
-    if truth["scene"].get("led_w_m2_all"):
-        found["led_w_m2"] = truth["scene"]["led_w_m2_all"]
+    found["link"] = {section: dict(keys) for section, keys in sent.link.table.items()}
+    if given.get("led_w_m2_all"):
+        found["led_w_m2"] = given["led_w_m2_all"]
     if bar["symbols"]:
         found["symbols"] = bar["symbols"]
     return found

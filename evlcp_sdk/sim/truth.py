@@ -1,12 +1,13 @@
 """The truth beside a recording: what each bar sent, with which link, and where it was in the image."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
@@ -14,13 +15,12 @@ from evlcp_sdk.files import read_json
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite, resolve_sites
+from evlcp_sdk.specs import SpecError, checked
 
 Floats = NDArray[np.float64]
 
 _DARK_W_M2 = 1e-6
 """Light up to which a bar counts as dark."""
-
-_PAYLOADS = ("symbols", "data", "messages")
 
 _MOST = 1e18
 """Size of the largest number that a truth holds: microseconds since 1970 are 1e15."""
@@ -180,8 +180,59 @@ def truth_from_table(
     Raises:
         InputError: It is not a scene's truth, or names codes that are not those of this installation.
     """
-    return _Reader(source, registry).truth(table, links)
+    try:
+        found = checked(_TruthTable, table)
+    except SpecError as refused:
+        raise InputError(f"{source}: not a scene's truth: {refused.lines()[0].strip()}") from refused
+    t_us, n = np.array(found.t_s) * 1e6, len(found.t_s)
+    if not n or (np.diff(t_us) <= 0).any():
+        raise _fault(source, "t_s", found.t_s, "rising times, one at the least")
+    for key, lists in (("distance_m", found.distance_m), ("bar_centre_px", found.bar_centre_px)):
+        if len(lists) < len(found.bars):
+            raise _fault(source, key, lists, f"one list a bar, {len(found.bars)}")
+    warnings: list[str] = []
+    if links is None:
+        links = _links_of(found, registry, source, warnings)
+    bars = []
+    for i, row in enumerate(found.bars):
+        where, (columns, rows), depths = f"bars.{i}", found.bar_centre_px[i], found.distance_m[i]
+        for key, values in (("bar_centre_px", columns), ("bar_centre_px", rows), ("distance_m", depths)):
+            if len(values) != n:
+                raise _fault(source, f"{key}.{i}", values, f"{n} numbers, one a time of t_s")
+        if row.link is None and not links:
+            link = _resolved(_link_table_of(row, where, source), registry, where, source)
+        elif (row.link or "") in links:
+            link = links[row.link or ""]
+        else:
+            raise _fault(source, f"{where}.link", row.link, "the digest of one of the links")
+        bars.append(_sent_bar(row, where, source, link, np.array([columns, rows]).T, np.array(depths)))
+    try:
+        path = {key: np.array(values) for key, values in found.camera_path.items()}
+    except ValueError as fault:
+        raise _fault(source, "camera_path", found.camera_path, "lists of one length") from fault
+    rest = {key: value for key, value in table.items() if key not in _READ}
+    rest["bars"] = tuple(
+        {
+            key: value
+            for key, value in row.items()
+            if key not in _OWN and (key not in _OF_LINK or row.get("chips_file") is not None)
+        }
+        for row in table["bars"]
+    )
+    return Truth(
+        t0_us=int(found.scene.t0_us),
+        duration_us=found.scene.duration_s * 1e6,
+        t_us=t_us,
+        bars=tuple(bars),
+        sites=_sites_of(found, source),
+        camera_path=path,
+        table=rest,
+        warnings=tuple(warnings),
+    )
 
+
+_READ = ("bars", "t_s", "distance_m", "bar_centre_px", "links", "sites", "camera_path")
+"""Keys of the table that a `Truth` holds itself."""
 
 _OWN = ("link", "symbols", "start_chip", "ppm", "payload", "covered", "cover_s", "pole_s")
 """Keys of a bar's table that `SentBar` holds, and those that follow from its link."""
@@ -210,247 +261,152 @@ def _table_of(bar: SentBar) -> dict[str, Any]:
     }
 
 
-class _Reader:
-    """Checks the values of a truth; every fault names its place."""
+_Number = Annotated[float, Field(ge=-_MOST, le=_MOST)]
+_Count = Annotated[int, Field(ge=1, le=2**32)]
+_Cluster = Annotated[int, Field(ge=0, le=2**32)]
 
-    def __init__(self, source: str, registry: Registry | None) -> None:
-        self._source = source
-        self._registry = registry
-        self._warnings: list[str] = []
 
-    def truth(self, table: Any, links: Mapping[str, Link] | None = None) -> Truth:
-        wanted = ("bar_centre_px", "bars", "distance_m", "scene", "t_s")
-        missing = [key for key in wanted if not isinstance(table, Mapping) or key not in table]
-        if missing:
-            raise InputError(f"{self._source}: not a scene's truth: {', '.join(missing)} missing")
-        scene, rows = self._table(table["scene"], "scene"), self._list(table["bars"], "bars")
-        t_us = self._numbers(table["t_s"], "t_s", 1) * 1e6
-        n = len(t_us)
-        if not n or (np.diff(t_us) <= 0).any():
-            raise self._fault("t_s", table["t_s"], "rising times, one at the least")
-        for key in ("distance_m", "bar_centre_px"):
-            if len(self._list(table[key], key)) < len(rows):
-                raise self._fault(key, table[key], f"one list a bar, {len(rows)}")
-        if links is None:
-            links = self._links(self._table(table.get("links") or {}, "links"))
-        bars = []
-        for i, row in enumerate(rows):
-            depth = self._numbers(table["distance_m"][i], f"distance_m.{i}", 1, n)
-            centre = self._numbers(table["bar_centre_px"][i], f"bar_centre_px.{i}", 2, 2, n).T
-            bars.append(self._bar(self._table(row, f"bars.{i}"), f"bars.{i}", links, centre, depth))
-        path = self._table(table.get("camera_path", {}), "camera_path")
-        rest = {
-            key: value
-            for key, value in table.items()
-            if key not in (*wanted, "links", "sites", "camera_path") or key == "scene"
-        }
-        rest["bars"] = tuple(
-            {
-                key: value
-                for key, value in row.items()
-                if key not in _OWN and (key not in _OF_LINK or row.get("chips_file") is not None)
-            }
-            for row in rows
-        )
-        return Truth(
-            t0_us=int(self._number(scene, "t0_us", "scene.")),
-            duration_us=self._number(scene, "duration_s", "scene.", least=0.0) * 1e6,
-            t_us=t_us,
-            bars=tuple(bars),
-            sites=self._sites(table.get("sites", [])),
-            camera_path={
-                key: self._numbers(values, f"camera_path.{key}", None) for key, values in path.items()
-            },
-            table=rest,
-            warnings=tuple(self._warnings),
-        )
+class _Table(BaseModel):
+    model_config = ConfigDict(extra="allow", strict=True, allow_inf_nan=False)
 
-    def _bar(
-        self, row: Mapping[str, Any], where: str, links: Mapping[str, Link], centre: Floats, depth: Floats
-    ) -> SentBar:
-        digest = row.get("link")
-        if digest is None and not links:
-            link = self._resolved(link_table_of(row, self._source, where), where)
-        elif isinstance(digest, str) and digest in links:
-            link = links[digest]
-        else:
-            raise self._fault(f"{where}.link", digest, "the digest of one of the links")
-        ppm = self._number(row, "ppm", f"{where}.", -_MOST_PPM, _MOST_PPM)
-        light = row.get("led_w_m2")
-        lit = light is None or self._number(row, "led_w_m2", f"{where}.") > _DARK_W_M2
-        clusters = link.codebook.clusters
-        payload = row.get("payload") or "symbols"
-        if payload not in _PAYLOADS:
-            raise self._fault(f"{where}.payload", payload, f"one of {', '.join(_PAYLOADS)}")
-        return SentBar(
-            link=link,
-            symbols=self._symbols(row, where, link),
-            start_chip=self._number(row, "start_chip", f"{where}.", least=0.0),
-            ppm=ppm,
-            payload=payload,
-            sends_frames=lit and row.get("chips_file") is None,
-            lit=lit,
-            centre_px=centre,
-            distance_m=depth,
-            covered=tuple(self._spans(row, "covered", where, 1, clusters)[:, 0].astype(int).tolist()),
-            cover_s=tuple(
-                (a, b, int(first), int(last))
-                for a, b, first, last in self._spans(row, "cover_s", where, 4, clusters).tolist()
-            ),
-            pole_s=tuple((a, b) for a, b in self._spans(row, "pole_s", where, 2, clusters).tolist()),
-        )
 
-    def _links(self, given: Mapping[str, Any]) -> dict[str, Link]:
-        found = {}
-        for digest, value in given.items():
-            where = f"links.{digest[:12]}"
-            entry = self._table(value, where)
-            table = self._table(entry.get("table"), f"{where}.table")
-            link = self._resolved(table, where)
-            if link.codebook.digest != entry.get("codebook"):
-                raise InputError(
-                    f"{self._source}: {where}.codebook = {str(entry.get('codebook'))[:12]}: its settings give"
-                    f" {link.codebook.digest[:12]} here{self._revisions(entry, link)};"
-                    " install the versions it was sent with"
-                )
-            if link.digest != digest:
-                self._warnings.append(
-                    f"{self._source}: {where}: resolves to {link.digest[:12]} here"
-                    f"{self._revisions(entry, link)}; the codes are the same"
-                )
-            found[digest] = link
-        return found
+class _SceneTable(_Table):
+    t0_us: _Number
+    duration_s: Annotated[float, Field(ge=0, le=_MOST)]
 
-    def _resolved(self, table: Mapping[str, Any], where: str) -> Link:
-        if self._registry is None:
-            self._registry = Registry.load()
-        try:
-            return resolve(table, self._registry)
-        except EvlcpError as refused:
-            first = str(refused).splitlines()[0]
-            raise InputError(f"{self._source}: {where}: not a link here: {first}") from refused
 
-    def _revisions(self, entry: Mapping[str, Any], link: Link) -> str:
-        """Which algorithms have another revision here than in the file."""
-        given = entry.get("revisions")
-        given = given if isinstance(given, Mapping) else {}
+class _BarTable(_Table):
+    """A bar, which says its link; or, in a file of another generator, its profile, clusters and frames."""
+
+    symbols: list[list[list[_Cluster]]]
+    start_chip: Annotated[float, Field(ge=0, le=_MOST)]
+    ppm: Annotated[float, Field(ge=-_MOST_PPM, le=_MOST_PPM)]
+    payload: Literal["symbols", "data", "messages"] | None = None
+    led_w_m2: _Number | None = None
+    chips_file: Any = None
+    covered: list[_Cluster] | None = None
+    cover_s: list[tuple[_Number, _Number, _Cluster, _Cluster]] | None = None
+    pole_s: list[tuple[_Number, _Number]] | None = None
+    link: str | None = None
+    profile: str | None = None
+    clusters: _Count = 16
+    frames: _Count | None = None
+    pilot_every: _Count = 1
+    length_m: _Number | None = None
+
+
+class _LinkTable(_Table):
+    table: dict[str, Any]
+    codebook: str
+    revisions: dict[str, Any] = {}
+
+
+class _TruthTable(_Table):
+    scene: _SceneTable
+    bars: list[_BarTable]
+    t_s: list[_Number]
+    distance_m: list[list[_Number]]
+    bar_centre_px: list[tuple[list[_Number], list[_Number]]]
+    links: dict[str, _LinkTable] | None = None
+    sites: list[Any] | None = None
+    camera_path: dict[str, list[_Number] | list[list[_Number]]] = {}
+
+
+def _fault(source: str, where: str, value: Any, wanted: str) -> InputError:
+    return InputError(f"{source}: not a scene's truth: {where} = {value!r:.40}: expected {wanted}")
+
+
+def _sent_bar(
+    row: _BarTable, where: str, source: str, link: Link, centre_px: Floats, distance_m: Floats
+) -> SentBar:
+    covered, cover_s = row.covered or [], row.cover_s or []
+    clusters, frames, top = link.codebook.clusters, link.packet.frames, len(link.codebook.codewords) - 1
+    for key, numbers in (("covered", covered), ("cover_s", [k for *_, a, b in cover_s for k in (a, b)])):
+        if max(numbers, default=0) >= clusters:
+            raise _fault(source, f"{where}.{key}", getattr(row, key), f"clusters 0 to {clusters - 1}")
+    wanted = f"packets of {frames} frames of {clusters} symbols, 0 to {top}"
+    if {len(packet) for packet in row.symbols} - {frames} or {
+        len(frame) for packet in row.symbols for frame in packet
+    } - {clusters}:
+        raise _fault(source, f"{where}.symbols", row.symbols, wanted)
+    symbols = np.array(row.symbols, np.int64).reshape(-1, frames, clusters)
+    for q, f, k in np.argwhere(symbols > top)[:1].tolist():
+        raise _fault(source, f"{where}.symbols.{q}.{f}.{k}", int(symbols[q, f, k]), f"0 to {top}")
+    lit = row.led_w_m2 is None or row.led_w_m2 > _DARK_W_M2
+    return SentBar(
+        link=link,
+        symbols=symbols,
+        start_chip=row.start_chip,
+        ppm=row.ppm,
+        payload=row.payload or "symbols",
+        sends_frames=lit and row.chips_file is None,
+        lit=lit,
+        centre_px=centre_px,
+        distance_m=distance_m,
+        covered=tuple(covered),
+        cover_s=tuple(cover_s),
+        pole_s=tuple(row.pole_s or ()),
+    )
+
+
+def _links_of(
+    truth: _TruthTable, registry: Registry | None, source: str, warnings: list[str]
+) -> dict[str, Link]:
+    """The links of a truth by digest; what fits this installation but for the digest is a warning."""
+    found = {}
+    for digest, entry in (truth.links or {}).items():
+        where = f"links.{digest[:12]}"
+        link = _resolved(entry.table, registry, where, source)
         other = [
-            f"{role} {link.table[role]['id']} {given.get(role)} there, {here} here"
+            f"{role} {link.table[role]['id']} {entry.revisions.get(role)} there, {here} here"
             for role, here in link.revisions.items()
-            if given.get(role) != here
+            if entry.revisions.get(role) != here
         ]
-        return f" (revisions: {'; '.join(other)})" if other else ""
+        revisions = f" (revisions: {'; '.join(other)})" if other else ""
+        if link.codebook.digest != entry.codebook:
+            raise InputError(
+                f"{source}: {where}.codebook = {entry.codebook[:12]}: its settings give"
+                f" {link.codebook.digest[:12]} here{revisions}; install the versions it was sent with"
+            )
+        if link.digest != digest:
+            warnings.append(
+                f"{source}: {where}: resolves to {link.digest[:12]} here{revisions}; the codes are the same"
+            )
+        found[digest] = link
+    return found
 
-    def _symbols(self, row: Mapping[str, Any], where: str, link: Link) -> NDArray[np.int64]:
-        frames, clusters = link.packet.frames, link.codebook.clusters
-        if "symbols" not in row:
-            raise InputError(f"{self._source}: {where}.symbols: missing")
-        given, top = row["symbols"], len(link.codebook.codewords)
-        wanted = f"packets of {frames} frames of {clusters} symbols, 0 to {top - 1}"
-        if isinstance(given, list) and not given:
-            return np.empty((0, frames, clusters), np.int64)
-        try:
-            symbols = np.array(given)
-        except ValueError as fault:
-            raise self._fault(f"{where}.symbols", given, wanted) from fault
-        if symbols.shape[1:] != (frames, clusters) or symbols.dtype.kind != "i":
-            raise self._fault(f"{where}.symbols", given, wanted)
-        for q, f, k in np.argwhere((symbols < 0) | (symbols >= top))[:1].tolist():
-            raise self._fault(f"{where}.symbols.{q}.{f}.{k}", int(symbols[q, f, k]), f"0 to {top - 1}")
-        return symbols.astype(np.int64)
 
-    def _sites(self, given: Any) -> tuple[BarSite, ...]:
-        if not self._list(given, "sites"):
-            return ()
-        try:
-            return resolve_sites({"bar": given}, source=f"{self._source}: not a scene's truth: sites")
-        except ConfigError as refused:
-            raise InputError(str(refused).splitlines()[0]) from refused
+def _resolved(table: Mapping[str, Any], registry: Registry | None, where: str, source: str) -> Link:
+    try:
+        return resolve(table, registry)
+    except EvlcpError as refused:
+        first = str(refused).splitlines()[0]
+        raise InputError(f"{source}: {where}: not a link here: {first}") from refused
 
-    def _spans(self, row: Mapping[str, Any], key: str, where: str, columns: int, clusters: int) -> Floats:
-        given = row.get(key) or []
-        rows = [[v] for v in given] if columns == 1 and isinstance(given, list) else given
-        found = self._numbers(rows, f"{where}.{key}", None)
-        if not found.size:
-            return np.empty((0, columns))
-        if found.ndim != 2 or found.shape[1] != columns:
-            raise self._fault(f"{where}.{key}", given, f"a list of lists of {columns} numbers")
-        # Behind the times, or alone, stand numbers of clusters.
-        numbers = found[:, 2:] if columns > 1 else found
-        if ((numbers < 0) | (numbers >= clusters) | (numbers % 1 != 0)).any():
-            raise self._fault(f"{where}.{key}", given, f"clusters 0 to {clusters - 1}")
-        return found
 
-    def _table(self, value: Any, where: str) -> Mapping[str, Any]:
-        if not isinstance(value, Mapping):
-            raise self._fault(where, value, "a table")
-        return value
-
-    def _list(self, value: Any, where: str) -> Sequence[Any]:
-        if not isinstance(value, list | tuple):
-            raise self._fault(where, value, "a list")
-        return value
-
-    def _number(
-        self,
-        table: Mapping[str, Any],
-        key: str,
-        before: str = "",
-        least: float = -_MOST,
-        most: float = _MOST,
-    ) -> float:
-        value = table.get(key)
-        wanted = "a number" if least == -_MOST else f"a number, at least {least:g}"
-        if key not in table:
-            raise InputError(f"{self._source}: {before}{key}: missing; expected {wanted}")
-        if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-            wanted += "" if most == _MOST else f" and at most {most:g}"
-            raise self._fault(before + key, value, wanted)
-        return value
-
-    def _numbers(self, given: Any, where: str, ndim: int | None, *shape: int) -> Floats:
-        wanted = f"finite numbers, {' x '.join(map(str, shape))}" if shape else "a list of finite numbers"
-        try:
-            found = np.array(given, np.float64)
-        except (TypeError, ValueError, OverflowError) as fault:
-            raise self._fault(where, given, wanted) from fault
-        right = ndim is None or (found.ndim == ndim and (not shape or found.shape == shape))
-        if not right or not (np.abs(found) <= _MOST).all():
-            raise self._fault(where, given, wanted)
-        return found
-
-    def _fault(self, where: str, value: Any, wanted: str) -> InputError:
-        return InputError(f"{self._source}: not a scene's truth: {where} = {value!r:.40}: expected {wanted}")
+def _sites_of(truth: _TruthTable, source: str) -> tuple[BarSite, ...]:
+    if not truth.sites:
+        return ()
+    try:
+        return resolve_sites({"bar": truth.sites}, source=f"{source}: not a scene's truth: sites")
+    except ConfigError as refused:
+        raise InputError(str(refused).splitlines()[0]) from refused
 
 
 _LEDS_PER_CLUSTER = 6
 
 
-def link_table_of(row: Mapping[str, Any], source: str, where: str) -> dict[str, Any]:
-    """The link's table of a bar that says its profile, clusters and frames instead of a link.
-
-    Args:
-        row: The bar's table.
-        source: What faults name as their file.
-        where: What faults name as the bar.
-
-    Raises:
-        InputError: A value is missing or not what it should be.
-    """
-    reader = _Reader(source, None)
-    clusters, frames, every = (
-        reader._number({"pilot_every": 1, "clusters": 16, **row}, key, f"{where}.", least=1)
-        for key in ("clusters", "frames", "pilot_every")
-    )
-    profile = row.get("profile")
-    if not isinstance(profile, str):
-        raise InputError(f"{source}: {where}.profile = {profile!r}: expected a modulation's id, or a link")
-    leds = _LEDS_PER_CLUSTER * int(clusters)
+def _link_table_of(row: _BarTable, where: str, source: str) -> dict[str, Any]:
+    """The link's table of a bar that says its profile, clusters and frames instead of a link."""
+    for key, value in (("profile", row.profile), ("frames", row.frames)):
+        if value is None:
+            raise InputError(f"{source}: {where}.{key}: missing; expected it, or a link")
+    leds = _LEDS_PER_CLUSTER * row.clusters
     bar: dict[str, Any] = {"rows": leds, "cluster_rows": _LEDS_PER_CLUSTER}
-    if "length_m" in row:
-        bar["led_pitch_m"] = round(reader._number(row, "length_m", f"{where}.") / leds, 9)
+    if row.length_m is not None:
+        bar["led_pitch_m"] = round(row.length_m / leds, 9)
     return {
-        "modulation": {"id": profile},
+        "modulation": {"id": row.profile},
         "bar": bar,
-        "air": {"frames_per_packet": frames, "pilot_every": every},
+        "air": {"frames_per_packet": row.frames, "pilot_every": row.pilot_every},
     }

@@ -201,7 +201,7 @@ def test_other_links_are_scored_as_plain_loops_score_them(name: str, tmp_path: P
 
 
 GOOD = ",".join(COLUMNS[:6]) + "\n"
-TRUE = '{"scene": {}, "bars": 3, "t_s": [], "distance_m": [], "bar_centre_px": []}'
+TRUE = '{"scene": {"t0_us": 0, "duration_s": 1}, "bars": 3, "t_s": [], "distance_m": [], "bar_centre_px": []}'
 
 
 SCENE = json.dumps(truth_of(Scene(duration_s=0.05)).to_table())
@@ -217,8 +217,8 @@ SCENE = json.dumps(truth_of(Scene(duration_s=0.05)).to_table())
         (f"{GOOD}0,1,1 x,,0,0\n", "{}", None, 3, "frames.csv: line 2: symbols = 'x': expected a whole"),
         (f"{GOOD}0,1,1,inf,0,0\n", "{}", None, 3, "line 2: distance_m = 'inf': expected a number"),
         (f"{GOOD}0,1,1,-1e308,0,0\n", "{}", None, 3, "distance_m = '-1e308': expected at most"),
-        (GOOD, "{}", None, 3, "not a scene's truth: bar_centre_px, bars, distance_m, scene, t_s"),
-        (GOOD, "[]", None, 3, "not a scene's truth"),
+        (GOOD, "{}", None, 3, "not a scene's truth: scene: missing"),
+        (GOOD, "[]", None, 3, "t.json: not a scene's truth: = []: expected a table"),
         (GOOD, TRUE, None, 3, "t.json: not a scene's truth: bars = 3: expected a list"),
         (GOOD, "{", None, 3, "not JSON"),
         (GOOD, None, None, 3, "cannot be read"),
