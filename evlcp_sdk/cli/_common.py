@@ -1,6 +1,7 @@
 """What the commands share: their options, where jobs run, what goes to stderr."""
 
 import gc
+import json
 import logging
 import os
 import sys
@@ -63,6 +64,11 @@ Dask = Annotated[
 def echo(text: str, *, nl: bool = True) -> None:
     """Print a text on stdout; what it has of names and texts from outside moves no cursor."""
     typer.echo(printable(text), nl=nl)
+
+
+def print_json(value: object, indent: int | None = None) -> None:
+    """Print a value as JSON on stdout: one line, unless indented."""
+    echo(json.dumps(value, indent=indent))
 
 
 class _Complaints(logging.Handler):

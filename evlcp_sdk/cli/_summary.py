@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from evlcp_sdk.cli._common import console, echo
+from evlcp_sdk.cli._common import console, print_json
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.spelling import counted
 
@@ -25,7 +25,7 @@ def print_end(
     if lines is not None:
         lines(json.dumps({"line": "summary"} | summary))
     if as_json:
-        echo(json.dumps(summary))
+        print_json(summary)
     elif lines is None or not lines.gone or folder is not None:
         show(summary, folder, stderr=lines is not None)
     if summary["status"] in ("failed", "degraded"):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, echo
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, console, print_json
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
@@ -40,8 +40,6 @@ def calibrate(
     position_sigma_m, heading_deg, pitch_deg, roll_deg, attitude_sigma_deg. What the views do not
     determine keeps its configured value, and is named.
     """
-    import json
-
     from evlcp_sdk import run
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.place.poses import read_poses
@@ -56,7 +54,7 @@ def calibrate(
         recordings, bars, known, link, registry=registry, limit_px=limit_px, name=str(poses)
     )
     if as_json:
-        echo(json.dumps(_table(found) | {"poses": len(known)}))
+        print_json(_table(found) | {"poses": len(known)})
     else:
         console().print(_toml(found, len(known)))
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, console, echo
+from evlcp_sdk.cli._common import Json, LinkFile, console, print_json
 
 if TYPE_CHECKING:
     from evlcp_sdk.link.resolve import Link
@@ -71,8 +71,6 @@ def check(
 
 
 def _check_link(link_file: str | None, overrides: Sequence[str], as_json: bool) -> None:
-    import json
-
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.testing.suite import check_link
 
@@ -94,7 +92,7 @@ def _check_link(link_file: str | None, overrides: Sequence[str], as_json: bool) 
             {"role": role, "id": None if role == "link" else link.table[role]["id"]} | _law(outcome)
             for role, outcome in found
         ]
-        echo(json.dumps({"link": link.digest, "failed": failed, "laws": laws}, indent=2))
+        print_json({"link": link.digest, "failed": failed, "laws": laws}, 2)
     else:
         console().print(f"{link_file or 'the default link'}: {_counted(outcomes)}")
     raise typer.Exit(1 if failed else 0)
@@ -108,8 +106,6 @@ def _check_one(
     excuses: Sequence[str],
     as_json: bool,
 ) -> None:
-    import json
-
     from evlcp_sdk.errors import ConfigError, PluginError
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.spelling import unhinted
@@ -132,20 +128,18 @@ def _check_one(
     outcomes = [_alone(outcome, role, id) for outcome in hold(role, algorithm, reasons, link)]
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     if as_json:
-        echo(
-            json.dumps(
-                {
-                    "role": role,
-                    "id": id,
-                    "distribution": entry.distribution,
-                    "version": entry.version,
-                    "link": link.digest,
-                    "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
-                    "failed": failed,
-                    "laws": [_law(outcome) for outcome in outcomes],
-                },
-                indent=2,
-            )
+        print_json(
+            {
+                "role": role,
+                "id": id,
+                "distribution": entry.distribution,
+                "version": entry.version,
+                "link": link.digest,
+                "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
+                "failed": failed,
+                "laws": [_law(outcome) for outcome in outcomes],
+            },
+            2,
         )
     else:
         _show(outcomes, max(len(o.law.name) for o in outcomes))

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, echo
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, echo, print_json
 
 
 class CodebookForm(StrEnum):
@@ -33,8 +33,6 @@ def config(
     See what a change does:    [bold]evlcp config -c link.toml --set modulation.id=wh8 --digest[/]
     Codes for the transmitter: [bold]evlcp config --codebook c > codebook.h[/]
     """
-    import json
-
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.link.text import to_toml
     from evlcp_sdk.plugin.registry import Registry
@@ -58,6 +56,6 @@ def config(
             "revisions": link.revisions,
             "configuration": link.table,
         }
-        echo(json.dumps(table, indent=2))
+        print_json(table, 2)
     else:
         echo(to_toml(link, registry), nl=False)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, bytes_bar, echo
+from evlcp_sdk.cli._common import Json, bytes_bar, echo, print_json
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.spelling import counted
 
@@ -41,8 +41,6 @@ def convert(
     From HDF5:                [bold]evlcp convert REC.hdf5 --size 1280x720 -o REC.raw[/]
     A camera, until Ctrl-C:   [bold]evlcp convert camera: -o REC.raw[/]
     """
-    import json
-
     from evlcp_sdk.errors import InputError, UnpluggedError
     from evlcp_sdk.io.urls import sides
     from evlcp_sdk.run import convert as run_convert
@@ -57,7 +55,7 @@ def convert(
     with stop_on_request() as stopped, bytes_bar(Path(url).name) as advance:
         told = run_convert(url, out, size=given, format=format, advance=advance, stopped=stopped)
     if as_json:
-        echo(json.dumps({"out": str(out)} | told))
+        print_json({"out": str(out)} | told)
     else:
         counts = told["counts"]
         lost = [f"{one['count']} {one['meaning']}" for one in told["losses"].values()]

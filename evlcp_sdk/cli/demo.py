@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from evlcp_sdk.cli._common import Json, Workers, console, echo
+from evlcp_sdk.cli._common import Json, Workers, console, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -59,7 +59,6 @@ def demo(
 
 
 def _drive(out: Path, workers: int | None, as_json: bool) -> None:
-    import json
     from contextlib import suppress
     from dataclasses import replace
 
@@ -100,7 +99,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
         outputs.write_text(page(summary), out / "report.html")
         outputs.commit()
     if as_json:
-        echo(json.dumps(summary.to_dict()))
+        print_json(summary.to_dict())
         return
     show_drive(summary)
     console().print(f"written: {out}/report.html, ber.png, rmse.png and more, {results}", style="dim")
@@ -140,7 +139,6 @@ def show_drive(summary: Summary) -> None:
 
 
 def _decode_recording(out: Path, as_json: bool) -> None:
-    import json
 
     from evlcp_sdk.cli._summary import show
     from evlcp_sdk.run import receive_to_folder
@@ -155,7 +153,7 @@ def _decode_recording(out: Path, as_json: bool) -> None:
     # The rows as they are written, which `evlcp score` reads, too.
     found = score_frames(read_frames(out), read_truth(truth_file))
     if as_json:
-        echo(json.dumps(summary | {"score": found}))
+        print_json(summary | {"score": found})
         return
     _show_frames(out / "frames.csv")
     show(summary, out)

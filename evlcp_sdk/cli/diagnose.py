@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, echo
+from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, print_json
 
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.diagnose import Diagnosis
@@ -34,8 +34,6 @@ def diagnose(
     Sources of light are found without a link, too: what blinks at which rate, lamps and all. Where a stage
     fails, other chip rates, modulations and lengths of a packet are tried. Ends with 0 whatever is wrong.
     """
-    import json
-
     from evlcp_sdk.diagnosis.diagnose import diagnose as run
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
@@ -52,7 +50,7 @@ def diagnose(
             outputs.write_text(page(found), out)
             outputs.commit()
     if as_json:
-        echo(json.dumps(found.to_dict()))
+        print_json(found.to_dict())
         return
     _show(found)
     if out is not None:

@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, echo
+from evlcp_sdk.cli._common import Json, print_json
 
 
 def info(
@@ -17,14 +17,12 @@ def info(
 
     Reads it once from front to back and decodes no light: [bold]evlcp info REC.raw[/]
     """
-    import json
-
     from evlcp_sdk.io.describe import describe
     from evlcp_sdk.io.open import STDIN, open_source
 
     with open_source(recording) as source:
         table = describe(source, str(source.path) if recording == STDIN else recording)
-    echo(json.dumps(table, indent=2) if as_json else _text(table))
+    print_json(table, indent=2) if as_json else _text(table)
 
 
 def _text(table: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from evlcp_sdk.cli._common import Json, echo
+from evlcp_sdk.cli._common import Json, print_json
 
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
@@ -18,12 +18,10 @@ def plugins(as_json: Json = False) -> None:
 
     Exit code 0, also when plugins are broken and left out.
     """
-    import json
-
     from evlcp_sdk.plugin.registry import Registry
 
     table = table_of(Registry.load())
-    echo(json.dumps(table, indent=2) if as_json else _text(table))
+    print_json(table, indent=2) if as_json else _text(table)
 
 
 def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Dask, bytes_bar, echo, hush, make_executor, progress_bar
+from evlcp_sdk.cli._common import Dask, bytes_bar, hush, make_executor, print_json, progress_bar
 from evlcp_sdk.cli._complain import complain
 from evlcp_sdk.cli._receiving import CameraOptions, LinePrinter, LinkOptions, PlaceOptions, ResultOptions
 from evlcp_sdk.cli._summary import print_end
@@ -166,7 +165,7 @@ def _print_failure(outcome: Outcome[ReceiveJob, dict[str, Any]], *, as_json: boo
     message = outcome.fault.message if outcome.fault else "no result"
     complain(message)
     if as_json:
-        echo(json.dumps({"status": "failed", "error": message, "recording": {"path": outcome.job.url}}))
+        print_json({"status": "failed", "error": message, "recording": {"path": outcome.job.url}})
 
 
 def _exit_code(outcomes: Sequence[Outcome[ReceiveJob, dict[str, Any]]], *, strict: bool) -> int:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console, echo
+from evlcp_sdk.cli._common import Json, console, echo, print_json
 from evlcp_sdk.cli._tables import print_table
 
 if TYPE_CHECKING:
@@ -40,8 +40,6 @@ def report(
 
     The page needs no network. A campaign that still runs can be looked at, too.
     """
-    import json
-
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.report.drawing import save_plots
     from evlcp_sdk.study.campaign.charts import charts_of
@@ -61,7 +59,7 @@ def report(
             outputs.write_text(page(summary), out)
         outputs.commit()
     if as_json:
-        echo(json.dumps(summary.to_dict(), indent=1))
+        print_json(summary.to_dict(), 1)
     elif markdown:
         echo(as_markdown(summary))
     else:

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console, echo
+from evlcp_sdk.cli._common import Json, console, print_json
 from evlcp_sdk.cli._complain import complain
 
 
@@ -27,8 +27,6 @@ def score(
 
     A result of another link than that of the truth is refused.
     """
-    import json
-
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.sim.truth import read_truth
     from evlcp_sdk.study.frames import read_frames
@@ -47,7 +45,7 @@ def score(
         complain(warning)
     found = score_frames(frames, truth, links if len(links) > 1 else None)
     if as_json:
-        echo(json.dumps(found))
+        print_json(found)
         return
     screen = console()
     screen.print(f"rows {found['rows']}, matching no true frame {found['unmatched']}")

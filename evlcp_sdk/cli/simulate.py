@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, console, echo, progress_bar
+from evlcp_sdk.cli._common import Json, console, echo, print_json, progress_bar
 from evlcp_sdk.spelling import counted
 
 
@@ -70,12 +70,11 @@ def simulate(
 
 
 def _list_presets(*, as_json: bool) -> None:
-    import json
 
     from evlcp_sdk.sim import preset_names, preset_text
 
     if as_json:
-        echo(json.dumps(preset_names()))
+        print_json(preset_names())
         return
     for name in preset_names():
         comments = (line.lstrip("# ") for line in preset_text(name).splitlines() if line.startswith("#"))
@@ -111,7 +110,6 @@ def _render(
     as_json: bool,
 ) -> None:
     """Render a scene into files, and say how that went."""
-    import json
     import time
 
     from evlcp_sdk.errors import ConfigError
@@ -139,7 +137,7 @@ def _render(
         "events_per_s": round(counts["events"] / elapsed_s),
     }
     if as_json:
-        echo(json.dumps(summary))
+        print_json(summary)
         return
     screen = console()
     screen.print(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, echo
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, console, print_json
 from evlcp_sdk.cli._receiving import PlaceOptions
 from evlcp_sdk.spelling import counted
 
@@ -76,7 +76,6 @@ def survey(
 
 def _write(found: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
     """Write the sites, and say which they are."""
-    import json
     from dataclasses import asdict
 
     from evlcp_sdk.files import Outputs
@@ -92,7 +91,7 @@ def _write(found: Sequence[SurveyedBar], out: Path, *, as_json: bool) -> None:
             | ({"contradicted": bar.contradicted} if bar.contradicted else {})
             for bar in found
         ]
-        echo(json.dumps({"bars": bars}))
+        print_json({"bars": bars})
     else:
         for bar in found:
             console().print(_line(bar))

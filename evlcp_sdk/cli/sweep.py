@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from evlcp_sdk.cli._campaign import campaign_bar, show_faults
-from evlcp_sdk.cli._common import Dask, Json, Workers, console, echo, make_executor
+from evlcp_sdk.cli._common import Dask, Json, Workers, console, make_executor, print_json
 
 
 def sweep(
@@ -46,7 +46,6 @@ def sweep(
     A result is kept as soon as it is there: stopped or killed at any moment, the same command goes on.
     One process a core, or as many as you say.
     """
-    import json
     from dataclasses import asdict
 
     from evlcp_sdk.errors import InterruptedRunError
@@ -75,7 +74,7 @@ def sweep(
     show_faults(progress)
     if as_json:
         numbers = {k: v for k, v in asdict(progress).items() if k != "faults"}
-        echo(json.dumps({"results": str(path), **numbers, "failed": len(progress.faults)}))
+        print_json({"results": str(path), **numbers, "failed": len(progress.faults)})
     else:
         console().print(
             f"{plan.name}: {progress.done} of {progress.tasks} tasks,"

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, echo
+from evlcp_sdk.cli._common import Json, LinkFiles, Overrides, bytes_bar, console, print_json
 from evlcp_sdk.spelling import counted
 
 
@@ -54,8 +54,6 @@ def video(
     number and distance. Browsers show both WebP and GIF; .mp4, for all other
     programs, takes the extra: [bold]pip install 'evlcp-sdk[mp4]'[/]
     """
-    import json
-
     from evlcp_sdk.link.several import load_links
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import film
@@ -76,7 +74,7 @@ def video(
             advance=advance,
         )
     if as_json:
-        echo(json.dumps(told))
+        print_json(told)
     else:
         _show(told, Path(recording).name)
 

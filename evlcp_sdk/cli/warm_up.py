@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from evlcp_sdk.cli._common import Json, console, echo, progress_bar
+from evlcp_sdk.cli._common import Json, console, print_json, progress_bar
 
 
 def warm_up(as_json: Json = False) -> None:
@@ -13,7 +13,6 @@ def warm_up(as_json: Json = False) -> None:
 
     In an image, before workers start:  [bold]evlcp warm-up[/]
     """
-    import json
     from dataclasses import asdict
 
     from evlcp_sdk.spelling import counted
@@ -22,7 +21,7 @@ def warm_up(as_json: Json = False) -> None:
     with progress_bar("compiling") as advance:
         warmth = warm(lambda step: advance(STEPS.index(step), len(STEPS)))
     if as_json:
-        echo(json.dumps(asdict(warmth) | {"kept_in": warmth.kept_in and str(warmth.kept_in)}))
+        print_json(asdict(warmth) | {"kept_in": warmth.kept_in and str(warmth.kept_in)})
         return
     if not warmth.compiled:
         console().print(f"nothing to compile; tried in {warmth.elapsed_s:.1f} s")
