@@ -719,6 +719,49 @@ def _shine(
             part[i] += room.halo[a, h, 0, i]
 
 
+@njit
+def _pick_entries(line: TimeLine, mask: Any, stride: int, mine: Array) -> int:
+    """The entries that a batch sees, into `mine`: of its sources, and every so many poses; how many."""
+    own = 0
+    for e in range(line.t_us.size):
+        what = line.kind[e]
+        if what == -2:
+            takes = line.pose[e] % stride == 0
+        else:
+            takes = what == -1 or (mask >> np.uint64(what)) & np.uint64(1) != np.uint64(0)
+        mine[own] = e
+        own += takes
+    return own
+
+
+@njit(fastmath={"contract"})
+def _look_around(lanes: int, f: Array, pose: int, scenery: Scenery) -> None:
+    """The light of the background and the dark current on each lane: bilinear in the periodic texture."""
+    field, last = scenery.field, scenery.field.shape[0] - 1
+    for i in range(lanes):
+        u, v = f[_X + i] + scenery.turn_px[pose, 0], f[_Y + i] + scenery.turn_px[pose, 1]
+        below, right = math.floor(v), math.floor(u)
+        down, aside = v - below, u - right
+        i0, j0 = int(below) & last, int(right) & last
+        i1, j1 = (i0 + 1) & last, (j0 + 1) & last
+        top = field[i0, j0] + aside * (field[i0, j1] - field[i0, j0])
+        low = field[i1, j0] + aside * (field[i1, j1] - field[i1, j0])
+        f[_AROUND + i] = scenery.light[1] + scenery.light[0] * (top + down * (low - top))
+
+
+@njit
+def _begin_new(pixels: int, batch: Batch, sensor: Array) -> None:
+    """Pixels that were not active before are at rest in their light, and armed."""
+    f = batch.f
+    for i in range(pixels):
+        if f[_NEW + i] > 0.0:
+            now = f[_TOTAL + i]
+            f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = now, 1.0 / now, math.log(now)
+            f[_READY + i], f[_ARMED + i] = -1e18, 1.0
+            f[_REFERENCE + i] = f[_FOLLOWER + i] if sensor[12] > 0.0 else f[_U + i]
+            batch.draw[i] += 1
+
+
 @njit(fastmath={"contract"})
 def _run_batch(
     size: tuple[int, int],
@@ -736,23 +779,11 @@ def _run_batch(
     lanes, _ = size
     mask, stride = of_batch
     f, poses, many = batch.f, scenery.turn_px.shape[0], 0
-    field, last = scenery.field, scenery.field.shape[0] - 1
     for g in range(strips.gain.size):
         if (mask >> np.uint64(g)) & np.uint64(1):
             lit[many] = g
             many += 1
-    # The entries that it sees: of its sources, and every so many poses.
-    own = 0
-    for e in range(line.t_us.size):
-        what = line.kind[e]
-        if what == -2:
-            takes = line.pose[e] % stride == 0
-        else:
-            takes = what == -1 or (mask >> np.uint64(what)) & np.uint64(1) != np.uint64(0)
-        if takes:
-            mine[own] = e
-            own += 1
-    pose = -1
+    own, pose = _pick_entries(line, mask, stride, mine), -1
     for q in range(own):
         e = mine[q]
         t_us, until = line.t_us[e], line.t_us[mine[q + 1]] if q + 1 < own else end_us
@@ -760,16 +791,7 @@ def _run_batch(
         # Where the sources are in the middle of these poses.
         here = min(pose + stride // 2, poses - 1)
         if before < 0 or pose // scenery.every != before // scenery.every:
-            for i in range(lanes):
-                # Bilinear in the periodic texture.
-                u, v = f[_X + i] + scenery.turn_px[pose, 0], f[_Y + i] + scenery.turn_px[pose, 1]
-                below, right = math.floor(v), math.floor(u)
-                down, aside = v - below, u - right
-                i0, j0 = int(below) & last, int(right) & last
-                i1, j1 = (i0 + 1) & last, (j0 + 1) & last
-                top = field[i0, j0] + aside * (field[i0, j1] - field[i0, j0])
-                low = field[i1, j0] + aside * (field[i1, j1] - field[i1, j0])
-                f[_AROUND + i] = scenery.light[1] + scenery.light[0] * (top + down * (low - top))
+            _look_around(lanes, f, pose, scenery)
         for i in range(lanes):
             f[_TOTAL + i] = f[_AROUND + i]
         for a in range(many):
@@ -784,14 +806,7 @@ def _run_batch(
             for i in range(lanes):
                 f[_TOTAL + i] = scenery.light[1] + shade * (f[_TOTAL + i] - scenery.light[1])
         if q == 0:
-            for i in range(size[1]):
-                if f[_NEW + i] > 0.0:
-                    # At rest, armed.
-                    now = f[_TOTAL + i]
-                    f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = now, 1.0 / now, math.log(now)
-                    f[_READY + i], f[_ARMED + i] = -1e18, 1.0
-                    f[_REFERENCE + i] = f[_FOLLOWER + i] if model.sensor[12] > 0.0 else f[_U + i]
-                    batch.draw[i] += 1
+            _begin_new(size[1], batch, model.sensor)
         redraw = int(line.kind[e] >= 0)
         for i in range(lanes):
             total, now = f[_TOTAL + i], f[_NOW + i]
@@ -918,6 +933,33 @@ def drop_blind(words: Array, begin_us: float, blind_us: Array, width: int, refra
 
 
 @njit
+def _take_row(waits: Array, row: int) -> int:
+    """The next row whose bit of `waits` is set, from `row` on and then from 0; it is cleared."""
+    place = row >> 6
+    bits = waits[place] >> np.uint64(row & 63) << np.uint64(row & 63)
+    while bits == np.uint64(0):
+        place = place + 1 if place + 1 < waits.size else 0
+        bits = waits[place]
+    lowest = bits & (~bits + np.uint64(1))
+    waits[place] ^= lowest
+    return place << 6 | int(_PLACES[(lowest * np.uint64(0x03F79D71B4CB0A89)) >> np.uint64(58)])
+
+
+@njit
+def _keep_waiting(words: Array, follow: Array, seen: int, pending: Array) -> int:
+    """Move the words that are not served, or not seen yet, to the front; how many these are."""
+    left = 0
+    for m in range(words.size):
+        if m >= seen or follow[m] != _SERVED:
+            if pending.size > 0:
+                _, y, x = _parts_of(words[m])
+                pending[y, x] = False
+            words[left] = words[m]
+            left += 1
+    return left
+
+
+@njit
 def read_out(
     words: Array,
     times_us: tuple[float, float, float],
@@ -983,15 +1025,7 @@ def read_out(
             due = begin_us + _parts_of(words[np.uint64(i)])[0] * (1.0 / TICKS) if i < size else math.inf
         if waiting == 0:
             continue
-        at_row += 1
-        place = at_row >> 6
-        bits = waits[place] >> np.uint64(at_row & 63) << np.uint64(at_row & 63)
-        while bits == np.uint64(0):
-            place = place + 1 if place + 1 < waits.size else 0
-            bits = waits[place]
-        lowest = bits & (~bits + np.uint64(1))
-        waits[place] ^= lowest
-        at_row = place << 6 | _PLACES[(lowest * np.uint64(0x03F79D71B4CB0A89)) >> np.uint64(58)]
+        at_row = _take_row(waits, at_row + 1)
         free += row_us
         stamp = math.floor(free)
         if stamp >= window_end:
@@ -1026,13 +1060,6 @@ def read_out(
             n += 1
     for j in range(n):
         out_x[j], out_p[j] = together[j] >> 32, together[j] & 1
-    left = 0
-    for m in range(size):
-        if m >= i or follow[m] != _SERVED:
-            if hold:
-                _, y, x = _parts_of(words[m])
-                pending[y, x] = False
-            words[left] = words[m]
-            left += 1
+    left = _keep_waiting(words, follow, i, pending)
     memory[0], memory[1], memory[2], memory[3] = free, at_row, window, used
     return n, dropped, held, left

@@ -32,11 +32,7 @@ def blur_of(depth_m: float, lens: LensSpec, camera: CameraModel, more_px: float 
     other = math.hypot(_defocus_px(depth_m, lens, camera), lens.blur_px, more_px)
     if not lens.wings:
         return Blur(np.array([math.hypot(blur_sigma_px(depth_m, lens, camera), more_px)]), np.ones(1))
-    return airy_blur(_wavelength_um(lens) * lens.f_number / camera.pitch_um, other)
-
-
-def _wavelength_um(lens: LensSpec) -> float:
-    return lens.wavelength_nm * 1e-3
+    return airy_blur(lens.wavelength_nm * 1e-3 * lens.f_number / camera.pitch_um, other)
 
 
 def _defocus_px(depth_m: float, lens: LensSpec, camera: CameraModel) -> float:
@@ -54,7 +50,7 @@ def blur_sigma_px(depth_m: float, lens: LensSpec, camera: CameraModel) -> float:
     >>> round(blur_sigma_px(50.0, LensSpec(), CameraModel()), 3)
     0.376
     """
-    diffraction_px = 0.42 * _wavelength_um(lens) * lens.f_number / camera.pitch_um
+    diffraction_px = 0.42 * (lens.wavelength_nm * 1e-3) * lens.f_number / camera.pitch_um
     return math.hypot(diffraction_px, _defocus_px(depth_m, lens, camera), lens.blur_px)
 
 

@@ -521,7 +521,12 @@ def resolve_scene(
     except ConfigError as refused:
         raise ConfigError(f"{before}{refused}") from refused
     if folder is not None:
-        scene = _with_folder(scene, folder)
+        # File names are relative to the scene's own folder.
+        path = scene.motion.path_file and str(folder / scene.motion.path_file)
+        bars = (
+            replace(bar, chips_file=bar.chips_file and str(folder / bar.chips_file)) for bar in scene.bars
+        )
+        scene = replace(scene, bars=tuple(bars), motion=replace(scene.motion, path_file=path))
     links_of(scene, registry, source=source)
     return scene
 
@@ -652,17 +657,6 @@ def _hint(path: tuple[str, ...]) -> str | None:
     """What to say of an unknown key that a bar's link has."""
     instead = _IN_LINK.get(path[-1]) if path[0] == "bars" else None
     return f"; its link says it: bars.link.{instead}" if instead else None
-
-
-def _with_folder(scene: Scene, folder: Path) -> Scene:
-    """File names, which are relative to the scene's own folder, made good."""
-
-    def found(name: str | None) -> str | None:
-        return None if name is None else str(folder / name)
-
-    bars = tuple(replace(bar, chips_file=found(bar.chips_file)) for bar in scene.bars)
-    motion = replace(scene.motion, path_file=found(scene.motion.path_file))
-    return replace(scene, bars=bars, motion=motion)
 
 
 def _parse_override(text: str) -> tuple[str, Any]:

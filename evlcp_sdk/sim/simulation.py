@@ -75,13 +75,6 @@ def seed_key(seed: int) -> np.uint64:
     return np.uint64((seed * 0x9E3779B97F4A7C15 + 0x632BE59BD9B4E019) & _MASK64)
 
 
-def pixel_model(sensor: SensorSpec, seed: int) -> _kernels.PixelModel:
-    """What the pixels of a sensor have in common."""
-    quantiles = quantile_table()
-    shifts = np.exp(sensor.noise_ln * quantiles)
-    return _kernels.PixelModel(seed_key(seed), sensor_vector(sensor), quantiles, shifts)
-
-
 def request_words(t_us: Floats, code: NDArray[np.int32], begin_us: float) -> NDArray[np.int64]:
     """Requests as words, their times since `begin_us` to the nearest tick, int64 (n,)."""
     ticks = np.rint((t_us - begin_us) * _kernels.TICKS).astype(np.int64)
@@ -313,6 +306,11 @@ class Simulation:
         threads: Threads that share the pixels; the events do not depend on it.
         registry: Where the algorithms of its links are found; None for all that are installed.
 
+    Attributes:
+        counts: Events written and dropped so far; signal events are counted before the readout.
+        hot_pixels: How many pixels are hot.
+        done_s: How much of the scene is rendered, s.
+
     Raises:
         ConfigError: The scene cannot be rendered.
         InputError: One of its files cannot be read.
@@ -331,9 +329,19 @@ class Simulation:
         strips = [strip for bar in self.bars for strip in (*bar.strips, *bar.images)]
         self._sources: list[Source] = [*strips, *self.lamps]
         self.path = CameraPath(scene.motion, scene.duration_s, scene.seed)
-        self._check_ahead()
+        _, depth = project(
+            np.array([bar.centre_m for bar in self.bars]).reshape(-1, 3), *self.path.at([0.0]), scene.camera
+        )
+        for i in np.flatnonzero(depth[0] <= NEAREST_M):
+            raise ConfigError(
+                f"bars.{i}: the bar is behind the camera as the scene starts (depth {depth[0, i]:.2f} m)"
+            )
         self._threads = max(1, threads)
-        self._model = pixel_model(scene.sensor, scene.seed)
+        quantiles = quantile_table()
+        shifts = np.exp(scene.sensor.noise_ln * quantiles)
+        self._model = _kernels.PixelModel(
+            seed_key(scene.seed), sensor_vector(scene.sensor), quantiles, shifts
+        )
         self._texture = _texture(scene)
         self._darkest_texture = float(self._texture.min())
         self._ends_m = np.array([s.strip.cuts_m()[[0, -1]] for s in self._sources]).reshape(-1, 3)
@@ -341,7 +349,8 @@ class Simulation:
         self._state = np.zeros((size, 8))
         self._counters = np.zeros((size, 3), np.int64)
         rng = np.random.default_rng([scene.seed, 0x40])
-        self._hot = rng.choice(size, rng.binomial(size, scene.sensor.hot_share), replace=False)
+        self.hot_pixels = int(rng.binomial(size, scene.sensor.hot_share))
+        self._hot = rng.choice(size, self.hot_pixels, replace=False)
         self._halos = [_Halo.of(scene.lens.halo, scene.lens.halo_px, 0)]
         # A halo of few pixels follows the image; a wide one changes little while it moves for 4 ms.
         self._texture_every = max(1, round(scene.background.texture_step_px / MOTION_STEP_PX))
@@ -357,37 +366,10 @@ class Simulation:
         )
         self._near_share = 1 - sum(halo.share for halo in self._halos)
         self._wide_reach = max(halo.reach_px for halo in self._halos)
-        self._counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
-        self._done_us = 0.0
+        self.counts = dict.fromkeys(("events", "signal_events", "dropped_by_rate_cap", "dropped_blind"), 0)
+        self.done_s = 0.0
         self._stretch: _Stretch | None = None
         self._looks: dict[int, _Look] = {}
-
-    def _check_ahead(self) -> None:
-        centres = np.array([bar.centre_m for bar in self.bars]).reshape(-1, 3)
-        _, depth = project(centres, *self.path.at([0.0]), self.scene.camera)
-        for i in np.flatnonzero(depth[0] <= NEAREST_M):
-            raise ConfigError(
-                f"bars.{i}: the bar is behind the camera as the scene starts (depth {depth[0, i]:.2f} m)"
-            )
-
-    @property
-    def counts(self) -> dict[str, int]:
-        """Events written and dropped so far; signal events are counted before the readout."""
-        return dict(self._counts)
-
-    @property
-    def hot_pixels(self) -> int:
-        """How many pixels are hot."""
-        return len(self._hot)
-
-    @property
-    def done_s(self) -> float:
-        """How much of the scene is rendered, s."""
-        return self._done_us * 1e-6
-
-    def count(self, what: str, more: int) -> None:
-        """Add to one of the counts."""
-        self._counts[what] += more
 
     def stream(self) -> Iterator[Events]:
         """Yield the events in order of time, in pieces of up to a block."""
@@ -416,7 +398,7 @@ class Simulation:
 
     def _given(self, events: Events, end_us: float) -> Iterator[Events]:
         """The events up to `end_us`, if there are any."""
-        self._done_us = end_us
+        self.done_s = end_us * 1e-6
         if len(events):
             yield events
 
@@ -742,7 +724,7 @@ class _Served:
         noise_to = min(end_us if over else safe, scene_end_us)
         noise = simulation.noise(number, self._noise_from_us, noise_to)
         self._noise_from_us = end_us if over else safe
-        simulation.count("signal_events", sum(len(t) for t, _ in signal))
+        simulation.counts["signal_events"] += sum(len(t) for t, _ in signal)
         begin = number * _BLOCK_US
         later, queue = (_since(words, begin - self._begin_us) for words in (self._later, self._queue))
         self._begin_us = begin
@@ -766,9 +748,9 @@ class _Served:
             words, times_us, camera.height, limit, self._memory, self._pending, columns
         )
         self._queue = words[:left].copy()
-        simulation.count("dropped_blind", cut - kept + held)
-        simulation.count("events", written)
-        simulation.count("dropped_by_rate_cap", dropped)
+        simulation.counts["dropped_blind"] += cut - kept + held
+        simulation.counts["events"] += written
+        simulation.counts["dropped_by_rate_cap"] += dropped
         if simulation.scene.t0_us:
             columns[0][:written] += simulation.scene.t0_us
         return Events(columns[0][:written], columns[1][:written], columns[2][:written], columns[3][:written])

@@ -210,15 +210,6 @@ def truth_from_table(
         path = {key: np.array(values) for key, values in found.camera_path.items()}
     except ValueError as fault:
         raise _fault(source, "camera_path", found.camera_path, "lists of one length") from fault
-    rest = {key: value for key, value in table.items() if key not in _READ}
-    rest["bars"] = tuple(
-        {
-            key: value
-            for key, value in row.items()
-            if key not in _OWN and (key not in _OF_LINK or row.get("chips_file") is not None)
-        }
-        for row in table["bars"]
-    )
     return Truth(
         t0_us=int(found.scene.t0_us),
         duration_us=found.scene.duration_s * 1e6,
@@ -226,7 +217,7 @@ def truth_from_table(
         bars=tuple(bars),
         sites=_sites_of(found, source),
         camera_path=path,
-        table=rest,
+        table=_rest_of(table),
         warnings=tuple(warnings),
     )
 
@@ -238,6 +229,14 @@ _OWN = ("link", "symbols", "start_chip", "ppm", "payload", "covered", "cover_s",
 """Keys of a bar's table that `SentBar` holds, and those that follow from its link."""
 
 _OF_LINK = ("profile", "clusters", "frames", "pilot_every", "packet_chips")
+
+
+def _rest_of(table: Mapping[str, Any]) -> dict[str, Any]:
+    """What of a truth's table nothing else of a `Truth` holds; of chips of a file, what a link says else."""
+    rest = {key: value for key, value in table.items() if key not in _READ}
+    bars = [(row, _OWN if row.get("chips_file") is not None else _OWN + _OF_LINK) for row in table["bars"]]
+    rest["bars"] = tuple({key: row[key] for key in row if key not in held} for row, held in bars)
+    return rest
 
 
 def _table_of(bar: SentBar) -> dict[str, Any]:

@@ -69,6 +69,8 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
         latitude, longitude, height = axes.to_geodetic(
             scene_to_enu(np.array([bar.x_m, bar.y_m, bar.z_m]), world.heading_deg)
         )
+        east, north, _ = scene_to_enu(np.array(bar_towards(bar)), world.heading_deg)
+        facing = math.degrees(math.atan2(east, north)) % 360
         east, north, up = -scene_to_enu(np.array(bar_axis(bar)), world.heading_deg)
         lean = math.hypot(east, north)
         # A bar that stands upright leans nowhere.
@@ -83,7 +85,7 @@ def sites_of(scene: Scene, registry: Registry | None = None) -> tuple[BarSite, .
                 tilt_deg=math.degrees(math.atan2(lean, up)),
                 length_m=link.bar.length_m,
                 position_sigma_m=0.0,
-                facing_deg=None if link.bar.in_even_line else _azimuth(bar, world.heading_deg),
+                facing_deg=None if link.bar.in_even_line else facing,
             )
         )
     return tuple(sites)
@@ -123,19 +125,10 @@ def sites_said(scene: Scene, seed: int, registry: Registry | None = None) -> tup
 def rendered(scene: Scene) -> Scene:
     """The scene without what is only said of it: scenes for which this is the same look the same."""
     bars = tuple(replace(bar, site_off_m=(0.0, 0.0, 0.0), site_of=None) for bar in scene.bars)
-    if scene.world is not None:
-        here = {name: getattr(scene.world, name) for name in _WHERE}
-        return replace(scene, bars=bars, world=WorldSpec(**here))
-    return replace(scene, bars=bars)
-
-
-_WHERE = ("latitude_deg", "longitude_deg", "height_m", "heading_deg")
-
-
-def _azimuth(bar: BarSpec, heading_deg: float) -> float:
-    """Where a bar's LEDs shine to, clockwise from north, degrees."""
-    east, north, _ = scene_to_enu(np.array(bar_towards(bar)), heading_deg)
-    return math.degrees(math.atan2(east, north)) % 360
+    world = scene.world
+    if world is not None:
+        world = WorldSpec(world.latitude_deg, world.longitude_deg, world.height_m, world.heading_deg)
+    return replace(scene, bars=bars, world=world)
 
 
 def camera_on_earth(scene: Scene, position_m: Floats, attitude_rad: Floats) -> dict[str, Any]:
