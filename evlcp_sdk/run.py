@@ -502,7 +502,7 @@ def _run(
         status,
         **_tables_of(source, url, watch, first_us, last_us),
         counts=receiver.counts,
-        losses={kind: asdict(loss) for kind, loss in source.losses.items()},
+        losses=source.losses,
         error=error,
         lit_us=receiver.lit_us,
         link_counts=receiver.link_counts,

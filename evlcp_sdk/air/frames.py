@@ -67,6 +67,11 @@ class PacketFormat:
         """Nominal length of a chip, us."""
         return 1e6 / self.chip_rate_hz
 
+    @property
+    def packet_us(self) -> float:
+        """Nominal length of a packet, us."""
+        return self.packet_chips * self.chip_us
+
     def has_pilot(self, frame: int) -> bool:
         """Whether a frame of the packet starts with a pilot."""
         return frame % self.pilot_every == 0

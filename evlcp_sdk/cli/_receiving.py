@@ -46,9 +46,9 @@ class LinkOptions:
 
         links = load_links(self.link_files, self.overrides or [], registry)
         if len(links) > 1:
-            from evlcp_sdk.diagnosis.warnings import check_alike
+            from evlcp_sdk.diagnosis.of_light import find_alike_links
 
-            for warning in check_alike(named_links(links)):
+            for warning in find_alike_links(named_links(links)):
                 complain(f"warning: {warning}")
         loaded()
         return links

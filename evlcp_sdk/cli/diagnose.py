@@ -61,6 +61,7 @@ _STYLES = {
     "pass": ("ok", "green"),
     "doubt": ("doubt", "yellow"),
     "fail": ("fails", "bold red"),
+    "note": ("-", "dim"),
     "skip": ("-", "dim"),
 }
 
@@ -74,7 +75,7 @@ def _show(found: Diagnosis) -> None:
     stages = Table(box=None, pad_edge=False, show_header=False)
     for one in found.checks:
         word, style = _STYLES[one.verdict]
-        stages.add_row(one.stage, Text(word, style), one.said)
+        stages.add_row(one.stage, Text(word, style), one.statement)
     out.print(stages)
     if found.sources:
         sources = Table(box=None, pad_edge=False, header_style="dim")

@@ -1,7 +1,7 @@
 """Diagnosis of a recording: one pass through the receiver and past it, then what may be wrong is tried."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -9,19 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.diagnosis.checks import Check, checks_of
+from evlcp_sdk.diagnosis.checks import find_stages
 from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
 from evlcp_sdk.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
 from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import find_warnings
 from evlcp_sdk.io.open import open_source
 from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.values import Events
+from evlcp_sdk.values import Events, Packet
 
 _RATE_SHARE = 0.005
 """How far a measured rate may be off: half of that is seen where rows are read late."""
@@ -37,10 +36,9 @@ class Diagnosis:
     Attributes:
         recording: Its name.
         headline: What is wrong first of all, or that nothing is, in one line.
-        checks: The stages in the order in which light passes them.
+        checks: What each check found, by stage, in the order in which light passes them.
         sources: What blinks, most events first.
         trials: Links that were tried, the one given first.
-        warnings: What `receive` would warn of.
         counts: The receiver's counts.
         cell_px: Size of the cells of the maps, px.
         frequency_hz: What each cell blinks with, NaN where it does not, float64 (rows, columns).
@@ -50,10 +48,9 @@ class Diagnosis:
 
     recording: str
     headline: str
-    checks: tuple[Check, ...]
+    checks: tuple[Diagnostic, ...]
     sources: tuple[LightSource, ...]
     trials: tuple[Trial, ...]
-    warnings: tuple[Diagnostic, ...]
     counts: dict[str, int]
     cell_px: int
     frequency_hz: NDArray[np.float64]
@@ -65,7 +62,7 @@ class Diagnosis:
         return {
             "recording": self.recording,
             "headline": self.headline,
-            "checks": [asdict(one) for one in self.checks],
+            "checks": [{"stage": one.stage, "verdict": one.verdict} | one.to_dict() for one in self.checks],
             "sources": [
                 {
                     "kind": one.kind,
@@ -87,7 +84,6 @@ class Diagnosis:
                 }
                 for one in self.trials
             ],
-            "warnings": [warning.to_dict() for warning in self.warnings],
             "counts": self.counts,
             "duration_s": self.duration_s,
         }
@@ -115,48 +111,43 @@ def diagnose(
     registry = Registry.load() if registry is None else registry
     link = link if isinstance(link, Link) else load_link(link, registry=registry)
     name = str(source.path if isinstance(source, EventSource) else source)
-    survey, receiver, sample = LightSurvey(link.camera.width, link.camera.height), Receiver(link), _Sample()
-    tally = RunTally(link.packet)
     with source if isinstance(source, EventSource) else open_source(source, registry) as source:
         check_sensor(source, name, link.camera)
-        for events in source.chunks():
-            for packet in receiver.feed(events):
-                tally.add(packet)
-            survey.feed(events)
-            sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
+        seen = _Pass(link)
+        for _ in seen.over(source):
             advance(source.position_bytes, source.size_bytes)
-    for packet in receiver.close():
-        tally.add(packet)
+    seen.end()
+    survey, receiver = seen.survey, seen.receiver
     sources, frequency_hz = survey.found()
     facts = Facts(
         link,
-        tally,
+        seen.tally,
         receiver.counts,
         survey.first_us,
         survey.last_us,
         receiver.lit_us,
         survey.readout,
-        sum(loss.count for loss in source.losses.values()),
+        tuple(source.losses.values()),
+        guessed=source.guessed,
+        step_us=source.step_us,
         reads_messages=link.messages.decode,
         others=partial(other_codewords, link, registry),
-        events=source.counts["events"],
+        surveyed=True,
         sources=sources,
         restless=survey.restless(),
-        losses=[str(loss) for loss in source.losses.values()],
     )
-    checks = checks_of(facts)
+    checks = find_stages(facts)
     trials: tuple[Trial, ...] = ()
-    failed = any(one.verdict == "fail" for one in checks)
-    if failed and sources and not facts.at_edge and _has_preambles(receiver):
-        trials = tuple(better_links(link, sample.events(), registry, _rates(sources, link)))
-        checks = checks_of(replace(facts, trials=trials))
+    wrong = any(one.verdict == "fail" or one.code in ("codewords", "unsure") for one in checks)
+    if wrong and sources and not facts.at_edge and seen.has_preambles:
+        trials = tuple(better_links(link, seen.sample(), registry, _rates(sources, link)))
+        checks = find_stages(replace(facts, trials=trials))
     return Diagnosis(
         name,
-        _headline(checks, tally),
+        _headline(checks, seen.tally),
         tuple(checks),
         tuple(sources),
         trials,
-        tuple(find_warnings(facts)),
         receiver.counts,
         survey.cell_px,
         frequency_hz,
@@ -180,51 +171,72 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
         InputError: The source cannot be read on.
     """
     registry = Registry.load() if registry is None else registry
-    survey, receiver, sample = LightSurvey(link.camera.width, link.camera.height), Receiver(link), _Sample()
-    for events in source.chunks():
-        receiver.feed(events)
-        survey.feed(events)
-        sample.feed(events, seen=receiver.counts["regions_opened"] > 0)
-        if sample.full and sample.seen:
+    seen = _Pass(link)
+    for _ in seen.over(source):
+        if seen.sampled:
             break
-    sources, _ = survey.found()
-    if not _has_preambles(receiver):
-        return [try_link(link, sample.events())]
-    trials = better_links(link, sample.events(), registry, _rates(sources, link))
+    sources, _ = seen.survey.found()
+    if not seen.has_preambles:
+        return [try_link(link, seen.sample())]
+    trials = better_links(link, seen.sample(), registry, _rates(sources, link))
     return sorted(trials, key=lambda one: one.rank, reverse=True)
 
 
-def _has_preambles(receiver: Receiver) -> bool:
-    """Whether packets begin with a preamble: what else a link may be is tried of those only."""
-    return "preambles" in receiver.counts
+class _Pass:
+    """A recording on its way through a survey and a receiver; keeps its first events.
 
+    Attributes:
+        survey: What blinks.
+        receiver: What the link reads.
+        tally: Figures of its transmitters.
+    """
 
-class _Sample:
-    """The first events of a recording, or those from where the receiver first finds something."""
-
-    def __init__(self) -> None:
+    def __init__(self, link: Link) -> None:
+        self.survey = LightSurvey(link.camera.width, link.camera.height)
+        self.receiver = Receiver(link)
+        self.tally = RunTally(link.packet)
         self._pieces: list[Events] = []
-        self._many = 0
-        self.seen = False
+        self._begun = False
+
+    def over(self, source: EventSource) -> Iterator[None]:
+        """Take a source's events piece by piece."""
+        for events in source.chunks():
+            self._add(self.receiver.feed(events))
+            self.survey.feed(events)
+            if self.receiver.counts["regions_opened"] and not self._begun:
+                # What was found had begun to blink in the piece before.
+                self._begun, self._pieces = True, self._pieces[-1:]
+            if not self._full:
+                self._pieces.append(events)
+            yield
+
+    def end(self) -> None:
+        """Nothing comes any more."""
+        self._add(self.receiver.close())
+
+    def _add(self, packets: Iterable[Packet]) -> None:
+        for packet in packets:
+            self.tally.add(packet)
 
     @property
-    def full(self) -> bool:
-        first = self._pieces[0].t_us[0] if self._pieces else 0
-        last = self._pieces[-1].t_us[-1] if self._pieces else 0
-        return self._many >= MOST_EVENTS or bool(last - first > _TRIAL_US)
+    def _full(self) -> bool:
+        pieces = self._pieces
+        long_us = pieces[-1].t_us[-1] - pieces[0].t_us[0] if pieces else 0
+        return sum(map(len, pieces)) >= MOST_EVENTS or bool(long_us > _TRIAL_US)
 
-    def feed(self, events: Events, *, seen: bool) -> None:
-        if seen and not self.seen:
-            self.seen = True
-            # What was found had begun to blink in the piece before.
-            self._pieces = self._pieces[-1:]
-            self._many = sum(map(len, self._pieces))
-        if not self.full:
-            self._pieces.append(events)
-            self._many += len(events)
+    @property
+    def sampled(self) -> bool:
+        """Whether there is enough to try other links on, from where something blinks."""
+        return self._begun and self._full
 
-    def events(self) -> Events:
+    def sample(self) -> Events:
+        """The first events, or those from where the receiver first finds something."""
         return Events.concat(self._pieces)[:MOST_EVENTS]
+
+    @property
+    def has_preambles(self) -> bool:
+        """Whether packets begin with a preamble: what else a link may be is tried of those only."""
+        return "preambles" in self.receiver.counts
 
 
 def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:
@@ -246,10 +258,9 @@ def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:
     return rates
 
 
-def _headline(checks: list[Check], tally: RunTally) -> str:
-    wrong = next((one for one in checks if one.verdict == "fail"), None)
-    if wrong is None:
-        doubts = [one for one in checks if one.verdict == "doubt"]
-        but = f"; but {doubts[0].said}" if doubts else ""
-        return f"it is read: {tally.headline()}{but}"
-    return f"{wrong.stage}: {wrong.said}"
+def _headline(checks: Sequence[Diagnostic], tally: RunTally) -> str:
+    for one in checks:
+        if one.verdict == "fail":
+            return f"{one.stage}: {one.text}"
+    but = next((f"; but {one.text}" for one in checks if one.verdict == "doubt"), "")
+    return f"it is read: {tally.headline()}{but}"

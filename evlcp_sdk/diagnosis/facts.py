@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,7 @@ from evlcp_sdk.diagnosis.tallies import SURE, RunTally
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.source import Loss
 
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.light import LightSource
@@ -39,23 +40,33 @@ some hundred."""
 _BESIDE = 0.1
 """Events of a source, of those of the largest, below which it is the halo of a lamp rather than a bar."""
 
-_ASIDE_M = 1e-9
-"""Way from a bar's first cluster to its last, in one direction, below which there is none."""
-
 _EDGE_PX = 8
 """Seam of the picture: a source that comes so near may go on outside."""
 
 
+BRIGHTER = (
+    "more light: nearer, a wider aperture, brighter LEDs, or a more sensitive sensor (lower bias_diff_on and"
+    " bias_diff_off, faster pixels by bias_fo)"
+)
+"""What to try where there is too little light."""
+
+Verdict = Literal["pass", "note", "doubt", "fail", "skip"]
+"""Of a check: passed; a plain statement; wrong, though frames may be read; wrong in any case; not reached."""
+
+
 @dataclass(frozen=True)
 class Diagnostic:
-    """Something that looks wrong, or a plain statement of what there was none of.
+    """What a check finds: something that looks wrong, a plain statement, or the count by which it is passed.
 
     Attributes:
-        code: What it is, in a word or two, e.g. `frames-rejected`; the same in every version.
+        code: What is wrong, in a word or two, e.g. `frames-rejected`; the same in every version. Empty for
+            nothing.
         text: The same in words, with the counts that say so.
         next_step: What to try; empty where there is nothing to do.
         transmitter: Number of the transmitter that it is about; None for all of the recording.
         link: Where there are several links, name of the one that it is about; empty for none of them.
+        verdict: What became of the check.
+        stage: The stage of the receiver that it belongs to.
 
     >>> print(Diagnostic("clock", "its clock is 900 ppm off", "try another rate", 0))
     transmitter 0: its clock is 900 ppm off: try another rate
@@ -66,16 +77,31 @@ class Diagnostic:
     next_step: str = ""
     transmitter: int | None = None
     link: str = ""
+    verdict: Verdict = "doubt"
+    stage: str = ""
 
     def __str__(self) -> str:
+        return f"{self.statement}: {self.next_step}" if self.next_step else self.statement
+
+    @property
+    def statement(self) -> str:
+        """The text, and what it is about."""
         whose = f"link {self.link}: " if self.link else ""
-        whose += "" if self.transmitter is None else f"transmitter {self.transmitter}: "
-        return f"{whose}{self.text}" + (f": {self.next_step}" if self.next_step else "")
+        return f"{whose}{'' if self.transmitter is None else f'transmitter {self.transmitter}: '}{self.text}"
 
     def to_dict(self) -> dict[str, Any]:
-        """The same as JSON values."""
-        found = asdict(self)
-        return found if self.link else {key: value for key, value in found.items() if key != "link"}
+        """The same as JSON values, without verdict and stage."""
+        found = {
+            "code": self.code,
+            "text": self.text,
+            "next_step": self.next_step,
+            "transmitter": self.transmitter,
+        }
+        return found | ({"link": self.link} if self.link else {})
+
+
+Found = Iterator[Diagnostic | str]
+"""What a check gives: what it finds wrong, or the count by which it is passed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,7 +117,7 @@ class Facts:
         lit_us: Of each transmitter, from when until when frames of it were due and its light was there, by
             number, us.
         readout: Events in each millisecond; None where they were not counted.
-        lost: Events and words that the source could not use.
+        losses: Events and words that the source could not use.
         guessed: What the recording does not say and was guessed; empty for nothing.
         step_us: What all its times are multiples of, us; 0 where nobody looked.
         skipped: Silences beside damage that a replay did not wait for, and their time, us.
@@ -99,10 +125,9 @@ class Facts:
         others: Codewords of other modulations by id, uint8 (symbols, chips); asked where it matters.
         positions: Figures of the positions; empty where none were computed.
         parts: Where there are several links, what is known of each, by name.
-        events: How many events there are. This and what follows is what `diagnose` knows beside.
+        surveyed: Whether somebody looked for what blinks, as `diagnose` does; the rest is what that found.
         sources: What blinks, by events.
         restless: Box of where far more happens than elsewhere, px; None for nowhere.
-        losses: What the reader skipped, in words.
         trials: Links that were tried, the one given first.
     """
 
@@ -113,7 +138,7 @@ class Facts:
     last_us: float = math.nan
     lit_us: Mapping[int, tuple[float, float]] | None = None
     readout: ReadoutTally | None = None
-    lost: int = 0
+    losses: Sequence[Loss] = ()
     guessed: str = ""
     step_us: int = 0
     skipped: tuple[int, int] = (0, 0)
@@ -121,10 +146,9 @@ class Facts:
     others: Callable[[], Mapping[str, NDArray[np.uint8]]] = dict
     positions: Mapping[str, Any] = field(default_factory=dict)
     parts: Mapping[str, Facts] = field(default_factory=dict)
-    events: int = 0
+    surveyed: bool = False
     sources: Sequence[LightSource] = ()
     restless: tuple[int, int, int, int] | None = None
-    losses: Sequence[str] = ()
     trials: Sequence[Trial] = ()
 
     @property
@@ -134,14 +158,14 @@ class Facts:
         return length_us if length_us > 0 else 0.0
 
     @property
-    def peak_mev_s(self) -> float:
-        """Events a second in the fullest millisecond, in millions; 0 where they were not counted."""
-        return self.readout.capped()[1] / 1e3 if self.readout is not None else 0.0
-
-    @property
     def blocks_read(self) -> int:
         """Packets with a block that can be read, alone or with others."""
         return self.counts.get("blocks_decoded", 0) + self.counts.get("blocks_combined", 0)
+
+    @property
+    def positions_tried(self) -> int:
+        """Positions of bars, given or refused."""
+        return int(self.positions["fixes"] + sum(self.positions["refused"].values())) if self.positions else 0
 
     @property
     def bar(self) -> LightSource | None:
@@ -168,12 +192,12 @@ class Facts:
     @property
     def reads(self) -> bool:
         """Whether most frames are accepted."""
-        frames, rejected = self.counts["frames"], self.counts.get("frames_rejected", 0)
+        frames, rejected = self.counts.get("frames", 0), self.counts.get("frames_rejected", 0)
         if frames >= _FEW and frames >= _ACCEPTED_SHARE * (frames + rejected):
             return True
         # What is no bar may lose its frames elsewhere in the picture.
         form = self.link.packet
-        sent = form.frames / (form.packet_chips * form.chip_us * 1e-6) * self.duration_us * 1e-6
+        sent = form.frames * self.duration_us / form.packet_us
         return any(
             one.frames >= max(_FEW, _ACCEPTED_SHARE * (one.last_frame - one.first_frame + 1), _MOST * sent)
             for one in self.tally.own
@@ -182,7 +206,7 @@ class Facts:
     @property
     def some_frames(self) -> bool:
         """Whether some frames are accepted: more than chance gives."""
-        return self.counts["frames"] >= _FEW
+        return self.counts.get("frames", 0) >= _FEW
 
     @property
     def sure(self) -> bool:
@@ -194,6 +218,10 @@ class Facts:
         """Another link that fits, the best of those tried."""
         fit = [trial for trial in self.trials if trial.changes and trial.fits and trial.quality >= SURE]
         return max(fit, key=lambda one: one.rank, default=None)
+
+    def better_value(self, key: str) -> Any:
+        """What that link has other in a `table.key`; None where it does not, or there is none."""
+        return None if self.better is None else dict(self.better.changes).get(key)
 
     @property
     def cluster_px(self) -> float:
@@ -216,15 +244,6 @@ class Facts:
         step_m = min(math.dist(centres_m[0], other) for other in centres_m[1:])
         return math.dist(centres_m[0], centres_m[-1]) / step_m
 
-    @property
-    def order(self) -> tuple[int, int]:
-        """1 where columns, and rows, of clusters grow as in the bar, -1 where they fall, 0 unknown."""
-        centres_m = self.link.bar.cluster_centres_m()
-        way_m = centres_m[-1] - centres_m[0]
-        along_px = np.sum([one.along_px for one in self.tally.own], 0) if self.tally.own else np.zeros(2)
-        right, down = np.sign(along_px * np.where(np.abs(way_m) > _ASIDE_M, way_m, 0.0)).astype(int).tolist()
-        return right, down
-
 
 def has_rate(source: LightSource, rate_hz: float) -> bool:
     """Whether a source may have a rate, or a multiple of it."""
@@ -245,3 +264,8 @@ def other_codewords(link: Link, registry: Registry) -> dict[str, NDArray[np.uint
         except EvlcpError:
             continue
     return found
+
+
+def in_ms(t_us: float) -> str:
+    """A time, in words."""
+    return f"{t_us * 1e-3:.0f} ms" if t_us < 1e7 else f"{t_us * 1e-6:.1f} s"

@@ -234,7 +234,7 @@ class RunTally:
         self.covered_us = 0.0
         self._messages: OrderedDict[tuple[int, int, int], ReceivedMessage] = OrderedDict()
         forms = {"": form} if isinstance(form, PacketFormat) else form
-        self._packets_us = {name: one.packet_chips * one.chip_us for name, one in forms.items()}
+        self._packets_us = {name: one.packet_us for name, one in forms.items()}
         self._until_us = -math.inf
 
     def add(self, packet: Packet) -> None:

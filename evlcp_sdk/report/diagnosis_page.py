@@ -12,7 +12,13 @@ from evlcp_sdk.report.pages import render_page
 
 _MOST_SOURCES = 40
 
-_MARKS = {"pass": ("yes", "ok"), "doubt": ("no", "doubt"), "fail": ("no", "fails"), "skip": ("note", "-")}
+_MARKS = {
+    "pass": ("yes", "ok"),
+    "doubt": ("no", "doubt"),
+    "fail": ("no", "fails"),
+    "note": ("note", "-"),
+    "skip": ("note", "-"),
+}
 """How a verdict looks, and what is written for it."""
 
 
@@ -48,7 +54,7 @@ def page(diagnosis: Diagnosis) -> str:
         name=name,
         diagnosis=diagnosis,
         marks=_MARKS,
-        steps=[one for one in diagnosis.checks if one.next_step and one.verdict != "skip"],
+        steps=[one for one in diagnosis.checks if one.next_step and one.verdict in ("doubt", "fail")],
         events_png=_png(_events_image(diagnosis.events_map)),
         frequency_png=_png(_frequency_image(diagnosis.frequency_hz)),
         width=width,

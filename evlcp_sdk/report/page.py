@@ -145,9 +145,7 @@ class Report(Sink):
             name=self.run.name,
             summary=summary,
             figures=self._headline(summary),
-            warnings=[
-                (Diagnostic(**{**one, "next_step": ""}), one["next_step"]) for one in summary["warnings"]
-            ],
+            warnings=[Diagnostic(**one) for one in summary["warnings"]],
             notes=[Diagnostic(**one) for one in summary["notes"]],
             counts={name: value for name, value in summary["counts"].items() if value},
             motions=motions,

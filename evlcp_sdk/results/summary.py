@@ -2,16 +2,17 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from typing import Any, Literal
 
+from evlcp_sdk.diagnosis.checks import run_checks
 from evlcp_sdk.diagnosis.facts import Facts
-from evlcp_sdk.diagnosis.warnings import find_notes, find_warnings
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import output_fault
 from evlcp_sdk.formatting import characters
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
+from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.results.folder import ResultFolder
 
 Status = Literal["complete", "degraded", "interrupted", "failed"]
@@ -39,7 +40,7 @@ class RunEnd:
     recording: Mapping[str, Any] = field(default_factory=dict)
     processing: Mapping[str, Any] = field(default_factory=dict)
     counts: Mapping[str, int] = field(default_factory=dict)
-    losses: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    losses: Mapping[str, Loss] = field(default_factory=dict)
     error: str | None = None
     lit_us: Mapping[int, tuple[float, float]] | None = None
     live: Mapping[str, Any] | None = None
@@ -62,7 +63,7 @@ def summary_of(
         sinks: What sinks say, by name; those that say nothing are left out.
         pps: Pulses of UTC, and the rate of the camera's clock by them; None where nobody asked.
     """
-    tally = facts.tally
+    tally, found = facts.tally, run_checks(facts)
     if facts.parts:
         described = {"links": {name: _describe(one.link) | _found(one) for name, one in facts.parts.items()}}
     else:
@@ -77,9 +78,9 @@ def summary_of(
         "counts": dict(facts.counts),
         "messages": tally.messages(),
         "messages_off": None if facts.reads_messages else messages_off(facts.link),
-        "warnings": [warning.to_dict() for warning in find_warnings(facts)],
-        "notes": [note.to_dict() for note in find_notes(facts)],
-        "losses": {kind: dict(loss) for kind, loss in end.losses.items()},
+        "warnings": [one.to_dict() for one in found if one.verdict in ("doubt", "fail")],
+        "notes": [one.to_dict() for one in found if one.verdict == "note"],
+        "losses": {kind: asdict(loss) for kind, loss in end.losses.items()},
         **described,
         "versions": dict(versions),
         **({"positions": dict(facts.positions)} if facts.positions else {}),

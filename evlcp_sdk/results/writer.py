@@ -174,7 +174,7 @@ class ResultWriter:
             math.nan if last_us is None else last_us,
             end.lit_us,
             self._readout,
-            sum(loss["count"] for loss in end.losses.values()),
+            tuple(end.losses.values()),
             guessed=str(recording.get("guessed", "")),
             step_us=recording.get("step_us", 0),
             skipped=(read.get("silences_skipped", 0), read.get("silences_skipped_us", 0)),

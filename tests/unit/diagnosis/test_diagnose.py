@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 
 from evlcp_sdk.cli._app import make_app
 from evlcp_sdk.diagnosis import _kernels
-from evlcp_sdk.diagnosis.checks import checks_of
+from evlcp_sdk.diagnosis.checks import find_stages
 from evlcp_sdk.diagnosis.diagnose import Diagnosis, diagnose, infer_link
 from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey, comb
@@ -56,7 +56,7 @@ def code_of(diagnosis: Diagnosis) -> str:
     [
         ("", {}),
         ("far", {"motion.distance_m": 400.0}),
-        ("no-negative", {"sensor.p_off_miss": 0.98}),
+        ("one-polarity", {"sensor.p_off_miss": 0.98}),
         ("refractory", {"sensor.refr_us": 300.0}),
         ("dim", {"bars.0.led_w_m2": 0.1}),
         ("dim", {"bars.0.led_w_m2": 0.1, "seed": 5}),
@@ -79,7 +79,7 @@ def test_what_is_wrong_is_named(code: str, changes: dict[str, Any]) -> None:
     [
         ("rate", ("air.chip_rate_hz=8000",), "--set air.chip_rate_hz=8000"),
         ("profile", ("modulation.id=wh8",), "--set modulation.id=wh8"),
-        ("frames-per-packet", ("air.frames_per_packet=7",), "--set air.frames_per_packet=7"),
+        ("link", ("air.frames_per_packet=7",), "--set air.frames_per_packet=7"),
     ],
 )
 def test_what_a_link_has_wrong_is_found_and_said(code: str, sent: tuple[str, ...], step: str) -> None:
@@ -152,10 +152,12 @@ def judged(
         one = tally.transmitters[0] = TransmitterTally(10, 34_600.0)
         one.frames, one.quality_sum, one.first_frame, one.last_frame = frames, quality * frames, 0, frames - 1
         one.values.update(range(64))
+        one.ranged = frames
         one.last_px = 410.0, 375.0
     counts = dict.fromkeys(("preambles", "regions_opened"), 3)
     counts |= {"frames": frames, "frames_rejected": rejected}
-    checks = checks_of(Facts(LINK, tally, counts, 0.0, duration_us, events=10**6, sources=sources))
+    counts["events"] = 10**6
+    checks = find_stages(Facts(LINK, tally, counts, 0.0, duration_us, surveyed=True, sources=sources))
     wrong = [one for one in checks if one.verdict in ("fail", "doubt")]
     assert all(one.next_step for one in wrong)
     return wrong[0].code if wrong else ""
@@ -190,7 +192,7 @@ SLOW = replace(BAR, kind="lamp", rate_hz=2360.0, strength=0.6, typical_us=814.0,
         ("short", BAR, {"rejected": 2, "duration_us": 4e4}),
         ("", BAR, {"frames": 8, "duration_us": 4e4}),
         # Of a bar 300 m away, the image of a column of LEDs is wider than two clusters are long.
-        ("frames", replace(BAR, wide_px=4.5, high_px=25.0), {"rejected": 30}),
+        ("frames-rejected", replace(BAR, wide_px=4.5, high_px=25.0), {"rejected": 30}),
         ("dim", replace(BAR, rises=568, events=1330), {}),
     ],
 )
@@ -280,7 +282,7 @@ def test_picture_upside_down_is_noticed(tmp_path: Path) -> None:
     write_events(tmp_path / "turned.raw", turned, 1280, 720)
     with open_source(tmp_path / "turned.raw") as source:
         diagnosis = diagnose(source, LINK)
-    assert code_of(diagnosis) == "upside-down"
+    assert code_of(diagnosis) == "turned"
     assert diagnosis.counts["frames_rejected"] == 0
 
 

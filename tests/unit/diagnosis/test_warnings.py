@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 
-from evlcp_sdk.diagnosis.facts import Facts, other_codewords
+from evlcp_sdk.diagnosis.checks import run_checks
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.diagnosis.warnings import find_notes, find_warnings
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
 
 LINK = load_link()
@@ -55,6 +56,14 @@ def tally_of(
     return tally
 
 
+def find_warnings(facts: Facts) -> list[Diagnostic]:
+    return [one for one in run_checks(facts) if one.verdict in ("doubt", "fail")]
+
+
+def find_notes(facts: Facts) -> list[Diagnostic]:
+    return [one for one in run_checks(facts) if one.verdict == "note"]
+
+
 def told(tally: RunTally, link: Link = LINK, **counts: int) -> list[str]:
     return [str(doubt) for doubt in find_warnings(Facts(link, tally, counts))]
 
@@ -64,7 +73,7 @@ FOUND, NOTHING = tally_of(RANDOM), RunTally(LINK.packet)
 READ = {"frames": 60, "blocks_tried": 6, "blocks_decoded": 4, "blocks_failed": 2}
 """Most packets are read, so that the link is right."""
 
-BLINKS = "something blinks, 5000000 events in 1 region, but no"
+BLINKS = "something blinks, 5,000,000 events in 1 region, but no"
 INVERTED = "50 of 60 frames fit only a light that is on where the link says off"
 
 
@@ -88,7 +97,7 @@ INVERTED = "50 of 60 frames fit only a light that is on where the link says off"
         (
             FOUND,
             {"blocks_tried": 6, "blocks_failed": 6, "blocks_alike": 4},
-            "none of 6 packets has a block that can be read, though 4 of them repeat others",
+            "none of 6 packets with a block that can be read, though 4 of them repeat others",
         ),
         (
             FOUND,
@@ -114,9 +123,13 @@ INVERTED = "50 of 60 frames fit only a light that is on where the link says off"
             "more than the receiver holds at a time: 7 events of crowded time steps dropped; 3 frames",
         ),
         (FOUND, {"frames": 60, "steps_forgotten": 50, "areas_left_out": 9}, ""),
-        (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 1, "locks": 0}, f"{BLINKS} preamble"),
-        (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 2, "locks": 1}, ""),
-        (NOTHING, {"events_in_regions": 20_000, "regions_opened": 3, "locks": 0}, ""),
+        (
+            NOTHING,
+            {"events_in_regions": 5_000_000, "regions_opened": 1, "preambles": 0},
+            f"{BLINKS} preamble",
+        ),
+        (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 2, "preambles": 1}, ""),
+        (NOTHING, {"events_in_regions": 20_000, "regions_opened": 3, "preambles": 0}, ""),
         # Of a framing that has no preamble.
         (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 1, "frames": 0}, f"{BLINKS} frame is"),
         (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 1, "frames": 2}, ""),
@@ -181,7 +194,7 @@ def test_what_there_was_no_time_for_is_no_fault_of_the_bar() -> None:
 
 
 def test_events_lost_in_the_file_are_said() -> None:
-    (doubt,) = find_warnings(Facts(LINK, NOTHING, {"events": 50_000}, lost=200))
+    (doubt,) = find_warnings(Facts(LINK, NOTHING, {"events": 50_000}, losses=[Loss(200, 0, "byte", "odd")]))
     assert "200 in the file" in doubt.text
 
 
@@ -189,7 +202,7 @@ def test_random_symbols_are_no_messages() -> None:
     random = {"blocks_tried": 6, "blocks_failed": 6}
     (note,) = find_notes(Facts(LINK, FOUND, random))
     assert note.code == "no-messages"
-    assert str(note) == "no messages: none of 6 packets has a block that can be read"
+    assert note.text == "no messages: none of 6 packets with a block that can be read"
     assert find_notes(Facts(LINK, FOUND, random, reads_messages=False)) == []
 
 

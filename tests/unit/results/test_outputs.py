@@ -18,6 +18,7 @@ from evlcp_sdk.air.frames import symbols_of_bits
 from evlcp_sdk.diagnosis.tallies import TransmitterTally
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.results.columns import FRAME_COLUMNS
 from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
@@ -41,7 +42,11 @@ def packet(number: int, *frames: Frame, transmitter: int = 0) -> Packet:
 
 
 END = RunEnd(
-    "complete", {"path": "a.raw"}, {"elapsed_s": 1.0}, {"events": 3}, {"odd_byte": {"count": 1, "first": 7}}
+    "complete",
+    {"path": "a.raw"},
+    {"elapsed_s": 1.0},
+    {"events": 3},
+    {"odd": Loss(1, 7, "byte", "a byte too many")},
 )
 
 
@@ -90,7 +95,7 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
     assert table["messages_off"] == "messages.decode = false"
     assert table["digest"] == LINK.digest
     assert table["codebook"] == {"digest": LINK.codebook.digest, "profile": "wh8"}
-    assert table["losses"] == {"odd_byte": {"count": 1, "first": 7}}
+    assert table["losses"]["odd"]["first"] == 7
     assert table["transmitters"][0] == {
         "transmitter": 0,
         "packets": 2,

@@ -1,0 +1,153 @@
+"""Checks of positions: against what is stated of bars, camera, attitude and satellites."""
+
+from collections.abc import Sequence
+
+from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, Found
+from evlcp_sdk.spelling import counted
+
+_MOST_IDS = 5
+"""Ids that a warning names; how many there are besides, it counts."""
+
+_DRIVE_SIGMAS = 3.0
+"""Sigmas beyond which what a drive shows is hinted at."""
+
+_SUSPECTS = {
+    "focal length": "camera.focal_mm, or give camera_sigma.focal_mm, and the drive shows the right one",
+    "heading": "--heading-deg, or that of the attitude file: the camera's, clockwise from north",
+    "attitude": "pitch and roll, their signs, and how the camera is mounted",
+}
+"""What to compare where a part of a position is what the rest contradicts."""
+
+
+def check_sigmas(facts: Facts) -> Found:
+    """What has no sigma, and so is taken as exact."""
+    exact = facts.positions["bars_exact"]
+    unsaid = [f"bars {', '.join(map(str, exact))} (position_sigma_m in site.toml)"] if exact else []
+    if not facts.link.camera_sigma.known:
+        unsaid.append("the camera ([camera_sigma], which evlcp calibrate prints)")
+    if unsaid:
+        yield Diagnostic(
+            "no-sigma",
+            f"positions take as exact what has no sigma: {' and '.join(unsaid)}; their sigmas and protection"
+            " levels hold only if it is",
+        )
+
+
+def _fitting_lens(facts: Facts) -> str:
+    """The focal length that would fit, where one is known; else empty."""
+    fits_mm, focal_mm = facts.positions.get("focal_mm_fits"), facts.link.camera.focal_mm
+    return f"camera.focal_mm = {focal_mm:g}: about {fits_mm:.3g} would fit" if fits_mm else ""
+
+
+def check_excluded(facts: Facts) -> Found:
+    """Parts that the rest contradicts."""
+    lens = _fitting_lens(facts)
+    for name, number in facts.positions["excluded"].items():
+        steps = [lens] if lens and name != "focal length" else []
+        steps.append(_SUSPECTS.get(name, "its place, angles and length, and their sigmas"))
+        text = f"{counted(number, 'position')} without {name}, which the rest contradicts"
+        yield Diagnostic("excluded", text, f"compare {'; or '.join(steps)}")
+
+
+def check_biases(facts: Facts) -> Found:
+    """What the drive shows of bars and camera, against what is stated of them."""
+    focal_mm = facts.link.camera.focal_mm
+    for row in facts.positions["learnt"]:
+        off, sigma, stated = row["correction"], row["sigma"], row["stated_sigma"]
+        if row["determined"] and abs(off) > _DRIVE_SIGMAS * stated:
+            yield Diagnostic(
+                "learnt",
+                f"the drive shows {row['part']}, {row['what']}, {off:+.3g} off what is stated, {stated:.3g}"
+                f" (sigma): {abs(off) / stated:.1f} sigmas",
+                "compare it with what is there",
+            )
+        elif row["determined"] and row["what"] == "focal_mm" and abs(off) > _DRIVE_SIGMAS * sigma:
+            yield Diagnostic(
+                "focal",
+                f"the drive shows a focal length of {focal_mm + off:.5g} +- {sigma:.2g} mm, not {focal_mm:g}",
+                "camera.focal_mm and camera_sigma.focal_mm may say so",
+            )
+
+
+def check_inputs(facts: Facts) -> Found:
+    """GNSS that contradicts bars, and attitudes and GNSS that do not go with the recording."""
+    positions = facts.positions
+    if number := positions["alarms"].get("contradicted", 0):
+        apart = ""
+        if positions["gnss_apart_m"] is not None:
+            east, north, up = (f"{value:+.3g}" for value in positions["gnss_apart_m"])
+            apart = f": it is {east} m east, {north} north, {up} up of them"
+        yield Diagnostic(
+            "gnss-contradicted",
+            f"{counted(number, 'time')} bars and GNSS contradict one another{apart}",
+            "compare heights (above the ellipsoid), the sigmas of both, position.antenna_m, and both clocks",
+        )
+    clock = "t_us of its file has to be the camera's clock, us"
+    if outside := positions["attitude_outside"]:
+        text = f"none of the attitude's {outside} lines is within the recording's time"
+        yield Diagnostic("attitude-outside", text, clock)
+    elif number := positions["attitude_missing"]:
+        yield Diagnostic(
+            "attitude-missing",
+            f"{number} of {facts.positions_tried} positions have no attitude: its file does not reach there,"
+            " or lacks lines",
+            f"{clock}, from before the first bar to after the last",
+        )
+    if (number := positions["gnss_outside"]) and not positions["gnss"]:
+        yield Diagnostic("gnss-outside", f"none of {number} GNSS fixes is within the recording's time", clock)
+    if number := positions["gnss_without_heading"]:
+        yield Diagnostic(
+            "gnss-without-heading",
+            f"{number} GNSS fix{'es' * (number != 1)} not used, as no heading says where the antenna is"
+            " (position.antenna_m)",
+            "give an attitude with a heading",
+        )
+
+
+def check_sites(facts: Facts) -> Found:
+    """Ids that are received and in no site."""
+    positions, step = facts.positions, "compare transmitter_id in site.toml"
+    received, unseen = positions["heard"], positions["sites_unseen"]
+    if (number := positions["refused"].get("no-site", 0)) and not positions["fixes"]:
+        yield Diagnostic(
+            "no-site",
+            f"{counted(number, 'position')} refused, as no bar in view stands at a known place;"
+            f" received: {_ids(sorted(set(received.values()))) or 'no id'}",
+            step,
+        )
+    placed = {*positions["bars"], *positions["sites_contradicted"]}
+    strange = sorted({one for n, one in received.items() if n not in placed})
+    if positions["fixes"] and strange and unseen:
+        # Either alone is no fault: a bar that is not on the list, a bar of the list that is elsewhere.
+        yield Diagnostic(
+            "unknown-id",
+            f"positions are without {_ids(strange)}, received and in no site;"
+            f" {_ids(unseen)} of the sites {'were' if len(unseen) > 1 else 'was'} not",
+            step,
+        )
+
+
+def _ids(ids: Sequence[int]) -> str:
+    """Ids, the first ones by name; empty for none."""
+    more = f" and {len(ids) - _MOST_IDS} more" if len(ids) > _MOST_IDS else ""
+    return f"id{'s' * (len(ids) > 1)} {', '.join(map(str, ids[:_MOST_IDS]))}{more}" if ids else ""
+
+
+def check_misfits(facts: Facts) -> Found:
+    """Positions refused, with the parts that would each explain most of them."""
+    number = facts.positions["refused"].get("misfit", 0)
+    if not number:
+        return
+    suspects, lens = facts.positions.get("suspects", {}), _fitting_lens(facts)
+    likely = {name: times for name, times in suspects.items() if 2 * times > number}
+    steps = {name: _SUSPECTS.get(name, f"place, angles and length of {name}") for name in likely}
+    if lens and "focal length" not in likely:
+        # One that is far off; what explains all of them at once is the first to compare.
+        likely["focal length"] = number + 1
+        steps["focal length"] = lens
+    names = sorted(likely, key=lambda name: -likely[name])
+    text = f"{counted(number, 'position')} refused, as bars, attitude and camera contradict one another"
+    if names:
+        text += f"; another {' or another '.join(names)} would explain it"
+    what = "sites, angles and [camera], its focal_mm first, with what is there, and their sigmas"
+    yield Diagnostic("misfit", text, f"compare {'; '.join(steps[name] for name in names) or what}")
