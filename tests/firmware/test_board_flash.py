@@ -1,16 +1,15 @@
 """The firmware as files, and into a part by its ROM; what is in there then boots on the model."""
 
-import contextlib
 import json
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import check_fault
+from board_lines import check_fault, needs
 from test_board_cli import Emulated
 
 from evlcp_sdk.errors import InputError
@@ -26,7 +25,7 @@ def some(count: int, seed: int = 0, address: int = FLASH_START) -> FlashImage:
     return FlashImage(address, np.random.default_rng(seed).integers(0, 256, count, np.uint8).tobytes())
 
 
-def test_files_hold_one_image(evlcp, needs: Callable[..., None], tmp_path: Path) -> None:
+def test_files_hold_one_image(evlcp, tmp_path: Path) -> None:
     needs("arm-none-eabi-gcc", "arm-none-eabi-objcopy")
     for target in build.TARGETS:
         done = evlcp("board", "build", "--target", target, "-o", tmp_path / "new", "--json")
@@ -99,7 +98,7 @@ def test_a_bad_line_gets_through_or_is_told() -> None:
     through = 0
     for seed in range(12):
         rom, new = RomEmulator(), some(6_000, seed)
-        with contextlib.suppress(LineError, RefusedError, VerifyError, NoBoardError):
+        with suppress(LineError, RefusedError, VerifyError, NoBoardError):
             flash_image(RomLoader(BadLine(rom, seed, 3_000)), new)
             through += 1
             assert rom.flash[:6_000] == new.data
@@ -159,9 +158,7 @@ def test_brown_out_is_set_and_nothing_else() -> None:
     assert rom.options == bytes([before[0] & 0xF3]) + before[1:]
 
 
-def test_what_the_command_flashes_boots_where_it_was_flashed(
-    evlcp, needs: Callable[..., None], tmp_path: Path
-) -> None:
+def test_what_the_command_flashes_boots_where_it_was_flashed(evlcp, tmp_path: Path) -> None:
     needs("arm-none-eabi-gcc")
     pytest.importorskip("unicorn", reason="unicorn missing: pip install --group dev installs it")
     port, kept = f"unix:{tmp_path / 'part'}", tmp_path / "flash.bin"
@@ -207,28 +204,22 @@ def test_a_part_without_brown_out_is_told(evlcp, tmp_path: Path) -> None:
     (tmp_path / "image.bin").write_bytes(some(1_000).data)
     for said, options in ((True, ()), (False, ("--brown-out",))):
         rom = RomEmulator()
-        with serving(rom) as port:
+        with socket.create_server(("127.0.0.1", 0)) as server:
+            thread = threading.Thread(target=serve, args=(rom, server))
+            thread.start()
+            port = f"tcp:127.0.0.1:{server.getsockname()[1]}"
             done = evlcp("board", "flash", tmp_path / "image.bin", "--port", port, *options)
+            thread.join(10)
         assert done.code == 0, done.err
         assert ("brown-out reset is off: flash with --brown-out" in done.out) == said
         assert rom.resets == (not said)
 
 
-@contextlib.contextmanager
-def serving(rom: RomEmulator) -> Iterator[str]:
+def serve(rom: RomEmulator, server: socket.socket) -> None:
     """A ROM at a port, for one host."""
-    with socket.create_server(("127.0.0.1", 0)) as server:
-
-        def serve() -> None:
-            line, _ = server.accept()
-            with line:
-                while data := line.recv(4096):
-                    line.sendall(rom.receive(data))
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        yield f"tcp:127.0.0.1:{server.getsockname()[1]}"
-        thread.join(10)
+    with server.accept()[0] as line:
+        while data := line.recv(4096):
+            line.sendall(rom.receive(data))
 
 
 @pytest.mark.parametrize(

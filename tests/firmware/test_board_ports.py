@@ -9,8 +9,10 @@ import subprocess
 import sys
 import termios
 import tty
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from unittest.mock import Mock, PropertyMock
 
 import pytest
 from board_lines import check_fault
@@ -35,6 +37,16 @@ def listed(
 
 
 @pytest.fixture
+def pty_name() -> Iterator[tuple[int, str]]:
+    """A pseudo-terminal: our end, and the name of the other, a port."""
+    ours, other = pty.openpty()
+    tty.setraw(other)
+    yield ours, os.ttyname(other)
+    os.close(ours)
+    os.close(other)
+
+
+@pytest.fixture
 def ports(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
     found = [listed("COM7", 0x0403, 0x6015, "D30A1"), listed("COM3"), listed("COM9", 0x1546, 0x01A9, "gps")]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: found)
@@ -42,15 +54,16 @@ def ports(monkeypatch: pytest.MonkeyPatch) -> list[SimpleNamespace]:
 
 
 @pytest.fixture
-def opened(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """Which ports were opened; none can be."""
-    names: list[str] = []
-
-    def refuse(url: str, **_: object) -> None:
-        names.append(url)
-        raise Fault(errno.ENOENT, "could not open port")
-
+def opened(monkeypatch: pytest.MonkeyPatch) -> Callable[[], list[str]]:
+    """Which ports were opened since the last look; none can be."""
+    refuse = Mock(side_effect=Fault(errno.ENOENT, "could not open port"))
     monkeypatch.setattr("serial.serial_for_url", refuse)
+
+    def names() -> list[str]:
+        found = sorted(call.args[0] for call in refuse.call_args_list)
+        refuse.reset_mock()
+        return found
+
     return names
 
 
@@ -74,7 +87,7 @@ def test_ports_by_usb_id(ports: list[SimpleNamespace], text: str, takes: list[st
             device_of(text)
 
 
-def test_a_usb_id_must_be_one(ports: list[SimpleNamespace], opened: list[str]) -> None:
+def test_a_usb_id_must_be_one(ports: list[SimpleNamespace], opened: Callable[[], list[str]]) -> None:
     for wrong in ("", "403", "0403-6015", "xyz0", "0403:"):
         with pytest.raises(ConfigError, match="expected VID, VID:PID or VID:PID:SERIAL"):
             UsbFilter.parse(wrong)
@@ -83,83 +96,71 @@ def test_a_usb_id_must_be_one(ports: list[SimpleNamespace], opened: list[str]) -
     ports.append(listed("COM8", 0x0403, 0x6015, "D30A2"))
     with pytest.raises(NoBoardError, match=r"2 ports have it: COM7 \(serial number D30A1\), COM8"):
         open_transport("usb:0403:6015")
-    assert opened == ["COM7"]
+    assert opened() == ["COM7"]
 
 
-def test_only_likely_ports_are_opened(ports: list[SimpleNamespace], opened: list[str]) -> None:
+def test_only_likely_ports_are_opened(ports: list[SimpleNamespace], opened: Callable[[], list[str]]) -> None:
     found = survey.survey(1_000_000)
-    assert opened == ["COM7"]
+    assert opened() == ["COM7"]
     assert [(f.port.device, f.asked) for f in found] == [("COM3", False), ("COM7", True), ("COM9", False)]
-    opened.clear()
     survey.survey(1_000_000, usb=UsbFilter.parse("1546"))
-    assert opened == ["COM9"]
-    opened.clear()
+    assert opened() == ["COM9"]
     survey.survey(1_000_000, every=True)
-    assert sorted(opened) == ["COM3", "COM7", "COM9"]
+    assert opened() == ["COM3", "COM7", "COM9"]
     with pytest.raises(NoBoardError, match=r"\(COM7\); not asked: COM3, COM9"):
         survey.find(1_000_000)
 
 
-def test_the_command_shows_and_filters(evlcp, ports: list[SimpleNamespace], opened: list[str]) -> None:
+def test_the_command_shows_and_filters(
+    evlcp, ports: list[SimpleNamespace], opened: Callable[[], list[str]]
+) -> None:
     rows = json.loads(evlcp("board", "ports", "--json").out)
     assert [(r["port"], r["usb"], r["asked"]) for r in rows] == [
         ("COM3", None, False),
         ("COM7", "0403:6015", True),
         ("COM9", "1546:01a9", False),
     ]
-    opened.clear()
+    assert opened() == ["COM7"]
     said = evlcp("board", "ports", "--no-ask", "--usb", "0403").out
     assert said == "COM7  0403:6015 D30A1  COM7 n/a  not asked\n"
-    assert opened == []
+    assert opened() == []
     assert "no serial port with USB id ffff" in evlcp("board", "ports", "--usb", "ffff").out
     check_fault(evlcp("board", "ports", "--usb", "no"), 2, "expected VID, VID:PID or VID:PID:SERIAL")
 
 
-def test_a_real_tty_gets_no_byte(monkeypatch: pytest.MonkeyPatch, evlcp) -> None:
+def test_a_real_tty_gets_no_byte(monkeypatch: pytest.MonkeyPatch, evlcp, pty_name: tuple[int, str]) -> None:
     """What hangs on a port of no bridge hears nothing of the search."""
-    ours, other = pty.openpty()
-    tty.setraw(other)
+    ours, port = pty_name
     os.set_blocking(ours, False)
-    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [listed(os.ttyname(other))])
+    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [listed(port)])
     assert evlcp("board", "hello").code == 4
     with pytest.raises(BlockingIOError):
         os.read(ours, 100)
     evlcp("board", "ports", "--all")
     assert os.read(ours, 100)
-    os.close(ours)
-    os.close(other)
 
 
-def test_who_has_the_port_is_said() -> None:
-    ours, other = pty.openpty()
-    tty.setraw(other)
-    device = os.ttyname(other)
+def test_who_has_the_port_is_said(pty_name: tuple[int, str]) -> None:
+    device = pty_name[1]
     code = (
         "import serial, sys, time; p = serial.Serial(sys.argv[1], exclusive=True); print(1, flush=True);"
         " time.sleep(60)"
     )
-    process = subprocess.Popen([sys.executable, "-c", code, device], stdout=subprocess.PIPE)
-    assert process.stdout is not None
-    process.stdout.readline()
-    try:
-        with pytest.raises(NoBoardError) as told:
-            SerialTransport(device, 1_000_000)
-        assert f"(process {process.pid}) has it open; end that first" in str(told.value)
-        assert any(str(process.pid) in who for who in holders(device))
-    finally:
-        process.kill()
-        process.wait()
-        process.stdout.close()
-        os.close(ours)
-        os.close(other)
+    with subprocess.Popen([sys.executable, "-c", code, device], stdout=subprocess.PIPE) as process:
+        assert process.stdout is not None
+        process.stdout.readline()
+        try:
+            says = rf"\(process {process.pid}\) has it open; end that first"
+            with pytest.raises(NoBoardError, match=says):
+                SerialTransport(device, 1_000_000)
+            assert any(str(process.pid) in who for who in holders(device))
+        finally:
+            process.kill()
     assert holders("/dev/nowhere") == []
 
 
 def refusing(monkeypatch: pytest.MonkeyPatch, fault: Exception) -> None:
-    def refuse(*_: object, **__: object) -> None:
-        raise fault
-
-    monkeypatch.setattr("serial.serial_for_url", refuse)
+    monkeypatch.setattr("serial.serial_for_url", Mock(side_effect=fault))
 
 
 WINDOWS = "could not open port 'COM3': "
@@ -171,12 +172,7 @@ MAC = "/dev/cu.usbserial-1"
     [
         # as pyserial words them on each system
         ("win32", "COM3", Fault(WINDOWS + "FileNotFoundError(2, 'x', None, 2)"), "not there"),
-        (
-            "win32",
-            "COM3",
-            Fault(WINDOWS + "PermissionError(13, 'Zugriff', None, 5)"),
-            "another program has it",
-        ),
+        ("win32", "COM3", Fault(WINDOWS + "PermissionError(13, 'x', None, 5)"), "another program has it"),
         ("win32", "COM3", Fault(WINDOWS + "OSError(22, 'x', None, 121)"), "evlcp board ports"),
         ("win32", "COM3", ValueError("Support for non-exclusive access not available"), "evlcp board ports"),
         ("darwin", MAC, Fault(errno.EBUSY, "busy"), f"lsof {MAC}"),
@@ -232,18 +228,10 @@ def test_no_permission_names_group_and_rule(evlcp, monkeypatch: pytest.MonkeyPat
     ids=lambda fault: type(fault).__name__,
 )
 def test_an_unplugged_port_is_a_broken_line(monkeypatch: pytest.MonkeyPatch, fault: Exception) -> None:
-    class Unplugged:
-        @property
-        def in_waiting(self) -> int:
-            raise fault
-
-        def write(self, _: bytes) -> None:
-            raise fault
-
-        def close(self) -> None:
-            raise fault
-
-    monkeypatch.setattr("serial.serial_for_url", lambda *_, **__: Unplugged())
+    unplugged = Mock()
+    type(unplugged).in_waiting = PropertyMock(side_effect=fault)
+    unplugged.write.side_effect = unplugged.close.side_effect = fault
+    monkeypatch.setattr("serial.serial_for_url", lambda *_, **__: unplugged)
     line = SerialTransport("COM3", 1_000_000)
     for do in (lambda: line.read(0.0), lambda: line.write(b"x")):
         with pytest.raises(LineError, match=r"COM3: the line broke: .*plug it in"):
@@ -251,11 +239,8 @@ def test_an_unplugged_port_is_a_broken_line(monkeypatch: pytest.MonkeyPatch, fau
     line.close()
 
 
-def test_without_unix_sockets(monkeypatch: pytest.MonkeyPatch, evlcp) -> None:
-    monkeypatch.delattr(socket, "AF_UNIX")
-    check_fault(evlcp("board", "hello", "--port", "unix:/tmp/board"), 4, "this system has no unix sockets")
-
-
-def test_no_port_at_all(evlcp, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_port_and_no_unix_sockets(monkeypatch: pytest.MonkeyPatch, evlcp) -> None:
     monkeypatch.setattr("serial.tools.list_ports.comports", list)
     check_fault(evlcp("board", "status"), 4, "--port native: for an emulated one")
+    monkeypatch.delattr(socket, "AF_UNIX")
+    check_fault(evlcp("board", "hello", "--port", "unix:/tmp/board"), 4, "this system has no unix sockets")
