@@ -2,7 +2,6 @@
 
 import json
 import math
-import random
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -34,7 +33,6 @@ from firmware_host.board.tables import about_table
 from firmware_host.emulators.led_record import LedRecord
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.errors import VerifyError
-from firmware_host.ports.transport import TraceTransport, Transport
 from firmware_host.protocol.client import Timing
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
@@ -91,11 +89,7 @@ def light_of(symbols: ArrayLike, link: Link, chips: int, trace: Path | None = No
     """
     bank = bank_of(symbols, link)
     device = SimulatedBoard()
-    line: Transport = SimulatedLine(device, "emulated")
-    first, nonce = random.randrange(1 << 16), random.randrange(1 << 32)
-    if trace is not None:
-        line = TraceTransport(line, trace, DEFAULT_BAUD, first, nonce)
-    with Session(line, Timing(DEFAULT_BAUD), first, nonce) as session:
+    with Session(SimulatedLine(device, "emulated"), Timing(DEFAULT_BAUD), trace=trace) as session:
         board = Board(session)
         programmed = provision(board, bank, Settings())
         device.run(math.ceil(chips / link.air.chip_rate_hz * 1e6) + 1000)

@@ -13,47 +13,24 @@ from evlcp_sdk.air.codebook import word_of_chips
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, queue_of, rest_content, word_limits
+from firmware_host.board.bank import Bank, queue_of, rest_content, word_limits
 from firmware_host.board.session import Session
 from firmware_host.board.stream import AHEAD, Stream
 from firmware_host.board.tables import name_of
 from firmware_host.errors import IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.client import RequestOutcome
+from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.profiles import DIGESTS
 from firmware_host.protocol.generated.requests import (
     CLUSTERS,
-    KEY_BYTES,
     LEDS,
     NO_BANK,
-    BlankRequest,
     Capability,
-    ChipsRequest,
-    CodebookRequest,
-    CommitRequest,
-    ConfigureRequest,
-    CrcRequest,
     Format,
-    HelloReply,
-    KeyRequest,
-    LedTestRequest,
-    LevelRequest,
     Profile,
-    ReadReply,
-    ReadRequest,
-    RecallReply,
-    RecallRequest,
-    SaveReply,
-    SaveRequest,
-    StartRequest,
     State,
     Status,
-    StatusReply,
-    StatusRequest,
-    StopRequest,
-    StreamRequest,
     Watchdog,
-    WatchdogRequest,
-    WriteRequest,
 )
 
 _BLOCK = 2048
@@ -65,7 +42,7 @@ _MOST_HOLD = 255
 _LEAST = 32
 """Smallest piece that a noisy line is tried with, bytes."""
 
-_WRITE_OVERHEAD = WriteRequest.fixed_bytes()
+_WRITE_OVERHEAD = protocol.WriteRequest.fixed_bytes()
 
 Progress = Callable[[int, int], None]
 """Called with bytes done and bytes in all."""
@@ -138,13 +115,13 @@ class Board:
 
     def __init__(self, session: Session) -> None:
         self.session = session
-        self.about: HelloReply = session.hello()
+        self.about: protocol.HelloReply = session.hello()
 
     # -- single requests
 
-    def status(self) -> StatusReply:
+    def status(self) -> protocol.StatusReply:
         """What the board does."""
-        return self.session.call(StatusRequest())
+        return self.session.call(protocol.StatusRequest())
 
     def start(self, at_pulse: int = 0, pulse_hz: int = 1, at_clock: int = 0) -> None:
         """Play the active bank: now, at a pulse and in step with them from then on, or at a clock.
@@ -154,15 +131,15 @@ class Board:
             pulse_hz: Pulses a second.
             at_clock: The clock, as STATUS tells it; 0: none.
         """
-        self.session.call(StartRequest(at_pulse, pulse_hz if at_pulse else 0, at_clock))
+        self.session.call(protocol.StartRequest(at_pulse, pulse_hz if at_pulse else 0, at_clock))
 
     def stop(self) -> None:
         """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
-        self.session.call(StopRequest())
+        self.session.call(protocol.StopRequest())
 
     def blank(self) -> None:
         """Dark at once."""
-        self.session.call(BlankRequest())
+        self.session.call(protocol.BlankRequest())
 
     def level(self, level_ma: int) -> None:
         """Set the LED current, mA.
@@ -170,23 +147,23 @@ class Board:
         Raises:
             RefusedError: It is above the board's maximum.
         """
-        self.session.call(LevelRequest(level_ma))
+        self.session.call(protocol.LevelRequest(level_ma))
 
     def watchdog(self, action: Watchdog, timeout_ms: int) -> None:
         """What to do when the host is silent for `timeout_ms`."""
-        self.session.call(WatchdogRequest(action, timeout_ms))
+        self.session.call(protocol.WatchdogRequest(action, timeout_ms))
 
-    def save(self, autostart: bool = False) -> SaveReply:
+    def save(self, autostart: bool = False) -> protocol.SaveReply:
         """Save active bank and settings to flash."""
-        return self.session.call(SaveRequest(int(autostart)))
+        return self.session.call(protocol.SaveRequest(int(autostart)))
 
-    def recall(self) -> RecallReply:
+    def recall(self) -> protocol.RecallReply:
         """Commit what was saved."""
-        return self.session.call(RecallRequest())
+        return self.session.call(protocol.RecallRequest())
 
     def test_leds(self, first: int, last: int, dwell_ms: int) -> None:
         """Walk over LEDs one by one."""
-        self.session.call(LedTestRequest(first, last, dwell_ms))
+        self.session.call(protocol.LedTestRequest(first, last, dwell_ms))
 
     def set_key(self, key: bytes | None) -> None:
         """Set the board's key, or take it away; a new session begins, and SAVE keeps it.
@@ -197,25 +174,25 @@ class Board:
         """
         if not self.about.capabilities & Capability.TRUST:
             raise IncompatibleError(f"{self.session.name}: cannot have a key; see 'evlcp board hello'")
-        self.session.call(KeyRequest(key or bytes(KEY_BYTES)))
+        self.session.call(protocol.KeyRequest(key or bytes(protocol.KEY_BYTES)))
         self.session.key = key
         self.about = self.session.renew()
 
     def crc(self, bank: int, offset: int, length: int) -> int:
         """CRC-32 of a bank's bytes."""
-        return self.session.call(CrcRequest(bank, offset, length)).crc
+        return self.session.call(protocol.CrcRequest(bank, offset, length)).crc
 
     def read(self, bank: int, offset: int, length: int) -> bytes:
         """A bank's bytes."""
-        most = self.about.max_payload - ReadReply.fixed_bytes()
+        most = self.about.max_payload - protocol.ReadReply.fixed_bytes()
         found: dict[int, bytes] = {}
 
-        def handle(request: ReadRequest, outcome: RequestOutcome) -> None:
+        def handle(request: protocol.ReadRequest, outcome: RequestOutcome) -> None:
             reply = self.session.checked(request, outcome)
             found[reply.offset] = reply.data
 
         pieces = [(at, min(most, offset + length - at)) for at in range(offset, offset + length, most)]
-        self.session.run((ReadRequest(bank, at, n) for at, n in pieces), handle)
+        self.session.run((protocol.ReadRequest(bank, at, n) for at, n in pieces), handle)
         data = b"".join(found.get(at, b"") for at, _ in pieces)
         if len(data) != length:
             raise LineError(f"{self.session.name}: READ gave {len(data)} bytes, expected {length}; try again")
@@ -262,12 +239,12 @@ class Board:
         digest = bytes.fromhex(bank.digest)
         if not bank.composed:
             clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
-            request = ChipsRequest(bank.packet.packet_chips, self._hold(bank), clusters, digest)
+            request = protocol.ChipsRequest(bank.packet.packet_chips, self._hold(bank), clusters, digest)
             self.session.call(request)
             return
         pilots = tuple(map(word_of_chips, bank.codebook.pilots))
         preamble = (bank.packet.preamble_chips, word_of_chips(bank.codebook.preamble))
-        self.session.call(CodebookRequest(*preamble, pilots, digest))
+        self.session.call(protocol.CodebookRequest(*preamble, pilots, digest))
 
     def _hold(self, bank: Bank) -> int:
         """How many chips of the board's chip rate a chip of the bank lasts.
@@ -293,7 +270,9 @@ class Board:
     def _configure(self, bank: Bank, level_limit_ma: int = 0, duty_limit: int = 0) -> None:
         about, rate = self.about, bank.chip_rate_hz * self._hold(bank)
         frames, every = _frames(bank)
-        configure = ConfigureRequest(rate, profile_number(bank), frames, every, level_limit_ma, duty_limit)
+        configure = protocol.ConfigureRequest(
+            rate, profile_number(bank), frames, every, level_limit_ma, duty_limit
+        )
         try:
             self.session.call(configure)
         except RefusedError as fault:
@@ -310,7 +289,7 @@ class Board:
                 fault.detail,
             ) from fault
 
-    def holds(self, bank: Bank, status: StatusReply) -> bool:
+    def holds(self, bank: Bank, status: protocol.StatusReply) -> bool:
         """Whether the active bank is this one."""
         if status.active_bank == NO_BANK or not self._same_packets(bank, status):
             return False
@@ -318,7 +297,7 @@ class Board:
         rate_hz = bank.chip_rate_hz * self._hold(bank)
         return held == (bank.crc, rate_hz, profile_number(bank), bank.digest)
 
-    def _same_packets(self, bank: Bank, status: StatusReply) -> bool:
+    def _same_packets(self, bank: Bank, status: protocol.StatusReply) -> bool:
         """Whether the active bank has packets of the same number and lengths."""
         if (status.format, status.packets, status.length) != (bank.format, bank.packets, len(bank.content)):
             return False
@@ -343,38 +322,39 @@ class Board:
         """
         content = self.fitted(content)
         self.check_fits(content)
-        before = self.session.client.retries
-        total = len(content.content)
+        retries, total, written = self.session.client.retries, len(content.content), 0
         status = self._settled()
-        if self.holds(content, status):
-            if progress:
-                progress(total, total)
-            return self._programmed(0, total, False, status, before)
-        self._check_rate(content, status)
-        self.prepare(content)
-        bank = 1 if status.active_bank == 0 else 0
-        written = self.fill(bank, content.content, progress)
-        if verify and written and self.crc(bank, 0, total) != content.crc:
-            raise VerifyError(
-                f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
-                " program it again, and if that does not help have the board looked at"
-            )
-        digest = bytes.fromhex(content.digest)
-        commit = CommitRequest(bank, content.format, content.packets, total, content.crc, digest)
-        self.session.call(commit)
-        status = self._settled()
-        if verify and not self.holds(content, status):
-            raise VerifyError(
-                f"{self.session.name}: bank {status.active_bank} is active, expected {bank}; program it again"
-            )
-        return self._programmed(written, total, True, status, before)
-
-    def _programmed(
-        self, written: int, length: int, swapped: bool, status: StatusReply, retries: int
-    ) -> Programmed:
-        again = self.session.client.retries - retries
-        watchdog = Watchdog(status.watchdog).name.lower()
-        return Programmed(written, length, swapped, status.active_bank, again, watchdog, status.watchdog_ms)
+        swapped = not self.holds(content, status)
+        if swapped:
+            self._check_rate(content, status)
+            self.prepare(content)
+            bank = 1 if status.active_bank == 0 else 0
+            written = self.fill(bank, content.content, progress)
+            if verify and written and self.crc(bank, 0, total) != content.crc:
+                raise VerifyError(
+                    f"{self.session.name}: bank {bank} does not hold what was sent; the old one goes on;"
+                    " program it again, and if that does not help have the board looked at"
+                )
+            digest = bytes.fromhex(content.digest)
+            commit = protocol.CommitRequest(bank, content.format, content.packets, total, content.crc, digest)
+            self.session.call(commit)
+            status = self._settled()
+            if verify and not self.holds(content, status):
+                raise VerifyError(
+                    f"{self.session.name}: bank {status.active_bank} is active, expected {bank};"
+                    " program it again"
+                )
+        elif progress:
+            progress(total, total)
+        return Programmed(
+            written=written,
+            length=total,
+            swapped=swapped,
+            bank=status.active_bank,
+            retries=self.session.client.retries - retries,
+            watchdog=name_of(Watchdog, status.watchdog),
+            watchdog_ms=status.watchdog_ms,
+        )
 
     def stream(self, link: Link, ahead: int = AHEAD) -> Stream:
         """Make the spare bank a queue of packets, and play from it: packets as they come.
@@ -407,7 +387,7 @@ class Board:
         bank = 1 if status.active_bank == 0 else 0
         if like.content:
             self.fill(bank, like.content)
-        request = StreamRequest(bank, like.format, bytes.fromhex(like.digest))
+        request = protocol.StreamRequest(bank, like.format, bytes.fromhex(like.digest))
         slots = self.session.call(request).slots
         if ahead >= slots:
             raise ConfigError(
@@ -428,10 +408,11 @@ class Board:
             self.start()
         return stream
 
-    def _check_rate(self, content: Bank, status: StatusReply) -> None:
+    def _check_rate(self, content: Bank, status: protocol.StatusReply) -> None:
         """Raise RefusedError if chips run at another rate, which a board that plays keeps."""
         rate_hz = content.chip_rate_hz * self._hold(content)
-        if _rate_held(status) and status.chip_rate_hz != rate_hz:
+        runs = status.state in (State.PLAYING, State.STOPPING, State.IDLE_PATTERN)
+        if runs and status.chip_rate_hz != rate_hz:
             raise RefusedError(
                 f"{self.session.name}: plays {status.chip_rate_hz} chips per second, this payload has"
                 f" {rate_hz}: a board that plays keeps its rate; 'evlcp board stop' first;"
@@ -440,7 +421,7 @@ class Board:
                 status.chip_rate_hz,
             )
 
-    def check_same_air(self, bank: Bank, status: StatusReply) -> None:
+    def check_same_air(self, bank: Bank, status: protocol.StatusReply) -> None:
         """Raise IncompatibleError unless what plays and what comes are of one codebook and one chip rate."""
         plays, comes = f"codebook {status.digest.hex()[:16]}", f"codebook {bank.digest[:16]}"
         if status.digest.hex() == bank.digest:
@@ -543,15 +524,15 @@ class Board:
         left = deque((at, at + n) for at, n in missing)
         state = {"piece": piece, "done": 0}
 
-        def requests() -> Iterator[WriteRequest]:
+        def requests() -> Iterator[protocol.WriteRequest]:
             while left:
                 at, end = left.popleft()
                 if end - at > state["piece"]:
                     left.appendleft((at + state["piece"], end))
                     end = at + state["piece"]
-                yield WriteRequest(bank, at, content[at:end])
+                yield protocol.WriteRequest(bank, at, content[at:end])
 
-        def handle(request: WriteRequest, outcome: RequestOutcome) -> None:
+        def handle(request: protocol.WriteRequest, outcome: RequestOutcome) -> None:
             n = len(request.data)
             if outcome.status is None and n > _LEAST:
                 state["piece"] = max(_LEAST, min(state["piece"], n // 2))
@@ -569,30 +550,26 @@ class Board:
         """Blocks (offset, bytes) of a bank that are not `content`."""
         missing: list[tuple[int, int]] = []
 
-        def handle(request: CrcRequest, outcome: RequestOutcome) -> None:
+        def handle(request: protocol.CrcRequest, outcome: RequestOutcome) -> None:
             crc = self.session.checked(request, outcome).crc
             if zlib.crc32(content[request.offset : request.offset + request.length]) != crc:
                 missing.append((request.offset, request.length))
 
         blocks = [(at, min(_BLOCK, len(content) - at)) for at in range(0, len(content), _BLOCK)]
-        self.session.run((CrcRequest(bank, at, n) for at, n in blocks), handle)
+        self.session.run((protocol.CrcRequest(bank, at, n) for at, n in blocks), handle)
         return sorted(missing)
 
-    def _settled(self) -> StatusReply:
+    def _settled(self) -> protocol.StatusReply:
         """Status once no bank waits for its packet boundary."""
-        status = self.status()
-        end = self.session.transport.now() + 10.0 + _packet_s(status)
-        while status.pending_bank != NO_BANK:
-            if self.session.transport.now() > end:
-                raise VerifyError(
-                    f"{self.session.name}: bank {status.pending_bank} does not become active;"
-                    " the old one plays on; 'evlcp board stop', then program it again"
-                )
-            self.session.transport.read(0.002)
-            status = self.status()
+        status = self.session.status_when(lambda status: status.pending_bank == NO_BANK, 10.0, 0.002)
+        if status.pending_bank != NO_BANK:
+            raise VerifyError(
+                f"{self.session.name}: bank {status.pending_bank} does not become active;"
+                " the old one plays on; 'evlcp board stop', then program it again"
+            )
         return status
 
-    def stay(self, seconds: float, status: StatusReply) -> None:
+    def stay(self, seconds: float, status: protocol.StatusReply) -> None:
         """Wait, and let the board hear of this host so often that its watchdog does not act.
 
         Args:
@@ -608,21 +585,9 @@ class Board:
             if acts and line.now() < end:
                 self.status()
 
-    def wait_dark(self, timeout_s: float = 10.0) -> StatusReply:
-        """Status once the LEDs are dark after a stop.
-
-        Raises:
-            LineError: They are not within `timeout_s` and the packet that a stop finishes.
-        """
-        status = self.status()
-        end = self.session.transport.now() + timeout_s + _packet_s(status)
-        while status.state not in (State.DARK, State.FAULT):
-            if self.session.transport.now() > end:
-                state = name_of(State, status.state).upper()
-                raise LineError(f"{self.session.name}: still {state}; try 'evlcp board blank'")
-            self.session.transport.read(0.005)
-            status = self.status()
-        return status
+    def wait_dark(self, timeout_s: float = 10.0) -> protocol.StatusReply:
+        """Status once the LEDs are dark after a stop; faults as of `Session.wait_dark`."""
+        return self.session.wait_dark(timeout_s)
 
 
 def provision(
@@ -653,8 +618,15 @@ def provision(
     if most_ma is not None or (duty is not None and not last):
         board.limit(bank, most_ma, None if last else duty)
         status = board.status()
-    level = settings.level_ma
-    later = level is not None and status.level_ma != level and not _set_level(board, level)
+    level, later = settings.level_ma, False
+    if level is not None and status.level_ma != level:
+        try:
+            board.level(level)
+        except RefusedError as fault:
+            # too much for what plays, but perhaps not for what comes
+            if fault.status != Status.TOO_BRIGHT:
+                raise
+            later = True
     wanted = (settings.watchdog, settings.watchdog_ms)
     if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
         board.watchdog(settings.watchdog, settings.watchdog_ms)
@@ -672,28 +644,6 @@ def provision(
     if settings.start and status.state != State.PLAYING:
         board.start()
     return done
-
-
-def _set_level(board: Board, level_ma: int) -> bool:
-    """Set the LED current; False where it is too much for what plays, but perhaps not for what comes."""
-    try:
-        board.level(level_ma)
-    except RefusedError as fault:
-        if fault.status != Status.TOO_BRIGHT:
-            raise
-        return False
-    return True
-
-
-def _rate_held(status: StatusReply) -> bool:
-    """Whether chips run, so that their rate cannot be changed."""
-    return status.state in (State.PLAYING, State.STOPPING, State.IDLE_PATTERN)
-
-
-def _packet_s(status: StatusReply) -> float:
-    """Time a packet of the active bank takes at most, s; of an older board by its frames."""
-    chips = status.packet_chips or PREAMBLE_CHIPS + 2 * WORD_CHIPS * status.frames
-    return chips / status.chip_rate_hz
 
 
 def _frames(bank: Bank) -> tuple[int, int]:

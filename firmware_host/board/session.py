@@ -2,8 +2,11 @@
 
 import random
 from collections.abc import Callable, Iterable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
+from evlcp_sdk.errors import OutputError
+from firmware_host.board.tables import name_of
 from firmware_host.errors import (
     BoardError,
     BoardResetError,
@@ -13,19 +16,10 @@ from firmware_host.errors import (
     RefusedError,
     VerifyError,
 )
-from firmware_host.ports.transport import Transport, on_network
+from firmware_host.ports.transport import TraceTransport, Transport, on_network
 from firmware_host.protocol.client import TRIES, Client, RequestOutcome, Timing
-from firmware_host.protocol.generated.requests import (
-    MAJOR,
-    MAX_PAYLOAD,
-    MINOR,
-    NO_SESSION,
-    SEAL_BYTES,
-    HelloReply,
-    HelloRequest,
-    Status,
-    Type,
-)
+from firmware_host.protocol.generated import requests as protocol
+from firmware_host.protocol.generated.requests import MAJOR, MINOR, State, Status
 from firmware_host.protocol.seal import Sealer, key_name
 from firmware_host.protocol.wire import WireMessage, WireRequest
 
@@ -65,7 +59,7 @@ _KINDS: dict[int, type[BoardError]] = {
 
 def refusal(name: str, type_: int, status: Status | int, detail: int) -> BoardError:
     """The error for a request that a board refused; its message says why and what to do."""
-    request = Type(type_).name
+    request = protocol.Type(type_).name
     word = status.name if isinstance(status, Status) else f"status {status}"
     advice = _ADVICE.get(status, "update the host") if isinstance(status, Status) else "update the host"
     major, minor = detail & 0xFF, detail >> 8 & 0xFF
@@ -89,10 +83,14 @@ class Session:
         nonce: Number of the session, by default drawn at random.
         tries: How often a request is sent before it is given up.
         key: The board's key, which requests are sealed with if it has one.
+        trace: File to record the line in.
 
     Attributes:
         key: The same.
         max_payload: Largest payload that the board takes, bytes; HELLO says it.
+
+    Raises:
+        OutputError: The trace cannot be written; the line is closed.
     """
 
     def __init__(
@@ -103,17 +101,21 @@ class Session:
         nonce: int | None = None,
         tries: int = TRIES,
         key: bytes | None = None,
+        trace: Path | None = None,
     ) -> None:
         draw = random.SystemRandom()
-        self.transport = transport
+        first = draw.randrange(1 << 16) if first is None else first
         self._nonce = draw.randrange(1 << 32) if nonce is None else nonce
         self.key = key
-        self.max_payload = MAX_PAYLOAD
-        self.client = Client(
-            timing or Timing(),
-            first=draw.randrange(1 << 16) if first is None else first,
-            tries=tries,
-        )
+        self.max_payload = protocol.MAX_PAYLOAD
+        self.client = Client(timing or Timing(), first=first, tries=tries)
+        self.transport = transport
+        if trace is not None:
+            try:
+                self.transport = TraceTransport(transport, trace, self.client.timing.baud, first, self._nonce)
+            except OutputError:
+                transport.close()
+                raise
 
     @property
     def name(self) -> str:
@@ -130,7 +132,7 @@ class Session:
         """Close the line."""
         self.transport.close()
 
-    def hello(self) -> HelloReply:
+    def hello(self) -> protocol.HelloReply:
         """Open the session, or keep it.
 
         Raises:
@@ -138,7 +140,7 @@ class Session:
             IncompatibleError: The board speaks another protocol.
             RefusedError: It has another key than this host.
         """
-        self.client.session = NO_SESSION
+        self.client.session = protocol.NO_SESSION
         self.client.sealer, known = None, self.client.sealer
         self.client.window = 1
         self.client.minor = MINOR
@@ -146,7 +148,9 @@ class Session:
         try:
             # Ends what a host before this one may have left half sent.
             self.transport.write(b"\0")
-            self.run([HelloRequest(MAJOR, MINOR, self._nonce)], lambda _, outcome: found.append(outcome))
+            self.run(
+                [protocol.HelloRequest(MAJOR, MINOR, self._nonce)], lambda _, outcome: found.append(outcome)
+            )
         except LineError as fault:
             if not on_network(self.name):
                 raise
@@ -160,8 +164,8 @@ class Session:
             if on_network(self.name):
                 advice = "another host may be connected to it: end that one; or the board behind it is off"
             raise NoBoardError(f"{self.name}: no board answers; {advice}")
-        if not isinstance(outcome.reply, HelloReply):
-            raise refusal(self.name, Type.HELLO, outcome.status, outcome.detail)
+        if not isinstance(outcome.reply, protocol.HelloReply):
+            raise refusal(self.name, protocol.Type.HELLO, outcome.status, outcome.detail)
         self.client.session = outcome.reply.session
         self.client.window = max(1, outcome.reply.window)
         self.max_payload = outcome.reply.max_payload
@@ -169,12 +173,12 @@ class Session:
         self.client.minor = min(MINOR, outcome.reply.minor)
         return outcome.reply
 
-    def renew(self) -> HelloReply:
+    def renew(self) -> protocol.HelloReply:
         """Open another session; faults as of `hello`."""
         self._nonce = (self._nonce + 1) & 0xFFFFFFFF
         return self.hello()
 
-    def _agree_on_key(self, about: HelloReply, token: int, known: Sealer | None) -> None:
+    def _agree_on_key(self, about: protocol.HelloReply, token: int, known: Sealer | None) -> None:
         """Seal what follows if the board has a key; without it its board can only be looked at."""
         if not any(about.key_name) or self.key is None:
             return
@@ -189,7 +193,7 @@ class Session:
         start = ((self.client.first + token) & 0xFFFF) - token
         same = known is not None and known.challenge == about.challenge
         self.client.sealer = known if same else Sealer(self.key, about.challenge, start)
-        self.max_payload = about.max_payload - SEAL_BYTES
+        self.max_payload = about.max_payload - protocol.SEAL_BYTES
 
     def call(self, request: WireRequest[Reply]) -> Reply:
         """One request and its answer.
@@ -202,12 +206,38 @@ class Session:
         self.run([request], lambda _, outcome: found.append(outcome))
         return self.checked(request, found[0])
 
+    def status_when(
+        self, done: Callable[[protocol.StatusReply], bool], timeout_s: float, pause_s: float = 0.005
+    ) -> protocol.StatusReply:
+        """Status once it is as wanted; or, not so, when `timeout_s` and a packet are over."""
+        status = self.call(protocol.StatusRequest())
+        # an older board's packet by its frames: a preamble of 32 chips at most, 32 a frame
+        packet_s = (status.packet_chips or 32 + 32 * status.frames) / status.chip_rate_hz
+        end = self.transport.now() + timeout_s + packet_s
+        while not done(status) and self.transport.now() <= end:
+            self.transport.read(pause_s)
+            status = self.call(protocol.StatusRequest())
+        return status
+
+    def wait_dark(self, timeout_s: float) -> protocol.StatusReply:
+        """Status once the LEDs are dark after a stop.
+
+        Raises:
+            LineError: They are not within `timeout_s` and the packet that a stop finishes.
+        """
+        ends = (State.DARK, State.FAULT)
+        status = self.status_when(lambda status: status.state in ends, timeout_s)
+        if status.state not in ends:
+            state = name_of(State, status.state).upper()
+            raise LineError(f"{self.name}: still {state}; try 'evlcp board blank'")
+        return status
+
     def _check_known(self, request: WireRequest[Any]) -> None:
         """Raise IncompatibleError if the board's protocol is too old for a request."""
         later = request.later(self.client.minor)
         if later is None:
             return
-        what = Type(request.TYPE).name + ("" if later == "it" else f" with {later}")
+        what = protocol.Type(request.TYPE).name + ("" if later == "it" else f" with {later}")
         raise IncompatibleError(
             f"{self.name}: {what} is not in its protocol {MAJOR}.{self.client.minor}, this host has"
             f" {MAJOR}.{MINOR}; update the firmware"
@@ -221,7 +251,7 @@ class Session:
         """
         if outcome.status is None:
             raise LineError(
-                f"{self.name}: no answer to {Type(request.TYPE).name} after {outcome.tries} tries;"
+                f"{self.name}: no answer to {protocol.Type(request.TYPE).name} after {outcome.tries} tries;"
                 " check the line and run the command again"
             )
         if outcome.reply is None:

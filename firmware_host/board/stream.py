@@ -12,12 +12,7 @@ from numpy.typing import ArrayLike
 from firmware_host.board.session import Session
 from firmware_host.errors import BoardError, LineError
 from firmware_host.protocol.client import RequestOutcome
-from firmware_host.protocol.generated.requests import (
-    PushRequest,
-    State,
-    StatusRequest,
-    StopRequest,
-)
+from firmware_host.protocol.generated.requests import PushRequest, StopRequest
 
 AHEAD = 4
 """Packets that wait on the board, the one that plays among them, unless the caller says otherwise."""
@@ -215,7 +210,7 @@ class Stream:
         self._submit(None, PushRequest(self._bank, self._next, 0, 1, b""))
         while self._flight:
             self._pump(self._pulse_s)
-        self._until_dark((self._next - self.begun + 1) * self.packet_s)
+        self._session.wait_dark((self._next - self.begun + 1) * self.packet_s + _DARK_S)
 
     def stop(self) -> None:
         """Dark after the packet that plays; those that wait are not played."""
@@ -224,15 +219,7 @@ class Stream:
         self._flight.clear()
         self._session.client.forget()
         self._session.call(StopRequest())
-        self._until_dark(self.packet_s)
-
-    def _until_dark(self, soon_s: float) -> None:
-        line = self._session.transport
-        end = line.now() + soon_s + _DARK_S
-        while self._session.call(StatusRequest()).state not in (State.DARK, State.FAULT):
-            if line.now() > end:
-                raise LineError(f"{self._session.name}: still lit; try 'evlcp board blank'")
-            line.read(min(0.005, self._pulse_s))
+        self._session.wait_dark(self.packet_s + _DARK_S)
 
     # -- what is on its way
 

@@ -3,20 +3,19 @@
 from enum import Enum
 from typing import Any
 
+from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import (
     NO_BANK,
     BoardFault,
     Capability,
     Format,
-    HelloReply,
     Profile,
     State,
-    StatusReply,
     Watchdog,
 )
 
 
-def about_table(about: HelloReply) -> dict[str, Any]:
+def about_table(about: protocol.HelloReply) -> dict[str, Any]:
     """What a board is and what it can, from its HELLO."""
     return {
         "hal": about.hal.rstrip(b"\0").decode("ascii", "replace"),
@@ -33,12 +32,12 @@ def about_table(about: HelloReply) -> dict[str, Any]:
     }
 
 
-def _numbers(reply: HelloReply | StatusReply, *names: str) -> dict[str, int]:
+def _numbers(reply: protocol.HelloReply | protocol.StatusReply, *names: str) -> dict[str, int]:
     """Fields that are told as they are."""
     return {name: getattr(reply, name) for name in names}
 
 
-def names_of_formats(about: HelloReply) -> list[str]:
+def names_of_formats(about: protocol.HelloReply) -> list[str]:
     """What a bank of a board may hold, and how many chips of that.
 
     A board that does not say so takes words and masks.
@@ -62,7 +61,7 @@ def names_of_bits(flags: type[Enum], value: int) -> list[str]:
     return [f"bit {int(name):#x}" if name.isdigit() else name for name in names]
 
 
-def status_table(status: StatusReply) -> dict[str, Any]:
+def status_table(status: protocol.StatusReply) -> dict[str, Any]:
     """What a board does, from its STATUS."""
 
     def bank(number: int) -> int | None:

@@ -7,7 +7,7 @@ import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.files import read_json
@@ -17,17 +17,8 @@ from firmware_host.board.tables import about_table
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.images import FlashImage
 from firmware_host.protocol.client import RequestOutcome
-from firmware_host.protocol.generated.requests import (
-    Capability,
-    Status,
-    UpdateBeginRequest,
-    UpdateCommitRequest,
-    UpdateConfirmRequest,
-    UpdateRestartRequest,
-    UpdateStatusReply,
-    UpdateStatusRequest,
-    UpdateWriteRequest,
-)
+from firmware_host.protocol.generated import requests as protocol
+from firmware_host.protocol.generated.requests import Capability, Status
 
 _NO_UPDATE = (
     "not a firmware update, or damaged; expected TARGET.update.json, as 'evlcp board build' makes it"
@@ -107,17 +98,8 @@ class Updated:
     sequence: int
     firmware: str
 
-    def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
-        return {
-            "image": self.image,
-            "bytes": self.length,
-            "sequence": self.sequence,
-            "firmware": self.firmware,
-        }
 
-
-def update_status(board: Board) -> UpdateStatusReply:
+def update_status(board: Board) -> protocol.UpdateStatusReply:
     """Which image of the firmware runs.
 
     Raises:
@@ -128,12 +110,12 @@ def update_status(board: Board) -> UpdateStatusReply:
             f"{board.session.name}: takes no updates over its line; 'evlcp board flash' instead",
             Status.NOT_SUPPORTED,
         )
-    return board.session.call(UpdateStatusRequest())
+    return board.session.call(protocol.UpdateStatusRequest())
 
 
 def confirm(board: Board) -> None:
     """Keep the image that runs on trial."""
-    board.session.call(UpdateConfirmRequest())
+    board.session.call(protocol.UpdateConfirmRequest())
 
 
 def update(
@@ -174,16 +156,16 @@ def update(
             f"{session.name}: {len(data)} bytes of firmware, an image may have {before.capacity}",
             Status.OUT_OF_RANGE,
         )
-    session.call(UpdateBeginRequest(before.next, len(data), zlib.crc32(data)))
+    session.call(protocol.UpdateBeginRequest(before.next, len(data), zlib.crc32(data)))
     advance = progress or (lambda _done, _total: None)
-    piece = (board.session.max_payload - UpdateWriteRequest.fixed_bytes()) // 4 * 4
+    piece = (board.session.max_payload - protocol.UpdateWriteRequest.fixed_bytes()) // 4 * 4
     done = 0
 
-    def requests() -> Iterator[UpdateWriteRequest]:
+    def requests() -> Iterator[protocol.UpdateWriteRequest]:
         for at in range(0, len(data), piece):
-            yield UpdateWriteRequest(at, data[at : at + piece])
+            yield protocol.UpdateWriteRequest(at, data[at : at + piece])
 
-    def handle(request: UpdateWriteRequest, outcome: RequestOutcome) -> None:
+    def handle(request: protocol.UpdateWriteRequest, outcome: RequestOutcome) -> None:
         nonlocal done
         session.checked(request, outcome)
         done += len(request.data)
@@ -191,7 +173,7 @@ def update(
 
     try:
         session.run(requests(), handle)
-        sequence = session.call(UpdateCommitRequest()).sequence
+        sequence = session.call(protocol.UpdateCommitRequest()).sequence
     except LineError as fault:
         raise type(fault)(
             f"{fault}; it begins anew, and the board keeps the firmware that it runs"
@@ -212,7 +194,7 @@ def _restart(board: Board, wait_s: float) -> None:
     """Restart the board, and say HELLO until it answers; one that has been reset has taken fewer requests."""
     session, line = board.session, board.session.transport
     taken = board.status().requests
-    session.call(UpdateRestartRequest())
+    session.call(protocol.UpdateRestartRequest())
     begin = line.now()
     # a slow one gets longer
     end = begin + wait_s + 20 * session.client.latency_s

@@ -165,4 +165,5 @@ def update(
         with progress_bar("updating") as progress:
             done = field.update(board, package, progress, keep)
     words = f"image {done.image} runs, {done.length} bytes, firmware {done.firmware}"
-    say(words + ("" if keep else ", on trial"), done.to_dict() | {"kept": keep}, as_json)
+    table = {"image": done.image, "bytes": done.length, "sequence": done.sequence, "firmware": done.firmware}
+    say(words + ("" if keep else ", on trial"), table | {"kept": keep}, as_json)

@@ -44,37 +44,25 @@ class BoardLine:
     @contextlib.contextmanager
     def open(self) -> "Iterator[Board]":
         """The board on the line, or the recorded one."""
-        from evlcp_sdk.errors import ConfigError, OutputError
+        from evlcp_sdk.errors import ConfigError
         from firmware_host.board.board import Board
         from firmware_host.board.keys import read_board_key
         from firmware_host.board.session import Session
         from firmware_host.emulators.opening import open_port
-        from firmware_host.ports.transport import ReplayTransport, TraceTransport, Transport
+        from firmware_host.ports.transport import ReplayTransport
         from firmware_host.protocol.client import Timing
 
         # before the line is opened
         key = None if self.key is None else read_board_key(self.key)
-        transport: Transport
-        first = nonce = None
-        baud = self.baud
-        if self.replay is not None:
-            if self.trace is not None:
-                raise ConfigError("--trace and --replay: give one of the two")
-            transport = played = ReplayTransport(self.replay)
-            first, nonce, baud = played.first, played.nonce, played.baud
+        if self.replay is None:
+            line = open_port(self.found(), self.baud)
+            session = Session(line, Timing(self.baud), key=key, trace=self.trace)
+        elif self.trace is not None:
+            raise ConfigError("--trace and --replay: give one of the two")
         else:
-            transport = open_port(self.found(), baud)
-            if self.trace is not None:
-                import random
-
-                draw = random.SystemRandom()
-                first, nonce = draw.randrange(1 << 16), draw.randrange(1 << 32)
-                try:
-                    transport = TraceTransport(transport, self.trace, baud, first, nonce)
-                except OutputError:
-                    transport.close()
-                    raise
-        with Session(transport, Timing(baud), first, nonce, key=key) as session:
+            played = ReplayTransport(self.replay)
+            session = Session(played, Timing(played.baud), played.first, played.nonce, key=key)
+        with session:
             yield Board(session)
 
 

@@ -11,17 +11,8 @@ from typing import Any
 
 from firmware_host.errors import DatagramError
 from firmware_host.protocol.datagram import Datagram, DatagramDecoder
-from firmware_host.protocol.generated.requests import (
-    CRC_BYTES,
-    HEADER_BYTES,
-    MAX_PAYLOAD,
-    MINOR,
-    NO_SESSION,
-    REPLIES,
-    REPLY_BIT,
-    SEALED,
-    Status,
-)
+from firmware_host.protocol.generated import requests as protocol
+from firmware_host.protocol.generated.requests import MINOR, REPLIES, SEALED, Status
 from firmware_host.protocol.seal import Sealer
 from firmware_host.protocol.wire import WireMessage, WireRequest
 
@@ -130,7 +121,7 @@ class Client:
 
     timing: Timing
     window: int = 1
-    session: int = NO_SESSION
+    session: int = protocol.NO_SESSION
     minor: int = MINOR
     sealer: Sealer | None = None
     first: int = field(default_factory=lambda: random.SystemRandom().randrange(1 << 16))
@@ -184,14 +175,16 @@ class Client:
         """Queue a request; returns the token its outcome will carry."""
         sequence = (self.first + self._tokens) & 0xFFFF
         token, payload, status = self._tokens, request.pack(self.minor), 0
-        if self.sealer is not None and self.session != NO_SESSION:
+        if self.sealer is not None and self.session != protocol.NO_SESSION:
             payload += self.sealer.seal(request.TYPE, self.session, token, payload)
             status = SEALED
         wire = Datagram(request.TYPE, status, sequence, self.session, payload).encode()
         reply = REPLIES[request.TYPE]
-        longest = MAX_PAYLOAD if reply.takes_more() else max(4, reply.fixed_bytes())
+        longest = protocol.MAX_PAYLOAD if reply.takes_more() else max(4, reply.fixed_bytes())
         self._tokens += 1
-        self._queue.append(_Waiting(token, request.TYPE, wire, longest + HEADER_BYTES + CRC_BYTES + 4))
+        self._queue.append(
+            _Waiting(token, request.TYPE, wire, longest + protocol.HEADER_BYTES + protocol.CRC_BYTES + 4)
+        )
         return token
 
     @property
@@ -209,7 +202,7 @@ class Client:
         self._now = self._now if now is None else now
         for datagram in self.decoder.feed(data):
             waiting = self._flight.get(datagram.sequence)
-            if waiting is None or datagram.type != waiting.type | REPLY_BIT:
+            if waiting is None or datagram.type != waiting.type | protocol.REPLY_BIT:
                 continue
             outcome = _outcome(waiting, datagram)
             if outcome is not None:

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import get_type_hints
 
 import pytest
+from board_lines import read_vectors
 from cobs import cobs
 from hypothesis import given, settings, strategies as st
 
@@ -16,7 +17,6 @@ from firmware_host.protocol.client import TRIES, Client, Timing
 from firmware_host.protocol.datagram import MAX_WIRE_BYTES, Datagram, DatagramDecoder
 from firmware_host.protocol.generated import requests as messages
 from firmware_host.protocol.wire import WireMessage
-from tests.firmware.wire_vectors import read_vectors
 
 VECTORS = list(read_vectors())
 PAYLOADS = [

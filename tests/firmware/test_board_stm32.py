@@ -40,7 +40,7 @@ class Bar:
         return np.repeat(np.resize(np.roll(self.chips, -first, axis=0), (count, 16)), 6, axis=1)
 
     def play(self, us: float, least: int) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-        """Start, and see that all rows are right, at least so many; these from the first lit one, and when."""
+        """Start, and see that all rows are right, at least so many; these from the first lit on, and when."""
         begin = len(self.log)
         self.board.start()
         self.chip.run(us)
