@@ -12,7 +12,7 @@ from evlcp_sdk.diagnosis.checks import run_checks
 from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
 from evlcp_sdk.diagnosis.readout import ReadoutTally
 from evlcp_sdk.diagnosis.tallies import RunTally
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
@@ -25,19 +25,10 @@ NO_POSITIONS: dict[str, Any] = {
     "attitude_missing": 0,
     "gnss_apart_m": None,
 }
-NONE = Range(float("nan"), float("nan"), 0)
-NEAR = Range(50.0, 0.1, 15)
 
 
 def tally_of(
-    symbols: np.ndarray,
-    *,
-    ppm: float = 0.0,
-    echo_of: int | None = None,
-    distance: Range = NEAR,
-    every_us: float = 0.0,
-    start_us: float = 0.0,
-    points: np.ndarray | None = None,
+    symbols: np.ndarray, *, ppm: float = 0.0, every_us: float = 0.0, start_us: float = 0.0, **of_frame: Any
 ) -> RunTally:
     """Packets of ten frames with these symbols, (packets, 10, 16)."""
     tally = RunTally(LINK.packet)
@@ -46,35 +37,31 @@ def tally_of(
     for n, packet in enumerate(symbols):
         at_us = start_us + n * period_us
         frames = [
-            Frame(0, n, f, at_us + f * every_us, SoftSymbols(one, unknown, 1.0), distance, None, 0.0, 0.0)
+            Frame(0, n, f, at_us + f * every_us, SoftSymbols(one, unknown, 1.0), NEAR, None, 0.0, 0.0)
             for f, one in enumerate(packet)
         ]
-        frames = [replace(frame, echo_of=echo_of) for frame in frames]
-        if points is not None:
-            frames = [replace(frame, points_px=points) for frame in frames]
+        frames = [replace(frame, **of_frame) for frame in frames]
         tally.add(Packet(0, n, at_us, 100.0, tuple(frames), 10))
     return tally
 
 
-def find_warnings(facts: Facts) -> list[Diagnostic]:
-    return [one for one in run_checks(facts) if one.verdict in ("doubt", "fail")]
+def find(facts: Facts, *verdicts: str) -> list[Diagnostic]:
+    return [one for one in run_checks(facts) if one.verdict in (verdicts or ("doubt", "fail"))]
 
 
-def find_notes(facts: Facts) -> list[Diagnostic]:
-    return [one for one in run_checks(facts) if one.verdict == "note"]
-
-
-def told(tally: RunTally, link: Link = LINK, **counts: int) -> list[str]:
-    return [str(doubt) for doubt in find_warnings(Facts(link, tally, counts))]
-
-
+NEAR, NONE = Range(50.0, 0.1, 15), Range(float("nan"), float("nan"), 0)
 RANDOM = np.random.default_rng(1).integers(0, 64, (6, 10, 16))
+HIDDEN = RANDOM.copy()
+HIDDEN[:, :, [4, 12]] = -1
+HIDDEN[:3, :, 7] = -1
+AT_50_M = 400 + LINK.camera.focal_px * LINK.bar.cluster_centres_m() / 50
+HEAD_DOWN = 800 - AT_50_M
 FOUND, NOTHING = tally_of(RANDOM), RunTally(LINK.packet)
+UNREAD = {"blocks_tried": 6, "blocks_failed": 6}
 READ = {"frames": 60, "blocks_tried": 6, "blocks_decoded": 4, "blocks_failed": 2}
 """Most packets are read, so that the link is right."""
-
-BLINKS = "something blinks, 5,000,000 events in 1 region, but no"
-INVERTED = "50 of 60 frames fit only a light that is on where the link says off"
+BLINKS = {"events_in_regions": 5_000_000, "regions_opened": 1}
+BLINKING = "something blinks, 5,000,000 events in 1 region, but no"
 
 
 @pytest.mark.parametrize(
@@ -85,29 +72,17 @@ INVERTED = "50 of 60 frames fit only a light that is on where the link says off"
         (FOUND, {"frames": 60, "frames_rejected": 20}, "20 of 80 frames rejected"),
         (FOUND, READ | {"frames_rejected": 20}, ""),
         (FOUND, READ | {"frames_rejected": 30}, "30 of 90 frames rejected"),
-        (
-            FOUND,
-            {"frames": 60, "frames_unread": 20},
-            "20 of 80 frames show their clusters, but not one symbol",
-        ),
+        (FOUND, {"frames": 60, "frames_unread": 20}, "20 of 80 frames show their clusters, but not one"),
         # A truck before it is no fault of the link's.
         (FOUND, {"frames": 60, "frames_dark": 60, "frames_rejected": 6, "frames_unread": 6}, ""),
         # Random symbols are no blocks; packets that repeat one another are.
-        (FOUND, {"blocks_tried": 6, "blocks_failed": 6}, ""),
-        (
-            FOUND,
-            {"blocks_tried": 6, "blocks_failed": 6, "blocks_alike": 4},
-            "none of 6 packets with a block that can be read, though 4 of them repeat others",
-        ),
-        (
-            FOUND,
-            {"blocks_tried": 6, "blocks_decoded": 5, "blocks_other_codebook": 1},
-            "1 packet sent with another codebook",
-        ),
+        (FOUND, UNREAD, ""),
+        (FOUND, UNREAD | {"blocks_alike": 4}, "none of 6 packets with a block that can be read, though 4"),
+        (FOUND, READ | {"blocks_other_codebook": 1}, "1 packet sent with another codebook"),
         (FOUND, {"frames": 60, "frames_askew": 40}, "40 of 60 frames show bars that do not stand plumb"),
         # One bar of three that is mounted so.
         (FOUND, {"frames": 60, "frames_askew": 20}, ""),
-        (FOUND, {"frames": 60, "frames_inverted": 50}, INVERTED),
+        (FOUND, {"frames": 60, "frames_inverted": 50}, "50 of 60 frames fit only a light that is on where"),
         (FOUND, {"frames": 60, "frames_inverted": 20}, ""),
         # Of a bar that another link reads.
         (FOUND, {"frames": 60, "frames_inverted": 90, "frames_of_others": 90}, ""),
@@ -123,16 +98,12 @@ INVERTED = "50 of 60 frames fit only a light that is on where the link says off"
             "more than the receiver holds at a time: 7 events of crowded time steps dropped; 3 frames",
         ),
         (FOUND, {"frames": 60, "steps_forgotten": 50, "areas_left_out": 9}, ""),
-        (
-            NOTHING,
-            {"events_in_regions": 5_000_000, "regions_opened": 1, "preambles": 0},
-            f"{BLINKS} preamble",
-        ),
-        (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 2, "preambles": 1}, ""),
+        (NOTHING, BLINKS | {"preambles": 0}, f"{BLINKING} preamble is"),
+        (NOTHING, BLINKS | {"preambles": 1}, ""),
         (NOTHING, {"events_in_regions": 20_000, "regions_opened": 3, "preambles": 0}, ""),
         # Of a framing that has no preamble.
-        (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 1, "frames": 0}, f"{BLINKS} frame is"),
-        (NOTHING, {"events_in_regions": 5_000_000, "regions_opened": 1, "frames": 2}, ""),
+        (NOTHING, BLINKS | {"frames": 0}, f"{BLINKING} frame is"),
+        (NOTHING, BLINKS | {"frames": 2}, ""),
         (NOTHING, {"events": 1000, "dropped_backward": 90}, ""),
         (NOTHING, {"events": 1_000_000, "dropped_backward": 900}, ""),
         (
@@ -140,70 +111,53 @@ INVERTED = "50 of 60 frames fit only a light that is on where the link says off"
             {"events": 50_000, "dropped_backward": 90, "dropped_off_sensor": 20},
             "110 events or words dropped (90 backward, 20 off sensor)",
         ),
-    ],
-)
-def test_what_counts_of_the_receiver_say(tally: RunTally, counts: dict[str, int], said: str) -> None:
-    lines = told(tally, **counts)
-    assert len(lines) == bool(said)
-    assert not said or lines[0].startswith(said)
-
-
-HIDDEN = RANDOM.copy()
-HIDDEN[:, :, [4, 12]] = -1
-HIDDEN[:3, :, 7] = -1
-AT_50_M = 400 + LINK.camera.focal_px * LINK.bar.cluster_centres_m() / 50
-HEAD_DOWN = 800 - AT_50_M
-
-
-@pytest.mark.parametrize(
-    ("tally", "said"),
-    [
-        (tally_of(RANDOM, ppm=100), ""),
+        (tally_of(RANDOM, ppm=100), {}, ""),
         # Of one packet, a dozen codewords are missing by chance.
-        (tally_of(RANDOM[:1]), ""),
-        (tally_of(RANDOM % 16), "48 of 64 codewords never occur in 960 symbols"),
+        (tally_of(RANDOM[:1]), {}, ""),
+        (tally_of(RANDOM % 16), {}, "transmitter 0: 48 of 64 codewords never occur in 960 symbols"),
         # Symbols beyond those that carry data alone.
-        (tally_of(RANDOM * 0 + 64), "64 of 64 codewords never occur"),
-        (tally_of(RANDOM, ppm=-5000), "its clock is -5000 ppm off"),
-        (tally_of(RANDOM, ppm=600), "air.chip_rate_hz = 10006 would fit"),
+        (tally_of(RANDOM * 0 + 64), {}, "transmitter 0: 64 of 64 codewords never occur"),
+        (tally_of(RANDOM, ppm=-5000), {}, "transmitter 0: its clock is -5000 ppm off"),
+        (tally_of(RANDOM, ppm=600), {}, "air.chip_rate_hz = 10006 would fit"),
         # Two packets: 40 us that light took, in 34.6 ms, are no clock.
-        (tally_of(RANDOM[:2], ppm=1150), ""),
-        (tally_of(RANDOM[:2], ppm=1800), "ppm off the link's"),
-        (tally_of(HIDDEN), "clusters never seen: 4, 12: "),
-        (tally_of(RANDOM, points=AT_50_M), ""),
-        (
-            tally_of(RANDOM, points=400 + (AT_50_M - 400) * 0.8),
-            "its distances are 20% too short for a bar of",
-        ),
-        (tally_of(RANDOM, points=400 + (AT_50_M - 400) * 1.5), "50% too long"),
-        (tally_of(RANDOM, points=HEAD_DOWN), "its clusters stand the other way round"),
+        (tally_of(RANDOM[:2], ppm=1150), {}, ""),
+        (tally_of(RANDOM[:2], ppm=1800), {}, "ppm off the link's"),
+        (tally_of(HIDDEN), {}, "transmitter 0: clusters never seen: 4, 12: "),
+        (tally_of(RANDOM, points_px=AT_50_M), {}, ""),
+        (tally_of(RANDOM, points_px=400 + (AT_50_M - 400) * 0.8), {}, "its distances are 20% too short for"),
+        (tally_of(RANDOM, points_px=400 + (AT_50_M - 400) * 1.5), {}, "50% too long"),
+        (tally_of(RANDOM, points_px=HEAD_DOWN), {}, "its clusters stand the other way round"),
         # What is known to be a reflection may be anything; in a wet road it stands on its head.
-        (tally_of(RANDOM % 16, ppm=5000, echo_of=3), ""),
-        (tally_of(RANDOM, points=HEAD_DOWN, echo_of=3), ""),
-        (tally_of(RANDOM, distance=NONE), "0 of 60 frames have a distance"),
+        (tally_of(RANDOM % 16, ppm=5000, echo_of=3), {}, ""),
+        (tally_of(RANDOM, points_px=HEAD_DOWN, echo_of=3), {}, ""),
+        (tally_of(RANDOM, range=NONE), {}, "0 of 60 frames have a distance"),
+        # What there was no time for is no fault of the bar's.
+        (tally_of(RANDOM, range=NONE), {"frames_not_ranged": 60}, ""),
     ],
 )
-def test_what_a_transmitter_shows(tally: RunTally, said: str) -> None:
-    lines = told(tally)
+def test_what_counts_and_frames_say(tally: RunTally, counts: dict[str, int], said: str) -> None:
+    lines = [str(one) for one in find(Facts(LINK, tally, counts))]
     assert len(lines) == bool(said)
-    assert not said or (said in lines[0] and lines[0].startswith("transmitter 0: "))
-
-
-def test_what_there_was_no_time_for_is_no_fault_of_the_bar() -> None:
-    assert told(tally_of(RANDOM, distance=NONE), frames_not_ranged=60) == []
+    assert not said or said in lines[0]
 
 
 def test_events_lost_in_the_file_are_said() -> None:
-    (doubt,) = find_warnings(Facts(LINK, NOTHING, {"events": 50_000}, losses=[Loss(200, 0, "byte", "odd")]))
+    (doubt,) = find(Facts(LINK, NOTHING, {"events": 50_000}, losses=[Loss(200, 0, "byte", "odd")]))
     assert "200 in the file" in doubt.text
 
 
-def test_random_symbols_are_no_messages() -> None:
-    random = {"blocks_tried": 6, "blocks_failed": 6}
-    (note,) = find_notes(Facts(LINK, FOUND, random))
-    assert note.code == "no-messages"
-    assert note.text == "no messages: none of 6 packets with a block that can be read"
-    assert find_notes(Facts(LINK, FOUND, random, reads_messages=False)) == []
+@pytest.mark.parametrize(
+    ("tally", "counts", "read", "said"),
+    [
+        (FOUND, UNREAD, True, "no messages: none of 6 packets with a block that can be read"),
+        (FOUND, UNREAD, False, None),
+        (NOTHING, {"events": 9}, True, "no frame was read"),
+        (NOTHING, {"events": 0}, True, None),
+    ],
+)
+def test_what_there_is_none_of(tally: RunTally, counts: dict[str, int], read: bool, said: str | None) -> None:
+    facts = Facts(LINK, tally, counts, reads_messages=read)
+    assert [one.text for one in find(facts, "note")] == [said] * (said is not None)
 
 
 @pytest.mark.parametrize(
@@ -223,9 +177,9 @@ def test_what_the_figures_of_a_transmitter_say(figures: dict[str, Any], decoded:
     tally = tally_of(RANDOM)
     for name, value in figures.items():
         setattr(tally.transmitters[0], name, value)
-    lines = told(tally, blocks_tried=60, blocks_decoded=decoded, blocks_failed=60 - decoded)
-    assert len(lines) == bool(said)
-    assert not said or (said in lines[0] and lines[0].startswith("transmitter 0: "))
+    counts = {"blocks_tried": 60, "blocks_decoded": decoded, "blocks_failed": 60 - decoded}
+    found = find(Facts(LINK, tally, counts))
+    assert [(said in one.text, one.transmitter) for one in found] == [(True, 0)] * bool(said)
 
 
 def test_the_modulation_that_was_sent() -> None:
@@ -237,15 +191,15 @@ def test_the_modulation_that_was_sent() -> None:
     sent = inside[np.random.default_rng(2).integers(0, 16, (6, 10, 16))]
     others = partial(other_codewords, LINK, Registry.load())
     counts = {"blocks_tried": 9, "blocks_failed": 9}
-    (doubt,) = find_warnings(Facts(LINK, tally_of(sent), counts, others=others))
+    (doubt,) = find(Facts(LINK, tally_of(sent), counts, others=others))
     assert (doubt.code, doubt.transmitter) == ("profile", 0)
     assert doubt.text == "only 16 of 64 symbols ever occur, 9 of 9 blocks unreadable"
     assert doubt.next_step == "was this sent with wh8? try --set modulation.id=wh8"
     noisy = np.where(np.random.default_rng(3).random(sent.shape) < 0.02, RANDOM, sent)
-    (doubt,) = find_warnings(Facts(LINK, tally_of(noisy), {}, others=others))
+    (doubt,) = find(Facts(LINK, tally_of(noisy), {}, others=others))
     assert doubt.code in ("profile", "codewords") or len(np.unique(noisy)) == 64
     # All the same, which every modulation has.
-    (doubt,) = find_warnings(Facts(LINK, tally_of(sent * 0), {}, others=others))
+    (doubt,) = find(Facts(LINK, tally_of(sent * 0), {}, others=others))
     assert doubt.code == "codewords"
 
 
@@ -262,19 +216,19 @@ def test_light_without_frames(start_us: float, lit_us: tuple[float, float] | Non
     """Six packets of 34.6 ms, the last frame 31.4 ms before their end, in a recording of a second."""
     tally = tally_of(RANDOM, every_us=3200.0, start_us=start_us)
     facts = Facts(LINK, tally, {}, 5e3, 1.005e6, None if lit_us is None else {0: lit_us})
-    found = find_warnings(facts)
+    found = find(facts)
     assert [doubt.code for doubt in found] == ["coverage"] * (says is not None)
     assert says is None or found[0].text == says
     # Where nothing is received is said in any case, but a road without bars is nothing wrong.
-    (note,) = find_notes(facts)
+    (note,) = find(facts, "note")
     first_ms = round((start_us - 5e3) / 1e3)
     assert note.text == (
         f"frames in 208 ms of 1000 ms: nothing before {first_ms} ms, nothing after {first_ms + 202} ms"
     )
-    assert find_notes(replace(facts, last_us=3e5)) == []
+    assert find(replace(facts, last_us=3e5), "note") == []
     # A reflection may be lit without a frame.
     mirrored = tally_of(RANDOM, every_us=3200.0, start_us=start_us, echo_of=3)
-    assert find_warnings(replace(facts, tally=mirrored)) == []
+    assert find(replace(facts, tally=mirrored)) == []
 
 
 def test_a_readout_at_its_limit() -> None:
@@ -290,7 +244,7 @@ def test_a_readout_at_its_limit() -> None:
         readout = ReadoutTally()
         for piece in np.array_split(t_us, 7):
             readout.add(Events.of(piece, piece * 0, piece * 0, piece * 0))
-        found = find_warnings(Facts(LINK, RunTally(LINK.packet), {}, 0.0, 3e5, readout=readout))
+        found = find(Facts(LINK, RunTally(LINK.packet), {}, 0.0, 3e5, readout=readout))
         assert [doubt.code for doubt in found] == ["saturated"] * capped
         assert not capped or "hold 3 Mev/s" in found[0].text
 
@@ -310,15 +264,6 @@ def test_events_of_each_millisecond(steps: list[int], pieces: int) -> None:
     )
 
 
-def test_what_is_not_found_is_looked_for_elsewhere() -> None:
-    (note,) = find_notes(Facts(LINK, RunTally(LINK.packet), {"events": 9}))
-    assert (note.code, note.next_step) == (
-        "nothing-found",
-        "`evlcp diagnose` says what blinks, and what to try",
-    )
-    assert find_notes(Facts(LINK, RunTally(LINK.packet), {"events": 0})) == []
-
-
 def learnt(part: str, what: str, off: float, sigma: float) -> dict[str, Any]:
     """Positions of a drive that shows an error of something of which a sigma of 0.2 is stated."""
     row = {"part": part, "what": what, "correction": off, "sigma": sigma, "stated_sigma": 0.2}
@@ -331,7 +276,12 @@ def misfit(suspects: dict[str, int], fits_mm: float | None = None) -> dict[str, 
 
 
 NO_SITE = {"refused": {"no-site": 4}, "heard": {"0": 9, "1": 7, "2": 9}}
-KNOWN = {"fixes": 9, "bars": {"0": 7}}
+
+
+def known(strange: list[int], unseen: list[int]) -> dict[str, Any]:
+    """Positions of a bar with the id 7, beside others that are in no site, and sites that are not seen."""
+    heard = {str(number): one for number, one in enumerate([7, *strange])}
+    return {"fixes": 9, "bars": {"0": 7}, "heard": heard, "sites_unseen": unseen}
 
 
 @pytest.mark.parametrize(
@@ -343,21 +293,17 @@ KNOWN = {"fixes": 9, "bars": {"0": 7}}
         ("no-site", NO_SITE | {"fixes": 9}, ""),
         (
             "unknown-id",
-            KNOWN | {"heard": {"0": 7, "1": 107}, "sites_unseen": [8]},
+            known([107], [8]),
             "without id 107, received and in no site; id 8 of the sites was not",
         ),
+        ("unknown-id", known([9, 4], [1, 2]), "without ids 4, 9, received and in no site; ids 1, 2 of the"),
         (
             "unknown-id",
-            KNOWN | {"heard": {"0": 7, "1": 9, "2": 4}, "sites_unseen": [1, 2]},
-            "without ids 4, 9, received and in no site; ids 1, 2 of the",
-        ),
-        (
-            "unknown-id",
-            KNOWN | {"heard": {"0": 7, "1": 9}, "sites_unseen": [*range(20, 40)]},
+            known([9], [*range(20, 40)]),
             "ids 20, 21, 22, 23, 24 and 15 more of the sites were not",
         ),
-        ("unknown-id", KNOWN | {"heard": {"0": 7, "1": 107}}, ""),
-        ("unknown-id", KNOWN | {"heard": {"0": 7}, "sites_unseen": [8]}, ""),
+        ("unknown-id", known([107], []), ""),
+        ("unknown-id", known([], [8]), ""),
         (
             "misfit",
             misfit({"heading": 9, "bar 1": 2}),
@@ -393,5 +339,5 @@ KNOWN = {"fixes": 9, "bars": {"0": 7}}
 def test_what_positions_say(code: str, positions: dict[str, Any], said: str) -> None:
     link = load_link(overrides=["camera_sigma.focal_mm=0.2"])
     facts = Facts(link, RunTally(link.packet), {}, positions=NO_POSITIONS | positions)
-    found = find_warnings(facts)
+    found = find(facts)
     assert [said in str(one) for one in found if one.code == code] == [True] * bool(said)
