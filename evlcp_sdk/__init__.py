@@ -62,9 +62,9 @@ if TYPE_CHECKING:
         Tracking as Tracking,
     )
     from evlcp_sdk.plugin.source import EventSource as EventSource, Loss as Loss
+    from evlcp_sdk.results.columns import frames_table as frames_table
     from evlcp_sdk.results.folder import ResultFolder as ResultFolder
     from evlcp_sdk.results.sink import Run as Run, Sink as Sink
-    from evlcp_sdk.results.tables import frames_table as frames_table
     from evlcp_sdk.run import (
         Reception as Reception,
         receive as receive,
@@ -130,7 +130,7 @@ _HOMES = {
     ),
     "results.folder": "ResultFolder",
     "results.sink": "Run Sink",
-    "results.tables": "frames_table",
+    "results.columns": "frames_table",
     "run": "Reception receive receive_to_folder",
     "rx.receiver": "Receiver",
     "scene.attitude": "Attitude AttitudeLog",

@@ -24,8 +24,8 @@ from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.several import load_links, named_links, placing_links
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.results.columns import frames_table
 from evlcp_sdk.results.summary import RunEnd, Status
-from evlcp_sdk.results.tables import frames_table
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.signals import Stopped

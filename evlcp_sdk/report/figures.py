@@ -1,12 +1,11 @@
 """Figures of one recording: where the regions were, which pixels show which cluster, distance over time.
 
-A `FigureProbe` listens to the receiver's stages and keeps a bounded share of what it hears, so that the
-figures of a recording of any length take constant memory; `Figures` draws them in the end.
+What is drawn in the end is kept as it comes, a bounded share of it, so that the figures of a recording of
+any length take constant memory.
 """
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from functools import partial
 from textwrap import fill
 from typing import Any
@@ -32,48 +31,40 @@ from evlcp_sdk.report.recording import (
 )
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150
 _MOST_ZOOMS = 3
 _MOST_PLACES = 4096
+_MOST_POINTS, _MOST_REGIONS = 1024, 64
+"""Frames of a transmitter and places of a region, and regions, that are kept."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Shown:
-    """The clearest presence map of a transmitter and the frame it belongs to."""
+class Figures(Sink):
+    """Draws `regions.png`, `presence.png`, `distance.png`, and with positions `track.png`.
 
-    frame: Frame
-    presence: PresenceMap
-
-
-class FigureProbe:
-    """Watches a receiver for the figures; register it with `Registry.load(probe)`.
-
-    Args:
-        camera: Has the size of the image.
-        points: How many frames of a transmitter, and places of a region, to keep.
-        most_regions: How many regions to keep: of more, those with the fewest places are left out.
+    A figure without anything to show is left out.
 
     Attributes:
-        many_regions: How many there were.
+        image: Events of each pixel, int64 (rows, columns).
+        many_regions: How many regions there were; `regions` has those with the most places.
+        clearest: The frame of each transmitter that is surest, and its presence map.
     """
 
-    def __init__(self, camera: CameraModel, points: int = 1024, most_regions: int = 64) -> None:
-        self.image: NDArray[np.int64] = np.zeros((camera.height, camera.width), np.int64)
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self.image: NDArray[np.int64] = np.zeros((run.link.camera.height, run.link.camera.width), np.int64)
         self.first_us: int | None = None
         self.regions: dict[int, Thinned[Region]] = {}
         self.many_regions = 0
-        self._most_regions = most_regions
         self.frames: dict[int, Thinned[Frame]] = {}
-        self.clearest: dict[int, _Shown] = {}
+        self.clearest: dict[int, tuple[Frame, PresenceMap]] = {}
         self.echo_of: dict[int, int | None] = {}
-        self._points = points
         self._presence: PresenceMap | None = None
+        self._track = Thinned[Settled](_MOST_PLACES)
 
-    def watch(self, events: Events) -> None:
+    def events(self, events: Events) -> None:
         """Add events to the accumulated image."""
         if len(events):
             if self.first_us is None:
@@ -91,58 +82,37 @@ class FigureProbe:
         elif stage == "separation":
             self._presence = value
         elif stage == "frame" and (value.transmitter in self.frames or len(self.frames) < _MOST_ZOOMS):
-            self.frames.setdefault(value.transmitter, Thinned(self._points)).add(value)
+            self.frames.setdefault(value.transmitter, Thinned(_MOST_POINTS)).add(value)
             # The newest frame knows most.
             self.echo_of[value.transmitter] = value.echo_of
             best = self.clearest.get(value.transmitter)
-            if self._presence is not None and (best is None or value.soft.quality > best.frame.soft.quality):
-                self.clearest[value.transmitter] = _Shown(value, self._presence)
+            if self._presence is not None and (best is None or value.soft.quality > best[0].soft.quality):
+                self.clearest[value.transmitter] = value, self._presence
 
     def _place(self, region: Region) -> None:
         """Keep a place of a region, and the regions with the most of them."""
         if region.id not in self.regions:
             self.many_regions += 1
-            if len(self.regions) == self._most_regions:
+            if len(self.regions) == _MOST_REGIONS:
                 del self.regions[min(self.regions, key=lambda number: len(self.regions[number]))]
-            self.regions[region.id] = Thinned(self._points)
+            self.regions[region.id] = Thinned(_MOST_POINTS)
         self.regions[region.id].add(region)
-
-
-class Figures(Sink):
-    """Draws `regions.png`, `presence.png`, `distance.png`, and with positions `track.png`.
-
-    A figure without anything to show is left out.
-    """
-
-    def __init__(self, folder: ResultFolder, run: Run) -> None:
-        super().__init__(folder, run)
-        self.probe = FigureProbe(run.link.camera)
-        self.track = Thinned[Settled](_MOST_PLACES)
-
-    def events(self, events: Events) -> None:
-        """Add events to the accumulated image."""
-        self.probe.watch(events)
-
-    @hookimpl
-    def evlcp_stage_finished(self, stage: str, value: Any) -> None:
-        """Keep regions, presence maps and frames."""
-        self.probe.evlcp_stage_finished(stage, value)
 
     def settle(self, settled: Sequence[Settled]) -> None:
         """Keep places."""
         for one in settled:
-            self.track.add(one)
+            self._track.add(one)
 
     def finish(self) -> Mapping[str, Any]:
         """Draw."""
-        probe, name = self.probe, self.run.name
-        self._save(draw_regions(probe, name), "regions.png")
-        if probe.clearest:
-            self._save(draw_presence(probe, name), "presence.png")
-        if probe.frames:
-            self._save(draw_distance(probe, name), "distance.png")
+        name = self.run.name
+        self._save(draw_regions(self, name), "regions.png")
+        if self.clearest:
+            self._save(draw_presence(self, name), "presence.png")
+        if self.frames:
+            self._save(draw_distance(self, name), "distance.png")
         if self.run.navigator is not None:
-            points = [*self.track]
+            points = [*self._track]
             plots = plot_positions(points, self.run.navigator.bars_enu_m(), seconds_since(0.0))
             self._save(draw_plots(plots, f"{name}: {counted(len(points), 'position')} shown"), "track.png")
         return {}
@@ -151,15 +121,15 @@ class Figures(Sink):
         figure.savefig(self.folder.path(name), format="png", dpi=_DPI)
 
 
-def draw_regions(probe: FigureProbe, title: str) -> Figure:
+def draw_regions(kept: Figures, title: str) -> Figure:
     """Accumulated events of the whole sensor with the followed regions, and a close view of some of them."""
-    shown = sorted(probe.regions.items(), key=lambda item: -len(item[1]))
+    shown = sorted(kept.regions.items(), key=lambda item: -len(item[1]))
     zooms = sorted(dict(shown[:_MOST_ZOOMS]))
     figure = Figure(figsize=(8 + 1.8 * len(zooms), 4.8), layout="constrained")
     axes = figure.subplots(1, 1 + len(zooms), width_ratios=[8] + [1.6] * len(zooms), squeeze=False)[0]
-    height, width = probe.image.shape
-    top = max(float(np.quantile(probe.image[probe.image > 0], 0.99)) if probe.image.any() else 1.0, 1.0)
-    shades = np.log1p(probe.image, dtype=np.float32)
+    height, width = kept.image.shape
+    top = max(float(np.quantile(kept.image[kept.image > 0], 0.99)) if kept.image.any() else 1.0, 1.0)
+    shades = np.log1p(kept.image, dtype=np.float32)
     # Coloured once, in bytes: Matplotlib would take 80 MB to do so while it draws.
     picture = colormaps["Greys"](np.clip(shades / np.float32(math.log1p(top)), 0, 1), bytes=True)
     for axis in axes:
@@ -167,13 +137,13 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
         axis.set_xlabel("column, px")
     whole = axes[0]
     whole.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), ylabel="row, px")
-    many = f"{probe.many_regions} region{'s' * (probe.many_regions != 1)}"
-    if probe.many_regions > len(probe.regions):
-        many += f", {len(probe.regions)} shown"
+    many = f"{kept.many_regions} region{'s' * (kept.many_regions != 1)}"
+    if kept.many_regions > len(kept.regions):
+        many += f", {len(kept.regions)} shown"
     if zooms:
         many += " (beside: dotted at first, solid at last)"
-    titled(whole, f"{title}: {probe.image.sum():,} events, {many}")
-    for n, (number, places) in enumerate(sorted(probe.regions.items())):
+    titled(whole, f"{title}: {kept.image.sum():,} events, {many}")
+    for n, (number, places) in enumerate(sorted(kept.regions.items())):
         colour = transmitter_colour(n)
         path = list(places)
         left, upper, right, lower = _bounds(path)
@@ -200,16 +170,16 @@ def draw_regions(probe: FigureProbe, title: str) -> Figure:
     return figure
 
 
-def draw_presence(probe: FigureProbe, title: str) -> Figure:
+def draw_presence(kept: Figures, title: str) -> Figure:
     """Which pixels show which cluster, in one frame of each transmitter, and the profile of each cluster."""
-    shown = [probe.clearest[n] for n in sorted(probe.clearest)[:_MOST_ZOOMS]]
+    shown = [kept.clearest[n] for n in sorted(kept.clearest)[:_MOST_ZOOMS]]
     figure = Figure(figsize=(6.4 * len(shown), 7.4), layout="constrained")
-    text = fill(_PRESENCE.format(size=shown[0].presence.grid_px), 92 * len(shown))
+    text = fill(_PRESENCE.format(size=shown[0][1].grid_px), 92 * len(shown))
     figure.supxlabel(text, x=0.02, ha="left", fontsize=9, color=INK_COLOUR)
     parts = figure.subfigures(1, len(shown), squeeze=False)[0]
-    for part, best in zip(parts, shown, strict=True):
-        number = best.frame.transmitter
-        _draw_one_presence(part, best, name_transmitter(number, probe.echo_of[number]))
+    for part, (frame, presence) in zip(parts, shown, strict=True):
+        number = frame.transmitter
+        _draw_one_presence(part, frame, presence, name_transmitter(number, kept.echo_of[number]))
     figure.suptitle(f"{title}: which pixels show which cluster", fontsize=11, color=INK_COLOUR)
     return figure
 
@@ -222,9 +192,8 @@ _PRESENCE = (
 )
 
 
-def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
+def _draw_one_presence(part: SubFigure, frame: Frame, presence: PresenceMap, who: str) -> None:
     cells, pixels, profile = part.subplots(1, 3, width_ratios=[1, 1, 1.8], sharey=True)
-    presence, frame = best.presence, best.frame
     colours = cluster_colours(len(presence.probability))
     height, width = presence.pixels.shape[1:]
     size = presence.grid_px
@@ -271,15 +240,15 @@ def _draw_one_presence(part: SubFigure, best: _Shown, who: str) -> None:
     )
 
 
-def draw_distance(probe: FigureProbe, title: str) -> Figure:
+def draw_distance(kept: Figures, title: str) -> Figure:
     """Distance of each transmitter, what it is off its neighbours, and quality, over time."""
-    axis = seconds_since(probe.first_us or 0)
+    axis = seconds_since(kept.first_us or 0)
     frames = {
         number: (
-            name_transmitter(number, probe.echo_of[number]),
-            sorted(probe.frames[number], key=lambda frame: frame.t_us),
+            name_transmitter(number, kept.echo_of[number]),
+            sorted(kept.frames[number], key=lambda frame: frame.t_us),
         )
-        for number in sorted(probe.frames)[:_MOST_ZOOMS]
+        for number in sorted(kept.frames)[:_MOST_ZOOMS]
     }
     plots = [plot for number, one in frames.items() for plot in plot_distances(number, *one, axis)]
     return draw_plots([*plots, plot_quality(frames, axis)], f"{title}: distance along the optical axis")

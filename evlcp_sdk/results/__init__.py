@@ -11,18 +11,18 @@ _OF_FRAMES = (
     ("packets", "results.packets_jsonl:PacketsJsonl", "packets.jsonl", "a line per packet or message"),
     (
         "points",
-        "results.points_csv:PointsCsv",
+        "results.position_tables:PointsCsv",
         "points.csv",
         "where each frame's bar is in the camera's axes",
     ),
 )
 _OF_POSITIONS = (
-    ("fixes", "results.fixes_csv:FixesCsv", "fixes.csv", "a row a position"),
+    ("fixes", "results.position_tables:FixesCsv", "fixes.csv", "a row a position"),
     (
-        *("alternatives", "results.alternatives_csv:AlternativesCsv", "alternatives.csv"),
+        *("alternatives", "results.position_tables:AlternativesCsv", "alternatives.csv"),
         "the poses that fit where a position is refused as two do",
     ),
-    ("track", "results.track_csv:TrackCsv", "track.csv", "positions smoothed and filtered"),
+    ("track", "results.position_tables:TrackCsv", "track.csv", "positions smoothed and filtered"),
     ("geojson", "results.geojson:GeoJson", "fixes.geojson", "positions, bars and track for a map"),
     ("nmea", "results.nmea:Nmea", "fixes.nmea", "positions as NMEA-0183"),
 )

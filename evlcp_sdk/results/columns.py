@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any, Literal
 
+from evlcp_sdk.errors import ConfigError, import_extra
 from evlcp_sdk.formatting import sigmas, symbol_list, text_or_empty
-from evlcp_sdk.values import Alternative, Fix, Frame
+from evlcp_sdk.values import Alternative, Fix, Frame, Packet
 
 if TYPE_CHECKING:
     from evlcp_sdk.place.navigator import Place
@@ -31,7 +33,6 @@ FILTERED_COLUMNS = ("distance_filtered_m", "distance_filtered_sigma_m")
 
 LINK_COLUMN = "link"
 """The last column where there are several links: the name of the one."""
-
 
 PLACE_COLUMNS = (
     *("latitude_deg", "longitude_deg", "height_m", "sigma_east_m", "sigma_north_m", "sigma_up_m"),
@@ -80,3 +81,35 @@ def place_row(place: Alternative | Fix | Place) -> list[str]:
         *(text_or_empty(value, 4) for value in (place.height_m, *sigmas(place.covariance_m2))),
         *(f"{v:.6g}" if math.isfinite(v) else "" for v in place.covariance_m2[[0, 0, 1], [1, 2, 2]].tolist()),
     ]
+
+
+def frames_table(packets: Iterable[Packet], kind: Literal["pandas", "arrow"] = "pandas") -> Any:
+    """The frames of packets as a table, a row per frame, with the columns of `frames.csv`, not rounded.
+
+    `symbols` holds lists, None for a symbol that is not given; a distance that is not given is NaN in pandas,
+    null in Arrow; `echo_of` is null in both where a frame is not a reflection. The columns of the filtered
+    distance are there if any frame has one.
+
+    Args:
+        packets: What a receiver gives; read to the end.
+        kind: "pandas" for a `pandas.DataFrame`, "arrow" for a `pyarrow.Table`.
+
+    Raises:
+        ConfigError: The library is not installed, or `kind` is another word.
+    """
+    if kind not in ("pandas", "arrow"):
+        raise ConfigError(f"kind = {kind!r}, expected 'pandas' or 'arrow'")
+    frames = [frame for packet in packets for frame in packet.frames]
+    names = frame_columns(
+        filtered=any(frame.filtered is not None for frame in frames),
+        links=any(frame.link for frame in frames),
+    )
+    columns = {name: [frame_value(frame, name) for frame in frames] for name in names}
+    if kind == "pandas":
+        return import_extra("pandas", "pandas").DataFrame(columns).astype({"echo_of": "Int64"})
+    for name, values in columns.items():
+        if values and isinstance(values[0], float):
+            columns[name] = [v if math.isfinite(v) else None for v in values]
+    table, at = import_extra("pyarrow", "parquet").table(columns), names.index("echo_of")
+    # Where nothing is a reflection, the column has no type of its own.
+    return table.set_column(at, "echo_of", table.column(at).cast("int64"))

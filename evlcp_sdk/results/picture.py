@@ -1,7 +1,6 @@
 """Pictures of events, two bits a pixel."""
 
-import struct
-import zlib
+import io
 from typing import Final
 
 import numpy as np
@@ -40,13 +39,10 @@ class EventImage:
 
     def png(self) -> bytes:
         """The picture as a PNG file; made quickly rather than small."""
-        four = np.pad(self.cells, ((0, 0), (0, -self.width % 4))).reshape(self.height, -1, 4)
-        packed = four[..., 0] << 6 | four[..., 1] << 4 | four[..., 2] << 2 | four[..., 3]
-        # A row of a PNG begins with its filter, 0 for none.
-        data = zlib.compress(np.pad(packed, ((0, 0), (1, 0))).tobytes(), level=1)
-        head = struct.pack(">IIBBBBB", self.width, self.height, 2, 3, 0, 0, 0)
-        chunks = ((b"IHDR", head), (b"PLTE", _PALETTE), (b"IDAT", data), (b"IEND", b""))
-        return b"\x89PNG\r\n\x1a\n" + b"".join(
-            struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
-            for name, body in chunks
-        )
+        from PIL import Image
+
+        picture = Image.frombuffer("P", (self.width, self.height), self.cells, "raw", "P", 0, 1)
+        picture.putpalette(_PALETTE)
+        data = io.BytesIO()
+        picture.save(data, "PNG", compress_level=1, bits=2)
+        return data.getvalue()

@@ -1,8 +1,6 @@
 """Pictures of events: what is painted and packed is what other programs read."""
 
 import io
-import struct
-import zlib
 
 import numpy as np
 import pytest
@@ -10,14 +8,6 @@ from PIL import Image
 
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.values import Events
-
-
-def stream_of(png: bytes) -> bytes:
-    """What is packed in a PNG with one IDAT."""
-    at = png.index(b"IDAT")
-    (size,) = struct.unpack_from(">I", png, at - 4)
-    assert struct.unpack_from(">I", png, at + 4 + size) == (zlib.crc32(png[at : at + 4 + size]),)
-    return png[at + 4 : at + 4 + size]
 
 
 @pytest.mark.parametrize("size", [(5, 4), (3, 7), (16, 1), (1, 2), (1, 1), (34, 50), (640, 480)])
@@ -36,14 +26,11 @@ def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
                 cells[row, column] |= 1 << sign
     assert (image.cells == cells).all()
     told = image.png()
-    # A row of a PNG begins with its filter; pixels are two bits each, the left one highest.
-    four = np.pad(cells, ((0, 0), (0, -width % 4))).reshape(height, -1, 4)
-    rows = (four << np.array([6, 4, 2, 0], np.uint8)).sum(axis=2).astype(np.uint8)
-    assert zlib.decompress(stream_of(told)) == np.pad(rows, ((0, 0), (1, 0))).tobytes()
     with Image.open(io.BytesIO(told)) as picture:
         picture.load()
         assert picture.mode == "P"
         assert (np.array(picture) == cells).all()
+        assert told[24] == 2, "bits a pixel"
         assert picture.getpalette()[:12] == [16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235]
     image.clear()
     assert not image.cells.any()

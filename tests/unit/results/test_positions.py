@@ -29,13 +29,11 @@ from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.report.recording import plot_positions, seconds_since
-from evlcp_sdk.results.alternatives_csv import AlternativesCsv
 from evlcp_sdk.results.columns import FRAME_COLUMNS
-from evlcp_sdk.results.fixes_csv import FixesCsv
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import GeoJson
 from evlcp_sdk.results.nmea import Nmea
-from evlcp_sdk.results.points_csv import PointsCsv
+from evlcp_sdk.results.position_tables import AlternativesCsv, FixesCsv, PointsCsv
 from evlcp_sdk.results.sink import Run
 from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.trail import cut
