@@ -103,11 +103,14 @@ def arguments_of(subject: Subject) -> tuple[Any, ...]:
 
 
 def compile_given(subject: Subject, arguments: tuple[Any, ...]) -> Any:
-    """What the subject's `compile` gives; None of a detection or framing that the receiver does by itself."""
-    if subject.role == "detection" and subject.algorithm.rhythmic:
-        return None
-    if subject.role == "framing" and subject.algorithm.roles >= STEPS:
-        return None
+    """What the subject's `compile` gives.
+
+    Raises:
+        InapplicableLawError: It is a detection or a framing that the receiver does by itself.
+    """
+    rhythmic = subject.role == "detection" and subject.algorithm.rhythmic
+    if rhythmic or (subject.role == "framing" and subject.algorithm.roles >= STEPS):
+        raise InapplicableLawError("the receiver does this by itself")
     return subject.algorithm.compile(*arguments)
 
 
@@ -194,11 +197,11 @@ def _events(packets: int) -> Callable[[Subject], tuple[Any, ...]]:
 
 
 def _detect(detector: Any, events: Events) -> Any:
-    return () if detector is None else detector.step(detector.init(), 0, events)[1]
+    return detector.step(detector.init(), 0, events)[1]
 
 
 def _frame(deframer: Any, events: Events) -> Any:
-    return () if deframer is None else feed_events(deframer, events, [int(events.t_us[-1]) + 1])
+    return feed_events(deframer, events, [int(events.t_us[-1]) + 1])
 
 
 def _synchronize(synchronizer: Any, t_us: Any, p: Any) -> Any:

@@ -57,7 +57,7 @@ class _Synchronizer:
 
 
 def _machine(subject: Subject) -> tuple[Link, Any]:
-    """The link, and what turns its events into frames or locks; None where the receiver does."""
+    """The link, and what turns its events into frames or locks."""
     link, made = link_of(subject), compile_subject(subject)
     return link, _Synchronizer(made) if subject.role == "synchronization" else made
 
@@ -73,8 +73,6 @@ def _steps(events: Events) -> list[int]:
 
 def _any_split(subject: Subject) -> None:
     link, machine = _machine(subject)
-    if machine is None:
-        return
     given, events = _GIVEN[subject.role], _recording(subject, link)
     wanted = feed_events(machine, events, _steps(events))
     last = int(events.t_us[-1]) + 1
@@ -91,8 +89,6 @@ def _any_split(subject: Subject) -> None:
 
 def _state_kept(subject: Subject) -> None:
     link, machine = _machine(subject)
-    if machine is None:
-        return
     given, events = _GIVEN[subject.role], _recording(subject, link)
     half = len(events) // 2
     middle, end = int(events.t_us[half]), int(events.t_us[-1]) + _FLUSH_US
@@ -114,8 +110,6 @@ def _state_kept(subject: Subject) -> None:
 @law("clean", "no error in the events of an ideal sensor, every frame in its place")
 def _reads_clean(subject: Subject) -> None:
     link, deframer = _machine(subject)
-    if deframer is None:
-        return
     bar, events = recording_of(link, _PACKETS, missing=0.0)
     found = feed_events(deframer, events, _steps(events))
     sent = bar.symbols.reshape(-1, link.codebook.clusters)
@@ -137,8 +131,6 @@ def _reads_clean(subject: Subject) -> None:
 @law("bounded", "a state of bounded size, however long the stream is")
 def _bounded(subject: Subject) -> None:
     link, deframer = _machine(subject)
-    if deframer is None:
-        return
     rng = np.random.default_rng(0)
     state, now_us, n = deframer.init(), 0, 500
     step_us = max(_STEP_US, round(link.packet.packet_chips * link.packet.chip_us / 4))
@@ -178,7 +170,7 @@ def _detector_and_events(subject: Subject) -> tuple[Any, Events]:
     """A detector, and a recording in which it finds something, if any: of a bar, or else of one light."""
     detector = compile_subject(subject)
     events = recording_of(link_of(subject), 2, missing=0.0)[1]
-    if detector is not None and subject.link is None and not any(_detect(detector, events)):
+    if subject.link is None and not any(_detect(detector, events)):
         # One that looks for single lights sees none in a bar.
         return _detector_and_events(replace(subject, link=link_of_one_cluster()))
     return detector, events
@@ -187,8 +179,6 @@ def _detector_and_events(subject: Subject) -> tuple[Any, Events]:
 @law("shapes", "regions of finite places and sizes, each of another id; one where a bar is, or a light")
 def _regions_shapes(subject: Subject) -> None:
     detector, events = _detector_and_events(subject)
-    if detector is None:
-        return
     found = _detect(detector, events)
     for regions in found:
         ids = [region.id for region in regions]
@@ -202,8 +192,6 @@ def _regions_shapes(subject: Subject) -> None:
 @law("state-kept", "a step leaves the state it is given, which can be pickled")
 def _detection_state_kept(subject: Subject) -> None:
     detector, events = _detector_and_events(subject)
-    if detector is None:
-        return
 
     def branch(state: Any, start_us: int) -> Any:
         # A branch that is given up, and a state that was away.

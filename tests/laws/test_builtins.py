@@ -10,7 +10,11 @@ from evlcp_sdk.testing import Law, laws_of
 from evlcp_sdk.testing.law import Subject, judge
 
 REGISTRY = Registry.load()
-DO_NOTHING = {("tracking", "none"), ("error-correction", "none"), ("ranging", "none")}
+DO_NOTHING = {
+    *(("tracking", "none"), ("error-correction", "none"), ("ranging", "none")),
+    *(("detection", "rhythm"), ("framing", "packets")),
+}
+"""What the receiver does by itself, of the last two."""
 
 CASES = [
     pytest.param(entry.algorithm.role, entry.algorithm.id, law, id=f"{entry.algorithm.id}-{law.name}")
