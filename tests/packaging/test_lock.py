@@ -1,4 +1,4 @@
-"""The lock of development holds what `pyproject.toml` asks for, each file by its hash."""
+"""The lock of development holds what `pyproject.toml` asks for, and what a release consists of agrees."""
 
 import json
 import re
@@ -15,6 +15,7 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[2]
 LOCK = (ROOT / "requirements-dev.lock").read_text()
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
+VERSION = PROJECT["project"]["version"]
 ASKED = [
     *PROJECT["build-system"]["requires"],
     *PROJECT["project"]["dependencies"],
@@ -80,3 +81,21 @@ def test_the_sbom_names_every_package_of_the_lock() -> None:
     assert licensed <= alike
     assert licensed >= alike & {"numpy", "scipy", "pydantic", "hatchling"} != set()
     assert "sbom:" in (ROOT / "Makefile").read_text()
+
+
+def test_citation_and_project_state_the_same_version_and_licence() -> None:
+    stated = dict(re.findall(r"^(version|license): (.+)$", (ROOT / "CITATION.cff").read_text(), re.MULTILINE))
+    assert stated == {"version": VERSION, "license": PROJECT["project"]["license"]}
+
+
+def test_make_has_a_rule_for_each_target_that_it_names() -> None:
+    text = (ROOT / "Makefile").read_text()
+    named = {name for line in re.findall(r"^\.PHONY: (.+)$", text, re.MULTILINE) for name in line.split()}
+    assert {"demo", "test", "docs", "release"} <= named
+    assert named <= set(re.findall(r"^([a-z]+):", text, re.MULTILINE))
+
+
+def test_the_changelog_begins_with_what_comes_next() -> None:
+    heads = re.findall(r"^## \[(.+?)\]", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert heads[0] in ("Unreleased", VERSION)
+    assert VERSION in heads[:2]

@@ -1,13 +1,20 @@
-"""Kernels work where no cache can be written, and say that they are compiled."""
+"""Kernels: compiled once and kept, warmed up by a command, and their time counted apart."""
 
+import json
 import subprocess
 import sys
+import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
-from evlcp_sdk.kernels import njit
+from evlcp_sdk.cli import _app
+from evlcp_sdk.kernels import COMPILING, njit
+from evlcp_sdk.stopwatch import Stopwatch
+from evlcp_sdk.warming import STEPS, Warmth, warm_up
 
 SDK = Path(__file__).parents[2]
 KERNELS = sorted(SDK.glob("evlcp_sdk/**/_kernels.py")) + sorted(SDK.glob("plugins/*/_kernels.py"))
@@ -92,3 +99,83 @@ def test_every_kernel_is_compiled_in_this_way() -> None:
     for path in KERNELS:
         assert "from evlcp_sdk.kernels import njit\n" in path.read_text()
         assert "from numba import" not in path.read_text()
+
+
+def busy(seconds: float) -> None:
+    until = time.process_time() + seconds
+    while time.process_time() < until:
+        pass
+
+
+def test_waiting_is_no_work() -> None:
+    watch = Stopwatch()
+    for _ in range(2):
+        with watch.running():
+            busy(0.02)
+            time.sleep(0.05)
+        busy(0.05)
+    assert 0.04 <= watch.processor_s < 0.07
+    assert watch.elapsed_s >= 0.14
+    assert watch.kernels_s == 0
+
+
+def test_time_for_kernels_is_left_out() -> None:
+    watch = Stopwatch()
+
+    def compile_(_sig: object) -> None:
+        busy(0.05)
+
+    stats = SimpleNamespace(cache_misses={})
+    inner = COMPILING.watched(SimpleNamespace(compile=compile_, stats=stats))
+    outer = COMPILING.watched(SimpleNamespace(compile=lambda sig: (busy(0.05), inner(sig)), stats=stats))
+    with watch.running():
+        began_s = time.perf_counter()
+        outer(None)
+        took_s = time.perf_counter() - began_s
+        busy(0.02)
+    # The inner one's time is in the outer's, and counts once.
+    assert 0.1 <= watch.kernels_s <= took_s
+    assert 0.02 <= watch.processor_s < 0.05
+
+
+def test_a_kernel_s_time_is_counted_once() -> None:
+    @njit
+    def summed(values: np.ndarray) -> float:  # type: ignore[type-arg]
+        return float((values**2).sum())
+
+    before = COMPILING.elapsed_s
+    assert summed(np.ones(3)) == 3
+    after = COMPILING.elapsed_s
+    assert after > before
+    assert summed(np.ones(3)) == 3
+    assert COMPILING.elapsed_s == after
+
+
+def test_a_warm_up_leaves_nothing_to_compile() -> None:
+    """The first compiles what there is not; the second finds all of it."""
+    steps: list[str] = []
+    warmth = warm_up(steps.append)
+    assert tuple(steps) == STEPS
+    assert warmth.kept_in is not None
+    assert warm_up().compiled == 0
+
+
+@pytest.mark.parametrize(
+    ("warmth", "words"),
+    [
+        (Warmth(0, 2.5, None), "nothing to compile; tried in 2.5 s"),
+        (Warmth(7, 31.0, None), "7 kernels compiled in 31 s they cannot be kept"),
+    ],
+)
+def test_the_command_says_what_it_did(monkeypatch: pytest.MonkeyPatch, warmth: Warmth, words: str) -> None:
+    monkeypatch.setattr("evlcp_sdk.warming.warm_up", lambda advance: [advance(s) for s in STEPS] and warmth)
+    runner, app = CliRunner(), _app.make_app()
+    done = runner.invoke(app, ["warm-up"])
+    assert done.exit_code == 0
+    assert " ".join(done.stdout.split()).startswith(words)
+    done = runner.invoke(app, ["warm-up", "--json"])
+    assert json.loads(done.stdout) == {
+        "compiled": warmth.compiled,
+        "elapsed_s": warmth.elapsed_s,
+        "kept_in": None,
+    }

@@ -1,4 +1,4 @@
-"""Blocks and beacons, held against struct and against hand-made bytes."""
+"""Blocks and beacons, held against struct and hand-made bytes; CRC-24 against its published values."""
 
 import binascii
 import struct
@@ -10,6 +10,7 @@ from hypothesis import given, strategies as st
 
 from evlcp_sdk.air.beacons import BEACON_BYTES, Beacon
 from evlcp_sdk.air.blocks import HEADER_BYTES, Block, BlockError, Kind, Message, joined, split
+from evlcp_sdk.air.crc import crc24
 from evlcp_sdk.errors import ConfigError
 
 DIGEST = bytes.fromhex("00112233")
@@ -174,3 +175,30 @@ def test_bytes_that_are_no_beacon() -> None:
         Beacon.unpack(bytes(27))
     with pytest.raises(BlockError, match="latitude_deg"):
         Beacon.unpack(struct.pack("<qqiHHI", 91 * 10**9, 0, 0, 0, 0, 1))
+
+
+NINE = np.unpackbits(np.frombuffer(b"123456789", np.uint8))
+
+
+def value(bits: np.ndarray) -> int:
+    return int("".join(map(str, bits)), 2)
+
+
+@pytest.mark.parametrize(
+    ("polynomial", "start", "check"),
+    [
+        (0x864CFB, 0xB704CE, 0x21CF02),
+        (0x864CFB, 0, 0xCDE703),
+        (0x800063, 0, 0x23EF52),
+        (0x328B63, 0xFFFFFF, 0xB4F3E6 ^ 0xFFFFFF),
+    ],
+    ids=["OpenPGP", "LTE-A", "LTE-B", "Interlaken, which sends it inverted"],
+)
+def test_published_check_values(polynomial: int, start: int, check: int) -> None:
+    got = value(crc24(NINE, polynomial, start))
+    assert got == check, hex(got)
+
+
+def test_nothing_does_not_pass() -> None:
+    for length in range(1, 600):
+        assert crc24(np.zeros(length, np.uint8)).any()

@@ -1,5 +1,6 @@
-"""Distances of leaning bars by a camera that knows its attitude: sigmas that are true."""
+"""Distances of bars that lean, or stand in the corners of a lens that distorts: with sigmas that are true."""
 
+import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -7,19 +8,30 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import evlcp_sdk as evlcp
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.sim import Simulation, read_truth, resolve_scene, truth_of, truth_path
+from evlcp_sdk.sim import Simulation, load_scene, read_truth, resolve_scene, truth_of, truth_path
 from evlcp_sdk.sim.world import attitude_log
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.score import score_frames
 from tests.conftest import ROOT
 
 PITCHED = ROOT.parent / "shared" / "recordings" / "road" / "pitch-4deg-45m.raw"
+CORNER = ROOT.parent / "shared" / "recordings" / "road2" / "k1-corner-45m.raw"
 LINK = load_link()
 SIGMA_DEG = 0.1
+
+
+def bar_of(
+    recording: Path, out: Path, link: evlcp.Link, attitude: Attitude | None = None
+) -> dict[str, float]:
+    """The score of a recording's bar."""
+    receive_to_folder(recording, out, link, attitude=attitude)
+    (bar,) = score_frames(read_frames(out), read_truth(truth_path(recording)))["road"]["bars"]
+    return bar  # type: ignore[no-any-return]
 
 
 def drive(distance_m: float, row_px: float, seed: int) -> list[np.ndarray]:
@@ -71,11 +83,36 @@ def test_an_independent_generator_s_pitch_is_corrected(tmp_path: Path) -> None:
     """One angle for all of a drive with vibration: what the bend alone makes of it is twice as far off."""
     found = {}
     for name, attitude in (("with", Attitude(4.0, 0.0, gravity_sigma_deg=0.3)), ("without", None)):
-        told = receive_to_folder(PITCHED, tmp_path / name, attitude=attitude)
-        assert told["counts"]["frames_askew"] == 0
-        (found[name],) = score_frames(read_frames(tmp_path / name), read_truth(truth_path(PITCHED)))["road"][
-            "bars"
-        ]
+        found[name] = bar_of(PITCHED, tmp_path / name, LINK, attitude)
+        assert json.loads((tmp_path / name / "summary.json").read_text())["counts"]["frames_askew"] == 0
     assert found["with"]["rmse_m"] < 0.02 < found["without"]["rmse_m"]
     assert 0.5 < found["with"]["nees"] < 2
     assert 0.5 < found["without"]["nees"] < 2
+
+
+@pytest.mark.parametrize(("x_m", "y_m"), [(-3.6, -1.6), (3.6, 1.6)])
+def test_a_stated_distortion_reaches_distances_in_opposite_corners(
+    tmp_path: Path, x_m: float, y_m: float
+) -> None:
+    lens = load_link(overrides=["camera.k1=-0.25"])
+    scene = load_scene(
+        "night", {"duration_s": 0.15, "motion.distance_m": 45.0, "camera.k1": -0.25}, link=lens
+    )
+    scene = replace(scene, bars=(replace(scene.bars[0], x_m=x_m, y_m=y_m),))
+    recording = tmp_path / "corner.raw"
+    evlcp.simulate(scene, 3).save(recording)
+    stated = bar_of(recording, tmp_path / "stated", lens)
+    without = bar_of(recording, tmp_path / "without", load_link())
+    assert stated["ber"] < 0.005
+    assert stated["rmse_m"] < 0.035
+    assert stated["nees"] < 2
+    assert without["bias_m"] > 2 * abs(stated["bias_m"])
+
+
+@pytest.mark.skipif(not CORNER.exists(), reason="needs ../shared/recordings, which users do not have")
+def test_an_independent_generator_s_corner(tmp_path: Path) -> None:
+    bar = bar_of(CORNER, tmp_path / "out", load_link(overrides=["camera.k1=-0.25"]))
+    assert bar["frames_found"] == bar["frames_sent"]
+    assert bar["bit_errors"] == 0
+    assert bar["rmse_m"] < 0.025
+    assert bar["nees"] < 2.5
