@@ -34,9 +34,8 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.fit_assessment import Pose
-from evlcp_sdk.place.observations import BarView, project_bars
+from evlcp_sdk.place.observations import BarView, Rejection, project_bars
 from evlcp_sdk.place.pose import solve_pose
-from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma

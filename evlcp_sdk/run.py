@@ -40,10 +40,9 @@ if TYPE_CHECKING:
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.publisher import Publisher
     from evlcp_sdk.place.bar_registry import BarRegistry
-    from evlcp_sdk.place.calibration import Calibrated, CalibrationView
+    from evlcp_sdk.place.calibration import Calibrated, CalibrationView, KnownPose
     from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.place.observations import BarView
-    from evlcp_sdk.place.poses import KnownPose
     from evlcp_sdk.place.survey import SurveyedBar
     from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.scene.sites import BarSite, LocalAxes
@@ -897,7 +896,7 @@ def _own_poses(
     saw.
     """
     from evlcp_sdk.place.navigator import Navigator
-    from evlcp_sdk.place.own_poses import OwnPoses
+    from evlcp_sdk.place.survey import OwnPoses
     from evlcp_sdk.scene.attitude import attitude_source
 
     navigator = Navigator(placing_links(named_links(links)), plan, attitude)

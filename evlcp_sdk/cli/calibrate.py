@@ -42,7 +42,7 @@ def calibrate(
     """
     from evlcp_sdk import run
     from evlcp_sdk.link.resolve import load_link
-    from evlcp_sdk.place.poses import read_poses
+    from evlcp_sdk.place.calibration import read_poses
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.sites import load_sites
 

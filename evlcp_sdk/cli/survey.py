@@ -49,7 +49,7 @@ def survey(
     """
     from evlcp_sdk import run
     from evlcp_sdk.link.several import load_links
-    from evlcp_sdk.place.poses import read_poses
+    from evlcp_sdk.place.calibration import read_poses
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.scene.attitude import AttitudeLog
 

@@ -16,11 +16,10 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
 
 if TYPE_CHECKING:
-    from evlcp_sdk.place import rejections, trajectory
-    from evlcp_sdk.place.estimated_biases import EstimatedBias
-    from evlcp_sdk.place.navigator import Navigator, Placed
+    from evlcp_sdk.place import observations, trajectory
+    from evlcp_sdk.place.navigator import EstimatedBias, Navigator, Placed
 else:
-    rejections, trajectory = (Late(f"evlcp_sdk.place.{name}") for name in ("rejections", "trajectory"))
+    observations, trajectory = (Late(f"evlcp_sdk.place.{name}") for name in ("observations", "trajectory"))
 
 _CELL_M = 0.01
 _FARTHEST_M = 1_000.0
@@ -351,7 +350,7 @@ class PositionTally:
             "fixes_verified": self.verified,
             "last": None if self.last is None else _last(self.last),
             "refused": {
-                kind: self.refused[kind] for kind in rejections.REJECTION_REASONS if self.refused[kind]
+                kind: self.refused[kind] for kind in observations.REJECTION_REASONS if self.refused[kind]
             },
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),

@@ -4,6 +4,9 @@ from dataclasses import asdict, dataclass
 from functools import lru_cache
 from typing import Self
 
+import numpy as np
+from numpy.typing import NDArray
+
 from evlcp_sdk.link.sections import PositionSpec
 
 
@@ -67,6 +70,12 @@ class ErrorModel(PositionSpec):
         1.0
         """
         return cls(**asdict(spec))
+
+
+def symmetric_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The symmetric root of a covariance, which turns as little as it can from fix to fix, float64 (n, n)."""
+    values, axes = np.linalg.eigh(covariance)
+    return np.asarray((axes * np.sqrt(np.maximum(values, 0))) @ axes.T)
 
 
 @lru_cache(maxsize=4096)

@@ -12,21 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.error_model import ErrorModel, chi_square
-from evlcp_sdk.place.fit import usual_cost
-from evlcp_sdk.place.model import (
+from evlcp_sdk.place.error_model import ErrorModel, chi_square, symmetric_root
+from evlcp_sdk.place.fit import (
     FAULT,
     FOCAL_UNIT,
     LENS,
     LOCAL,
     SHARED,
     Equations,
-    Fit,
+    inverted,
     linearize,
-    move,
+    misfits,
 )
-from evlcp_sdk.place.observations import Problem, skewed
-from evlcp_sdk.place.rejections import Rejection
+from evlcp_sdk.place.observations import Problem, Rejection, skewed
 from evlcp_sdk.values import FailedBar
 
 Floats = NDArray[np.float64]
@@ -48,9 +46,6 @@ _LARGER = 4.0
 
 _LITTLE = 0.01
 """Share of a position's variance below which a doubt does not count."""
-
-_ROUNDING = 1e-14
-"""Share of a diagonal that rounding may leave of nothing."""
 
 _FLAT = 1e-9
 """Share of what a part says in its best direction below which it says nothing in another."""
@@ -129,113 +124,70 @@ class AssessedPose:
     tests: Mapping[str, float]
 
 
-@dataclass(frozen=True, eq=False)
-class _Solution:
-    """What the equations at a fit determine.
-
-    Attributes:
-        spread: Covariance of the 14 shared unknowns, 0 of those that are not free, float64 (14, 14).
-        equations: There.
-    """
-
-    spread: Floats
-    equations: Equations
-
-
-def _solve(problem: Problem, equations: Equations | None) -> _Solution | None:
-    """The equations at a fit, solved; None where they are singular or the fit is behind a bar."""
-    if equations is None:
-        return None
-    free = np.ix_(problem.free, problem.free)
-    inverse = _inverted(equations.normal()[0][free])
-    if inverse is None:
-        return None
-    spread = np.zeros((SHARED, SHARED))
-    spread[free] = inverse
-    return _Solution(spread, equations)
-
-
-def _inverted(matrix: Floats) -> Floats | None:
-    """The inverse of a matrix that is positive definite beyond rounding; None of another."""
-    scale = 1 / np.sqrt(np.maximum(np.diag(matrix), 1e-300))
-    scaled = matrix * scale * scale[:, None]
-    try:
-        if np.square(np.diag(np.linalg.cholesky(scaled))).min(initial=1.0) < _ROUNDING:
-            return None
-    except np.linalg.LinAlgError:
-        return None
-    inverse: Floats = np.linalg.inv(scaled) * scale * scale[:, None]
-    return inverse
-
-
-def assess_fit(problem: Problem, fit: Equations) -> AssessedPose | Rejection:
+def assess_fit(fit: Equations) -> AssessedPose | Rejection:
     """The pose with its covariance and tests, or why it cannot be trusted."""
+    problem, spread = fit.problem, fit.spread
     spec, freedom = problem.spec, problem.freedom
-    solution = _solve(problem, fit)
-    if solution is None:
+    if spread is None:
         return Rejection("not-determined", "the equations are singular")
-    if (end_on := _end_on(problem, fit.at)) is not None:
-        return end_on
-    size, axes = np.linalg.eigh(solution.spread[:3, :3])
+    if len(problem.transmitters) == 1:
+        first, last = problem.points[0, :3] - fit.at.position, problem.points[-1, :3] - fit.at.position
+        sine = float(np.linalg.norm(np.cross(last - first, first + last)))
+        sine /= float(np.linalg.norm(last - first) * np.linalg.norm(first + last))
+        if sine < math.sin(math.radians(spec.min_view_deg)):
+            seen_deg = math.degrees(math.asin(sine))
+            return Rejection("end-on", f"the bar is seen {seen_deg:.0f} degrees from its axis")
+    size, axes = np.linalg.eigh(spread[:3, :3])
     wide = math.sqrt(max(size[-1], 0.0))
     if wide > spec.max_sigma_m:
         return Rejection("uncertain", f"by {wide:.1f} m, more than {spec.max_sigma_m:g} m")
-    bent, slopes = _bend(problem, solution, size, axes)
-    amiss = misfits(problem, fit)
+    bent, slopes = _bend(fit, size, axes)
+    amiss = misfits(fit)
     # A fit of what does not fit need not be at the least cost.
     if bent > _MOST_BEND and not amiss:
         return Rejection("uncertain", f"by {wide:.2f} m along a curve: an ellipse would mislead")
-    levels, tests, worst = _test_parts(problem, solution)
+    (horizontal_m, vertical_m, hidden_m), tests, worst = _test_parts(fit, spread)
     doubt = f"the points miss the sites by {math.sqrt(fit.cost / freedom):.1f} sigmas (rms)" if amiss else ""
-    moves = _moves_by_errors(problem, solution)
-    noise, slow = _rest(problem, solution, moves)
-    doubted = _doubted(problem, solution)
+    moves = _moves_by_errors(fit, spread)
+    noise, slow = _rest(fit, spread, moves)
+    doubted = _doubted(fit, spread)
+    standing = _named(problem, *moves)
+    if doubted.any():
+        standing = {"doubt": symmetric_root(doubted[:3, :3]), **standing}
     pose = Pose(
         fit.at.position,
         fit.at.rotation,
-        solution.spread[:6, :6] + doubted,
+        spread[:6, :6] + doubted,
         noise,
         slow,
-        {**_doubt(doubted[:3, :3]), **_named(problem, *moves)},
+        standing,
         fit.cost / freedom,
         freedom,
         problem.transmitters,
-        _level(levels.horizontal_m, spec),
-        _level(levels.vertical_m, spec),
+        _level(horizontal_m, spec),
+        _level(vertical_m, spec),
         along=axes[:, -1],
         standing_slope=_named(problem, *slopes),
-        hidden_m=levels.hidden_m,
+        hidden_m=hidden_m,
     )
     return AssessedPose(pose, worst or doubt, tests)
 
 
-def _end_on(problem: Problem, fit: Fit) -> Rejection | None:
-    """A lone bar that points along the line of sight."""
-    if len(problem.transmitters) > 1:
-        return None
-    first, last = problem.points[0, :3] - fit.position, problem.points[-1, :3] - fit.position
-    axis, sight = last - first, first + last
-    cosine = float(axis @ sight) / math.sqrt(float(axis @ axis) * float(sight @ sight))
-    sine = math.sqrt(max(1 - cosine**2, 0.0))
-    if sine >= math.sin(math.radians(problem.spec.min_view_deg)):
-        return None
-    return Rejection("end-on", f"the bar is seen {math.degrees(math.asin(sine)):.0f} degrees from its axis")
-
+Levels = tuple[float, float, Floats]
+"""Protection levels, horizontal and vertical, m; what one fault may hide to the east, north and up, (3,)."""
 
 Moves = tuple[Floats, Floats, Floats]
 """The position's moves by one sigma of what stays: of the camera (3, 7), of the attitude (3, 4), of what is
 each bar's (bars, 3, 7)."""
 
 
-def _moves_by_errors(problem: Problem, solution: _Solution) -> Moves:
-    place = solution.spread[:3]
-    angles = solution.equations.angles
-    by_attitude = place @ angles.T @ problem.angles.causes[: len(angles)]
-    by_bars = place @ solution.equations.bars.gain[:, 2:].swapaxes(1, 2)
-    return -place[:, LENS:], by_attitude if len(angles) else np.zeros((3, 4)), by_bars
+def _moves_by_errors(fit: Equations, spread: Floats) -> Moves:
+    place = spread[:3]
+    by_attitude = place @ fit.angles.T @ fit.problem.angles.causes[: len(fit.angles)]
+    return -place[:, LENS:], by_attitude, place @ fit.bars.gain[:, 2:].swapaxes(1, 2)
 
 
-def _bend(problem: Problem, solution: _Solution, size: Floats, axes: Floats) -> tuple[float, Moves]:
+def _bend(fit: Equations, size: Floats, axes: Floats) -> tuple[float, Moves]:
     """How far the cost is from its parabola two sigmas away, and how the moves by errors change there.
 
     Returns:
@@ -243,34 +195,27 @@ def _bend(problem: Problem, solution: _Solution, size: Floats, axes: Floats) -> 
         the expected growth of the cost, and of one and the square of how far the way there, an arc about the
         bars, is from that axis, in sigmas; and the mean slopes of the moves, a metre.
     """
-    wide, fit, huber = math.sqrt(max(size[-1], 0.0)), solution.equations, problem.spec.huber_sigmas
-    bent, slopes = 1.0, tuple(np.zeros_like(part) for part in _moves_by_errors(problem, solution))
+    problem, spread, wide = fit.problem, fit.spread, math.sqrt(max(size[-1], 0.0))
+    assert spread is not None
+    bent, slopes = 1.0, tuple(np.zeros_like(part) for part in _moves_by_errors(fit, spread))
     for way in (-2 / wide, 2 / wide):
-        shared = way * solution.spread[:, :3] @ axes[:, -1]
-        there = move(problem, fit.at, fit.step(shared))
-        again = _solve(problem, linearize(problem, there, huber))
-        if again is not None and again.equations.cost - fit.cost > _FAR_COST:
+        shared = way * spread[:, :3] @ axes[:, -1]
+        there = fit.moved(shared)
+        again = linearize(problem, there)
+        if again is not None and again.cost - fit.cost > _FAR_COST:
             # Errors of sites take up what is left of second order.
-            there = move(problem, there, again.equations.step(np.zeros(SHARED)))
-            again = _solve(problem, linearize(problem, there, huber))
-        growth = 1e-9 if again is None else max((again.equations.cost - fit.cost) / 4, 1e-9)
+            there = again.moved(np.zeros(SHARED))
+            again = linearize(problem, there)
+        determined = None if again is None else again.spread
+        growth = 1e-9 if again is None or determined is None else max((again.cost - fit.cost) / 4, 1e-9)
         off = axes.T @ (there.position - fit.at.position - shared[:3])
         square = float((off**2 / np.maximum(size, 1e-15 * size[-1])).sum())
         bent = max(bent, growth, 1 / growth, 1 + square)
-        if again is not None:
+        if again is not None and determined is not None:
             share = math.copysign(1 / (4 * wide), way)
-            for slope, moved in zip(slopes, _moves_by_errors(problem, again), strict=True):
+            for slope, moved in zip(slopes, _moves_by_errors(again, determined), strict=True):
                 slope += share * moved
     return bent, (slopes[0], slopes[1], slopes[2])
-
-
-@dataclass(frozen=True, eq=False)
-class _Levels:
-    """Protection levels, m, and what one fault may hide to the east, north and up, float64 (3,)."""
-
-    horizontal_m: float
-    vertical_m: float
-    hidden_m: Floats
 
 
 def _widest(covariances: Floats) -> Floats:
@@ -296,10 +241,10 @@ class _Tested(NamedTuple):
     unseen: Floats
 
 
-def _test_parts(problem: Problem, solution: _Solution) -> tuple[_Levels, dict[str, float], str]:
+def _test_parts(fit: Equations, spread: Floats) -> tuple[Levels, dict[str, float], str]:
     """Protection levels, each part's test value, and the part that fits the rest the least, if any fails."""
-    spec = problem.spec
-    tested = list(_tested_parts(problem, solution))
+    spec = fit.problem.spec
+    tested = list(_tested_parts(fit, spread))
     chance = spec.false_alarm / 2 / len(tested)
     limits = {name: chi_square(chance, one.freedom) for name, one in tested if one.freedom}
     tests = {name: one.value for name, one in tested if one.freedom}
@@ -314,35 +259,41 @@ def _test_parts(problem: Problem, solution: _Solution) -> tuple[_Levels, dict[st
     added = np.array([nothing, *(one.added for _, one in faults)])
     unseen = np.array([nothing, *(one.unseen for _, one in faults)])
     hidden_m = np.sqrt(limit[:, None] * np.maximum(np.diagonal(unseen, axis1=1, axis2=2), 0.0))
-    whole = solution.spread[:3, :3] + added
+    whole = spread[:3, :3] + added
     flat, high = (math.sqrt(chi_square(spec.risk, freedom)) for freedom in (2, 1))
     level_m = np.sqrt(limit) * _widest(unseen) + flat * _widest(whole)
     height_m = hidden_m[:, 2] + high * np.sqrt(np.maximum(whole[:, 2, 2], 0.0))
-    return _Levels(level_m.max(), height_m.max(), hidden_m.max(0)), tests, doubt
+    return (level_m.max(), height_m.max(), hidden_m.max(0)), tests, doubt
 
 
-def _tested_parts(problem: Problem, solution: _Solution) -> Iterator[tuple[str, _Tested]]:
+def _tested_parts(fit: Equations, spread: Floats) -> Iterator[tuple[str, _Tested]]:
     """Names and `_test` of each bar, the focal length, the attitude and the heading, as far as there are."""
-    spec, free = problem.spec, problem.free[:, None]
+    problem, spec, free = fit.problem, fit.problem.spec, fit.problem.free[:, None]
+    info, right = fit.bars.info, fit.bars.right
     for bar, number in enumerate(problem.transmitters):
-        own, side = solution.equations.bars.info[bar, :6, :6], solution.equations.bars.right[bar, :6]
-        columns = solution.equations.bars.info[bar, :, :6] * free
-        yield f"bar {number}", _test(own, columns, side, solution.spread, _bar_bound(problem, solution, bar))
-    columns = solution.equations.bars.info.sum(0)[:, FAULT : FAULT + 1] * free
-    information = solution.equations.bars.info[:, FAULT, FAULT].sum().reshape(1, 1)
+        bound = np.zeros((6, 6))
+        if spec.bar_fault_m:
+            # As a move and a turn of the camera that this bar alone sees.
+            row = problem.points[int((problem.bar == bar).argmax())]
+            half = np.diag(np.repeat([1 / spec.bar_fault_m, 1 / _BAR_TURN_RAD], 3))
+            half[:3, 3:] = skewed((row[:3] - row[3:6] - fit.at.position)[None])[0].T / spec.bar_fault_m
+            bound = half.T @ half
+        yield (
+            f"bar {number}",
+            _test(info[bar, :6, :6], info[bar, :, :6] * free, right[bar, :6], spread, bound),
+        )
     focal = (FOCAL_UNIT / spec.focal_fault) ** 2 if spec.focal_fault else 0.0
-    side = solution.equations.bars.right[:, FAULT].sum().reshape(1)
-    yield FOCAL, _test(information, columns, side, solution.spread, np.full((1, 1), focal))
-    angles, miss = solution.equations.angles, solution.equations.angles_miss
-    bound: NDArray[np.floating] = np.zeros((len(angles), len(angles)))
+    column, side = info.sum(0)[:, FAULT : FAULT + 1], right[:, FAULT].sum().reshape(1)
+    yield FOCAL, _test(column[FAULT:][:1], column * free, side, spread, np.full((1, 1), focal))
+    angles, miss = fit.angles, fit.angles_miss
+    fault = np.zeros((len(angles), len(angles)))
     if spec.attitude_fault_deg and len(angles):
         white = math.radians(spec.attitude_fault_deg) * problem.angles.white[: len(angles), : len(angles)]
-        bound = np.linalg.inv(white @ white.T)
+        fault[:] = np.linalg.inv(white @ white.T)
     for first, name in ((0, "attitude"), (2, "heading")):
         if len(angles) > first and problem.free[3:6].any():
-            alone = np.eye(len(angles) - first)
-            columns = angles[first:].T * free
-            yield name, _test(alone, columns, miss[first:], solution.spread, bound[first:, first:])
+            alone, columns = np.eye(len(angles) - first), angles[first:].T * free
+            yield name, _test(alone, columns, miss[first:], spread, fault[first:, first:])
 
 
 def _test(
@@ -373,7 +324,7 @@ def _test(
     # What is not tested may be of any size, or of as much as the bound allows.
     share = np.where(redundant, share, 1e-12)
     if bound.any() and len(share):
-        inverse = _inverted(turned.T @ bound @ turned + np.diag(share))
+        inverse = inverted(turned.T @ bound @ turned + np.diag(share))
         if inverse is None:
             return _Tested(0.0, 0, _ANYWHERE_M2 * np.eye(3), np.zeros((3, 3)))
         moves = moved @ inverse
@@ -382,25 +333,12 @@ def _test(
     return _Tested(value, int(redundant.sum()), moves @ moved.T, (moves * share) @ moves.T)
 
 
-def _bar_bound(problem: Problem, solution: _Solution, bar: int) -> Floats:
-    """Inverse covariance of a bar's fault, as a move and a turn of the camera that it alone sees, (6, 6)."""
-    place_m = problem.spec.bar_fault_m
-    if not place_m:
-        return np.zeros((6, 6))
-    row = problem.points[int((problem.bar == bar).argmax())]
-    half = np.zeros((6, 6))
-    half[:3, :3], half[3:, 3:] = np.eye(3) / place_m, np.eye(3) / _BAR_TURN_RAD
-    half[:3, 3:] = skewed((row[:3] - row[3:6] - solution.equations.at.position)[None])[0].T / place_m
-    return half.T @ half
-
-
-def _rest(problem: Problem, solution: _Solution, moves: Moves) -> tuple[Floats, Floats]:
+def _rest(fit: Equations, spread: Floats, moves: Moves) -> tuple[Floats, Floats]:
     """What the position's covariance is made of beside the errors that stay: noise and slow, (3, 3) each."""
-    place, equations = solution.spread[:3], solution.equations
-    follow = (equations.bars.gain @ place.T)[problem.bar]
-    rows = equations.rows[:, :, LOCAL:-1] @ place.T - equations.rows[:, :, :LOCAL] @ follow
-    rows = rows.reshape(-1, 3)
-    slow = rows.T @ (rows * equations.stands[:, None])
+    place = spread[:3]
+    follow = (fit.bars.gain @ place.T)[fit.problem.bar]
+    rows = (fit.rows[:, :, LOCAL:-1] @ place.T - fit.rows[:, :, :LOCAL] @ follow).reshape(-1, 3)
+    slow = rows.T @ (rows * fit.stands[:, None])
     by_camera, by_attitude, by_bars = moves
     rest = place[:, :3] - slow - by_camera @ by_camera.T - by_attitude @ by_attitude.T
     rest = rest - (by_bars @ by_bars.swapaxes(1, 2)).sum(0)
@@ -409,21 +347,21 @@ def _rest(problem: Problem, solution: _Solution, moves: Moves) -> tuple[Floats, 
     return (axes * np.maximum(size, 1e-12)) @ axes.T, slow
 
 
-def _doubted(problem: Problem, solution: _Solution) -> Floats:
+def _doubted(fit: Equations, spread: Floats) -> Floats:
     """What the doubt adds to a covariance whether the attitude's errors are larger than their sigmas say.
 
     The mean over both hypotheses, by their odds after the fit: as said, or `_LARGER` times as large, which
     is so `_RARELY`. What is no likelier after the fit than before is in the sigmas already. Of position and
     turn, float64 (6, 6); 0 where it is too little to count.
     """
-    rows, miss = solution.equations.angles, solution.equations.angles_miss
+    rows, miss = fit.angles, fit.angles_miss
     nothing = np.zeros((6, 6))
-    if not (len(miss) and problem.free[3:6].any()):
+    if not (len(miss) and fit.problem.free[3:6].any()):
         return nothing
     more = _LARGER**2 - 1
-    follow = solution.spread[:6] @ rows.T
-    whole = np.eye(len(miss)) + more * (np.eye(len(miss)) - rows @ solution.spread @ rows.T)
-    inverse = _inverted(whole)
+    follow = spread[:6] @ rows.T
+    whole = np.eye(len(miss)) + more * (np.eye(len(miss)) - rows @ spread @ rows.T)
+    inverse = inverted(whole)
     if inverse is None:
         return nothing
     off = more * inverse @ miss
@@ -431,7 +369,7 @@ def _doubted(problem: Problem, solution: _Solution) -> Floats:
     weight, moved = 1 / (1 + math.exp(-min(evidence, 700.0))), follow @ off
     wider = follow @ (more * inverse) @ follow.T
     added = max(weight - _RARELY, 0.0) * wider + weight * np.outer(moved, moved)
-    little = np.trace(added[:3, :3]) < _LITTLE * np.trace(solution.spread[:3, :3])
+    little = np.trace(added[:3, :3]) < _LITTLE * np.trace(spread[:3, :3])
     return nothing if little else np.asarray(added)
 
 
@@ -447,20 +385,6 @@ def covering(pose: Pose, other: Pose, spec: ErrorModel) -> Pose:
 def _level(level_m: float, spec: ErrorModel) -> float:
     """A level as it is given: none above the highest."""
     return level_m if level_m <= spec.max_protection_m else math.inf
-
-
-def misfits(problem: Problem, fit: Equations) -> bool:
-    """Whether the sum of the squared misses is more than chance makes it."""
-    return fit.cost > usual_cost(problem)
-
-
-def _doubt(doubted: Floats) -> dict[str, Floats]:
-    """The position's moves by the doubt, by its name; none where there is none."""
-    if not doubted.any():
-        return {}
-    values, axes = np.linalg.eigh(doubted)
-    # The symmetric root changes little from fix to fix.
-    return {"doubt": (axes * np.sqrt(np.maximum(values, 0))) @ axes.T}
 
 
 def _named(problem: Problem, camera: Floats, attitude: Floats, bars: Floats) -> dict[str, Floats]:

@@ -8,18 +8,17 @@ that the rest contradicts is left out, and named. Frames and signs: `docs/positi
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
 
 import numpy as np
 
 from evlcp_sdk.place.error_model import ErrorModel, chi_square
-from evlcp_sdk.place.fit import ODDS, fit_pose, likely_fits
-from evlcp_sdk.place.fit_assessment import FOCAL, AssessedPose, Pose, assess_fit, covering, misfits
-from evlcp_sdk.place.model import Equations
-from evlcp_sdk.place.observations import BarView, Problem, project_bars
-from evlcp_sdk.place.rejections import Candidate, Rejection
+from evlcp_sdk.place.fit import ODDS, Equations, fit_pose, likely_fits, misfits
+from evlcp_sdk.place.fit_assessment import FOCAL, AssessedPose, Pose, assess_fit, covering
+from evlcp_sdk.place.observations import BarView, Candidate, Problem, Rejection, project_bars
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.values import FailedBar
@@ -79,6 +78,7 @@ def solve_pose(
     problem = Problem.of(views, camera, attitude, spec, sigma)
     if isinstance(problem, Rejection):
         return problem
+    mixed_up = partial(_mixed_up, views, camera, attitude, spec, sigma)
     found = _plain(problem)
     tests: Mapping[str, float]
     if isinstance(found, Rejection):
@@ -91,7 +91,7 @@ def solve_pose(
         pose = found.pose
         # Two bars on gravity do not show which is which.
         if problem.angles.known == 2 == len(pose.transmitters) and math.isfinite(pose.hpl_m + pose.vpl_m):
-            for _, behind in _mixed_up(views, camera, attitude, spec, sigma):
+            for _, behind in mixed_up():
                 pose = covering(pose, behind, spec)
         return pose
     fits, unsure = _fits_without_one(problem, sigma, tests)
@@ -103,9 +103,13 @@ def solve_pose(
     if len(fits) == 1:
         name, pose = fits[0]
         if not rivals and tests:
-            rivals = [name for name, _ in _mixed_up(views, camera, attitude, spec, sigma)]
+            rivals = [name for name, _ in mixed_up()]
             if not rivals:
-                return replace(pose, excluded=(name,), failed=_failed(problem, name, pose, tests))
+                failed = None
+                if name.startswith("bar ") and name in tests:
+                    bar = problem.transmitters.index(int(name[4:]))
+                    failed = estimate_fault(problem, bar, pose, tests[name], len(tests))
+                return replace(pose, excluded=(name,), failed=failed)
         names = [name]
     names += rivals
     if isinstance(found, Rejection) and not names:
@@ -118,19 +122,26 @@ def _fits_without_one(
     problem: Problem, sigma: CameraSigma, tests: Mapping[str, float]
 ) -> tuple[list[tuple[str, Pose]], list[str]]:
     """Which part is left out of each fit that is fine, and the parts without which there is no position."""
+    attitude = problem.attitude
+    focal_mm = math.hypot(sigma.focal_mm, _FREE_FOCAL * problem.camera.focal_mm)
+    parts: dict[str, Problem | Rejection] = {}
+    if len(problem.transmitters) > 1:
+        parts = {f"bar {number}": problem.without(i) for i, number in enumerate(problem.transmitters)}
+        if attitude is not None and attitude.heading_deg is not None:
+            parts["heading"] = problem.with_attitude(replace(attitude, heading_deg=None))
+        if attitude is not None:
+            parts["attitude"] = problem.with_attitude(None)
+    parts[FOCAL] = problem.seen_by(replace(sigma, focal_mm=focal_mm, correlation=()))
+    most = max(tests.values(), default=0.0)
+    hopeless = {name for name in parts if tests.get(name, most) < _HOPELESS * most and most > _FAR}
     fits: list[tuple[str, Pose]] = []
     unsure = []
-    most = max(tests.values(), default=0.0)
-    likely: list[tuple[str, Problem | Rejection]] = []
-    others: list[tuple[str, Problem | Rejection]] = []
-    for part in _without(problem, sigma):
-        hopeless = tests.get(part[0], most) < _HOPELESS * most and most > _FAR
-        (others if hopeless else likely).append(part)
     # Where nothing fits without one, or several do, the tests may be of a fit that has gone astray.
-    for parts in (likely, others):
+    for names in (parts.keys() - hopeless, hopeless):
         if len(fits) == 1:
             break
-        for name, other in parts:
+        for name in (name for name in parts if name in names):
+            other = parts[name]
             again = other if isinstance(other, Rejection) else _explained(other)
             if isinstance(again, Pose):
                 fits.append((name, again))
@@ -138,14 +149,6 @@ def _fits_without_one(
                 # It may be this part; without it there is no position that would tell.
                 unsure.append(name)
     return fits, unsure
-
-
-def _failed(problem: Problem, name: str, pose: Pose, tests: Mapping[str, float]) -> FailedBar | None:
-    """The bar of a name; None where that is another part."""
-    for i, number in enumerate(problem.transmitters):
-        if name == f"bar {number}":
-            return estimate_fault(problem, i, pose, tests[name], len(tests)) if name in tests else None
-    return None
 
 
 def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: int) -> FailedBar:
@@ -164,11 +167,9 @@ def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: i
     from scipy.special import chndtr
 
     rows = problem.points[problem.bar == bar]
-    shift, even = (
-        np.array([[one[0], one[1]], [one[1], one[2]]]) for one in problem.bar_sigma[bar, 3:].reshape(2, 3)
-    )
-    weight = rows[:, 8, None, None] * even
-    shift = (weight @ shift).reshape(-1, 2)
+    first = problem.parts[bar].start
+    weight = rows[:, 8, None, None] * problem.known.even[first]
+    shift = (weight @ problem.known.root[first]).reshape(-1, 2)
     whole = np.linalg.inv(np.eye(2 * len(rows)) + shift @ shift.T)
     off_m = np.zeros(3)
     for _ in range(_FAULT_STEPS):
@@ -247,28 +248,14 @@ def _mixed_up(
     return found
 
 
-def _without(problem: Problem, sigma: CameraSigma) -> Iterator[tuple[str, Problem | Rejection]]:
-    """The same without each part that may be at fault, and its name."""
-    bars, attitude = problem.transmitters, problem.attitude
-    if len(bars) > 1:
-        for i, number in enumerate(bars):
-            yield f"bar {number}", problem.without(i)
-        if attitude is not None and attitude.heading_deg is not None:
-            yield "heading", problem.with_attitude(replace(attitude, heading_deg=None))
-    if attitude is not None and len(bars) > 1:
-        yield "attitude", problem.with_attitude(None)
-    focal_mm = math.hypot(sigma.focal_mm, _FREE_FOCAL * problem.camera.focal_mm)
-    yield FOCAL, problem.seen_by(replace(sigma, focal_mm=focal_mm, correlation=()))
-
-
 def _plain(problem: Problem) -> AssessedPose | Rejection:
     """The pose by all that is given, whether it is to be believed or not."""
     fits = likely_fits(problem)
-    if isinstance(fits, Rejection) or not misfits(problem, fits[0]):
-        return fits if isinstance(fits, Rejection) else _settled(problem, fits)
+    if isinstance(fits, Rejection) or not misfits(fits[0]):
+        return fits if isinstance(fits, Rejection) else _settled(fits)
     # What is off matters, not whether it is as much off from elsewhere, nor how surely it is there.
     fitted, _ = fit_pose(problem, fits[0].at)
-    found = assess_fit(problem, fitted or fits[0])
+    found = assess_fit(fitted or fits[0])
     if isinstance(found, AssessedPose):
         return found
     return Rejection("not-determined", "nothing explains what is seen")
@@ -279,39 +266,34 @@ def _explained(problem: Problem) -> Pose | Rejection | None:
     fits = likely_fits(problem)
     if isinstance(fits, Rejection):
         return fits
-    found = None if misfits(problem, fits[0]) else _settled(problem, fits)
+    found = None if misfits(fits[0]) else _settled(fits)
     if isinstance(found, AssessedPose):
         return None if found.doubt else found.pose
     return found
 
 
-def _settled(problem: Problem, fits: Sequence[Equations]) -> AssessedPose | Rejection:
+def _settled(fits: Sequence[Equations]) -> AssessedPose | Rejection:
     """The likeliest of some fits, which is the first, assessed; refused where another one is as likely."""
     best = fits[0]
-    found = assess_fit(problem, best)
-    if isinstance(found, Rejection):
+    found = assess_fit(best)
+    if isinstance(found, Rejection) or len(fits) == 1:
         return found
-    known = [best]
-    for other in fits:
-        if other.cost - best.cost < ODDS and _apart(other, known, found.pose):
+    known, inverse = [best], np.linalg.pinv(found.pose.covariance[:3, :3])
+    for other in fits[1:]:
+        away = [other.at.position - one.at.position for one in known]
+        # By the covariance of the likeliest one.
+        alone = all(m @ inverse @ m > _APART_SIGMAS**2 for m in away)
+        if other.cost - best.cost < ODDS and alone:
             known.append(other)
-    if len(known) > 1:
-        apart_m = float(np.linalg.norm(known[1].at.position - best.at.position))
-        detail = f"two positions {apart_m:.2f} m apart fit the image alike"
-        return Rejection("two-solutions", detail, tuple(_candidate(problem, fit, best) for fit in known))
-    return found
-
-
-def _apart(fit: Equations, others: Sequence[Equations], pose: Pose) -> bool:
-    """Whether a fit is another solution than these, by the covariance of the likeliest one."""
-    for other in others:
-        apart = fit.at.position - other.at.position
-        if fit is other or not apart @ np.linalg.pinv(pose.covariance[:3, :3]) @ apart > _APART_SIGMAS**2:
-            return False
-    return True
-
-
-def _candidate(problem: Problem, fit: Equations, best: Equations) -> Candidate:
-    found = assess_fit(problem, fit)
-    spread = found.pose.covariance[:3, :3] if isinstance(found, AssessedPose) else np.full((3, 3), math.nan)
-    return Candidate(fit.at.position, fit.at.rotation, spread, math.exp((best.cost - fit.cost) / 2))
+    if len(known) == 1:
+        return found
+    candidates = []
+    for fit in known:
+        one, spread = assess_fit(fit), np.full((3, 3), math.nan)
+        if isinstance(one, AssessedPose):
+            spread = one.pose.covariance[:3, :3]
+        likelihood = math.exp((best.cost - fit.cost) / 2)
+        candidates.append(Candidate(fit.at.position, fit.at.rotation, spread, likelihood))
+    apart_m = float(np.linalg.norm(known[1].at.position - best.at.position))
+    detail = f"two positions {apart_m:.2f} m apart fit the image alike"
+    return Rejection("two-solutions", detail, tuple(candidates))

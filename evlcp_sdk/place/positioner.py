@@ -12,10 +12,9 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.bar_registry import BarRegistry
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.observations import BarView
+from evlcp_sdk.place.observations import BarView, Rejection
 from evlcp_sdk.place.points import points_at
 from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
-from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.dead_reckoning import imu_sigmas, reckon
-from evlcp_sdk.place.error_model import ErrorModel, chi_square
+from evlcp_sdk.place.error_model import ErrorModel, chi_square, symmetric_root
 from evlcp_sdk.scene.attitude import Swing
 from evlcp_sdk.values import Fix
 
@@ -318,9 +318,7 @@ def _seen(causes: Sequence[Cause], fix: Fix) -> Floats:
     """How a fix depends on the states, float64 (3, n)."""
     seen = np.zeros((3, _FIXED + sum(cause.size for cause in causes)))
     seen[:, :3] = np.eye(3)
-    values, axes = np.linalg.eigh(fix.slow_m2)
-    # The symmetric root turns as little as it can from fix to fix.
-    seen[:, _SLOW] = (axes * np.sqrt(np.maximum(values, 0))) @ axes.T
+    seen[:, _SLOW] = symmetric_root(fix.slow_m2)
     for cause, at in _columns(causes):
         if cause.name in fix.standing:
             seen[:, at] = fix.standing[cause.name]

@@ -6,7 +6,7 @@ from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
 from evlcp_sdk.formatting import sigmas
-from evlcp_sdk.place.geoid import geoid_m
+from evlcp_sdk.place.gnss import geoid_m
 from evlcp_sdk.place.navigator import Place
 from evlcp_sdk.values import Fix
 

@@ -17,9 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.formatting import sigmas
-from evlcp_sdk.place.geoid import geoid_m
+from evlcp_sdk.place.gnss import checksum, geoid_m
 from evlcp_sdk.place.navigator import Place
-from evlcp_sdk.place.nmea import checksum
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.utc import zero_at

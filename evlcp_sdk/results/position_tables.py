@@ -6,9 +6,9 @@ from typing import ClassVar
 
 from evlcp_sdk.files import defused
 from evlcp_sdk.formatting import text_or_empty
-from evlcp_sdk.place.bearing import bar_point
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.navigator import Place, Settled
+from evlcp_sdk.place.points import bar_point
 from evlcp_sdk.results.columns import PLACE_COLUMNS, place_row
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink

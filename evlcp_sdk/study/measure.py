@@ -9,7 +9,7 @@ import numpy as np
 from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
-from evlcp_sdk.place.rejections import CONTRADICTIONS
+from evlcp_sdk.place.observations import CONTRADICTIONS
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.sim.truth import Truth

@@ -9,7 +9,7 @@ from typing import Any
 from xml.sax.saxutils import escape
 
 from evlcp_sdk.formatting import sigmas
-from evlcp_sdk.place.geoid import geoid_m
+from evlcp_sdk.place.gnss import geoid_m
 from evlcp_sdk.place.navigator import Place, Settled
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink

@@ -13,8 +13,8 @@ from mcap.reader import make_reader
 from evlcp_sdk.io import open_source
 from evlcp_sdk.io.open import open_writer
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.place.nmea import checksum, read_nmea
-from evlcp_sdk.place.poses import read_poses
+from evlcp_sdk.place.calibration import read_poses
+from evlcp_sdk.place.gnss import checksum, read_nmea
 from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import load_sites

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, write_events
-from evlcp_sdk.place.nmea import checksum
+from evlcp_sdk.place.gnss import checksum
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, load_sites, to_toml
 from evlcp_sdk.values import Events, Triggers
 

@@ -6,8 +6,8 @@ import math
 import numpy as np
 import pytest
 
-from evlcp_sdk.place.bearing import bar_point
 from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.points import bar_point
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 from evlcp_sdk.values import Frame, Range, SoftSymbols
 from tests.unit.place.place_scenes import POINTS_ONLY, by_chance, square

@@ -15,9 +15,9 @@ from evlcp_sdk.place.calibration import (
     CalibrationView,
     _turn_slope,
     calibrate,
+    read_poses,
 )
 from evlcp_sdk.place.observations import BarView, project_bars
-from evlcp_sdk.place.poses import read_poses
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel
 from tests.unit.place.place_scenes import POINTS_ONLY, bar

@@ -8,10 +8,9 @@ import pytest
 from scipy import stats
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.estimated_biases import EstimatedBias, estimate_biases, focal_share
-from evlcp_sdk.place.observations import BarView, project_bars
+from evlcp_sdk.place.navigator import EstimatedBias, estimate_biases, focal_share
+from evlcp_sdk.place.observations import BarView, Rejection, project_bars
 from evlcp_sdk.place.pose import solve_pose
-from evlcp_sdk.place.rejections import Rejection
 from evlcp_sdk.place.trajectory import IMU, TrajectoryPoint, filter_fixes
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma

@@ -3,7 +3,7 @@
 import pytest
 from hypothesis import given, strategies as st
 
-from evlcp_sdk.place.geoid import geoid_m
+from evlcp_sdk.place.gnss import geoid_m
 
 # The points and heights that come with EGM96's own program, by interpolation in its grid of a quarter degree.
 PUBLISHED = [

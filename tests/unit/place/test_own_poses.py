@@ -5,14 +5,12 @@ import pytest
 from scipy import stats
 
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.place.calibration import CalibrationView
+from evlcp_sdk.place.calibration import CalibrationView, KnownPose
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import GnssLog
 from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import BarView, project_bars
-from evlcp_sdk.place.own_poses import OwnPoses
-from evlcp_sdk.place.poses import KnownPose
-from evlcp_sdk.place.survey import survey
+from evlcp_sdk.place.survey import OwnPoses, survey
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Packet

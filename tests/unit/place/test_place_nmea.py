@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import ConfigError, InputError
-from evlcp_sdk.place.gnss import GnssLog
-from evlcp_sdk.place.nmea import checksum, read_nmea
+from evlcp_sdk.place.gnss import GnssLog, checksum, read_nmea
 from evlcp_sdk.results.nmea import clock_of, gst
 
 GGA = "$GPGGA,172814.0,3723.46587704,N,12202.26957864,W,2,6,1.2,18.893,M,-25.669,M,2.0,0031*4F"

@@ -14,9 +14,8 @@ from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.kinds import BeaconKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.observations import project_bars
+from evlcp_sdk.place.observations import Candidate, Rejection, project_bars
 from evlcp_sdk.place.positioner import BarKind, Positioner, _alternatives
-from evlcp_sdk.place.rejections import Candidate, Rejection
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
 from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CameraModel

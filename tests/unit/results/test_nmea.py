@@ -6,7 +6,7 @@ import pynmea2
 import pytest
 from hypothesis import given, strategies as st
 
-from evlcp_sdk.place.nmea import checksum
+from evlcp_sdk.place.gnss import checksum
 from evlcp_sdk.results.nmea import clock_of, gga, rmc
 
 ZERO = datetime(2026, 3, 1, 23, 59, 58, tzinfo=UTC)

@@ -22,8 +22,7 @@ from evlcp_sdk.files import STAGE_PREFIX
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place import navigator
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.geoid import geoid_m
-from evlcp_sdk.place.gnss import GnssLog
+from evlcp_sdk.place.gnss import GnssLog, geoid_m
 from evlcp_sdk.place.navigator import Navigator, Place, PositionPlan
 from evlcp_sdk.place.observations import project_bars
 from evlcp_sdk.place.trajectory import trajectory_step
