@@ -13,21 +13,17 @@ from evlcp_sdk.plugin.writer import LAST_TIME_US
 
 UNITS_US: Final = {"s": 1e6, "ms": 1e3, "us": 1.0, "ns": 1e-3}
 
-_UNITS: Final = {
-    "s": "s|secs?|seconds?",
-    "ms": "ms|msecs?|millis|milliseconds?",
-    "us": "us|µs|μs|usecs?|micros|microseconds?",
-    "ns": "ns|nsecs?|nanos|nanoseconds?",
-}
 _UNIT: Final = re.compile(
-    "(?:in )?(?:" + "|".join(f"(?P<{unit}>{words})" for unit, words in _UNITS.items()) + ")"
+    r"(?:in )?(?:(?P<s>s|secs?|seconds?)|(?P<ms>ms|msecs?|millis|milliseconds?)"
+    # A micro sign of older programs is no UTF-8.
+    r"|(?P<us>[uµμ\ufffd]s|usecs?|micros|microseconds?)|(?P<ns>ns|nsecs?|nanos|nanoseconds?))"
 )
-_BRACKETS: Final = re.compile(r"(.*?)[ _.]*[(\[]([^()\[\]]*)[)\]]")
-_WITH_UNIT: Final = re.compile(r"(.+?)(?:[ _.]in)?(?:[ _.]+|[ _.]*/[ ]?)([^ _./]+)")
-_SHORT_UNIT: Final = re.compile(r"(.+?)(ms|us|ns)")
 _TIME: Final = re.compile(
-    r"(?:(?:events?|elapsed)[ _.]?)?(?:t|ts|times?|timestamps?|time[ _]stamps?)(?:[ _.]events?)?"
+    r"(?P<name>(?:(?:events?|elapsed)[ _.]?)?(?:time[ _]?stamps?|times?|ts|t)(?:[ _.]events?)?)"
+    r"(?:[ _.]*[(\[](?P<inside>[^()\[\]]*)[)\]]"
+    r"|(?:[ _.]in)?(?:[ _.]+|[ _.]*/ ?)(?P<behind>[^ _./]+)|(?P<short>ms|us|ns))?"
 )
+_BRACKETS: Final = re.compile(r"[ _.]*[(\[][^()\[\]]*[)\]]$")
 _NAMES: Final = {
     "p": re.compile(
         r"(?:events?[ _.]?|is[ _.]?)?(?:p|ps|pol|pols|polarity|polarities|on|on[ _/]?off|signs?|value|level"
@@ -188,21 +184,18 @@ def fields_of(names: Sequence[str]) -> Fields | None:
     >>> fields_of(["a", "b"]) is None
     True
     """
-    plain = [_plain(name) for name in names]
-    times = [(k, said) for k, name in enumerate(plain) if (said := _as_time(name)) is not None]
-    bare = [match[1] if (match := _BRACKETS.fullmatch(name)) else name for name in plain]
+    names = [plain(name).lower() for name in names]
+    bare = [_BRACKETS.sub("", name) for name in names]
+    units = {k: unit for k, name in enumerate(names) if (unit := _as_time(name)) is not None}
     found = {key: [k for k, name in enumerate(bare) if word.fullmatch(name)] for key, word in _NAMES.items()}
     # `t` and `p` before longer names that may mean something else.
-    if len(times) > 1:
-        times = [one for one in times if bare[one[0]] in ("t", "ts", "time", "timestamp")]
-    of_p = found["p"] or [k for k, name in enumerate(bare) if name in _EVENT]
-    if len(of_p) > 1:
-        of_p = [k for k in of_p if bare[k] in ("p", "pol", "polarity")]
-    if len(times) != 1 or len(of_p) != 1:
+    times = [k for k in units if len(units) == 1 or bare[k] in ("t", "ts", "time", "timestamp")]
+    signs = found["p"] or [k for k, name in enumerate(bare) if name in _EVENT]
+    signs = [k for k in signs if len(signs) == 1 or bare[k] in ("p", "pol", "polarity")]
+    if len(times) != 1 or len(signs) != 1:
         return None
-    (time, unit), (polarity,) = times[0], of_p
     places = (found["x"][0], found["y"][0]) if len(found["x"]) == len(found["y"]) == 1 else None
-    return Fields(time, polarity, places, unit or None)
+    return Fields(times[0], signs[0], places, units[times[0]] or None)
 
 
 def unit_of(name: str) -> str | None:
@@ -211,25 +204,23 @@ def unit_of(name: str) -> str | None:
     >>> unit_of("[microseconds]"), unit_of("p")
     ('us', None)
     """
-    match = _UNIT.fullmatch(_plain(name).strip("()[]").strip())
-    return next((unit for unit in _UNITS if match[unit]), None) if match else None
+    match = _UNIT.fullmatch(plain(name).lower().strip("()[]").strip())
+    return match.lastgroup if match else None
 
 
-def _plain(name: str) -> str:
-    return name.strip().strip("\"'").strip().lower()
+def plain(cell: str) -> str:
+    """A cell without blanks and quotes around it."""
+    return cell.strip(" \t\r\n\"'")
 
 
 def _as_time(name: str) -> str | None:
     """The unit that a name of times says, empty for none; None where it is of something else."""
-    if _TIME.fullmatch(name):
-        return ""
-    for form in (_BRACKETS, _WITH_UNIT, _SHORT_UNIT):
-        match = form.fullmatch(name)
-        if match and _TIME.fullmatch(match[1]):
-            unit = unit_of(match[2])
-            return unit if unit or form is not _BRACKETS else ""
-    # A unit alone; `s` may be a sign.
-    return unit_of(name) if len(name) > 1 else None
+    match = _TIME.fullmatch(name)
+    if match is None:
+        # A unit alone; `s` may be a sign.
+        return unit_of(name) if len(name) > 1 else None
+    unit = unit_of(match["inside"] or match["behind"] or match["short"] or "")
+    return None if match["behind"] and unit is None else unit or ""
 
 
 def unit_named(text: str) -> str:
@@ -312,7 +303,7 @@ def _are_signs(values: NDArray[Any]) -> bool:
     if values.dtype.kind == "b":
         return True
     if values.dtype.kind in "US":
-        return all(str(word).strip().lower() in _ON | _OFF for word in np.unique(values).tolist())
+        return all(is_polarity(_word(word)) for word in np.unique(values).tolist())
     return any(np.isin(values, pair).all() for pair in _LEVELS)
 
 
@@ -482,7 +473,7 @@ class Polarities:
         [1, 0, 0]
         """
         if values.dtype.kind in "US":
-            return _of_words(values)
+            return self._of_words(values)
         found, first = np.unique(values, return_index=True)
         pair = _LEVELS[0]
         for level, row in sorted(zip(found.tolist(), first.tolist(), strict=True), key=lambda one: one[1]):
@@ -497,15 +488,25 @@ class Polarities:
             self._levels, pair = known, fits
         return np.asarray(values == pair[1], np.uint8)
 
+    @staticmethod
+    def _of_words(values: NDArray[Any]) -> NDArray[np.uint8]:
+        words, which = np.unique(values, return_inverse=True)
+        texts = [_word(word) for word in words.tolist()]
+        for k, text in enumerate(texts):
+            if not is_polarity(text):
+                row = int((which.ravel() == k).argmax())
+                raise RowError(row, f"polarity {text!r}, expected 0 or 1, or -1 or 1, or ON or OFF")
+        return np.array([_lowered(text) in _ON for text in texts], np.uint8)[which.ravel()]
 
-def _of_words(values: NDArray[Any]) -> NDArray[np.uint8]:
-    words = {}
-    for word in np.unique(values).tolist():
-        text = (word.decode("utf-8", "replace") if isinstance(word, bytes) else word).strip().strip("\"'")
-        plain = text.lower().removesuffix(".0")
-        if plain not in _ON and plain not in _OFF:
-            row = int((values == word).argmax())
-            raise RowError(row, f"polarity {text!r}, expected 0 or 1, or -1 or 1, or ON or OFF")
-        words[word] = plain in _ON
-    kinds, which = np.unique(values, return_inverse=True)
-    return np.array([words[kind] for kind in kinds.tolist()], np.uint8)[which.ravel()]
+
+def _word(value: str | bytes) -> str:
+    return plain(value.decode("utf-8", "replace") if isinstance(value, bytes) else value)
+
+
+def _lowered(text: str) -> str:
+    return text.lower().removesuffix(".0")
+
+
+def is_polarity(text: str) -> bool:
+    """Whether a word means ON or OFF."""
+    return _lowered(text) in _ON | _OFF

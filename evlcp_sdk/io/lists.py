@@ -7,15 +7,14 @@ source's header says how.
 import codecs
 import csv
 import gzip
-import itertools
+import io
 import math
 import re
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import IO, Any, Final, TextIO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,20 +22,23 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io.arrays import read_npy, read_npz
 from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, Piece
-from evlcp_sdk.io.fields import Fields, Polarities, fields_of, fields_of_values, unit_named, unit_of
+from evlcp_sdk.io.fields import Fields, fields_of, fields_of_values, is_polarity, plain, unit_named, unit_of
 from evlcp_sdk.io.tables import CSV_HEADER
 from evlcp_sdk.io.urls import flag, split_options
 
-PIECE_BYTES: Final = 1 << 20
+PIECE_CHARACTERS: Final = 1 << 20
 
-_COMMENTS: Final = (b"#", b"%", b"//")
-_SEPARATORS: Final = (b";", b"\t", b"|", b",")
-_DECIMAL_COMMA: Final = re.compile(rb"(?<=\d),(?=\d)")
+_COMMENTS: Final = ("#", "%", "//")
+_SEPARATORS: Final = (";", "\t", "|", ",")
+_DECIMAL_COMMA: Final = re.compile(r"(?<=\d),(?=\d)")
 _UTF_16: Final = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+_LOOKED_AT: Final = 512
+"""Lines at the start from which columns are recognized."""
+
 _TITLES: Final = 10
 """Lines that may stand above a table: a title, what recorded it, `sep=;`."""
-_TEXT: Final = re.compile(rb"[\t\r\n -~\x80-\xff]+")
-_NPY: Final = b"\x93NUMPY"
+
+_NO_TEXT: Final = re.compile(r"[\0-\x08\x0b-\x1f\x7f]")
 SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".txt", ".txt.gz", ".dat", ".npy")
 """Of names, where the content alone does not say that it is a list."""
 
@@ -109,12 +111,9 @@ def is_list(path: Path) -> bool:
     """
     if _kind(path) != "CSV":
         return True
-    with path.open("rb") as file:
-        start = file.read(1 << 13)
-    if start.startswith(_UTF_16):
-        start = start[: len(start) // 2 * 2].decode("utf-16", "replace").encode()
-    start = start.removeprefix(codecs.BOM_UTF8)
-    return _TEXT.fullmatch(start) is not None and _Text(start, None).fields is not None
+    with ExitStack() as stack:
+        start = _open_text(path, stack)[1].read(1 << 13)
+    return not _NO_TEXT.search(start) and _Text(start.splitlines(), None).fields is not None
 
 
 def _kind(path: Path) -> str:
@@ -122,298 +121,188 @@ def _kind(path: Path) -> str:
         start = file.read(16)
     if start.startswith(b"PK\x03\x04") or path.suffix.lower() == ".npz":
         return "NPZ"
-    return "NPY" if start.startswith(_NPY) else "CSV"
+    return "NPY" if start.startswith(b"\x93NUMPY") else "CSV"
+
+
+def _open_text(path: Path, stack: ExitStack) -> tuple[IO[bytes], TextIO]:
+    """A file, and its text."""
+    raw = stack.enter_context(path.open("rb"))
+    start = raw.peek(2)[:2]
+    file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if start == b"\x1f\x8b" else raw
+    encoding = "utf-16" if start in _UTF_16 else "utf-8-sig"
+    return raw, stack.enter_context(io.TextIOWrapper(file, encoding, "replace"))
 
 
 def read_csv(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
     """A table of text."""
-    raw = stack.enter_context(path.open("rb"))
-    start = raw.read(2)
-    file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if start == b"\x1f\x8b" else raw
-    if start in _UTF_16:
-        file = codecs.EncodedFile(raw, "utf-8", "utf-16", "replace")
-    raw.seek(0)
-    text = file.read(PIECE_BYTES).removeprefix(codecs.BOM_UTF8)
-    table = _Text(text, fields)
+    raw, file = _open_text(path, stack)
+    lines = file.readlines(PIECE_CHARACTERS)
+    table = _Text(lines, fields)
     if table.fields is None:
         raise InputError(
-            f"{path}: line {table.line}: found {_show(table.heading)}, expected the columns t and p"
+            f"{path}: line {table.first}: found {_show(table.heading)}, expected the columns t and p"
             " (or say which they are, as by list:PATH?columns=t,p)"
         )
-    pieces = _csv_pieces(path, raw, file, text, table)
+    pieces = _csv_pieces(path, raw, file, lines, table, table.fields)
     # A table of ours has times as a camera gave them; others may be in any order.
-    window_us = WINDOW_US if table.heading.strip() == CSV_HEADER else math.inf
+    window_us = WINDOW_US if table.heading.strip() == CSV_HEADER.decode() else math.inf
     return EventTable("CSV", pieces, table.fields.unit, "line", window_us=window_us)
 
 
 _READERS: Final[dict[str, Read]] = {"NPZ": read_npz, "NPY": read_npy, "CSV": read_csv}
 
 
-def _csv_pieces(path: Path, raw: Any, file: Any, text: bytes, table: "_Text") -> Iterator[Piece]:
-    line, more = 1, text
-    while more:
-        more = file.read(PIECE_BYTES)
-        text += more
-        whole = text if not more else text[: text.rfind(b"\n") + 1]
-        text = text[len(whole) :]
-        lines = whole.splitlines()
-        last_is_cut = not more and not whole.endswith((b"\n", b"\r"))
-        number = partial(table.number, lines, line)
-        try:
-            rows, cut = table.rows(lines, line, last_is_cut)
-        except _LineError as error:
-            rows, _ = table.rows(lines[: error.line - line], line, last_is_cut=False)
-            if len(rows[0]):
-                yield Piece(*rows, number, raw.tell())
-            raise InputError(f"{path}: line {error.line}: {error}") from error
-        if len(rows[0]) or cut:
-            yield Piece(*rows, number, raw.tell(), cut)
-        line += len(lines)
+def _csv_pieces(
+    path: Path, raw: IO[bytes], file: TextIO, lines: list[str], table: "_Text", fields: Fields
+) -> Iterator[Piece]:
+    above = 0
+    while lines:
+        more = file.readlines(PIECE_CHARACTERS)
+        numbers = [k for k, line in enumerate(lines, above + 1) if k >= table.first and _is_data(line)]
+        rows = [lines[k - above - 1] for k in numbers]
+        # Whoever wrote it was stopped.
+        cut = int(bool(rows) and not more and lines[-1][-1] != "\n" and not table.is_row(rows[-1], fields))
+        good = len(rows) - cut
+        columns = table.columns(rows[:good], fields)
+        if columns is None:
+            good = next(k for k, row in enumerate(rows) if not table.is_row(row, fields))
+            columns = table.columns(rows[:good], fields)
+        if columns is not None and rows:
+            yield Piece(*columns, numbers.__getitem__, raw.tell(), cut)
+        if good + cut < len(rows):
+            what = "a time and a polarity" + (", x and y" if fields.places else "")
+            raise InputError(f"{path}: line {numbers[good]}: found {_show(rows[good])}, expected {what}")
+        above, lines = above + len(lines), more
 
 
-def _show(line: bytes) -> str:
+def _show(line: str) -> str:
     """The start of a line for a message."""
-    text = line[:60].decode("utf-8", "replace")
-    return repr(text + ("..." if len(line) > 60 else ""))
-
-
-class _LineError(ValueError):
-    """A line that is no row of its table.
-
-    Args:
-        line: Its number.
-        what: What it is, and what was expected.
-    """
-
-    def __init__(self, line: int, what: str) -> None:
-        super().__init__(what)
-        self.line = line
+    text = line.rstrip("\n")
+    return repr(text[:60] + ("..." if len(text) > 60 else ""))
 
 
 class _Text:
     """How the lines of a text are read: what separates cells, and which is what.
 
     Args:
-        start: The first bytes, behind a byte order mark.
+        lines: The first ones.
         fields: Which column is what; None: as its heading or its values say.
+
+    Attributes:
+        fields: The same; None where nothing says it.
+        first: Number of the first line that may be a row, or of the one that says nothing.
+        heading: The line that has the names, or is the first row.
     """
 
-    def __init__(self, start: bytes, fields: Fields | None) -> None:
-        lines = start.splitlines()[:512]
-        data = [(k, line) for k, line in enumerate(lines, 1) if _is_data(line)]
-        # A heading may stand in a comment, as numpy.savetxt writes it.
-        above = [
-            line.strip().lstrip(b"#%/").strip()
-            for line in lines[: data[0][0] - 1 if data else len(lines)]
-            if line.strip()
-        ]
-        self.line, self.heading = data[0] if data else (1, lines[0] if lines else b"")
+    def __init__(self, lines: list[str], fields: Fields | None) -> None:
+        data = [(k, line) for k, line in enumerate(lines[:_LOOKED_AT], 1) if _is_data(line)]
         self._separator = _separator([line for _, line in data[:256]])
-        self.is_named = False
         self.fields = fields
-        if fields is not None and data:
-            self.line, _ = _first_number(data, fields.time, self)
-        elif data:
-            for top in range(min(_TITLES, len(data))):
-                found = self._told([line for _, line in data[top:]], above)
-                if found is not None:
-                    self.fields, self.is_named, units = found
-                    self.line, self.heading = data[top + units] if top + units < len(data) else data[top]
-                    break
-                if top + 1 < len(data) and self._is_like(data[top][1], data[top + 1][1]):
-                    break
-        self.first = self.line + self.is_named
-        self.line = self.first if self.fields is not None else self.line
+        self.first, self.heading = data[0] if data else (1, lines[0] if lines else "")
+        if fields is not None:
+            times = ((k, self.cells(line)[fields.time : fields.time + 1]) for k, line in data)
+            self.first = next((k for k, cells in times if cells and _is_number(cells[0])), self.first)
+            return
+        # A heading may stand in a comment, as numpy.savetxt writes it.
+        above = [line.strip().lstrip("#%/").strip() for line in lines[: self.first - 1]]
+        for top, (number, line) in enumerate(data[:_TITLES]):
+            found = self._recognize([line for _, line in data[top:]], above)
+            if found is not None:
+                self.fields, names = found
+                self.first, self.heading = data[top + names - 1][0] + 1 if names else number, line
+                break
+            # A row as the next one is no title, and not to be passed over.
+            following = self.cells(data[top + 1][1]) if top + 1 < len(data) else []
+            if len(self.cells(line)) == len(following) and any(map(_is_number, self.cells(line))):
+                break
 
-    def _told(self, lines: list[bytes], above: list[bytes]) -> tuple[Fields, bool, int] | None:
-        """Which is what, if a table begins with these lines.
-
-        Returns:
-            The columns; whether the first line names them; and how many lines of units follow that.
-        """
+    def _recognize(self, lines: list[str], above: list[str]) -> tuple[Fields, int] | None:
+        """Which is what, if a table begins with these lines, and how many of them name columns and units."""
         head = self.cells(lines[0])
-        if not any(_is_number(cell) for cell in head):
-            named = fields_of(head)
-            if named is None:
-                return None
-            second = self.cells(lines[1]) if len(lines) > 1 else []
-            unit = unit_of(second[named.time]) if len(second) > max(named.which) else None
-            units = unit is not None
-            if unit:
-                named = replace(named, unit=named.unit or unit)
-            rows = [self.cells(line) for line in lines[1 + units : 9]]
-            if rows and all(len(row) == len(head) + 1 for row in rows):
-                # Without a name for the numbers of rows, as R writes it.
-                named = named.behind(1)
-            return named, True, int(units)
-        above_it = next((found for text in above[::-1] if (found := self._said(text, len(head)))), None)
-        shown = above_it or self._shown(lines[:256])
-        return None if shown is None else (shown, False, 0)
+        if any(map(_is_number, head)):
+            for text in reversed(above):
+                for names in (self.cells(text), re.split(r"[,;\s]+", text)):
+                    found = fields_of(names)
+                    if found is not None and len(names) == len(head):
+                        return found, 0
+            shown = self._recognize_values(lines[:256])
+            return None if shown is None else (shown, 0)
+        named = fields_of(head)
+        if named is None:
+            return None
+        second = self.cells(lines[1]) if len(lines) > 1 else []
+        unit = unit_of(second[named.time]) if len(second) > max(named.which) else None
+        rows = [self.cells(line) for line in lines[1 + bool(unit) : 9]]
+        if rows and all(len(row) == len(head) + 1 for row in rows):
+            # Without a name for the numbers of rows, as R writes it.
+            named = named.behind(1)
+        return replace(named, unit=named.unit or unit), 1 + bool(unit)
 
-    def _is_like(self, line: bytes, following: bytes) -> bool:
-        """Whether a line is a row as the next one is: no title then, and not to be passed over."""
-        cells = self.cells(line)
-        return len(cells) == len(self.cells(following)) and any(_is_number(cell) for cell in cells)
-
-    def _said(self, text: bytes, many: int) -> Fields | None:
-        for cells in (self.cells(text), re.split(r"[,;\s]+", text.decode("utf-8", "replace"))):
-            found = fields_of(cells)
-            if found is not None and len(cells) == many:
-                return found
-        return None
-
-    def _shown(self, sample: list[bytes]) -> Fields | None:
+    def _recognize_values(self, sample: list[str]) -> Fields | None:
         rows = [self.cells(line) for line in sample]
-        if len({len(row) for row in rows}) != 1:
+        if len(set(map(len, rows))) != 1:
             # The last one may be cut.
             rows = rows[:-1]
-        if not rows or len({len(row) for row in rows}) != 1:
+        if len(set(map(len, rows))) != 1:
             return None
-        columns: list[NDArray[Any]] = []
-        for cells in zip(*rows, strict=True):
-            try:
-                columns.append(np.array([float(cell) for cell in cells]))
-            except ValueError:
-                columns.append(np.array(cells))
-        return fields_of_values(columns)
+        return fields_of_values([_numbers(np.array(cells)) for cells in zip(*rows, strict=True)])
 
-    def cells(self, line: bytes) -> list[str]:
-        """What stands between the separators of a line."""
-        try:
-            text = line.decode().strip()
-        except UnicodeDecodeError:
-            # As older programs write a micro sign.
-            text = line.decode("latin-1").strip()
-        if self._separator == b" ":
-            return [_plain(cell) for cell in text.split()]
-        mark = self._separator.decode()
-        if '"' in text:
-            try:
-                cells = next(csv.reader([text], delimiter=mark, skipinitialspace=True))
-            except csv.Error:
-                # A cell that is no end of, or bytes that are no text.
-                cells = text.split(mark)
-            return [_plain(cell) for cell in cells]
-        return [_plain(cell) for cell in text.split(mark)]
+    def cells(self, line: str) -> list[str]:
+        """What stands between the separators of a line, decimal commas as points."""
+        mark = None if self._separator == " " else self._separator
+        cells = line.split(mark)
+        if mark and '"' in line:
+            # A cell may be longer than `csv` takes.
+            with suppress(csv.Error):
+                (cells,) = csv.reader([line], delimiter=mark, skipinitialspace=True)
+        return [_DECIMAL_COMMA.sub(".", plain(cell)) if "," in cell else plain(cell) for cell in cells]
 
-    def rows(
-        self, lines: list[bytes], first: int, last_is_cut: bool
-    ) -> tuple[tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None], int]:
-        """Times, polarities and places of some lines, and how many cut ones at the end are left out.
-
-        Args:
-            lines: The lines.
-            first: Number of the first.
-            last_is_cut: The last one has no end, so it may be cut.
-
-        Raises:
-            _LineError: A line is no row of the table.
-        """
-        assert self.fields is not None
-        data = list(self._data(lines, first))
-        # Whoever wrote it was stopped.
-        cut = int(last_is_cut and bool(data) and not self._is_row(data[-1][1]))
-        data = data[: len(data) - cut]
-        if not data:
-            return (np.empty(0, np.int64), np.empty(0, np.int64), None), cut
-        kept = [line for _, line in data]
-        if self._separator != b"," and b"," in kept[0]:
-            kept = [_DECIMAL_COMMA.sub(b".", line) for line in kept]
-        found = self._loaded(kept, self.fields.which)
-        return found or _split(np.array([self._cells_of(k, line) for k, line in data])), cut
-
-    def _data(self, lines: list[bytes], first: int) -> Iterator[tuple[int, bytes]]:
-        """Number and text of those that are rows of the table, from `first` on."""
-        return ((k, line) for k, line in enumerate(lines, first) if k >= self.first and _is_data(line))
-
-    def _cells_of(self, number: int, line: bytes) -> list[str]:
-        """The cells of a row that count."""
-        assert self.fields is not None
-        if not self._is_row(line):
-            more = ", x and y" if self.fields.places else ""
-            raise _LineError(number, f"found {_show(line)}, expected a time and a polarity{more}")
-        cells = self.cells(line)
-        return [cells[k] for k in self.fields.which]
-
-    def number(self, lines: list[bytes], first: int, row: int) -> int:
-        """In which line the row stands, of these from `first` on, the row from 0."""
-        return next(itertools.islice(self._data(lines, first), row, None))[0]
-
-    def _loaded(
-        self, lines: list[bytes], which: tuple[int, ...]
+    def columns(
+        self, rows: list[str], fields: Fields
     ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None] | None:
-        """The same by NumPy, where all cells are plain numbers; None where they are not."""
-        mark = None if self._separator == b" " else self._separator.decode()
-        for kind in (np.dtype(np.int64), np.dtype(np.float64)):
+        """Times, polarities and places of some lines, (n,), (n,) and (n, 2); None where one is no row."""
+        which, mark = fields.which, None if self._separator == " " else self._separator
+        if not rows:
+            return np.empty(0, np.int64), np.empty(0, np.int64), None
+        decimal = [_DECIMAL_COMMA.sub(".", row) for row in rows] if mark != "," and "," in rows[0] else rows
+        for kind in (np.int64, np.float64):
             try:
-                found = np.loadtxt(lines, kind, None, mark, usecols=which, ndmin=2)
+                found = np.loadtxt(decimal, kind, None, mark, usecols=which, ndmin=2)
             except (ValueError, OverflowError):
                 continue
-            return found[:, 0], found[:, 1], found[:, 2:] if len(which) > 2 else None
+            return found[:, 0], found[:, 1], found[:, 2:] if fields.places else None
         try:
-            return _split(np.loadtxt(lines, "U32", None, mark, usecols=which, ndmin=2, quotechar='"'))
-        except ValueError:
+            cells = np.array([[cells[k] or "nan" for k in which] for cells in map(self.cells, rows)])
+        except IndexError:
             return None
+        times, *places = (_numbers(column) for k, column in enumerate(cells.T) if k != 1)
+        if any(column.dtype.kind == "U" for column in (times, *places)):
+            return None
+        return times, cells[:, 1], np.stack(places, 1) if places else None
 
-    def _is_row(self, line: bytes) -> bool:
-        assert self.fields is not None
+    def is_row(self, line: str, fields: Fields) -> bool:
+        """Whether a line has numbers and a polarity where the columns are."""
         cells = self.cells(line)
-        which = self.fields.which
-        if len(cells) <= max(which):
+        if len(cells) <= max(fields.which):
             return False
-        if not all(_is_number(cells[k] or "nan") for k in which if k != self.fields.polarity):
-            return False
-        try:
-            Polarities().of(np.array([cells[self.fields.polarity] or "nan"]))
-        except ValueError:
-            return _is_number(cells[self.fields.polarity] or "nan")
-        return True
+        time, polarity, *places = (cells[k] or "nan" for k in fields.which)
+        return all(map(_is_number, (time, *places))) and (is_polarity(polarity) or _is_number(polarity))
 
 
-def _split(cells: NDArray[np.str_]) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None]:
-    """Times, polarities and places of cells (n, 2 or 4).
-
-    Raises:
-        ValueError: A time or a place is no number.
-    """
-    cells = np.char.strip(cells, " \t\"'")
-    cells[cells == ""] = "nan"
-    try:
-        times: NDArray[Any] = cells[:, 0].astype(np.int64)
-    except (ValueError, OverflowError):
-        times = cells[:, 0].astype(np.float64)
-    return times, cells[:, 1], cells[:, 2:].astype(np.float64) if cells.shape[1] > 2 else None
-
-
-def _plain(cell: str) -> str:
-    """A cell without quotes, and with a point where it has a comma."""
-    return re.sub(r"(?<=\d),(?=\d)", ".", cell.strip().strip("\"'").strip())
-
-
-def _first_number(data: list[tuple[int, bytes]], time: int, text: "_Text") -> tuple[int, bytes]:
-    """The first of some lines, with their numbers, that has a number for its time; else the very first."""
-    rows = (
-        (k, line) for k, line in data if len(cells := text.cells(line)) > time and _is_number(cells[time])
-    )
-    return next(rows, data[0])
-
-
-def _separator(lines: list[bytes]) -> bytes:
+def _separator(lines: list[str]) -> str:
     """What stands between the cells of most lines."""
 
-    def in_most(found: Callable[[bytes], Any]) -> bool:
-        return 2 * sum(bool(found(line)) for line in lines) >= len(lines) > 0
+    def is_in_most(pattern: str) -> bool:
+        return 2 * sum(bool(re.search(pattern, line)) for line in lines) >= len(lines) > 0
 
-    mark = next((mark for mark in _SEPARATORS if in_most(lambda line, mark=mark: mark in line)), b" ")  # type: ignore[misc]
-    if mark == b"," and in_most(lambda line: re.fullmatch(rb"\s*\d+,\d+(\s+[^\s,]+)+\s*", line)):
-        # A comma for the point, and blanks between.
-        return b" "
-    return mark
+    mark = next((mark for mark in _SEPARATORS if is_in_most(re.escape(mark))), " ")
+    # A comma for the point, and blanks between.
+    return " " if mark == "," and is_in_most(r"^\s*\d+,\d+(\s+[^\s,]+)+\s*$") else mark
 
 
-def _is_data(line: bytes) -> bool:
-    plain = line.strip()
-    return bool(plain) and not plain.startswith(_COMMENTS)
+def _is_data(line: str) -> bool:
+    text = line.strip()
+    return bool(text) and not text.startswith(_COMMENTS)
 
 
 def _is_number(text: str) -> bool:
@@ -422,3 +311,13 @@ def _is_number(text: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def _numbers(words: NDArray[np.str_]) -> NDArray[Any]:
+    """Whole numbers, or numbers, of words; the words where one is none."""
+    for kind in (np.int64, np.float64):
+        try:
+            return words.astype(kind)
+        except (ValueError, OverflowError):
+            continue
+    return words
