@@ -42,9 +42,22 @@ _UNFINISHED = {
 """What stands in place of the last file, if it is JSON, while others come into place."""
 
 
-def output_fault(path: Path | str, fault: OSError) -> OutputError:
-    """What is said of an output that the system refuses."""
-    return OutputError(f"{path}: cannot be written: {fault.strerror or fault}")
+@contextmanager
+def writing(path: Path | str) -> Iterator[None]:
+    """What the system refuses within becomes an `OutputError` that names the file or folder."""
+    try:
+        yield
+    except OSError as fault:
+        raise OutputError(f"{path}: cannot be written: {fault.strerror or fault}") from fault
+
+
+@contextmanager
+def _reading(path: Path | str) -> Iterator[None]:
+    """What the system refuses within becomes an `InputError` that names the file."""
+    try:
+        yield
+    except OSError as fault:
+        raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
 
 
 class Outputs:
@@ -73,15 +86,13 @@ class Outputs:
             return self._staged[target]
         if target in self._direct:
             return target
-        try:
+        with writing(target):
             if _is_special(target):
                 self._direct.append(target)
                 return target
             if target.parent not in self._stages:
                 stage = tempfile.mkdtemp(prefix=STAGE_PREFIX, dir=target.parent)
                 self._stages[target.parent] = Path(stage)
-        except OSError as fault:
-            raise output_fault(target, fault) from fault
         self._staged[target] = self._stages[target.parent] / target.name
         return self._staged[target]
 
@@ -92,23 +103,16 @@ class Outputs:
             OutputError: As `path`.
             OSError: It cannot be opened.
         """
-        file = self.path(target).open(self._mode(target), encoding="utf-8", newline="")
-        self._open.append(file)
-        return file  # type: ignore[return-value]
+        return self._opened(target, "", encoding="utf-8", newline="")  # type: ignore[return-value]
 
     def open_binary(self, target: Path) -> BinaryIO:
-        """A binary file; it is closed with the others.
+        """A binary file; as `open`."""
+        return self._opened(target, "b")  # type: ignore[return-value]
 
-        Raises:
-            OutputError: As `path`.
-            OSError: It cannot be opened.
-        """
-        file = self.path(target).open(f"{self._mode(target)}b")
-        self._open.append(file)
-        return file  # type: ignore[return-value]
-
-    def _mode(self, target: Path) -> str:
-        return "w" if target in self._direct else "x"
+    def _opened(self, target: Path, kind: str, **text: str) -> IO[Any]:
+        path = self.path(target)
+        self._open.append(path.open(f"{'w' if target in self._direct else 'x'}{kind}", **text))  # type: ignore[call-overload]
+        return self._open[-1]
 
     def write_text(self, text: str, target: Path) -> None:
         """Write a text file.
@@ -116,7 +120,7 @@ class Outputs:
         Raises:
             OutputError: It cannot be written.
         """
-        with self.told(target), self.open(target) as file:
+        with writing(target), self.open(target) as file:
             file.write(text)
 
     def write_array(self, array: "NDArray[Any]", target: Path) -> None:
@@ -130,16 +134,8 @@ class Outputs:
         # To a file itself NumPy writes past Python, which a pipe cannot take.
         whole = io.BytesIO()
         np.save(whole, array)
-        with self.told(target), self.open_binary(target) as file:
+        with writing(target), self.open_binary(target) as file:
             file.write(whole.getbuffer())
-
-    @contextmanager
-    def told(self, target: Path) -> Iterator[None]:
-        """What the system refuses within becomes an `OutputError` that names the file."""
-        try:
-            yield
-        except OSError as fault:
-            raise output_fault(target, fault) from fault
 
     def drop(self, target: Path) -> None:
         """Remove what is left of an earlier run when the files come into place."""
@@ -176,11 +172,11 @@ class Outputs:
             OutputError: A file cannot be written; an earlier result stays, unless the fault came while files
                 came into place.
         """
-        with self.told(next(iter((*self._staged, *self._direct)), Path())):
+        with writing(next(iter((*self._staged, *self._direct)), Path())):
             self.close_files()
         written = {target: staged for target, staged in self._staged.items() if staged.exists()}
         for target, staged in written.items():
-            with self.told(target):
+            with writing(target):
                 # Somebody may have put a link there meanwhile.
                 _is_special(target)
                 _sync(staged)
@@ -188,16 +184,16 @@ class Outputs:
         gone = [target for target in gone if os.path.lexists(target)]
         others, seals = [*written][:-1], [*written][-1:]
         for seal in seals if others or gone else ():
-            with self.told(seal):
+            with writing(seal):
                 self._unseal(seal)
         for target in gone:
-            with self.told(target):
+            with writing(target):
                 target.unlink()
         for target in others:
-            with self.told(target):
+            with writing(target):
                 written[target].replace(target)
         for seal in seals:
-            with self.told(seal):
+            with writing(seal):
                 if others:
                     self._sync_folders()
                 written[seal].replace(seal)
@@ -275,10 +271,8 @@ def check_output(path: Path, *, regular: bool = True) -> None:
     Raises:
         OutputError: A link, a folder or a device is in its place.
     """
-    try:
+    with writing(path):
         special = _is_special(path)
-    except OSError as fault:
-        raise output_fault(path, fault) from fault
     if special and regular:
         raise OutputError(f"{path}: cannot be written: not a regular file")
 
@@ -296,15 +290,16 @@ def _sync(path: Path) -> None:
         os.close(number)
 
 
-def write_new(data: bytes, path: Path, mode: int = 0o600) -> None:
-    """Write a file that is not there yet; one that cannot be written whole does not stay.
+def write_secret(data: bytes, path: Path) -> None:
+    """Write a file that its owner alone can use; one that cannot be written whole does not stay.
 
     Raises:
-        FileExistsError: Something is there.
-        OutputError: It cannot be written.
+        OutputError: Something is there, or it cannot be written.
     """
-    try:
-        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    if os.path.lexists(path):
+        raise OutputError(f"{path}: exists; a key is not overwritten; --show prints it again")
+    with writing(path):
+        number = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
         try:
             with os.fdopen(number, "wb") as file:
                 file.write(data)
@@ -314,10 +309,6 @@ def write_new(data: bytes, path: Path, mode: int = 0o600) -> None:
         except BaseException:
             path.unlink()
             raise
-    except FileExistsError:
-        raise
-    except OSError as fault:
-        raise output_fault(path, fault) from fault
 
 
 def read_secret(path: Path, most_bytes: int) -> bytes:
@@ -326,16 +317,13 @@ def read_secret(path: Path, most_bytes: int) -> bytes:
     Raises:
         InputError: It cannot be read, or others can use it.
     """
-    try:
-        with path.open("rb") as file:
-            mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
-            if mode & _OTHERS:
-                raise InputError(
-                    f"{path}: mode {mode:04o}, expected a private key that its owner alone can use: chmod 600"
-                )
-            return file.read(most_bytes)
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    with _reading(path), path.open("rb") as file:
+        mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
+        if mode & _OTHERS:
+            raise InputError(
+                f"{path}: mode {mode:04o}, expected a private key that its owner alone can use: chmod 600"
+            )
+        return file.read(most_bytes)
 
 
 def open_log(path: Path) -> TextIO:
@@ -345,11 +333,9 @@ def open_log(path: Path) -> TextIO:
         OutputError: The file cannot be written.
     """
     flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_CLOEXEC
-    try:
+    with writing(path):
         flags |= 0 if _is_special(path) else os.O_NOFOLLOW
         return os.fdopen(os.open(path, flags, 0o666), "w", encoding="utf-8")
-    except OSError as fault:
-        raise output_fault(path, fault) from fault
 
 
 def defused(text: str) -> str:
@@ -375,11 +361,8 @@ def check_sha256(path: Path, expected: str, source: str) -> None:
     Raises:
         InputError: It cannot be read, or is another one.
     """
-    try:
-        with path.open("rb") as file:
-            found = hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+    with _reading(path), path.open("rb") as file:
+        found = hashlib.file_digest(file, "sha256").hexdigest()
     if found != expected:
         raise InputError(
             f"{path}: not the file that {source} speaks of: SHA-256 {found[:16]}, expected {expected[:16]};"
@@ -396,25 +379,21 @@ def read_csv(path: Path | str) -> tuple[tuple[str, ...], list[tuple[int, dict[st
     """
     try:
         # Spreadsheets start a file with a byte order mark.
-        with Path(path).open(newline="", encoding="utf-8-sig") as file:
+        with _reading(path), Path(path).open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             rows = [(reader.line_num, row) for row in reader]
             names = tuple(reader.fieldnames or ())
-            for name in filter(None, names):
-                if names.count(name) > 1:
-                    raise ConfigError(f"{path}: line 1: {names.count(name)} columns {name}: expected one")
-            for line, row in rows:
-                beyond = len(row.get(None, ()))
-                if beyond or None in row.values():
-                    fields = len(names) + beyond - list(row.values()).count(None)
-                    raise ConfigError(
-                        f"{path}: line {line}: {fields} fields, expected {len(names)}, as line 1 has"
-                    )
-            return names, rows
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
     except (UnicodeDecodeError, csv.Error) as fault:
         raise InputError(f"{path}: not a CSV file: {fault}") from fault
+    for name in filter(None, names):
+        if names.count(name) > 1:
+            raise ConfigError(f"{path}: line 1: {names.count(name)} columns {name}: expected one")
+    for line, row in rows:
+        beyond = len(row.get(None, ()))
+        if beyond or None in row.values():
+            fields = len(names) + beyond - list(row.values()).count(None)
+            raise ConfigError(f"{path}: line {line}: {fields} fields, expected {len(names)}, as line 1 has")
+    return names, rows
 
 
 _UNITS = frozenset(
@@ -556,13 +535,10 @@ def read_whole(path: Path | str) -> bytes:
     Raises:
         InputError: It cannot be read, or is too large to be read whole, as a device without end.
     """
-    try:
-        with Path(path).open("rb") as file:
-            data = file.read(MOST_BYTES + 1)
+    with _reading(path), Path(path).open("rb") as file:
+        data = file.read(MOST_BYTES + 1)
         if len(data) > MOST_BYTES:
             raise OSError(errno.EFBIG, f"larger than {MOST_BYTES >> 20} MiB")
-    except OSError as fault:
-        raise InputError(f"{path}: cannot be read: {fault.strerror or fault}") from fault
     return data
 
 

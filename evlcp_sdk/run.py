@@ -16,7 +16,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from evlcp_sdk.errors import ConfigError, InputError, PluginError, UnpluggedError
-from evlcp_sdk.files import Outputs
+from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
 from evlcp_sdk.io.open import STDIN, is_recording
 from evlcp_sdk.io.patience import open_until, pieces_until
@@ -611,7 +611,7 @@ def film(
     with open_source(recording, registry) as source:
         drawn = list(draw_film(plan, source.chunks(), footage, links))
     with Outputs() as outputs:
-        with outputs.told(out):
+        with writing(out):
             save_film(drawn, outputs.path(out), kind)
         outputs.commit()
     width, height = plan.size_px

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import Outputs, output_fault, read_json
+from evlcp_sdk.files import Outputs, read_json, writing
 from evlcp_sdk.link.compose import messages_of, packets_of
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.text import to_toml
@@ -162,10 +162,8 @@ def loop(
     coder = link.block_coder()
     (message,) = messages_of(link, text=text, transmitter_id=_TRANSMITTER_ID, sequence=seed & 0xFFFFFFFF)
     symbols = packets_of([message], coder)
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as fault:
-        raise output_fault(folder, fault) from fault
     yield _message_step(text, message, symbols, link, folder)
 
     # Every packet passes whole, a second time if the first has begun before the camera looks.

@@ -16,8 +16,8 @@ from typing import TYPE_CHECKING, Annotated
 from pydantic import Field
 
 from evlcp_sdk.air.blocks import Kind, Message
-from evlcp_sdk.errors import ConfigError, InputError, OutputError
-from evlcp_sdk.files import read_secret, write_new
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import read_secret, write_secret
 
 if TYPE_CHECKING:
     from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
@@ -52,10 +52,7 @@ def make_key(path: Path) -> str:
     text = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
     )
-    try:
-        write_new(text, path)
-    except FileExistsError as fault:
-        raise OutputError(f"{path}: exists; a key is not overwritten; --show prints it again") from fault
+    write_secret(text, path)
     return public_key(key)
 
 

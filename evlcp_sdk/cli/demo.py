@@ -64,7 +64,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
 
     from evlcp_sdk.cli._campaign import campaign_bar, show_faults
     from evlcp_sdk.cli._common import make_executor
-    from evlcp_sdk.files import Outputs, output_fault
+    from evlcp_sdk.files import Outputs, writing
     from evlcp_sdk.report.drawing import save_plots
     from evlcp_sdk.study.campaign.charts import charts_of
     from evlcp_sdk.study.campaign.report import page
@@ -76,10 +76,8 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     plan = plan_of(demo_campaign())
     if not as_json:
         console().print(f"simulating and receiving {len(plan.jobs)} stretches of a drive ...", style="dim")
-    try:
+    with writing(out):
         out.mkdir(parents=True, exist_ok=True)
-    except OSError as fault:
-        raise output_fault(out, fault) from fault
     results = out / f"{CAMPAIGN_NAME}.sqlite"
     for name in (results, *(results.with_name(results.name + end) for end in ("-wal", "-shm"))):
         with suppress(FileNotFoundError):

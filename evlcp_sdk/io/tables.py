@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import OutputError, StreamError
-from evlcp_sdk.files import Outputs
+from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.plugin.writer import LAST_TIME_US, EventWriter
 from evlcp_sdk.values import Events, Triggers
 
@@ -63,7 +63,7 @@ class NpzWriter(EventWriter):
         super().__init__(path, width, height, outputs)
         self._stack = ExitStack()
         try:
-            with self._outputs.told(self.path):
+            with writing(self.path):
                 self._spools: dict[str, IO[bytes]] = {
                     name: self._stack.enter_context(tempfile.TemporaryFile(dir=self.path.parent))  # noqa: SIM115
                     for name in WIRE_TYPES

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import OutputError, StreamError
-from evlcp_sdk.files import Outputs
+from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.values import Events, Triggers
 
 LAST_TIME_US = 10**18 - 1
@@ -46,7 +46,7 @@ class EventWriter(ABC):
         self._last_us: int | None = None
         self._alone = outputs is None
         self._outputs = Outputs() if outputs is None else outputs
-        with self._outputs.told(self.path):
+        with writing(self.path):
             self._file = self._outputs.open_binary(self.path)
 
     def write(self, events: Events, triggers: Triggers | None = None) -> None:
@@ -67,7 +67,7 @@ class EventWriter(ABC):
         self._check("event", "p", events.p, 2)
         self._check("trigger", "channel", triggers.channel, self.channels)
         self._check("trigger", "value", triggers.value, 2)
-        with self._outputs.told(self.path):
+        with writing(self.path):
             self._write(events, triggers)
         lasts = [int(column[-1]) for column in (events.t_us, triggers.t_us) if len(column)]
         if lasts:
@@ -90,7 +90,7 @@ class EventWriter(ABC):
         if self._file.closed:
             return
         try:
-            with self._outputs.told(self.path):
+            with writing(self.path):
                 self._finish()
                 self._file.close()
             if self._alone:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullLocator, StrMethodFormatter
 
-from evlcp_sdk.files import Outputs, output_fault
+from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.report.plots import INK, WIDTHS_PX, Plot, Shape, log_ticks
 
 INK_COLOUR = "#333333"
@@ -111,16 +111,14 @@ def save_plots(plots: Sequence[Plot], title: str, folder: Path, outputs: Outputs
     Raises:
         OutputError: A file cannot be written.
     """
-    try:
+    with writing(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    except OSError as fault:
-        raise output_fault(folder, fault) from fault
     written = []
     for plot in plots:
         figure = draw_plot(plot, title)
         for kind in ("png", "svg"):
             path = folder / f"{plot.id}.{kind}"
-            with outputs.told(path):
+            with writing(path):
                 figure.savefig(outputs.path(path), format=kind, dpi=150)
             written.append(path)
     return written

@@ -7,7 +7,7 @@ from types import TracebackType
 from typing import Any, BinaryIO, Self, TextIO
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import Outputs, check_output, check_sha256, output_fault, read_json
+from evlcp_sdk.files import Outputs, check_output, check_sha256, read_json, writing
 from evlcp_sdk.plugin.records import SUMMARY
 
 
@@ -32,10 +32,8 @@ class ResultFolder:
         self._opened: set[str] = set()
         self._outputs = Outputs()
         self._made = not folder.exists()
-        try:
+        with writing(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        except OSError as fault:
-            raise output_fault(folder, fault) from fault
         for name in self._files:
             check_output(folder / name)
 
@@ -87,7 +85,7 @@ class ResultFolder:
         Raises:
             OutputError: A file cannot be written, e.g. the disk is full.
         """
-        with self._outputs.told(self.folder):
+        with writing(self.folder):
             return self._outputs.digests()
 
     def finish(self) -> None:

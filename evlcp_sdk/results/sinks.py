@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.errors import EvlcpError, PluginError
-from evlcp_sdk.files import output_fault
+from evlcp_sdk.files import writing
 from evlcp_sdk.plugin.records import InstalledSink
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
@@ -110,11 +110,10 @@ class Sinks:
     @contextmanager
     def _blame(self, installed: InstalledSink) -> Iterator[None]:
         try:
-            yield
+            with writing(self._folder.folder):
+                yield
         except EvlcpError:
             raise
-        except OSError as fault:
-            raise output_fault(self._folder.folder, fault) from fault
         except (Exception, SystemExit) as fault:
             last = traceback.extract_tb(fault.__traceback__)[-1]
             what = f"{type(fault).__name__}: {fault}".splitlines()[0]

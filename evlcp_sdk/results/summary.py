@@ -8,7 +8,7 @@ from typing import Any, Literal
 from evlcp_sdk.diagnosis.checks import run_checks
 from evlcp_sdk.diagnosis.facts import Facts
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.files import output_fault
+from evlcp_sdk.files import writing
 from evlcp_sdk.formatting import characters
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.records import SUMMARY
@@ -120,10 +120,8 @@ def write_summary(table: Mapping[str, Any], folder: ResultFolder) -> None:
     Raises:
         OutputError: It cannot be written.
     """
-    try:
+    with writing(folder.folder):
         folder.open(SUMMARY).write(json.dumps(table, indent=2) + "\n")
-    except OSError as fault:
-        raise output_fault(folder.folder, fault) from fault
 
 
 def messages_off(link: Link) -> str | None:

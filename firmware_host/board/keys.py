@@ -3,8 +3,8 @@
 import secrets
 from pathlib import Path
 
-from evlcp_sdk.errors import InputError, OutputError
-from evlcp_sdk.files import read_secret, write_new
+from evlcp_sdk.errors import InputError
+from evlcp_sdk.files import read_secret, write_secret
 from firmware_host.protocol.generated.requests import KEY_BYTES
 from firmware_host.protocol.seal import key_name
 
@@ -18,10 +18,7 @@ def make_board_key(path: Path) -> str:
         OutputError: The file exists, or cannot be written.
     """
     key = secrets.token_bytes(KEY_BYTES)
-    try:
-        write_new(key.hex().encode() + b"\n", path)
-    except FileExistsError as fault:
-        raise OutputError(f"{path}: exists; a key is not overwritten; --show prints it again") from fault
+    write_secret(key.hex().encode() + b"\n", path)
     return key_name(key).hex()
 
 

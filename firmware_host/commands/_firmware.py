@@ -36,7 +36,7 @@ def build_images(
 
     For example: [bold]evlcp board build --target stm32f405-8mhz -o build[/]
     """
-    from evlcp_sdk.files import Outputs, output_fault
+    from evlcp_sdk.files import Outputs, writing
     from firmware_host.board.update import Package
     from firmware_host.build import TARGETS, arm_image
     from firmware_host.images import FlashImage
@@ -51,10 +51,8 @@ def build_images(
         ".update.json": package.encode(),
     }
     paths = [output / f"{target}{suffix}" for suffix in contents]
-    try:
+    with writing(output):
         output.mkdir(parents=True, exist_ok=True)
-    except OSError as fault:
-        raise output_fault(output, fault) from fault
     with Outputs() as outputs:
         for path, content in zip(paths, contents.values(), strict=True):
             outputs.open_binary(path).write(content)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import Outputs, output_fault, read_whole
+from evlcp_sdk.files import Outputs, read_whole, writing
 from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.images import check_flash_file
@@ -44,10 +44,8 @@ class NativeBoard:
                     raise InputError(f"{flash}: not a flash file of {len(self._held)} bytes")
                 self._device.set_flash(held)
             self._store(self._device.flash())  # a place that takes no SAVE is known now
-        try:
+        with writing(leds or ""):
             self._leds = None if leds is None else leds.open("wb")
-        except OSError as fault:
-            raise output_fault(leds or "", fault) from fault
         self._begun_s = time.monotonic()
 
     def exchange(self, data: bytes) -> bytes:
@@ -61,11 +59,9 @@ class NativeBoard:
             self._store(held)
         records = self._device.take_records()
         if self._leds is not None:
-            try:
+            with writing(self._leds.name):
                 self._leds.write(records.tobytes())
                 self._leds.flush()
-            except OSError as fault:
-                raise output_fault(self._leds.name, fault) from fault
         return self._device.sent()
 
     def close(self) -> None:
@@ -79,7 +75,7 @@ class NativeBoard:
         It may hold a key: it is as private as the old one was, and at first for its owner alone.
         """
         if self._flash is not None:
-            with Outputs() as outputs, outputs.told(self._flash):
+            with Outputs() as outputs, writing(self._flash):
                 mode = stat.S_IMODE(self._flash.stat().st_mode) if self._flash.exists() else 0o600
                 file = outputs.open_binary(self._flash)
                 os.fchmod(file.fileno(), mode)

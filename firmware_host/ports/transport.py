@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import open_log, output_fault
+from evlcp_sdk.files import open_log, writing
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.serial_port import SerialTransport
 from firmware_host.ports.usb import device_of
@@ -169,10 +169,8 @@ class TraceTransport:
             self._put(line)
 
     def _put(self, line: Mapping[str, Any]) -> None:
-        try:
+        with writing(self._path):
             self._file.write(json.dumps(line) + "\n")
-        except OSError as fault:
-            raise output_fault(self._path, fault) from fault
 
     def now(self) -> float:
         """The inner line's time, s."""
@@ -192,10 +190,8 @@ class TraceTransport:
     def close(self) -> None:
         """Close line and file."""
         self._inner.close()
-        try:
+        with writing(self._path):
             self._file.close()
-        except OSError as fault:
-            raise output_fault(self._path, fault) from fault
 
 
 class ReplayTransport:

@@ -21,7 +21,7 @@ from evlcp_sdk.files import (
     open_log,
     read_csv,
     read_json,
-    write_new,
+    write_secret,
 )
 from evlcp_sdk.specs import read_toml
 
@@ -122,8 +122,8 @@ def test_links_are_neither_followed_nor_replaced(tmp_path: Path, dangling: bool)
             write()
     assert link.is_symlink()
     assert victim.exists() is not dangling
-    with pytest.raises(FileExistsError):
-        write_new(b"x", link)
+    with pytest.raises(OutputError, match=r"a\.txt: exists; a key is not overwritten"):
+        write_secret(b"x", link)
     with Outputs() as outputs:
         outputs.write_text("x", tmp_path / "b.txt")
         (tmp_path / "b.txt").symlink_to(victim)
@@ -186,13 +186,13 @@ def test_a_death_between_two_renames_leaves_a_mark(
 
 
 def test_a_new_file_is_never_an_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    write_new(b"key", tmp_path / "k")
+    write_secret(b"key", tmp_path / "k")
     assert stat.S_IMODE((tmp_path / "k").stat().st_mode) == 0o600
-    with pytest.raises(FileExistsError):
-        write_new(b"other", tmp_path / "k")
+    with pytest.raises(OutputError, match="k: exists; a key is not overwritten"):
+        write_secret(b"other", tmp_path / "k")
     monkeypatch.setattr("os.fsync", full)
     with pytest.raises(OutputError, match="cannot be written: No space left"):
-        write_new(b"key", tmp_path / "half")
+        write_secret(b"key", tmp_path / "half")
     assert [p.name for p in tmp_path.iterdir()] == ["k"]
 
 
