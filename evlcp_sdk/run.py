@@ -18,9 +18,9 @@ from typing import TYPE_CHECKING, Any, Self
 from evlcp_sdk.errors import ConfigError, InputError, PluginError, UnpluggedError
 from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
+from evlcp_sdk.io.describe import check_sensor
 from evlcp_sdk.io.open import STDIN, is_recording
 from evlcp_sdk.io.patience import open_until, pieces_until
-from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.link.several import load_links, named_links, placing_links
 from evlcp_sdk.plugin.registry import Registry

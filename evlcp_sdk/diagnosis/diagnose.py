@@ -14,8 +14,8 @@ from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
 from evlcp_sdk.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
 from evlcp_sdk.diagnosis.tallies import RunTally
+from evlcp_sdk.io.describe import check_sensor
 from evlcp_sdk.io.open import open_source
-from evlcp_sdk.io.sensor import check_sensor
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource

@@ -1,11 +1,13 @@
-"""What a recording holds, without decoding its light."""
+"""What a recording holds, without decoding its light, and whether it is of the link's sensor."""
 
 from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.scene.camera import CameraModel
 
 RATE_WINDOW_US = 10_000
 """The peak rate is the most events in a window of this length on a fixed grid."""
@@ -67,3 +69,22 @@ def describe(source: EventSource, name: str) -> dict[str, Any]:
         "losses": {kind: asdict(loss) for kind, loss in source.losses.items()},
         "anomalies": [str(loss) for loss in source.losses.values()],
     }
+
+
+def check_sensor(source: EventSource, url: object, camera: CameraModel) -> None:
+    """Refuse a recording of another sensor than the camera has; one that does not say its size passes.
+
+    Args:
+        source: The recording, open.
+        url: What the message calls it.
+        camera: That of the link.
+
+    Raises:
+        ConfigError: The sizes differ.
+    """
+    size = (source.width, source.height)
+    if None not in size and size != (camera.width, camera.height):
+        raise ConfigError(
+            f"{url}: recorded with {size[0]} x {size[1]} pixels, but the link's camera has"
+            f" {camera.width} x {camera.height}; set camera.width, camera.height and camera.pitch_um"
+        )

@@ -224,13 +224,9 @@ def _as_time(name: str) -> str | None:
 
 
 def unit_named(text: str) -> str:
-    """A unit of times that somebody names: `s`, `ms`, `us` or `ns`.
-
-    Raises:
-        ValueError: It is none of them.
-    """
+    """A unit of times that somebody names, for `split_options`."""
     if text not in UNITS_US:
-        raise ValueError(f"{', '.join(UNITS_US)}")
+        raise ValueError(", ".join(UNITS_US))
     return text
 
 

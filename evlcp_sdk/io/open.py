@@ -1,6 +1,7 @@
 """Open and save recordings of any format, and whatever plugins bring."""
 
 import io
+import math
 import re
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -144,16 +145,13 @@ def _open_replay(url: str, registry: Registry) -> EventSource:
     def opened() -> EventSource:
         return open_source(inner, registry)
 
-    for_s = options.get("for_s")
-    again = (
-        LoopSource(opened, for_us=None if for_s is None else for_s * 1e6) if options.get("loop") else opened()
-    )
+    for_s = options.get("for_s", math.inf)
+    if for_s < math.inf and not options.get("loop"):
+        raise InputError(f"{url}: for_s = {for_s:g}: only with loop=1")
+    again = LoopSource(opened, for_us=for_s * 1e6) if options.get("loop") else opened()
     if again.live:
         again.close()
         raise InputError(f"{url}: {inner} has a pace of its own, expected a recording")
-    if for_s is not None and not options.get("loop"):
-        again.close()
-        raise InputError(f"{url}: for_s = {for_s:g}: only with loop=1")
     return ReplaySource(again, options.get("speed", 1.0))
 
 

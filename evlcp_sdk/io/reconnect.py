@@ -5,7 +5,8 @@ from collections.abc import Callable, Mapping
 from typing import Final
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.plugin.source import EventSource, Loss
+from evlcp_sdk.io.replay import WrappingSource
+from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.signals import Stopped
 from evlcp_sdk.values import Events, Triggers
 
@@ -13,7 +14,7 @@ _EVERY_S: Final = 0.5
 """How often it is tried."""
 
 
-class ReconnectingSource(EventSource):
+class ReconnectingSource(WrappingSource):
     """A live source, opened again and again when it ends or fails, until stopped.
 
     Its clock may begin anew with each opening; a receiver takes that for a restart of the camera's clock.
@@ -23,9 +24,6 @@ class ReconnectingSource(EventSource):
         stopped: Whether to give up.
         sleep: Waits, s.
 
-    Attributes:
-        reconnects: How often it was opened again.
-
     Raises:
         InputError: It cannot be opened the first time.
     """
@@ -33,20 +31,12 @@ class ReconnectingSource(EventSource):
     live = True
 
     def __init__(
-        self,
-        opened: Callable[[], EventSource],
-        stopped: Stopped = lambda: False,
-        sleep: Callable[[float], None] = time.sleep,
+        self, opened: Callable[[], EventSource], stopped: Stopped, sleep: Callable[[float], None] = time.sleep
     ) -> None:
-        self._opened = opened
-        self._stopped = stopped
-        self._sleep = sleep
-        self._source = source = opened()
-        super().__init__(source.path, source.format, source.width, source.height, source.header)
-        self.guessed = source.guessed
-        self.reconnects = 0
+        super().__init__(opened())
+        self._opened, self._stopped, self._sleep = opened, stopped, sleep
+        self._reconnects = 0
         self._closed = False
-        self._lost: dict[str, Loss] = {}
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """As of the source; waits while it is gone."""
@@ -55,45 +45,31 @@ class ReconnectingSource(EventSource):
                 piece = next(self._source.stream(max_events), None)
             except InputError:
                 piece = None
-            if piece is not None:
+            if piece is not None or not self._is_back():
                 return piece
-            if not self._again():
-                return None
 
-    def _again(self) -> bool:
-        self._lost = self.losses
-        self._source.close()
+    def _is_back(self) -> bool:
         while not self._stopped() and not self._closed:
             try:
-                source = self._opened()
+                self._replace(self._opened)
             except InputError:
                 self._sleep(_EVERY_S)
                 continue
-            self._source = source
-            self.reconnects += 1
+            self._reconnects += 1
             return True
         return False
-
-    def clock_s(self, t_us: float) -> float | None:
-        """As of the source."""
-        return self._source.clock_s(t_us)
 
     @property
     def health(self) -> Mapping[str, float | int | str]:
         """As of the source, with `reconnects`."""
-        return {**self._source.health, "reconnects": self.reconnects}
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As of the source, those of earlier openings too."""
-        return Loss.added(self._lost, self._source.losses)
+        return {**self._source.health, "reconnects": self._reconnects}
 
     @property
     def counts(self) -> dict[str, int]:
         """As `EventSource.counts`, with `reconnects`."""
-        return super().counts | {"reconnects": self.reconnects}
+        return super().counts | {"reconnects": self._reconnects}
 
     def close(self) -> None:
         """Open it no more, and let it go."""
         self._closed = True
-        self._source.close()
+        super().close()

@@ -1,5 +1,6 @@
 """A recording given out at the pace of its own clock."""
 
+import math
 import time
 from bisect import bisect_right
 from collections.abc import Callable
@@ -18,57 +19,76 @@ DAMAGE_US = 100_000
 the clock behind it, while the noise of its pixels alone keeps a sensor from being silent for so long."""
 
 
-class LoopSource(EventSource):
+class WrappingSource(EventSource):
+    """A source that gives out what another gives, which it closes.
+
+    Args:
+        source: The other, as it is at first.
+        size_bytes: Size of its file; None where it is opened again.
+    """
+
+    def __init__(self, source: EventSource, size_bytes: int | None = None) -> None:
+        super().__init__(source.path, source.format, source.width, source.height, source.header, size_bytes)
+        self.guessed, self.step_us = source.guessed, source.step_us
+        self._source = source
+        self._lost: dict[str, Loss] = {}
+
+    def _replace(self, opened: Callable[[], EventSource]) -> None:
+        """Open another one instead; what was lost stays counted."""
+        self._source.close()
+        source = opened()
+        self._lost, self._source = self.losses, source
+
+    def clock_s(self, t_us: float) -> float | None:
+        """As of the other."""
+        return self._source.clock_s(t_us)
+
+    @property
+    def losses(self) -> dict[str, Loss]:
+        """As of the other, those before it was opened again too."""
+        return Loss.added(self._lost, self._source.losses)
+
+    def close(self) -> None:
+        """Close the other."""
+        self._source.close()
+
+
+class LoopSource(WrappingSource):
     """A recording again and again, its clock going on.
 
     Args:
         opened: Opens the recording.
         seam_us: Time between the last event of a pass and the first of the next one, us.
         for_us: Ends with the pass in which so much time is over, us; None: never.
-
-    Attributes:
-        passes: How many have begun.
     """
 
     def __init__(
-        self, opened: Callable[[], EventSource], seam_us: int = SEAM_US, for_us: float | None = None
+        self, opened: Callable[[], EventSource], seam_us: int = SEAM_US, for_us: float = math.inf
     ) -> None:
-        self._opened = opened
-        self._source = source = opened()
-        super().__init__(source.path, source.format, source.width, source.height, source.header)
-        self.live, self.guessed, self.step_us = source.live, source.guessed, source.step_us
-        self.passes = 1
-        self._seam_us = seam_us
-        self._for_us = for_us
+        super().__init__(opened())
+        self.live = self._source.live
+        self._opened, self._seam_us, self._for_us = opened, seam_us, for_us
         self._shift_us = 0
         self._start_us: int | None = None
-        self._last_us: int | None = None
-        self._begins = True
-        self._lost: dict[str, Loss] = {}
+        self._last_us = 0
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         """As of the recording, with the times of this pass."""
         piece = next(self._source.stream(max_events), None)
+        begins = self._start_us is None
         while piece is None:
-            if self._last_us is None or self._start_us is None:
-                return None  # It is empty.
-            if self._for_us is not None and self._last_us - self._start_us >= self._for_us:
-                return None
-            self._lost = self.losses
-            self._source.close()
-            self._source = self._opened()
-            self.passes += 1
-            self._begins = True
+            if self._start_us is None or self._last_us - self._start_us >= self._for_us:
+                return None  # It is empty, or over.
+            self._replace(self._opened)
+            begins = True
             piece = next(self._source.stream(max_events), None)
         events, triggers = piece
         columns = [column for column in (events.t_us, triggers.t_us) if len(column)]
         first_us = min(int(column[0]) for column in columns)
-        if self._begins:
-            self._begins = False
-            if self._last_us is None:
-                self._start_us = first_us
-            else:
-                self._shift_us = self._last_us + self._seam_us - first_us
+        if self._start_us is None:
+            self._start_us = first_us
+        elif begins:
+            self._shift_us = self._last_us + self._seam_us - first_us
         self._last_us = max(int(column[-1]) for column in columns) + self._shift_us
         if not self._shift_us:
             return piece
@@ -77,17 +97,8 @@ class LoopSource(EventSource):
             Triggers(triggers.t_us + self._shift_us, triggers.channel, triggers.value),
         )
 
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As the recording's, of all passes."""
-        return Loss.added(self._lost, self._source.losses)
 
-    def close(self) -> None:
-        """Close the recording."""
-        self._source.close()
-
-
-class ReplaySource(EventSource):
+class ReplaySource(WrappingSource):
     """A recording given out at the pace of its own clock, as a camera would.
 
     A silence is waited for, but not one of over `DAMAGE_US` in a piece of the recording with losses, or next
@@ -100,9 +111,6 @@ class ReplaySource(EventSource):
         slice_us: Camera time between two pieces, us; each comes when its time is over.
         clock: Gives the time, s.
         sleep: Waits, s.
-
-    Attributes:
-        lag_s: How much later than due the last piece was asked for, s; it grows if the receiver is too slow.
 
     Raises:
         StreamError: `speed` or `slice_us` is not positive.
@@ -120,19 +128,14 @@ class ReplaySource(EventSource):
     ) -> None:
         if not speed > 0 or slice_us < 1:
             raise StreamError(f"replay at speed {speed} in slices of {slice_us} us, expected both positive")
-        super().__init__(
-            source.path, source.format, source.width, source.height, source.header, source.size_bytes
-        )
-        self.guessed, self.step_us = source.guessed, source.step_us
-        self.lag_s = 0.0
-        self._source = source
+        super().__init__(source, source.size_bytes)
         self._s_per_us = 1e-6 / speed
         self._slice_us = slice_us
         self._clock = clock
         self._sleep = sleep
         self._piece = (Events.empty(), Triggers.empty())
         self._last_us: int | None = None  # of what was given out
-        self._lost = 0
+        self._damages = 0
         self._damaged = False  # this piece of the recording
         # Camera clock, us, and own clock, s: of the first piece and of each after a silence that was skipped.
         self._origins: list[tuple[int, float]] = []
@@ -147,7 +150,7 @@ class ReplaySource(EventSource):
                 return None
             self._piece = piece
             lost = sum(loss.count for loss in self._source.losses.values())
-            self._damaged, self._lost = lost > self._lost, lost
+            self._damaged, self._damages = lost > self._damages, lost
             damaged |= self._damaged
         events, triggers = self._piece
         first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
@@ -165,14 +168,9 @@ class ReplaySource(EventSource):
         self._last_us = max(int(column[k - 1]) for column, k in ((events.t_us, n), (triggers.t_us, m)) if k)
 
         early_s = start_s + (end_us - start_us) * self._s_per_us - self._clock()
-        self.lag_s = max(-early_s, 0.0)
         if early_s > 0:
             self._sleep(early_s)
         return events[:n], triggers[:m]
-
-    def close(self) -> None:
-        """Close the recording."""
-        self._source.close()
 
     def clock_s(self, t_us: float) -> float | None:
         """When a time of the recording is due, by the clock given; None before the first piece."""
@@ -186,11 +184,6 @@ class ReplaySource(EventSource):
     def position_bytes(self) -> int:
         """As the recording's."""
         return self._source.position_bytes
-
-    @property
-    def losses(self) -> dict[str, Loss]:
-        """As the recording's."""
-        return self._source.losses
 
     @property
     def counts(self) -> dict[str, int]:

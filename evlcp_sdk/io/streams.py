@@ -1,9 +1,6 @@
 """RAW words from the network and from other programs: TCP, UDP, Unix sockets."""
 
-import os
 import socket
-import threading
-from pathlib import Path
 from typing import Any, Final
 from urllib.parse import urlsplit
 
@@ -36,19 +33,16 @@ class SocketBytes:
 
     Args:
         sock: The socket, connected, or bound where it is of datagrams.
-        name: What faults call it.
-        header: Put before what comes, where that has none; None where it must have one.
+        header: Put before what comes, where that has none.
     """
 
-    def __init__(self, sock: socket.socket, name: str, header: bytes | None) -> None:
+    def __init__(self, sock: socket.socket, header: bytes = b"") -> None:
         self._socket = sock
-        self._name = name
         self._header = header
         self._datagrams = sock.type == socket.SOCK_DGRAM
         self._ready = b""
-        self._buffer = bytearray(_DATAGRAM_BYTES)
         self._first = True
-        self._closed = threading.Event()
+        self._closed = False
         sock.settimeout(_LOOK_S)
 
     def fileno(self) -> int:
@@ -61,37 +55,32 @@ class SocketBytes:
         Raises:
             OSError: The connection has failed.
         """
-        if not self._ready:
-            self._ready = self._received(len(room))
-            if self._first and self._ready:
-                self._first = False
-                if self._header is not None and not self._ready.startswith(b"% "):
-                    self._ready = self._header + self._ready
+        while not self._ready:
+            try:
+                data = self._socket.recv(
+                    _DATAGRAM_BYTES if self._datagrams else min(len(room), _DATAGRAM_BYTES)
+                )
+            except TimeoutError:
+                continue
+            except OSError:
+                if self._closed:
+                    return 0
+                raise
+            # Of datagrams one is empty now and then, and a header comes again and again.
+            if self._datagrams and (not data or (not self._first and data.startswith(b"% evt "))):
+                continue
+            if not data:
+                return 0
+            self._ready = self._header + data if self._first and not data.startswith(b"% ") else data
+            self._first = False
         size = min(len(room), len(self._ready))
         room[:size] = self._ready[:size]
         self._ready = self._ready[size:]
         return size
 
-    def _received(self, most: int) -> bytes:
-        while not self._closed.is_set():
-            try:
-                size = self._socket.recv_into(
-                    self._buffer, 0 if self._datagrams else min(most, _DATAGRAM_BYTES)
-                )
-            except TimeoutError:
-                continue
-            except OSError:
-                if self._closed.is_set():
-                    break
-                raise
-            data = bytes(memoryview(self._buffer)[:size])
-            if not self._datagrams or (data and (self._first or not data.startswith(b"% evt "))):
-                return data
-        return b""
-
     def close(self) -> None:
         """Let the connection go; a read in another thread ends soon."""
-        self._closed.set()
+        self._closed = True
         self._socket.close()
 
 
@@ -112,15 +101,16 @@ def open_stream(url: str) -> EventSource:
     """
     named, options = split_options(url, {"evt": _encoding, "size": sides})
     scheme = named.partition(":")[0].lower()
-    header = None
+    header = b""
     if options or scheme == "udp":
         width, height = options.get("size", (1280, 720))
         header = format_header(CODECS[options.get("evt", "EVT3")], width, height)
     try:
         sock = _connected(scheme, named)
     except OSError as fault:
-        raise InputError(f"{url}: {_what(fault)}; {_NEXT[scheme]}") from fault
-    return StreamSource(url, file=SocketBytes(sock, url, header))
+        what = fault.strerror or str(fault) or type(fault).__name__
+        raise InputError(f"{url}: {what}; {_NEXT[scheme]}") from fault
+    return StreamSource(url, file=SocketBytes(sock, header))
 
 
 _NEXT: Final = {
@@ -130,31 +120,23 @@ _NEXT: Final = {
 }
 
 
-def _what(fault: OSError) -> str:
-    return fault.strerror or str(fault) or type(fault).__name__
-
-
 def _connected(scheme: str, url: str) -> socket.socket:
-    if scheme == "unix":
-        path = url.partition(":")[2].removeprefix("//")
-        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        try:
-            sock.settimeout(_CONNECT_S)
-            sock.connect(os.fspath(Path(path)))
-        except BaseException:
-            sock.close()
-            raise
-        return sock
-    host, port = _address(url)
     if scheme == "tcp":
-        sock = socket.create_connection((host or "localhost", port), _CONNECT_S)
+        sock = socket.create_connection(_address(url), _CONNECT_S)
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
         return sock
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    sock = socket.socket(family, socket.SOCK_DGRAM)
+    if scheme == "unix":
+        sock = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    else:
+        address = _address(url)
+        sock = socket.socket(socket.AF_INET6 if ":" in address[0] else socket.AF_INET, socket.SOCK_DGRAM)
     try:
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
-        sock.bind((host or "localhost", port))
+        if scheme == "unix":
+            sock.settimeout(_CONNECT_S)
+            sock.connect(url.partition(":")[2].removeprefix("//"))
+        else:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _KERNEL_BYTES)
+            sock.bind(address)
     except BaseException:
         sock.close()
         raise
@@ -174,4 +156,4 @@ def _address(url: str) -> tuple[str, int]:
         port = None
     if not port or not url.partition(":")[2].startswith("//") or parts.path not in ("", "/"):
         raise InputError(f"{url}: expected {parts.scheme}://HOST:PORT")
-    return parts.hostname or "", port
+    return parts.hostname or "localhost", port

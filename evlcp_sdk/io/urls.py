@@ -1,4 +1,7 @@
-"""What stands behind the `?` of a source's name, checked."""
+"""What stands behind the `?` of a source's name, checked.
+
+What makes a value of a text raises ValueError with what it expects.
+"""
 
 from collections.abc import Callable, Mapping
 from contextlib import suppress
@@ -15,7 +18,7 @@ def split_options(url: str, kinds: Mapping[str, Callable[[str], Any]]) -> tuple[
 
     Args:
         url: The name.
-        kinds: What makes the value of each option; raises ValueError with what it expects.
+        kinds: What makes the value of each option.
 
     Raises:
         InputError: An option is not known, given twice, or its value is not as expected.
@@ -40,11 +43,7 @@ def split_options(url: str, kinds: Mapping[str, Callable[[str], Any]]) -> tuple[
 
 
 def positive(text: str) -> float:
-    """A number above 0.
-
-    Raises:
-        ValueError: It is none; says what is expected.
-    """
+    """A number above 0."""
     with suppress(ValueError):
         if 0 < float(text) < 1e9:
             return float(text)
@@ -52,11 +51,7 @@ def positive(text: str) -> float:
 
 
 def flag(text: str) -> bool:
-    """0 or 1.
-
-    Raises:
-        ValueError: It is neither; says what is expected.
-    """
+    """0 or 1."""
     if text not in ("0", "1"):
         raise ValueError("0 or 1")
     return text == "1"
@@ -64,9 +59,6 @@ def flag(text: str) -> bool:
 
 def sides(text: str) -> tuple[int, int]:
     """Columns and rows of a sensor.
-
-    Raises:
-        ValueError: It is none; says what is expected.
 
     >>> sides("1280x720")
     (1280, 720)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import EventSource, open_source
-from evlcp_sdk.io.sensor import check_sensor
+from evlcp_sdk.io.describe import check_sensor
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry

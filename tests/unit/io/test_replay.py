@@ -37,7 +37,6 @@ def test_each_slice_comes_when_its_time_is_over(recording):
         assert source.counts == {"events": 6, "triggers": 3}
         assert source.position_bytes == source.size_bytes
         assert source.losses == {}
-        assert source.lag_s == 0
     assert got == [
         (1000, [500, 700], [400]),
         (2000, [1499, 1500], []),
@@ -58,13 +57,3 @@ def test_any_slices_give_the_same_events(recording):
             events = Events.concat(e for e, _ in pieces)
             assert events.x.tolist() == list(range(6))
             assert np.concatenate([g.channel for _, g in pieces]).tolist() == [1, 2, 3]
-
-
-def test_lag_tells_that_the_receiver_is_too_slow(recording):
-    clock = Clock()
-    with ReplaySource(open_source(recording), clock=clock, sleep=clock.sleep) as source:
-        stream = source.stream()
-        next(stream)
-        clock.now += 0.5
-        next(stream)
-        assert source.lag_s == pytest.approx(0.499)
