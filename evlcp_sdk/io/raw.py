@@ -23,7 +23,6 @@ CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 """The encodings that can be read and written, by name."""
 
 MAX_HEADER_BYTES = 1 << 16
-BUFFER_BYTES = 1 << 19
 PIPE_BYTES, PIPE_WAIT_S = 1 << 17, 0.1
 """Bytes of a pipe that are waited for first, and for how long: words enough to tell their encoding."""
 WRITE_WORDS = 1 << 15
@@ -151,27 +150,21 @@ def _interpret(
         found = f"'% evt {version}' beside '% format {fields['format']}'"
         raise RawFormatError(path, offsets["evt"], found, "one encoding")
 
-    sizes: dict[str, set[int]] = {"width": set(), "height": set()}
-    for option in options:
-        key, _, value = option.partition("=")
-        if key in sizes:
-            sizes[key].add(_side(value, offsets["format"], fields["format"], path))
+    sides = [("format", side, text) for side, _, text in (option.partition("=") for option in options)]
     if "geometry" in fields:
         width, _, height = fields["geometry"].partition("x")
-        sizes["width"].add(_side(width, offsets["geometry"], fields["geometry"], path))
-        sizes["height"].add(_side(height, offsets["geometry"], fields["geometry"], path))
-    for key, values in sizes.items():
-        if len(values) > 1:
-            found = f"'% geometry {fields['geometry']}' beside '% format {fields['format']}'"
-            raise RawFormatError(path, offsets["geometry"], found, f"one {key}")
-    return codecs[0], next(iter(sizes["width"]), None), next(iter(sizes["height"]), None)
-
-
-def _side(text: str, at: int, line: str, path: Path | str) -> int:
-    """Return a width or height of the sensor."""
-    if text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_SIDE:
-        return int(text)
-    raise RawFormatError(path, at, repr(line), f"a width and a height from 1 to {MAX_SIDE}")
+        sides += [("geometry", "width", width), ("geometry", "height", height)]
+    sizes: dict[str, int] = {}
+    for key, side, text in sides:
+        if side not in ("width", "height"):
+            continue
+        if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_SIDE):
+            expected = f"a width and a height from 1 to {MAX_SIDE}"
+            raise RawFormatError(path, offsets[key], repr(fields[key]), expected)
+        if sizes.setdefault(side, int(text)) != int(text):
+            found = f"'% {key} {fields[key]}' beside '% format {fields['format']}'"
+            raise RawFormatError(path, offsets[key], found, f"one {side}")
+    return codecs[0], sizes.get("width"), sizes.get("height")
 
 
 def _describe(data: bytes) -> str:
@@ -183,9 +176,8 @@ def _describe(data: bytes) -> str:
         b"\x1f\x8b": "a gzip file",
         b"%PDF": "a PDF document",
     }
-    name = next((name for magic, name in magics.items() if data.startswith(magic)), None)
-    start = data[:8].hex(" ")
-    return f"{start} ({name})" if name else start
+    name = next((f" ({name})" for magic, name in magics.items() if data.startswith(magic)), "")
+    return data[:8].hex(" ") + name
 
 
 class RawSource(EventSource):
@@ -193,7 +185,6 @@ class RawSource(EventSource):
 
     Args:
         path: The file.
-        buffer_bytes: Size of the buffer; half a megabyte at the least.
         file: What is read if it is open already, without a buffer of its own; `path` is then what faults
             call it.
 
@@ -204,11 +195,9 @@ class RawSource(EventSource):
 
     _gives_bits = True
 
-    def __init__(
-        self, path: Path | str, buffer_bytes: int = BUFFER_BYTES, file: RawBytes | None = None
-    ) -> None:
+    def __init__(self, path: Path | str, file: RawBytes | None = None) -> None:
         self._path = Path(path)
-        self._buffer = np.empty(max(buffer_bytes, 2 * _kernels.LOOK_BYTES), np.uint8)
+        self._buffer = np.empty(2 * _kernels.LOOK_BYTES, np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False

@@ -250,7 +250,7 @@ def test_writer_leaves_what_was_there_when_it_fails(tmp_path):
 def test_a_file_larger_than_the_buffer(tmp_path):
     events = crowd(200_000, 9_000_000)
     write_events(tmp_path / "a.raw", events, WIDTH, HEIGHT)
-    with RawSource(tmp_path / "a.raw", 1) as source:
+    with RawSource(tmp_path / "a.raw") as source:
         assert source.size_bytes > 1 << 20
         got = Events.concat(source.chunks(1000))
     assert np.array_equal(key(got), key(events))
