@@ -40,9 +40,7 @@ _COUNTERS: Final = ((0, 1 << 32, 1 << 26), (-(1 << 31), 1 << 31, 1 << 26), (0, 1
 For 32 bits of microseconds that is 67 s; for 24, which are full after 17 s, 131 ms.
 """
 
-DAMAGE: Final = (
-    *(OSError, EOFError, ValueError, RuntimeError, zlib.error, lzma.LZMAError, zipfile.BadZipFile),
-)
+DAMAGE: Final = (OSError, EOFError, ValueError, RuntimeError, zlib.error, lzma.LZMAError, zipfile.BadZipFile)
 """What reading a damaged file raises; RuntimeError: a ZIP file's member is encrypted."""
 
 
@@ -122,7 +120,8 @@ class ColumnSource(EventSource):
                 table = read(self.path, stack)
                 size_bytes = self.path.stat().st_size
             except DAMAGE as error:
-                raise self._damaged(error) from error
+                what = error.strerror if isinstance(error, OSError) else None
+                raise InputError(f"{path}: {what or f'damaged or closed file: {one_line(error)}'}") from error
             self._begin(table, size_bytes, unit, inverted)
             self._stack = stack.pop_all()
 
@@ -189,10 +188,6 @@ class ColumnSource(EventSource):
         if fault is not None:
             raise fault
 
-    def _damaged(self, error: Exception) -> InputError:
-        what = error.strerror if isinstance(error, OSError) else None
-        return InputError(f"{self.path}: {what or f'damaged or closed file: {one_line(error)}'}")
-
     def _next_piece(self) -> Piece | None:
         try:
             piece = next(self._pieces, None)
@@ -237,10 +232,10 @@ class ColumnSource(EventSource):
         """A piece without the rows in which something is no number; they are counted."""
         good = np.ones(len(piece.times), bool)
         for column in (piece.times, piece.polarities, *(() if piece.places is None else piece.places.T)):
-            if column.dtype.kind == "f":
-                good &= np.isfinite(column)
-            elif column.dtype.kind in "US":
+            if column.dtype.kind in "US":
                 good &= ~np.isin(np.char.lower(column), np.array(["nan", ""]).astype(column.dtype.kind))
+            else:
+                good &= np.isfinite(column)
         if good.all():
             return piece
         kept = np.flatnonzero(good)
@@ -256,8 +251,7 @@ class ColumnSource(EventSource):
     @property
     def counts(self) -> dict[str, int]:
         """As `EventSource.counts`, with rows out of order or cut, and times gone round, if there were any."""
-        counted = {name: count for name, count in self._counts.items() if count}
-        return self._given | self._sieve.counts | counted
+        return self._given | self._sieve.counts | {name: n for name, n in self._counts.items() if n}
 
     @property
     def losses(self) -> dict[str, Loss]:
@@ -309,7 +303,7 @@ def _unwrap(times: NDArray[Any], before: int | None, gone_round: int) -> tuple[N
     follow = np.concatenate([times[:1] if before is None else [before], times])
     if not gone_round and not (follow[1:] < follow[:-1]).any():
         return times, 0, 0
-    finite = follow[np.isfinite(follow)] if follow.dtype.kind == "f" else follow
+    finite = follow[np.isfinite(follow)]
     turns = np.zeros(len(times), np.int64)
     size = 0
     for first, end, near in _COUNTERS:
@@ -347,7 +341,7 @@ def _in_order(events: Events, window_us: float) -> Events:
 
 def _step_us(unit: TimeUnit, times: NDArray[Any]) -> int:
     """What all times are multiples of, us, but for the first; 0 where there are too few to tell."""
-    finite = times[np.isfinite(times)] if times.dtype.kind == "f" else times
+    finite = times[np.isfinite(times)]
     with np.errstate(over="ignore"):
         steps = np.diff(np.unique(finite)) * unit.factor
     if len(finite) < 1000:

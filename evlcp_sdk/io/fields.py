@@ -257,7 +257,8 @@ def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
 
 def _fields_without_one(columns: Sequence[NDArray[Any]]) -> Fields | None:
     """The same where one column counts the rows, or is the same in all, and so says nothing."""
-    kept = [k for k, column in enumerate(columns) if not _counts_rows(column)]
+    numbers = [column.astype(float) if column.dtype.kind in "iuf" else np.zeros(0) for column in columns]
+    kept = [k for k, steps in enumerate(map(np.diff, numbers)) if len(steps) < 2 or (steps != 1).any()]
     if len(kept) == len(columns):
         kept = [k for k, column in enumerate(columns) if (column != column[0]).any()]
     found = fields_of_values([columns[k] for k in kept]) if len(kept) == len(columns) - 1 else None
@@ -270,12 +271,9 @@ def _fields_without_one(columns: Sequence[NDArray[Any]]) -> Fields | None:
 def _fields_of_four(columns: Sequence[NDArray[Any]], signs: list[int]) -> Fields | None:
     """The same of four columns, of which `signs` may be polarities."""
     # The last one, or the last but one, where places are 0 and 1, too.
-    rest = [k for k in range(4) if k not in signs] if len(signs) == 1 else list(range(4))
-    if len(signs) > 1:
-        signs = [k for k in signs if k >= 2][-1:] or signs[-1:]
-        rest = [k for k in range(4) if k != signs[0]]
-    numbers = [k for k in rest if columns[k].dtype.kind in "iuf"]
-    if len(numbers) < 3:
+    sign = ([k for k in signs if k >= 2] or signs)[-1]
+    rest = [k for k in range(4) if k != sign]
+    if any(columns[k].dtype.kind not in "iuf" for k in rest):
         return None
 
     def is_place(column: NDArray[Any]) -> bool:
@@ -288,11 +286,7 @@ def _fields_of_four(columns: Sequence[NDArray[Any]], signs: list[int]) -> Fields
     if len(times) != 1:
         return None
     x, y = (k for k in rest if k != times[0])
-    return Fields(times[0], signs[0], (x, y))
-
-
-def _counts_rows(values: NDArray[Any]) -> bool:
-    return values.dtype.kind in "iuf" and len(values) > 2 and bool((np.diff(values.astype(float)) == 1).all())
+    return Fields(times[0], sign, (x, y))
 
 
 def _are_signs(values: NDArray[Any]) -> bool:
@@ -332,7 +326,7 @@ def time_unit(
     """
     if named is not None:
         return TimeUnit(named, "as its column says")
-    inside = np.sort(times[np.isfinite(times)] if times.dtype.kind == "f" else times)
+    inside = np.sort(times[np.isfinite(times)])
     rates = _Rates(inside, MOST_PLACED_HZ if placed else MOST_RATE_HZ)
     if (blinks := _blinking_unit(inside)) is not None:
         unit, rate_hz = blinks
