@@ -311,24 +311,9 @@ def live(
     """Receive in real time: results to listeners as they come, delays measured, what is too much left out.
 
     See `evlcp_sdk.live` for how to listen. A recording that has no pace of its own is replayed at that of its
-    clock.
-
-    Args:
-        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
-        folder: Where a result goes as `receive_to_folder` writes it; None: nothing is written.
-        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
-        registry: The plugins; None for all that are installed.
-        plan: What positions are computed from; None for none.
-        attitude: What is known of the camera's attitude; None for nothing.
-        clock_zero: UTC of the camera clock's 0, or pulses on its trigger input that say it; None if it is not
-            known.
-        sinks: Output formats beside the default ones, by name.
-        lines: Takes a line of JSON for each frame, message and fix as it comes; None for nobody.
-        publisher: Where listeners subscribe, and pictures are drawn; None for nobody. Closed at the end.
-        budget: When what is left out.
-        warm: Load all kernels before the first event, and before a source that does not wait is opened:
-            nothing waits for one later.
-        stopped: Ends the run.
+    clock. Arguments are as of `receive_to_folder`, and three more: `publisher` is where listeners subscribe
+    and pictures are drawn, and is closed at the end; `budget` says when what is left out; `warm` is to load
+    all kernels before the first event, and before a source that does not wait is opened.
 
     Returns:
         The summary, as of `receive_to_folder`, with `live`: delays by stage, and what was shed.

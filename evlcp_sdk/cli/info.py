@@ -6,7 +6,7 @@ from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import Json, print_json
+from evlcp_sdk.cli._common import Json, echo, print_json
 
 
 def info(
@@ -22,7 +22,10 @@ def info(
 
     with open_source(recording) as source:
         table = describe(source, str(source.path) if recording == STDIN else recording)
-    print_json(table, indent=2) if as_json else _text(table)
+    if as_json:
+        print_json(table, 2)
+    else:
+        echo(_text(table))
 
 
 def _text(table: dict[str, Any]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from evlcp_sdk.cli._common import Json, print_json
+from evlcp_sdk.cli._common import Json, echo, print_json
 
 if TYPE_CHECKING:
     from evlcp_sdk.plugin.registry import Registry
@@ -21,7 +21,10 @@ def plugins(as_json: Json = False) -> None:
     from evlcp_sdk.plugin.registry import Registry
 
     table = table_of(Registry.load())
-    print_json(table, indent=2) if as_json else _text(table)
+    if as_json:
+        print_json(table, 2)
+    else:
+        echo(_text(table))
 
 
 def table_of(registry: Registry) -> dict[str, list[dict[str, Any]]]:

@@ -442,6 +442,8 @@ def _assembled(
             _check_alphabet(codebook)
     if codebook is None:
         codebook = _codes_of_roles(parts, table)
+    content = {"table": table, "codebook": codebook.digest, "revisions": dict(revisions)}
+    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
     return Link(
         **{section: parts[section] for section in _SPECS},
         algorithms={role: parts[role] for role in ROLES if role in parts},
@@ -449,7 +451,7 @@ def _assembled(
         codebook=codebook,
         packet=PacketFormat.of(codebook, air.frames_per_packet, air.chip_rate_hz, air.pilot_every),
         table=table,
-        digest=_digest(table, codebook, revisions),
+        digest=hashlib.sha256(text.encode()).hexdigest(),
         kinds=kinds,
         name=name,
         built_in=built_in,
@@ -515,9 +517,3 @@ def _parse_override(text: str) -> tuple[str, str, Any]:
     if not (equals and dot and section and key):
         raise ConfigError(f"--set {text}: expected table.key=value, e.g. modulation.id=wh8")
     return section, key, parse_value(value)
-
-
-def _digest(table: Mapping[str, Any], codebook: Codebook, revisions: Mapping[str, int]) -> str:
-    content = {"table": table, "codebook": codebook.digest, "revisions": dict(revisions)}
-    text = json.dumps(content, sort_keys=True, separators=(",", ":"))
-    return hashlib.sha256(text.encode()).hexdigest()

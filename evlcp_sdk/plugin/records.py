@@ -134,10 +134,12 @@ def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, str]]) ->
         value = getattr(record, key)
         if not (isinstance(value, str) and value):
             return f"sink {record.name!r}: {key} = {value!r}, expected text"
-    if not (isinstance(record.files, tuple | list) and all(_is_file_name(name) for name in record.files)):
-        return (
-            f"sink '{record.name}': files = {record.files!r}, expected names of files in the result's folder"
-        )
+    files: Any = record.files
+    if not isinstance(files, tuple | list) or not all(
+        isinstance(name, str) and name not in ("", ".", "..") and not set(name) & {"/", "\\", "\0"}
+        for name in files
+    ):
+        return f"sink '{record.name}': files = {files!r}, expected names of files in the result's folder"
     if SUMMARY in record.files:
         return f"sink '{record.name}': {SUMMARY} is the summary's file"
     for other, owner in others:
@@ -146,10 +148,6 @@ def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, str]]) ->
         if shared := [name for name in record.files if name in other.files]:
             return f"sink '{record.name}': {shared[0]} is a file of the {InstalledSink(other, owner)}, too"
     return None
-
-
-def _is_file_name(name: Any) -> bool:
-    return isinstance(name, str) and name not in ("", ".", "..") and not set(name) & {"/", "\\", "\0"}
 
 
 def _kind_fault(kind: MessageKind, others: Sequence[tuple[MessageKind, str]]) -> str | None:
