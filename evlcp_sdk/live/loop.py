@@ -280,16 +280,10 @@ class LiveLoop:
         """Say how it goes, where it is time for that."""
         at_s = time.monotonic()
         since_s = at_s - self._status_s
-        if since_s < _STATUS_EVERY_S and not now:
+        if (since_s < _STATUS_EVERY_S and not now) or not self._publisher.wanted("status"):
             return
-        if self._publisher.wanted("status"):
-            self._publisher.publish("status", self._last_us, self._status(at_s, since_s))
-        self._status_s, self._status_events = at_s, self._events
-        self._recent = {stage: DelayTally() for stage in self.delays}
-
-    def _status(self, at_s: float, since_s: float) -> LiveStatus:
         waiting, oldest_s = self._reader.waiting
-        return LiveStatus(
+        status = LiveStatus(
             t_us=self._last_us,
             elapsed_s=at_s - self._start_s,
             events=self._events,
@@ -306,6 +300,9 @@ class LiveLoop:
             regions=self._receiver.regions,
             health=self._source.health,
         )
+        self._publisher.publish("status", self._last_us, status)
+        self._status_s, self._status_events = at_s, self._events
+        self._recent = {stage: DelayTally() for stage in self.delays}
 
 
 def _span_us(pieces: list[Slice]) -> int:

@@ -7,7 +7,6 @@ from typing import Any, Final
 
 from evlcp_sdk.errors import PluginError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.live.loop import LiveStatus
 from evlcp_sdk.live.pictures import Picture
 from evlcp_sdk.live.publisher import News
 from evlcp_sdk.results.columns import frame_columns
@@ -86,7 +85,8 @@ class Serializer:
         if kind == "message":
             return [self._message(value)]
         if kind == "status":
-            return [(kind, _status(value))]
+            shown = asdict(value)
+            return [(kind, {name: shown[name] for name in shown.keys() - {"regions", "health"}})]
         if kind == "end":
             return [(kind, {key: value.get(key) for key in ("status", "error", "result")})]
         fix, place = value.fix, value.filtered
@@ -157,20 +157,3 @@ def _bar(frame: Frame) -> str:
         f' "x_px": {frame.x_px:.2f}, "y_px": {frame.y_px:.2f}, "points": [{points}],'
         f' "symbols": {frame.soft.symbols.tolist()}}}'
     )
-
-
-def _status(status: LiveStatus) -> dict[str, Any]:
-    return {
-        "t_us": status.t_us,
-        "elapsed_s": round(status.elapsed_s, 3),
-        "events": status.events,
-        "events_per_s": round(status.events_per_s),
-        "waiting_ms": round(status.waiting_ms, 3),
-        "level": status.level,
-        "level_text": status.level_text,
-        "shed": dict(status.shed),
-        "delays": {stage: dict(told) for stage, told in status.delays.items()},
-        "recent": {stage: dict(told) for stage, told in status.recent.items()},
-        "counts": dict(status.counts),
-        "losses": {kind: asdict(loss) for kind, loss in status.losses.items()},
-    }

@@ -8,9 +8,9 @@ from types import TracebackType
 from typing import Self
 
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.live.loop_thread import LoopThread
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.recorder import Recorder
+from evlcp_sdk.live.server import LoopThread
 from evlcp_sdk.live.tcp_output import TcpOutput
 from evlcp_sdk.live.viewer import Viewer
 from evlcp_sdk.scene.sites import BarSite

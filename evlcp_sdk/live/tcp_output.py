@@ -6,13 +6,14 @@ import socket
 from datetime import UTC, datetime, timedelta
 from typing import Any, Final
 
-from evlcp_sdk.live.loop_thread import cannot_listen, stop_listening
-from evlcp_sdk.live.publisher import News, Publisher, Subscription
+from evlcp_sdk.live.publisher import News, Publisher
+from evlcp_sdk.live.server import Server
 from evlcp_sdk.results.gpsd import VERSION, answer, sky, tpv
 from evlcp_sdk.results.nmea import sentences
 from evlcp_sdk.utc import ClockZero, zero_at
 
 _HOST: Final = "127.0.0.1"
+_KINDS: Final = frozenset({"fix", "status"})
 _MOST_WAITING: Final = 1000
 """Fixes that wait to be told; the oldest go."""
 _MOST_BYTES: Final = 1 << 18
@@ -23,8 +24,8 @@ _KERNEL_BYTES: Final = 1 << 16
 """What the kernel holds for a client: what waits there is old."""
 
 
-class TcpOutput:
-    """Serves positions over TCP; runs in the loop of a `LoopThread`.
+class TcpOutput(Server):
+    """Serves positions over TCP.
 
     Where the UTC of the camera's clock is not known, the computer's clock says it, once: programs that read
     positions want a time.
@@ -34,62 +35,41 @@ class TcpOutput:
         gpsd: As gpsd's JSON, to clients that say `?WATCH`; or else NMEA, to whoever connects.
         port: Where to listen, on this machine only; 0 for any that is free.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
-
-    Attributes:
-        port: Where it listens, once started.
-        dropped: What clients were not sent as they did not take it, so far.
     """
 
     def __init__(
         self, publisher: Publisher, *, gpsd: bool, port: int = 0, clock_zero: ClockZero = None
     ) -> None:
-        self._publisher, self._gpsd, self.port = publisher, gpsd, port
-        self._zero = clock_zero
+        self._loop: asyncio.AbstractEventLoop | None = None
+        self._came = asyncio.Event()
+        super().__init__(publisher, _KINDS, _MOST_WAITING, _HOST, port, self._wake)
+        self._gpsd, self._zero = gpsd, clock_zero
         self._clients: dict[asyncio.StreamWriter, dict[str, Any]] = {}
         self._newest: dict[str, dict[str, Any]] = {}
         self._unsent = 0
-        self._mine: Subscription | None = None
 
     @property
     def dropped(self) -> int:
         """What clients were not sent as they did not take it, or as there was no time, so far."""
-        late = 0 if self._mine is None else self._mine.dropped
-        return late + self._unsent
+        return self._mine.dropped + self._unsent
 
-    async def start(self) -> "asyncio.Task[None]":
-        """Listen; the task that is done when all that was found is on its way.
+    def _wake(self) -> None:
+        # The loop may be over before the receiver is.
+        if self._loop is not None and not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(self._came.set)
 
-        Raises:
-            ConfigError: The port cannot be had.
-        """
-        loop = asyncio.get_running_loop()
-        came = asyncio.Event()
+    async def _listen(self) -> asyncio.Server:
+        self._loop = asyncio.get_running_loop()
+        # Something may have come already.
+        self._came.set()
+        return await asyncio.start_server(self._serve, self._host, self.port, limit=_MOST_LINE)
 
-        def wake() -> None:
-            # The loop may be over before the receiver is.
-            if not loop.is_closed():
-                loop.call_soon_threadsafe(came.set)
-
-        mine = self._mine = self._publisher.subscribe({"fix", "status"}, most=_MOST_WAITING, wake=wake)
-        try:
-            server = await asyncio.start_server(self._serve, _HOST, self.port, limit=_MOST_LINE)
-        except OSError as fault:
-            self._publisher.leave(mine)
-            raise cannot_listen(_HOST, self.port, fault) from fault
-        self.port = server.sockets[0].getsockname()[1]
-
-        async def pump() -> None:
-            try:
-                while not mine.ended:
-                    await came.wait()
-                    came.clear()
-                    for news in mine.take(0):
-                        self._tell(news)
-            finally:
-                self._publisher.leave(mine)
-                await stop_listening(server)
-
-        return asyncio.create_task(pump())
+    async def _tell_all(self) -> None:
+        while not self._mine.ended:
+            await self._came.wait()
+            self._came.clear()
+            for news in self._mine.take(0):
+                self._tell(news)
 
     def _tell(self, news: News) -> None:
         if self._zero is None:

@@ -25,17 +25,17 @@ from markupsafe import Markup
 from evlcp_sdk.errors import import_extra
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.budget import LEVELS
-from evlcp_sdk.live.loop_thread import cannot_listen, stop_listening
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.serializer import Serializer
+from evlcp_sdk.live.server import Server
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_hex
 from evlcp_sdk.report.pages import TEMPLATES, render_page
 from evlcp_sdk.scene.sites import BarSite
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
-    from websockets.asyncio.server import Server, ServerConnection
+    from websockets.asyncio.server import ServerConnection
     from websockets.http11 import Request, Response
 
 _KINDS: Final = frozenset({"frame", "message", "fix", "status", "end"})
@@ -73,8 +73,8 @@ class _Browser:
         self.waiting.append(line)
 
 
-class Viewer:
-    """Serves the page and what it shows; runs in the loop of a `LoopThread`.
+class Viewer(Server):
+    """Serves the page and what it shows.
 
     Args:
         publisher: Where results and pictures come from.
@@ -84,10 +84,6 @@ class Viewer:
         host: Where to listen: of this machine only, unless it is another address of it.
         port: The same; 0 for any that is free.
         recorder: Starts and stops recordings as a browser asks; None: browsers only look on.
-
-    Attributes:
-        port: Where it listens, once started.
-        dropped: Results that browsers were not sent as they did not take them, so far.
     """
 
     def __init__(
@@ -101,11 +97,10 @@ class Viewer:
         port: int = 0,
         recorder: Recorder | None = None,
     ) -> None:
-        self._publisher, self._recorder = publisher, recorder
-        self._mine = publisher.subscribe(_KINDS, most=_MOST_WAITING)
+        super().__init__(publisher, _KINDS, _MOST_WAITING, host, port)
+        self._recorder = recorder
         self._serializer = Serializer(links, sites)
         self._name, self._links, self._sites = name, links, len(sites)
-        self._host, self.port = host, port
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
         self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
@@ -133,70 +128,45 @@ class Viewer:
         many = counted(self._serializer.untold, "message")
         return f"{many} could not be shown on the page: {self._serializer.fault}"
 
-    async def start(self) -> "asyncio.Task[None]":
-        """Listen; the task that is done when browsers have had the last words.
-
-        Raises:
-            ConfigError: The port cannot be had, or the package `websockets` is not installed.
-        """
+    async def _listen(self) -> Any:
         serve = import_extra("websockets.asyncio.server", "live").serve
         self._body = page(self._name).encode()
-        try:
-            server: Server = await serve(
-                self._serve,
-                self._host,
-                self.port,
-                process_request=self._answer,
-                compression=None,
-                max_size=_MOST_SAID,
-                server_header=None,
-            )
-        except OSError as fault:
-            self._publisher.leave(self._mine)
-            raise cannot_listen(self._host, self.port, fault) from fault
-        self.port = next(iter(server.sockets)).getsockname()[1]
+        given = {"process_request": self._answer, "compression": None, "max_size": _MOST_SAID}
+        return await serve(self._serve, self._host, self.port, server_header=None, **given)
 
-        async def pump() -> None:
-            loop, turn_s = asyncio.get_running_loop(), 0.0
-            try:
-                while not self._mine.ended:
-                    # At even times, unless they are over already.
-                    now_s = loop.time()
-                    turn_s = max(turn_s + 1 / _PICTURES_PER_S, now_s)
-                    await asyncio.sleep(turn_s - now_s)
-                    for news in self._mine.take(0):
-                        for kind, line in self._serializer.lines(news, frames=bool(self._browsers)):
-                            self._tell(kind, line)
-                    self._send_all()
-                # The last words, once a browser has shown what it was sent before.
-                await asyncio.sleep(2 / _PICTURES_PER_S)
-                self._send_all()
-                while any(browser.waiting for browser in self._browsers):
-                    await asyncio.sleep(1 / _PICTURES_PER_S)
-                    self._send_all()
-            finally:
-                self._publisher.leave(self._mine)
-                await stop_listening(server)
-
-        return asyncio.create_task(pump())
-
-    def _keep(self, task: "asyncio.Task[None]") -> None:
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
+    async def _tell_all(self) -> None:
+        loop, turn_s = asyncio.get_running_loop(), 0.0
+        while not self._mine.ended:
+            # At even times, unless they are over already.
+            now_s = loop.time()
+            turn_s = max(turn_s + 1 / _PICTURES_PER_S, now_s)
+            await asyncio.sleep(turn_s - now_s)
+            for news in self._mine.take(0):
+                for kind, line in self._serializer.lines(news, frames=bool(self._browsers)):
+                    self._tell(kind, line)
+            self._send_all()
+        # The last words, once a browser has shown what it was sent before.
+        await asyncio.sleep(2 / _PICTURES_PER_S)
+        self._send_all()
+        while any(browser.waiting for browser in self._browsers):
+            await asyncio.sleep(1 / _PICTURES_PER_S)
+            self._send_all()
 
     # What browsers ask for
 
     def _answer(self, connection: "ServerConnection", request: "Request") -> "Response | None":
         """Give the page, let a WebSocket through, or refuse."""
-        hosts, path = request.headers.get_all("Host"), urlsplit(request.path).path
+        hosts, origins = (request.headers.get_all(name) for name in ("Host", "Origin"))
+        given, _, rest = urlsplit(request.path).path.removeprefix("/").partition("/")
+        why = ""
         if len(hosts) != 1 or not self._is_ours(hosts[0]):
-            return self._refused(connection, "this server is known by another name")
-        origins = request.headers.get_all("Origin")
-        if origins not in ([], [f"http://{hosts[0]}"]):
-            return self._refused(connection, "the page of another server may not look on")
-        given, _, rest = path.removeprefix("/").partition("/")
-        if not secrets.compare_digest(given.encode(), self._token.encode()):
-            return self._refused(connection, "expected the address that the run has printed, with its key")
+            why = "this server is known by another name"
+        elif origins not in ([], [f"http://{hosts[0]}"]):
+            why = "the page of another server may not look on"
+        elif not secrets.compare_digest(given.encode(), self._token.encode()):
+            why = "expected the address that the run has printed, with its key"
+        if why:
+            return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
         if rest == "live":
             if len(self._browsers) >= _MOST_BROWSERS:
                 return connection.respond(HTTPStatus.SERVICE_UNAVAILABLE, "too many browsers look on\n")
@@ -220,9 +190,6 @@ class Viewer:
             return ip_address(name).is_loopback or self._host in ("0.0.0.0", "::")
         except ValueError:
             return False
-
-    def _refused(self, connection: "ServerConnection", why: str) -> "Response":
-        return connection.respond(HTTPStatus.FORBIDDEN, f"{why}\n")
 
     def _page(self) -> "Response":
         from websockets.datastructures import Headers
@@ -280,7 +247,9 @@ class Viewer:
             self._recorder.start()
         elif asked["record"] is False:
             # Its end waits for the disk.
-            self._keep(asyncio.create_task(asyncio.to_thread(self._recorder.stop)))
+            task = asyncio.create_task(asyncio.to_thread(self._recorder.stop))
+            self._tasks.add(task)
+            task.add_done_callback(self._tasks.discard)
         else:
             return False
         return True
@@ -292,7 +261,13 @@ class Viewer:
             "about": {
                 "name": self._name,
                 "run": self._token[:6],
-                "links": {name: _shown(link) for name, link in self._links.items()},
+                "links": {
+                    name: {
+                        "symbols": 2**link.codebook.bits_per_symbol,
+                        "cluster_colours": cluster_hex(link.codebook.clusters),
+                    }
+                    for name, link in self._links.items()
+                },
                 "colours": list(TRANSMITTER_COLOURS),
                 "width": camera.width,
                 "height": camera.height,
@@ -338,15 +313,6 @@ class Viewer:
             browser.ready = False
             # It waits for nothing: of one that does not read there is no second bundle under way.
             broadcast([browser.socket], struct.pack("<I", len(text)) + text + data)
-
-
-def _shown(link: Link) -> dict[str, Any]:
-    """What the page must know of a link: how many symbols there are, and the clusters' colours."""
-    book = link.codebook
-    return {
-        "symbols": 2**book.bits_per_symbol,
-        "cluster_colours": cluster_hex(book.clusters),
-    }
 
 
 def page(name: str) -> str:

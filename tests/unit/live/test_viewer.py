@@ -23,7 +23,7 @@ from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.air.kinds import TextKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
-from evlcp_sdk.live import Publisher, loop_thread
+from evlcp_sdk.live import Publisher, server
 from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.services import Services, Serving
 from evlcp_sdk.live.viewer import page
@@ -335,7 +335,7 @@ def test_a_browser_shows_what_the_files_say(
 ) -> None:
     """Beside one that stalls: a lost link comes back, pictures change, numbers are those of frames.csv."""
     # A slow machine shows the last of it late.
-    monkeypatch.setattr(loop_thread, "FINISH_S", 60.0)
+    monkeypatch.setattr(server, "FINISH_S", 60.0)
     publisher, summary, enough = Publisher(), {}, threading.Event()
 
     def pieces() -> Iterator[bytes]:
