@@ -189,30 +189,13 @@ def _like(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int
     Raises:
         ConfigError: No board can play it.
     """
-    _refuse(limits(packet))
+    check_rate(packet)
     clusters = int(led_clusters.max()) + 1
     if clusters != codebook.clusters:
         raise ConfigError(f"LEDs of {clusters} clusters, expected {codebook.clusters}, one for each pilot")
     composed = not word_limits(codebook, packet, led_clusters)
     form = Format.WORDS if composed else Format.CLUSTERS if -(-clusters // 8) < ROW_BYTES else Format.MASKS
     return Bank(form, codebook, packet, led_clusters, composed)
-
-
-def rest_content(like: Bank) -> bytes | None:
-    """A packet during which nothing is sent, as it stands in a bank; None if any pattern may stand there."""
-    if like.rest is None:
-        return None
-    return like.encode(np.full((like.packet.packet_chips, like.clusters), like.rest, np.uint8))
-
-
-def limits(packet: PacketFormat) -> list[str]:
-    """What of a link no driver board can play; empty if one can. The rest is for HELLO to say."""
-    rate = packet.chip_rate_hz
-    if rate != round(rate):
-        return [f"air.chip_rate_hz = {rate}: a board takes whole chips per second"]
-    if rate > MOST_CHIPS_A_SECOND:
-        return [f"air.chip_rate_hz = {rate}, at most {MOST_CHIPS_A_SECOND}"]
-    return []
 
 
 def word_limits(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int64]) -> list[str]:
@@ -232,9 +215,15 @@ def word_limits(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[
     return faults
 
 
-def check_link(link: Link) -> None:
-    """Raise ConfigError, one line, if no driver board can play a link; see `limits`."""
-    _refuse(limits(link.packet))
+def check_rate(packet: PacketFormat) -> None:
+    """Raise ConfigError, one line, if no driver board plays so many chips a second; the rest HELLO says."""
+    rate, fault = packet.chip_rate_hz, ""
+    if rate != round(rate):
+        fault = "a board takes whole chips per second"
+    elif rate > MOST_CHIPS_A_SECOND:
+        fault = f"expected at most {MOST_CHIPS_A_SECOND}"
+    if fault:
+        raise ConfigError(f"the driver board cannot play this link: air.chip_rate_hz = {rate}: {fault}")
 
 
 def bank_of(symbols: ArrayLike, link: Link) -> Bank:
@@ -259,11 +248,6 @@ def queue_of(link: Link) -> Bank:
     like = replace(_like(link.codebook, link.packet, link.bar.led_clusters()), rest=rest)
     # A board that composes packets has words for no pause.
     return like.holding(like.chips) if rest is None else like.chip_by_chip()
-
-
-def _refuse(faults: list[str]) -> None:
-    if faults:
-        raise ConfigError(f"the driver board cannot play this link: {'; '.join(faults)}")
 
 
 def _checked(symbols: ArrayLike) -> NDArray[Any]:
@@ -295,7 +279,7 @@ def read_masks(path: Path, link: Link) -> Bank:
         ConfigError: No board can play such packets.
         InputError: The file cannot be read, or holds something else.
     """
-    check_link(link)
+    check_rate(link.packet)
     chips = read_numbers(path)
     try:
         bank = Bank.of_chips(chips, link.codebook, link.packet, link.bar.led_clusters())

@@ -13,7 +13,7 @@ from evlcp_sdk.air.codebook import word_of_chips
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from firmware_host.board.bank import Bank, queue_of, rest_content, word_limits
+from firmware_host.board.bank import Bank, queue_of, word_limits
 from firmware_host.board.session import Session
 from firmware_host.board.stream import AHEAD, Stream
 from firmware_host.board.tables import name_of
@@ -401,9 +401,13 @@ class Board:
                 raise ConfigError(f"symbols of shape {packet.shape}, expected {shape}: frames, clusters")
             return like.encode(packet_chips(packet, link.codebook, link.packet.pilot_every))
 
-        packet_s = like.packet.packet_chips / like.chip_rate_hz
+        chips = like.packet.packet_chips
+        packet_s = chips / like.chip_rate_hz
         pulse_s = min(0.5, status.watchdog_ms / 3e3) if acts else 0.5
-        stream = Stream(self.session, bank, content, packet_s, ahead, pulse_s, rest_content(like))
+        pause = None
+        if like.rest is not None:
+            pause = like.encode(np.full((chips, like.clusters), like.rest, np.uint8))
+        stream = Stream(self.session, bank, content, packet_s, ahead, pulse_s, pause)
         if status.state != State.PLAYING:
             self.start()
         return stream
@@ -497,8 +501,9 @@ class Board:
         queue = not bank.packets
         if bank.packet_bytes * (2 if queue else 1) > room:
             most = _most(bank, room // 2 if queue else room)
+            length = f"{bank.packet.frames} frames" if bank.composed else f"{bank.packet.packet_chips} chips"
             raise ConfigError(
-                f"a packet of {_length(bank)} takes {bank.packet_bytes} bytes, {what}:"
+                f"a packet of {length} takes {bank.packet_bytes} bytes, {what}:"
                 f" {'a stream needs room for two' if queue else 'not one fits'};"
                 f" a packet may have at most {most}"
             )
@@ -653,11 +658,6 @@ def _frames(bank: Bank) -> tuple[int, int]:
 
 def _in_frames(frames: int, pilot_every: int) -> str:
     return f"{frames} frames, pilot in every {pilot_every}"
-
-
-def _length(bank: Bank) -> str:
-    """How long a bank's packets are, for a person."""
-    return f"{bank.packet.frames} frames" if bank.composed else f"{bank.packet.packet_chips} chips"
 
 
 def _most(bank: Bank, room: int) -> str:

@@ -1,7 +1,6 @@
 """Many boards at once, from one inventory."""
 
 import contextlib
-import json
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -18,11 +17,11 @@ from evlcp_sdk.link.compose import messages_of, packets_of, utf8
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.specs import SpecError, build, read_toml, shown
-from firmware_host.board.bank import MOST_RANDOM_FRAMES, Bank, bank_of, check_link, random_symbols, read_masks
+from firmware_host.board.bank import MOST_RANDOM_FRAMES, Bank, bank_of, check_rate, random_symbols, read_masks
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.keys import read_board_key
+from firmware_host.board.messages import site_that_sends
 from firmware_host.board.session import Session
-from firmware_host.board.sites import site_that_sends
 from firmware_host.board.symbols import read_symbols
 from firmware_host.emulators.opening import open_port
 from firmware_host.errors import FleetError, IncompatibleError
@@ -114,13 +113,7 @@ class Entry:
 
 @dataclass(frozen=True)
 class Inventory:
-    """The boards of a file, each with what it plays.
-
-    Attributes:
-        path: The file.
-        entries: The boards.
-        banks: What each plays, by its id.
-    """
+    """The boards of a file, and what each plays, by its id."""
 
     path: Path
     entries: tuple[Entry, ...]
@@ -129,15 +122,7 @@ class Inventory:
 
 @dataclass(frozen=True)
 class Result:
-    """How one board ended.
-
-    Attributes:
-        entry: The board.
-        said: What was done, for a person.
-        table: The same as plain values.
-        fault: Why it failed.
-        elapsed_s: How long it took, s.
-    """
+    """How one board ended: what was done, for a person and as plain values, or why it failed."""
 
     entry: Entry
     said: str
@@ -175,8 +160,8 @@ def read_inventory(path: Path) -> Inventory:
         InputError: A payload or a key cannot be read.
         IncompatibleError: A payload was made with another link.
     """
-    entries, links = read_entries(path), _Links(path)
-    banks = {entry.id: _bank(path, n, entry, links) for n, entry in enumerate(entries)}
+    entries, registry = read_entries(path), Registry.load()
+    banks = {entry.id: _bank(path, n, entry, registry) for n, entry in enumerate(entries)}
     return Inventory(path, entries, banks)
 
 
@@ -196,7 +181,15 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
         raise ConfigError(f"{path}: defaults = {shown(defaults)}, expected a table [defaults]")
     if not isinstance(rows, list) or not rows or not all(isinstance(r, dict) for r in rows):
         raise ConfigError(f"{path}: board: expected at least one [[board]] table")
-    entries = [_entry(path, i, defaults | row) for i, row in enumerate(rows)]
+    entries = []
+    for i, row in enumerate(rows):
+        place = f"{path}: board[{i}]"
+        try:
+            entries.append(build(Entry, defaults | row))
+        except SpecError as refused:
+            raise ConfigError("\n".join(refused.lines(f"{place}."))) from refused
+        except ConfigError as fault:
+            raise ConfigError(f"{place}: {fault}") from fault
     for key in ("id", "port"):
         first: dict[str, int] = {}
         for i, entry in enumerate(entries):
@@ -210,48 +203,22 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
     return tuple(entries)
 
 
-def _entry(path: Path, index: int, row: dict[str, Any]) -> Entry:
-    place = f"{path}: board[{index}]"
+def _bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank:
+    folder, given, named = path.parent, None, entry.link
     try:
-        return build(Entry, row)
-    except SpecError as refused:
-        raise ConfigError("\n".join(refused.lines(f"{place}."))) from refused
-    except ConfigError as fault:
-        raise ConfigError(f"{place}: {fault}") from fault
-
-
-class _Links:
-    """The links of an inventory, each resolved once."""
-
-    def __init__(self, path: Path) -> None:
-        self._folder = path.parent
-        self._found: dict[str, Link] = {}
-        self.registry = Registry.load()
-
-    def of(self, named: str | dict[str, Any]) -> Link:
-        key = json.dumps(named, sort_keys=True, default=str)
-        if key not in self._found:
-            self._found[key] = (
-                load_link(self._folder / named, (), self.registry)
-                if isinstance(named, str)
-                else resolve(named, self.registry, source="link")
-            )
-        return self._found[key]
-
-
-def _bank(path: Path, index: int, entry: Entry, links: _Links) -> Bank:
-    place = f"{path}: board[{index}]"
-    try:
-        given = None if entry.link is None else links.of(entry.link)
+        if isinstance(named, str):
+            given = load_link(folder / named, (), registry)
+        elif named is not None:
+            given = resolve(named, registry, source="link")
         if entry.payload is not None and not entry.payload.endswith(".npy"):
-            symbols, link = read_symbols(path.parent / entry.payload, given, links.registry)
+            symbols, link = read_symbols(folder / entry.payload, given, registry)
             return bank_of(symbols, link)
-        link = given or links.of({})
-        check_link(link)
+        link = given or resolve({}, registry)
+        check_rate(link.packet)
         if entry.has_message:
-            return bank_of(_message(path.parent, entry, link), link)
+            return bank_of(_message(folder, entry, link), link)
         if entry.payload is not None:
-            return read_masks(path.parent / entry.payload, link)
+            return read_masks(folder / entry.payload, link)
         packets, frames = entry.random or 0, link.packet.frames
         if packets * frames > MOST_RANDOM_FRAMES:
             raise ConfigError(
@@ -263,6 +230,7 @@ def _bank(path: Path, index: int, entry: Entry, links: _Links) -> Bank:
         kind = next(
             k for k in (IncompatibleError, InputError, ConfigError, EvlcpError) if isinstance(fault, k)
         )
+        place = f"{path}: board[{index}]"
         raise kind("\n".join(f"{place}: {line}" for line in str(fault).splitlines())) from fault
 
 
@@ -315,12 +283,6 @@ Work = Callable[[Entry, Board], tuple[str, dict[str, Any]]]
 def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) -> None:
     """Do something with all boards of an inventory; one that fails does not hold up the others.
 
-    Args:
-        path: The inventory.
-        entries: Its boards.
-        work: What is done.
-        report: Called with each result as it comes.
-
     Raises:
         FleetError: A board failed; it has the exit code of the first of them.
     """
@@ -352,16 +314,7 @@ def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) 
 
 
 def program_fleet(inventory: Inventory, verify: bool, report: Report) -> None:
-    """Program all boards at once.
-
-    Args:
-        inventory: The boards.
-        verify: Whether to compare what each board holds.
-        report: Called with each result as it comes.
-
-    Raises:
-        FleetError: See `run_fleet`.
-    """
+    """Program all boards at once; faults as of `run_fleet`."""
 
     def work(entry: Entry, board: Board) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()

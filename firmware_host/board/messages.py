@@ -13,13 +13,13 @@ from evlcp_sdk.air.blocks import Message
 from evlcp_sdk.air.kinds import Countdown
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.compose import each_packet, messages_of, packets_of
+from evlcp_sdk.scene.sites import BarSite, load_sites
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
     from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.scene.sites import BarSite
     from firmware_host.board.stream import Stream
 
 
@@ -78,6 +78,22 @@ class Content:
         )
 
 
+def site_that_sends(path: Path, transmitter_id: int | None, by: str) -> BarSite:
+    """The bar of a file of sites that sends: of an id, or the only one; `by` is how a person chooses one.
+
+    Raises:
+        ConfigError: The file is wrong, or it is not clear which bar is meant.
+    """
+    sites = load_sites(path)
+    ids = ", ".join(str(s.transmitter_id) for s in sites)
+    if transmitter_id is None and len(sites) > 1:
+        raise ConfigError(f"{path}: {len(sites)} bars: choose one with {by}, of {ids}")
+    chosen = [s for s in sites if transmitter_id in (None, s.transmitter_id)]
+    if not chosen:
+        raise ConfigError(f"{path}: no bar has transmitter_id {transmitter_id}, but {ids}")
+    return chosen[0]
+
+
 def packet_s(link: Link) -> float:
     """How long a packet is on air, s."""
     return link.packet.packet_chips / link.air.chip_rate_hz
@@ -110,14 +126,7 @@ def send_anew(
 ) -> None:
     """Send content anew every so often, until nothing is left of a countdown, or so many times.
 
-    Args:
-        stream: Of a board.
-        content: What is sent.
-        link: How.
-        repeat: So often each packet in a row.
-        every_s: From one time to the next, s.
-        count: How many times; None for no end.
-        stopped: Ends it.
+    Each packet goes out `repeat` times in a row; `stopped` ends it.
     """
     coder = link.block_coder()
 

@@ -15,14 +15,7 @@ _PROBE_TRIES = 2
 
 @dataclass(frozen=True)
 class Found:
-    """A port and what answered there.
-
-    Attributes:
-        port: The port.
-        asked: Whether anything was written to it.
-        about: The board's HELLO, or None.
-        fault: Why there is none.
-    """
+    """A port, whether anything was written to it, and the HELLO that came, or why none did."""
 
     port: SerialPort
     asked: bool

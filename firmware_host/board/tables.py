@@ -17,13 +17,15 @@ from firmware_host.protocol.generated.requests import (
 
 def about_table(about: protocol.HelloReply) -> dict[str, Any]:
     """What a board is and what it can, from its HELLO."""
+    # one that does not say what a bank may hold takes words and masks
+    formats = about.formats or 1 << Format.WORDS | 1 << Format.MASKS
     return {
         "hal": about.hal.rstrip(b"\0").decode("ascii", "replace"),
         "unique_id": about.unique_id.hex(),
         "firmware": f"{about.version_major}.{about.version_minor}.{about.version_patch}",
         "protocol": f"{about.major}.{about.minor}",
         **_numbers(about, "clusters", "leds", "banks", "bank_bytes"),
-        "formats": names_of_formats(about),
+        "formats": [name_of(Format, n) for n in range(formats.bit_length()) if formats >> n & 1],
         **_numbers(about, "window", "max_payload", "tick_hz", "chip_rate_min_hz", "chip_rate_max_hz"),
         **_numbers(about, "clock_hz", "level_max_ma", "mean_max_ma", "burst_chips"),
         "capabilities": names_of_bits(Capability, about.capabilities),
@@ -35,16 +37,6 @@ def about_table(about: protocol.HelloReply) -> dict[str, Any]:
 def _numbers(reply: protocol.HelloReply | protocol.StatusReply, *names: str) -> dict[str, int]:
     """Fields that are told as they are."""
     return {name: getattr(reply, name) for name in names}
-
-
-def names_of_formats(about: protocol.HelloReply) -> list[str]:
-    """What a bank of a board may hold, and how many chips of that.
-
-    A board that does not say so takes words and masks.
-    """
-    known = about.formats or 1 << Format.WORDS | 1 << Format.MASKS
-    numbers = [n for n in range(known.bit_length()) if known >> n & 1]
-    return [name_of(Format, n) for n in numbers]
 
 
 def name_of(enum: type[Enum], value: int) -> str:

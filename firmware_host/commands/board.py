@@ -162,9 +162,7 @@ def program(
     *,
     context: typer.Context,
     payload: BankOptions,
-    inventory: Annotated[
-        Path | None, typer.Option(metavar="FILE.toml", help="Program all boards of an inventory at once.")
-    ] = None,
+    inventory: InventoryFile = None,
     level: Annotated[int | None, typer.Option(help="LED current, mA.", min=0, max=65535)] = None,
     level_limit: Annotated[
         int | None, typer.Option(help="Largest LED current from now on, mA.", min=1, max=65535)
@@ -188,7 +186,12 @@ def program(
     """
     if inventory is not None:
         _beside_inventory(context, "verify", "stay")
-        _program_fleet(inventory, verify, stay, as_json)
+        from firmware_host.board.fleet import program_fleet, read_inventory
+
+        boards = read_inventory(inventory)
+        program_fleet(boards, verify, _report(as_json))
+        if stay:
+            _watch_fleet(inventory, boards.entries, 1.0, None, True, as_json, quiet=True)
         return
     from firmware_host.board.board import Settings, provision
     from firmware_host.protocol.generated.requests import Watchdog
@@ -252,15 +255,6 @@ def _each(
 
     _beside_inventory(context, *allowed)
     run_fleet(inventory, read_entries(inventory), lambda _, board: work(board), _report(as_json))
-
-
-def _program_fleet(path: Path, verify: bool, stay: bool, as_json: bool) -> None:
-    from firmware_host.board.fleet import program_fleet, read_inventory
-
-    inventory = read_inventory(path)
-    program_fleet(inventory, verify, _report(as_json))
-    if stay:
-        _watch_fleet(path, inventory.entries, 1.0, None, True, as_json, quiet=True)
 
 
 @app.command(cls=LineCommand)
@@ -487,14 +481,7 @@ def _watch_fleet(
 ) -> None:
     """Watch all boards of an inventory until Ctrl-C, or until each has been seen `count` times.
 
-    Args:
-        path: The inventory.
-        entries: The boards.
-        interval: Seconds between two looks.
-        count: Looks at each board.
-        reconnect: Whether to look for a board that is gone.
-        as_json: Whether to print JSON.
-        quiet: Print only boards that go and come.
+    `quiet` prints only boards that go and come.
     """
     import threading
     from concurrent.futures import ThreadPoolExecutor
@@ -663,25 +650,22 @@ def emulate(
 
     For example: [bold]evlcp board emulate native --listen unix:/tmp/board --leds leds.bin[/]
     """
-    import re
-
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import check_output
     from evlcp_sdk.signals import stop_on_request
     from firmware_host.emulators import processes
     from firmware_host.emulators.listening import HostLine, check_free
     from firmware_host.emulators.native import NativeBoard, serve
+    from firmware_host.ports.transport import socket_address
 
-    scheme, _, place = listen.partition(":")
     known = ("unix", "tcp", "pty") if emulator is Emulator.NATIVE else ("unix", "tcp")
-    if scheme not in known:
+    if listen.partition(":")[0] not in known:
         raise ConfigError(f"--listen {listen}: expected {' or '.join(known)} for {emulator}")
-    if scheme == "tcp":
-        host, _, number = place.rpartition(":")
-        if not host or not re.fullmatch("[0-9]{1,5}", number) or not 1 <= int(number) <= 65535:
-            raise ConfigError(f"--listen {listen}: expected tcp:HOST:PORT with a port from 1 to 65535")
-    if scheme == "unix" and not place:
-        raise ConfigError(f"--listen {listen}: expected unix:PATH")
+    if listen != "pty":
+        try:
+            socket_address(listen)
+        except ValueError as fault:
+            raise ConfigError(f"--listen {listen}: {fault}") from fault
     check_free(listen)
     if leds is not None:
         check_output(leds, regular=False)

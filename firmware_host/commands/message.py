@@ -67,8 +67,7 @@ class ContentOptions:
         from evlcp_sdk.errors import ConfigError
         from evlcp_sdk.files import read_whole
         from evlcp_sdk.link.compose import utf8
-        from firmware_host.board.messages import Content
-        from firmware_host.board.sites import site_that_sends
+        from firmware_host.board.messages import Content, site_that_sends
 
         if not self.time and (self.text, self.file, self.beacon, self.countdown) == (None,) * 4:
             raise ConfigError(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import NoBoardError, ToolchainError
-from firmware_host.ports.transport import SocketTransport
+from firmware_host.ports.transport import SocketTransport, socket_address
 
 _MOST_BYTES = 2048
 
@@ -39,31 +39,30 @@ class HostLine:
     """
 
     def __init__(self, listen: str, link: Path | None = None) -> None:
-        scheme, _, self.place = listen.partition(":")
+        self.place = listen
         self._server: socket.socket | None = None
         self._host: int | None = None
         self._others: list[int] = []
         self._link: Path | None = link
         self._out = b""
         try:
-            if scheme == "pty":
+            if listen == "pty":
                 self._open_terminal(link)
             else:
-                self._server = self._listen(scheme)
-                self.place = listen
+                self._server = self._listen(listen)
         except OSError as fault:
             raise ToolchainError(f"{listen}: no board can listen there: {fault.strerror or fault}") from fault
 
-    def _listen(self, scheme: str) -> socket.socket:
-        if scheme == "tcp":
-            host, _, port = self.place.rpartition(":")
-            return socket.create_server((host, int(port)))
-        self._link = Path(self.place)
+    def _listen(self, listen: str) -> socket.socket:
+        address = socket_address(listen)
+        if isinstance(address, tuple):
+            return socket.create_server(address)
+        self._link = Path(address)
         if self._link.is_socket():
             self._link.unlink()
         server = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
-            server.bind(self.place)
+            server.bind(address)
         except OSError:
             server.close()
             raise

@@ -51,10 +51,6 @@ def _model(*options: str) -> list[str]:
 def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
     """Command line of the model of an STM32F405 with the image as it is flashed.
 
-    Args:
-        listen: `unix:PATH` or `tcp:HOST:PORT`.
-        leds: File for the LED records.
-
     Raises:
         ToolchainError: Unicorn or the model is missing, or the image cannot be built.
     """
@@ -67,10 +63,7 @@ def stm32_command(listen: str, leds: Path | None = None) -> list[str]:
 def rom_command(listen: str, flash: Path | None = None, leds: Path | None = None) -> list[str]:
     """Command line of an STM32F405 that waits in its ROM, and runs on its model what it is told to.
 
-    Args:
-        listen: `unix:PATH` or `tcp:HOST:PORT`.
-        flash: File that keeps its flash, 1 MiB; new or there.
-        leds: File for the LED records of what runs.
+    The file of its flash, 1 MiB, is new or there.
 
     Raises:
         InputError: The flash file cannot be used.

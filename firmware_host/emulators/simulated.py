@@ -43,10 +43,7 @@ def _library() -> ctypes.CDLL:
 
 
 class SimulatedBoard:
-    """One board; time moves only in `run`.
-
-    Args:
-        unique_id: The board's number, 12 bytes.
+    """One board, of a number of 12 bytes; time moves only in `run`.
 
     Raises:
         ToolchainError: The firmware cannot be built.

@@ -28,10 +28,7 @@ Progress = Callable[[int, int], None]
 
 
 class RomLoader:
-    """A part that waits in its ROM.
-
-    Args:
-        transport: The line, with even parity.
+    """A part that waits in its ROM, on a line with even parity.
 
     Raises:
         NoBoardError: Nobody answers.

@@ -33,6 +33,24 @@ def on_network(port: str) -> bool:
     return port.startswith(_NETWORK)
 
 
+def socket_address(spec: str) -> str | tuple[str, int]:
+    """The path of `unix:PATH`, or host and port of `tcp:HOST:PORT`.
+
+    Raises:
+        ValueError: It is neither; the message says what was expected.
+    """
+    scheme, _, place = spec.partition(":")
+    if scheme == "unix":
+        if not place:
+            raise ValueError("expected unix:PATH")
+        return place
+    host, _, port = place.rpartition(":")
+    # Not left to the system: some take a port modulo 65536.
+    if not host or not re.fullmatch("[0-9]{1,5}", port) or not 1 <= int(port) <= 65535:
+        raise ValueError("expected tcp:HOST:PORT with a port from 1 to 65535")
+    return host, int(port)
+
+
 class Transport(Protocol):
     """A byte line and the clock that its time-outs follow.
 
@@ -78,27 +96,24 @@ class SocketTransport:
         Raises:
             NoBoardError: Nobody listens there, or it is no such place.
         """
-        scheme, _, place = spec.partition(":")
-        host, _, port = place.rpartition(":")
-        # Not left to the system: some take a port modulo 65536.
-        if scheme == "tcp" and not (host and re.fullmatch("[0-9]{1,5}", port) and 1 <= int(port) <= 65535):
-            raise NoBoardError(f"{spec}: expected tcp:HOST:PORT with a port from 1 to 65535")
-        if scheme == "unix" and not place:
-            raise NoBoardError(f"{spec}: expected unix:PATH")
         try:
-            if scheme == "unix":
-                if not hasattr(socket, "AF_UNIX"):
-                    raise ValueError("this system has no unix sockets")
+            address = socket_address(spec)
+        except ValueError as fault:
+            raise NoBoardError(f"{spec}: {fault}") from fault
+        try:
+            if isinstance(address, tuple):
+                connected = socket.create_connection(address, timeout=5.0)
+                connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            elif hasattr(socket, "AF_UNIX"):
                 connected = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
                 connected.settimeout(5.0)
                 try:
-                    connected.connect(place)
+                    connected.connect(address)
                 except OSError:
                     connected.close()
                     raise
             else:
-                connected = socket.create_connection((host, int(port)), timeout=5.0)
-                connected.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                raise ValueError("this system has no unix sockets")
         except (OSError, ValueError, OverflowError) as fault:
             raise NoBoardError(
                 f"{spec}: no board listens there ({fault}); start one with"
@@ -142,13 +157,6 @@ class TraceTransport:
 
     The first line has port, line rate and what the client drew at random; each further one is
     `{"t": seconds, "dir": "tx" | "rx", "hex": bytes}`.
-
-    Args:
-        inner: The line.
-        path: The file.
-        baud: Line rate, bit/s.
-        first: First sequence number that the client drew.
-        nonce: Session number that it drew.
 
     Raises:
         OutputError: The file cannot be written; so do `read`, `write` and `close`.

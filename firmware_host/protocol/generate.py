@@ -14,7 +14,6 @@ from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.link.resolve import resolve
 
 HERE = Path(__file__).parents[1]
@@ -132,20 +131,6 @@ class Exchange:
         return self.kind == "session" or any(not f.size for f in self.request)
 
 
-def profiles_of(definition: dict[str, Any]) -> list[str]:
-    """The profiles that the firmware is built with: those of the definition but `custom`, by number."""
-    return [name for name in definition["enums"]["profile"] if name not in ("doc", "custom")]
-
-
-def codebook_of(profile: str) -> Codebook:
-    """The codebook of the default link with another profile.
-
-    Raises:
-        UnknownAlgorithmError: No modulation has that name.
-    """
-    return resolve({"modulation": {"id": profile}}).codebook
-
-
 _CLASSES = {"fault": "BoardFault"}
 """Classes whose name is not that of their definition, which the SDK has for something else."""
 
@@ -211,7 +196,12 @@ def render(template: str, definition: dict[str, Any]) -> str:
         messages=messages,
         numbers=numbers,
         stored=[(t["name"], t["doc"], [Field.parse(f) for f in t["fields"]]) for t in definition["stored"]],
-        digests={profile: codebook_of(profile).digest for profile in profiles_of(definition)},
+        digests={
+            # those that the firmware is built with: of the default link with another profile
+            profile: resolve({"modulation": {"id": profile}}).codebook.digest
+            for profile in definition["enums"]["profile"]
+            if profile not in ("doc", "custom")
+        },
     )
 
 

@@ -17,10 +17,6 @@ def rows_of_chips(chips: ArrayLike, led_clusters: NDArray[np.int64] = BOARD_LEDS
 
     LED 0 is the most significant bit of the first byte; there are 96 at most.
 
-    Args:
-        chips: The chips, 0 or 1.
-        led_clusters: The cluster of each LED.
-
     Raises:
         ConfigError: The chips are not 0 and 1, or there are other columns.
 

@@ -1,8 +1,7 @@
 """Any link on a board, LED by LED: other bars, other codes, characters, chips as they are."""
 
 import json
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -73,72 +72,8 @@ EXPECTED = leds_of(symbol_chips(SYMBOLS, BOOK, 2), LED_CLUSTERS)
 """80 chips of preamble, two pilots and three words of 24: twice."""
 
 
-@dataclass(frozen=True)
-class Case:
-    """What is played, and what the LEDs do then; a link's packets may be streamed, too."""
-
-    bank: Bank
-    leds: NDArray[np.uint8]
-    link: Link | None = None
-    symbols: NDArray[np.int64] | None = None
-
-
-def case_of_link(*overrides: str) -> Case:
-    link = board_link(*overrides)
-    symbols = symbols_of(2, 1, link)
-    chips = np.concatenate([packet_chips(one, link.codebook, link.packet.pilot_every) for one in symbols])
-    return Case(bank_of(symbols, link), leds_of(chips, link.bar.led_clusters()), link, symbols)
-
-
-def case_of_own_codes() -> Case:
-    rows = hadamard(8)
-    values = np.array([1, 1, 1, -1, 1], np.int8)
-    book = Codebook.of_values("wh8", values, np.concatenate([-rows, rows]), rows)
-    symbols = random_symbols(2, 3, book, np.random.default_rng(0))
-    bank = Bank.of_symbols(symbols, book)
-    assert profile_number(bank) == Profile.CUSTOM
-    return Case(bank, np.repeat(symbol_chips(symbols, book), 6, axis=1))
-
-
-def case_of_rows() -> Case:
-    rows = np.random.default_rng(2).integers(0, 2, (400, 96), dtype=np.uint8)
-    rows[:, 87:] = 0
-    packet = PacketFormat.of(BOOK, 3, 20_000.0, pilot_every=2)
-    return Case(Bank.of_chips(rows[:, :87], BOOK, packet, LED_CLUSTERS), rows)
-
-
-def case_of_drawn_clusters() -> Case:
-    assert EXPECTED.shape == (400, 96)
-    # ten clusters are two bytes a chip, behind the 12 bytes of each cluster's mask
-    assert len(a_bank().content) == 10 * 12 + 400 * 2
-    return Case(a_bank(), EXPECTED)
-
-
-EDGES = ("separation.id=edges", "decoding.id=edges")
-DIMMED = ("modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed")
-ONE_LED = ("bar.rows=1", "bar.cluster_rows=1", "ranging.id=none")
-CASES: dict[str, tuple[Format, Callable[[], Case]]] = {
-    "wh4x2": (Format.WORDS, case_of_link),
-    "wh8": (Format.WORDS, lambda: case_of_link("modulation.id=wh8")),
-    "raw8": (Format.WORDS, lambda: case_of_link("modulation.id=raw8")),
-    "a pilot in every fourth frame": (Format.WORDS, lambda: case_of_link("air.pilot_every=4")),
-    "one pilot": (Format.WORDS, lambda: case_of_link("air.frames_per_packet=3", "air.pilot_every=64")),
-    "own codes": (Format.WORDS, case_of_own_codes),
-    "nrz": (Format.CLUSTERS, lambda: case_of_link(*EDGES, "modulation.id=nrz")),
-    "ppm": (Format.CLUSTERS, lambda: case_of_link(*EDGES, "modulation.id=ppm")),
-    "dimmed": (Format.CLUSTERS, lambda: case_of_link(*EDGES, *DIMMED)),
-    "one LED": (Format.CLUSTERS, lambda: case_of_link(*EDGES, *ONE_LED, "modulation.id=nrz")),
-    "ten clusters": (Format.CLUSTERS, case_of_drawn_clusters),
-    "rows": (Format.MASKS, case_of_rows),
-}
-
-
-@pytest.mark.parametrize("name", CASES)
-def test_every_led_does_what_it_is_sent(name: str, device: SimulatedBoard, board: Board) -> None:
-    form, make = CASES[name]
-    case = make()
-    bank, leds = case.bank, case.leds
-    assert bank.format == form
+def check_plays(device: SimulatedBoard, board: Board, bank: Bank, leds: NDArray[np.uint8]) -> None:
+    """The board takes a bank, within the very share of time that it has a LED on, and its LEDs play it."""
     share = np.ceil(1000 * leds.mean(0).max() - 1e-9)
     done = provision(board, bank, Settings(duty_limit=share / 1000))
     assert (done.written, done.swapped) == (len(bank.content), True)
@@ -152,17 +87,55 @@ def test_every_led_does_what_it_is_sent(name: str, device: SimulatedBoard, board
     assert (status.packet_chips, status.faults) == (bank.packet.packet_chips, 0)
     assert board.verify(bank) == status.active_bank
     assert provision(board, bank, Settings()).written == 0
-    if case.link is None or case.symbols is None:
-        return
+
+
+EDGES = ("separation.id=edges", "decoding.id=edges")
+DIMMED = ("modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed")
+ONE_LED = ("bar.rows=1", "bar.cluster_rows=1", "ranging.id=none")
+
+
+@pytest.mark.parametrize(
+    ("form", "overrides"),
+    [
+        (Format.WORDS, ()),
+        (Format.WORDS, ("modulation.id=wh8",)),
+        (Format.WORDS, ("modulation.id=raw8",)),
+        (Format.WORDS, ("air.pilot_every=4",)),
+        (Format.WORDS, ("air.frames_per_packet=3", "air.pilot_every=64")),
+        (Format.CLUSTERS, (*EDGES, "modulation.id=nrz", "air.chip_rate_hz=20000.0")),
+        (Format.CLUSTERS, (*EDGES, "modulation.id=ppm")),
+        (Format.CLUSTERS, (*EDGES, *DIMMED)),
+        (Format.CLUSTERS, (*EDGES, *ONE_LED, "modulation.id=nrz")),
+    ],
+    ids=lambda value: "-".join(value) if isinstance(value, tuple) else value.name,
+)
+def test_every_led_does_what_it_is_sent(
+    device: SimulatedBoard, board: Board, form: Format, overrides: tuple[str, ...]
+) -> None:
+    link = board_link(*overrides)
+    symbols = symbols_of(2, 1, link)
+    chips = np.concatenate([packet_chips(one, link.codebook, link.packet.pilot_every) for one in symbols])
+    bank, leds = bank_of(symbols, link), leds_of(chips, link.bar.led_clusters())
+    assert bank.format == form
+    check_plays(device, board, bank, leds)
     # a stream, whose idle pattern is no brighter and of the bar's LEDs alone, keeps to the same limit
-    with board.stream(case.link) as stream:
+    with board.stream(link) as stream:
         stream.wait(0.1)
-        for packet in case.symbols:
+        for packet in symbols:
             stream.send(packet)
     rows = shown(device)
     assert (rows[-len(leds) :] == leds).all()
     assert not rows[:, len(bank.led_clusters) :].any()
     assert board.status().faults == 0
+
+
+def test_own_codes_are_composed_too(device: SimulatedBoard, board: Board) -> None:
+    rows, values = hadamard(8), np.array([1, 1, 1, -1, 1], np.int8)
+    book = Codebook.of_values("wh8", values, np.concatenate([-rows, rows]), rows)
+    symbols = random_symbols(2, 3, book, np.random.default_rng(0))
+    bank = Bank.of_symbols(symbols, book)
+    assert (bank.format, profile_number(bank)) == (Format.WORDS, Profile.CUSTOM)
+    check_plays(device, board, bank, np.repeat(symbol_chips(symbols, book), 6, axis=1))
 
 
 @given(st.data())
@@ -256,23 +229,23 @@ def test_the_idle_pattern_keeps_to_the_limits(
 
 
 def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None:
-    good = protocol.ChipsRequest(200, 1, 10, bytes.fromhex(BOOK.digest))
-    for name, wrong, nearest in (
-        ("packet_chips", 0, 1),
-        ("packet_chips", 40961, 40960),
-        ("packet_chips", 2**32 - 1, 40960),
-        ("hold", 0, 1),
-        ("clusters", 97, 96),
+    call, bank = board.session.call, a_bank()
+    digest = bytes.fromhex(bank.digest)
+    for place, wrong, nearest in (
+        (0, 0, 1),
+        (0, 40961, 40960),
+        (0, 2**32 - 1, 40960),
+        (1, 0, 1),
+        (2, 97, 96),
     ):
+        values = [200, 1, 10]
+        values[place] = wrong
         with pytest.raises(RefusedError) as told:
-            board.session.call(replace(good, **{name: wrong}))
+            call(protocol.ChipsRequest(*values, digest))
         assert (told.value.status, told.value.detail) == (Status.OUT_OF_RANGE, nearest)
-    bank = a_bank()
-    commit = protocol.CommitRequest(
-        0, bank.format, 2, len(bank.content), bank.crc, bytes.fromhex(bank.digest)
-    )
+    commit = protocol.CommitRequest(0, bank.format, 2, len(bank.content), bank.crc, digest)
     with pytest.raises(RefusedError):
-        board.session.call(commit)  # CLUSTERS with a codebook
+        call(commit)  # CLUSTERS with a codebook
     board.prepare(bank)
     board.fill(0, bank.content)
     for name, wrong in (
@@ -282,7 +255,7 @@ def test_what_the_firmware_refuses(device: SimulatedBoard, board: Board) -> None
         ("digest", bytes(32)),
     ):
         with pytest.raises((RefusedError, IncompatibleError)):
-            board.session.call(replace(commit, **{name: wrong}))
+            call(replace(commit, **{name: wrong}))
     # an LED of two clusters would be on for longer than either
     overlapping = bytearray(bank.content)
     overlapping[12] |= overlapping[0]
@@ -457,9 +430,7 @@ KINDS = ["7E2", "8O1, turned", "4-PPM"]
 @pytest.mark.parametrize("kind", KINDS)
 def test_characters_and_pulses_are_those_of_the_link(kind: str, device: SimulatedBoard, board: Board) -> None:
     link, symbols, told = packet_of(kind)
-    provision(board, bank_of(symbols[None], link), Settings())
-    device.run(100_000)
-    check_round(shown(device), told, len(told) + 1)
+    check_plays(device, board, bank_of(symbols[None], link), told)
 
 
 @pytest.mark.parametrize("kind", [*KINDS, "ten clusters"])

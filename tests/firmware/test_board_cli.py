@@ -333,19 +333,6 @@ def test_ports_are_asked(native: str, tmp_path: Path) -> None:
     os.close(other)
 
 
-def test_board_that_hangs_up_is_told(tmp_path: Path) -> None:
-    board = Native(f"unix:{tmp_path / 'b'}")
-    options = ("--interval", "0.05", "--no-reconnect", "--port", f"unix:{tmp_path / 'b'}")
-    command = [*EVLCP, "board", "monitor", *options]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    process.stdout.readline()
-    board.end()
-    said = process.communicate(timeout=20)[1]
-    assert process.returncode == 6
-    assert "the board hung up; start it again" in said
-
-
 @pytest.mark.parametrize("option", ["--listen", "--link"])
 def test_an_emulator_leaves_a_users_file_alone(evlcp, tmp_path: Path, option: str) -> None:
     path = tmp_path / "notes.txt"

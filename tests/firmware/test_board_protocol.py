@@ -30,13 +30,8 @@ def definition() -> dict:
     return tomllib.loads((generate.HERE / "protocol" / "protocol.toml").read_text())
 
 
-def test_generated_files_are_fresh() -> None:
-    stale = [p.name for p, text in generate.generated_files().items() if p.read_text() != text]
-    assert not stale, "run python -m firmware_host.protocol.generate"
-
-
-def test_generator_names_a_stale_file(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
-    assert generate.main(["--check"]) == 0
+def test_generated_files_are_fresh(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture) -> None:
+    assert generate.main(["--check"]) == 0, "run python -m firmware_host.protocol.generate"
     files = generate.generated_files()
     first = next(iter(files))
     monkeypatch.setattr(generate, "generated_files", lambda: files | {first: "other"})
@@ -69,26 +64,6 @@ def test_golden_vector(vector) -> None:
     assert vector.wire == cobs.encode(body + zlib.crc32(body).to_bytes(4, "little")) + b"\0"
     assert d.encode() == vector.wire
     assert DatagramDecoder().feed(vector.wire) == [d]
-
-
-def test_golden_vectors_carry_real_messages() -> None:
-    requests = {p.TYPE: p for p in PAYLOADS if p.__name__.endswith("Request")}
-    seen = set()
-    for vector in VECTORS:
-        if not vector.datagram.type & messages.REPLY_BIT and not vector.name.startswith("write-"):
-            requests[vector.datagram.type].unpack(vector.datagram.payload)
-            seen.add(vector.datagram.type)
-    assert len(seen) >= 10
-
-
-def test_c_header_has_the_same_sizes() -> None:
-    header = (generate.HERE / "firmware" / "generated" / "protocol.h").read_text()
-    for message in definition()["message"]:
-        for kind in ("request", "reply"):
-            name = message["name"].replace("_", "") + kind
-            cls = next((p for p in PAYLOADS if p.__name__.lower() == name), messages.EmptyReply)
-            line = f"#define EVLCP_{message['name'].upper()}_{kind.upper()}_BYTES {cls.fixed_bytes()}u"
-            assert line in header
 
 
 @st.composite
@@ -134,7 +109,6 @@ def test_values_that_do_not_fit_are_refused() -> None:
         messages.CommitRequest(0, 0, 1, 0, 0, b"short").pack()
     with pytest.raises(DatagramError, match="at most 512"):
         Datagram(4, 0, 0, 0, bytes(513)).encode()
-    assert dataclasses.is_dataclass(messages.LevelRequest)
 
 
 @settings(max_examples=200)
@@ -178,19 +152,20 @@ def reply(request: Datagram, payload: bytes = b"", status: int = 0) -> bytes:
     return Datagram(request.type | 0x80, status, request.sequence, request.session, payload).encode()
 
 
-def sent(wire: bytes) -> list[Datagram]:
-    return DatagramDecoder().feed(wire)
+def sent(client: Client, now: float = 0.0) -> list[Datagram]:
+    """What the client writes then."""
+    return DatagramDecoder().feed(client.poll(now)[0])
 
 
 def test_window_bounds_what_is_under_way() -> None:
     client = Client(Timing(), window=3)
     tokens = [client.submit(messages.CrcRequest(0, i, 1)) for i in range(5)]
-    first = sent(client.poll(0.0)[0])
+    first = sent(client)
     assert len(first) == 3
     assert not client.room
     done = client.receive(reply(first[1], messages.CrcReply(9).pack()))
     assert [(o.token, o.reply) for o in done] == [(tokens[1], messages.CrcReply(9))]
-    assert len(sent(client.poll(0.0)[0])) == 1
+    assert len(sent(client)) == 1
 
 
 def test_tries_back_off_and_end() -> None:
@@ -202,7 +177,7 @@ def test_tries_back_off_and_end() -> None:
         done = client.receive(b"")
         if done:
             break
-        assert sent(wire)
+        assert wire
         times.append(now)
         assert deadline is not None
         now = deadline
@@ -228,7 +203,7 @@ def test_time_out_follows_the_line_rate() -> None:
 def test_late_doubled_and_foreign_answers_are_ignored() -> None:
     client = Client(Timing(), first=0xFFFF)
     client.submit(messages.CrcRequest(0, 0, 1))
-    request = sent(client.poll(0.0)[0])[0]
+    request = sent(client)[0]
     assert request.sequence == 0xFFFF
     answer = messages.CrcReply(9).pack()
     other = Datagram(request.type, 0, 5, 0, b"")
@@ -240,14 +215,14 @@ def test_late_doubled_and_foreign_answers_are_ignored() -> None:
     assert client.receive(reply(request, answer))[0].reply == messages.CrcReply(9)
     assert client.receive(reply(request, answer)) == []
     client.submit(messages.StatusRequest())
-    assert sent(client.poll(1.0)[0])[0].sequence == 0
+    assert sent(client, 1.0)[0].sequence == 0
 
 
 def test_refusal_carries_status_and_detail() -> None:
     client = Client(Timing())
     for status in (messages.Status.OUT_OF_RANGE, 99):
         client.submit(messages.StopRequest())
-        request = sent(client.poll(0.0)[0])[0]
+        request = sent(client)[0]
         outcome = client.receive(reply(request, (60).to_bytes(4, "little"), int(status)))[0]
         assert (outcome.status, outcome.detail, outcome.reply) == (status, 60, None)
 
@@ -256,7 +231,7 @@ def answer(client: Client, now: float, after_s: float) -> float:
     """A CRC request that is sent again until its answer, which takes so long, is there; gives that time."""
     client.submit(messages.CrcRequest(0, 0, 1))
     wire, deadline = client.poll(now)
-    request, end = sent(wire)[0], now + after_s
+    (request,), end = DatagramDecoder().feed(wire), now + after_s
     while deadline is not None and deadline < end:
         deadline = client.poll(deadline)[1]
     (done,) = client.receive(reply(request, messages.CrcReply(9).pack()), end)
