@@ -221,7 +221,10 @@ def calibrate(
     found, misfit, covariance = solved.camera, solved.misfit, solved.covariance[: len(CAMERA_PARAMETERS)]
     covariance = covariance[:, : len(CAMERA_PARAMETERS)]
     sigma = dict(zip(CAMERA_PARAMETERS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
-    corner = {name: _at_corner(start, name) * sigma[name] for name in CAMERA_PARAMETERS}
+    # How far the image's farthest corner moves by each.
+    corners = np.array([[x, y] for x in (0.0, start.width) for y in (0.0, start.height)])
+    moved = np.linalg.norm(_slopes(start, (corners - start.centre_px) / start.focal_px), axis=1).max(0)
+    corner = {name: float(far) * sigma[name] for name, far in zip(CAMERA_PARAMETERS, moved, strict=True)}
     usual = _usual_sigma(start)
     sure = [n for n in CAMERA_PARAMETERS if corner[n] <= limit_px and sigma[n] <= _LEARNT * usual[n]]
     if "focal_mm" not in sure:
@@ -379,14 +382,6 @@ def _slopes(camera: CameraModel, direction: Floats) -> Floats:
     slope = camera.parameter_slope(direction)
     slope[:, :, 0] *= camera.focal_px / camera.focal_mm
     return slope
-
-
-def _at_corner(camera: CameraModel, name: str) -> float:
-    """How far the image's farthest corner moves by a parameter's unit, px."""
-    corners = np.array([[x, y] for x in (0.0, camera.width) for y in (0.0, camera.height)])
-    direction = (corners - camera.centre_px) / camera.focal_px
-    moved = _slopes(camera, direction)[:, :, CAMERA_PARAMETERS.index(name)]
-    return float(np.linalg.norm(moved, axis=1).max())
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,10 +8,10 @@ grid is 0.15 m over the earth, and it is never more than 4 m.
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from functools import cache, partial, reduce
+from functools import cache, reduce
 from importlib.resources import files
 from pathlib import Path
 from typing import NamedTuple
@@ -72,6 +72,10 @@ _UP = 2.0
 """How much less precise heights of satellites are than places, where only the latter's sigma is said."""
 
 
+_LETTERS = {3: ("N", "S"), 5: ("E", "W"), 10: ("M", ""), 12: ("M", "")}
+"""Fields of GGA that are a letter: hemispheres, and metres."""
+
+
 class NmeaFix(NamedTuple):
     """A GGA with its GST: the line of the first, UTC, latitude, longitude and height, sigmas.
 
@@ -110,14 +114,29 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
     sigmas: dict[float, Floats] = {}
     # One day for both kinds: the last time that is known.
     last = near.timestamp()
+
+    def value(field: int, name: str, within: tuple[float, float], piece: slice = slice(None)) -> float:
+        return csv_number(path, line, name, fields[field][piece], within)
+
+    def angle(field: int, name: str, signs: str) -> float:
+        """Degrees of ddmm.mmm and its sign, which is the next field."""
+        minutes = len(fields[field].partition(".")[0]) - 2
+        degrees = value(field, name, (0, PLACE[name][1]), slice(0, minutes))
+        degrees += value(field, name, (0, 60), slice(minutes, None)) / 60
+        return -degrees if fields[field + 1] == signs[1] else degrees
+
     for line, kind, fields in _sentences(path):
         if kind not in ("GGA", "GST") or (kind == "GGA" and fields[6] in ("", "0")):
             continue
         if kind == "GST" and not all(fields[6:9]):
             continue
-        value = partial(_value, path, line, fields)
         if kind == "GGA":
-            _check_letters(path, line, fields)
+            for field, letters in _LETTERS.items():
+                if fields[field] not in letters:
+                    said, expected = f"{fields[field]!r:.40}", " or ".join(filter(None, letters))
+                    raise ConfigError(
+                        f"{path}: line {line}: GGA's field {field} = {said}: expected {expected}"
+                    )
             value(6, "quality", (0, 9))
         hours, minutes, seconds = (
             value(1, f"{kind}'s time", (0, most), piece)
@@ -143,8 +162,7 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
                 " heights here are above the ellipsoid"
             )
         height = value(9, "height_m", PLACE["height_m"]) + value(11, "height of the geoid", (-200, 200))
-        latitude = _angle(value, fields, 2, "latitude_deg", "NS")
-        fixes.append((line, at, (latitude, _angle(value, fields, 4, "longitude_deg", "EW"), height)))
+        fixes.append((line, at, (angle(2, "latitude_deg", "NS"), angle(4, "longitude_deg", "EW"), height)))
     found = []
     for line, at, place in fixes:
         spread = sigmas.get(round(at, 3))
@@ -162,8 +180,7 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
 
 def _sentences(path: Path | str) -> Iterator[tuple[int, str, list[str]]]:
     """Line, kind and fields of each sentence, of which there are 15 or more: empty ones are added."""
-    lines = read_whole(path).decode("ascii", "replace").splitlines()
-    for line, text in enumerate(lines, 1):
+    for line, text in enumerate(read_whole(path).decode("ascii", "replace").splitlines(), 1):
         if not text.strip():
             continue
         body, _, given = text.strip().removeprefix("$").partition("*")
@@ -172,39 +189,6 @@ def _sentences(path: Path | str) -> Iterator[tuple[int, str, list[str]]]:
             raise ConfigError(f"{path}: line {line}: expected a sentence, $...*, and its checksum{expected}")
         fields = body.split(",")
         yield line, fields[0][2:], fields + [""] * 15
-
-
-_LETTERS = {3: ("N", "S"), 5: ("E", "W"), 10: ("M", ""), 12: ("M", "")}
-"""Fields of GGA that are a letter: hemispheres, and metres."""
-
-
-def _check_letters(path: Path | str, line: int, fields: list[str]) -> None:
-    for field, letters in _LETTERS.items():
-        if fields[field] not in letters:
-            expected = " or ".join(filter(None, letters))
-            raise ConfigError(
-                f"{path}: line {line}: GGA's field {field} = {fields[field]!r:.40}: expected {expected}"
-            )
-
-
-def _value(
-    path: Path | str,
-    line: int,
-    fields: list[str],
-    field: int,
-    name: str,
-    within: tuple[float, float],
-    piece: slice = slice(None),
-) -> float:
-    return csv_number(path, line, name, fields[field][piece], within)
-
-
-def _angle(value: "partial[float]", fields: list[str], field: int, name: str, signs: str) -> float:
-    """Degrees of ddmm.mmm and its sign, which is the next field."""
-    point = fields[field].partition(".")[0]
-    digits = slice(0, len(point) - 2), slice(len(point) - 2, None)
-    degrees = value(field, name, (0, PLACE[name][1]), digits[0]) + value(field, name, (0, 60), digits[1]) / 60
-    return -degrees if fields[field + 1] == signs[1] else degrees
 
 
 _SIGMAS = ("sigma_east_m", "sigma_north_m", "sigma_up_m")
@@ -253,7 +237,18 @@ class GnssLog:
                 a covariance is none, or NMEA lacks what it needs.
         """
         if Path(path).suffix.lower() == ".nmea" or _starts_with_dollar(Path(path)):
-            return cls._of_nmea(path, clock_zero, usual_sigma_m)
+            if clock_zero is None:
+                raise ConfigError(
+                    f"{path}: NMEA tells UTC: expected --clock-zero, the UTC of the camera clock's 0, as"
+                    " `evlcp receive` takes it, or a CSV file"
+                )
+            fixes = read_nmea(path, clock_zero, usual_sigma_m)
+            if not fixes:
+                raise ConfigError(f"{path}: expected a GGA with a fix or more")
+            t_us = np.array([(fix.utc - clock_zero).total_seconds() * 1e6 for fix in fixes])
+            check_rising(path, [fix.line for fix in fixes], "t_us", t_us)
+            place, spread = (np.array([fix[k] for fix in fixes]) for k in (2, 3))
+            return cls(t_us, place, spread)
         if Path(path).suffix.lower() == ".pos":
             raise ConfigError(f"{path}: a solution of RTKLIB: expected its NMEA (rnx2rtkp -n), or a CSV file")
         needed = {"t_us": ANY_NUMBER, **PLACE, **dict.fromkeys(_SIGMAS, _SIGMA_M)}
@@ -265,22 +260,6 @@ class GnssLog:
         for line, one in zip(lines, spread, strict=True):
             _check_covariance(f"{path}: line {line}", one)
         return cls(table["t_us"], np.stack([table[name] for name in PLACE], 1), spread)
-
-    @classmethod
-    def _of_nmea(cls, path: Path | str, zero: datetime | None, usual_sigma_m: float) -> "GnssLog":
-        if zero is None:
-            raise ConfigError(
-                f"{path}: NMEA tells UTC: expected --clock-zero, the UTC of the camera clock's 0, as `evlcp"
-                " receive` takes it, or a CSV file"
-            )
-        found = read_nmea(path, zero, usual_sigma_m)
-        if not found:
-            raise ConfigError(f"{path}: expected a GGA with a fix or more")
-        t_us = np.array([(fix.utc - zero).total_seconds() * 1e6 for fix in found])
-        check_rising(path, [fix.line for fix in found], "t_us", t_us)
-        return cls(
-            t_us, np.array([fix.place for fix in found]), np.array([fix.covariance_m2 for fix in found])
-        )
 
 
 def _starts_with_dollar(path: Path) -> bool:
@@ -357,12 +336,11 @@ def gnss_fix(
     )
 
 
-def attitude_of(known: Attitude | None, heading: Callable[[], tuple[float, float] | None]) -> Attitude | None:
-    """An attitude with a heading: its own, or the track's; level where nothing measures gravity."""
-    if known is not None and known.heading_deg is not None:
-        return known
-    found = heading()
-    if found is None:
+def attitude_of(known: Attitude | None, heading: tuple[float, float] | None) -> Attitude | None:
+    """An attitude with a heading: its own, or the track's, degrees, with its sigma; level where nothing
+    measures gravity.
+    """
+    if heading is None or (known is not None and known.heading_deg is not None):
         return known
     level = Attitude(gravity_sigma_deg=math.degrees(_GRAVITY_RAD)) if known is None else known
-    return Attitude(level.pitch_deg, level.roll_deg, found[0] % 360, level.gravity_sigma_deg, found[1])
+    return Attitude(level.pitch_deg, level.roll_deg, heading[0] % 360, level.gravity_sigma_deg, heading[1])

@@ -4,7 +4,6 @@ import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -268,7 +267,12 @@ class Navigator:
         """
         used = self._counts["gnss"] + self._counts["gnss_without_heading"]
         given = 0 if self._gnss is None else len(self._gnss.t_us)
-        return self._counts | {"gnss_outside": given - used, "attitude_outside": self._attitude_outside()}
+        lines = 0
+        if self._log is not None and self._span is not None:
+            first_us, last_us = self._span
+            t_us = self._log.t_us
+            lines = len(t_us) if t_us[-1] < first_us or t_us[0] > last_us else 0
+        return self._counts | {"gnss_outside": given - used, "attitude_outside": lines}
 
     @property
     def apart_m(self) -> Floats | None:
@@ -277,14 +281,6 @@ class Navigator:
         The median of the last thousand times, float64 (3,); None for none.
         """
         return np.median(self._apart, 0) if self._apart else None
-
-    def _attitude_outside(self) -> int:
-        """How many lines an attitude's file has, if all that it spans is before or after the recording."""
-        if self._log is None or self._span is None:
-            return 0
-        first_us, last_us = self._span
-        outside = self._log.t_us[-1] < first_us or self._log.t_us[0] > last_us
-        return len(self._log.t_us) if outside else 0
 
     def seen(self, first_us: float, last_us: float) -> None:
         """Take note that the recording has events from one time to another: fixes of satellites count in it.
@@ -324,15 +320,14 @@ class Navigator:
         for row in range(first, self._gnss_next):
             if self.positioner.axes is None:
                 self.positioner.axes = LocalAxes(*log.place[row].tolist())
-            attitude = attitude_of(self._attitude_at(log.t_us[row]), partial(self._heading, log.t_us[row]))
+            t_us = log.t_us[row]
+            heading = None if self._state is None else heading_at(self._state, t_us, self._imu)
+            attitude = attitude_of(self._attitude_at(t_us), heading)
             fix = gnss_fix(log, row, self.positioner.axes, attitude, self._spec)
             self._counts["gnss" if fix is not None else "gnss_without_heading"] += 1
             if fix is not None:
                 placed.append(self._placed(fix))
         return placed
-
-    def _heading(self, t_us: float) -> tuple[float, float] | None:
-        return None if self._state is None else heading_at(self._state, t_us, self._imu)
 
     def estimated_biases(self) -> list[EstimatedBias]:
         """What the drive says so far of standing errors: of the camera, the attitude, the IMU, the sites."""
@@ -355,7 +350,19 @@ class Navigator:
         if fix.refusal:
             return Placed(fix, None)
         point = self._state = trajectory_step(self._state, fix, self._spec, self._imu)
-        fix = self._compared(fix, point)
+        if point.starts:
+            self._taken = {}
+        if point.misses:
+            # What contradicts it: bars, GNSS, on which the track stood when it was left out.
+            self._counts["gnss_left_out"] += fix.source == GNSS
+            taken = self._taken.items()
+            others = tuple(n for n, t in taken if n != fix.source and fix.t_us - t <= _STANDS_US)
+            if others:
+                off = fix.enu_m - point.mean[:3]
+                self._apart.append(off if fix.source == GNSS else -off)
+            fix = replace(fix, contradicted=others)
+        else:
+            self._taken[fix.source] = fix.t_us
         self._attitude = self._attitude_at(fix.t_us) or self._attitude
         for cause in point.causes:
             # The last of many bars are kept.
@@ -366,20 +373,6 @@ class Navigator:
         filtered = self._place(point)
         self._window.append((fix, point, filtered))
         return Placed(fix, filtered, self._settle(_BLOCK) if len(self._window) == 2 * _BLOCK else ())
-
-    def _compared(self, fix: Fix, point: TrajectoryPoint) -> Fix:
-        """A fix with what contradicts it: bars, GNSS, on which the track stood when it was left out."""
-        if point.starts:
-            self._taken = {}
-        if not point.misses:
-            self._taken[fix.source] = fix.t_us
-            return fix
-        self._counts["gnss_left_out"] += fix.source == GNSS
-        others = tuple(n for n, t in self._taken.items() if n != fix.source and fix.t_us - t <= _STANDS_US)
-        if others:
-            off = fix.enu_m - point.mean[:3]
-            self._apart.append(off if fix.source == GNSS else -off)
-        return replace(fix, contradicted=others)
 
     def _settle(self, count: int) -> tuple[Settled, ...]:
         """Smooth the window, and drop its first points from it."""
@@ -397,18 +390,16 @@ class Navigator:
         latitude, longitude, height = axes.to_geodetic(point.mean[:3])
         east, north = float(point.mean[3]), float(point.mean[4])
         link = self._link
-        focal = focal_share(point.standing("camera"), link.camera, link.camera_sigma)
         return Place(
-            t_us=point.t_us,
-            latitude_deg=float(latitude),
-            longitude_deg=float(longitude),
-            height_m=float(height),
-            enu_m=point.mean[:3],
-            covariance_m2=point.covariance_m2,
-            speed_m_s=math.hypot(east, north),
-            course_deg=math.degrees(math.atan2(east, north)) % 360,
-            left_out=point.misses > 0,
-            starts=point.starts,
-            focal_share=focal[0],
-            focal_share_sigma=focal[1],
+            point.t_us,
+            float(latitude),
+            float(longitude),
+            float(height),
+            point.mean[:3],
+            point.covariance_m2,
+            math.hypot(east, north),
+            math.degrees(math.atan2(east, north)) % 360,
+            point.misses > 0,
+            point.starts,
+            *focal_share(point.standing("camera"), link.camera, link.camera_sigma),
         )

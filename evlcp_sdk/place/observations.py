@@ -277,8 +277,14 @@ class Problem:
             number = int(whole.sum())
             most = max(most, number)
             if number >= spec.min_points:
+                pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
+                sigma_px = view.sigma_px[whole, None]
+                # From the whole bar's centre: errors of its attitude turn it about that, whatever is seen.
+                arm = (view.enu_m - view.enu_m.mean(0))[whole]
+                share = np.minimum((pixel / sigma_px) ** 2, 1.0)
                 kept.append(view.transmitter)
-                parts.append(_rows_of(view, whole, spec))
+                columns = [view.enu_m[whole], arm, view.points_px[whole], 1 / sigma_px, share]
+                parts.append(np.concatenate(columns, 1))
                 sigmas.append(_sigmas_of(view, whole, spec, between))
         if not kept:
             return Rejection(
@@ -333,9 +339,13 @@ class Problem:
         if bars == 1 and self.angles.known < 3:
             why = "one bar gives a position only with the camera's heading known"
             return Rejection("heading-unknown", why)
-        if self.attitude is None and (bars < 3 or _flatness(self.points, self.bar, bars) < _INLINE):
-            many = "two bars give" if bars == 2 else "bars in line give"
-            return Rejection("gravity-unknown", f"{many} a position only with gravity known")
+        if self.attitude is None:
+            centres = np.array([self.points[part, :3].mean(0) for part in self.parts])
+            # Along the line that fits the bars best, and across it.
+            along, across = np.linalg.svd(centres - centres.mean(0), compute_uv=False)[:2]
+            if bars < 3 or across <= _INLINE * along:
+                many = "two bars give" if bars == 2 else "bars in line give"
+                return Rejection("gravity-unknown", f"{many} a position only with gravity known")
         return self
 
     @cached_property
@@ -378,16 +388,6 @@ def whole_clusters(points_px: Floats, sigma_px: Floats, width: int, height: int)
     inside = (points_px >= edge) & (points_px <= np.array([width, height]) - 1 - edge)
     counted: NDArray[np.bool_] = inside.all(1) & (sigma_px > 0) & (sigma_px < math.inf)
     return counted
-
-
-def _rows_of(view: BarView, whole: NDArray[np.bool_], spec: ErrorModel) -> Floats:
-    """A bar's whole clusters as rows of a `Problem`, float64 (n, 10)."""
-    pixel = spec.pixel_sigma_px if view.pixel_px is None else view.pixel_px
-    sigma = view.sigma_px[whole, None]
-    # From the whole bar's centre: errors of its attitude turn it about that, whatever is seen of it.
-    arm = view.enu_m - view.enu_m.mean(0)
-    share = np.minimum((pixel / sigma) ** 2, 1.0)
-    return np.concatenate([view.enu_m[whole], arm[whole], view.points_px[whole], 1 / sigma, share], 1)
 
 
 def _sigmas_of(view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, between: float) -> Floats:
@@ -441,13 +441,6 @@ def _ends(places: Floats, counted: NDArray[np.int64]) -> tuple[int, int]:
         away = np.linalg.norm(places[counted] - places[other], axis=1)
         one, other = other, int(counted[away.argmax()])
     return one, other
-
-
-def _flatness(points: Floats, bar: NDArray[np.int64], bars: int) -> float:
-    """How far the bars' centres spread across the line that fits them best, against along it."""
-    centres = np.array([points[bar == number, :3].mean(0) for number in range(bars)])
-    values = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
-    return float(values[1] / values[0]) if values[0] > 0 else 0.0
 
 
 def _whitening(attitude: Attitude, causes: Floats, angles: int, shaken_rad: float) -> Floats:

@@ -19,7 +19,7 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.values import Alternative, FailedBar, Fix, Frame, Packet
+from evlcp_sdk.values import Alternative, Fix, Frame, Packet
 
 Floats = NDArray[np.float64]
 
@@ -109,11 +109,19 @@ class Positioner:
             if packet.link not in self._kinds:
                 continue
             self.bars.hear(packet)
-            if packet.echo_of is None:
-                self._take(packet)
-            else:
+            if packet.echo_of is not None:
                 # What was not known to be a reflection before is no bar at a place, either.
                 self._frames.pop(packet.transmitter, None)
+            clusters = self._kinds[packet.link].bar.clusters
+            for frame in packet.frames if packet.echo_of is None else ():
+                if len(frame.points_px) != clusters or not np.isfinite(frame.points_t_us):
+                    continue
+                number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
+                if self._next is None:
+                    self._next = number
+                # What is late for its own grid time may still serve the next as a neighbour.
+                self._counts["frames_late"] += number < self._next
+                self._frames.setdefault(packet.transmitter, []).append(frame)
             # A packet of another bar that starts half a packet after a fix is complete one packet later; of
             # longer packets than this one, some that are not have begun before it.
             earlier = 1 - self._kinds[packet.link].packet_us / self._packet_us
@@ -123,17 +131,6 @@ class Positioner:
     def links_of(self, fix: Fix) -> str:
         """Names of the links of a fix's transmitters, each once."""
         return " ".join(dict.fromkeys(self.bars.link_of(number) for number in fix.transmitters))
-
-    def _take(self, packet: Packet) -> None:
-        clusters = self._kinds[packet.link].bar.clusters
-        for frame in packet.frames:
-            if len(frame.points_px) == clusters and np.isfinite(frame.points_t_us):
-                number = math.ceil(frame.points_t_us / self._packet_us - 0.5)
-                if self._next is None:
-                    self._next = number
-                # What is late for its own grid time may still serve the next as a neighbour.
-                self._counts["frames_late"] += number < self._next
-                self._frames.setdefault(packet.transmitter, []).append(frame)
 
     def close(self) -> list[Fix]:
         """End the stream; return the rest of the fixes."""
@@ -214,8 +211,11 @@ class Positioner:
             refused = Fix.refused(t_us, tuple(views), pose.kind, pose.detail)
             others = _alternatives(pose, here, axes)
             return replace(refused, alternatives=others, suspects=pose.suspects)
-        verified = all(self.bars.verified(n) for n in pose.transmitters)
         turn = axes.turn_from(here)
+        failed = pose.failed
+        if failed is not None:
+            spread = turn @ failed.covariance_m2 @ turn.T
+            failed = replace(failed, off_m=turn @ failed.off_m, covariance_m2=spread)
         return Fix(
             t_us=t_us,
             **_on_earth(pose.enu_m, pose.rotation, here, axes),
@@ -223,7 +223,7 @@ class Positioner:
             noise_m2=turn @ pose.noise @ turn.T,
             heading_sigma_deg=math.degrees(math.sqrt(pose.covariance[5, 5])),
             transmitters=pose.transmitters,
-            verified=verified,
+            verified=all(self.bars.verified(n) for n in pose.transmitters),
             slow_m2=turn @ pose.slow @ turn.T,
             standing={name: turn @ moves for name, moves in pose.standing.items()},
             misfit=pose.misfit,
@@ -235,15 +235,8 @@ class Positioner:
             along=turn @ pose.along,
             standing_slope={name: turn @ slope for name, slope in pose.standing_slope.items()},
             hidden_m=pose.hidden_m if math.isfinite(pose.hpl_m + pose.vpl_m) else np.full(3, math.inf),
-            failed=_turned(pose.failed, turn),
+            failed=failed,
         )
-
-
-def _turned(failed: FailedBar | None, turn: Floats) -> FailedBar | None:
-    """A bar that was left out, in other axes."""
-    if failed is None:
-        return None
-    return replace(failed, off_m=turn @ failed.off_m, covariance_m2=turn @ failed.covariance_m2 @ turn.T)
 
 
 def _on_earth(enu_m: Floats, rotation: Floats, here: LocalAxes, axes: LocalAxes) -> dict[str, Any]:

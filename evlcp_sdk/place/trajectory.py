@@ -175,8 +175,14 @@ def trajectory_step(
     """
     if state is None:
         return _first(fix)
-    ahead = _joined(_ahead(state, fix.t_us, _swing(state, fix, imu), spec), fix)
-    ahead, seen = _expected(ahead, fix)
+    swing = imu(state.t_us, fix.t_us) if imu is not None and fix.t_us > state.t_us else None
+    if swing is None:
+        # As the camera's headings do, if they are known.
+        turn = math.remainder(fix.heading_deg - state.heading_deg, 360.0)
+        recent = fix.t_us - state.heading_t_us <= _TURN_US
+        turn_rad = math.radians(turn) if recent and math.isfinite(turn) else 0.0
+        swing = Swing.even((fix.t_us - state.t_us) * 1e-6, turn_rad)
+    ahead, seen = _expected(_joined(_ahead(state, fix.t_us, swing, spec), fix), fix)
     innovation = fix.enu_m - seen @ ahead.mean
     spread = seen @ ahead.covariance @ seen.T + fix.noise_m2
     limit = chi_square(spec.false_alarm, 3) if fix.source == GNSS else spec.gate_sigmas**2
@@ -248,7 +254,9 @@ def _again(
     for i, (point, there) in enumerate(zip(points, smoothed, strict=True)):
         if point.fix is None:
             continue
-        away = point.fix.enu_m - _seen(there.causes, point.fix) @ _still(there)
+        # What changes slowly is noise.
+        still = np.where(np.arange(len(there.mean)) // 3 == _SLOW.start // 3, 0.0, there.mean)
+        away = point.fix.enu_m - _seen(there.causes, point.fix) @ still
         if point.starts:
             again[i] = replace(_first(_moved(point.fix, away)), fix=point.fix)
         elif i:
@@ -271,7 +279,8 @@ def _smoothed(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[Traje
         here = _biased(points[i], after.t_us, swing, spec)
         ahead, move, noise, causes, _ = _motion(here, after.t_us, swing, spec)
         # Causes that came later are independent of this point: what is common has passed on.
-        common = _shared(causes, after.causes)
+        at = {cause.name: columns for cause, columns in _columns(after.causes)}
+        common = [*range(_FIXED), *(i for c in causes for i in range(at[c.name].start, at[c.name].stop))]
         mean = ahead[: len(common)]
         spread = (move @ here.covariance @ move.T + noise)[: len(common), : len(common)]
         crossed = (move @ here.covariance)[: len(common)]
@@ -369,13 +378,6 @@ def _moved(fix: Fix, away_m: Floats) -> Fix:
     return replace(fix, standing=moves)
 
 
-def _still(point: TrajectoryPoint) -> Floats:
-    """A point's states without what changes slowly, which is noise, float64 (n,)."""
-    states = point.mean.copy()
-    states[_SLOW] = 0
-    return states
-
-
 def _swayed(fix: Fix) -> bool:
     """Whether its noise changes what errors that stay do to it by as much as matters in a hundred fixes."""
     noise = fix.noise_m2 + fix.slow_m2
@@ -440,7 +442,10 @@ def _motion(
 ) -> tuple[Floats, Floats, Floats, tuple[Cause, ...], float]:
     """A point at a later time, (m,), how it depends on it, (m, n), what is new, (m, m), causes, the turn."""
     dt = (t_us - point.t_us) * 1e-6
-    kept = [(c, at) for c, at in _columns(point.causes) if _stays(c, t_us)]
+    # Of what passes by, most never comes back.
+    late = [c for c in point.causes if t_us - c.t_us > _KEPT_US]
+    passed = {c.name for c in late if c.name.startswith("bar ") or c.name == "doubt"}
+    kept = [(c, at) for c, at in _columns(point.causes) if c.name not in passed]
     rows = [*range(_FIXED), *(i for _, at in kept for i in range(at.start, at.stop))]
     move = np.eye(len(point.mean))[rows]
     noise = np.zeros((len(rows), len(rows)))
@@ -467,25 +472,3 @@ def _motion(
     # The mean has them already, the move by them is what is left.
     move[:_MOTION, own.start : own.start + len(imu)] = way.by_imu
     return mean, move, noise, tuple(causes), way.turn_rad
-
-
-def _stays(cause: Cause, t_us: float) -> bool:
-    passing = cause.name.startswith("bar ") or cause.name == "doubt"
-    return not passing or t_us - cause.t_us <= _KEPT_US
-
-
-def _shared(causes: Sequence[Cause], later: Sequence[Cause]) -> list[int]:
-    """Where a later point has the motion and these causes, in their order; it has all of them."""
-    at = {cause.name: columns for cause, columns in _columns(later)}
-    return [*range(_FIXED), *(i for c in causes for i in range(at[c.name].start, at[c.name].stop))]
-
-
-def _swing(state: TrajectoryPoint, fix: Fix, imu: SwingSource | None) -> Swing:
-    """How the way turns to a fix: as the IMU says, else as the camera's headings do, if they are known."""
-    found = imu(state.t_us, fix.t_us) if imu is not None and fix.t_us > state.t_us else None
-    if found is not None:
-        return found
-    turn = math.remainder(fix.heading_deg - state.heading_deg, 360.0)
-    recent = fix.t_us - state.heading_t_us <= _TURN_US
-    turn_rad = math.radians(turn) if recent and math.isfinite(turn) else 0.0
-    return Swing.even((fix.t_us - state.t_us) * 1e-6, turn_rad)

@@ -106,11 +106,11 @@ def test_the_antenna_is_not_the_camera() -> None:
 
 def test_headings_for_the_antenna() -> None:
     compass = Attitude(1.0, 2.0, 3.0)
-    assert attitude_of(compass, lambda: None) is compass
-    assert attitude_of(None, lambda: None) is None
-    found = attitude_of(Attitude(1.0, 2.0, None, 0.3), lambda: (-10.0, 0.5))
+    assert attitude_of(compass, None) is compass
+    assert attitude_of(None, None) is None
+    found = attitude_of(Attitude(1.0, 2.0, None, 0.3), (-10.0, 0.5))
     assert found == Attitude(1.0, 2.0, 350.0, 0.3, 0.5)
-    found = attitude_of(None, lambda: (10.0, 0.5))
+    found = attitude_of(None, (10.0, 0.5))
     assert found is not None
     assert found.gravity_sigma_deg == pytest.approx(10)
 
