@@ -35,12 +35,12 @@ from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.sim import Truth, read_truth, truth_path
+from evlcp_sdk.study.compare import load_variants
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.study.match import match
 from evlcp_sdk.study.measure import bar_tallies
 from evlcp_sdk.study.score import score_frames
 from evlcp_sdk.study.tally import Statistics, Tally
-from evlcp_sdk.study.variants import load_variants
 
 SHARED = Path(__file__).parents[2] / "shared" / "recordings"
 TARGETS = Path(__file__).with_suffix(".toml")

@@ -16,8 +16,8 @@ from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.errors import ConfigError, OutputError
 
 if TYPE_CHECKING:
+    from evlcp_sdk.study.compare import Variant
     from evlcp_sdk.study.comparison import Comparison, Table
-    from evlcp_sdk.study.variants import Variant
 
 _SQLITE = b"SQLite format 3\0"
 
@@ -122,8 +122,7 @@ def _of_recordings(
 ) -> tuple[int, Comparison]:
     from evlcp_sdk.errors import InterruptedRunError
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.study.compare import comparison_of
-    from evlcp_sdk.study.variants import load_variants
+    from evlcp_sdk.study.compare import comparison_of, load_variants
 
     if not texts:
         raise typer.BadParameter("name at least one, e.g. --variant paper:", param_hint="--variant")

@@ -42,8 +42,8 @@ def report(
     """
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.report.drawing import save_plots
-    from evlcp_sdk.study.campaign.charts import charts_of
-    from evlcp_sdk.study.campaign.report import page
+    from evlcp_sdk.study.charts import charts_of
+    from evlcp_sdk.study.report import page
     from evlcp_sdk.study.store import Store
     from evlcp_sdk.study.summary import summarize
 
@@ -90,7 +90,7 @@ def as_markdown(summary: Summary) -> str:
 
 def _tables(summary: Summary) -> list[tuple[Sequence[str], Sequence[Sequence[str]], int]]:
     """Head and rows of each table that has rows, and how many of its columns say what a row is."""
-    from evlcp_sdk.study.campaign import report as of_campaign
+    from evlcp_sdk.study import report as of_campaign
     from evlcp_sdk.study.summary import beside_paper
 
     tables = [

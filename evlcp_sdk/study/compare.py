@@ -6,25 +6,118 @@ counts.
 """
 
 import math
+import re
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import EventSource, open_source
 from evlcp_sdk.io.describe import check_sensor
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.link.several import load_links, named_links
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim.truth import Truth, read_truth, truth_path
 from evlcp_sdk.stopwatch import Stopwatch
 from evlcp_sdk.study.bound import frame_bound
-from evlcp_sdk.study.comparison import STAGES, Comparison, Measured, Row, Table, Times, total_of
+from evlcp_sdk.study.comparison import STAGES, Comparison, Measured, Table, Times, total_of
 from evlcp_sdk.study.frames import FrameRow, frames_of
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.measure import statistics_of, without_truth
-from evlcp_sdk.study.variants import Variant
 from evlcp_sdk.values import Events, FrameView, Range
+
+_KEY = r"[\w-]+\s*\.\s*[\w-]+\s*(?:\.\s*[\w-]+\s*)?="
+_SETTING = re.compile(rf"{_KEY}.*", re.DOTALL)
+_AT_SETTING = re.compile(rf",(?=\s*{_KEY})")
+"""A comma is part of a value, as in `[1, 14]`, unless another setting follows it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Variant:
+    """A configuration with a name.
+
+    Attributes:
+        name: As the user calls it.
+        settings: What sets it apart, e.g. `ranging.id=centroid`.
+        links: The resolved configuration by name, which is empty for a single link.
+    """
+
+    name: str
+    settings: tuple[str, ...]
+    links: Mapping[str, Link]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Settings, digest and resolved table as JSON values; of several links under `links`, by name."""
+        described = {
+            name: {
+                "digest": link.digest,
+                "configuration": {section: dict(keys) for section, keys in link.table.items()},
+            }
+            for name, link in self.links.items()
+        }
+        return {"settings": list(self.settings)} | described.get("", {"links": described})
+
+
+def load_variants(
+    texts: Sequence[str],
+    path: Path | str | Sequence[Path | str] | None = None,
+    overrides: Sequence[str] = (),
+    registry: Registry | None = None,
+) -> tuple[Variant, ...]:
+    """Resolve variants, each `NAME:TABLE.KEY=VALUE,TABLE.KEY=VALUE`; `NAME:` is the link as it is.
+
+    Args:
+        texts: What `--variant` takes.
+        path: The `link.toml` that they share, or several; None for all defaults.
+        overrides: What `--set` takes; holds for all, and yields to a variant's own settings.
+        registry: Where algorithms are found; None for all that are installed.
+
+    Raises:
+        ConfigError: All faults, one line each.
+
+    >>> [v.settings for v in load_variants(["a:", "b:ranging.id=poc,ranging.clusters=[1, 14]"])]
+    [(), ('ranging.id=poc', 'ranging.clusters=[1, 14]')]
+    """
+    registry = Registry.load() if registry is None else registry
+    found: list[Variant] = []
+    faults: list[str] = []
+    for text in texts:
+        name, colon, rest = text.partition(":")
+        name = name.strip()
+        settings = tuple(part.strip() for part in _AT_SETTING.split(rest)) if rest.strip() else ()
+        odd = [s for s in settings if not _SETTING.fullmatch(s)]
+        if not colon or not name or odd:
+            what = f" ('{odd[0]}')" if odd else ""
+            faults.append(
+                f"--variant {text}{what}: expected NAME:TABLE.KEY=VALUE,..., e.g. mine:ranging.id=poc"
+            )
+            continue
+        if name in [v.name for v in found]:
+            faults.append(f"--variant {text}: the name '{name}' is taken by another variant")
+            continue
+        try:
+            links = load_links(path, [*overrides, *settings], registry)
+            found.append(Variant(name, settings, named_links(links)))
+        except ConfigError as fault:
+            for line in str(fault).splitlines():
+                here = line.removeprefix("--set: ")
+                faults.append(f"--variant {name}: {here}" if _is_about(here, settings) else line)
+    if faults:
+        raise ConfigError("\n".join(dict.fromkeys(faults)))
+    return tuple(found)
+
+
+def _is_about(fault: str, settings: Iterable[str]) -> bool:
+    """Whether a fault is one of these settings: it starts with the key, or names the unknown id."""
+    pairs = [[part.strip() for part in setting.split("=", 1)] for setting in settings]
+    # What names a link first names it for that link alone.
+    pairs = [[".".join(key.split(".")[-2:]), value] for key, value in pairs]
+    return any(fault.startswith(key) or f"named '{value}'" in fault for key, value in pairs)
+
 
 _WARM_PACKETS = 2
 """Packets that a variant decodes beforehand: one may be cut, so that a whole one loads every kernel."""
@@ -117,7 +210,6 @@ class _Lane:
 def compare_recording(
     url: str,
     variants: Sequence[Variant],
-    registry: Registry | None = None,
     advance: Callable[[int, int | None], None] = lambda _done, _of: None,
 ) -> Table:
     """Receive a recording with every variant, and score it where its truth lies beside it.
@@ -128,14 +220,13 @@ def compare_recording(
     Args:
         url: The recording, plugins asked first.
         variants: At least one.
-        registry: The plugins; None for all that are installed.
         advance: Called after every piece with the bytes that are done, and of how many if that is known.
 
     Raises:
         ConfigError: Its sensor, or the link it was sent with, is not that of a variant.
         InputError: The recording or its truth cannot be read.
     """
-    registry = Registry.load() if registry is None else registry
+    registry = Registry.load()
     path = truth_path(url)
     truth = read_truth(path, registry) if path.exists() else None
     if truth is not None:
@@ -166,10 +257,10 @@ def compare_recording(
         bound.settle()
     bounds_m = () if bound is None else tuple(m for m in bound.sigma_m if math.isfinite(m))
     recorded_s = (last_us - first_us) * 1e-6
-    rows = tuple(
-        Row(variant.name, lane.measured(url, truth, recorded_s, reading.processor_s))
+    rows = {
+        variant.name: lane.measured(url, truth, recorded_s, reading.processor_s)
         for variant, lane in zip(variants, lanes, strict=True)
-    )
+    }
     return Table(url, rows, bounds_m)
 
 
@@ -219,8 +310,8 @@ def comparison_of(
         beside = truth_path(table.name)
         if not beside.exists():
             notes.append(f"{table.name}: no {beside.name} beside it, so no BER and no distance error")
-    for i, variant in enumerate(variants):
-        counted = [one.rows[i].measured.statistics for one in tables]
+    for variant in variants:
+        counted = [one.rows[variant.name].statistics for one in tables]
         if ghosts := sum(one.unmatched for one in counted):
             notes.append(f"{variant.name}: {ghosts} frame{'s' * (ghosts != 1)} without a true one")
         if echoes := sum(one.echoes for one in counted):

@@ -234,26 +234,18 @@ class Bar:
 
 
 @dataclass(frozen=True)
-class Row:
-    """A variant's line."""
-
-    variant: str
-    measured: Measured
-
-
-@dataclass(frozen=True)
 class Table:
     """All variants on one recording, or on all.
 
     Attributes:
         name: Of the recording.
-        rows: One a variant.
+        rows: What each variant gave, by its name.
         bounds_m: The frames' Cramer-Rao bounds, m.
         together: It is of all the other tables' recordings.
     """
 
     name: str
-    rows: tuple[Row, ...]
+    rows: Mapping[str, Measured]
     bounds_m: tuple[float, ...] = ()
     together: bool = False
 
@@ -266,7 +258,7 @@ class Table:
         for column in COLUMNS:
             if column.rank is None:
                 continue
-            ranks = [column.rank(row.measured) for row in self.rows]
+            ranks = [column.rank(measured) for measured in self.rows.values()]
             known = [rank for rank in ranks if not math.isnan(rank)]
             if len(known) > 1:
                 for keys, rank in zip(found, ranks, strict=True):
@@ -276,7 +268,7 @@ class Table:
 
     def columns(self) -> list["Column"]:
         """Those that have a figure of any row."""
-        return [c for c in COLUMNS if any(c.cell(row.measured) != "-" for row in self.rows)]
+        return [c for c in COLUMNS if any(c.cell(measured) != "-" for measured in self.rows.values())]
 
     def charts(self) -> list[tuple[str, list[Bar]]]:
         """Of each column in which rows differ: its title, and a bar for each row that has a figure."""
@@ -285,15 +277,15 @@ class Table:
         for column in self.columns():
             if column.rank is None:
                 continue
-            ranks = [column.rank(row.measured) for row in self.rows]
+            ranks = [column.rank(measured) for measured in self.rows.values()]
             if len({rank for rank in ranks if not math.isnan(rank)}) < 2:
                 continue
             bars = []
-            for row, rank, keys in zip(self.rows, ranks, best, strict=True):
+            for (name, measured), rank, keys in zip(self.rows.items(), ranks, best, strict=True):
                 if not math.isnan(rank):
-                    low, high = _ends(row.measured, column.key)
-                    text = column.cell(row.measured)
-                    bars.append(Bar(row.variant, abs(rank), text, low, high, best=column.key in keys))
+                    low, high = _ends(measured, column.key)
+                    text = column.cell(measured)
+                    bars.append(Bar(name, abs(rank), text, low, high, best=column.key in keys))
             if column.key == "rmse_m" and self.bounds_m:
                 bound_m = rms(self.bounds_m)
                 bars.append(Bar(BOUND_NAME, bound_m, number_text(bound_m, ".4f"), bound_m, bound_m, dim=True))
@@ -307,11 +299,11 @@ class Table:
         """
         best, columns = self.best(), self.columns()
         lines = []
-        for row, keys in zip(self.rows, best, strict=True):
-            line = [(row.variant, False)]
+        for (name, measured), keys in zip(self.rows.items(), best, strict=True):
+            line = [(name, False)]
             for column in columns:
                 is_best = column.key in keys
-                line.append((column.cell(row.measured) + (MARK if is_best else ""), is_best))
+                line.append((column.cell(measured) + (MARK if is_best else ""), is_best))
             lines.append(line)
         if self.bounds_m:
             bound = [number_text(rms(self.bounds_m), ".4f") if c.key == "rmse_m" else "" for c in columns]
@@ -321,13 +313,12 @@ class Table:
     def records(self) -> list[dict[str, Any]]:
         """Every figure of each row as plain values; None where it was not measured."""
         found = []
-        for row, keys in zip(self.rows, self.best(), strict=True):
-            m = row.measured
+        for (name, m), keys in zip(self.rows.items(), self.best(), strict=True):
             tally, known = m.tally, m.tally.frames_sent > 0
             low, high = (m.ber.low, m.ber.high) if _interval(m) != "-" else (math.nan, math.nan)
             values: dict[str, Any] = {
                 "recording": self.name,
-                "variant": row.variant,
+                "variant": name,
                 "frames": m.statistics.rows,
                 "frames_sent": tally.frames_sent if known else None,
                 "frames_found": tally.frames_found if known else None,
@@ -438,11 +429,9 @@ class Comparison:
 
 def total_of(tables: Sequence[Table], name: str = "all") -> Table:
     """The table of all recordings together; they have the same variants."""
-    rows = []
-    for same in zip(*(one.rows for one in tables), strict=True):
-        rows.append(Row(same[0].variant, sum((row.measured for row in same), Measured())))
+    rows = {variant: sum((one.rows[variant] for one in tables), Measured()) for variant in tables[0].rows}
     bounds_m = tuple(bound for one in tables for bound in one.bounds_m)
-    return Table(name, tuple(rows), bounds_m, together=True)
+    return Table(name, rows, bounds_m, together=True)
 
 
 def of_campaign(summary: Summary) -> Comparison:
@@ -451,7 +440,7 @@ def of_campaign(summary: Summary) -> Comparison:
     Time, which a campaign does not keep, has no column; nor is there a bound, which needs the events.
     """
     links: dict[str, Mapping[str, Any]] = {}
-    scenes: dict[str, list[Row]] = {}
+    scenes: dict[str, dict[str, Measured]] = {}
     for series in summary.series:
         scene, link = _part(series, "scene.", "the scene"), _part(series, "link.", "the link")
         settings = [
@@ -464,10 +453,11 @@ def of_campaign(summary: Summary) -> Comparison:
             "configuration": identity.get("table", {}),
         }
         recordings = {f"seed {i}": one for i, one in enumerate(series.recordings)}
-        scenes.setdefault(scene, []).append(Row(link, Measured(recordings)))
-    tables = [Table(name, tuple(rows)) for name, rows in scenes.items()]
+        rows = scenes.setdefault(scene, {})
+        rows[link] = rows.get(link, Measured()) + Measured(recordings)
+    tables = [Table(name, rows) for name, rows in scenes.items()]
     notes = [f"campaign {summary.plan.name}, {summary.plan.digest}"]
-    if len({tuple(row.variant for row in table.rows) for table in tables}) > 1:
+    if len({tuple(table.rows) for table in tables}) > 1:
         notes.append("not every link receives every scene, so that there is no table of all scenes")
     elif len(tables) > 1:
         tables.append(total_of(tables, "all scenes"))

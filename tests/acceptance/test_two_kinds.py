@@ -19,11 +19,10 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes, load_sites
 from evlcp_sdk.sim.truth import read_truth, truth_path
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.study.compare import compare_recording
+from evlcp_sdk.study.compare import compare_recording, load_variants
 from evlcp_sdk.study.frames import frames_of, read_frames
 from evlcp_sdk.study.match import check_link
 from evlcp_sdk.study.score import links_of_result, score_frames
-from evlcp_sdk.study.variants import load_variants
 
 LAMP = """
 [bar]
@@ -47,10 +46,10 @@ def compare_and_film(folder: Path, links: list[Path], score: dict[str, Any]) -> 
     assert variants[0].links["bar"].digest == variants[1].links["bar"].digest
     assert set(variants[0].to_dict()["links"]) == {"bar", "far"}
     table = compare_recording(str(folder / "two.raw"), variants)
-    for row in table.rows:
-        total = row.measured.statistics.total()
+    for measured in table.rows.values():
+        total = measured.statistics.total()
         assert total.frames_found == sum(bar["frames_found"] for bar in score["bars"])
-        assert (total.bit_errors, row.measured.statistics.unmatched) == (0, 0)
+        assert (total.bit_errors, measured.statistics.unmatched) == (0, 0)
     assert table.bounds_m == ()
     told = film(folder / "two.raw", folder / "two.webp", links, for_ms=2.0, longest_px=200)
     assert len(told["transmitters"]) == 2

@@ -9,15 +9,14 @@ import pytest
 from evlcp_sdk.cli.report import as_markdown
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.report.drawing import save_plots
-from evlcp_sdk.study.campaign.charts import charts_of
-from evlcp_sdk.study.campaign.report import POSITION_HEAD, page, position_rows
+from evlcp_sdk.study.charts import charts_of
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
-from evlcp_sdk.study.paper import PAPER
 from evlcp_sdk.study.plan import Case, Job, Plan, make_plan
+from evlcp_sdk.study.report import POSITION_HEAD, page, position_rows
 from evlcp_sdk.study.store import Store
-from evlcp_sdk.study.summary import Series, Summary, beside_paper, summarize, verdict_of
+from evlcp_sdk.study.summary import PAPER, Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.tally import Statistics, Tally
 from tests.unit.report.test_pages import Elements
 from tests.unit.study.browser import CHROMIUM, Browser

@@ -13,14 +13,13 @@ from markupsafe import Markup, escape
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.study.collect import collect
-from evlcp_sdk.study.compare import _Watch
+from evlcp_sdk.study.compare import _Watch, load_variants
 from evlcp_sdk.study.comparison import (
     BOUND_NAME,
     COLUMNS,
     STAGES,
     Comparison,
     Measured,
-    Row,
     Table,
     Times,
     of_campaign,
@@ -30,7 +29,6 @@ from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import summarize
 from evlcp_sdk.study.tally import Statistics, Tally
-from evlcp_sdk.study.variants import load_variants
 from tests.unit.study.fake import fake_plan, run_fake
 
 
@@ -70,11 +68,11 @@ BLIND = Measured(
 
 def table(*rows: Measured, bound: float | None = 0.05) -> Table:
     names = [f"v{n}" for n in range(len(rows))]
-    return Table("REC.raw", tuple(map(Row, names, rows)), () if bound is None else (bound,))
+    return Table("REC.raw", dict(zip(names, rows, strict=True)), () if bound is None else (bound,))
 
 
 def comparison(*tables: Table) -> Comparison:
-    about = {row.variant: {"settings": [], "digest": "0" * 64} for row in tables[0].rows}
+    about = {name: {"settings": [], "digest": "0" * 64} for name in tables[0].rows}
     return Comparison(about, tables, ("a note, with <brackets>",), {"python": "3"})
 
 
@@ -141,13 +139,13 @@ def test_cells() -> None:
 def test_total_adds_recordings() -> None:
     one = table(measured(), measured(bit_errors=1))
     total = total_of([one, one])
-    assert total.rows[1].measured.tally.bit_errors == 2
-    assert total.rows[0].measured.tally.rmse_m == measured().tally.rmse_m
+    assert total.rows["v1"].tally.bit_errors == 2
+    assert total.rows["v0"].tally.rmse_m == measured().tally.rmse_m
     assert total.bounds_m == (0.05, 0.05)
     # A recording without truth adds frames and time, and takes nothing from the rest.
     mixed = total_of([one, table(BLIND, BLIND)])
-    assert mixed.rows[0].measured.tally.ber == measured().tally.ber
-    assert mixed.rows[0].measured.statistics.rows == 95
+    assert mixed.rows["v0"].tally.ber == measured().tally.ber
+    assert mixed.rows["v0"].statistics.rows == 95
 
 
 def test_a_recording_whose_name_is_a_formula_is_none_in_the_csv() -> None:
@@ -265,7 +263,7 @@ def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
     assert [one.name for one in whole.tables] == ["distance 30 m", "distance 40 m", "all scenes"]
     assert list(whole.variants) == ["link 0", "link 1"]
     counted = [series.statistics for series in summary.series]
-    rows = [row.measured.statistics for one in whole.tables for row in one.rows]
+    rows = [row.statistics for one in whole.tables for row in one.rows.values()]
     assert rows == [*counted, counted[0] + counted[2], counted[1] + counted[3]]
     page = whole.to_html()
     assert "Variants compared: link 0 and link 1 on 2 scenes" in page

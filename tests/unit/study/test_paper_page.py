@@ -5,9 +5,8 @@ from typing import Any
 
 import pytest
 
-from evlcp_sdk.study.campaign.report import comparison_rows
-from evlcp_sdk.study.paper import PAPER, Reference
-from evlcp_sdk.study.summary import Figure, PaperComparison, verdict_of
+from evlcp_sdk.study.report import comparison_rows
+from evlcp_sdk.study.summary import PAPER, Figure, PaperComparison, Reference, verdict_of
 from tests.conftest import ROOT
 
 PAGE = (ROOT / "docs" / "paper.md").read_text()

@@ -13,12 +13,12 @@ from typing import Any
 import pytest
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.study.campaign.charts import charts_of
-from evlcp_sdk.study.campaign.report import page
+from evlcp_sdk.study.charts import charts_of
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import Comparison, of_campaign
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.plan import Case, make_plan
+from evlcp_sdk.study.report import page
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import Summary, summarize
 from tests.unit.mutants import mutants, refusal

@@ -9,11 +9,10 @@ from markupsafe import Markup
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import SCRIPT
 from evlcp_sdk.spelling import counted
-from evlcp_sdk.study.campaign.charts import charts_of
+from evlcp_sdk.study.charts import charts_of
 from evlcp_sdk.study.intervals import INTERVALS, Figure, measure, number_text
-from evlcp_sdk.study.paper import PAPER_NAME
 from evlcp_sdk.study.plan import digest_of
-from evlcp_sdk.study.summary import AGREEMENT, PaperComparison, Series, Summary, beside_paper
+from evlcp_sdk.study.summary import AGREEMENT, PAPER_NAME, PaperComparison, Series, Summary, beside_paper
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
 

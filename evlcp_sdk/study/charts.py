@@ -7,8 +7,7 @@ from functools import partial
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS
 from evlcp_sdk.report.plots import DASHES, INK, Plot
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, INTERVALS, Figure, measure
-from evlcp_sdk.study.paper import PAPER, PAPER_NAME, Reference
-from evlcp_sdk.study.summary import Series, Summary
+from evlcp_sdk.study.summary import PAPER, PAPER_NAME, Reference, Series, Summary
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
 
 Dash = Sequence[int]

@@ -1,1 +1,0 @@
-"""The pages and charts of a campaign."""
