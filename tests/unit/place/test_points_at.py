@@ -1,5 +1,8 @@
-"""A bar's image points between frames: their sigmas hold, in a still image, a moving and a shaken one."""
+"""A bar's image points between frames: their sigmas hold, in a still image, a moving and a shaken one; its
+point in the camera's axes, against drawn errors.
+"""
 
+import dataclasses
 import math
 from dataclasses import replace
 
@@ -9,8 +12,10 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import BarView
-from evlcp_sdk.place.points import points_at, unseen_px
-from tests.unit.place.place_scenes import Floats, frame
+from evlcp_sdk.place.points import bar_point, points_at, unseen_px
+from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
+from evlcp_sdk.values import Frame, Range, SoftSymbols
+from tests.unit.place.place_scenes import POINTS_ONLY, Floats, by_chance, frame, square
 
 SPEC = ErrorModel(pixel_sigma_px=0.08)
 EXACT = replace(SPEC, pixel_sigma_px=0.0, early_sigma_us=0.0)
@@ -197,3 +202,56 @@ def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> Non
         midway = 1e-16 * 0.5625 * 3600.0**4
         off = abs(found.points_px[:, 0].mean() - 300.0)
         assert found.between == pytest.approx(off / midway, rel=1e-6)
+
+
+BENT = CameraModel(focal_mm=8.0, k1=-0.2, k2=0.05, p1=1e-3, p2=-1e-3, centre_x_px=650.0, centre_y_px=350.0)
+LENS = CameraSigma(0.04, 2.0, 2.0, 0.01, 0.01, 1e-4, 1e-4)
+STRETCHED = ErrorModel(
+    shaken_sigma_px=0.1, shared_sigma_px=0.17320508, shared_share=0.002, stretch_share=0.004
+)
+SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
+
+
+def ranged(x_px: float, y_px: float, distance_m: float, sigma_m: float) -> Frame:
+    return Frame(0, 0, 0, 0.0, SOFT, Range(distance_m, sigma_m, 10), None, x_px, y_px)
+
+
+def test_the_point_is_the_one_that_is_seen() -> None:
+    true = np.array([3.0, -2.0, 40.0])
+    x, y = BENT.project(true)
+    found = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT)
+    assert found is not None
+    np.testing.assert_allclose(found.point_m, true, atol=1e-6)
+    # The sigma of the distance is along the line of sight, not along the axis.
+    along = true / 40.0
+    spec = dataclasses.replace(POINTS_ONLY, stretch_share=0.001)
+    exact = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT, None, spec)
+    assert exact is not None
+    stretched = 0.1**2 + (40 * 0.001) ** 2
+    np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
+
+
+def test_every_error_is_in_its_covariance() -> None:
+    rng = np.random.default_rng(3)
+    true, squares = np.array([3.0, -2.0, 25.0]), []
+    for _ in range(400):
+        root = LENS.root(BENT)
+        off = root @ rng.normal(size=7)
+        values = {
+            name: getattr(BENT, name) + v for name, v in zip(CAMERA_PARAMETERS[1:], off[1:], strict=True)
+        }
+        lens = dataclasses.replace(BENT, focal_mm=BENT.focal_mm * (1 + off[0] / BENT.focal_px), **values)
+        shift = math.hypot(0.2, 0.002 * BENT.focal_px * 0.96 / 25)
+        x, y = lens.project(true) + rng.normal(0, shift, 2)
+        # By its length in the image a bar is the farther, the longer the lens is said to be.
+        distance = 25 * BENT.focal_px / lens.focal_px * (1 + 0.004 * rng.normal()) + 0.15 * rng.normal()
+        found = bar_point(ranged(x, y, distance, 0.15), 0.96, BENT, LENS, STRETCHED)
+        assert found is not None
+        squares.append(square(found.point_m - true, found.covariance_m2))
+    assert by_chance(squares, 3, 0.999)
+    assert np.linalg.eigvalsh(found.covariance_m2 - found.standing @ found.standing.T)[0] > 0
+
+
+@pytest.mark.parametrize(("distance_m", "sigma_m"), [(math.nan, math.nan), (40.0, math.nan)])
+def test_a_frame_without_a_distance_has_none(distance_m: float, sigma_m: float) -> None:
+    assert bar_point(ranged(640.0, 360.0, distance_m, sigma_m), 0.96, BENT) is None

@@ -150,6 +150,12 @@ def test_a_site_of_another_link_is_named() -> None:
 
 
 def test_one_bar_gives_a_fix_a_packet_time() -> None:
+    unknown = positioner([LEFT])
+    fixes = fixes_of(unknown, packets_of(RIGHT, 3, 4))
+    assert {(f.refusal, f.transmitters) for f in fixes} == {("no-site", (3,))}
+    assert fixes[0].detail == "no site is known of transmitter 3 (no id heard)"
+    assert unknown.counts["refused"] == len(fixes)
+
     p = positioner([LEFT])
     fixes = fixes_of(p, packets_of(LEFT, 0, 8))
     assert_right(fixes)
@@ -223,15 +229,6 @@ def test_dark_clusters_and_a_gap_in_time() -> None:
     fixes = fixes_of(positioner([LEFT]), stream)
     assert len(fixes) == 8
     assert_right(fixes)
-
-
-def test_an_unknown_site_is_refused() -> None:
-    p = positioner([LEFT])
-    fixes = fixes_of(p, packets_of(RIGHT, 3, 4))
-    assert {f.refusal for f in fixes} == {"no-site"}
-    assert fixes[0].transmitters == (3,)
-    assert fixes[0].detail == "no site is known of transmitter 3 (no id heard)"
-    assert p.counts["refused"] == len(fixes)
 
 
 def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
@@ -355,45 +352,30 @@ def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) 
 
 def test_an_attitude_file(tmp_path: Path) -> None:
     path = tmp_path / "attitude.csv"
-    path.write_text(
-        "t_us,heading_deg,pitch_deg,roll_deg,heading_sigma_deg\n0,359,1,-1,0.2\n1000,1,3,-1,0.4\n"
-    )
-    track = AttitudeLog.read(path)
+    # As a spreadsheet writes it.
+    text = "t_us,heading_deg,pitch_deg,roll_deg,heading_sigma_deg\n0,359,1,-1,0.2\n1000,1,3,-1,0.4\n"
+    path.write_text(text, encoding="utf-8-sig")
+    # What the file has not are those that are said.
+    track = AttitudeLog.read(path, Attitude(gravity_sigma_deg=0.7, heading_sigma_deg=3.0))
     found = track.at(500)
     assert found is not None
-    assert found.heading_deg == pytest.approx(0)
-    assert (found.pitch_deg, found.roll_deg) == (2, -1)
-    assert found.heading_sigma_deg == pytest.approx(0.3)
-    assert found.gravity_sigma_deg == Attitude().gravity_sigma_deg
+    angles = (found.pitch_deg, found.roll_deg, found.heading_deg)
+    assert angles == pytest.approx((2, -1, 0))
+    assert (found.gravity_sigma_deg, found.heading_sigma_deg) == pytest.approx((0.7, 0.3))
     assert track.at(1001) is None
-    path.write_text("t_us,pitch_deg,roll_deg\n0,1,2\n10,1,2\n")
-    level = AttitudeLog.read(path).at(3)
-    assert level is not None
-    assert level.heading_deg is None
-    # Sigmas that the file has not are those that are said; and it may come from a spreadsheet.
-    path.write_text(path.read_text(), encoding="utf-8-sig")
-    level = AttitudeLog.read(path, Attitude(gravity_sigma_deg=0.7, heading_sigma_deg=3.0)).at(3)
-    assert level is not None
-    assert (level.gravity_sigma_deg, level.heading_sigma_deg) == (0.7, 3.0)
-
-
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("t_us,roll_deg\n0,1\n", r"line 1: no column pitch_deg"),
-        ("t_us,pitch_deg,roll_deg\n0,1,2\n", r"two lines or more with rising t_us"),
-        ("t_us,pitch_deg,roll_deg\n0,1,2\n\n5,1,2\n3,1,2\n", r"line 5: t_us = 3: expected more than .* 5"),
+    head = "t_us,pitch_deg,roll_deg\n"
+    for fault, message in (
+        ("t_us,roll_deg\n0,1\n", "line 1: no column pitch_deg"),
+        (f"{head}0,1,2\n", "two lines or more with rising t_us"),
+        (f"{head}0,1,2\n\n5,1,2\n3,1,2\n", r"line 5: t_us = 3: expected more than .* 5"),
         (
             "t_us,pitch_deg,roll_deg,gravity_sigma_deg\n0,1,2,1\n1,1,2,-1\n",
             "line 3: gravity_sigma_deg = '-1'",
         ),
-    ],
-)
-def test_faults_of_an_attitude_file(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "attitude.csv"
-    path.write_text(text)
-    with pytest.raises(ConfigError, match=message):
-        AttitudeLog.read(path)
+    ):
+        path.write_text(fault)
+        with pytest.raises(ConfigError, match=message):
+            AttitudeLog.read(path)
 
 
 def test_poses_that_are_left_open_are_told_on_earth() -> None:

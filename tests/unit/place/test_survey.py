@@ -1,4 +1,4 @@
-"""A survey: bars come back within their sigmas, also by poses that are all off alike."""
+"""A survey: bars come back within their sigmas, by poses that are all off alike, or of a track of its own."""
 
 import dataclasses
 import math
@@ -10,14 +10,18 @@ from scipy import stats
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.place.calibration import CalibrationView
+from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.place.calibration import CalibrationView, KnownPose
 from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.gnss import GnssLog
+from evlcp_sdk.place.navigator import Navigator, PositionPlan
 from evlcp_sdk.place.observations import BarView, project_bars
-from evlcp_sdk.place.survey import survey
+from evlcp_sdk.place.survey import OwnPoses, survey
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from tests.unit.place.place_scenes import POINTS_ONLY, square
+from evlcp_sdk.values import Packet
+from tests.unit.place.place_scenes import POINTS_ONLY, Floats, frame, square
 
 AXES = LocalAxes(35.0, 137.0, 50.0)
 CAMERA = CameraModel(focal_mm=16.0)
@@ -25,12 +29,12 @@ SPEC = dataclasses.replace(POINTS_ONLY, bend_sigma_px=0)
 ROTATION = Attitude(3.0, 1.0, 2.0).rotation()
 
 
-def site(number: int, enu: list[float], tilt: float, heading: float) -> BarSite:
+def site_at(number: int, enu: list[float], tilt: float, heading: float) -> BarSite:
     latitude, longitude, height = (float(v) for v in AXES.to_geodetic(np.array(enu)))
     return BarSite(number, latitude, longitude, height, heading, tilt)
 
 
-BARS = [site(7, [-3.0, 45.0, 3.0], 4.0, 200.0), site(9, [3.0, 50.0, 4.0], 90.0, 80.0)]
+BARS = [site_at(7, [-3.0, 45.0, 3.0], 4.0, 200.0), site_at(9, [3.0, 50.0, 4.0], 90.0, 80.0)]
 
 
 def views(
@@ -93,7 +97,7 @@ def test_bars_come_back_within_their_sigmas() -> None:
 def test_a_bar_that_looks_bent_leans_within_its_sigma() -> None:
     """The perspective of a lean towards the camera is a bend, and the same in all views."""
     rng = np.random.default_rng(12)
-    bars = [site(7, [0.1, 45.0, 0.2], 6.0, 10.0)]
+    bars = [site_at(7, [0.1, 45.0, 0.2], 6.0, 10.0)]
     bent = dataclasses.replace(SPEC, bend_sigma_px=0.2)
     sigmas: dict[ErrorModel, list[float]] = {bent: [], SPEC: []}
     for _ in range(8):
@@ -124,3 +128,103 @@ def test_what_cannot_be_surveyed_is_told() -> None:
     wrong = dataclasses.replace(seen[3], enu_m=seen[3].enu_m + np.array([3.0, 0.0, 0.0]))
     with pytest.raises(ConfigError, match="miss one another"):
         survey([*seen[:3], wrong, *seen[4:]], AXES, 0.96, CAMERA, None, SPEC)
+
+
+LINK = load_link()
+PACKET_US = LINK.packet.packet_chips * LINK.packet.chip_us
+TRUE = Attitude(2.0, 0.5, 3.0)
+BIAS_DEG, SITE_M = 0.1, 0.02
+SPOTS = {0: (-4.0, 60.0, 3.0), 1: (4.0, 66.0, 4.0), 2: (1.0, 75.0, 5.0)}
+
+
+def site_of(number: int, off: Floats | None = None) -> BarSite:
+    enu = np.array(SPOTS[number]) + (0.0 if off is None else off)
+    latitude, longitude, height = (float(v) for v in AXES.to_geodetic(enu))
+    return BarSite(number, latitude, longitude, height, transmitter=number, position_sigma_m=SITE_M)
+
+
+def where(t_us: float) -> Floats:
+    return np.array([0.5, 10e-6 * t_us, 0.0])
+
+
+def packets(rng: np.random.Generator, first: int = 15, last: int = 45) -> list[Packet]:
+    """Two known bars all the time, a new one for a second in the middle."""
+    found = []
+    for n in range(60):
+        for number in SPOTS:
+            if number == 2 and not first <= n < last:
+                continue
+            enu = site_of(number).cluster_positions_m(16, AXES)
+            frames = []
+            for k in range(3):
+                t_us = n * PACKET_US + 2600 + k * 11_000
+                points, _ = project_bars(enu, where(t_us), TRUE.rotation(), LINK.camera)
+                points = points + rng.normal(0, 0.07, points.shape) + rng.normal(0, 0.05, 2)
+                frames.append(frame(points, 0.0707, t_us, number, n, k))
+            found.append(Packet(number, n, n * PACKET_US, 100.0, tuple(frames), 10))
+    return found
+
+
+def own_poses(rng: np.random.Generator, stream: list[Packet]) -> list[KnownPose]:
+    bias = BIAS_DEG * rng.normal(size=3)
+    told = Attitude(2.0 + bias[0], 0.5 + bias[1], 3.0 + bias[2], BIAS_DEG, BIAS_DEG)
+    sites = tuple(site_of(n, SITE_M * rng.normal(size=3)) for n in (0, 1))
+    own = OwnPoses(Navigator(LINK, PositionPlan(sites), told), lambda _t: told, "rec.raw")
+    for packet in stream:
+        own.take(packet)
+    return own.close()
+
+
+def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:
+    rng, squares, off = np.random.default_rng(3), [], []
+    for _ in range(3):
+        stream = packets(rng)
+        poses = own_poses(rng, stream)
+        assert 8 < len(poses) <= 12
+        assert all(14.5 * PACKET_US < pose.t_us < 45.5 * PACKET_US for pose in poses)
+        views = []
+        # A few of them: the survey itself is slow.
+        for pose in poses[::3]:
+            assert pose.attitude is not None
+            here = AXES.to_enu(pose.latitude_deg, pose.longitude_deg, pose.height_m)
+            off.append(np.linalg.norm(here - where(pose.t_us)) / pose.position_sigma_m)
+            points, _ = project_bars(
+                site_of(2).cluster_positions_m(16, AXES), where(pose.t_us), TRUE.rotation(), LINK.camera
+            )
+            points += rng.normal(0, 0.07, points.shape)
+            seen = (BarView(2, np.empty((0, 3)), points, np.full(16, 0.0707)),)
+            sigmas = (pose.position_sigma_m, pose.attitude.rotation(), pose.attitude_sigma_deg)
+            views.append(CalibrationView(seen, here, *sigmas))
+        (bar,) = survey(views, AXES, 0.96, LINK.camera, None, ErrorModel())
+        place = AXES.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
+        squares.append(square(place - SPOTS[2], bar.covariance_m2))
+        assert np.linalg.norm(place - SPOTS[2]) < 0.4
+    # Errors of place and of attitude, which belong together, count one by one: never too sure.
+    assert sum(squares) < stats.chi2.isf(1e-3, 9)
+    assert max(off) < 4
+
+
+def test_without_new_bars_there_are_no_poses() -> None:
+    rng = np.random.default_rng(4)
+    assert own_poses(rng, [p for p in packets(rng) if p.transmitter != 2]) == []
+
+
+def test_satellites_and_a_compass_do_without_known_bars() -> None:
+    """A new bar behind the last known one: places by satellites, angles by the log."""
+    rng = np.random.default_rng(5)
+    stream = [p for p in packets(rng, 40, 60) if p.transmitter == 2 or p.packet < 30]
+    t_us = np.arange(20) * 1e5
+    place = np.stack(AXES.to_geodetic(np.array([where(t) for t in t_us])), 1)
+    log = GnssLog(t_us, place, np.tile(0.01 * np.eye(3), (20, 1, 1)))
+    told = Attitude(2.0, 0.5, 3.0, 0.2, 0.3)
+    plan = PositionPlan((site_of(0), site_of(1)), log)
+    own = OwnPoses(Navigator(LINK, plan, told), lambda _t: told, "rec.raw")
+    for packet in stream:
+        own.take(packet)
+    poses = own.close()
+    assert len(poses) >= 4
+    for pose in poses:
+        assert pose.t_us in t_us
+        assert pose.attitude is told
+        assert pose.attitude_sigma_deg == pytest.approx(0.3)
+        assert pose.position_sigma_m < 0.2
