@@ -15,7 +15,7 @@ from tempfile import TemporaryDirectory
 
 from evlcp_sdk.link.several import load_links, named_links
 from evlcp_sdk.live import Budget, Publisher
-from evlcp_sdk.live.services import Services, Serving
+from evlcp_sdk.live.services import Serving, serve
 from evlcp_sdk.place.navigator import PositionPlan
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.attitude import AttitudeLog
@@ -42,7 +42,7 @@ def main() -> None:
     over = threading.Event()
     with (
         TemporaryDirectory() as folder,
-        Services(serving, publisher, named_links(links), name=given.recording.name, sites=sites) as services,
+        serve(serving, publisher, named_links(links), name=given.recording.name, sites=sites) as services,
         Browser(Path(folder)) as browser,
     ):
         assert services.view is not None

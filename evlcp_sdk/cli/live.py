@@ -147,7 +147,7 @@ def live(
     from evlcp_sdk.link.several import named_links
     from evlcp_sdk.live.budget import Budget
     from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.live.services import Services
+    from evlcp_sdk.live.services import serve
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.run import live as run_live
     from evlcp_sdk.signals import stop_on_request
@@ -161,10 +161,13 @@ def live(
     sinks = result.names(registry, positions=plan is not None)
     attitude, publisher = camera.attitude(place), Publisher()
     sites = plan.sites if plan is not None else ()
-    services = Services(
-        chosen, publisher, named_links(links), name=Path(url).name, sites=sites, clock_zero=clock
-    )
-    with stop_on_request() as stopped, services, _going_on(publisher, silent=lines is not None):
+    with (
+        stop_on_request() as stopped,
+        serve(
+            chosen, publisher, named_links(links), name=Path(url).name, sites=sites, clock_zero=clock
+        ) as services,
+        _going_on(publisher, silent=lines is not None),
+    ):
         _say_where(services)
         source = ReconnectingSource(partial(open_source, url, registry), stopped) if reconnect else url
         summary = run_live(

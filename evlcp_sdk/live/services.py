@@ -1,11 +1,9 @@
 """What a live run serves beside its results: the web view, NMEA and gpsd's JSON over TCP."""
 
-from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.publisher import Publisher
@@ -38,80 +36,67 @@ class Serving:
     gpsd_port: int | None = None
 
 
+@dataclass(frozen=True)
 class Services:
-    """The servers of a live run, in a thread of their own; a context manager around it.
+    """The servers of a live run; None for those that nobody asked for.
+
+    Attributes:
+        view: The web view.
+        nmea: The server of NMEA.
+        gpsd: That of gpsd's JSON.
+    """
+
+    view: Viewer | None
+    nmea: TcpOutput | None
+    gpsd: TcpOutput | None
+
+    @property
+    def dropped(self) -> dict[str, int]:
+        """Results that clients were not sent as they did not take them, by server."""
+        return {name: server.dropped for name, server in vars(self).items() if server is not None}
+
+
+@contextmanager
+def serve(
+    serving: Serving,
+    publisher: Publisher,
+    links: Mapping[str, Link],
+    *,
+    name: str,
+    sites: Sequence[BarSite] = (),
+    clock_zero: ClockZero = None,
+) -> Iterator[Services]:
+    """Serve in a thread beside a live run; in the end what there is is told, and a recording completed.
 
     Args:
-        serving: Which.
-        publisher: Where results come from.
+        serving: What.
+        publisher: Where results come from; closed in the end.
         links: The configurations by name, as `named_links` gives them.
         name: Name of the source.
         sites: Where the bars stand.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
 
-    Attributes:
-        view: The web view; None for none.
-        nmea: The server of NMEA; None for none.
-        gpsd: That of gpsd's JSON; None for none.
-
     Raises:
         ConfigError: A port cannot be had, or a package is not installed.
     """
-
-    def __init__(
-        self,
-        serving: Serving,
-        publisher: Publisher,
-        links: Mapping[str, Link],
-        *,
-        name: str,
-        sites: Sequence[BarSite] = (),
-        clock_zero: ClockZero = None,
-    ) -> None:
-        self._recorder: Recorder | None = None
-        self.view: Viewer | None = None
-        if serving.view:
-            if serving.record_to is not None:
-                camera = next(iter(links.values())).camera
-                self._recorder = Recorder(publisher, serving.record_to, camera.width, camera.height)
-            self.view = Viewer(
-                publisher,
-                links,
-                name=name,
-                sites=sites,
-                host=serving.host,
-                port=serving.port,
-                recorder=self._recorder,
-            )
-        ports = {False: serving.nmea_port, True: serving.gpsd_port}
-        self.nmea, self.gpsd = (
-            None if port is None else TcpOutput(publisher, gpsd=gpsd, port=port, clock_zero=clock_zero)
-            for gpsd, port in ports.items()
-        )
-        self._publisher = publisher
-        self._stack = ExitStack()
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        """Results that clients were not sent as they did not take them, by server."""
-        servers = {"view": self.view, "nmea": self.nmea, "gpsd": self.gpsd}
-        return {name: server.dropped for name, server in servers.items() if server is not None}
-
-    def __enter__(self) -> Self:
-        servers = [one for one in (self.view, self.nmea, self.gpsd) if one is not None]
-        with ExitStack() as stack:
-            if servers:
-                loop_thread = stack.enter_context(LoopThread())
-                for server in servers:
-                    stack.callback(loop_thread.finish, loop_thread.call(server.start()))
-            stack.callback(self._publisher.close)
-            if self._recorder is not None:
-                stack.callback(self._recorder.stop)
-            self._stack = stack.pop_all()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """End the servers, once they have told what there is; a recording is completed."""
-        self._stack.__exit__(kind, value, trace)
+    recorder = view = None
+    if serving.view:
+        if serving.record_to is not None:
+            camera = next(iter(links.values())).camera
+            recorder = Recorder(publisher, serving.record_to, camera.width, camera.height)
+        host, port = serving.host, serving.port
+        view = Viewer(publisher, links, name=name, sites=sites, host=host, port=port, recorder=recorder)
+    nmea, gpsd = (
+        None if port is None else TcpOutput(publisher, gpsd=gpsd, port=port, clock_zero=clock_zero)
+        for gpsd, port in ((False, serving.nmea_port), (True, serving.gpsd_port))
+    )
+    servers = [one for one in (view, nmea, gpsd) if one is not None]
+    with ExitStack() as stack:
+        if servers:
+            loop_thread = stack.enter_context(LoopThread())
+            for server in servers:
+                stack.callback(loop_thread.finish, loop_thread.call(server.start()))
+        stack.callback(publisher.close)
+        if recorder is not None:
+            stack.callback(recorder.stop)
+        yield Services(view, nmea, gpsd)

@@ -70,6 +70,10 @@ class TimeAxis:
         """Time since its beginning, ms."""
         return (t_us - self.zero_us) * 1e-3
 
+    def of(self, some: Iterable[Frame | Fix]) -> NDArray[np.float64]:
+        """The times of frames or fixes, in its unit, float64 (n,)."""
+        return np.array([self.ms(one.t_us) for one in some]) / self.step_ms
+
 
 def seconds_since(zero_us: float) -> TimeAxis:
     """An axis in seconds."""
@@ -91,7 +95,7 @@ def plot_distances(number: int, who: str, frames: Sequence[Frame], axis: TimeAxi
     if not frames:
         return []
     colour, name = transmitter_colour(number), f"{who}, with one sigma"
-    t = np.array([axis.ms(frame.t_us) for frame in frames]) / axis.step_ms
+    t = axis.of(frames)
     depth = np.array([frame.range.distance_m for frame in frames])
     sigma = np.array([frame.range.sigma_m for frame in frames])
     labels = label_frames(who, frames, axis)
@@ -113,9 +117,9 @@ def plot_quality(frames: Mapping[int, tuple[str, Sequence[Frame]]], axis: TimeAx
     """Quality of the frames of each transmitter over time, by its number; with what it is called."""
     quality = Plot("quality", axis.name, "quality", "quality", y_limits=(-0.03, 1.06))
     for number, (who, some) in frames.items():
-        t = [axis.ms(frame.t_us) / axis.step_ms for frame in some]
         values = [frame.soft.quality for frame in some]
-        quality.dots(t, values, transmitter_colour(number), who, label_frames(who, some, axis))
+        labels = label_frames(who, some, axis)
+        quality.dots(axis.of(some), values, transmitter_colour(number), who, labels)
     return quality
 
 
@@ -193,7 +197,7 @@ def _plot_maps(
 
 def _plot_times(points: Sequence[Settled], labels: Sequence[str], axis: TimeAxis) -> list[Plot]:
     fixes = [point.fix for point in points]
-    t = [axis.ms(fix.t_us) / axis.step_ms for fix in fixes]
+    t = axis.of(fixes)
     up, sigma = np.array([fix.enu_m[2] for fix in fixes]), np.array([_sigmas_m(fix) for fix in fixes])
     height = Plot("height", axis.name, "up, m", "height")
     for way, colour, name in _ways(points):

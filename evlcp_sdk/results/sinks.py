@@ -41,21 +41,21 @@ class Sinks:
     """Hands on what a run finds to each of its sinks.
 
     What a sink raises becomes a `PluginError` that names it, or an `OutputError` where the disk refuses.
-
-    Args:
-        classes: The sinks with their classes, in the order in which they are called.
-        folder: Where they write.
-        run: What is written down.
-
-    Raises:
-        OutputError: A file cannot be opened.
     """
 
-    def __init__(
+    def __init__(self) -> None:
+        self._folder = Path()
+        self._sinks: list[tuple[InstalledSink, Sink]] = []
+
+    def open(
         self, classes: Sequence[tuple[InstalledSink, type[Sink]]], folder: ResultFolder, run: Run
     ) -> None:
-        self._folder = folder
-        self._sinks: list[tuple[InstalledSink, Sink]] = []
+        """Make sinks of their classes, in the order in which they are called.
+
+        Raises:
+            OutputError: A file cannot be opened.
+        """
+        self._folder = folder.folder
         for installed, cls in classes:
             with self._blame(installed):
                 self._sinks.append((installed, cls(folder, run)))
@@ -110,7 +110,7 @@ class Sinks:
     @contextmanager
     def _blame(self, installed: InstalledSink) -> Iterator[None]:
         try:
-            with writing(self._folder.folder):
+            with writing(self._folder):
                 yield
         except EvlcpError:
             raise

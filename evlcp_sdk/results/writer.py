@@ -94,13 +94,13 @@ class ResultWriter:
             )
             self._lines = JsonLines(lines, filtered=run.filtered, links=bool(several), links_of=links_of)
         self._folder: ResultFolder | None = None
-        self._sinks: Sinks | None = None
+        self._sinks = Sinks()
         with ExitStack() as stack:
             if folder is not None:
                 classes = load_sinks(choose_sinks(self._registry, sinks, positions=plan is not None))
                 files = [file for s in installed_sinks(self._registry).values() for file in s.record.files]
                 self._folder = stack.enter_context(ResultFolder(folder, files))
-                self._sinks = Sinks(classes, self._folder, run)
+                self._sinks.open(classes, self._folder, run)
                 stack.enter_context(self._registry.joined(*self._sinks.all))
             self._stack = stack.pop_all()
 
@@ -109,8 +109,7 @@ class ResultWriter:
         self._readout.add(events)
         if self._navigator is not None and len(events):
             self._navigator.seen(int(events.t_us[0]), int(events.t_us[-1]))
-        if self._sinks is not None:
-            self._sinks.events(events)
+        self._sinks.events(events)
 
     def write(self, packets: Iterable[Packet]) -> None:
         """Take the receiver's next packets.
@@ -121,8 +120,7 @@ class ResultWriter:
         """
         for packet in packets:
             self._tally.add(packet)
-            if self._sinks is not None:
-                self._sinks.packet(packet)
+            self._sinks.packet(packet)
             if self._lines is not None:
                 self._lines.packet(packet)
             if self._navigator is not None:
@@ -142,19 +140,18 @@ class ResultWriter:
         if self._navigator is not None:
             fixes, settled = self._navigator.close()
             self._place(fixes)
-            if self._sinks is not None:
-                self._sinks.settle(settled)
+            self._sinks.settle(settled)
             positions = self._positions.to_dict(self._navigator)
         facts = self._facts(end, positions)
         table = summary_of(
             end,
             facts,
             self._registry.versions(),
-            {} if self._sinks is None else self._sinks.finish(),
+            self._sinks.finish(),
             None if self._pulses is None else self._pulses.to_dict(),
         )
         table["files"] = {}
-        if self._sinks is not None and self._folder is not None:
+        if self._folder is not None:
             self._sinks.conclude(table)
             table["files"] = self._folder.digests()
             write_summary(table, self._folder)
@@ -200,8 +197,7 @@ class ResultWriter:
     def _place(self, fixes: Iterable[Placed]) -> None:
         for placed in fixes:
             self._positions.add(placed)
-            if self._sinks is not None:
-                self._sinks.placed(placed)
+            self._sinks.placed(placed)
             if self._lines is not None:
                 self._lines.fix(placed.fix)
             if self._on_placed is not None:

@@ -15,7 +15,7 @@ from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 from evlcp_sdk.live import Publisher
-from evlcp_sdk.live.services import Services, Serving
+from evlcp_sdk.live.services import Serving, serve
 from evlcp_sdk.run import live, receive
 from tests.unit.live.helpers import LINKS, PATIENT, key, port_of, publish_fix, sender
 
@@ -33,7 +33,7 @@ def dies(link: socket.socket) -> None:
 def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
     publisher, over, lives = Publisher(), threading.Event(), {"nmea": 0, "gpsd": 0, "view": 0}
     serving = Serving(view=True, nmea_port=0, gpsd_port=0)
-    with Services(serving, publisher, LINKS, name="x") as services:
+    with serve(serving, publisher, LINKS, name="x") as services:
         assert services.view is not None
         url = services.view.url.replace("http", "ws") + "live"
 

@@ -13,7 +13,7 @@ import pynmea2
 import pytest
 
 from evlcp_sdk.live import Publisher
-from evlcp_sdk.live.services import Services, Serving
+from evlcp_sdk.live.services import Services, Serving, serve
 from tests.unit.live.helpers import LINKS, port_of, publish_fix
 
 GPSPIPE = shutil.which("gpspipe")
@@ -22,7 +22,7 @@ GPSPIPE = shutil.which("gpspipe")
 @pytest.fixture
 def served() -> Iterator[tuple[Publisher, Services]]:
     publisher = Publisher()
-    with Services(Serving(nmea_port=0, gpsd_port=0), publisher, LINKS, name="x") as services:
+    with serve(Serving(nmea_port=0, gpsd_port=0), publisher, LINKS, name="x") as services:
         yield publisher, services
         publisher.close()
 

@@ -25,7 +25,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io.open import open_source
 from evlcp_sdk.live import Publisher, server
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.services import Services, Serving
+from evlcp_sdk.live.services import Services, Serving, serve
 from evlcp_sdk.live.viewer import page
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.run import live
@@ -87,7 +87,7 @@ class Stage:
 @pytest.fixture
 def stage() -> Iterator[Stage]:
     publisher = Publisher()
-    with Services(Serving(view=True), publisher, LINKS, name="a name", sites=(SITE,)) as services:
+    with serve(Serving(view=True), publisher, LINKS, name="a name", sites=(SITE,)) as services:
         yield Stage(publisher, services)
         publisher.close()
 
@@ -235,7 +235,7 @@ class Failing(TextKind):
 
 def test_a_message_that_cannot_be_shown_is_counted_and_said() -> None:
     publisher = Publisher()
-    with Services(Serving(view=True), publisher, LINKS, name="a name") as services:
+    with serve(Serving(view=True), publisher, LINKS, name="a name") as services:
         stage = Stage(publisher, services)
         with stage.connect() as link:
             link.recv(30)
@@ -270,7 +270,7 @@ def test_a_recording_is_what_came(tmp_path: Path) -> None:
     publisher = Publisher()
     folder = tmp_path / "not" / "made"
     serving = Serving(view=True, record_to=folder)
-    with Services(serving, publisher, LINKS, name="x") as services:
+    with serve(serving, publisher, LINKS, name="x") as services:
         stage = Stage(publisher, services)
         with stage.connect() as link:
             link.recv(30)
@@ -324,7 +324,7 @@ def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
             ConfigError,
             match=rf"127.0.0.1:{stage.port}: .*expected an address of this machine and a port",
         ),
-        Services(Serving(view=True, port=stage.port), Publisher(), LINKS, name="x"),
+        serve(Serving(view=True, port=stage.port), Publisher(), LINKS, name="x"),
     ):
         pass
 
@@ -346,7 +346,7 @@ def test_a_browser_shows_what_the_files_say(
             enough.wait(0.2)
 
     with (
-        Services(Serving(view=True), publisher, LINKS, name=demo_raw.name) as services,
+        serve(Serving(view=True), publisher, LINKS, name=demo_raw.name) as services,
         Browser(tmp_path / "profile") as browser,
         Stage(publisher, services).connect(),  # which never says that it is ready
         sender(pieces()) as source,
