@@ -123,12 +123,7 @@ class PlaceOptions:
         typer.Option("--sites", metavar="site.toml", help="Where known bars stand: compute positions."),
     ] = None
     attitude_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--attitude",
-            metavar="FILE.csv",
-            help="The camera's attitude over time, for distances and positions.",
-        ),
+        Path | None, typer.Option("--attitude", metavar="FILE.csv", help="The camera's attitude over time.")
     ] = None
     gnss: Annotated[
         Path | None,
@@ -177,10 +172,7 @@ class CameraOptions:
     pitch_deg: Annotated[float | None, typer.Option("--pitch-deg", help="Its pitch, up.")] = None
     roll_deg: Annotated[float | None, typer.Option("--roll-deg", help="Its roll, top to the right.")] = None
     heading_sigma_deg: Annotated[
-        float,
-        typer.Option(
-            "--heading-sigma-deg", min=0, help="Standard deviation of the heading, unless a file has it."
-        ),
+        float, typer.Option("--heading-sigma-deg", min=0, help="Sigma of the heading, unless a file has it.")
     ] = 0.5
     gravity_sigma_deg: Annotated[
         float | None,
@@ -191,14 +183,10 @@ class CameraOptions:
         ),
     ] = None
     white_sigma_deg: Annotated[
-        float,
-        typer.Option(
-            "--white-sigma-deg", min=0, help="Of what is new in each angle with every line of the file."
-        ),
+        float, typer.Option("--white-sigma-deg", min=0, help="Of what is new in each angle with each line.")
     ] = 0.0
     time_sigma_us: Annotated[
-        float,
-        typer.Option("--time-sigma-us", min=0, help="Of the offset of the file's times from the camera's."),
+        float, typer.Option("--time-sigma-us", min=0, help="Of the file's times from the camera's.")
     ] = 0.0
     pps: Annotated[
         int | None,

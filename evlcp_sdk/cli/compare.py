@@ -38,9 +38,7 @@ def compare(
     overrides: Overrides = None,
     out: Annotated[
         list[Path] | None,
-        typer.Option(
-            "-o", "--out", metavar="FILE", help="Also write FILE.csv, .html or .json; may be repeated."
-        ),
+        typer.Option("-o", "--out", metavar="FILE", help="Also write .csv, .html or .json; repeat it."),
     ] = None,
     jobs: Annotated[
         int,

@@ -22,11 +22,7 @@ def convert(
     ],
     size: Annotated[
         str | None,
-        typer.Option(
-            "--size",
-            metavar="WIDTHxHEIGHT",
-            help="Of the sensor, where SOURCE does not say it.",
-        ),
+        typer.Option("--size", metavar="WIDTHxHEIGHT", help="Of the sensor, where SOURCE does not say."),
     ] = None,
     format: Annotated[
         str | None,

@@ -16,10 +16,7 @@ if TYPE_CHECKING:
 def diagnose(
     recording: Annotated[str, typer.Argument(metavar="REC", help="A recording.")],
     out: Annotated[
-        Path | None,
-        typer.Option(
-            "-o", "--out", metavar="PAGE.html", help="Also write one page with maps of the picture."
-        ),
+        Path | None, typer.Option("-o", "--out", metavar="PAGE.html", help="Also write a page with maps.")
     ] = None,
     link_file: LinkFile = None,
     overrides: Overrides = None,

@@ -47,16 +47,11 @@ class ServingOptions:
         typer.Option("--view-port", min=0, max=65535, metavar="PORT", help="Its port; 0: any that is free."),
     ] = 0
     view_record: Annotated[
-        bool,
-        typer.Option(
-            "--view-record", help="Who looks on may start and stop recordings, into OUT or this folder."
-        ),
+        bool, typer.Option("--view-record", help="Who looks on may record, into OUT or this folder.")
     ] = False
     nmea_port: Annotated[
         int | None,
-        typer.Option(
-            "--nmea-port", min=0, max=65535, metavar="PORT", help="Serve positions as NMEA-0183 by TCP."
-        ),
+        typer.Option("--nmea-port", min=0, max=65535, metavar="PORT", help="Serve NMEA-0183 by TCP."),
     ] = None
     gpsd_port: Annotated[
         int | None,
@@ -114,9 +109,7 @@ def live(
     ] = False,
     waiting_ms: Annotated[
         float,
-        typer.Option(
-            "--waiting-ms", min=1.0, help="How long events may wait before something is left out, in ms."
-        ),
+        typer.Option("--waiting-ms", min=1.0, help="How long events may wait before some are left out."),
     ] = 20.0,
     serving: ServingOptions,
 ) -> None:

@@ -52,17 +52,11 @@ def receive(
     *,
     recordings: Annotated[
         list[str],
-        typer.Argument(
-            metavar="REC...", help="Recordings, or what a plugin can open; - for RAW on standard input."
-        ),
+        typer.Argument(metavar="REC...", help="Recordings, or what a plugin opens; - for RAW on stdin."),
     ],
     link: LinkOptions,
     link_mode: Annotated[
-        LinkMode,
-        typer.Option(
-            "--link",
-            help="auto: chip rate, modulation, frames per packet and per pilot are tried, the best taken.",
-        ),
+        LinkMode, typer.Option("--link", help="auto: try other rates, modulations, packets; take the best.")
     ] = LinkMode.GIVEN,
     strict: Annotated[bool, typer.Option("--strict", help="End with 1 where there are warnings.")] = False,
     result: ResultOptions,

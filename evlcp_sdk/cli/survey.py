@@ -27,9 +27,7 @@ def survey(
     out: Annotated[Path, typer.Option("-o", "--out", metavar="site.toml", help="Where the bars stand.")],
     poses: Annotated[
         Path | None,
-        typer.Option(
-            "--poses", metavar="poses.csv", help="Where the camera was, how it was turned, and when."
-        ),
+        typer.Option("--poses", metavar="poses.csv", help="Where the camera was, how turned, when."),
     ] = None,
     place: PlaceOptions,
     link_files: LinkFiles = None,

@@ -16,10 +16,7 @@ def video(
         str, typer.Argument(metavar="REC", help="A recording, or what a plugin can open twice.")
     ],
     out: Annotated[
-        Path,
-        typer.Option(
-            "-o", "--out", metavar="FILM", help="Where the film goes: NAME.webp, NAME.gif or NAME.mp4."
-        ),
+        Path, typer.Option("-o", "--out", metavar="FILM", help="The film: NAME.webp, NAME.gif or NAME.mp4.")
     ],
     link_files: LinkFiles = None,
     overrides: Overrides = None,

@@ -56,7 +56,7 @@ class BarSite:
         Field(
             gt=0,
             le=100,
-            description="From its first to its last LED's outer edge; of clusters not in line, its height.",
+            description="Between its outermost LEDs' edges; of clusters not in line, its height.",
         ),
     ] = 0.96
     transmitter: Annotated[

@@ -50,11 +50,7 @@ class BarSpec:
         ),
     ] = None
     width_m: Annotated[
-        float,
-        Field(
-            gt=0,
-            description="Width of one column of LEDs, as it is lit; a ring and a table say it themselves.",
-        ),
+        float, Field(gt=0, description="Lit width of a column of LEDs; a ring and a table say it themselves.")
     ] = 0.005
     lean_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans to the right.")] = 0.0
     tilt_deg: Annotated[float, Field(gt=-90, lt=90, description="Its top leans away from the camera.")] = 0.0
@@ -128,10 +124,7 @@ class ReflectionSpec:
     share: Annotated[float, Field(gt=0, le=1, description="Share of the bar's light.")] = 0.2
     gap_m: Annotated[
         float,
-        Field(
-            description="road: from the bar's lower end down to its image; rail: from the bar to its image,"
-            " to the right."
-        ),
+        Field(description="road: from the bar's lower end down to its image; rail: from the bar to it."),
     ] = 0.1
     shift_px: Annotated[
         tuple[float, float], Field(description="window: shift of the image to the right and down.")
@@ -180,10 +173,7 @@ class LensSpec:
         float, Field(ge=0.05, description="Sigma of the blur that is left in focus; a guess.")
     ] = 0.36
     wings: Annotated[
-        bool,
-        Field(
-            description="The near skirt of an ideal lens: its Airy pattern's wings; without: its core only."
-        ),
+        bool, Field(description="The Airy pattern's wings of an ideal lens; without: its core only.")
     ] = True
     halo: Annotated[float, Field(ge=0, lt=1, description="Share of the light in the halo; a guess.")] = 0.02
     halo_px: Annotated[float, Field(ge=2, le=400, description="Sigma of the halo; a guess.")] = 40.0
@@ -222,10 +212,7 @@ class MotionSpec:
         float, Field(gt=0, le=10, description="Time constant of its decay; a guess.")
     ] = 0.1
     path_file: Annotated[
-        str | None,
-        Field(
-            description="CSV of t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg instead of the straight approach."
-        ),
+        str | None, Field(description="CSV of t_s,x_m,y_m,z_m,yaw_deg,pitch_deg,roll_deg for the approach.")
     ] = None
 
 
@@ -275,10 +262,7 @@ class BackgroundSpec:
         float, Field(ge=2, le=64, description="Distance at which its correlation is 1 / e; a guess.")
     ] = 12.0
     texture_step_px: Annotated[
-        float,
-        Field(
-            ge=0.1, le=4, description="How far it moves in the image until the light on a pixel follows it."
-        ),
+        float, Field(ge=0.1, le=4, description="How far it moves until the light on a pixel follows it.")
     ] = 0.8
     around_px: Annotated[
         int,

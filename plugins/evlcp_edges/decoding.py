@@ -47,9 +47,7 @@ class EdgeDecoding(Decoding):
     independent_pixels: Annotated[
         float,
         Field(
-            gt=0,
-            le=1,
-            description="Share of the pixels that err by themselves; neighbours share light and motion.",
+            gt=0, le=1, description="Share of the pixels that err by themselves, not with their neighbours."
         ),
     ] = 0.25
 

@@ -46,10 +46,7 @@ class KalmanTracking(Tracking):
         Field(ge=0, description="Change of image speed in a jolt (sigma): a pothole peaks at 7000 px/s."),
     ] = 3000.0
     gate: Annotated[
-        float,
-        Field(
-            gt=1, description="Sigmas from the prediction beyond which a measurement is a jolt's or left out."
-        ),
+        float, Field(gt=1, description="Sigmas off the prediction from which on it is a jolt's or left out.")
     ] = 5.0
     pooled_frames: Annotated[
         int, Field(ge=1, description="Frames over which the measurement's variance is averaged.")
