@@ -85,14 +85,9 @@ def test_a_name_that_is_not_there() -> None:
 
 def imported(code: str) -> set[str]:
     """All modules that a fresh interpreter has after a statement."""
-    done = subprocess.run(
-        [sys.executable, "-c", f"import sys\n{code}\nprint(*sys.modules)"],
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=60,
-    )
-    return set(done.stdout.split())
+    command = [sys.executable, "-c", f"import sys\n{code}\nprint(*sys.modules)"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60)
+    return set(done.stdout.splitlines()[-1].split())
 
 
 def test_importing_the_package_imports_nothing_else() -> None:
@@ -100,10 +95,29 @@ def test_importing_the_package_imports_nothing_else() -> None:
     assert more == {"evlcp_sdk"}
 
 
-@pytest.mark.parametrize("name", ["load_link", "hookimpl", "Registry", "ConfigError"])
-def test_a_light_name_imports_no_kernels(name: str) -> None:
-    more = imported(f"import evlcp_sdk as evlcp; evlcp.{name}")
-    assert not {"numba", "scipy", "evlcp_sdk.rx", "evlcp_sdk.sim", "matplotlib"} & more
+COMMAND = """
+from evlcp_sdk.cli.main import main
+sys.argv = ["evlcp", {!r}]
+try: main()
+except SystemExit as end: assert not end.code, end
+"""
+LIGHT = "numba scipy evlcp_sdk.rx evlcp_sdk.sim matplotlib"
+
+
+@pytest.mark.parametrize(
+    ("code", "heavy"),
+    [
+        *((f"import evlcp_sdk as evlcp; evlcp.{name}", LIGHT) for name in ("load_link", "hookimpl")),
+        *((f"import evlcp_sdk as evlcp; evlcp.{name}", LIGHT) for name in ("Registry", "ConfigError")),
+        ("import evlcp_sdk.io", "numba scipy faery"),
+        ("import evlcp_sdk.sim.truth", "numba scipy"),
+        ("import evlcp_sdk.run", "scipy.ndimage scipy.special scipy.linalg scipy.optimize"),
+        (COMMAND.format("--help"), "numpy numba scipy matplotlib"),
+        (COMMAND.format("plugins"), "numpy numba scipy matplotlib llvmlite"),
+    ],
+)
+def test_what_is_light_imports_nothing_heavy(code: str, heavy: str) -> None:
+    assert not {*heavy.split()} & imported(code)
 
 
 @pytest.mark.parametrize(

@@ -75,27 +75,6 @@ def test_help_teaches_by_example(evlcp: Evlcp, command: str) -> None:
     assert "\x1b" not in done.out
 
 
-def test_help_imports_nothing_heavy() -> None:
-    code = (
-        "import sys\n"
-        "from evlcp_sdk.cli.main import main\n"
-        "sys.argv = ['evlcp', '--help']\n"
-        "try:\n    main()\nexcept SystemExit:\n    pass\n"
-        "heavy = {'numpy', 'numba', 'scipy', 'matplotlib'} & set(sys.modules)\n"
-        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True, stdout=subprocess.DEVNULL)
-
-
-def test_what_receives_is_imported_without_what_only_some_of_it_needs() -> None:
-    code = (
-        "import sys, evlcp_sdk.run\n"
-        "heavy = {'scipy.ndimage', 'scipy.special', 'scipy.linalg', 'scipy.optimize'} & set(sys.modules)\n"
-        "sys.exit(f'imported {heavy}' if heavy else 0)\n"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
-
-
 def test_a_plain_receive_loads_what_it_needs_and_lets_the_collector_rest_until_then(tmp_path: Path) -> None:
     write_events(tmp_path / "one.raw", Events.of([0], [640], [360], [1]), 1280, 720)
     code = (

@@ -2,8 +2,6 @@
 
 import hashlib
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -44,9 +42,3 @@ def test_columns_have_the_expected_digests_in_every_format(name, tmp_path):
         assert digests_of(got) == expected["sha256"]
         for column in ("t_us", "channel", "value"):
             assert np.array_equal(getattr(edges, column), getattr(triggers, column))
-
-
-def test_import_is_cheap():
-    code = "import sys, evlcp_sdk.io; print(sorted({'numba', 'scipy', 'faery'} & set(sys.modules)))"
-    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert out.strip() == "[]"

@@ -1,8 +1,6 @@
 """The truth beside a recording: what a file says comes back, and what it cannot mean is refused."""
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -159,12 +157,6 @@ def test_another_revision_with_the_same_codes_is_a_warning() -> None:
     (warning,) = truth_from_table(table, here, source="t.json").warnings
     assert warning.startswith("t.json: links.")
     assert "(revisions: ranging own 1 there, 2 here); the codes are the same" in warning
-
-
-def test_a_truth_is_read_without_the_kernels() -> None:
-    says = "import sys, evlcp_sdk.sim.truth; print('numba' in sys.modules, 'scipy' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", says], capture_output=True, text=True, check=True)
-    assert done.stdout == "False False\n"
 
 
 def test_a_truth_changed_at_any_place_is_a_truth_or_refused_in_one_line(tmp_path: Path) -> None:
