@@ -2,6 +2,7 @@
 
 import ctypes
 from functools import cache
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,39 +12,54 @@ from firmware_host.emulators.led_record import RECORD, LedRecord
 from firmware_host.protocol.generated.requests import LEDS, ROW_BYTES
 
 
+class _Health(ctypes.Structure):
+    _fields_: ClassVar = [
+        ("temperature_dc", ctypes.c_int16),
+        ("faults", ctypes.c_uint8),
+        ("open_leds", ctypes.c_uint8 * ROW_BYTES),
+    ]
+
+
+class Bench(ctypes.Structure):
+    """What can be read and turned on a board: `struct native_bench` of `hal/native/board.h`."""
+
+    _fields_: ClassVar = [
+        ("output", ctypes.c_void_p),
+        ("output_length", ctypes.c_size_t),
+        ("records", ctypes.c_void_p),
+        ("record_count", ctypes.c_size_t),
+        ("flash", ctypes.c_void_p),
+        ("flash_bytes", ctypes.c_size_t),
+        ("images", ctypes.c_void_p * 2),
+        ("pulse_period", ctypes.c_double),
+        ("pulse_next", ctypes.c_double),
+        ("late", ctypes.c_uint32),
+        ("power_left", ctypes.c_uint32),
+        ("power_fails", ctypes.c_bool),
+        ("level_fails", ctypes.c_bool),
+        ("flash_fails", ctypes.c_bool),
+        ("running", ctypes.c_uint8),
+        ("level_ma", ctypes.c_uint16),
+        ("shown", ctypes.c_uint8 * ROW_BYTES),
+        ("health", _Health),
+    ]
+
+
 @cache
 def _library() -> ctypes.CDLL:
     library = ctypes.CDLL(str(build.native_library()))
-    handle, size = ctypes.c_void_p, ctypes.c_size_t
-    for name, result, arguments in (
-        ("new", handle, [ctypes.c_char_p]),
-        ("free", None, [handle]),
-        ("reset", None, [handle]),
-        ("run_us", None, [handle, ctypes.c_uint64]),
-        ("input", None, [handle, ctypes.c_char_p, size]),
-        ("output", size, [handle, ctypes.c_char_p, size]),
-        ("record_count", size, [handle]),
-        ("take_records", None, [handle, handle]),
-        ("set_health", None, [handle, ctypes.c_int16, ctypes.c_uint8, ctypes.c_uint8]),
-        ("set_late", None, [handle, ctypes.c_uint32]),
-        ("set_failures", None, [handle, ctypes.c_uint8, ctypes.c_uint8]),
-        ("shown", None, [handle, ctypes.c_char_p]),
-        ("level", ctypes.c_uint16, [handle]),
-        ("running", ctypes.c_uint8, [handle]),
-        ("set_pulse", None, [handle, ctypes.c_double, ctypes.c_double]),
-        ("cut_power", None, [handle, ctypes.c_uint32]),
-        ("image", None, [handle, ctypes.c_uint8, ctypes.c_char_p]),
-        ("flash_bytes", size, []),
-        ("flash", None, [handle, ctypes.c_char_p]),
-        ("set_flash", None, [handle, ctypes.c_char_p]),
-    ):
-        function = getattr(library, f"board_{name}")
-        function.restype, function.argtypes = result, arguments
+    library.board_new.restype = ctypes.POINTER(Bench)
+    library.board_run_us.argtypes = [ctypes.POINTER(Bench), ctypes.c_uint64]
+    library.board_input.argtypes = [ctypes.POINTER(Bench), ctypes.c_char_p, ctypes.c_size_t]
     return library
 
 
 class SimulatedBoard:
     """One board, of a number of 12 bytes; time moves only in `run`.
+
+    Attributes:
+        bench: What can be read and turned on it.
+        now_us: Time since it was made, us.
 
     Raises:
         ToolchainError: The firmware cannot be built.
@@ -54,13 +70,12 @@ class SimulatedBoard:
     def __init__(self, unique_id: bytes = b"simulated   ") -> None:
         self._c = _library()
         self._board = self._c.board_new(unique_id)
-        self._room = ctypes.create_string_buffer(1 << 16)
+        self.bench: Bench = self._board.contents
         self.now_us = 0
 
     def __del__(self) -> None:
-        if getattr(self, "_board", None):
+        if hasattr(self, "bench"):
             self._c.board_free(self._board)
-            self._board = None
 
     def run(self, us: int) -> None:
         """Let `us` microseconds pass."""
@@ -77,14 +92,13 @@ class SimulatedBoard:
 
     def sent(self) -> bytes:
         """Bytes the board has sent since the last call."""
-        count = self._c.board_output(self._board, self._room, len(self._room))
-        return ctypes.string_at(self._room, count)
+        count, self.bench.output_length = self.bench.output_length, 0
+        return ctypes.string_at(self.bench.output, count)
 
     def take_records(self) -> NDArray[np.void]:
         """LED outputs since the last call, an array of `RECORD`."""
-        table = np.zeros(self._c.board_record_count(self._board), RECORD)
-        self._c.board_take_records(self._board, table.ctypes.data)
-        return table
+        count, self.bench.record_count = self.bench.record_count, 0
+        return np.frombuffer(ctypes.string_at(self.bench.records or 0, count * RECORD.itemsize), RECORD)
 
     def records(self) -> LedRecord:
         """LED outputs since the last call."""
@@ -92,53 +106,16 @@ class SimulatedBoard:
 
     def flash(self) -> bytes:
         """The slots of SAVE."""
-        room = ctypes.create_string_buffer(self._c.board_flash_bytes())
-        self._c.board_flash(self._board, room)
-        return room.raw
+        return ctypes.string_at(self.bench.flash, self.bench.flash_bytes)
 
     def set_flash(self, content: bytes) -> None:
         """Be a board that has these slots, and has just been reset."""
-        self._c.board_set_flash(self._board, content)
+        ctypes.memmove(self.bench.flash, content, self.bench.flash_bytes)
+        self.reset()
 
     def shown(self) -> NDArray[np.uint8]:
         """The LEDs now, uint8 (96,)."""
-        row = ctypes.create_string_buffer(ROW_BYTES)
-        self._c.board_shown(self._board, row)
-        return np.unpackbits(np.frombuffer(row.raw, np.uint8))[:LEDS]
-
-    def level_ma(self) -> int:
-        """The LED current that the hardware is set to, mA."""
-        return int(self._c.board_level(self._board))
-
-    def running(self) -> int:
-        """The image of the firmware that runs: 0 the first, 1 or 2 one that came by an update."""
-        return int(self._c.board_running(self._board))
-
-    def image(self, image: int, count: int) -> bytes:
-        """The first bytes in the place of image 1 or 2."""
-        room = ctypes.create_string_buffer(1 << 16)
-        self._c.board_image(self._board, image, room)
-        return room.raw[:count]
-
-    def cut_power(self, left: int) -> None:
-        """Let the flash do so many words and erases more, the last one by half; 0: all of them."""
-        self._c.board_cut_power(self._board, left)
-
-    def set_pulse(self, period_ticks: float, first_tick: float) -> None:
-        """Pulses on the pulse input, in ticks of the board's own crystal; a period of 0: none."""
-        self._c.board_set_pulse(self._board, period_ticks, first_tick)
-
-    def set_health(self, temperature_c: float = 25.0, faults: int = 0, open_led: int = 255) -> None:
-        """What the sensors report from now on; an `open_led` of 255 is none."""
-        self._c.board_set_health(self._board, round(10 * temperature_c), faults, open_led)
-
-    def set_late(self, ticks: int) -> None:
-        """Delay that every chip reports from now on, ticks."""
-        self._c.board_set_late(self._board, ticks)
-
-    def set_failures(self, level: bool = False, flash: bool = False) -> None:
-        """Hardware that does not follow."""
-        self._c.board_set_failures(self._board, level, flash)
+        return np.unpackbits(np.array(self.bench.shown, np.uint8))[:LEDS]
 
 
 class SimulatedLine:

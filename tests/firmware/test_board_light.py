@@ -197,9 +197,9 @@ def test_a_burst_beyond_the_limits_goes_dark_before_it_is_shown(device: Simulate
 def test_the_led_test_keeps_to_the_mean_current(device: SimulatedBoard, board: Board) -> None:
     board.level(60)
     board.test_leds(3, 4, 50)
-    assert (device.level_ma(), board.status().level_ma) == (30, 60)
+    assert (device.bench.level_ma, board.status().level_ma) == (30, 60)
     device.run(60_000)
-    assert device.level_ma() == 30
+    assert device.bench.level_ma == 30
     device.run(60_000)
     assert board.status().state == State.DARK
-    assert device.level_ma() == 60
+    assert device.bench.level_ma == 60

@@ -138,16 +138,16 @@ def test_a_control_request_is_done_once_and_none_that_is_older(wire: Wire) -> No
     assert wire.ask(level(40)) == Status.OK
     assert wire.ask(level(30), sequence=one) == Status.STALE
     assert wire.ask(level(30), sequence=wire.sequence) == Status.OK, "answered again"
-    assert wire.device.level_ma() == 40
+    assert wire.device.bench.level_ma == 40
     # the sequence wraps, and queries in between do not make a later control request look old
     for _ in range(700):
         wire.sequence = (wire.sequence + 99) & 0xFFFF
         wire.ask(protocol.StatusRequest())
     assert wire.each(level(50), level(61)) == [Status.OK, Status.OUT_OF_RANGE]
     assert wire.detail == 60
-    wire.device.set_failures(level=True)
+    wire.device.bench.level_fails = True
     assert wire.ask(level(10)) == Status.HARDWARE_FAULT
-    assert (wire.device.level_ma(), wire.status().level_ma) == (50, 50)
+    assert (wire.device.bench.level_ma, wire.status().level_ma) == (50, 50)
 
 
 def test_dark_until_commit_and_start(wire: Wire) -> None:
@@ -269,10 +269,10 @@ def test_limits_of_configure(wire: Wire) -> None:
 def test_a_chip_that_comes_a_whole_chip_late_ends_in_the_dark(wire: Wire) -> None:
     wire.committed()
     wire.ask(START)
-    wire.device.set_late(999)
+    wire.device.bench.late = 999
     wire.chips(2)
     assert (wire.status().state, wire.status().lateness_max_ticks) == (State.PLAYING, 999)
-    wire.device.set_late(1000)
+    wire.device.bench.late = 1000
     wire.chips(2)
     assert wire.status().state == State.FAULT
     assert not wire.device.shown().any()

@@ -18,7 +18,7 @@ def crystal(ppm: float = 0.0) -> tuple[SimulatedBoard, Board]:
     """A programmed board whose crystal is off by `ppm`, with a pulse of a true clock each second."""
     device = SimulatedBoard()
     rate = 1 + ppm * 1e-6
-    device.set_pulse(1e7 * rate, 1e7 * rate * 0.5)
+    device.bench.pulse_period, device.bench.pulse_next = 1e7 * rate, 1e7 * rate * 0.5
     board = board_on(device)
     provision(board, some_bank(2), Settings(start=False))
     return device, board
@@ -41,7 +41,7 @@ def test_two_boards_that_are_60_ppm_apart_stay_within_a_tenth_of_a_chip_until_th
         assert state_of(board) == (State.PLAYING, 0)
         found.append(times_us(device, ppm)[:200_000])
         # without pulses it is named, and playing goes on by its own crystal
-        device.set_pulse(0, 0)
+        device.bench.pulse_period, device.bench.pulse_next = 0, 0
         device.run(3_000_000)
         assert state_of(board) == (State.PLAYING, BoardFault.PULSE)
         assert np.abs(np.diff(times_us(device, ppm)) - CHIP_US).max() < 1
@@ -76,13 +76,13 @@ def test_start_at_a_clock() -> None:
 
 def test_a_pulse_that_does_not_come_is_told_and_the_board_stopped() -> None:
     device, board = crystal()
-    device.set_pulse(0, 0)
+    device.bench.pulse_period, device.bench.pulse_next = 0, 0
     assert start_together([board]) == [3]
     says = r"has not come in 2 s \(pulses since reset: simulated: has counted 0\): check the wire"
     with pytest.raises(LineError, match=says):
         wait_for_pulse([board], 2.0)
     assert board.status().state == State.DARK
-    device.set_pulse(1e6, 1e5)
+    device.bench.pulse_period, device.bench.pulse_next = 1e6, 1e5
     device.run(500_000)
     start_together([board], 10)
     wait_for_pulse([board], 2.0)

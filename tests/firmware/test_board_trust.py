@@ -103,11 +103,11 @@ def test_any_bit_that_is_changed_is_found(device: SimulatedBoard) -> None:
             continue
         bad = Datagram(b[0], b[1], int.from_bytes(b[2:4], "little"), good.session, bytes(b[4:]))
         answers |= set(replayed(line, bad.encode()))
-        assert device.level_ma() == 20
+        assert device.bench.level_ma == 20
     # a sequence of another number, a type of another length or none at all: never done
     assert answers <= {Status.BAD_SEAL, Status.NEEDS_KEY, Status.UNKNOWN_TYPE, Status.BAD_LENGTH}
     assert replayed(line, wire) == [Status.OK]
-    assert device.level_ma() == 33
+    assert device.bench.level_ma == 33
 
 
 def replayed(line: SimulatedLine, wire: bytes) -> list[int]:
@@ -134,7 +134,7 @@ def test_what_was_recorded_works_again_on_a_board_without_a_key_and_not_on_one_w
     wire = session_of(plain, None)
     plain.reset()
     assert set(replayed(SimulatedLine(plain), wire)) >= {Status.OK}
-    assert plain.level_ma() == 15, "the attack that a key is against"
+    assert plain.bench.level_ma == 15, "the attack that a key is against"
 
     device = SimulatedBoard()
     board = locked(device)
@@ -169,7 +169,7 @@ def test_nor_is_anything_done_twice_in_a_session(device: SimulatedBoard, wraps: 
             board.status()
         client._tokens = client._tokens // 65536 * 65536
     assert replayed(SimulatedLine(device), first) == [Status.BAD_SEAL if wraps else Status.STALE]
-    assert device.level_ma() == 44
+    assert device.bench.level_ma == 44
 
 
 def test_who_has_no_key_does_not_stand_in_for_the_host(device: SimulatedBoard) -> None:
@@ -223,7 +223,7 @@ def test_a_key_is_kept_and_changed(device: SimulatedBoard) -> None:
     board.level(33)
     board.set_key(None)
     board_on(device).level(34)
-    assert device.level_ma() == 34
+    assert device.bench.level_ma == 34
 
 
 def test_a_noisy_line_with_a_key(device: SimulatedBoard) -> None:
@@ -231,7 +231,7 @@ def test_a_noisy_line_with_a_key(device: SimulatedBoard) -> None:
     board.set_key(KEY)
     for level in range(40):
         board.level(level)
-        assert device.level_ma() == board.status().level_ma == level
+        assert device.bench.level_ma == board.status().level_ma == level
     board.blank()
     assert board.session.client.retries
 

@@ -1,6 +1,7 @@
 """Updates in the field: two images, trial, roll-back, power that fails at every step; one on the model."""
 
 import contextlib
+import ctypes
 import json
 from pathlib import Path
 
@@ -34,17 +35,22 @@ def package(seed: int, count: int = 400) -> Package:
     return Package("native", {1: some(seed), 2: some(seed + 100)})
 
 
+def image_of(device: SimulatedBoard, image: int, count: int) -> bytes:
+    """What stands in the place of image 1 or 2."""
+    return ctypes.string_at(device.bench.images[image - 1], count)
+
+
 def resets(device: SimulatedBoard, count: int) -> list[int]:
     """Which image runs after each of so many resets."""
     found = []
     for _ in range(count):
         device.reset()
-        found.append(device.running())
+        found.append(device.bench.running)
     return found
 
 
 def test_updates_take_turns_and_run_after_every_reset(device: SimulatedBoard, board: Board) -> None:
-    assert device.running() == 0
+    assert device.bench.running == 0
     assert update_status(board).next == 1
     for n, image in enumerate((1, 2, 1, 2), 1):
         told: list[tuple[int, int]] = []
@@ -52,8 +58,8 @@ def test_updates_take_turns_and_run_after_every_reset(device: SimulatedBoard, bo
         done = update(board, new, lambda at, total, told=told: told.append((at, total)))
         assert (done.image, done.length, done.sequence) == (image, 3_001, n)
         assert told[-1] == (3_001, 3_001)
-        assert device.running() == image
-        assert device.image(image, 3_001) == new.images[image]
+        assert device.bench.running == image
+        assert image_of(device, image, 3_001) == new.images[image]
         assert update_status(board).trial == 0
         assert resets(device, 4) == [image] * 4
         board = board_on(device)
@@ -89,29 +95,29 @@ def test_power_that_fails_at_every_step_leaves_one_of_the_two(before: int) -> No
         board = board_on(device)
         if before:
             update(board, package(1))
-        old = device.running()
-        device.cut_power(left)
+        old = device.bench.running
+        device.bench.power_left, device.bench.power_fails = left, False
         with contextlib.suppress(BoardError):
             update(board, new, wait_s=0.5)
-        device.cut_power(0)
+        device.bench.power_left, device.bench.power_fails = 0, False
         device.reset()
         place = 2 if before else 1
-        if device.running() == place:
+        if device.bench.running == place:
             ended["new"] += 1
-            assert device.image(place, 400) == new.images[place]
+            assert image_of(device, place, 400) == new.images[place]
         else:
             ended["old"] += 1
-            assert device.running() == old
+            assert device.bench.running == old
             if old:
-                assert device.image(old, 400) == package(1).images[old]
+                assert image_of(device, old, 400) == package(1).images[old]
         # the next run ends well, whatever was left
         board = board_on(device)
         if update_status(board).trial:
             confirm(board)
         done = update(board, package(9))
-        assert device.image(done.image, 400) == package(9).images[done.image]
+        assert image_of(device, done.image, 400) == package(9).images[done.image]
         device.reset()
-        assert device.running() == done.image
+        assert device.bench.running == done.image
     assert ended["new"] >= 2
     assert ended["old"] >= len(moments) - 6
 
@@ -149,19 +155,19 @@ def test_what_is_interrupted_keeps_the_old_one_and_ends_well_when_it_is_run_agai
     device: SimulatedBoard,
 ) -> None:
     noisy = NoisyLine(device, flips=2e-4, drops=0.0, doubles=0.0, seed=3)
-    assert update(board_on(noisy, latency_s=0.01), package(4, 20_000)).image == device.running() == 1
+    assert update(board_on(noisy, latency_s=0.01), package(4, 20_000)).image == device.bench.running == 1
     assert noisy.counts["flipped"] > 2
-    assert device.image(1, 20_000) == package(4, 20_000).images[1]
+    assert image_of(device, 1, 20_000) == package(4, 20_000).images[1]
     new = package(5, 20_000)
     with pytest.raises(LineError, match="was reset"):
         update(board_on(FatalLine(device, 3_000, lambda line: line.board.reset())), new)
-    assert device.running() == 1
+    assert device.bench.running == 1
     with pytest.raises(LineError, match="it begins anew, and the board keeps the firmware that it runs"):
         update(board_on(FatalLine(device, 4_000, deafen), latency_s=0.01), new)
     board = board_on(device)
     assert (update_status(board).running, update_status(board).trial) == (1, 0)
     assert update(board, new).image == 2
-    assert device.image(2, 20_000) == new.images[2]
+    assert image_of(device, 2, 20_000) == new.images[2]
 
 
 class SlowLine(SimulatedLine):
@@ -192,7 +198,7 @@ class SlowLine(SimulatedLine):
 def test_a_slow_board_is_waited_for(device: SimulatedBoard) -> None:
     board = board_on(SlowLine(device), latency_s=0.1)
     done = update(board, package(3, 30_000))
-    assert (done.image, device.running()) == (1, 1)
+    assert (done.image, device.bench.running) == (1, 1)
     # the first ones go out again; then it is known how long an answer takes
     assert board.session.client.retries < 20
 
@@ -204,8 +210,8 @@ def test_a_board_with_a_key_takes_updates_from_its_host_alone(device: SimulatedB
     board.save()  # or the key is gone with the restart
     with pytest.raises(RefusedError, match="NEEDS_KEY"):
         update(board_on(device), package(1))
-    assert device.running() == 0
-    assert update(board_on(device, key=key), package(1)).image == device.running() == 1
+    assert device.bench.running == 0
+    assert update(board_on(device, key=key), package(1)).image == device.bench.running == 1
 
 
 def test_a_file_of_an_update(tmp_path: Path) -> None:

@@ -256,7 +256,7 @@ def test_save_survives_reset_and_damage(device: SimulatedBoard, board: Board) ->
     device.records()
     device.run(100_000)
     assert (device.records().played().chips()[:346] == first.chips).all()
-    device.set_failures(flash=True)
+    device.bench.flash_fails = True
     board = board_on(device)
     board.blank()
     with pytest.raises(RefusedError, match="flash"):
@@ -265,19 +265,20 @@ def test_save_survives_reset_and_damage(device: SimulatedBoard, board: Board) ->
 
 def test_faults_show_and_darken_and_end_the_led_test(device: SimulatedBoard, board: Board) -> None:
     provision(board, some_bank(), Settings())
-    device.set_health(30.0, BoardFault.OPEN_LED, open_led=95)
+    health = device.bench.health
+    health.temperature_dc, health.faults, health.open_leds[-1] = 300, BoardFault.OPEN_LED, 1
     device.run(300_000)
     status = board.status()
     assert (status.temperature_dc, status.faults, status.open_leds[-1]) == (300, BoardFault.OPEN_LED, 1)
     # the fault that comes back ends the test, though it was latched before
     for tested in (False, True):
-        device.set_health(120.0, BoardFault.OVER_TEMPERATURE)
+        health.faults = BoardFault.OVER_TEMPERATURE
         device.run(300_000)
         assert board.status().state == State.FAULT
         assert not device.shown().any()
         with pytest.raises(RefusedError, match="a fault holds the LEDs dark"):
             board.start()
-        device.set_health()
+        health.faults = 0
         device.run(300_000)
         if not tested:
             board.test_leds(0, 95, 1000)

@@ -10,8 +10,8 @@ int LLVMFuzzerTestOneInput(const uint8_t *data, size_t size);
 static void drain(struct native *board)
 {
     board_run_us(board, 1000u);
-    board->output_length = 0u;
-    board->record_count = 0u;
+    board->bench.output_length = 0u;
+    board->bench.record_count = 0u;
 }
 
 static void send_datagram(struct native *board, uint16_t sequence, uint16_t session, uint8_t type,

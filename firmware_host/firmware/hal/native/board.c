@@ -26,14 +26,14 @@ void hal_info(struct evlcp_hal_info *info)
 
 void hal_leds(const uint8_t *row, uint32_t chip)
 {
-    memcpy(self->shown, row, EVLCP_ROW_BYTES);
-    if (self->record_count == self->record_room) {
+    memcpy(self->bench.shown, row, EVLCP_ROW_BYTES);
+    if (self->bench.record_count == self->record_room) {
         self->record_room = self->record_room == 0u ? 4096u : 2u * self->record_room;
-        self->records = realloc(self->records, self->record_room * NATIVE_RECORD_BYTES);
-        if (self->records == NULL)
+        self->bench.records = realloc(self->bench.records, self->record_room * NATIVE_RECORD_BYTES);
+        if (self->bench.records == NULL)
             abort();
     }
-    uint8_t *record = self->records + self->record_count++ * NATIVE_RECORD_BYTES;
+    uint8_t *record = self->bench.records + self->bench.record_count++ * NATIVE_RECORD_BYTES;
     evlcp_put32(record, (uint32_t)self->now);
     evlcp_put32(record + 4, chip);
     memcpy(record + 8, row, EVLCP_ROW_BYTES);
@@ -72,12 +72,12 @@ bool hal_pulse(struct evlcp_pulse *pulse)
 
 static void pulses(struct native *board)
 {
-    while (board->pulse_period > 0.0 && (double)board->now >= board->pulse_next) {
-        uint32_t at = (uint32_t)(uint64_t)board->pulse_next;
+    while (board->bench.pulse_period > 0.0 && (double)board->now >= board->bench.pulse_next) {
+        uint32_t at = (uint32_t)(uint64_t)board->bench.pulse_next;
         board->pulse.between = board->pulse.count != 0u ? at - board->pulse.at : 0u;
         board->pulse.at = at;
         board->pulse.count++;
-        board->pulse_next += board->pulse_period;
+        board->bench.pulse_next += board->bench.pulse_period;
     }
 }
 
@@ -94,7 +94,7 @@ static uint64_t next_due(struct native *board)
 
 uint32_t hal_lateness(void)
 {
-    return self->late;
+    return self->bench.late;
 }
 
 uint32_t hal_millis(void)
@@ -104,11 +104,11 @@ uint32_t hal_millis(void)
 
 uint32_t hal_send(const uint8_t *bytes, uint32_t count)
 {
-    size_t room = sizeof self->output - self->output_length;
+    size_t room = sizeof self->output - self->bench.output_length;
     if (count > room)
         count = (uint32_t)room;
-    memcpy(self->output + self->output_length, bytes, count);
-    self->output_length += count;
+    memcpy(self->output + self->bench.output_length, bytes, count);
+    self->bench.output_length += count;
     return count;
 }
 
@@ -124,14 +124,14 @@ uint32_t hal_lost(void)
 
 bool hal_level(uint16_t level_ma)
 {
-    if (!self->level_fails)
-        self->level_ma = level_ma;
-    return !self->level_fails;
+    if (!self->bench.level_fails)
+        self->bench.level_ma = level_ma;
+    return !self->bench.level_fails;
 }
 
 void hal_health(struct evlcp_health *health)
 {
-    *health = self->health;
+    *health = self->bench.health;
 }
 
 #define WAIT_TICKS (NATIVE_TICK_HZ / 2000u)
@@ -146,10 +146,10 @@ static uint8_t *slot_of(uint8_t slot, uint32_t *size)
 static bool powered(bool *cut)
 {
     *cut = false;
-    if (self->power_left == 0u)
-        return !self->power_fails;
-    if (--self->power_left == 0u) {
-        self->power_fails = true;
+    if (self->bench.power_left == 0u)
+        return !self->bench.power_fails;
+    if (--self->bench.power_left == 0u) {
+        self->bench.power_fails = true;
         *cut = true;
     }
     return true;
@@ -165,7 +165,7 @@ bool hal_flash_erase(uint8_t slot)
     /* An erase that is cut short leaves some of the old bits. */
     for (uint32_t i = 0; i < size; i++)
         bytes[i] = cut && i % 3u != 0u ? bytes[i] | 0x5au : 0xffu;
-    return !self->flash_fails && !cut;
+    return !self->bench.flash_fails && !cut;
 }
 
 bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32_t count)
@@ -179,7 +179,7 @@ bool hal_flash_write(uint8_t slot, uint32_t offset, const uint8_t *bytes, uint32
             return false;
         to[offset + i] &= cut ? bytes[i] | 0xa5u : bytes[i];
     }
-    return !self->flash_fails && !cut;
+    return !self->bench.flash_fails && !cut;
 }
 
 bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t count)
@@ -191,7 +191,7 @@ bool hal_flash_read(uint8_t slot, uint32_t offset, uint8_t *bytes, uint32_t coun
 
 uint8_t hal_running(void)
 {
-    return self->running;
+    return self->bench.running;
 }
 
 void hal_restart(void)
@@ -204,14 +204,14 @@ void board_reset(struct native *board)
     self = board;
     board->reset_at = board->now;
     board->period = 0u;
-    board->late = 0u;
-    board->output_length = 0u;
+    board->bench.late = 0u;
+    board->bench.output_length = 0u;
     board->restart = false;
     board->pulse = (struct evlcp_pulse){.count = 0u};
     board->waits = false;
     board->in_step = false;
     memset(&board->core, 0, sizeof board->core);
-    board->running = evlcp_update_pick();
+    board->bench.running = evlcp_update_pick();
     evlcp_init(&board->core);
 }
 
@@ -222,15 +222,20 @@ struct native *board_new(const uint8_t unique_id[12])
         return NULL;
     memset(board->flash, 0xff, sizeof board->flash);
     memset(board->images, 0xff, sizeof board->images);
+    board->bench.output = board->output;
+    board->bench.flash = board->flash[0];
+    board->bench.flash_bytes = sizeof board->flash;
+    for (uint32_t i = 0; i < EVLCP_IMAGES; i++)
+        board->bench.images[i] = board->images[i];
     memcpy(board->unique_id, unique_id, sizeof board->unique_id);
-    board->health.temperature_dc = 250;
+    board->bench.health.temperature_dc = 250;
     board_reset(board);
     return board;
 }
 
 void board_free(struct native *board)
 {
-    free(board->records);
+    free(board->bench.records);
     free(board);
 }
 
@@ -273,96 +278,4 @@ void board_input(struct native *board, const uint8_t *bytes, size_t count)
 {
     self = board;
     evlcp_receive(&board->core, bytes, (uint32_t)count);
-}
-
-size_t board_output(struct native *board, uint8_t *bytes, size_t room)
-{
-    size_t count = board->output_length < room ? board->output_length : room;
-    memcpy(bytes, board->output, count);
-    memmove(board->output, board->output + count, board->output_length - count);
-    board->output_length -= count;
-    return count;
-}
-
-size_t board_record_count(const struct native *board)
-{
-    return board->record_count;
-}
-
-/* Moves all records out; `bytes` has room for board_record_count of them. */
-void board_take_records(struct native *board, uint8_t *bytes)
-{
-    if (board->record_count != 0u)
-        memcpy(bytes, board->records, board->record_count * NATIVE_RECORD_BYTES);
-    board->record_count = 0u;
-}
-
-void board_set_health(struct native *board, int16_t temperature_dc, uint8_t faults, uint8_t open_led)
-{
-    board->health = (struct evlcp_health){.temperature_dc = temperature_dc, .faults = faults};
-    if (open_led < EVLCP_LEDS)
-        board->health.open_leds[open_led / 8u] = (uint8_t)(0x80u >> open_led % 8u);
-}
-
-void board_set_late(struct native *board, uint32_t ticks)
-{
-    board->late = ticks;
-}
-
-void board_set_failures(struct native *board, uint8_t level, uint8_t flash)
-{
-    board->level_fails = level != 0u;
-    board->flash_fails = flash != 0u;
-}
-
-void board_shown(const struct native *board, uint8_t row[EVLCP_ROW_BYTES])
-{
-    memcpy(row, board->shown, EVLCP_ROW_BYTES);
-}
-
-uint16_t board_level(const struct native *board)
-{
-    return board->level_ma;
-}
-
-uint8_t board_running(const struct native *board)
-{
-    return board->running;
-}
-
-/* The flash does so many words and erases more, the last one by half; 0: all of them. */
-void board_cut_power(struct native *board, uint32_t left)
-{
-    board->power_left = left;
-    board->power_fails = false;
-}
-
-/* What stands in the place of an image, EVLCP_IMAGE_SLOT_BYTES. */
-void board_image(const struct native *board, uint8_t image, uint8_t *bytes)
-{
-    memcpy(bytes, board->images[image - 1u], EVLCP_IMAGE_SLOT_BYTES);
-}
-
-/* Pulses from tick `next` on, a period in ticks; 0: none. */
-void board_set_pulse(struct native *board, double period, double next)
-{
-    board->pulse_period = period;
-    board->pulse_next = next;
-}
-
-size_t board_flash_bytes(void)
-{
-    return sizeof((struct native *)0)->flash;
-}
-
-void board_flash(const struct native *board, uint8_t *bytes)
-{
-    memcpy(bytes, board->flash, sizeof board->flash);
-}
-
-/* The flash of another board, and a reset. */
-void board_set_flash(struct native *board, const uint8_t *bytes)
-{
-    memcpy(board->flash, bytes, sizeof board->flash);
-    board_reset(board);
 }
