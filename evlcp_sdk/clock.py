@@ -1,14 +1,18 @@
-"""The clock that is believed, of files and cameras: which events are in order, and where a clock leaps.
+"""The clock that is believed, of files and cameras: which events are in order, where it leaps, and its steps.
 
 Clocks of cameras restart, and a flipped bit makes one leap. A leap is believed once enough events agree on
 it; until then they are held. Inside, time counts from the stream's first event and leaps are a few seconds
 long, so that no stage sees one and floating point is as fine late on a clock as early.
 """
 
+import math
 from bisect import bisect_right
 from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_sdk import _kernels
 from evlcp_sdk.values import Events, plain
@@ -34,6 +38,15 @@ _MOST_BREAKS = 64
 
 _FARTHEST_US = 1 << 62
 """No event is further from 0."""
+
+_MOST_PIECES = 64
+"""Pieces of a time step that wait to be put together, but for one more in `_WHOLE_EVENTS`: small ones take
+more memory than their events."""
+
+_WHOLE_EVENTS = 4096
+
+_LATER_US = 1 << 62
+"""When what is due later than in the open step is due."""
 
 _BACKWARD, _OFF_SENSOR, _DOUBTFUL, _KEPT, _HELD = range(5)
 """Verdicts on an event, as the kernel gives them."""
@@ -97,19 +110,22 @@ class CameraClock:
 
     def take(self, events: Events) -> list[Events]:
         """Take the next events of the stream; give those that are kept, with their times inside."""
-        self._counts["events"] += len(events)
-        if not len(events):
+        t_us, x, y, p = events.t_us, events.x, events.y, events.p
+        self._counts["events"] += t_us.size
+        if not t_us.size:
             return []
-        # Kernels take them as they are from here on.
-        t_us, x, y, p = plain(events.t_us), plain(events.x), plain(events.y), plain(events.p)
-        events = Events.as_is(t_us, x, y, p)
-        if (
-            self._starts_us
-            and not self._state[3]
-            and int(t_us[0]) - int(self._state[0]) >= 0
-            and int(t_us[-1]) - int(self._state[0]) <= LEAP_US
-        ):
-            inside_us = np.empty(len(t_us), np.int64)
+        if not (t_us.flags.carray and x.flags.carray and y.flags.carray and p.flags.carray):
+            # Kernels take them as they are from here on.
+            t_us, x, y, p = plain(t_us), plain(x), plain(y), plain(p)
+            events = Events.as_is(t_us, x, y, p)
+        if not self._starts_us:
+            first_us = self._first(events)
+            if first_us is None:
+                return []
+            self._begin(first_us, 0)
+        before_us, _, _, held = self._state.tolist()
+        if not held and before_us <= int(t_us[0]) and int(t_us[-1]) - before_us <= LEAP_US:
+            inside_us = np.empty(t_us.size, np.int64)
             if _kernels.all_ordered(t_us, x, y, *self._size, self._offset_us, inside_us):
                 self._state[0] = t_us[-1]
                 self.last_us = int(inside_us[-1])
@@ -140,11 +156,6 @@ class CameraClock:
         limits = (LEAP_US, held_us, _SETBACK_US, _AGREE_EVENTS, _AGREE_US, _MOST_HELD, _FARTHEST_US)
         given: list[Events] = []
         while len(events):
-            if not self._starts_us:
-                first = self._first(events)
-                if first is None:
-                    return given
-                self._begin(first, 0)
             verdicts = np.empty(len(events), np.uint8)
             many, lost = _kernels.sort_out(
                 events.t_us, events.x, events.y, *self._size, limits, self._state, verdicts
@@ -206,3 +217,145 @@ class CameraClock:
         t_us = events.t_us - self._offset_us
         self.last_us = int(t_us[-1])
         return Events(t_us, events.x, events.y, events.p)
+
+
+@dataclass(frozen=True, eq=False)
+class TimeStep:
+    """The events of one time step, or of its part so far.
+
+    Attributes:
+        start_us: A multiple of the step's length after the stream's first event, us.
+        end_us: Start of the next step, or the last event of a stream that ends in this one, us; of a part,
+            the time before which all of its events are.
+        events: Those in it, in order.
+        after_gap: Steps in which nothing could happen were left out before it.
+        whole: It is no part: its events do not come again.
+    """
+
+    start_us: int
+    end_us: int
+    events: Events
+    after_gap: bool
+    whole: bool = True
+
+
+class Timeline:
+    """Cuts a stream into time steps on a fixed grid, whatever pieces it comes in.
+
+    A step is given once an event after it has been seen. Empty steps are given as long as somebody waits for
+    them, and left out in a gap. The part of a step before a time at which something is due is given as soon
+    as an event after that has been seen in the step, and once more with the whole step. Times are those
+    inside: see `CameraClock`.
+
+    Args:
+        step_us: Length of a step, us.
+        width: Columns of the sensor.
+        height: Its rows.
+        most_events: How many events a step may have.
+
+    Attributes:
+        dropped: Events beyond that, of all steps so far.
+        clock: What time it is, and which events are dropped.
+
+    >>> timeline = Timeline(1000, 1280, 720, most_events=100)
+    >>> events = Events.of([100, 2500, 2600], x=[5, 5, 5], y=[7, 7, 7], p=[1, 0, 1])
+    >>> [(s.start_us, len(s.events)) for s in timeline.feed(events, lambda: True, lambda: math.inf)]
+    [(0, 1), (1000, 0)]
+    >>> [(s.start_us, s.end_us, len(s.events)) for s in timeline.close()]
+    [(2000, 2500, 2)]
+    """
+
+    def __init__(self, step_us: int, width: int, height: int, most_events: int) -> None:
+        self.clock = CameraClock(width, height)
+        self.dropped = 0
+        self._most, self._waiting = most_events, 0
+        self._step_us, self._start_us = step_us, 0
+        self._pending: list[Events] = []
+        self._after_gap = False
+        self._part_us = 0
+        self._due_us: int | None = None
+
+    def feed(
+        self, events: Events, waiting: Callable[[], bool], due_us: Callable[[], float]
+    ) -> Iterator[TimeStep]:
+        """Take the next events of the stream; give the steps that they complete.
+
+        Args:
+            events: Those that the clock drops are in no step.
+            waiting: Says after a step whether the next one matters even if it is empty.
+            due_us: Says after a step, or a part, when something is due next, us; what it says changes with
+                these only.
+        """
+        for kept in self.clock.take(events):
+            t_us, done = kept.t_us, 0
+            for end in (*self._bounds(t_us), t_us.size):
+                while True:
+                    if self._due_us is None:
+                        due = due_us()
+                        within = max(self._start_us, self._part_us) < due < self._start_us + self._step_us
+                        self._due_us = math.ceil(due) if within else _LATER_US
+                    if not end or t_us[end - 1] < self._due_us:
+                        break
+                    part = done + int(t_us[done:end].searchsorted(self._due_us))
+                    self._part_us, self._due_us = self._due_us, None
+                    yield self._so_far(kept[done:part])
+                self._keep(kept[done:end])
+                done = end
+                if end < t_us.size:
+                    yield self._next()
+                    next_us = int(t_us[end]) // self._step_us * self._step_us
+                    while self._start_us < next_us and waiting():
+                        yield self._next()
+                    if self._start_us < next_us:
+                        self._start_us, self._after_gap = next_us, True
+
+    def close(self) -> Iterator[TimeStep]:
+        """End the stream; give the step that it ends in, if there is one."""
+        self.clock.close()
+        if self._pending:
+            yield self._next(self.clock.last_us)
+
+    def _bounds(self, t_us: NDArray[np.int64]) -> list[int]:
+        """Where each new time step starts among events, which are in order and not none."""
+        start_us, step_us = self._start_us, self._step_us
+        first_us = max(int(t_us[0]) // step_us * step_us, start_us)
+        last_us = int(t_us[-1])
+        if last_us - first_us > step_us * t_us.size:
+            # Sparse events: look at each instead of at each step.
+            step = t_us // step_us
+            return np.flatnonzero(np.diff(step, prepend=start_us // step_us) > 0).tolist()
+        # Steps before the first event of these are not looked at, however many there are.
+        next_us = first_us + step_us * (first_us == start_us)
+        if next_us > last_us:
+            return []
+        return sorted(set(t_us.searchsorted(np.arange(next_us, last_us + 1, step_us)).tolist()))
+
+    def _so_far(self, newest: Events) -> TimeStep:
+        """The part of the open step whose end is due: what is kept of it, and what is not yet."""
+        if len(self._pending) > 1:
+            self._pending = [Events.concat(self._pending)]
+        # A view where it is all of one piece: the whole step is one, too.
+        newest = newest[: self._most - self._waiting]
+        events = Events.concat([*self._pending, newest]) if self._pending else newest
+        return TimeStep(self._start_us, self._part_us, events, self._after_gap, whole=False)
+
+    def _keep(self, events: Events) -> None:
+        """Add events to the step that is open, as far as it has room."""
+        many, room = events.t_us.size, self._most - self._waiting
+        if many > room:
+            self.dropped += many - room
+            events, many = events[:room], room
+        if not many:
+            return
+        self._waiting += many
+        self._pending.append(events)
+        if len(self._pending) > _MOST_PIECES + self._waiting // _WHOLE_EVENTS:
+            self._pending = [Events.concat(self._pending)]
+
+    def _next(self, end_us: int | None = None) -> TimeStep:
+        """The step whose events are pending; `end_us` where the stream ends inside it."""
+        events = self._pending[0] if len(self._pending) == 1 else Events.concat(self._pending)
+        start_us, after_gap = self._start_us, self._after_gap
+        self._pending, self._waiting, self._after_gap, self._due_us = [], 0, False, None
+        self._start_us += self._step_us
+        return TimeStep(start_us, self._start_us if end_us is None else end_us, events, after_gap)

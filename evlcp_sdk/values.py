@@ -87,16 +87,9 @@ class Events:
     @classmethod
     def concat(cls, parts: Iterable["Events"]) -> "Events":
         """All events of `parts`, in order."""
-        ps = list(parts)
-        if not ps:
-            return cls.empty()
+        columns = [(q.t_us, q.x, q.y, q.p) for q in parts]
         # Columns of one type and length stay so.
-        return Events.as_is(
-            np.concatenate([q.t_us for q in ps]),
-            np.concatenate([q.x for q in ps]),
-            np.concatenate([q.y for q in ps]),
-            np.concatenate([q.p for q in ps]),
-        )
+        return Events.as_is(*map(np.concatenate, zip(*columns, strict=True))) if columns else cls.empty()
 
     def to_pandas(self) -> "pandas.DataFrame":
         """The events as a table of pandas, with the columns t_us, x, y, p; copied.

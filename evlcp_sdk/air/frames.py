@@ -89,6 +89,11 @@ class PacketFormat:
         pilots = -(-frame // self.pilot_every)
         return self.preamble_chips + frame * self.info_chips + pilots * self.pilot_chips
 
+    @cached_property
+    def frame_starts(self) -> tuple[int, ...]:
+        """Chips of the packet at which its frames start, and at which it ends: see `frame_start_chip`."""
+        return tuple(map(self.frame_start_chip, range(self.frames + 1)))
+
     def gross_bit_s(self, bits_per_symbol: int, clusters: int) -> float:
         """Bits on air a second, the share of preamble and pilots taken off.
 

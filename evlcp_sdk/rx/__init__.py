@@ -1,7 +1,7 @@
 """From events to packets.
 
-`receiver` joins the others, `listener` those of one link, and `contest` says which of several links fits:
-`timeline` (time steps), `detection` (regions), `steps` (the link's algorithms), `transmitters` and `grid`
-(whose frame is due when), `look` and `plausibility` (a frame with the bar held still), `points` (what
-positions are computed from), `packets` and `inbox` (packets and messages).
+`receiver` joins the others, and `multi` says which of several links fits: `regions` follows what blinks (by
+`rhythm`), `bars` sets it right by what frames show; `framing` finds packets in its events; of a frame,
+`alignment` holds the bar still, `placement` finds its layout, `steps` and `reading` read it, `points` says
+what positions are computed from; `reflections` collects packets, and `inbox` reads their messages.
 """

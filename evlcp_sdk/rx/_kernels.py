@@ -50,6 +50,20 @@ _ROUND = np.uint32(CLOCK_ROUND - 1)
 
 
 @njit
+def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: int) -> None:
+    """In so many rows from the first on, round and round, set rises of `least` ticks ago or more to `age`."""
+    then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK)
+    today, oldest = np.uint32(now), np.uint32(least)
+    height = len(pixels)
+    for row in range(first, first + many):
+        line = pixels[row % height]
+        for u in range(line.size):
+            state = line[u]
+            ago = np.uint32(np.uint32(today - np.uint32(state >> _CLOCK)) & _ROUND)
+            line[u] = np.uint32(then | np.uint32(state & _LOW)) if ago >= oldest else state
+
+
+@njit
 def score_rises(
     events: Columns,
     pixels: Array,
@@ -58,6 +72,7 @@ def score_rises(
     lows: Array,
     limits: tuple[int, int, int],
     shifts: tuple[int, int],
+    old: tuple[int, int, int, int, int],
 ) -> int:
     """Score each pixel by the rhythm of its rises; add those of candidates to their cell's `hits`; how many.
 
@@ -65,8 +80,10 @@ def score_rises(
     the first of `limits`, is the same; `kinds` says what a number of ticks is, the last, 0, for all beyond,
     and `lows` what becomes of time and score, and in the bits above whether it is `AGAIN` the same time. Of
     `shifts`, a tick is 2^first us, a cell 2^second px wide. A rise with less than the least score is no hit,
-    nor is one beyond, or after the same time so often; these are the other `limits`.
+    nor is one beyond, or after the same time so often; these are the other `limits`. First, what is `old`
+    grows no older: see `grow_old`.
     """
+    grow_old(pixels, *old)
     t_us, x, y, p = events
     soon, min_score, most_same = limits
     tick_shift, cell_shift = shifts
@@ -108,20 +125,6 @@ def score_rises(
             cells[(row >> shift) * columns + ((at - row * width) >> shift)] += 1
             candidates += 1
     return candidates
-
-
-@njit
-def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: int) -> None:
-    """In so many rows from the first on, round and round, set rises of `least` ticks ago or more to `age`."""
-    then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK)
-    today, oldest = np.uint32(now), np.uint32(least)
-    height = len(pixels)
-    for row in range(first, first + many):
-        line = pixels[row % height]
-        for u in range(line.size):
-            state = line[u]
-            ago = np.uint32(np.uint32(today - np.uint32(state >> _CLOCK)) & _ROUND)
-            line[u] = np.uint32(then | np.uint32(state & _LOW)) if ago >= oldest else state
 
 
 @njit
@@ -1627,14 +1630,14 @@ def places_at(t_us: Array, places: Array, ahead: float, centre: Array) -> None:
 
 
 @njit
-def clear_cells(hits: Array, box: tuple[int, int, int, int], cell_shift: int) -> int:
-    """Set the cells that a box (left, top, right, bottom) of pixels touches to 0; what they had."""
-    left, top, right, bottom = box
+def clear_cells(hits: Array, boxes: Array, cell_shift: int) -> int:
+    """Set the cells that boxes (n, left, top, right, bottom) of pixels touch to 0; what they had."""
     had = 0
-    for v in range(top >> cell_shift, min((bottom - 1 >> cell_shift) + 1, hits.shape[0])):
-        for u in range(left >> cell_shift, min((right - 1 >> cell_shift) + 1, hits.shape[1])):
-            had += hits[v, u]
-            hits[v, u] = 0
+    for left, top, right, bottom in boxes:
+        for v in range(top >> cell_shift, min((bottom - 1 >> cell_shift) + 1, hits.shape[0])):
+            for u in range(left >> cell_shift, min((right - 1 >> cell_shift) + 1, hits.shape[1])):
+                had += hits[v, u]
+                hits[v, u] = 0
     return had
 
 
@@ -1686,3 +1689,29 @@ def slope_of_rows(
     spread = max(1.48 * median(rest, n), least)
     mean = at[:n].mean()
     return slope, spread / np.sqrt(((at[:n] - mean) ** 2).sum())
+
+
+@njit
+def delay_of_rows(
+    counts: Array,
+    chips: Array,
+    chip_steps: int,
+    step_us: float,
+    rows: Array,
+    limits: tuple[int, float, float],
+) -> tuple[float, float]:
+    """Delay from row to row by both polarities together, and its sigma, us; NaN where neither says it.
+
+    `counts` are those of `count_rows`, in steps of `step_us`; `rows` and `limits` those of `slope_of_rows`.
+    """
+    fewest, chance, least = limits
+    fit = np.empty((2, counts.shape[1], counts.shape[2] - chips.size * chip_steps + 1))
+    fit_rows(counts, chips, chip_steps, fit)
+    total, weight = 0.0, 0.0
+    for polarity in range(2):
+        seen = counts[polarity].sum(axis=1)
+        lag, sigma = slope_of_rows(rows, fit[polarity], seen, fewest, chance, least)
+        if np.isfinite(lag):
+            total += lag * step_us / (sigma * step_us) ** 2
+            weight += 1 / (sigma * step_us) ** 2
+    return (total / weight, 1 / np.sqrt(weight)) if weight else (np.nan, np.nan)

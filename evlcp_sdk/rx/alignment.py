@@ -12,11 +12,8 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.detection import MARGIN_PX
-from evlcp_sdk.rx.followed import Followed
-from evlcp_sdk.rx.grid import DueFrame
 from evlcp_sdk.rx.placement import Placement, layout_of, lit, masked, placements, without
-from evlcp_sdk.rx.rhythm import columns_of
+from evlcp_sdk.rx.regions import MARGIN_PX, Followed
 from evlcp_sdk.values import Events, PresenceMap, SyncLock
 
 _LEAST_CLUSTERS = 0.5
@@ -24,6 +21,35 @@ _LEAST_CLUSTERS = 0.5
 
 _EVEN = 0.01
 """Steps from cluster to cluster are a spacing where they are longer by rounding only."""
+
+
+@dataclass(frozen=True)
+class DueFrame:
+    """A frame whose events are all there.
+
+    Attributes:
+        number: Counted from the first frame of the grid's packet 0.
+        packet: Number of its packet on the grid.
+        index: Its number in the packet.
+        chips: Its length, with its pilot if it has one.
+        has_pilot: Whether it has.
+        packet_us: Start of its packet's preamble, us.
+        start_us: Start of its first chip, us.
+        end_us: When the events of its last edge end, us.
+        lock: What these times come from.
+        read_us: When those of the chips after it that are read with it end, too, us.
+    """
+
+    number: int
+    packet: int
+    index: int
+    chips: int
+    has_pilot: bool
+    packet_us: float
+    start_us: float
+    end_us: float
+    lock: SyncLock
+    read_us: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -318,7 +344,8 @@ def polarity_sums(
     on_us, off_us = float(start_us + lock.delay_on_us), float(start_us + lock.delay_off_us)
     chip_us, row_us = float(lock.chip_us), float(lock.row_us)
     for e in events:
-        _kernels.add_polarity(columns_of(e), (on_us, off_us), chip_us, (row_us, row_px), shift, sums)
+        columns = e.t_us, e.x, e.y, e.p
+        _kernels.add_polarity(columns, (on_us, off_us), chip_us, (row_us, row_px), shift, sums)
     return sums, rest_px
 
 

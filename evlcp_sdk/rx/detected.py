@@ -10,11 +10,17 @@ import numpy as np
 
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Detector
-from evlcp_sdk.rx.detection import BACKFILL_STEPS
-from evlcp_sdk.rx.followed import Followed, Places, held_bytes, make_room, same_place
-from evlcp_sdk.rx.framer import RegionTracker
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.regions import (
+    BACKFILL_STEPS,
+    Followed,
+    Places,
+    RegionTracker,
+    held_bytes,
+    make_room,
+    same_place,
+)
 from evlcp_sdk.values import Events, Region
 
 _BACKFILL_FRAMES = 2

@@ -1,21 +1,21 @@
-"""What receives a link's packets: a tracker finds regions, a framer finds packets in them and reads them."""
+"""What a framer is, which finds packets in regions and reads them, and what it is told of the stream."""
 
 import math
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import count
-from typing import ClassVar
+from typing import Any, ClassVar
 
-import pluggy
-
-from evlcp_sdk.clock import CameraClock
-from evlcp_sdk.rx.followed import Followed
+from evlcp_sdk.clock import CameraClock, TimeStep
+from evlcp_sdk.errors import EvlcpError, PluginError
+from evlcp_sdk.rx.guard import fault_text
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.rx.regions import Followed
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
-from evlcp_sdk.values import Events, Region
+from evlcp_sdk.values import Frame, Region, SyncLock, changed
 
 _MOST_LIT = 1024
 """Transmitters that are remembered: those seen last."""
@@ -45,6 +45,51 @@ class LitTimes:
             del self.by_number[next(iter(self.by_number))]
 
 
+def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
+    """What a stage gives, with the times of the camera's clock."""
+    match value:
+        case Region():
+            return changed(value, t_us=camera_us(value.t_us))
+        case SyncLock():
+            return changed(value, packet_t_us=camera_us(value.packet_t_us))
+    return value
+
+
+class Announcer:
+    """Says of each finished stage what it gave and how long it took.
+
+    Args:
+        hook: Where that is heard.
+        camera_us: Gives the camera clock's time of a time inside.
+    """
+
+    def __init__(self, hook: Callable[..., Any], camera_us: Callable[[float], float]) -> None:
+        self._hook, self._camera_us = hook, camera_us
+        self.start()
+
+    def start(self) -> None:
+        """Start the clock."""
+        self._start_s = self._lap_s = time.perf_counter()
+
+    def lap(self, stage: str, value: object) -> None:
+        """Announce what took the time since the last lap."""
+        now = time.perf_counter()
+        elapsed_s, self._lap_s = now - self._lap_s, now
+        self._say(stage, value, elapsed_s)
+
+    def frame(self, frame: Frame) -> None:
+        """Announce a frame, which took all laps since the start together."""
+        self._say("frame", frame, self._lap_s - self._start_s)
+
+    def _say(self, stage: str, value: object, elapsed_s: float) -> None:
+        try:
+            self._hook(stage=stage, value=on_camera(value, self._camera_us), elapsed_s=elapsed_s)
+        except EvlcpError:
+            raise
+        except (Exception, SystemExit) as fault:
+            raise PluginError(f"evlcp_stage_finished() of a plugin: {fault_text(fault)}") from fault
+
+
 @dataclass(frozen=True)
 class StreamContext:
     """A stream of events, and what is known of it.
@@ -53,7 +98,7 @@ class StreamContext:
         clock: Its clock.
         attitude_at: What is known of the camera's attitude at a time.
         clock_zero: UTC of the camera clock's 0; None if it is not known.
-        hook: Where finished stages are announced; None for nowhere.
+        announcer: Announces finished stages; None where nobody listens.
         limits: How much each link holds at the most.
         numbers: Where the numbers of transmitters come from.
     """
@@ -61,45 +106,9 @@ class StreamContext:
     clock: CameraClock
     attitude_at: Callable[[float], Attitude | None]
     clock_zero: ClockZero = None
-    hook: pluggy.HookRelay | None = None
+    announcer: Announcer | None = None
     limits: Limits = LIMITS
     numbers: Iterator[int] = field(default_factory=count)
-
-
-class RegionTracker(ABC):
-    """Regions of a stream with their events, followed from time step to time step.
-
-    Attributes:
-        alive: Those that are followed.
-        counts: What was left out for want of room.
-    """
-
-    alive: list[Followed]
-    counts: dict[str, int]
-
-    @abstractmethod
-    def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
-        """Take the events of a time step; give the regions that are alive or ended in it.
-
-        Args:
-            start_us: Start of the step, us.
-            events: Those in it, in order.
-            taken: Places that are others': no region is opened there, nor reaches into them.
-        """
-
-    @abstractmethod
-    def skip(self) -> None:
-        """Pass over a gap in time, with no region alive."""
-
-    def close(self) -> None:
-        """End the stream: forget all events."""
-        self.skip()
-        self.alive = []
-
-    def drop(self, followed: Followed) -> None:
-        """Let a region go at once."""
-        followed.released = True
-        self.alive = [other for other in self.alive if other is not followed]
 
 
 class Framer(ABC):

@@ -1,26 +1,67 @@
-"""The built-in framing: packets of a preamble and frames, from the events of regions to frames."""
+"""The built-in framing: packets of a preamble and frames, from the events of regions to frames.
+
+What is known of a region that sends is a transmitter: numbered at its first frame, remembered when lost from
+sight. Its frames stand on a grid of packets, which a lock sets. Its rows come late: a sensor reads them one
+after another, 0.1 to 0.35 us each, those without an event in no time. All clusters of a bar change together
+at the preamble's edges, as they do in the middle of every value, so that its rows wait for one another: 20 us
+from end to end at 50 m, 90 us at 16 m.
+"""
 
 import math
 from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.clock import TimeStep
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.alignment import AlignedFrame, FrameAligner
-from evlcp_sdk.rx.delays import RowDelays
-from evlcp_sdk.rx.detection import MARGIN_PX, RegionFollower
-from evlcp_sdk.rx.followed import SAME_PX, Followed, same_place
-from evlcp_sdk.rx.framer import Framer, LitTimes, RegionTracker, StreamContext
-from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.plugin.roles import Synchronizer
+from evlcp_sdk.rx import _kernels
+from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner, Pilot
+from evlcp_sdk.rx.bars import BarFollower
+from evlcp_sdk.rx.framer import Framer, LitTimes, StreamContext
+from evlcp_sdk.rx.guard import Guard, compiled
+from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.reading import FrameReader
-from evlcp_sdk.rx.reflections import FrameDetection, ReflectionQueue
-from evlcp_sdk.rx.steps import Announcer, Steps
-from evlcp_sdk.rx.timeline import TimeStep
-from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS, Transmitter, Transmitters
-from evlcp_sdk.values import Frame, Region, SyncLock, changed
+from evlcp_sdk.rx.reflections import LONGEST_ROW_US, FrameDetection, PacketAssembler, ReflectionQueue
+from evlcp_sdk.rx.regions import MARGIN_PX, SAME_PX, Followed, Places, RegionTracker, same_place
+from evlcp_sdk.rx.steps import Steps
+from evlcp_sdk.values import Events, Frame, Region, SyncLock, changed
+
+LOOKBACK_PACKETS = 2
+"""Packets of events kept while there is no lock: one to find a preamble in, one to look back on."""
+
+_REMEMBER_US = 1e6
+"""How long a transmitter lost from sight is remembered: clocks 100 ppm apart drift by a chip in it."""
+
+_UNSEEN_STEPS = 5
+"""Steps without a position after which a region counts as lost: it blinks in every chip otherwise."""
+
+_STEPS = 10
+"""Steps of a chip in which the response of a block of rows is placed."""
+
+_BLOCK_PX = 8
+"""Rows that are looked at together: hundreds of events in a preamble, read within 2 us."""
+
+_FEWEST_BLOCKS = 4
+"""Blocks below which a bar is too small to tell, and for a delay by row to matter."""
+
+_TYPICAL_US = 0.2
+"""Time a row takes (sigma) before one has been measured."""
+
+_WALK_US = 0.01
+"""Change of it from packet to packet: with the number of events in a row, as the bar grows."""
+
+_CHANCE_SIGMAS = 4.0
+"""Sigmas (the root of the number of events) that a block must fit the preamble by."""
+
+_PLACE_SIGMA_US = 2.0
+"""Least error of a block's place, from the steps."""
 
 _TAIL_CHIPS = 0.5
 """A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
@@ -68,6 +109,310 @@ class Skipped(StrEnum):
     """It shows them, and no symbol that is sure."""
 
 
+@dataclass
+class PacketGrid:
+    """Packets and frames by number, and the next frame to decode.
+
+    Attributes:
+        format: Lengths of a packet's parts.
+        chips_after: Chips after a frame that are read with it (`Codebook.chips_after`).
+        lock: The newest lock; None before the first.
+        packet: Number of the lock's packet, counted from the first that may have a frame here.
+        frame: Next frame to decode, counted from that packet's first.
+    """
+
+    format: PacketFormat
+    chips_after: int = 0
+    lock: SyncLock | None = None
+    packet: int = 0
+    frame: int = 0
+    _known: DueFrame | None = field(default=None, init=False, repr=False)
+
+    def follow(self, lock: SyncLock) -> bool:
+        """Take a lock, frames going on where they are; False, and nothing taken, where it is off the grid."""
+        if self.lock is None:
+            return False
+        apart = (lock.packet_t_us - self.lock.packet_t_us) / (self.format.packet_chips * lock.chip_us)
+        if abs(apart - round(apart)) * self.format.packet_chips >= 1:
+            return False
+        self.packet += round(apart)
+        self.lock = lock
+        return True
+
+    def restart(self, lock: SyncLock, earliest_us: float) -> None:
+        """Take a lock that is off the grid; frames go on with the first whole one, under new numbers."""
+        old, done = self.lock, self.frame
+        if old is not None:
+            earliest_us = max(earliest_us, self.start_us(done))
+        back = math.ceil((lock.packet_t_us - earliest_us) / (self.format.packet_chips * lock.chip_us))
+        self.lock = lock
+        self.packet = back + (0 if old is None else -(-done // self.format.frames))
+        self.frame = (self.packet - back) * self.format.frames
+        self.skip_before(earliest_us)
+
+    def skip_before(self, earliest_us: float) -> int:
+        """Pass over the frames that start before a time; how many."""
+        first = self.frame
+        while self.start_us(self.frame) < earliest_us:
+            self.frame += 1
+        return self.frame - first
+
+    def start_us(self, frame: int) -> float:
+        """Start of a frame's first chip, us."""
+        lock = self.lock
+        assert lock is not None
+        number, index = divmod(frame, self.format.frames)
+        chips = (number - self.packet) * self.format.packet_chips + self.format.frame_starts[index]
+        return lock.packet_t_us + chips * lock.chip_us
+
+    def due(self, until_us: float = math.inf) -> DueFrame | None:
+        """The next frame, if it lies before a time with all that is read with it; None before a lock."""
+        lock, known = self.lock, self._known
+        if lock is None:
+            return None
+        # Asked for again and again before it is due.
+        if known is None or known.lock is not lock or known.number != self.frame:
+            start_us = self.start_us(self.frame)
+            number, index = divmod(self.frame, self.format.frames)
+            begin, end = self.format.frame_starts[index : index + 2]
+            late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
+            end_us = start_us + (end - begin) * lock.chip_us + late_us
+            self._known = known = DueFrame(
+                number=self.frame,
+                packet=number,
+                index=index,
+                chips=end - begin,
+                has_pilot=end - begin > self.format.info_chips,
+                packet_us=start_us - begin * lock.chip_us,
+                start_us=start_us,
+                end_us=end_us,
+                lock=lock,
+                read_us=end_us + self.chips_after * lock.chip_us,
+            )
+        return known if known.read_us <= until_us else None
+
+
+@dataclass(frozen=True)
+class RowDelay:
+    """What is known of a bar's rows.
+
+    Attributes:
+        row_us: How much later a row's events come than those of the row above, us.
+        variance: Of it, us2.
+    """
+
+    row_us: float = 0.0
+    variance: float = _TYPICAL_US**2
+
+    def measured(self, row_us: float, sigma_us: float) -> "RowDelay":
+        """Take a packet's measurement, as a Kalman filter does."""
+        variance = self.variance + _WALK_US**2
+        gain = variance / (variance + sigma_us**2)
+        return RowDelay(self.row_us + gain * (row_us - self.row_us), (1 - gain) * variance)
+
+
+def measure_row_delay(
+    chips: NDArray[np.float64],
+    lock: SyncLock,
+    pieces: Iterable[tuple[int, Events]],
+    centre_px: float,
+    height_px: float,
+) -> tuple[float, float]:
+    """Delay from one row to the next in a preamble, and its sigma, us; NaN where too few rows show it.
+
+    Args:
+        chips: Of the preamble, -1 and +1, float64 (P,).
+        lock: As synchronization gave it.
+        pieces: Events of the region, (start us, events) a time step, those of the preamble among them.
+        centre_px: Row of the bar's centre.
+        height_px: Its height.
+    """
+    blocks = round(height_px / _BLOCK_PX)
+    if blocks < _FEWEST_BLOCKS:
+        return math.nan, math.nan
+    reach = _STEPS + _STEPS // 2
+    step_us = float(lock.chip_us) / _STEPS
+    top_px = centre_px - (height_px - 1) / 2 - 0.5
+    start_us = np.array([lock.delay_off_us, lock.delay_on_us]) + lock.packet_t_us - reach * step_us
+    counts = np.zeros((2, blocks, len(chips) * _STEPS + 2 * reach))
+    first_us, last_us = float(start_us.min()), float(start_us.max()) + counts.shape[2] * step_us
+    for begin_us, e in pieces:
+        if begin_us < last_us and e.t_us.size and e.t_us[-1] >= first_us:
+            _kernels.count_rows(e.t_us, e.y, e.p, start_us, step_us, top_px, height_px / blocks, counts)
+    rows_px = (np.arange(blocks) + 0.5) * height_px / blocks
+    limits = _FEWEST_BLOCKS, _CHANCE_SIGMAS, _PLACE_SIGMA_US / step_us
+    return _kernels.delay_of_rows(counts, chips, _STEPS, step_us, rows_px, limits)
+
+
+@dataclass
+class Transmitter:
+    """What the receiver knows of one region.
+
+    Attributes:
+        region: Where it is in the image, and its events.
+        sync: State of its synchronization.
+        packets: Collects its frames.
+        grid: Where its frames stand on the clock.
+        distance: What is known of its distance.
+        number: Transmitter number, None before the first frame.
+        first: Number of the first packet on the grid that had a frame, None before.
+        rows: How late the rows of its bar are read.
+        pilot: The newest pilot, None where it showed no bar.
+        said: Number of the newest frame that was decoded, on the grid, and its symbols.
+        missed: Frames due that were not given, by the count that they belong to.
+        behind: Frames that are due wait for the next step.
+        tried: Number of the newest frame on the grid that was not given as soon as it was due.
+        lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
+    """
+
+    region: Followed
+    sync: Any
+    packets: PacketAssembler
+    grid: PacketGrid
+    distance: Any = None
+    number: int | None = None
+    first: int | None = None
+    rows: RowDelay = field(default_factory=RowDelay)
+    pilot: Pilot | None = None
+    said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
+    missed: Counter[str] = field(default_factory=Counter)
+    behind: bool = False
+    tried: int = -1
+    lit_us: float | None = None
+
+
+class Transmitters:
+    """Regions with what is known of them, by the region's number.
+
+    Args:
+        packet: What is on air.
+        step_us: Length of a time step, us.
+        limits: How many are remembered.
+        numbers: Where their numbers come from.
+        chips_after: Chips after a frame that are read with it.
+
+    Attributes:
+        alive: Those in sight, by the number of their region.
+    """
+
+    def __init__(
+        self,
+        packet: PacketFormat,
+        step_us: int,
+        limits: Limits,
+        numbers: Iterator[int],
+        chips_after: int,
+    ) -> None:
+        self._packet = packet
+        self._chips_after = chips_after
+        self._remembered = limits.remembered
+        self._step_us = step_us
+        self.alive: dict[int, Transmitter] = {}
+        self._released: list[Transmitter] = []
+        self._numbers = numbers
+
+    def open(self, region: Followed, sync: Any, distance: Any) -> Transmitter:
+        """Take a new region, with the first states of its synchronization and its distance filter."""
+        packets, grid = PacketAssembler(self._packet.frames), self._grid()
+        transmitter = Transmitter(region, sync, packets, grid, distance)
+        self.alive[region.id] = transmitter
+        return transmitter
+
+    def adopt(self, transmitter: Transmitter, lock: SyncLock) -> bool:
+        """Take a new lock; frames go on where they were, or start with the first whole one of the region.
+
+        Returns whether it is another packet grid than before.
+        """
+        if transmitter.grid.follow(lock):
+            return False
+        transmitter.pilot = None
+        # Half a chip before the first event, at 0, is still within the first edge's delay.
+        earliest_us = max(transmitter.region.first_us, -lock.chip_us / 2)
+        if transmitter.grid.lock is None and self._inherit(transmitter, lock):
+            transmitter.grid.skip_before(earliest_us)
+            return True
+        transmitter.grid.restart(lock, earliest_us)
+        return True
+
+    def number(self, transmitter: Transmitter) -> int:
+        """Its number: the next one, if it has none."""
+        if transmitter.number is None:
+            transmitter.number = next(self._numbers)
+        return transmitter.number
+
+    def _inherit(self, transmitter: Transmitter, lock: SyncLock) -> bool:
+        """Go on as a transmitter that was lost from sight, if the packets stand on its grid."""
+        for lost in [*self.alive.values(), *self._released]:
+            unseen_us = lock.packet_t_us - lost.region.latest.t_us
+            if lost is transmitter or not 0 < unseen_us < _REMEMBER_US:
+                continue
+            if unseen_us < _UNSEEN_STEPS * self._step_us or not lost.grid.follow(lock):
+                continue
+            transmitter.number, transmitter.first = lost.number, lost.first
+            transmitter.distance = lost.distance
+            transmitter.packets, lost.packets = lost.packets, transmitter.packets
+            transmitter.grid, lost.grid = lost.grid, self._grid()
+            return True
+        return False
+
+    def _grid(self) -> PacketGrid:
+        return PacketGrid(self._packet, self._chips_after)
+
+    def in_step(self, transmitter: Transmitter) -> list[Transmitter]:
+        """Others that have shown no frame yet either, whose packets stand on the same times.
+
+        They are parts of one bar, or a bar and its image: of two bars, three in a hundred pairs would.
+        """
+        lock = transmitter.grid.lock
+        if lock is None or transmitter.region.size_px is not None:
+            return []
+        period_us, same = self._packet.packet_chips * lock.chip_us, []
+        for other in self.alive.values():
+            heard = other.grid.lock
+            if other is transmitter or heard is None or other.region.size_px is not None:
+                continue
+            apart = (heard.packet_t_us - lock.packet_t_us) / period_us
+            rows_px = abs(other.region.latest.y_px - transmitter.region.latest.y_px)
+            within_us = lock.chip_us / 4 + LONGEST_ROW_US * rows_px
+            if abs(apart - round(apart)) * period_us <= within_us:
+                same.append(other)
+        return same
+
+    def forget(self, transmitter: Transmitter, now_us: float) -> None:
+        """Drop the events that no frame can need any more."""
+        region, grid = transmitter.region, transmitter.grid
+        oldest_us = now_us - LOOKBACK_PACKETS * self._packet.packet_chips * self._packet.chip_us
+        if grid.lock is None:
+            keep_us = oldest_us
+            region.first_us = max(region.first_us, int(keep_us))
+        else:
+            # A later lock may move the next frame's start by a chip; the preamble before a packet's first
+            # frame has yet to say how late the rows are.
+            due = grid.due()
+            assert due is not None
+            keep_us = due.start_us - grid.lock.chip_us
+            if due.index == 0:
+                keep_us -= self._packet.preamble_chips * grid.lock.chip_us
+        region.forget_before(keep_us, self._step_us, min(keep_us, oldest_us))
+
+    def release(self, transmitter: Transmitter) -> None:
+        """Remember a transmitter whose region has ended, without its events."""
+        region = transmitter.region
+        del self.alive[region.id]
+        region.hold(deque())
+        region.positions = Places([region.latest])
+        transmitter.sync = transmitter.pilot = None
+        oldest_us = region.latest.t_us - _REMEMBER_US
+        kept = [r for r in self._released if r.region.latest.t_us > oldest_us]
+        self._released = [*kept, transmitter][-self._remembered :]
+
+    def close(self) -> list[Transmitter]:
+        """Give those that are alive, and forget all."""
+        alive = list(self.alive.values())
+        self.alive, self._released = {}, []
+        return alive
+
+
 class PacketFraming(Framer):
     """Finds the packets of the regions of a stream, decodes their frames, and sets the regions right by them.
 
@@ -75,11 +420,11 @@ class PacketFraming(Framer):
         link: The resolved configuration.
         name: Name of the link, that its frames have; empty for none.
         stream: What it is a part of.
-        steps: The algorithms of the other roles.
+        steps: The algorithms that read a frame.
         regions: The regions of the stream.
         follower: The same where frames correct them; None where they stay as a detector has them.
         queue: Where decoded frames go.
-        announcer: Gets every frame.
+        on_frame: Gets each frame as soon as it is decoded; None for nobody.
     """
 
     cut_by_the_end = True
@@ -91,16 +436,20 @@ class PacketFraming(Framer):
         stream: StreamContext,
         steps: Steps,
         regions: RegionTracker,
-        follower: RegionFollower | None,
+        follower: BarFollower | None,
         queue: ReflectionQueue,
-        announcer: Announcer,
+        on_frame: Callable[[Frame], None] | None,
     ) -> None:
         self._attitude_at = stream.attitude_at
         self._packet = link.packet
         self._step_us = link.regions.step_us
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
         self._clock = stream.clock
-        self._announcer = announcer
+        self._announcer, self._on_frame = stream.announcer, on_frame
+        self._sync_guard = Guard(link, "synchronization")
+        self._synchronizer: Synchronizer = compiled(
+            link, "synchronization", link.codebook, link.packet, methods=("init", "step")
+        )
         self._steps = steps
         self._regions, self._follower = regions, follower
         self._name = name
@@ -119,7 +468,7 @@ class PacketFraming(Framer):
         self._codebook = link.codebook
         self._unknown = np.full(link.codebook.clusters, -1, np.int8)
         self._unknown.setflags(write=False)
-        self._rows = RowDelays(link.codebook.preamble)
+        self._preamble = 2 * link.codebook.preamble.astype(np.float64) - 1
         self._reflections = queue.reflections
         self._queue = queue
         self._joined: set[int] = set()
@@ -149,7 +498,7 @@ class PacketFraming(Framer):
             transmitter = self._hear(region, step)
             until_us = step.end_us - self._tail_us
             self._decode_due(transmitter, until_us, self._most_due)
-            transmitter.behind = transmitter.grid.due_us <= until_us
+            transmitter.behind = transmitter.grid.due(until_us) is not None
             if region.id in self._joined:
                 continue
             self._transmitters.forget(transmitter, step.end_us)
@@ -166,9 +515,9 @@ class PacketFraming(Framer):
         if self._follower is None:
             return math.inf
         due_us = math.inf
-        for one in self._transmitters.alive:
-            if _in_time(one):
-                due_us = min(due_us, one.grid.due_us)
+        for one in self._transmitters.alive.values():
+            if _in_time(one) and (due := one.grid.due()) is not None:
+                due_us = min(due_us, due.read_us)
         return due_us + self._tail_us
 
     def ahead(self, step: TimeStep) -> None:
@@ -178,7 +527,8 @@ class PacketFraming(Framer):
         self._joined.clear()
         self._due.clear()
         until_us = step.end_us - self._tail_us
-        due = [one for one in self._transmitters.alive if _in_time(one) and one.grid.due_us <= until_us]
+        alive = self._transmitters.alive.values()
+        due = [one for one in alive if _in_time(one) and one.grid.due(until_us) is not None]
         meant = {one.region.id for one in due}
         with self._follower.ahead(step.start_us, step.end_us, step.events, meant):
             for transmitter in due:
@@ -186,13 +536,13 @@ class PacketFraming(Framer):
 
     def number_of(self, region: Followed) -> int | None:
         """Number of a region's transmitter; None before its first frame."""
-        transmitter = self._transmitters.of(region)
+        transmitter = self._transmitters.alive.get(region.id)
         return None if transmitter is None else transmitter.number
 
     def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
         """Count no frame that was not read where another link's packet was; return how many they were."""
         missed: Counter[str] = Counter()
-        for one in self._transmitters.alive:
+        for one in self._transmitters.alive.values():
             if one.number == number if place is None else same_place(one.region.latest, place):
                 missed, one.missed = missed + one.missed, Counter()
         for ended in list(self._ended):
@@ -218,29 +568,46 @@ class PacketFraming(Framer):
 
     def _hear(self, region: Followed, step: TimeStep) -> Transmitter:
         """Listen to a region's events of a time step, or to all that it has if it is new."""
-        transmitter, pieces = self._transmitters.of(region), [region.pieces[-1]]
+        transmitter, guard = self._transmitters.alive.get(region.id), self._sync_guard
+        pieces: Iterable[tuple[int, Events]] = region.pieces if transmitter is None else (region.pieces[-1],)
         if transmitter is None:
             self.counts["regions_opened"] += 1
-            sync, distance = self._steps.sync_init(), self._steps.distance_init()
-            transmitter, pieces = self._transmitters.open(region, sync, distance), list(region.pieces)
+            with guard:
+                state = self._synchronizer.init()
+            transmitter = self._transmitters.open(region, state, self._steps.distance_init())
         for start_us, events in pieces:
             self.counts["events_in_regions"] += events.t_us.size
             until_us = min(start_us + self._step_us, step.end_us)
-            transmitter.sync, locks = self._steps.synchronize(transmitter.sync, events, until_us)
+            if self._announcer is not None:
+                self._announcer.start()
+            try:
+                transmitter.sync, locks = self._synchronizer.step(
+                    transmitter.sync, events.t_us, events.p, until_us
+                )
+            except (Exception, SystemExit) as fault:
+                guard.blame(fault)
+                raise
+            if guard.checks:
+                guard.expect_locks(locks, until_us, self._packet)
             for heard in locks:
+                if self._announcer is not None:
+                    self._announcer.lap("synchronization", heard)
                 self.counts["preambles"] += 1
                 lock = self._late_rows(transmitter, heard)
                 self.counts["locks"] += self._transmitters.adopt(transmitter, lock)
         return transmitter
 
     def _late_rows(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
-        """A lock with what its preamble says of the rows of its bar."""
+        """A lock with what its preamble, and those before, say of the rows of its bar."""
         region = transmitter.region
         middle_us = lock.packet_t_us + self._packet.preamble_chips / 2 * lock.chip_us
-        _, y = region.positions.place_at(middle_us)
+        _, y_px = region.positions.place_at(middle_us)
         _, height_px = region.positions.size_at(middle_us)
-        transmitter.rows, lock = self._rows.hear(transmitter.rows, lock, region.pieces, y, height_px)
-        return lock
+        row_us, sigma_us = measure_row_delay(self._preamble, lock, region.pieces, y_px, height_px)
+        if math.isfinite(row_us):
+            transmitter.rows = transmitter.rows.measured(row_us, sigma_us)
+        row_us = transmitter.rows.row_us
+        return changed(lock, row_us=row_us, last_row_us=abs(row_us) * height_px / 2)
 
     def _decode_ahead(self, transmitter: Transmitter, until_us: float) -> None:
         """Decode the next frame before its time step is over.
@@ -297,7 +664,8 @@ class PacketFraming(Framer):
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> FrameDetection | Skipped:
         """Read a frame, or say why it is not given."""
-        self._announcer.start()
+        if self._announcer is not None:
+            self._announcer.start()
         aligned = self._align(transmitter, due)
         if aligned is None:
             return Skipped.DARK if _went_dark(transmitter, due, self._packet) else Skipped.REJECTED
@@ -343,7 +711,10 @@ class PacketFraming(Framer):
             echo_of=self._reflections.echo_of(number),
             link=self._name,
         )
-        self._announcer.frame(frame)
+        if self._on_frame is not None:
+            self._on_frame(frame)
+        if self._announcer is not None:
+            self._announcer.frame(frame)
         return FrameDetection.of(frame, due, aligned.pilot.placement, reading.spread)
 
     def _is_ranged(self) -> bool:
@@ -429,7 +800,7 @@ class PacketFraming(Framer):
     def let_go(self, region: Followed) -> None:
         """Forget a region that has become a part of another, or whose place is another's."""
         self._joined.add(region.id)
-        transmitter = self._transmitters.of(region)
+        transmitter = self._transmitters.alive.get(region.id)
         if transmitter is not None:
             self.counts["regions_released"] += 1
             self._was_part(transmitter.missed)

@@ -62,7 +62,16 @@ class Guard:
     def __exit__(
         self, kind: type[BaseException] | None, fault: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if fault is not None and not isinstance(fault, self._passes):
+        if fault is not None:
+            self.blame(fault)
+
+    def blame(self, fault: BaseException) -> None:
+        """Name the algorithm that raised something: where a context would cost time.
+
+        Raises:
+            PluginError: It does not pass.
+        """
+        if not isinstance(fault, self._passes):
             raise PluginError(self._said(f": {fault_text(fault)}")) from fault
 
     def refuse(self, gave: str, expected: str) -> NoReturn:

@@ -8,18 +8,14 @@ have. A transmitter that explains half of its light holds its place: other links
 """
 
 from collections import OrderedDict, deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.followed import same_place
-from evlcp_sdk.rx.framer import StreamContext
-from evlcp_sdk.rx.link_receiver import LinkReceiver
-from evlcp_sdk.rx.rhythm import Rhythm
-from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.rx.regions import Rhythm, same_place
 from evlcp_sdk.values import Frame, Packet, Region, changed
 
 _CLEARLY = 1.25
@@ -54,7 +50,7 @@ def explained_us(packet: Packet, form: PacketFormat) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class _Shown:
+class Shown:
     """A packet that was decoded, and what it explains.
 
     Attributes:
@@ -79,72 +75,48 @@ class _Shown:
 
 
 class SeveralLinks:
-    """Receives several links of one stream: lets packets wait, and gives those that fit their place best.
+    """Lets packets of several links wait, and says which of them fit their place best.
 
     Args:
-        links: The links by their names.
-        stream: The stream.
-        on_frame: Gets each frame once, see `EarlyFrames`; None for nobody.
+        links: The links.
+        patience_us: How late the slowest of them answers, us.
 
     Attributes:
-        receivers: One a link.
-        early: Which frames were told.
+        owning: Numbers of the transmitters that hold their places.
     """
 
-    def __init__(
-        self, links: Mapping[str, Link], stream: StreamContext, on_frame: Callable[[Frame], None] | None
-    ) -> None:
-        rhythms, tell = _rhythms(links), None if on_frame is None else self._decoded
-        self.receivers = [
-            LinkReceiver(link, name, stream, rhythms.get(name), tell) for name, link in links.items()
-        ]
-        self.early = EarlyFrames(on_frame)
-        some = list(links.values())
-        self._gap_px = max(link.regions.merge_px for link in some)
-        # Until the slowest link has answered.
-        self._wait_us = max(one.framing.patience_us for one in self.receivers) + some[0].regions.step_us
-        self._longest_us = max(link.packet.packet_chips * link.packet.chip_us for link in some)
-        self._waiting: deque[_Shown] = deque()
-        self._judged: deque[_Shown] = deque()
+    def __init__(self, links: Collection[Link], patience_us: float) -> None:
+        self._links = tuple(links)
+        self._gap_px = max(link.regions.merge_px for link in links)
+        self._wait_us = patience_us + self._links[0].regions.step_us
+        self._longest_us = max(link.packet.packet_chips * link.packet.chip_us for link in links)
+        self._waiting: deque[Shown] = deque()
+        self._judged: deque[Shown] = deque()
         self._frames = 0
-        self._places: list[Mapping[int, Region]] = [{} for _ in some]
+        self._places: list[Mapping[int, Region]] = [{} for _ in links]
         self._known: dict[int, Region] = {}
-        # Numbers of the transmitters that hold their places.
-        self._owning: set[int] = set()
+        self.owning: set[int] = set()
 
     def __bool__(self) -> bool:
         """Whether anything waits."""
         return bool(self._waiting)
 
-    def step(self, step: TimeStep) -> list[Packet]:
-        """Give each link a time step; give the packets that have waited long enough and fit."""
-        for number, one in enumerate(self.receivers):
-            found = one.step(step, self._taken(number), self._owning)
-            self._see(number, one.places)
-            self._add(number, found, step.end_us)
-        return self._given(step.end_us)
-
-    def close(self, last_us: float) -> list[Packet]:
-        """End the stream's events; give all packets that wait."""
-        for number, found in enumerate([one.finish() for one in self.receivers]):
-            self._add(number, found, last_us)
-        return self._given(float("inf"))
-
-    def _decoded(self, frame: Frame) -> None:
-        self.early.decoded(frame, owns=frame.transmitter in self._owning)
-
-    def _taken(self, link: int) -> list[Region]:
+    def taken(self, link: int) -> list[Region]:
         """Places that transmitters of other links hold, with the gap below which areas are one."""
         return [
-            _grown(place, 2 * self._gap_px)
+            self.around(place)
             for other, places in enumerate(self._places)
             if other != link
             for number, place in places.items()
-            if number in self._owning
+            if number in self.owning
         ]
 
-    def _see(self, link: int, places: Mapping[int, Region]) -> None:
-        """Take where the transmitters of a link are now, by their numbers."""
+    def around(self, place: Region) -> Region:
+        """A place with the gap below which areas are one."""
+        return _grown(place, 2 * self._gap_px)
+
+    def add(self, link: int, places: Mapping[int, Region], packets: Iterable[Packet], now_us: float) -> None:
+        """Take where a link's transmitters are now, by their numbers, and the packets that it has decoded."""
         self._places[link] = places
         for number, place in places.items():
             self._known.pop(number, None)
@@ -152,11 +124,8 @@ class SeveralLinks:
         while len(self._known) > _MOST_KNOWN:
             number = next(iter(self._known))
             del self._known[number]
-            self._owning.discard(number)
-
-    def _add(self, link: int, packets: list[Packet], now_us: float) -> None:
-        """Take packets that a link has decoded by now."""
-        form, clusters = self.receivers[link].link.packet, self.receivers[link].link.codebook.clusters
+            self.owning.discard(number)
+        form, clusters = self._links[link].packet, self._links[link].codebook.clusters
         for packet in packets:
             newest = packet.frames[-1]
             seen = self._known.get(packet.transmitter)
@@ -165,37 +134,24 @@ class SeveralLinks:
             long_us = form.packet_chips * packet.chip_us
             times = packet.t_us, packet.t_us + long_us, now_us + self._wait_us
             light_us = explained_us(packet, form)
-            self._waiting.append(_Shown(link, packet, place, *times, light_us, long_us * clusters))
+            self._waiting.append(Shown(link, packet, place, *times, light_us, long_us * clusters))
             self._frames += len(packet.frames)
 
-    def _given(self, now_us: float) -> list[Packet]:
-        """Judge the packets that have waited long enough: read what fits, count what does not."""
-        packets = []
+    def judge(self, now_us: float) -> Iterator[tuple[Shown, bool]]:
+        """Give the packets that have waited long enough, and whether they fit."""
         while self._waiting and (self._waiting[0].leaves_us <= now_us or self._frames > _MOST_FRAMES):
             shown = self._waiting[0]
-            mine, number = self.receivers[shown.link], shown.packet.transmitter
             fits = self._winner(shown) == shown.link
             self._frames -= len(shown.packet.frames)
             self._judged.append(self._waiting.popleft())
-            if not fits:
-                self._owning.discard(number)
-                mine.refuse(shown.packet)
-                self.early.refused(shown.packet)
-                continue
-            owns = shown.light_us >= _OWNS * shown.whole_us
-            (self._owning.add if owns else self._owning.discard)(number)
-            (given,) = mine.read([shown.packet])
-            self.early.given(given, owns=owns)
-            packets.append(given)
-            for other in self.receivers:
-                if other is not mine:
-                    other.discard_place(_grown(shown.place, 2 * self._gap_px))
+            owns = fits and shown.light_us >= _OWNS * shown.whole_us
+            (self.owning.add if owns else self.owning.discard)(shown.packet.transmitter)
+            yield shown, fits
         oldest_us = now_us - 2 * self._wait_us - self._longest_us
         while self._judged and (self._judged[0].leaves_us < oldest_us or len(self._judged) > _MOST_FRAMES):
             self._judged.popleft()
-        return packets
 
-    def _winner(self, shown: _Shown) -> int:
+    def _winner(self, shown: Shown) -> int:
         """The link that explains most of the light in a packet's place about its time."""
         about = [
             other
@@ -212,7 +168,7 @@ class SeveralLinks:
         light, whole = dict.fromkeys((shown.link,), 0.0), dict.fromkeys((shown.link,), 0.0)
         for other in about:
             if (number := other.packet.transmitter) in rivals:
-                held = _HELD if number in self._owning else 1.0
+                held = _HELD if number in self.owning else 1.0
                 light[other.link] = light.get(other.link, 0.0) + held * other.light_us
                 whole[other.link] = whole.get(other.link, 0.0) + other.whole_us
         best, *others = sorted(light)
@@ -234,10 +190,9 @@ class SeveralLinks:
                 return True
             if its > _CLEARLY * mine:
                 return False
-        one_link, other_link = self.receivers[one].link, self.receivers[than].link
-        return len(one_link.codebook.codewords) < len(other_link.codebook.codewords)
+        return len(self._links[one].codebook.codewords) < len(self._links[than].codebook.codewords)
 
-    def _overlap(self, one: _Shown, other: _Shown) -> bool:
+    def _overlap(self, one: Shown, other: Shown) -> bool:
         """Whether two packets were in one place at one time: by their frames that are nearest in time."""
         if max(other.from_us - one.until_us, one.from_us - other.until_us) > 0:
             return False
@@ -318,7 +273,7 @@ class EarlyFrames:
         return {key for key, frame in over.items() if key[0] == packet.packet and frame is None}
 
 
-def _rhythms(links: Mapping[str, Link]) -> dict[str, Rhythm]:
+def shared_rhythms(links: Mapping[str, Link]) -> dict[str, Rhythm]:
     """Scores of the pixels for links whose rhythms agree, by name: one pass over the events for all."""
     alike: dict[tuple[float, int, int], list[str]] = {}
     for name, link in links.items():

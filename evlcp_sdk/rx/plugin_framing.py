@@ -7,14 +7,13 @@ from typing import Any
 
 import numpy as np
 
+from evlcp_sdk.clock import TimeStep
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
-from evlcp_sdk.rx.followed import Followed
 from evlcp_sdk.rx.framer import Framer, LitTimes, StreamContext
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.reflections import FrameDetection, PacketAssembler, ReflectionQueue
-from evlcp_sdk.rx.steps import Announcer
-from evlcp_sdk.rx.timeline import TimeStep
+from evlcp_sdk.rx.regions import Followed
 from evlcp_sdk.values import DecodedFrame, Frame, Range
 
 _COUNTED = "events_in_regions", "events_in_regions_on", "regions_opened", "regions_released", "frames"
@@ -56,7 +55,7 @@ class PluginFraming(Framer):
         name: Name of the link, that its frames have; empty for none.
         stream: What it is a part of.
         queue: Where frames go.
-        announcer: Gets every frame.
+        on_frame: Gets each frame as soon as it is decoded; None for nobody.
     """
 
     cut_by_the_end = False
@@ -67,7 +66,7 @@ class PluginFraming(Framer):
         name: str,
         stream: StreamContext,
         queue: ReflectionQueue,
-        announcer: Announcer,
+        on_frame: Callable[[Frame], None] | None,
     ) -> None:
         self._guard = Guard(link, "framing")
         self._deframer: Deframer = compiled(
@@ -78,7 +77,7 @@ class PluginFraming(Framer):
         self._queue = queue
         self._reflections = queue.reflections
         self._camera_us: Callable[[float], float] = stream.clock.camera_us
-        self._announcer = announcer
+        self._announcer, self._on_frame = stream.announcer, on_frame
         self._listeners: dict[int, _Listener] = {}
         self._name = name
         self._numbers = stream.numbers
@@ -177,7 +176,10 @@ class PluginFraming(Framer):
                 link=self._name,
             )
             self.counts["frames"] += 1
-            self._announcer.frame(frame)
+            if self._on_frame is not None:
+                self._on_frame(frame)
+            if self._announcer is not None:
+                self._announcer.frame(frame)
             self.lit.note(listener.number, frame.t_us, frame.t_us)
             times, light = (one.t_us, end_us, one.packet_t_us, one.chip_us), listener.events / len(heard)
             self._queue.add(

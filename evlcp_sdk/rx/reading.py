@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.codebook import edges_of_chips
 from evlcp_sdk.air.frames import chips_behind
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.alignment import AlignedFrame, FrameAligner
-from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner
 from evlcp_sdk.rx.llr_calibration import calibrate_llr, still_lit
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder

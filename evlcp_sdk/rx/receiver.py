@@ -1,22 +1,31 @@
 """The receiver: events in, packets out."""
 
+import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
 import pluggy
 
+from evlcp_sdk.clock import Timeline, TimeStep
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
-from evlcp_sdk.rx.framer import StreamContext
+from evlcp_sdk.plugin.roles import STEPS
+from evlcp_sdk.rx.bars import BarFollower
+from evlcp_sdk.rx.detected import DetectedRegions
+from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, on_camera
+from evlcp_sdk.rx.framing import LOOKBACK_PACKETS, PacketFraming
+from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.link_receiver import LinkReceiver
-from evlcp_sdk.rx.multi import SeveralLinks
-from evlcp_sdk.rx.timeline import Timeline, TimeStep
+from evlcp_sdk.rx.multi import EarlyFrames, SeveralLinks, shared_rhythms
+from evlcp_sdk.rx.plugin_framing import PluginFraming
+from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
+from evlcp_sdk.rx.regions import RegionTracker, Rhythm, same_place
+from evlcp_sdk.rx.steps import Steps, tracker_of
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
-from evlcp_sdk.values import Events, Frame, Packet, Region
+from evlcp_sdk.values import Events, Frame, Packet, Region, changed
 
 
 class Receiver:
@@ -69,17 +78,25 @@ class Receiver:
         on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
         links = named_links(link)
-        first = next(iter(links.values()))
-        self._timeline = Timeline(first.regions.step_us, first.camera.width, first.camera.height, limits)
-        self._clock = self._timeline.clock
-        if len(links) > 1:
-            limits = replace(limits, region_bytes=limits.region_bytes // len(links))
-        stream = StreamContext(self._clock, attitude_source(attitude), clock_zero, hook, limits)
-        self._several = SeveralLinks(links, stream, on_frame) if len(links) > 1 else None
-        if self._several is None:
-            self._receivers = [LinkReceiver(first, "", stream, on_frame=on_frame)]
+        first, camera = next(iter(links.values())), next(iter(links.values())).camera
+        self._timeline = Timeline(first.regions.step_us, camera.width, camera.height, limits.step_events)
+        self._clock = clock = self._timeline.clock
+        limits = replace(limits, region_bytes=limits.region_bytes // len(links))
+        announcer = None
+        if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
+            announcer = Announcer(hook.evlcp_stage_finished, clock.camera_us)
+        stream = StreamContext(clock, attitude_source(attitude), clock_zero, announcer, limits)
+        self._early = EarlyFrames(on_frame)
+        self._several: SeveralLinks | None = None
+        if len(links) == 1:
+            self._receivers = [LinkReceiver(first, "", stream, None, on_frame)]
         else:
-            self._receivers = self._several.receivers
+            rhythms, tell = shared_rhythms(links), None if on_frame is None else self._decoded
+            self._receivers = [
+                LinkReceiver(one, name, stream, rhythms.get(name), tell) for name, one in links.items()
+            ]
+            patience_us = max(one.framing.patience_us for one in self._receivers)
+            self._several = SeveralLinks(links.values(), patience_us)
         self._closed = False
         self.left: list[Packet] = []
 
@@ -113,7 +130,7 @@ class Receiver:
         for one in self._receivers:
             total.update(one.counts)
         crowded = {"dropped_crowded": self._timeline.dropped}
-        withdrawn = {} if self._several is None else {"frames_withdrawn": self._several.early.withdrawn}
+        withdrawn = {} if self._several is None else {"frames_withdrawn": self._early.withdrawn}
         return self._clock.counts | crowded | dict(total) | withdrawn
 
     @property
@@ -149,10 +166,13 @@ class Receiver:
         for one in self._receivers:
             one.end_at(self._clock.last_us)
         packets = [packet for step in self._timeline.close() for packet in self._run(step)]
+        left = [one.finish() for one in self._receivers]
         if self._several is None:
-            packets += self._receivers[0].read(self._receivers[0].finish())
+            packets += self._receivers[0].read(left[0])
         else:
-            packets += self._several.close(self._clock.last_us)
+            for number, found in enumerate(left):
+                self._several.add(number, {}, found, self._clock.last_us)
+            packets += self._judged(self._several, math.inf)
         for one in self._receivers:
             one.close()
         return packets
@@ -163,7 +183,7 @@ class Receiver:
 
     def _due_us(self) -> float:
         """When the next frame can be decoded, us."""
-        return min(one.framing.due_us for one in self._receivers)
+        return min([one.framing.due_us for one in self._receivers])
 
     def _run(self, step: TimeStep) -> list[Packet]:
         """Give each link a time step; give the packets that are complete, of the links that fit."""
@@ -171,7 +191,188 @@ class Receiver:
             for one in self._receivers:
                 one.framing.ahead(step)
             return []
-        if self._several is not None:
-            return self._several.step(step)
-        (one,) = self._receivers
-        return one.read(one.step(step))
+        several = self._several
+        if several is None:
+            (one,) = self._receivers
+            return one.read(one.step(step))
+        for number, one in enumerate(self._receivers):
+            found = one.step(step, several.taken(number), several.owning)
+            several.add(number, one.places, found, step.end_us)
+        return self._judged(several, step.end_us)
+
+    def _judged(self, several: SeveralLinks, now_us: float) -> list[Packet]:
+        """Read those packets of several links that fit by now, and count what does not."""
+        packets = []
+        for shown, fits in several.judge(now_us):
+            mine = self._receivers[shown.link]
+            if not fits:
+                mine.refuse(shown.packet)
+                self._early.refused(shown.packet)
+                continue
+            packets += mine.read([shown.packet])
+            self._early.given(packets[-1], owns=shown.packet.transmitter in several.owning)
+            for other in self._receivers:
+                if other is not mine:
+                    other.discard_place(several.around(shown.place))
+        return packets
+
+    def _decoded(self, frame: Frame) -> None:
+        """Take a frame of one of several links."""
+        assert self._several is not None
+        self._early.decoded(frame, owns=frame.transmitter in self._several.owning)
+
+
+class LinkReceiver:
+    """Follows the regions of a stream by one link, receives and decodes what they send, reads its messages.
+
+    Args:
+        link: The resolved configuration.
+        name: Name of the link, that its frames have; empty for none.
+        stream: What it is a part of.
+        rhythm: Scores of the pixels, of another link in the same rhythm; None for its own.
+        on_frame: Gets each frame as soon as it is decoded; None for nobody.
+
+    Attributes:
+        framing: What reads its frames.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        name: str,
+        stream: StreamContext,
+        rhythm: Rhythm | None,
+        on_frame: Callable[[Frame], None] | None,
+    ) -> None:
+        self.name = name
+        self._clock, self._announcer = stream.clock, stream.announcer
+        tracker = tracker_of(link)
+        self._regions: RegionTracker
+        follower: BarFollower | None = None
+        if link.algorithm("detection").rhythmic:
+            self._regions = follower = BarFollower(
+                link.regions,
+                link.camera,
+                link.packet.chip_us,
+                tracker.position,
+                LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us,
+                stream.limits,
+                link.codebook.longest_gap_chips,
+                rhythm,
+            )
+        else:
+            self._regions = DetectedRegions(link, stream.limits)
+        self._queue = ReflectionQueue(Reflections(link.packet, len(link.codebook.codewords)))
+        self.framing: Framer
+        if link.algorithm("framing").roles >= STEPS:
+            steps = Steps(link, self._announcer, tracker)
+            self.framing = PacketFraming(
+                link, name, stream, steps, self._regions, follower, self._queue, on_frame
+            )
+        else:
+            self.framing = PluginFraming(link, name, stream, self._queue, on_frame)
+        self._messages = MessageAssembler.of(link, stream.clock_zero)
+        self._given = {"frames_reflected": 0, "packets": 0}
+        self._of_others = self._rejected_of_others = 0
+
+    @property
+    def regions(self) -> list[Region]:
+        """Where the regions that are followed were seen last, on the camera's clock."""
+        return [on_camera(one.latest, self._clock.camera_us) for one in self._regions.alive]
+
+    @property
+    def places(self) -> dict[int, Region]:
+        """Where the transmitters are that have a number and are in sight, by number."""
+        numbers = ((self.framing.number_of(one), one.latest) for one in self._regions.alive)
+        return {number: place for number, place in numbers if number is not None}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """What was found so far, and dropped."""
+        messages = self._messages.counts if self._messages is not None else {}
+        found = self._regions.counts | self.framing.counts
+        found["frames"] -= self._queue.cut
+        found["frames_at_end"] = self._queue.cut
+        if self.name:
+            found["frames"] -= self._of_others
+            found["frames_of_others"] = self._of_others + self._rejected_of_others
+        return found | self._given | messages
+
+    def __bool__(self) -> bool:
+        """Whether anything waits for the next step."""
+        return bool(self._regions.alive or self._queue)
+
+    def step(
+        self, step: TimeStep, taken: Sequence[Region] = (), owning: Collection[int] = ()
+    ) -> list[Packet]:
+        """Follow the regions through a time step; receive and decode what they send.
+
+        Args:
+            step: The events.
+            taken: Places that other links hold.
+            owning: Numbers of the transmitters that own theirs.
+        """
+        if step.after_gap:
+            self._regions.skip()
+        if taken:
+            self._leave(taken, owning)
+        if self._announcer is not None:
+            self._announcer.start()
+        regions = self._regions.step(step.start_us, step.events, taken)
+        if self._announcer is not None:
+            for region in regions:
+                self._announcer.lap("regions", region.latest)
+        self.framing.step(regions, step)
+        return self._queue.step()
+
+    def _leave(self, taken: Sequence[Region], owning: Collection[int]) -> None:
+        """Let regions go in places that are others', but for those of transmitters that own theirs."""
+        for region in list(self._regions.alive):
+            if self.framing.number_of(region) in owning:
+                continue
+            if any(same_place(region.latest, place) for place in taken):
+                self._regions.drop(region)
+                self.framing.let_go(region)
+
+    def end_at(self, end_us: float) -> None:
+        """Let the stream end at a time, us: frames that are cut by it are not given."""
+        if self.framing.cut_by_the_end:
+            self._queue.ends_us = end_us
+
+    def finish(self) -> list[Packet]:
+        """End the stream's events; give the packets that were still incomplete."""
+        self.framing.close()
+        return self._queue.close()
+
+    def read(self, packets: list[Packet]) -> list[Packet]:
+        """Read the messages that packets carry."""
+        read = []
+        for packet in packets:
+            self._given["packets"] += 1
+            self._given["frames_reflected"] += len(packet.frames) * (packet.echo_of is not None)
+            packet = changed(packet, t_us=self._clock.camera_us(packet.t_us))
+            if self._announcer is not None:
+                self._announcer.start()
+            if self._messages is not None:
+                packet = self._messages.add(packet)
+            if self._announcer is not None:
+                for message in packet.messages:
+                    self._announcer.lap("message", message)
+            read.append(packet)
+        return read
+
+    def refuse(self, packet: Packet) -> None:
+        """Count a packet that another link fits better."""
+        self._of_others += len(packet.frames)
+        self._rejected_of_others += self.framing.discard(number=packet.transmitter)
+
+    def discard_place(self, place: Region) -> None:
+        """Count frames that were rejected in another link's place apart from those that no link reads."""
+        self._rejected_of_others += self.framing.discard(place=place)
+
+    def close(self) -> None:
+        """End the stream: what messages still lack is missing."""
+        if self._messages is not None:
+            self._messages.close()
+        # Whoever draws or writes now needs the room.
+        self._regions.close()

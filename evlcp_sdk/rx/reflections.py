@@ -15,10 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.delays import LONGEST_ROW_US
-from evlcp_sdk.rx.followed import SAME_PX
-from evlcp_sdk.rx.grid import DueFrame
+from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.placement import Placement
+from evlcp_sdk.rx.regions import SAME_PX
 from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet, changed
 
@@ -27,6 +26,9 @@ FOLLOWED_CHIPS = 2.5
 two chips after those due. The stream ends with the latest event, which is later than its light by more than
 the mean of those that the clock is set by: a tenth of a chip to a quarter, as latencies and rows spread, and
 a half where the rows of two bars and of their reflections wait for each other."""
+
+LONGEST_ROW_US = 0.35
+"""The longest that a sensor takes to read a row, us: of two parts, the lower one may come as much later."""
 
 _REPEATED = 0.25
 """Share of the symbols that a reflection repeats at the least; with fewer, nothing would be read of it."""

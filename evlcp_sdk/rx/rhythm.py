@@ -22,13 +22,13 @@ opened by rises only that come soon after the one before. One pass, four bytes a
 """
 
 import math
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.values import Events
 
 _MOST_SCORE = 40
 """Scores rise no further: what has blinked in rhythm for long is forgotten after so many rises off it."""
@@ -45,7 +45,7 @@ _STRAY_CHIPS = 0.3
 _LONGEST_TICKS = 2**15
 """Of what is looked up by its length: a tick is 1 us but for chips slower than 190 a second."""
 
-_SAME, _LAMP = 7, 14
+SAME, LAMP = 7, 14
 """Repetitions of a time, less what speaks against a lamp, from which on a pixel opens no region, and from
 which on it is not listened to before a frame shows where the bar is. Pixels that see a random code are so
 for five per cent of the time by the first, which a bar can spare, as its other clusters open the region; and
@@ -69,160 +69,35 @@ _SHORT = 6
 of a pair code are whole chips apart."""
 
 
-class Rhythm:
-    """Scores of a sensor's pixels.
+@dataclass(frozen=True, eq=False)
+class RhythmTables:
+    """What the times between rises of some chips say, looked up by a time's ticks.
 
-    A pixel's state holds when it last rose (17 bits of the clock's ticks), how often the same time came again
-    (5 bits), the time between that and the rise before (4 bits), and its score (6 bits).
-    The clock of 17 bits goes round in an eighth of a second. Rows are looked at in turn, where rises so long
-    ago that all such times are alike become the youngest of these; and so soon that none looks young.
-
-    Args:
-        width: Columns of the sensor.
-        height: Its rows.
-        chip_us: Nominal length of a chip, us.
-        min_score: Score at which a pixel is a candidate; half of it is enough inside a region.
-        gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
-        shared: Several followers ask for the same steps; the first one's answer is kept for the others.
+    Attributes:
+        tick_shift: A tick is 2^this us.
+        soon: Ticks before which a rise is the same.
+        kinds: Kind of a time, the last for all beyond, uint8 (ticks,).
+        lows: See `_lows`.
     """
 
-    def __init__(
-        self,
-        width: int,
-        height: int,
-        chip_us: float,
-        min_score: int,
-        gap_chips: int = 4,
-        *,
-        shared: bool = False,
-    ) -> None:
+    tick_shift: int
+    soon: int
+    kinds: NDArray[np.uint8]
+    lows: NDArray[np.uint16]
+
+    @classmethod
+    def of(cls, chip_us: float, gap_chips: int) -> "RhythmTables":
+        """By the length of a chip, us, and the longest time from rise to rise in the codes, chips."""
         late_us = (min(3 * gap_chips, _MOST_CHIPS) + 0.5) * chip_us
-        self._shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
-        tick_us = 1 << self._shift
-        self._soon = int(_SOON_CHIPS * chip_us) >> self._shift
-        self._kinds = _kinds(chip_us, late_us, tick_us)
-        self._lows = _lows(gap_chips)
-        self._min_score = min_score
-        self._pixels = np.zeros((height, width), np.uint32)
-        # No time that is looked up is longer; nor are rows looked at one by one after so long a gap.
-        self._turn = _kernels.CLOCK_ROUND // 4
-        self._old = self._turn + self._turn // 8
-        self._every = _kernels.CLOCK_ROUND - self._turn - self._old
-        self._row = 0
-        self._seen: int | None = None
-        self._open_us, self._taken, self._rises = -1, 0, 0
-        self._shared = shared
-        self._kept: tuple[tuple[int, int], int, NDArray[np.int32]] | None = None
-
-    def step(self, start_us: int, events: Events, hits: NDArray[np.int32], cell_shift: int) -> int:
-        """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
-
-        Args:
-            start_us: Start of the step, us.
-            events: Those in it, in order; a part of a step comes again with the rest, and counts once.
-            hits: Of cells of 2^cell_shift px, int32 (rows, columns).
-            cell_shift: See there.
-        """
-        if self._kept is not None and self._kept[0] == (start_us, len(events)):
-            hits[:] = self._kept[2]
-            return self._kept[1]
-        if start_us != self._open_us:
-            self._open_us, self._taken, self._rises = start_us, 0, 0
-            self._grow_old(start_us >> self._shift)
-        limits, shifts = (self._soon, self._min_score, _SAME), (self._shift, cell_shift)
-        self._rises += _kernels.score_rises(
-            columns_of(events, self._taken), self._pixels, hits, self._kinds, self._lows, limits, shifts
-        )
-        self._taken = events.t_us.size
-        if self._shared:
-            self._kept = (start_us, len(events)), self._rises, hits.copy()
-        return self._rises
-
-    def of(self, events: Events) -> Events:
-        """Those of candidates that are no lamps.
-
-        Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
-        all of it.
-        """
-        return events[self._rhythmic(events, _LAMP)]
-
-    def may_open(self, events: Events) -> bool:
-        """Whether any of them is of a candidate that opens a region."""
-        return bool(self._rhythmic(events, _SAME).any())
-
-    def _rhythmic(self, events: Events, most_same: int) -> NDArray[np.bool_]:
-        state = self._pixels[events.y, events.x]
-        rhythmic: NDArray[np.bool_] = (state & _kernels.SCORES) >= self._min_score
-        rhythmic &= (state >> _kernels.SAME_AT) & _kernels.MOST_SAME < most_same
-        return rhythmic
-
-    def measure(
-        self,
-        box: tuple[int, int, int, int],
-        end_us: int,
-        span_us: int,
-        seam_px: int,
-        reach_px: float,
-        rows: NDArray[np.int64],
-        strips: tuple[float, float, NDArray[np.float64]] | None = None,
-    ) -> tuple[int, float, int, int, float, float]:
-        """Where in a box pixels blink that rose in a time up to now, by what is enough inside a region.
-
-        Args:
-            box: (left, top, right, bottom), px.
-            end_us: Now: the end of a step, us.
-            span_us: How long before that a rise may be, us.
-            seam_px: Columns at either side that should be dark.
-            reach_px: How far from the mean column rows are counted.
-            rows: Takes how many pixels count in each row, int64 (bottom - top,).
-            strips: Of a bar whose light stands in strips of columns: see `measure_strips`, (expected, near,
-                strips); None of others.
-
-        Returns:
-            (pixels, mean column, first column, last column, upper edge, lower edge).
-        """
-        score = max(self._min_score // 2, 1)
-        awake = end_us >> self._shift, span_us >> self._shift, score
-        if strips is not None:
-            return _kernels.measure_strips(self._pixels, box, awake, *strips, rows)
-        return _kernels.measure_box(self._pixels, box, awake, seam_px, reach_px, rows)
-
-    def _grow_old(self, now: int) -> None:
-        """Look at as many rows as the time since the last step asks for, at all after a gap."""
-        height = len(self._pixels)
-        passed = self._turn if self._seen is None else now - self._seen
-        self._seen = now
-        if passed >= self._turn:
-            _kernels.grow_old(self._pixels, 0, height, now, 0, self._old)
-            return
-        many = -(-height * passed // self._every)
-        _kernels.grow_old(self._pixels, self._row, many, now, self._old, self._old)
-        self._row = (self._row + many) % height
-
-
-def columns_of(events: Events, first: int = 0) -> _kernels.Columns:
-    """The columns of events from one on."""
-    return events.t_us[first:], events.x[first:], events.y[first:], events.p[first:]
-
-
-def select(events: Events, box: tuple[int, int, int, int]) -> Events:
-    """Those inside a box (left, top, right, bottom), in no more memory than twice what they need."""
-    room = events.t_us.size + 1
-    into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
-    n = _kernels.select_box(columns_of(events), box, into)
-    part = [column[:n] for column in into]
-    return Events.as_is(*(column.copy() for column in part) if 2 * n < room else part)
-
-
-def _kinds(chip_us: float, late_us: float, tick_us: int) -> NDArray[np.uint8]:
-    """Kind of a time between rises by its ticks, the last for all beyond."""
-    run_us = np.arange(int(late_us) // tick_us + 2) * float(tick_us)
-    chips = np.floor(run_us / chip_us + 0.5)
-    middles = np.array(_TIMES)
-    kinds = 1 + np.searchsorted((middles[1:] + middles[:-1]) / 2 * chip_us, run_us, side="right")
-    kinds += _OFF * (np.abs(run_us - chips * chip_us) > _STRAY_CHIPS * chip_us)
-    kinds[run_us > late_us] = _LATE
-    return np.asarray(kinds, np.uint8)
+        shift = max(math.ceil(math.log2(late_us / _LONGEST_TICKS)), 0)
+        tick_us = 1 << shift
+        run_us = np.arange(int(late_us) // tick_us + 2) * float(tick_us)
+        chips = np.floor(run_us / chip_us + 0.5)
+        middles = np.array(_TIMES)
+        kinds = 1 + np.searchsorted((middles[1:] + middles[:-1]) / 2 * chip_us, run_us, side="right")
+        kinds += _OFF * (np.abs(run_us - chips * chip_us) > _STRAY_CHIPS * chip_us)
+        kinds[run_us > late_us] = _LATE
+        return cls(shift, int(_SOON_CHIPS * chip_us) >> shift, kinds.astype(np.uint8), _lows(gap_chips))
 
 
 def _lows(gap_chips: int) -> NDArray[np.uint16]:

@@ -1,94 +1,19 @@
 """A link's algorithms as the receiver calls them: compiled once, guarded, checked, announced."""
 
 import math
-import time
 from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import pluggy
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.plugin.roles import STEPS, Filter, Synchronizer, Tracker
-from evlcp_sdk.rx.guard import Guard, compiled, fault_text
+from evlcp_sdk.plugin.roles import Filter, Tracker
+from evlcp_sdk.rx.framer import Announcer
+from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.scene.lean import BarSight
-from evlcp_sdk.values import (
-    Events,
-    Frame,
-    FrameView,
-    PresenceMap,
-    Range,
-    Region,
-    SoftSymbols,
-    SyncLock,
-    changed,
-)
-
-
-def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
-    """What a stage gives, with the times of the camera's clock."""
-    match value:
-        case Region():
-            return changed(value, t_us=camera_us(value.t_us))
-        case SyncLock():
-            return changed(value, packet_t_us=camera_us(value.packet_t_us))
-    return value
-
-
-class Announcer:
-    """Says of each finished stage what it gave and how long it took.
-
-    Args:
-        hook: Where that is heard (`Registry.hook`); None for nowhere.
-        camera_us: Gives the camera clock's time of a time inside.
-        on_frame: Gets each frame; None for nobody.
-    """
-
-    def __init__(
-        self,
-        hook: pluggy.HookRelay | None = None,
-        camera_us: Callable[[float], float] = lambda t_us: t_us,
-        on_frame: Callable[[Frame], None] | None = None,
-    ) -> None:
-        self._camera_us = camera_us
-        self._on_frame = on_frame
-        self._hook: Callable[..., Any] | None = None
-        if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
-            self._hook = hook.evlcp_stage_finished
-        self._start_s = self._lap_s = time.perf_counter()
-
-    def start(self) -> None:
-        """Start the clock."""
-        if self._hook is None:
-            return
-        self._start_s = self._lap_s = time.perf_counter()
-
-    def lap(self, stage: str, value: object) -> None:
-        """Announce what took the time since the last lap."""
-        if self._hook is None:
-            return
-        now = time.perf_counter()
-        elapsed_s, self._lap_s = now - self._lap_s, now
-        self._say(stage, value, elapsed_s)
-
-    def frame(self, frame: Frame) -> None:
-        """Announce a frame, which took all laps since the start together."""
-        if self._on_frame is not None:
-            self._on_frame(frame)
-        if self._hook is not None:
-            self._say("frame", frame, self._lap_s - self._start_s)
-
-    def _say(self, stage: str, value: object, elapsed_s: float) -> None:
-        assert self._hook is not None
-        try:
-            self._hook(stage=stage, value=on_camera(value, self._camera_us), elapsed_s=elapsed_s)
-        except EvlcpError:
-            raise
-        except (Exception, SystemExit) as fault:
-            raise PluginError(f"evlcp_stage_finished() of a plugin: {fault_text(fault)}") from fault
+from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
 
 
 def tracker_of(link: Link) -> Tracker:
@@ -106,49 +31,28 @@ def tracker_of(link: Link) -> Tracker:
 
 
 class Steps:
-    """The five roles of the receiver; it keeps no state of a stream.
+    """The roles that read a frame; it keeps no state of a stream.
 
     Args:
         link: The resolved configuration.
-        announcer: Gets every result but the filters'.
+        announcer: Gets every result but the filters'; None for nobody.
         tracker: The filters of its tracking, as `tracker_of` gives them.
     """
 
-    def __init__(self, link: Link, announcer: Announcer, tracker: Tracker) -> None:
+    def __init__(self, link: Link, announcer: Announcer | None, tracker: Tracker) -> None:
         self._codebook = link.codebook
-        self._packet = link.packet
         self._keeper = RangeKeeper()
         self._announcer = announcer
-        self._guards = {role: Guard(link, role) for role in STEPS}
+        self._guards = {role: Guard(link, role) for role in ("separation", "decoding", "ranging")}
         book = link.codebook
-        self._synchronizer: Synchronizer = compiled(
-            link, "synchronization", book, link.packet, methods=("init", "step")
-        )
         self._separate = compiled(link, "separation", book)
         self._decode: Callable[..., SoftSymbols] = compiled(link, "decoding", book)
         self._measure = compiled(link, "ranging", link.camera, link.bar, book)
         self._distance = tracker.distance
 
-    def sync_init(self) -> Any:
-        """State of a region's synchronization before its first event."""
-        with self._guards["synchronization"]:
-            return self._synchronizer.init()
-
     def distance_init(self) -> tuple[Ranges, Any]:
         """What is known of a transmitter's distance before its first frame."""
         return Ranges(), None if self._distance is None else self._distance.init()
-
-    def synchronize(self, state: Any, events: Events, until_us: int) -> tuple[Any, list[SyncLock]]:
-        """Take a region's events up to a time; give the new state and the packets that were found."""
-        guard = self._guards["synchronization"]
-        self._announcer.start()
-        with guard:
-            state, locks = self._synchronizer.step(state, events.t_us, events.p, until_us)
-        if guard.checks:
-            guard.expect_locks(locks, until_us, self._packet)
-        for lock in locks:
-            self._announcer.lap("synchronization", lock)
-        return state, locks
 
     def separate(self, sums: NDArray[np.int16]) -> PresenceMap:
         """Where the clusters are, from a pilot's polarity sums, int16 (chips, height, width)."""
@@ -157,7 +61,8 @@ class Steps:
             presence: PresenceMap = self._separate(sums)
         if guard.checks:
             guard.expect_presence(presence, self._codebook.clusters, *sums.shape[1:])
-        self._announcer.lap("separation", presence)
+        if self._announcer is not None:
+            self._announcer.lap("separation", presence)
         return presence
 
     def decode(
@@ -178,18 +83,21 @@ class Steps:
             soft = self._decode(presence, sums, *more)
         if guard.checks:
             guard.expect_symbols(soft, self._codebook)
-        self._announcer.lap("decoding", soft)
+        if self._announcer is not None:
+            self._announcer.lap("decoding", soft)
         return soft
 
     def measure(self, view: FrameView) -> Range:
         """How far the bar is."""
         guard = self._guards["ranging"]
-        self._announcer.lap("view", view)
+        if self._announcer is not None:
+            self._announcer.lap("view", view)
         with guard:
             distance: Range = self._measure(view)
         if guard.checks:
             guard.expect_range(distance)
-        self._announcer.lap("ranging", distance)
+        if self._announcer is not None:
+            self._announcer.lap("ranging", distance)
         return distance
 
     def follow(

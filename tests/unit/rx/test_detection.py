@@ -12,9 +12,9 @@ from rx_streams import LINK
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.detection import RegionFollower, _clear, _cut_off
-from evlcp_sdk.rx.followed import Followed, Places
-from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.bars import BarFollower
+from evlcp_sdk.rx.boxes import clear_of, cut_off
+from evlcp_sdk.rx.regions import Followed, Places, RegionFollower, Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import (
     IdealBar,
@@ -33,8 +33,8 @@ BAR_EVENTS = ideal_events(LINK, BAR)
 CENTRE, SIZE = (BAR.x_px - 0.5, BAR.y_px - 0.5), (4.0, 128.0)
 
 
-def follower(spec: RegionSpec = SPEC, **options: Any) -> RegionFollower:
-    return RegionFollower(spec, CameraModel(), LINK.packet.chip_us, **options)
+def follower(spec: RegionSpec = SPEC, **options: Any) -> BarFollower:
+    return BarFollower(spec, CameraModel(), LINK.packet.chip_us, **options)
 
 
 def steps(events: Events, until_us: int) -> Iterator[tuple[int, Events]]:
@@ -376,9 +376,9 @@ def test_a_region_does_not_go_on_to_the_bar_below() -> None:
         ([(5, 105, 25, 200)], (0, 0, 30, 100)),
     ],
 )
-def test_what_other_bars_cut_off(others: list[tuple[int, int, int, int]], left: tuple[int, ...]) -> None:
+def test_what_other_barscut_off(others: list[tuple[int, int, int, int]], left: tuple[int, ...]) -> None:
     """Of a box with a seam of 5 px around a bar."""
-    assert _cut_off((0, 0, 30, 100), (5, 5, 25, 95), others) == left
+    assert cut_off((0, 0, 30, 100), (5, 5, 25, 95), others) == left
 
 
 @pytest.mark.parametrize(
@@ -395,7 +395,7 @@ def test_what_other_bars_cut_off(others: list[tuple[int, int, int, int]], left: 
 def test_the_part_of_a_box_that_is_clear_of_others(
     others: list[tuple[int, int, int, int]], clear: tuple[int, int, int, int]
 ) -> None:
-    assert _clear((0, 0, 20, 100), others) == clear
+    assert clear_of((0, 0, 20, 100), others) == clear
 
 
 def test_of_two_regions_that_follow_the_same_the_older_stays() -> None:

@@ -1,13 +1,13 @@
 """Packet grids against a walk through the chips on air."""
 
-import math
 from itertools import takewhile
 
 import pytest
 from hypothesis import assume, given, strategies as st
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.grid import DueFrame, PacketGrid
+from evlcp_sdk.rx.alignment import DueFrame
+from evlcp_sdk.rx.framing import PacketGrid
 from evlcp_sdk.values import SyncLock
 
 CHIP_US, ZERO_US = 100.5, 1234.5
@@ -73,15 +73,15 @@ def test_frames_are_due_as_they_are_on_air(
 def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat, after: int) -> None:
     """And the chips after it that are read with it."""
     grid = PacketGrid(form, chips_after=after)
-    assert (grid.due(math.inf), grid.due_us) == (None, math.inf)
+    assert grid.due() is None
     grid.restart(lock_of(form, 0, delay_us=35.0), ZERO_US)
     _, _, start_us, end_us = on_air(form, 1)[0]
     read_us = end_us + 35 + after * CHIP_US
-    assert grid.due_us == pytest.approx(read_us)
     assert grid.due(read_us - 1) is None
     due = grid.due(read_us + 1)
     assert due is not None
-    assert (due.start_us, due.end_us) == pytest.approx((start_us, end_us + 35))
+    assert due is grid.due()
+    assert (due.start_us, due.end_us, due.read_us) == pytest.approx((start_us, end_us + 35, read_us))
 
 
 @pytest.mark.parametrize("form", FORMATS)

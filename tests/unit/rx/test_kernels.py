@@ -12,7 +12,7 @@ from scipy import stats
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.placement import _WIDEST_PX, Layout, Placement, masked
-from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.regions import Rhythm
 from evlcp_sdk.scene.lean import BarSight, foreshortening
 from evlcp_sdk.values import Events, PresenceMap
 
@@ -498,13 +498,14 @@ def test_cells_in_and_out_of_place(seed, clusters):
 
 
 @pytest.mark.parametrize("box", [(0, 0, 24, 16), (3, 5, 9, 6), (4, 4, 8, 8), (20, 8, 40, 30)])
-def test_cells_that_a_box_touches_are_cleared(box):
+def test_cells_that_boxes_touch_are_cleared(box):
     hits = np.random.default_rng(0).integers(1, 9, (4, 6)).astype(np.int32)
     left, top, right, bottom = box
     v, u = np.mgrid[:4, :6]
     inside = (4 * v < bottom) & (4 * v + 4 > top) & (4 * u < right) & (4 * u + 4 > left)
+    inside |= (u == 5) & (v == 0)
     had, want = int(hits[inside].sum()), np.where(inside, 0, hits)
-    assert _kernels.clear_cells(hits, box, 2) == had
+    assert _kernels.clear_cells(hits, np.array([box, (20, 0, 21, 1)]), 2) == had
     assert_array_equal(hits, want)
 
 

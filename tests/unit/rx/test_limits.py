@@ -1,5 +1,6 @@
 """What the receiver holds at the most: each limit with a stream that would take more, and any split of it."""
 
+import math
 import tracemalloc
 from collections.abc import Iterable, Iterator
 from itertools import pairwise, product
@@ -8,12 +9,11 @@ import numpy as np
 import pytest
 from rx_streams import LINK, frames_of
 
+from evlcp_sdk.clock import Timeline
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.detection import RegionFollower
-from evlcp_sdk.rx.followed import EVENT_BYTES, PIECE_BYTES
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.rx.timeline import Timeline
+from evlcp_sdk.rx.regions import EVENT_BYTES, PIECE_BYTES, RegionFollower
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
 from evlcp_sdk.values import Events
@@ -51,10 +51,9 @@ def bytes_of(pieces: Iterable[tuple[int, Events]]) -> int:
 @pytest.mark.parametrize("size", [7, 1000, 10**6])
 def test_a_step_takes_its_first_events(size: int) -> None:
     events = noise_events(3e6, 3000)
-    timeline = Timeline(1000, 1280, 720, Limits(step_events=2000))
-    steps = [
-        s for a in range(0, len(events), size) for s in timeline.feed(events[a : a + size], lambda: True)
-    ]
+    timeline = Timeline(1000, 1280, 720, 2000)
+    pieces = (events[a : a + size] for a in range(0, len(events), size))
+    steps = [s for piece in pieces for s in timeline.feed(piece, lambda: True, lambda: math.inf)]
     steps += timeline.close()
     times = events.t_us - events.t_us[0]
     for n, step in enumerate(steps):
@@ -66,10 +65,10 @@ def test_a_step_takes_its_first_events(size: int) -> None:
 
 def test_small_pieces_of_a_step_take_the_memory_of_their_events() -> None:
     events = Events.of(np.zeros(20_000, np.int64), *np.ones((3, 20_000), np.int64))
-    timeline = Timeline(1000, 1280, 720)
+    timeline = Timeline(1000, 1280, 720, 10**6)
     tracemalloc.start()
     for k in range(len(events)):
-        list(timeline.feed(events[k : k + 1], lambda: True))
+        list(timeline.feed(events[k : k + 1], lambda: True, lambda: math.inf))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     # 700 bytes a piece would be 14 MB.

@@ -13,9 +13,9 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.detected import DetectedRegions
-from evlcp_sdk.rx.detection import RegionFollower
 from evlcp_sdk.rx.multi import explained_us
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.rx.regions import RegionFollower
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols, changed

@@ -1,12 +1,13 @@
 """Time steps of a stream: the laws of the grid, against a loop over single events."""
 
+import math
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 
-from evlcp_sdk.rx.timeline import Timeline, TimeStep
+from evlcp_sdk.clock import Timeline, TimeStep
 from evlcp_sdk.values import Events
 
 STEP_US, WIDTH, HEIGHT = 100, 8, 6
@@ -40,14 +41,14 @@ def rows(events: Events) -> list[tuple[int, ...]]:
 
 def steps_of(events: Events, cuts: list[int], *, waits: int) -> tuple[list[TimeStep], Timeline]:
     """The steps of a stream in pieces; after one with events, `waits` empty ones are waited for."""
-    timeline = Timeline(STEP_US, WIDTH, HEIGHT)
+    timeline = Timeline(STEP_US, WIDTH, HEIGHT, 10**6)
     steps: list[TimeStep] = []
 
     def waiting() -> bool:
         return any(len(s.events) for s in steps[-waits:]) if waits else False
 
     for a, b in pairwise([0, *cuts, len(events)]):
-        for step in timeline.feed(events[a:b], waiting):
+        for step in timeline.feed(events[a:b], waiting, lambda: math.inf):
             steps.append(step)
     return steps + list(timeline.close()), timeline
 
@@ -102,7 +103,7 @@ def test_any_split_of_the_stream_gives_the_same_steps(seed: int, cuts: list[int]
 
 def parts_of(events: Events, cuts: list[int], dues_us: list[int]) -> list[TimeStep]:
     """Steps and parts of a stream in pieces, where something is due at times inside."""
-    timeline = Timeline(STEP_US, WIDTH, HEIGHT)
+    timeline = Timeline(STEP_US, WIDTH, HEIGHT, 10**6)
     steps: list[TimeStep] = []
 
     def due_us() -> float:

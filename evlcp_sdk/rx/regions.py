@@ -1,0 +1,892 @@
+"""Regions that blink in the rhythm of the chips: which pixels do, what is one region, and where it goes."""
+
+import math
+from abc import ABC, abstractmethod
+from collections import deque
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from evlcp_sdk.link.sections import RegionSpec
+from evlcp_sdk.plugin.roles import Filter
+from evlcp_sdk.rx import _kernels
+from evlcp_sdk.rx.boxes import (
+    CELL_SHIFT,
+    Box,
+    box_around,
+    box_of,
+    clear_of,
+    cut_off,
+    find_areas,
+    grown,
+    hits_in,
+    joined,
+    likeliest_row,
+    overlap,
+    shows_again,
+)
+from evlcp_sdk.rx.limits import LIMITS, Limits
+from evlcp_sdk.rx.rhythm import LAMP, SAME, RhythmTables
+from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.values import Events, Region
+
+MARGIN_PX = 5
+"""Seam around a region: how far it may move in a step, 1.5 px/ms and more, and how far it is blurred."""
+
+_LEAST_RISES = 20
+"""Rises of candidate pixels in a step that a new region needs: a cluster at 100 m has as many, noise few."""
+
+_MEASURE_GAPS = 1.5
+"""A blinking pixel rises once in the longest time of the code; half of that again allows for a late event."""
+
+_AGE_CHIPS = 5
+"""Age of a measured centre. A moving bar's leading end counts once its pixels have risen in rhythm twice,
+some six chips late and more where events go missing; its trailing end stays for the six chips of the
+measurement. In recordings and simulated scenes the centre is 3 to 8 chips late."""
+
+STRAY_PX = 2.0
+"""How much too long a region may be before what is too much must be strays: an edge is good to a pixel."""
+
+_LONGEST_US = 200_000
+"""How long events of the whole image are kept at the most, to gather those of a region anew: a packet that is
+longer than that starts with the frames in reach."""
+
+_BLUR_PX = 2.0
+"""How much longer than a bar its blinking pixels are: blur of a pixel at either end; in motion twice that."""
+
+_SEAM_PX = 2
+"""Columns at either side of a box that a bar should leave dark: some of the least seam of a region."""
+
+_MIN_PIXELS = 4
+"""Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
+
+_CENTRE_SIGMA_PX = 0.25
+"""Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
+
+BACKFILL_STEPS = 12
+"""Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
+
+_COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
+
+SAME_PX = 5.0
+"""How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
+
+_HEIGHTS = 9
+"""Measured heights whose median is a region's: a bar ahead grows by a percent in so many steps at 80 km/h."""
+
+_MOST_AHEAD_STEPS = 2
+"""Steps beyond the measured centres for which a region goes straight on, before a shaking camera turns."""
+
+_ROOM = 64
+"""Places that find room at first; a second of steps does not fit, and is moved once in a while."""
+
+EVENT_BYTES: Final = 13
+"""Of an event: its time, column, row and polarity."""
+
+PIECE_BYTES: Final = 768
+"""Of four arrays and what holds them, however few events there are."""
+
+Piece = tuple[int, Events]
+
+
+class Places:
+    """Centres and sizes of a region, oldest first, never none.
+
+    Args:
+        regions: As they were measured.
+
+    Attributes:
+        latest: The newest.
+
+    >>> places = Places([Region(0, 0.0, 5.0, 7.0, 4.0, 9.0), Region(0, 100.0, 6.0, 7.0, 4.0, 9.0)])
+    >>> len(places), places.place_at(50.0), places.place_at(1000.0), places.size_at(70.0)
+    (2, (5.5, 7.0), (8.0, 7.0), (4.0, 9.0))
+    """
+
+    def __init__(self, regions: Iterable[Region]) -> None:
+        regions = list(regions)
+        self.latest = regions[-1]
+        self._first, self._end = 0, len(regions)
+        self._columns = np.empty((5, max(2 * len(regions), _ROOM)))
+        for column, p in zip(self._columns.T, regions, strict=False):
+            column[:] = p.t_us, p.x_px, p.y_px, p.width_px, p.height_px
+
+    def __len__(self) -> int:
+        return self._end - self._first
+
+    def __iter__(self) -> Iterator[Region]:
+        for row in self._held().T.tolist():
+            yield region_of(self.latest.id, *row)
+
+    def append(self, region: Region) -> None:
+        """Take the next one."""
+        columns, end = self._columns, self._end
+        if end == columns.shape[1]:
+            held = self._held().copy()
+            end = held.shape[1]
+            if 2 * end > columns.shape[1]:
+                self._columns = columns = np.empty((5, 2 * columns.shape[1]))
+            columns[:, :end] = held
+            self._first = 0
+        columns[:, end] = region.t_us, region.x_px, region.y_px, region.width_px, region.height_px
+        self._end = end + 1
+        self.latest = region
+
+    def take_back(self) -> None:
+        """Drop the newest, as if it had not been taken."""
+        self._end -= 1
+        self.latest = region_of(self.latest.id, *self._columns[:, self._end - 1].tolist())
+
+    def forget_before(self, t_us: float) -> None:
+        """Drop those older than a time but for the newest of them, and two in any case."""
+        t = self._columns[0]
+        while self._end - self._first > 2 and t[self._first + 1] < t_us:
+            self._first += 1
+
+    def moved(
+        self,
+        id: int,
+        right_px: float,
+        down_px: float,
+        size_px: tuple[float, float] | None = None,
+        *,
+        row_px: float = 0.0,
+        most_px: float = np.inf,
+        grown_us: tuple[float, float] | None = None,
+    ) -> "Places":
+        """The same elsewhere, under a number, all of one size if one is given.
+
+        Where the height was off the new one by more than `most_px`, the middle may be off by half of what is
+        more: of those rows, the nearest to `row_px` is taken. Between the times `grown_us` they came to be so
+        far off little by little; before the first, they are right.
+        """
+        other = object.__new__(Places)
+        held = self._held()
+        many = held.shape[1]
+        other._columns = columns = np.empty((5, max(2 * many, _ROOM)))
+        other._first, other._end = 0, many
+        columns[0, :many] = held[0]
+        share = np.ones(many)
+        if grown_us is not None and grown_us[1] > grown_us[0]:
+            share = np.clip((held[0] - grown_us[0]) / (grown_us[1] - grown_us[0]), 0.0, 1.0)
+        columns[1, :many] = held[1] + share * right_px
+        columns[2, :many] = held[2] + share * down_px
+        columns[3:, :many] = held[3:]
+        if size_px is not None and most_px < np.inf:
+            slack_px = np.maximum(np.abs(held[4] - size_px[1]) - most_px, 0.0) / 2
+            off_px = row_px - columns[2, :many]
+            columns[2, :many] += np.minimum(np.maximum(off_px, -slack_px), slack_px)
+        if size_px is not None:
+            columns[3, :many], columns[4, :many] = size_px
+        other.latest = region_of(id, *columns[:, many - 1].tolist())
+        return other
+
+    def expected(self, t_us: float) -> tuple[float, float]:
+        """Centre (column, row) at a time soon, if it goes on as between the two newest, px."""
+        last = self.latest
+        if self._end - self._first < 2:
+            return last.x_px, last.y_px
+        before_us, x_px, y_px = self._columns[:3, self._end - 2].tolist()
+        # Further ahead than that, a shaking camera has turned back.
+        ahead = min((t_us - last.t_us) / (last.t_us - before_us), 1.0)
+        return last.x_px + ahead * (last.x_px - x_px), last.y_px + ahead * (last.y_px - y_px)
+
+    def at(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Centre (column, row) at times, float64 (2, n), px: interpolated, straight on for a little."""
+        centre = np.empty((2, len(t_us)))
+        _kernels.places_at(t_us, self._held(), _MOST_AHEAD_STEPS, centre)
+        return centre
+
+    def place_at(self, t_us: float) -> tuple[float, float]:
+        """The same as `at` for one time."""
+        last = self.latest
+        if self._end - self._first == 1:
+            return last.x_px, last.y_px
+        # The line from the place before a time to the one after it; the outermost ones go on for a little.
+        t, right = self._columns[0], self._end - 1
+        while right > self._first + 1 and t[right - 1] > t_us:
+            right -= 1
+        (one_us, other_us), (one_x, other_x), (one_y, other_y) = self._columns[
+            :3, right - 1 : right + 1
+        ].tolist()
+        long_us = other_us - one_us
+        late = t_us > other_us
+        after_us = t_us - (other_us if late else one_us)
+        after_us = min(max(after_us, -_MOST_AHEAD_STEPS * long_us), _MOST_AHEAD_STEPS * long_us)
+        x_px = (other_x if late else one_x) + (other_x - one_x) / long_us * after_us
+        return x_px, (other_y if late else one_y) + (other_y - one_y) / long_us * after_us
+
+    def size_at(self, t_us: float) -> tuple[float, float]:
+        """(width, height) measured nearest to a time, px."""
+        t, i = self._columns[0], self._end - 1
+        while i > self._first and t[i - 1] >= t_us:
+            i -= 1
+        if i > self._first and t_us - t[i - 1] < t[i] - t_us:
+            i -= 1
+        width_px, height_px = self._columns[3:, i].tolist()
+        return width_px, height_px
+
+    def _held(self) -> NDArray[np.float64]:
+        """Times, columns, rows, widths and heights, float64 (5, n)."""
+        return self._columns[:, self._first : self._end]
+
+
+def region_of(id: int, t_us: float, x_px: float, y_px: float, width_px: float, height_px: float) -> Region:
+    """A region, made without the calls that a frozen class makes for each field: there are many a frame."""
+    region = object.__new__(Region)
+    vars(region).update(id=id, t_us=t_us, x_px=x_px, y_px=y_px, width_px=width_px, height_px=height_px)
+    return region
+
+
+def held_bytes(events: Events) -> int:
+    """Bytes that some events take."""
+    return PIECE_BYTES + EVENT_BYTES * len(events.t_us)
+
+
+@dataclass
+class Followed:
+    """A region followed over time, and its events since the first.
+
+    Attributes:
+        id: Number of the region, from 0.
+        positions: Where it was measured, oldest first.
+        pieces: Its events, one entry a time step: (start of the step, us; events).
+        first_us: Start of the first step of which it has events, us.
+        filter: State of the filter of its centre, None without one.
+        heights: As measured lately, px; of a bar of known size, those of steps in which both ends were seen.
+        size_px: (width, height) of the whole bar, by what its frames show, px; None before the first.
+        lit_px: Upper and lower edge, from the bar's centre, of the part that its newest frame showed, px;
+            None where it showed both ends.
+        strips_px: Of a bar whose light stands in strips of columns, (middle from the bar's centre, half the
+            width) of each, px, float64 (n, 2); None of others, and before the first frame.
+        shown_us: When its newest frame showed its place, us; None before the first.
+        outgrown: The region before that, which may have held other bars: (right, down) of its centre from
+            this one's, width and height, px, and until when that matters, us.
+        released: True once it has faded or was merged into another; it gets no more events.
+        opened_us: End of the step in which it was found, us.
+        cut_us: Until when its events were forgotten for want of room, us; None where none were.
+        held_bytes: What its pieces take.
+    """
+
+    id: int
+    positions: Places
+    first_us: int
+    pieces: deque[Piece] = field(default_factory=deque)
+    released: bool = False
+    filter: Any = None
+    heights: deque[float] = field(default_factory=lambda: deque(maxlen=_HEIGHTS))
+    size_px: tuple[float, float] | None = None
+    lit_px: tuple[float, float] | None = None
+    strips_px: NDArray[np.float64] | None = None
+    shown_us: float | None = None
+    outgrown: tuple[float, float, float, float, float] | None = None
+    opened_us: int = 0
+    cut_us: int | None = None
+    held_bytes: int = 0
+
+    def __post_init__(self) -> None:
+        self.hold(self.pieces)
+
+    def hold(self, pieces: deque[Piece]) -> None:
+        """Take other events instead of those held."""
+        self.pieces = pieces
+        self.held_bytes = sum(held_bytes(events) for _, events in pieces)
+
+    def add(self, start_us: int, events: Events) -> None:
+        """Take the events of the next step."""
+        self.pieces.append((start_us, events))
+        self.held_bytes += held_bytes(events)
+
+    def forget(self) -> int:
+        """Drop the events of the oldest step; how many they were."""
+        _, events = self.pieces.popleft()
+        self.held_bytes -= held_bytes(events)
+        return len(events)
+
+    def events_between(self, from_us: float, until_us: float) -> int:
+        """How many of its events there are from one time to before another."""
+        return sum(
+            int(np.diff(np.searchsorted(events.t_us, (from_us, until_us)))[0])
+            for start_us, events in self.pieces
+            if start_us < until_us
+        )
+
+    @property
+    def latest(self) -> Region:
+        """The newest position."""
+        return self.positions.latest
+
+    def covers(self, t_us: float, point_px: tuple[float, float]) -> bool:
+        """Whether a point on the sensor (column, row) is inside the region at a time."""
+        (x, y), (width, height) = self.positions.place_at(t_us), self.positions.size_at(t_us)
+        return abs(point_px[0] - x) <= width / 2 and abs(point_px[1] - y) <= height / 2
+
+    def holds(self, other: "Followed", t_us: float, same_px: float) -> bool:
+        """Whether another region is a part of this bar, or the same bar, its centre so near at a time."""
+        mine, when = self.latest, other.latest.t_us if other.size_px is None else t_us
+        (x, y), (u, v) = self.positions.place_at(when), other.positions.place_at(when)
+        right, down = abs(u - x), abs(v - y)
+        if other.size_px is not None:
+            return max(right, down) <= same_px
+        # Half of it, or more, in each direction.
+        return right <= mine.width_px / 2 + same_px and down <= mine.height_px / 2
+
+    def forget_before(self, t_us: float, step_us: int, places_us: float) -> None:
+        """Drop events older than a time, and positions older than another: others ask where it was."""
+        while self.pieces and self.pieces[0][0] + step_us <= t_us:
+            self.forget()
+        self.positions.forget_before(places_us)
+
+
+def make_room(regions: Sequence[Followed], most_bytes: int, step_us: int) -> int:
+    """Forget the oldest events of regions where all together take too much; how many they were."""
+    spare, dropped = most_bytes, 0
+    for followed in regions:
+        spare -= followed.held_bytes
+    while spare < 0:
+        held = [followed for followed in regions if len(followed.pieces) > 1]
+        if not held:
+            break
+        oldest_us = min(followed.pieces[0][0] for followed in held)
+        for followed in held:
+            if spare < 0 and followed.pieces[0][0] == oldest_us:
+                spare += followed.held_bytes
+                dropped += followed.forget()
+                spare -= followed.held_bytes
+                followed.cut_us = followed.first_us = oldest_us + step_us
+    return dropped
+
+
+def same_place(one: Region, other: Region) -> bool:
+    """Whether the centre of one of two regions lies in the other."""
+    right, down = abs(one.x_px - other.x_px), abs(one.y_px - other.y_px)
+    return any(right <= at.width_px / 2 and down <= at.height_px / 2 for at in (one, other))
+
+
+class RegionTracker(ABC):
+    """Regions of a stream with their events, followed from time step to time step.
+
+    Attributes:
+        alive: Those that are followed.
+        counts: What was left out for want of room.
+    """
+
+    alive: list[Followed]
+    counts: dict[str, int]
+
+    @abstractmethod
+    def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
+        """Take the events of a time step; give the regions that are alive or ended in it.
+
+        Args:
+            start_us: Start of the step, us.
+            events: Those in it, in order.
+            taken: Places that are others': no region is opened there, nor reaches into them.
+        """
+
+    @abstractmethod
+    def skip(self) -> None:
+        """Pass over a gap in time, with no region alive."""
+
+    def close(self) -> None:
+        """End the stream: forget all events."""
+        self.skip()
+        self.alive = []
+
+    def drop(self, followed: Followed) -> None:
+        """Let a region go at once."""
+        followed.released = True
+        self.alive = [other for other in self.alive if other is not followed]
+
+
+class Rhythm:
+    """Scores of a sensor's pixels, one uint32 each, whose bits `_kernels` names.
+
+    Their clock of 17 bits goes round in an eighth of a second. Rows are looked at in turn, where rises so
+    long ago that all such times are alike become the youngest of these; and so soon that none looks young.
+
+    Args:
+        width: Columns of the sensor.
+        height: Its rows.
+        chip_us: Nominal length of a chip, us.
+        min_score: Score at which a pixel is a candidate; half of it is enough inside a region.
+        gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
+        shared: Several followers ask for the same steps; the first one's answer is kept for the others.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        chip_us: float,
+        min_score: int,
+        gap_chips: int = 4,
+        *,
+        shared: bool = False,
+    ) -> None:
+        self._tables = RhythmTables.of(chip_us, gap_chips)
+        self._shift = self._tables.tick_shift
+        self._min_score = min_score
+        self._pixels = np.zeros((height, width), np.uint32)
+        # No time that is looked up is longer; nor are rows looked at one by one after so long a gap.
+        self._turn = _kernels.CLOCK_ROUND // 4
+        self._old = self._turn + self._turn // 8
+        self._every = _kernels.CLOCK_ROUND - self._turn - self._old
+        self._row = 0
+        self._seen: int | None = None
+        self._open_us, self._taken, self._rises = -1, 0, 0
+        self._shared = shared
+        self._kept: tuple[tuple[int, int], int, NDArray[np.int32]] | None = None
+
+    def step(self, start_us: int, events: Events, hits: NDArray[np.int32], cell_shift: int) -> int:
+        """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
+
+        Args:
+            start_us: Start of the step, us.
+            events: Those in it, in order; a part of a step comes again with the rest, and counts once.
+            hits: Of cells of 2^cell_shift px, int32 (rows, columns).
+            cell_shift: See there.
+        """
+        if self._kept is not None and self._kept[0] == (start_us, len(events)):
+            hits[:] = self._kept[2]
+            return self._kept[1]
+        old = self._row, 0, 0, 0, self._old
+        if start_us != self._open_us:
+            self._open_us, self._taken, self._rises = start_us, 0, 0
+            # As many rows as the time since the last step asks for, all after a gap.
+            now, height = start_us >> self._shift, len(self._pixels)
+            passed = self._turn if self._seen is None else now - self._seen
+            whole = passed >= self._turn
+            many = height if whole else -(-height * passed // self._every)
+            old = self._row, many, now, 0 if whole else self._old, self._old
+            self._row, self._seen = (self._row + many) % height, now
+        first, tables = self._taken, self._tables
+        newest = events.t_us[first:], events.x[first:], events.y[first:], events.p[first:]
+        limits, shifts = (tables.soon, self._min_score, SAME), (self._shift, cell_shift)
+        self._rises += _kernels.score_rises(
+            newest, self._pixels, hits, tables.kinds, tables.lows, limits, shifts, old
+        )
+        self._taken = events.t_us.size
+        if self._shared:
+            self._kept = (start_us, len(events)), self._rises, hits.copy()
+        return self._rises
+
+    def of(self, events: Events) -> Events:
+        """Those of candidates that are no lamps.
+
+        Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
+        all of it.
+        """
+        return events[self._rhythmic(events, LAMP)]
+
+    def may_open(self, events: Events) -> bool:
+        """Whether any of them is of a candidate that opens a region."""
+        return bool(self._rhythmic(events, SAME).any())
+
+    def _rhythmic(self, events: Events, most_same: int) -> NDArray[np.bool_]:
+        state = self._pixels[events.y, events.x]
+        rhythmic: NDArray[np.bool_] = (state & _kernels.SCORES) >= self._min_score
+        rhythmic &= (state >> _kernels.SAME_AT) & _kernels.MOST_SAME < most_same
+        return rhythmic
+
+    def measure(
+        self,
+        box: Box,
+        end_us: int,
+        span_us: int,
+        reach_px: float,
+        rows: NDArray[np.int64],
+        strips: tuple[float, float, NDArray[np.float64]] | None,
+    ) -> tuple[int, float, int, int, float, float]:
+        """Where in a box pixels blink that rose in the last `span_us`, see `_kernels.measure_box`.
+
+        `strips` are (expected, near, strips) of `_kernels.measure_strips` for a bar whose light stands in
+        strips of columns, None for others.
+        """
+        # Half the score suffices inside a region: its seam is new to the light as the bar moves.
+        awake = end_us >> self._shift, span_us >> self._shift, max(self._min_score // 2, 1)
+        if strips is not None:
+            return _kernels.measure_strips(self._pixels, box, awake, *strips, rows)
+        return _kernels.measure_box(self._pixels, box, awake, _SEAM_PX, reach_px, rows)
+
+
+def select(events: Events, box: Box) -> Events:
+    """Those inside a box (left, top, right, bottom), in no more memory than twice what they need."""
+    room = events.t_us.size + 1
+    into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
+    n = _kernels.select_box((events.t_us, events.x, events.y, events.p), box, into)
+    t_us, x, y, p = into
+    inside = Events.as_is(t_us[:n], x[:n], y[:n], p[:n])
+    return Events.concat([inside]) if 2 * n < room else inside
+
+
+class RegionFollower(RegionTracker):
+    """Finds what blinks in the rhythm of the chips, and follows it: the tracker of the receiver.
+
+    Args:
+        spec: Parameters.
+        camera: For the size of the sensor.
+        chip_us: Nominal length of a chip, us.
+        position: Filter of the centres; None for centres as measured.
+        keep_us: How long events of the whole image are kept, so that a region may turn out to be larger than
+            it was taken for, us.
+        limits: How much is held.
+        gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
+        rhythm: Scores of the pixels, of another follower in the same rhythm; None for its own.
+    """
+
+    def __init__(
+        self,
+        spec: RegionSpec,
+        camera: CameraModel,
+        chip_us: float,
+        position: Filter | None = None,
+        keep_us: float = 0.0,
+        limits: Limits = LIMITS,
+        gap_chips: int = 4,
+        rhythm: Rhythm | None = None,
+    ) -> None:
+        self._spec = spec
+        self._limits = limits
+        self._keep_us = keep_us
+        self._position = position
+        self._camera = camera
+        self._measure_us = round(_MEASURE_GAPS * gap_chips * chip_us)
+        self._age_us = _AGE_CHIPS * chip_us
+        shape = (camera.height, camera.width)
+        self._rhythm = rhythm or Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
+        self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in shape], np.int32)
+        self._fresh: list[Box] = []
+        steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
+        self._recent: deque[Piece] = deque()
+        self._most_recent = max(steps, BACKFILL_STEPS)
+        self._recent_bytes = 0
+        self._next_id = 0
+        self.alive: list[Followed] = []
+        self.counts = dict.fromkeys(_COUNTS, 0)
+
+    def step(self, start_us: int, events: Events, taken: Sequence[Region] = ()) -> list[Followed]:
+        """Take the events of one time step; return the regions that are alive or ended in it."""
+        spec = self._spec
+        self._remember(start_us, events)
+        rises = self._rhythm.step(start_us, events, self._hits, CELL_SHIFT)
+        end_us = start_us + spec.step_us
+        boxes = self._boxes(start_us + spec.step_us / 2, taken)
+        owned = self._own(boxes) if len(boxes) > 1 else boxes
+        for followed, box, own in zip(self.alive, boxes, owned, strict=True):
+            inside = select(events, box)
+            # Before a frame shows where in its box a bar is, panels and moving textures around it would drown
+            # it: only what blinks in rhythm counts.
+            followed.add(start_us, inside if followed.size_px else self._rhythm.of(inside))
+            if (found := self._locate(followed, own, end_us)) is not None:
+                followed.filter, place = found
+                followed.positions.append(place)
+        if len(self.alive) > 1:
+            self._merge()
+        self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, spec.step_us)
+        self._open(end_us, rises, taken)
+        seen = list(self.alive)
+        gone = False
+        for followed in seen:
+            followed.released |= end_us - followed.positions.latest.t_us > spec.fade_us
+            gone |= followed.released
+        if gone:
+            self._let_go()
+        return seen
+
+    def _boxes(self, t_us: float, taken: Sequence[Region]) -> list[Box]:
+        """Where each region should be in the middle of a step; one of unknown size beside the others."""
+        boxes, known, unknown = [], [], []
+        for number, followed in enumerate(self.alive):
+            last = followed.positions.latest
+            place = *self._expected(followed, t_us), last.width_px, last.height_px
+            boxes.append(self._reach(*place))
+            if followed.size_px is None:
+                unknown.append(number)
+            else:
+                known.append(place)
+        if unknown:
+            others = [box_of(place) for place in taken] + [box_around(*place) for place in known]
+            for number in unknown:
+                boxes[number] = clear_of(boxes[number], others)
+        return boxes
+
+    def _own(self, boxes: list[Box]) -> list[Box]:
+        """What of each box shows where its region is: the seam without other bars of known size.
+
+        Rows of a bar below would be as good as its own, so that a region would move on to them.
+        """
+        tight = [
+            grown(box, -MARGIN_PX) if one.size_px else None
+            for box, one in zip(boxes, self.alive, strict=True)
+        ]
+        bars = [bar for bar in tight if bar is not None]
+        if len(bars) < 2:
+            return boxes
+        return [
+            box if bar is None else cut_off(box, bar, bars) for box, bar in zip(boxes, tight, strict=True)
+        ]
+
+    def _let_go(self) -> None:
+        """Follow those no more that are released."""
+        lost = [followed for followed in self.alive if followed.released and followed.size_px is not None]
+        self.alive = [followed for followed in self.alive if not followed.released]
+        for followed in self.alive:
+            # A bar that was seen in what another was taken for is no halo when it is seen again.
+            if any(_lies_in_outgrown(followed, gone.latest) for gone in lost):
+                followed.outgrown = None
+
+    def _remember(self, start_us: int, events: Events) -> None:
+        """Keep a step's events of the whole image, and as many before it as there is room for."""
+        self._recent.append((start_us, events))
+        self._recent_bytes += held_bytes(events)
+        most_bytes = self._limits.recent_bytes
+        while len(self._recent) > self._most_recent or (
+            self._recent_bytes > most_bytes and len(self._recent) > 1
+        ):
+            self.counts["steps_forgotten"] += len(self._recent) <= self._most_recent
+            _, forgotten = self._recent.popleft()
+            self._recent_bytes -= held_bytes(forgotten)
+
+    def skip(self) -> None:
+        """Pass over a gap in time, with no region alive."""
+        self._fresh = []
+        self._recent.clear()
+        self._recent_bytes = 0
+
+    def gather(self, followed: Followed, from_us: float = -math.inf, until_us: float = math.inf) -> None:
+        """Take a region's events once more, from where it is now known to have been.
+
+        Args:
+            followed: The region.
+            from_us: From the step that holds this time, us.
+            until_us: To the step before this time, us.
+        """
+        oldest_us = followed.pieces[0][0] if followed.pieces else followed.first_us
+        step_us = self._spec.step_us
+        kept = [
+            piece
+            for piece in self._recent
+            if oldest_us <= piece[0] < until_us and piece[0] + step_us > from_us
+        ]
+        last = followed.latest
+        gathered = {}
+        x, y = followed.positions.at(np.array([start + step_us / 2 for start, _ in kept]))
+        for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
+            box = self._reach(x_px, y_px, last.width_px, last.height_px)
+            gathered[start] = select(events, box)
+        followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
+        self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, step_us)
+
+    def _expected(self, followed: Followed, t_us: float) -> tuple[float, float]:
+        """Where a region's centre should be soon: by its filter, or else straight on."""
+        if self._position is None or (expected := self._position.predict(followed.filter, t_us)) is None:
+            return followed.positions.expected(t_us)
+        return float(expected[0][0]), float(expected[0][1])
+
+    def _whole(self, followed: Followed, measured: Region, top: int, rows: NDArray[np.int64]) -> Region:
+        """A region of the height that it lately had; `rows`: its pixels in each row from `top` on.
+
+        Where few pixels are awake, an end is dark; where noise wakes pixels that a fast bar has left, there
+        is one too many. Of the places that the edges allow, the nearest to the expected one is taken; of more
+        rows than the bar has, those that are likeliest to be its own. Where more of a bar of known size is
+        missing, an end is hidden: the one that is nearer to its place counts alone.
+        """
+        known, lit = followed.size_px, followed.lit_px
+        _, expected_px = self._expected(followed, measured.t_us)
+        heights = followed.heights
+        if lit is not None and known is not None and shows_again(rows, expected_px - top, known[1], lit):
+            # Those before are of the part.
+            lit, heights = None, deque()
+        whole_px = measured.height_px if known is None else known[1] if lit is None else lit[1] - lit[0]
+        # Of a bar with a hidden end, the part that is seen is found, and says where the whole is.
+        off_px = 0.0 if lit is None else (lit[0] + lit[1]) / 2
+        expected_px += off_px
+        if known is None or -STRAY_PX <= measured.height_px - whole_px <= 2 * _BLUR_PX:
+            heights.append(measured.height_px)
+        # A part of the bar says nothing of its height, once that is known.
+        height_px = _median(heights) if heights else whole_px
+        excess_px = measured.height_px - height_px
+        if excess_px > STRAY_PX:
+            # What is not known yet may grow to either side.
+            sized = known is not None
+            y_px = likeliest_row(rows, top, round(height_px), expected_px, STRAY_PX, sized=sized)
+        elif known is not None and excess_px < -2 * MARGIN_PX:
+            # By its upper end, and by its lower one.
+            ends_px = measured.y_px - excess_px / 2, measured.y_px + excess_px / 2
+            y_px = min(ends_px, key=lambda end_px: abs(end_px - expected_px))
+            if abs(y_px - expected_px) > MARGIN_PX:
+                y_px = followed.latest.y_px + off_px
+        else:
+            slack_px = abs(excess_px) / 2
+            y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
+        size_px = known or (measured.width_px, height_px + min(max(excess_px, 0.0), STRAY_PX))
+        return region_of(measured.id, measured.t_us, measured.x_px, y_px - off_px, *size_px)
+
+    def _locate(self, followed: Followed, box: Box, now_us: int) -> tuple[Any, Region] | None:
+        """State of a region's filter after it was measured in a box, and its place by it; None if unseen."""
+        rows = np.empty(box[3] - box[1], np.int64)
+        seen = self._measure(followed, box, now_us, rows)
+        if seen is None:
+            return None
+        measured = self._whole(followed, seen, box[1], rows)
+        if self._position is None:
+            return followed.filter, measured
+        centre = np.array([measured.x_px, measured.y_px])
+        state, centre, _ = self._position.step(followed.filter, measured.t_us, centre, _CENTRE_SIGMA_PX)
+        x_px, y_px = float(centre[0]), float(centre[1])
+        return state, Region(measured.id, measured.t_us, x_px, y_px, measured.width_px, measured.height_px)
+
+    def _reach(self, x_px: float, y_px: float, width_px: float, height_px: float) -> Box:
+        """The box in which a region's events lie within the next step; an empty one off the sensor."""
+        m = MARGIN_PX
+        half_w, half_h = width_px / 2 + m, height_px / 2 + m
+        width, height = self._camera.width, self._camera.height
+        left, top = int(x_px - half_w), int(y_px - half_h)
+        right, bottom = int(x_px + half_w) + 1, int(y_px + half_h) + 1
+        if left < 0 or top < 0 or right > width or bottom > height:
+            left, right = min(max(left, 0), width), min(max(right, 0), width)
+            top, bottom = min(max(top, 0), height), min(max(bottom, 0), height)
+        return left, top, right, bottom
+
+    def _measure(
+        self, followed: Followed | None, box: Box, end_us: int, rows: NDArray[np.int64] | None = None
+    ) -> Region | None:
+        """Centre and size of what blinks in a box at the end of a step; `rows`: its pixels in each row.
+
+        Of a bar of known width, rows count no pixels beside it, and of strips none between them.
+        """
+        width_px, strips = math.inf, None
+        if followed is not None and followed.size_px is not None:
+            width_px = followed.size_px[0]
+        if followed is not None and followed.strips_px is not None:
+            expected_px, _ = self._expected(followed, end_us - self._age_us)
+            strips = expected_px, float(MARGIN_PX), followed.strips_px
+        if rows is None:
+            rows = np.empty(box[3] - box[1], np.int64)
+        total, column, left, right, upper, lower = self._rhythm.measure(
+            box, end_us, self._measure_us, width_px / 2 + 1, rows, strips
+        )
+        if total < _MIN_PIXELS:
+            return None
+        id = self._next_id if followed is None else followed.id
+        return region_of(
+            id, end_us - self._age_us, column, (upper + lower - 1) / 2, right - left + 1.0, lower - upper
+        )
+
+    def _open(self, end_us: int, rises: int, taken: Sequence[Region]) -> None:
+        """Open a region where something blinks in two steps on end outside those known, and `taken` places.
+
+        `rises` are how many hits there are; `end_us` is the end of the step.
+        """
+        hits, merge_px = self._hits, self._spec.merge_px
+        if rises >= _LEAST_RISES and (self.alive or taken):
+            known = [self._reach(place.x_px, place.y_px, place.width_px, place.height_px) for place in taken]
+            for followed in self.alive:
+                last = followed.positions.latest
+                reach = self._reach(last.x_px, last.y_px, last.width_px, last.height_px)
+                known.append(reach if followed.size_px else grown(reach, merge_px))
+                if followed.outgrown is not None and end_us > followed.outgrown[4]:
+                    known.append(self._reach(*_outgrown(followed)))
+            rises -= _kernels.clear_cells(hits, np.array(known, np.int64), CELL_SHIFT)
+        fresh, self._fresh = self._fresh, []
+        if rises >= _LEAST_RISES:
+            areas, left_out = find_areas(hits, self._limits.areas, (self._camera.width, self._camera.height))
+            self.counts["areas_left_out"] += left_out
+            lit = [region for area in areas if (region := self._measure(None, area, end_us)) is not None]
+            boxes = [box for box in joined(map(box_of, lit), merge_px) if hits_in(hits, box) >= _LEAST_RISES]
+        else:
+            boxes = []
+        if rises:
+            hits[:] = 0
+        for box in boxes:
+            if any(overlap(grown(box, merge_px), other) for other in fresh):
+                self._start(box, end_us)
+            else:
+                self._fresh.append(box)
+
+    def _start(self, box: Box, end_us: int) -> None:
+        region = self._measure(None, box, end_us)
+        if region is None:
+            return
+        reach = self._reach(region.x_px, region.y_px, region.width_px, region.height_px)
+        # Lamps whose pixels were not known as such in the step before are now.
+        newest = select(self._recent[-1][1], reach)
+        if not self._rhythm.may_open(newest) or not self._place_for_one(end_us):
+            return
+        self._next_id += 1
+        for like in self.alive:
+            if like.outgrown and region.t_us <= like.outgrown[4] and _lies_in_outgrown(like, region):
+                # It was seen as long as the one that it was taken to be a part of.
+                right, down = region.x_px - like.latest.x_px, region.y_px - like.latest.y_px
+                size_px = region.width_px, region.height_px
+                places = like.positions.moved(region.id, right, down, size_px)
+                pieces = deque((start, Events.empty()) for start, _ in self._recent)
+                followed = Followed(region.id, places, pieces[0][0], pieces, opened_us=end_us)
+                followed.filter = self._position.init() if self._position else None
+                self.gather(followed)
+                self.alive.append(followed)
+                return
+        recent = list(self._recent)[-BACKFILL_STEPS:]
+        pieces = deque((start, self._rhythm.of(select(events, reach))) for start, events in recent)
+        state = self._position.init() if self._position else None
+        self.alive.append(
+            Followed(region.id, Places([region]), pieces[0][0], pieces, filter=state, opened_us=end_us)
+        )
+
+    def _place_for_one(self, now_us: int) -> bool:
+        """Whether a new region may be followed, maybe in place of one that had its time and shows no bar."""
+        followed = [one for one in self.alive if not one.released]
+        if len(followed) < self._limits.regions:
+            return True
+        idle = [one for one in followed if one.size_px is None and one.opened_us + self._keep_us < now_us]
+        if not idle:
+            self.counts["regions_left_out"] += 1
+            return False
+        min(idle, key=lambda one: (one.opened_us, one.id)).released = True
+        self.counts["regions_gave_way"] += 1
+        return True
+
+    def _merge(self) -> None:
+        """Keep the older of two regions that have grown together.
+
+        Of bars that frames have shown, each stays as large as it is: where a jolt brings one region over
+        another, both are followed, until they follow the same.
+        """
+        boxes = [box_of(followed.latest) for followed in self.alive]
+        for i, older in enumerate(self.alive):
+            for k in range(i + 1, len(boxes)):
+                younger = self.alive[k]
+                if not overlap(boxes[i], boxes[k]) or younger.released:
+                    continue
+                one, other = older.latest, younger.latest
+                shown = (older.size_px is not None) + (younger.size_px is not None)
+                apart_px = max(abs(one.x_px - other.x_px), abs(one.y_px - other.y_px))
+                if shown == 0 or apart_px <= SAME_PX or (shown == 1 and same_place(one, other)):
+                    younger.released = True
+        # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
+
+
+def _outgrown(followed: Followed) -> tuple[float, float, float, float]:
+    """Column, row, width and height that a region would have now if no frame had shown its size, px."""
+    assert followed.outgrown is not None
+    right, down, width, height, _ = followed.outgrown
+    last = followed.latest
+    return last.x_px + right, last.y_px + down, width, height
+
+
+def _lies_in_outgrown(like: Followed, region: Region) -> bool:
+    """Whether a region's centre lies in what another was taken for, at any time."""
+    if like.outgrown is None:
+        return False
+    x_px, y_px, width_px, height_px = _outgrown(like)
+    return abs(region.x_px - x_px) <= width_px / 2 and abs(region.y_px - y_px) <= height_px / 2
+
+
+def _median(values: Iterable[float]) -> float:
+    ordered = sorted(values)
+    many = len(ordered)
+    return ordered[many // 2] if many % 2 else (ordered[many // 2 - 1] + ordered[many // 2]) / 2
