@@ -2,7 +2,6 @@
 
 from collections import OrderedDict
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -104,7 +103,7 @@ class MessageAssembler:
         clock_zero: ClockZero = None,
     ) -> None:
         self._coder = coder
-        self._guard: AbstractContextManager[None] = guard or nullcontext()
+        self._guard = guard
         self._kinds = kinds
         self._spec = spec
         self._room = coder.block_bytes - HEADER_BYTES
@@ -202,8 +201,7 @@ class MessageAssembler:
 
     def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
         """The bytes of a packet's block and the packets it took; None if that is not known yet."""
-        with self._guard:
-            found = self._coder.block(llr)
+        found = self._block(llr)
         if found is not None or not self._spec.combine_packets:
             return found, 1
         alike = [_agreement(llr, earlier.llr) for earlier in inbox.sums]
@@ -214,11 +212,18 @@ class MessageAssembler:
         self.counts["blocks_alike"] += 1
         one = inbox.sums.pop(best)
         total = _Sum(one.llr + llr, one.packets + 1)
-        with self._guard:
-            found = self._coder.block(total.llr)
+        found = self._block(total.llr)
         if found is None:
             inbox.sums.append(total)
         return found, total.packets
+
+    def _block(self, llr: NDArray[np.float32]) -> bytes | None:
+        try:
+            return self._coder.block(llr)
+        except (Exception, SystemExit) as fault:
+            if self._guard is not None:
+                self._guard.blame(fault)
+            raise
 
     def _take(self, inbox: _Inbox, block: Block, packet: Packet) -> list[ReceivedMessage]:
         """Put a block into its message; give what can be handed on now."""

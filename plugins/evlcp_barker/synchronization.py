@@ -1,4 +1,4 @@
-"""Packet timing by sliding correlation with the preamble."""
+"""Packet timing: where preambles are in a sliding correlation, when, and the clock that they show."""
 
 import math
 from dataclasses import dataclass, field
@@ -10,12 +10,17 @@ from pydantic import Field
 
 from evlcp_barker import _kernels
 from evlcp_barker.bound import due_chips, guard_chips, least_correlation
-from evlcp_barker.preamble import find_peaks, time_preamble
 from evlcp_sdk.air.codebook import Codebook, are_pairs
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Synchronization
-from evlcp_sdk.values import SyncLock, changed, plain
+from evlcp_sdk.values import SyncLock, changed
+
+Floats = NDArray[np.float64]
+
+_OUTSTANDS = 6.0
+"""A correlation so many times the rms of a packet's others is a preamble: random data reach 5 in 20 s. The
+rms is no less than one over the root of the events' number, which is that of random signs."""
 
 _TIMING_SIGMA_US = 2.0
 """Least spread of one packet's time, from the grid of the correlation and the jitter of the pixels."""
@@ -142,7 +147,7 @@ class SyncState:
     """
 
     first_bin: int | None = None
-    counts: NDArray[np.float64] = field(default_factory=lambda: np.zeros((2, 0)))
+    counts: Floats = field(default_factory=lambda: np.zeros((2, 0)))
     next_bin: int = 0
     power: float = 0.0
     known: int = 0
@@ -195,7 +200,7 @@ class BarkerSynchronizer:
         locks: list[SyncLock] = []
         power, known, clock, stray = state.power, state.known, state.clock, state.stray
         lo = state.next_bin - state.first_bin
-        _kernels.count_bins(plain(t_us), plain(p), state.first_bin, self._bin_us, state.counts, counts)
+        _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
         if lags - guard > lo:
             rho, squares = np.empty(lags), np.empty(lags - guard - lo)
             top = _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)
@@ -211,8 +216,7 @@ class BarkerSynchronizer:
                         locks.append(self._lock(clock, found.quality))
             lo = lags - guard
         drop = max(lo - guard, 0)
-        state = changed(
-            state,
+        state = SyncState(
             first_bin=state.first_bin + drop,
             # A view would have kernels compiled once more, for arrays that are not in one piece.
             counts=counts[:, drop:].copy(),
@@ -224,14 +228,22 @@ class BarkerSynchronizer:
         )
         return state, locks
 
-    def _refine(self, lag: int, counts: NDArray[np.float64], first_bin: int, quality: float) -> _Preamble:
+    def _refine(self, lag: int, counts: Floats, first_bin: int, quality: float) -> _Preamble:
         """Times of one preamble, for positive and negative events apart, us."""
-        times, variances = time_preamble(counts, lag, self._chips, _STEPS, self._pair, self._rising)
-        if math.isnan(times[0]):
-            times[0], variances[0] = times[1], variances[1]
-        on_us, off_us, onset_us = [(first_bin + v) * self._bin_us for v in times]
-        noises = [_TIMING_SIGMA_US**2 + v * self._bin_us**2 for v in variances]
-        return _Preamble(on_us, off_us, onset_us, quality, *noises)
+        found = time_preamble(counts, lag, self._chips, _STEPS, self._pair, self._rising)
+        (on, on_noise), (off, off_noise), (onset, onset_noise) = found
+        if math.isnan(on):
+            on, on_noise = off, off_noise
+        bin_us, least = self._bin_us, _TIMING_SIGMA_US**2
+        return _Preamble(
+            on_us=(first_bin + on) * bin_us,
+            off_us=(first_bin + off) * bin_us,
+            onset_us=(first_bin + onset) * bin_us,
+            quality=quality,
+            on_noise=least + on_noise * bin_us**2,
+            off_noise=least + off_noise * bin_us**2,
+            onset_noise=least + onset_noise * bin_us**2,
+        )
 
     def _accept(
         self, clock: _Clock | None, stray: _Preamble | None, found: _Preamble
@@ -331,3 +343,94 @@ class BarkerSynchronizer:
             delay_off_us=clock.apart.value - onset,
             quality=quality,
         )
+
+
+def find_peaks(rho: Floats, first: int, guard: int, squares: Floats, least: float) -> list[int]:
+    """Lags from the first on that correlate enough, best within `guard` on both sides; the first of equals.
+
+    `squares` are the mean squares up to each; what is `_OUTSTANDS` times their root is enough, from half of
+    `least`, and `least` is in any case.
+    """
+    high = np.flatnonzero(rho[first : first + len(squares)] >= least / 2)
+    high = first + high[rho[first + high] >= np.minimum(_OUTSTANDS * np.sqrt(squares[high]), least)]
+    found = []
+    for lag in high.tolist():
+        low = max(lag - guard, 0)
+        if lag == low + int(rho[low : lag + guard + 1].argmax()):
+            found.append(lag)
+    return found
+
+
+def time_preamble(
+    counts: Floats, lag: int, chips: Floats, steps: int, pair: int, rising: NDArray[np.int64]
+) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
+    """Times of a preamble found at a lag in counts of OFF and ON, float64 (2, bins), `steps` a chip.
+
+    `pair` chips, a pair of pair codes, are left out together to see how sure the first two are; the third is
+    by the chips that are `rising`.
+
+    Returns:
+        Where positive events fit best, and negative ones, NaN where none do; and where positive ones first
+        reach half of their most, over what comes all the time; in steps. Each with its jackknife's variance.
+    """
+    first, last = max(lag - steps, 0), min(lag + steps + 1, counts.shape[1] - steps * len(chips) + 1)
+    running = np.zeros((2, last - first + steps * len(chips)))
+    np.cumsum(counts[:, first : first + running.shape[1] - 1], axis=1, out=running[:, 1:])
+    bounds = np.arange(last - first) + steps * np.arange(len(chips) + 1)[:, None]
+    windows = running[:, bounds]
+    # Of negative and positive events: what may be left out, by lags.
+    values = np.array([[[-1.0]], [[1.0]]]) * chips[:, None] * (windows[:, 1:] - windows[:, :-1])
+    if pair > 1:
+        values = values.reshape(2, -1, pair, last - first).sum(2)
+    off, off_noise = _jackknife(_middles(_without_each(values[0])))
+    on, on_noise = _jackknife(_middles(_without_each(values[1])))
+    at = lag + steps * rising[:, None] + np.arange(-steps, steps)
+    response = counts[1, np.clip(at, 0, counts.shape[1] - 1)]
+    onset, onset_noise = _jackknife(_onsets(_without_each(response)))
+    return (first + on, on_noise), (first + off, off_noise), (lag - steps + onset, onset_noise)
+
+
+def _without_each(parts: Floats) -> Floats:
+    """The sum of parts (n, m), then the sums without each of them, (1 + n, m)."""
+    out = np.empty((len(parts) + 1, parts.shape[1]))
+    out[0] = parts.sum(0)
+    np.subtract(out[0], parts, out=out[1:])
+    return out
+
+
+def _middles(fits: Floats) -> Floats:
+    """Where correlations (n, lags) are best; NaN where one is positive nowhere.
+
+    The top is flat where a window holds all events of an edge: its middle is the best window.
+    """
+    top = fits.max(1)
+    weight = np.maximum(fits - 0.9 * top[:, None], 0)
+    total = weight.sum(1)
+    total[top <= 0] = np.nan
+    found: Floats = weight @ np.arange(fits.shape[1]) / total
+    return found
+
+
+def _onsets(responses: Floats) -> Floats:
+    """Where counts (n, steps) first reach half of their most, over what comes always: a quartile."""
+    ordered = np.sort(responses, axis=1)
+    half = (ordered[:, ordered.shape[1] // 4] + ordered[:, -1]) / 2
+    k = (responses >= half[:, None]).argmax(1)
+    rows = np.arange(len(responses))
+    reached, below = responses[rows, k], np.where(k > 0, responses[rows, k - 1], 0.0)
+    rises = reached > below
+    found: Floats = k - 0.5 + rises * (half - below) / np.where(rises, reached - below, 1.0)
+    return found
+
+
+def _jackknife(found: Floats) -> tuple[float, float]:
+    """What was found of all, and its variance by what was found without each; NaN of these says nothing."""
+    whole, *without = found.tolist()
+    many, total, squares = 0, 0.0, 0.0
+    for value in without:
+        if value == value:
+            many, total = many + 1, total + value
+    for value in without:
+        if value == value:
+            squares += (value - total / many) ** 2
+    return whole, (many - 1) * squares / many if many else 0.0

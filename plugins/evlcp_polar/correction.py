@@ -251,14 +251,16 @@ class _PolarCode:
             sure = 2 * np.abs(values[np.isfinite(values)]).max(initial=1.0)
             values = np.nan_to_num(values, nan=0.0, posinf=sure, neginf=-sure)
         words = values[: self.words * self.length].reshape(self.words, -1)
-        parts = [self._decode_word(word) for word in words]
-        return Corrected(
-            np.concatenate([part.bits for part in parts]),
-            all(part.ok for part in parts),
-            sum(part.flipped for part in parts),
-        )
+        message, ok, flipped = [], True, 0
+        for word in words:
+            codeword, inputs, passes = self._decode_word(word)
+            message.append(inputs[:-CRC_BITS])
+            ok &= passes
+            flipped += int(((word < 0) != codeword[self.sent].astype(bool))[word != 0].sum())
+        return Corrected(np.concatenate(message), ok, flipped)
 
-    def _decode_word(self, llr: NDArray[np.float64]) -> Corrected:
+    def _decode_word(self, llr: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.uint8], bool]:
+        """The likeliest codeword that was found, its inputs, and whether it passes."""
         weight = np.abs(llr)
         mean = weight.mean()
         if mean > 0:
@@ -276,21 +278,12 @@ class _PolarCode:
             most = np.inf if size == 1 else limit
             found = _kernels.list_decode(mother, self.nodes, size, most, codewords, metric)
             for path in np.argsort(metric[:found], kind="stable"):
-                inputs = self._inputs(codewords[path])
+                inputs = transform(codewords[path])[self.information]
                 if metric[path] <= limit and not crc24(inputs).any():
-                    return self._corrected(llr, codewords[path], inputs, ok=True)
+                    return codewords[path], inputs, True
                 if metric[path] < least:
                     guess, least = codewords[path], metric[path]
             # Whatever a longer list found would most likely be as far off as all that this one has found.
             if limit < 0 or found == 0:
                 break
-        return self._corrected(llr, guess, self._inputs(guess), ok=False)
-
-    def _inputs(self, codeword: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        return transform(codeword)[self.information]
-
-    def _corrected(
-        self, llr: NDArray[np.float64], codeword: NDArray[np.uint8], inputs: NDArray[np.uint8], *, ok: bool
-    ) -> Corrected:
-        flipped = int(((llr < 0) != codeword[self.sent].astype(bool))[llr != 0].sum())
-        return Corrected(inputs[:-CRC_BITS].copy(), ok, flipped)
+        return guess, transform(guess)[self.information], False

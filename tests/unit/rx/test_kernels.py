@@ -142,7 +142,7 @@ def test_what_blinks_in_a_box(box, share, reach):
     pixels = states(rose, rng.integers(0, 14, rose.shape), score)
     span_us = 100 if share < 1 else 200
     rows = np.empty(box[3] - box[1], np.int64)
-    got = rhythm_of(pixels, min_score=10).measure(box, 1100, span_us, 2, reach, rows)
+    got = rhythm_of(pixels, min_score=10).measure(box, 1100, span_us, reach, rows, None)
     want, want_rows = twins.measure_box((rose >= 1100 - span_us) & (score >= 5), box, 2, reach)
     assert_allclose(got, want, rtol=1e-12)
     assert_array_equal(rows, want_rows)
@@ -156,7 +156,7 @@ def test_what_blinks_in_strips(strips, share):
     blinks = rng.random((HEIGHT, WIDTH)) < share
     pixels = states(np.full(blinks.shape, 1000), 0, np.where(blinks, 5, 3))
     rows = np.empty(box[3] - box[1], np.int64)
-    got = rhythm_of(pixels, min_score=10).measure(box, 1100, 200, 2, np.inf, rows, (11.3, 2.0, strips))
+    got = rhythm_of(pixels, min_score=10).measure(box, 1100, 200, np.inf, rows, (11.3, 2.0, strips))
     want, want_rows = twins.measure_strips(blinks, box, 11.3, 2.0, strips)
     assert_allclose(got, want, rtol=1e-12)
     assert_array_equal(rows, want_rows)
@@ -171,12 +171,12 @@ def test_strips_are_measured_whatever_each_has_awake():
     box, rows = (0, 0, WIDTH, HEIGHT), np.empty(HEIGHT, np.int64)
     strips = 12.5, 2.0, np.array([[-6, 1.5], [6, 1.5]])
     rhythm = rhythm_of(pixels, min_score=10)
-    many, column, first, last, upper, lower = rhythm.measure(box, 1100, 200, 2, np.inf, rows, strips)
+    many, column, first, last, upper, lower = rhythm.measure(box, 1100, 200, np.inf, rows, strips)
     assert (many, first, last) == (36, 4, 18)
     assert column == pytest.approx(11)
     assert rows[8] == 3
     assert (upper, lower) == pytest.approx((3 + 1 / 6, 13 - 1 / 6))  # 36 pixels in ten rows
-    assert abs(rhythm.measure(box, 1100, 200, 2, np.inf, rows)[1] - 11) > 3
+    assert abs(rhythm.measure(box, 1100, 200, np.inf, rows, None)[1] - 11) > 3
 
 
 @pytest.mark.parametrize("n", [0, 1, 500])
