@@ -30,7 +30,6 @@ from evlcp_sdk.sim import (
     Simulation,
     Truth,
     read_truth,
-    scene_of_truth,
     truth_of,
 )
 from evlcp_sdk.sim.optics import blur_of
@@ -50,6 +49,7 @@ from tests.models.pixels import (
     pixel_events,
     step_response,
 )
+from tests.models.truths import scene_of_truth
 
 SHARED = Path(__file__).parents[3] / "shared" / "recordings"
 SENSOR = SensorSpec()
@@ -186,7 +186,7 @@ def compare() -> None:
         print("no ../shared/recordings: comparison left out")
         return
     told = read_truth(SHARED / "night-50m-30kmh.truth.json")
-    scene = scene_of_truth(told)
+    scene = scene_of_truth(told.to_table())
     columns = []
     for events, truth_ in (
         (read_events(SHARED / "night-50m-30kmh.raw"), told),
@@ -206,7 +206,7 @@ def compare() -> None:
     print("| | Mev/s | ON share | frames | wrong bits | RMSE m (95 %) |\n|---|---|---|---|---|---|")
     for path in paths:
         told = read_truth(path.with_suffix(".truth.json"))
-        made = scene_of_truth(told)
+        made = scene_of_truth(told.to_table())
         for name, events, truth_ in (
             (path.stem, read_events(path), told),
             ("simulated", Events.concat(Simulation(made).stream()), truth_of(made)),
@@ -230,7 +230,7 @@ def compare_road() -> None:
     print("| recording | Mev/s | here | share of ON events | here |\n|---|---|---|---|---|")
     for path in paths:
         told = read_truth(path.with_suffix(".truth.json"))
-        made = scene_of_truth(told)
+        made = scene_of_truth(told.to_table())
         theirs, ours = read_events(path), Events.concat(Simulation(made).stream())
         rates = (f"{len(events) / made.duration_s / 1e6:.2f}" for events in (theirs, ours))
         shares = (f"{events.p.mean():.3f}" for events in (theirs, ours))

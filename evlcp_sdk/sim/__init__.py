@@ -4,7 +4,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from evlcp_sdk.sim.record import scene_of_truth as scene_of_truth, truth_of as truth_of
+    from evlcp_sdk.sim.record import truth_of as truth_of
     from evlcp_sdk.sim.scene import (
         BackgroundSpec as BackgroundSpec,
         BarSpec as BarSpec,
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.sim.world import sites_of as sites_of
 
 _HOMES = {
-    "record": "scene_of_truth truth_of",
+    "record": "truth_of",
     "scene": (
         "BackgroundSpec BarSpec LampSpec LensSpec MotionSpec ReflectionSpec Scene SensorSpec WiperSpec "
         "WorldSpec load_scene preset_names preset_text resolve_scene"

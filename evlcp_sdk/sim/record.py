@@ -1,27 +1,23 @@
-"""What a simulation leaves beside its recording: the truth, and the scene that a truth describes."""
+"""What a simulation leaves beside its recording: the truth."""
 
-import math
-from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim.light import BarLight, reflections_of
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_sigma_px
-from evlcp_sdk.sim.scene import Scene, resolve_scene
+from evlcp_sdk.sim.scene import Scene
 from evlcp_sdk.sim.simulation import Simulation
-from evlcp_sdk.sim.truth import SentBar, Truth, truth_from_table
+from evlcp_sdk.sim.truth import Truth, truth_from_table
 from evlcp_sdk.sim.world import camera_on_earth, sites_of
 
 Floats = NDArray[np.float64]
 
-_OF_SENSOR = (
+OF_SENSOR = (
     *("noise_hz", "refr_us", "th_on", "th_off", "noise_ln", "p_on_miss", "p_off_miss"),
     *("dly_on_us", "dly_off_us", "jitter_us", "tau_sf_us", "t_row_us", "cap_mev_s"),
 )
@@ -129,7 +125,7 @@ def _scene_of(simulation: Simulation) -> dict[str, Any]:
         "hot_pixels": simulation.hot_pixels,
         "focus_m": scene.lens.focus_m,
         "f_number": scene.lens.f_number,
-        **{name: getattr(sensor, name) for name in _OF_SENSOR},
+        **{name: getattr(sensor, name) for name in OF_SENSOR},
         "hpf_us": 0.0,
         "halo": scene.lens.halo,
         "seed": scene.seed,
@@ -173,126 +169,3 @@ def _others(simulation: Simulation, position: Floats, attitude: Floats) -> list[
                 }
             )
     return found
-
-
-def scene_of_truth(truth: Truth | Mapping[str, Any]) -> Scene:
-    """The scene of a recording, from its truth: the same bars, symbols, light and sensor; another vibration.
-
-    A truth written here gives exactly its scene. Of another generator's, with the same keys, everything is
-    taken over that both know: covers, wiper, bloom, potholes, mirror images, ghost images and panels among
-    it. Lamps at random places are as many, but at other places.
-
-    Raises:
-        ConfigError: Keys are missing, or ask for what is not modelled (`hpf_us`).
-    """
-    if isinstance(truth, Truth):
-        truth = truth.to_table()
-    if "simulator" in truth:
-        return resolve_scene(truth["simulator"], source="truth")
-    try:
-        sent, given, camera = truth_from_table(truth).bars, truth["scene"], truth["camera"]
-        if given["hpf_us"] != 0:
-            raise ConfigError(f"truth: scene.hpf_us = {given['hpf_us']}: a high-pass filter is not modelled")
-        optics = {key: camera[key] for key in ("width", "height", "focal_mm", "pitch_um")}
-        focal_px = CameraModel(**optics).focal_px
-        table = {
-            **_taken(given, ("name", "duration_s", "t0_us", "seed", "flicker_lamps")),
-            "camera": optics,
-            # Its blur is stated as one sigma: a Gaussian without wings.
-            "lens": {**_taken(given, ("f_number", "focus_m", "halo"), ("bloom", "bloom_px")), "wings": False},
-            "motion": _motion_of(given, focal_px),
-            "background": {
-                "light_w_m2": given["background_w_m2"],
-                "texture": given["background_texture"],
-                **_taken(given, (), ("texture_px",)),
-                # How far around the bar such recordings have events of a background that moves.
-                **({"around_px": 24, "texture_step_px": 0.4} if given.get("bg_moves") else {}),
-            },
-            "sensor": {
-                **_taken(given, _OF_SENSOR),
-                "hot_share": given["hot_pixels"] / (camera["width"] * camera["height"]),
-            },
-            "bars": [_bar_spec_of(*both, given) for both in zip(truth["bars"], sent, strict=True)],
-            **_others_of(truth, given["distance_m"] / focal_px),
-        }
-        if given.get("wiper"):
-            table["wiper"] = dict(zip(("at_s", "lasts_s", "share"), given["wiper"], strict=True), edge_s=0.0)
-    except (KeyError, TypeError) as fault:
-        raise ConfigError(f"truth: not a scene's truth: {fault}") from fault
-    except InputError as fault:
-        raise ConfigError(str(fault)) from fault
-    return resolve_scene(table, source="truth")
-
-
-def _taken(given: Mapping[str, Any], keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, Any]:
-    """Values under keys that a scene has, too; the optional ones where they are."""
-    return {key: given[key] for key in (*keys, *(key for key in optional if key in given))}
-
-
-def _bar_spec_of(bar: Mapping[str, Any], sent: SentBar, given: Mapping[str, Any]) -> dict[str, Any]:
-    """A bar's table of a scene, from its row of the truth and what that means."""
-    found = _taken(
-        bar,
-        ("x_m", "y_m", "z_m", "width_m", "ppm", "led_w_m2", "start_chip"),
-        ("chips_file", "lean_deg", "tilt_deg", "covered", "cover_s", "pole_s"),
-    )
-    found["link"] = {section: dict(keys) for section, keys in sent.link.table.items()}
-    if given.get("led_w_m2_all"):
-        found["led_w_m2"] = given["led_w_m2_all"]
-    if bar["symbols"]:
-        found["symbols"] = bar["symbols"]
-    return found
-
-
-def _motion_of(given: Mapping[str, Any], focal_px: float) -> dict[str, Any]:
-    """What a scene's table says of the camera's motion, as keys of `[motion]`."""
-    found = _taken(given, ("distance_m", "speed_mps", "vib_rate_rad_s"), ("lateral_mps",))
-    names = {
-        "cam_yaw_deg": "yaw_deg",
-        "cam_pitch_deg": "pitch_deg",
-        "cam_roll_deg": "roll_deg",
-        "yaw_share": "vib_yaw_share",
-    }
-    found |= {ours: given[theirs] for theirs, ours in names.items() if theirs in given}
-    if given.get("pothole_px_ms"):
-        found["pothole_s"] = [given["pothole_s"]]
-        found["pothole_rad_s"] = given["pothole_px_ms"] * 1000 / focal_px
-        found["pothole_hz"] = given["pothole_hz"]
-    return found
-
-
-def _others_of(truth: Mapping[str, Any], m_per_px: float) -> dict[str, Any]:
-    """What another generator's truth says of mirror images, ghost images and panels."""
-    camera = truth["camera"]
-    reflections, lamps = [], []
-    for i, other in enumerate(truth.get("others", [])):
-        kind = other["kind"]
-        if kind == "pwm":
-            lamps.append(
-                {
-                    "x_m": (other["u_px"] - camera["cx"]) * m_per_px,
-                    "y_m": (other["v_px"] - camera["cy"]) * m_per_px,
-                    "width_m": other["w_px"] * m_per_px,
-                    "height_m": other["h_px"] * m_per_px,
-                    "light_w_m2": other["led_w_m2"],
-                    "flicker_hz": other["pwm_hz"],
-                    "duty": other["duty"],
-                }
-            )
-            continue
-        bar = truth["bars"][other["src"]]
-        one = {"bar": other["src"], "share": other["gain"]}
-        if kind == "mirror":
-            low = bar["y_m"] + bar["length_m"] / 2
-            sigma = truth["psf_sigma_px"][other["src"]]
-            one |= {
-                "kind": "road",
-                "gap_m": 2 * (other["road_y_m"] - low),
-                "blur_px": sigma * math.sqrt(other["streak"] ** 2 - 1),
-            }
-        elif kind == "ghost":
-            one |= {"kind": "window", "shift_px": [other["dx_px"], other["dy_px"]]}
-        else:
-            raise ConfigError(f"truth: others.{i}.kind = {kind!r}: expected mirror, ghost or pwm")
-        reflections.append(one)
-    return {"reflections": reflections, "lamps": lamps}

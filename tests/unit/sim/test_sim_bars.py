@@ -24,7 +24,6 @@ from evlcp_sdk.sim import (
     Truth,
     load_scene,
     resolve_scene,
-    scene_of_truth,
     sites_of,
     truth_of,
 )
@@ -65,7 +64,7 @@ def test_a_bar_lays_its_tables_over_the_scene_s(tmp_path: Path) -> None:
         (tmp_path / f"{name}.toml").unlink()
     assert links_of(pickle.loads(pickle.dumps(scene))) == links_of(scene)
     assert resolve_scene(asdict(scene)) == scene
-    assert links_of(scene_of_truth(truth_of(scene).to_table())) == links_of(scene)
+    assert links_of(resolve_scene(truth_of(scene).table["simulator"])) == links_of(scene)
 
 
 def turned(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:

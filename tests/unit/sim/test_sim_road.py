@@ -25,7 +25,6 @@ from evlcp_sdk.sim import (
     Simulation,
     WiperSpec,
     resolve_scene,
-    scene_of_truth,
     truth_of,
 )
 from evlcp_sdk.sim.light import BarLight, wiper_switches
@@ -299,7 +298,7 @@ def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
     until = 15_900
     assert rows(events[events.t_us < until]) == rows(long[long.t_us < until])
     table = json.loads(json.dumps(truth_of(scene).to_table()))
-    assert scene_of_truth(table) == scene
+    assert resolve_scene(table["simulator"]) == scene
     assert resolve_scene(json.loads(json.dumps(asdict(scene)))) == scene
 
 
