@@ -1,4 +1,4 @@
-"""The table of a comparison: sums, who is best, what is written; variants as users name them."""
+"""The table of a comparison: sums, who is best, what is written; variants; the paper beside ours."""
 
 import csv
 import io
@@ -26,9 +26,11 @@ from evlcp_sdk.study.comparison import (
     total_of,
 )
 from evlcp_sdk.study.jobs import Inline
+from evlcp_sdk.study.report import comparison_rows
 from evlcp_sdk.study.store import Store
-from evlcp_sdk.study.summary import summarize
+from evlcp_sdk.study.summary import PAPER, Figure, PaperComparison, Reference, summarize, verdict_of
 from evlcp_sdk.study.tally import Statistics, Tally
+from tests.conftest import ROOT
 from tests.unit.study.fake import fake_plan, run_fake
 
 
@@ -148,13 +150,6 @@ def test_total_adds_recordings() -> None:
     assert mixed.rows["v0"].statistics.rows == 95
 
 
-def test_a_recording_whose_name_is_a_formula_is_none_in_the_csv() -> None:
-    name = '=HYPERLINK("http://192.0.2.1/","a.raw")'
-    rows = list(csv.DictReader(io.StringIO(comparison(replace(table(measured()), name=name)).to_csv())))
-    assert f"'{name}" in rows[0].values()
-    assert not any(text.startswith(("=", "@", "+")) for row in rows for text in row.values())
-
-
 def test_json_csv_and_html_parse_back() -> None:
     whole = comparison(table(measured(), measured(bit_errors=0)), table(BLIND, BLIND, bound=None))
     parsed = json.loads(whole.to_json())
@@ -173,6 +168,11 @@ def test_json_csv_and_html_parse_back() -> None:
                 assert float(line[key]) == value, key
             elif value is None:
                 assert line[key] == "", key
+    # A name that is a formula is none to a spreadsheet.
+    formula = '=HYPERLINK("http://192.0.2.1/","a.raw")'
+    (row,) = csv.DictReader(io.StringIO(comparison(replace(table(measured()), name=formula)).to_csv()))
+    assert f"'{formula}" in row.values()
+    assert not any(text.startswith(("=", "@", "+")) for text in row.values())
     page = whole.to_html()
     assert "<h1>Variants compared: v0 and v1 on 2 recordings</h1>" in page
     assert "&lt;brackets&gt;" in page
@@ -273,3 +273,37 @@ def test_a_campaign_is_a_table_a_scene(tmp_path: Path) -> None:
     # Twice the error in every frame.
     assert "rmse_m" in whole.tables[2].best()[0]
     assert "packets" in whole.tables[0].cells()[0]
+
+
+PAGE = (ROOT / "docs" / "paper.md").read_text()
+RESULT: dict[str, Any] = json.loads((ROOT / "docs" / "paper.json").read_text())
+FIELDS = ("measure", "clusters", "speed_kmh", "from_m", "to_m", "value", "bound")
+
+
+def beside(table: dict[str, Any]) -> PaperComparison:
+    reference = Reference(**{name: table[name] for name in FIELDS})
+    return PaperComparison(
+        reference, table["series"], Figure(**table["ours"]), *table["ours_at_m"], table["verdict"]
+    )
+
+
+@pytest.mark.parametrize(
+    "table", RESULT["paper"], ids=lambda t: f"{t['measure']}-{t['from_m']}-{t['series']}"
+)
+def test_every_comparison_is_on_the_page(table: dict[str, Any]) -> None:
+    (row,) = comparison_rows([beside(table)])
+    assert table["verdict"] == verdict_of(table["ours"]["value"], beside(table).reference)
+    assert f"| {' | '.join(row)} |" in PAGE
+
+
+def test_the_result_is_whole_and_of_the_shipped_campaign() -> None:
+    assert RESULT["done"] == RESULT["tasks"]
+    assert {tuple(t[name] for name in FIELDS) for t in RESULT["paper"]} == {
+        tuple(getattr(r, name) for name in FIELDS) for r in PAPER
+    }
+    assert [s["name"] for s in RESULT["series"]] == [
+        f"{v} km/h, {method}" for v in (20, 30, 40) for method in ("16 clusters", "two clusters")
+    ]
+    # The guesses bring the near figures within 30 %.
+    near = [t for t in RESULT["paper"] if (t["measure"], t["clusters"]) == ("rmse_m", 16) and t["to_m"] <= 50]
+    assert [(t["value"], t["verdict"]) for t in near] == [(0.0702, "agrees"), (0.1216, "agrees")]

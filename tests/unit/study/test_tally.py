@@ -1,0 +1,209 @@
+"""Statistics add exactly, in any order; intervals over recordings cover where errors come in bursts."""
+
+import json
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given, strategies as st
+from scipy.stats import binomtest, chi2, t
+
+from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.study.intervals import (
+    FEWEST_RECORDINGS,
+    measure,
+    ratio_interval,
+)
+from evlcp_sdk.study.tally import Statistics, Tally, segment_of
+
+TALLIES = st.one_of(
+    st.just(Tally(frames_sent=1)),
+    st.builds(Tally, frames_found=st.just(1), bits=st.just(96), bit_errors=st.integers(0, 96)),
+    st.builds(Tally.distance, st.floats(-20, 20), st.one_of(st.just(math.nan), st.floats(0, 2))),
+    st.builds(Tally.fix, st.floats(0, 20), st.floats(0, 1e15)),
+)
+STATISTICS = st.builds(
+    Statistics.of,
+    st.lists(st.tuples(st.sampled_from([30, 40, 50]), TALLIES), max_size=12),
+    tasks=st.integers(0, 5),
+    events=st.integers(0, 10**9),
+    rows=st.integers(0, 10**7),
+    sigma_squares_nm2=st.integers(0, 10**20),
+)
+
+
+@given(STATISTICS, STATISTICS, STATISTICS)
+def test_sums_do_not_depend_on_order(a: Statistics, b: Statistics, c: Statistics) -> None:
+    assert (a + b) + c == a + (b + c) == c + b + a
+    assert a + Statistics() == a
+
+
+@given(STATISTICS)
+def test_json_keeps_them(a: Statistics) -> None:
+    assert Statistics.from_dict(json.loads(json.dumps(a.to_dict()))) == a
+
+
+def test_figures_are_those_of_the_errors() -> None:
+    errors = np.random.default_rng(1).normal(0.03, 0.4, 500)
+    tally = sum((Tally.distance(float(e), 0.4) for e in errors), Tally())
+    assert tally.rmse_m == pytest.approx(math.sqrt((errors**2).mean()), abs=1e-9)
+    assert tally.bias_m == pytest.approx(errors.mean(), abs=1e-9)
+    assert tally.worst_m == pytest.approx(abs(errors).max(), abs=1e-9)
+    assert tally.nees == pytest.approx(((errors / 0.4) ** 2).mean(), abs=1e-6)
+    assert tally.gross_share == (np.abs(errors) >= 0.5).mean()
+    assert sum(tally.histogram.values()) == 500
+    assert math.isnan(Tally().rmse_m)
+    for name in ("ber", "erased_share", "claimed_share", "bias_m", "worst_m", "nees", "filtered_rmse_m"):
+        assert math.isnan(getattr(Tally(), name)), name
+    some = Tally(bits=96, bit_errors=3, visible=20, erased=4, hidden=8, claimed=2)
+    assert (some.ber, some.erased_share, some.claimed_share) == (3 / 96, 0.2, 0.25)
+    # Errors at the edge count, and far ones have a bin.
+    assert [Tally.distance(error_m).gross for error_m in (-0.5, 0.499999)] == [1, 0]
+    assert [Tally.distance(error_m).histogram for error_m in (1e4, -1e4)] == [{150: 1}, {-150: 1}]
+    assert segment_of(50.0) == 50
+    # A sigma of 0 is wrong beyond all measure, none counts not at all.
+    assert Tally.distance(0.1, 0.0).nees == 1e12
+    assert Tally.distance(0.1).with_sigma == 0
+
+
+def test_positions_have_quantiles() -> None:
+    errors_m = np.random.default_rng(0).exponential(0.1, 999)
+    total = sum((Tally.fix(float(e), 3.0) for e in errors_m), Tally(fixes_refused=2))
+    assert (total.fixes, total.fixes_refused) == (999, 2)
+    assert total.position_rmse_m == pytest.approx(np.sqrt((errors_m**2).mean()), rel=1e-4)
+    assert total.position_nees == pytest.approx(3.0)
+    for share in (0.5, 0.95):
+        # The upper end of the bin that holds it.
+        true = np.quantile(errors_m, share, method="higher")
+        assert 0 <= total.position_quantile_m(share) - true <= 0.005 + 1e-9
+    assert math.isnan(Tally().position_quantile_m(0.5))
+    assert Statistics.from_dict(Statistics.of([(40, total)], tasks=1).to_dict()).total() == total
+
+
+def test_what_is_silent_and_not_covered_is_counted() -> None:
+    flags = [
+        (14.1, {}),
+        (14.2, {}),
+        (99.0, {"protected": True}),
+        (99.0, {"protected": True, "beyond": True, "excluded": True}),
+        (1.0, {"protected": True, "beyond": True}),
+    ]
+    total = sum((Tally.fix(0.1, nees, **kinds) for nees, kinds in flags), Tally(fixes_refused=9))
+    assert (total.fixes, total.fixes_silent, total.fixes_uncovered) == (5, 3, 2)
+    assert (total.fixes_excluded, total.fixes_protected, total.fixes_beyond) == (1, 3, 2)
+    assert total.kept_share == 1.0
+    assert (total + Tally(fixes_refused=5, fixes_contradicted=5)).kept_share == 0.5
+    table = Statistics.of([(40, total)]).to_dict()
+    table["segments"][40]["fixes_uncovered"] = 4
+    with pytest.raises(ConfigError, match="fixes_uncovered: more than fixes_silent"):
+        Statistics.from_dict(table)
+
+
+def test_a_track_has_errors_as_filtered_and_as_smoothed() -> None:
+    total = Tally.tracked(0.3, 4.0, 0.1, 2.0) + Tally.tracked(0.4, 2.0, 0.1, 4.0)
+    assert total.track_rmse_m == pytest.approx(math.sqrt((0.09 + 0.16) / 2))
+    assert (total.track_nees, total.smoothed_nees) == pytest.approx((3.0, 3.0))
+    assert total.smoothed_rmse_m == pytest.approx(0.1)
+    assert math.isnan(Tally().track_nees)
+
+
+BITS, FRAMES = 6000, 60
+
+
+@pytest.mark.parametrize("recordings", [FEWEST_RECORDINGS, 8, 24])
+def test_intervals_of_bursts_cover(recordings: int) -> None:
+    """The error rate is another one in each recording, as vibration has it: log-normal."""
+    rng = np.random.default_rng(5)
+    rate = 0.01 * np.exp(rng.normal(-0.5, 1.0, (200, recordings)))
+    errors = rng.binomial(BITS, np.minimum(rate, 1))
+    wholes = np.full(recordings, BITS)
+    inside = [low <= 0.01 <= high for low, high in (ratio_interval(some, wholes) for some in errors)]
+    assert 0.89 <= np.mean(inside) <= 0.98
+    # Errors taken as independent say far too much.
+    total = recordings * BITS
+    naive = [
+        low <= 0.01 <= high for low, high in (binomtest(int(k), total).proportion_ci() for k in errors.sum(1))
+    ]
+    assert np.mean(naive) < 0.35
+
+
+@pytest.mark.parametrize("recordings", [FEWEST_RECORDINGS, 8, 24])
+def test_intervals_of_correlated_distance_errors_cover(recordings: int) -> None:
+    """Distance errors that follow the vibration: a Markov chain, each recording with its own scale."""
+    rng = np.random.default_rng(6)
+    kept = 0.8
+    steps = rng.normal(0, math.sqrt(1 - kept**2), (150, recordings, FRAMES))
+    steps[..., 0] = rng.normal(0, 1, (150, recordings))
+    for i in range(1, FRAMES):
+        steps[..., i] += kept * steps[..., i - 1]
+    errors = 0.1 * steps * np.exp(rng.normal(-0.16, 0.4, (150, recordings, 1)))
+    squares = np.round((errors**2).sum(2) * 1e12).astype(np.int64)
+    inside, naive = [], []
+    for some in squares.tolist():
+        rmse = measure([Tally(ranged=FRAMES, squares_nm2=v * 10**6) for v in some], "rmse_m")
+        inside.append(rmse.low <= 0.1 <= rmse.high)
+        low, high = rmse.value * np.sqrt(rmse.count / chi2.ppf([0.975, 0.025], rmse.count))
+        naive.append(low <= 0.1 <= high)
+    assert 0.89 <= np.mean(inside) <= 0.99
+    assert np.mean(naive) < 0.6
+
+
+def test_the_draws_are_those_of_every_possible_sample() -> None:
+    """Of three recordings there are 27 samples: quantiles of all of them, one by one."""
+    parts, wholes = np.array([4, 9, 30]), np.array([100, 120, 90])
+
+    def log_and_error(sample: tuple[int, ...]) -> tuple[float, float]:
+        a, b = parts[list(sample)], wholes[list(sample)]
+        ratio = a.sum() / b.sum()
+        spread = math.sqrt(((a - ratio * b) ** 2).sum() * 3 / 2) / b.sum()
+        return math.log(ratio), spread / ratio
+
+    centre, error = log_and_error((0, 1, 2))
+    every = [log_and_error(s) for s in product(range(3), repeat=3)]
+    away = np.sort([(log - centre) / e for log, e in every if e > 0])
+    low, high = ratio_interval(parts, wholes, confidence=0.2)
+    down, up = np.quantile(away, [0.6, 0.4]) * [1, -1]
+    least = t.ppf(0.6, 2)
+    down, up = (min(max(end, least), 2 * least) for end in (down, up))
+    assert math.log(low) == pytest.approx(centre - down * error, abs=0.05)
+    assert math.log(high) == pytest.approx(centre + up * error, abs=0.05)
+
+
+def test_few_recordings_have_a_range_and_one_has_nothing() -> None:
+    # Draws of nearly equal recordings do not make it endless.
+    low, high = ratio_interval([40, 41, 40, 41, 900], [6000] * 5)
+    assert 0 < low < 1062 / 30_000 < high < 100 * 1062 / 30_000
+    some = [Tally(bits=1000, bit_errors=k, frames_found=10) for k in (10, 20, 60)]
+    few = measure(some, "ber")
+    assert (few.value, few.low, few.high, few.recordings) == (0.03, 0.01, 0.06, 3)
+    assert few.interval(".2f") == "(0.01, 0.06)"
+    (alone,) = (measure(some[:1], "ber"),)
+    assert math.isnan(alone.low)
+    assert alone.interval(".2f") == ""
+    # A recording without data is none.
+    assert measure([*some, Tally()], "ber") == few
+    assert measure([], "rmse_m").count == 0
+    assert math.isnan(measure([Tally()], "gross_share").value)
+    enough = measure(some * 2, "ber")
+    assert enough.low < 0.03 < enough.high
+    assert enough.interval(".2f").startswith("[")
+
+
+def test_without_errors_there_is_a_limit_by_frames() -> None:
+    none = measure([Tally(bits=960, frames_found=10)] * 8, "ber")
+    assert (none.value, none.low, none.none) == (0, 0, True)
+    assert none.high == binomtest(0, 80).proportion_ci().high
+    all_found = measure([Tally(frames_sent=10, frames_found=10)] * 8, "found_share")
+    assert (all_found.value, all_found.high) == (1, 1)
+    assert all_found.low == binomtest(80, 80).proportion_ci().low
+
+
+def test_a_share_near_one_is_bounded_by_one() -> None:
+    found = measure([Tally(frames_sent=100, frames_found=100 - k) for k in (0, 0, 1, 0, 9, 0)], "found_share")
+    assert 0 < found.low < found.value < found.high <= 1
+    lost = measure(
+        [Tally(messages_sent=100, messages_found=100 - k) for k in (0, 0, 1, 0, 9, 0)], "lost_share"
+    )
+    assert lost.value == pytest.approx(1 - found.value)
+    assert (lost.low, lost.high) == pytest.approx((1 - found.high, 1 - found.low))
