@@ -9,8 +9,10 @@ from pathlib import Path
 from typing import Any
 
 from evlcp_sdk.errors import EvlcpError
+from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.jobs import Processes
 from evlcp_sdk.study.plan import Case, Job, Plan, StopRule, make_plan
+from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics, Tally
 
 
@@ -60,15 +62,7 @@ def fake_statistics(scene: int, link: int, seed: int) -> Statistics:
     return Statistics.of(tallies, **counts)
 
 
-def main(store: str, workers: str, scenes: str, links: str, seeds: str, seconds: str) -> None:
-    """The process that the kill tests kill."""
-    from evlcp_sdk.study.collect import collect
-    from evlcp_sdk.study.store import Store
-
-    plan = fake_plan(int(scenes), int(links), int(seeds), seconds=float(seconds))
-    with Store(Path(store), create=True) as file:
-        collect(plan, file, Processes(int(workers)), run_fake)
-
-
 if __name__ == "__main__":
-    main(*sys.argv[1:])
+    # The process that the kill tests kill.
+    with Store(Path(sys.argv[1]), create=True) as file:
+        collect(fake_plan(8, 2, 4, seconds=0.02), file, Processes(2), run_fake)

@@ -21,7 +21,8 @@ from evlcp_sdk.sim.scene import WorldSpec
 from evlcp_sdk.sim.world import attitude_log, sites_said
 from evlcp_sdk.study.measure import position_tallies
 from evlcp_sdk.study.tally import Tally
-from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Packet
+from tests.unit.place.place_scenes import frame
 
 GATE = {
     "duration_s": 0.12,
@@ -44,24 +45,9 @@ def seen(truth: Truth) -> list[Packet]:
             turned = Attitude(*here[3:]).rotation()
             clusters = sites_of(scene)[i].cluster_positions_m(16, LocalAxes(*here[:3]))
             points = scene.camera.project(clusters @ turned)
-            symbols = SoftSymbols(np.zeros(16, int), np.zeros((16, 6), np.float32), 1.0)
-            middle = points.mean(0)
-            frames.append(
-                Frame(
-                    transmitter=number,
-                    packet=f // 10,
-                    frame=f % 10,
-                    t_us=at - 800,
-                    soft=symbols,
-                    range=Range(float("nan"), float("nan"), 0),
-                    filtered=None,
-                    x_px=float(middle[0]),
-                    y_px=float(middle[1]),
-                    points_px=points,
-                    points_sigma_px=np.full(16, 0.1),
-                    points_t_us=at,
-                )
-            )
+            shown = frame(points, 0.1, at, number, f // 10, f % 10)
+            x_px, y_px = points.mean(0).tolist()
+            frames.append(replace(shown, t_us=at - 800, x_px=x_px, y_px=y_px))
         packets += [
             Packet(number, p, frames[10 * p].t_us - 2600, 100.0, tuple(frames[10 * p : 10 * p + 10]), 10)
             for p in range(3)

@@ -3,19 +3,20 @@
 import json
 import os
 import random
+import shutil
 import sqlite3
 import subprocess
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from evlcp_sdk.cli.report import as_markdown, show_tables
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.study.charts import charts_of
 from evlcp_sdk.study.collect import collect
-from evlcp_sdk.study.comparison import Comparison, of_campaign
+from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.plan import Case, make_plan
 from evlcp_sdk.study.report import page
@@ -73,11 +74,9 @@ ENDLESS = "WITH RECURSIVE n(i) AS (SELECT 1 UNION ALL SELECT i + 1 FROM n)"
 )
 def test_a_file_of_other_tables_is_refused_at_once(results: Path, statements: tuple[str, ...]) -> None:
     change(results, *statements)
-    began = time.monotonic()
     for create in (False, True):
         with pytest.raises(InputError, match=r"a\.sqlite: not a results file of this SDK: other tables"):
             Store(results, create=create)
-    assert time.monotonic() - began < 30
 
 
 def test_a_page_that_is_its_own_child_is_damage(results: Path) -> None:
@@ -122,36 +121,32 @@ def test_what_still_runs_is_read_from_its_log(results: Path) -> None:
 
 def test_a_folder_that_cannot_be_written_is_read(results: Path) -> None:
     """By another user, as root may write anywhere; others may not look into pytest's folders."""
-    folder = Path("/dev/shm") if Path("/dev/shm").is_dir() else results.parent
-    copied = folder / f"evlcp-{os.getpid()}"
-    copied.mkdir()
+    base = Path("/dev/shm") if Path("/dev/shm").is_dir() else results.parent
+    folder = base / f"evlcp-{os.getpid()}"
+    shutil.copytree(results.parent, folder)
+    folder.chmod(0o555)
+    code = (
+        "import os, sys\nfrom pathlib import Path\nfrom evlcp_sdk.study.store import Store\n"
+        "def read():\n    with Store(Path(sys.argv[1])) as store: return len(store.results())\n"
+        # Whoever it becomes may not import anything more.
+        "read()\nif os.geteuid() == 0: os.setuid(65534)\nprint(read())\n"
+    )
     try:
-        (copied / "a.sqlite").write_bytes(results.read_bytes())
-        copied.chmod(0o555)
-        code = (
-            "import os, sys\nfrom pathlib import Path\nfrom evlcp_sdk.study.store import Store\n"
-            "def read():\n    with Store(Path(sys.argv[1])) as store: return len(store.results())\n"
-            # Whoever it becomes may not import anything more.
-            "read()\nif os.geteuid() == 0: os.setuid(65534)\nprint(read())\n"
-        )
-        command = [sys.executable, "-c", code, copied / "a.sqlite"]
+        command = [sys.executable, "-c", code, folder / results.name]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert done.stdout == "8\n", done.stderr
     finally:
-        copied.chmod(0o755)
-        (copied / "a.sqlite").unlink()
-        copied.rmdir()
+        folder.chmod(0o755)
+        shutil.rmtree(folder)
 
 
 def told(summary: Summary) -> Elements:
     """Everything that is told of a summary; its page."""
-    from evlcp_sdk.cli.report import as_markdown, show_tables
-
     json.dumps(summary.to_dict(), allow_nan=False)
     show_tables(summary)
     as_markdown(summary)
     charts_of(summary)
-    compared: Comparison = of_campaign(summary)
+    compared = of_campaign(summary)
     compared.to_json()
     compared.to_csv()
     assert_plain(Elements(compared.to_html()))
@@ -174,9 +169,9 @@ def kept(path: Path) -> tuple[Any, dict[str, Any]]:
     return json.loads(body), {task: json.loads(text) for task, text in rows}
 
 
-def keep(path: Path, plan: Any, rows: dict[str, Any]) -> None:
+def keep(path: Path, plan: str, rows: dict[str, Any]) -> None:
     base = sqlite3.connect(path)
-    base.execute("UPDATE plan SET body = ?", (json.dumps(plan),))
+    base.execute("UPDATE plan SET body = ?", (plan,))
     base.executemany(
         "UPDATE result SET statistics = ? WHERE task = ?", [(json.dumps(v), t) for t, v in rows.items()]
     )
@@ -188,18 +183,15 @@ def keep(path: Path, plan: Any, rows: dict[str, Any]) -> None:
 def test_what_was_changed_is_taken_or_refused_in_one_line(results: Path, changed: str) -> None:
     plan, rows = kept(results)
     task = next(iter(rows))
-    link = {"table": {"bar": {"rows": 96, "cluster_rows": 6, "columns": 1, "cluster_columns": 1}}}
-    plan["links"][0]["identity"] = link["table"] | {
-        "digest": "d" * 64,
-        "table": {"ranging": {}, **link["table"]},
-    }
+    table = {"bar": {"rows": 96, "cluster_rows": 6, "columns": 1, "cluster_columns": 1}}
+    plan["links"][0]["identity"] = table | {"digest": "d" * 64, "table": {"ranging": {}, **table}}
     plan["scenes"][0]["identity"] = {"motion": {"speed_mps": 8.0}}
     refused = 0
     for mutant, what in mutants(plan if changed == "plan" else rows[task], 10, seed=3):
         if changed == "plan":
-            keep(results, mutant, {})
+            keep(results, json.dumps(mutant), {})
         else:
-            keep(results, plan, {task: mutant})
+            keep(results, json.dumps(plan), {task: mutant})
         line = refusal(lambda: told(read(results)))
         if line is not None:
             refused += 1
@@ -226,11 +218,7 @@ def test_what_was_changed_is_taken_or_refused_in_one_line(results: Path, changed
 )
 def test_what_is_no_plan_is_named_in_one_line(results: Path, change: str | dict[str, Any], says: str) -> None:
     plan, _ = kept(results)
-    base = sqlite3.connect(results)
-    body = change if isinstance(change, str) else json.dumps(plan | change)
-    base.execute("UPDATE plan SET body = ?", (body,))
-    base.commit()
-    base.close()
+    keep(results, change if isinstance(change, str) else json.dumps(plan | change), {})
     with pytest.raises(InputError, match=r"a\.sqlite: damaged, or no results file of evlcp sweep") as caught:
         read(results)
     assert says in str(caught.value)

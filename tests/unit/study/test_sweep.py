@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.sim.scene import links_of
 from evlcp_sdk.study.jobs import Inline
-from evlcp_sdk.study.plan import Job
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import summarize
 from evlcp_sdk.study.task import plan_of, run_job
@@ -56,18 +56,14 @@ def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) ->
     assert "short: 4 of 4 tasks, 4 of 4 points" in done.out
     with Store(results) as store:
         found = store.results()
-    plan = plan_of(campaign)
-    for outcome in Inline().run(run_job, plan.jobs[:1]):
+    for outcome in Inline().run(run_job, plan_of(campaign).jobs[:1]):
         assert outcome.value is not None
-        for task, statistics in outcome.value:
-            assert found[task] == statistics, "another process found something else"
+        assert all(found[task] == one for task, one in outcome.value), "another process found something else"
     for statistics in found.values():
         tally = statistics.total()
         assert tally.frames_found >= 0.85 * tally.frames_sent > 0
-        assert tally.ber < 0.01
-        assert statistics.unmatched == 0
-    again = evlcp("sweep", campaign, "-o", results, "--json")
-    table = json.loads(again.out)
+        assert (tally.ber < 0.01, statistics.unmatched) == (True, 0)
+    table = json.loads(evlcp("sweep", campaign, "-o", results, "--json").out)
     assert (table["done"], table["tasks"], table["failed"]) == (4, 4, 0)
 
     shown = evlcp("report", results)
@@ -77,10 +73,6 @@ def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) ->
     table = json.loads(evlcp("report", results, "--json").out)
     assert [s["name"] for s in table["series"]] == ["16 clusters", "two clusters"]
     assert "| 16 clusters |" in evlcp("report", results, "--markdown").out
-    drawn = evlcp("report", results, "-o", tmp_path / "page.html")
-    assert drawn.code == 0
-    assert 'id="histogram"' in (tmp_path / "page.html").read_text()
-    assert len(list((tmp_path / "page-figures").iterdir())) == 10
 
 
 @pytest.mark.parametrize(
@@ -103,14 +95,10 @@ def test_bad_campaigns_are_one_line(
     assert not (tmp_path / "r.sqlite").exists()
 
 
-def test_other_code_is_refused(campaign: Path) -> None:
-    plan = plan_of(campaign)
-    job = plan.jobs[0]
-    with pytest.raises(ConfigError, match="not those of the campaign's plan"):
-        run_job(Job(job.scene, job.seed, job.tasks, {"source": "0" * 64}))
-
-
 def test_a_link_of_a_scene_is_a_file_beside_the_campaign(campaign: Path, tmp_path: Path) -> None:
+    job = plan_of(campaign).jobs[0]
+    with pytest.raises(ConfigError, match="not those of the campaign's plan"):
+        run_job(replace(job, environment={"source": "0" * 64}))
     (tmp_path / "scenes").mkdir()
     (tmp_path / "scenes" / "mine.toml").write_text("duration_s = 0.05\n")
     (tmp_path / "link.toml").write_text("[air]\nchip_rate_hz = 5000.0\n")
