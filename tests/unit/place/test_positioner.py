@@ -3,7 +3,7 @@
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +13,7 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message
 from evlcp_sdk.air.kinds import BeaconKind
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.place.bar_registry import BarRegistry
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.observations import Candidate, Rejection, project_bars
 from evlcp_sdk.place.positioner import BarKind, Positioner, _alternatives
@@ -241,68 +242,56 @@ def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
 
 
 def test_beacons_tell_who_and_where() -> None:
-    told = {0: (heard(RIGHT, "unverified", 0),)}
     # The id decides, not the receiver's number, which is the other bar's here.
+    told = {0: (heard(RIGHT, "unverified", 0),)}
     fixes = fixes_of(positioner([LEFT, RIGHT]), packets_of(RIGHT, 0, 6, messages=told))
     assert_right(fixes)
     assert not any(f.verified for f in fixes)
-    # Without a file, a verified beacon's own place is believed; an unverified one's only if so configured.
-    for trust, believed, given in (
-        ("verified", "verified", True), ("unverified", "verified", False),
-        ("unverified", "any", True), ("verified", "none", False),
-    ):  # fmt: skip
-        told = {0: (heard(RIGHT, cast(Trust, trust), 0),)}
-        fixes = fixes_of(positioner([], beacons=believed), packets_of(RIGHT, 0, 6, messages=told))
-        if given:
-            assert_right(fixes)
-            assert all(f.verified == (trust == "verified") for f in fixes)
-        else:
-            assert {f.refusal for f in fixes} == {"no-site"}
-
-
-def test_a_forged_beacon_cannot_move_the_camera() -> None:
-    liar = dataclasses.replace(RIGHT, transmitter_id=7)
-    told = {
-        0: (heard(LEFT, "verified", 0),),
-        2: (heard(liar, "unverified", 2),),
-        4: (heard(liar, "forged", 4),),
-    }
+    # Without a file, a verified beacon's own place is believed, until one is forged.
+    told = {0: (heard(RIGHT, "verified", 0),), 4: (heard(LEFT, "forged", 4),)}
     p = positioner([])
-    fixes = fixes_of(p, packets_of(LEFT, 0, 9, messages=told))
+    fixes = fixes_of(p, packets_of(RIGHT, 0, 9, messages=told))
     given = [f for f in fixes if not f.refusal]
     assert_right(given)
     assert all(f.verified for f in given)
+    # What is said in packet 4 counts for fixes that are not out yet.
+    assert 1 <= len(given) <= 4
     assert {f.refusal for f in fixes[len(given) :]} == {"no-site"}
     assert p.counts["beacons_forged"] == 1
-    # What was said in packet 4 counts for fixes that were not out yet.
-    assert 1 <= len(given) <= 4
 
 
-def test_a_beacon_whose_key_runs_out_is_believed_no_longer() -> None:
-    """The same beacon, heard again when its key was not valid any more; a renewed one counts again."""
-    first = heard(RIGHT, "verified", 0)
-    lapsed = dataclasses.replace(
-        first, trust="unverified", reason="received when its key was not valid any more"
-    )
-    liar = dataclasses.replace(RIGHT, transmitter_id=8)
-    told = {
-        0: (first,),
-        7: (lapsed,),
-        9: (heard(liar, "unverified", 9),),
-        13: (heard(RIGHT, "verified", 13),),
-    }
-    packets = packets_of(RIGHT, 0, 18, messages=told)
-    fixes = fixes_of(positioner([]), packets)
-    given = [not f.refusal for f in fixes]
-    assert_right([f for f in fixes if not f.refusal])
-    assert all(f.verified for f in fixes if not f.refusal)
-    assert given[0]
-    assert given[-1]
-    assert given.count(False) >= 3
-    # Whoever believes any beacon goes on, and is told that it is not verified; the liar never counts.
-    fixes = fixes_of(positioner([], beacons="any"), packets)
-    assert_right(fixes)
-    assert [f.verified for f in fixes] == given
+@pytest.mark.parametrize(
+    ("beacons", "messages", "known"),
+    [
+        ("verified", [(RIGHT, "verified", 0)], "+"),
+        ("verified", [(RIGHT, "unverified", 0)], "-"),
+        ("any", [(RIGHT, "unverified", 0)], "?"),
+        ("none", [(RIGHT, "verified", 0)], "-"),
+        # Who has signed once is not moved by one who does not.
+        ("verified", [(RIGHT, "verified", 0), (LEFT, "unverified", 1), (LEFT, "forged", 2)], "++-"),
+        ("any", [(RIGHT, "forged", 0), (RIGHT, "unverified", 1), (RIGHT, "verified", 2)], "--+"),
+        # The same beacon when its key was not valid any more; a renewed one counts again.
+        *(
+            (believed, [(RIGHT, "verified", 0), (RIGHT, "unverified", 0), (LEFT, "unverified", 1),
+                        (RIGHT, "verified", 2)], known)
+            for believed, known in (("verified", "+--+"), ("any", "+??+"))
+        ),
+    ],
+)  # fmt: skip
+def test_which_beacons_are_believed(
+    beacons: Any, messages: list[tuple[BarSite, Trust, int]], known: str
+) -> None:
+    """After each message: `+` its place is known and verified, `?` known, `-` not."""
+    registry = BarRegistry([], ErrorModel(beacons=beacons))
+    for message, mark in zip(messages, known, strict=True):
+        registry.hear(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(*message),)))
+        found = registry.site(0)
+        assert (found is None) == (mark == "-")
+        if found is not None:
+            assert registry.verified(0) == (mark == "+")
+            assert ORIGIN.to_enu(found.latitude_deg, found.longitude_deg, found.height_m) == pytest.approx(
+                [2.0, -6.0, 0.0], abs=0.01
+            )
 
 
 def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
@@ -343,11 +332,11 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
 )
 def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) -> None:
     """A lone bar of the wrong length or place fits the image as well as the right one."""
-    packets = packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)})
-    fixes = fixes_of(positioner([dataclasses.replace(LEFT, **change)]), packets)  # type: ignore[arg-type]
-    assert {f.refusal for f in fixes} == ({"site-contradicted"} if told else {""})
-    if told:
-        assert told in fixes[0].detail
+    registry = BarRegistry([dataclasses.replace(LEFT, **change)], ErrorModel())  # type: ignore[arg-type]
+    registry.hear(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(LEFT, "unverified", 0),)))
+    assert (registry.site(0) is None) == (told is not None)
+    assert (told or "") in registry.contradiction(0)
+    assert bool(told) == bool(registry.contradiction(0))
 
 
 def test_an_attitude_file(tmp_path: Path) -> None:

@@ -111,14 +111,6 @@ def test_a_bar_that_looks_bent_leans_within_its_sigma() -> None:
     assert low < np.mean(np.square(sigmas[bent])) < high < np.mean(np.square(sigmas[SPEC]))
 
 
-def test_by_exact_poses_bars_are_where_they_stand() -> None:
-    found = survey(views(np.random.default_rng(9), 1e-5, 1e-5), AXES, 0.96, CAMERA, None, SPEC)
-    for bar, true in zip(found, BARS, strict=True):
-        place = LocalAxes.of([true])
-        error = place.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
-        assert np.linalg.norm(error) < 5 * (bar.site.position_sigma_m or 0) < 0.1
-
-
 def test_what_cannot_be_surveyed_is_told() -> None:
     seen = views(np.random.default_rng(10), 0.02, 0.05)
     with pytest.raises(ConfigError, match="needs poses with heading_deg"):

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory, trajectory_step
+from evlcp_sdk.place.trajectory import filter_fixes, smooth_trajectory
 from evlcp_sdk.values import Fix
 from tests.unit.place.place_scenes import Floats, by_chance, fix, square
 
@@ -33,7 +33,8 @@ def drive(rng: np.random.Generator, n: int) -> tuple[Floats, Floats]:
 def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
     fixes = [fix(i * 1e5, np.array([float(i), 0, 0]), NOISE_M2) for i in range(10)]
     fixes[5] = fix(5e5, np.array([50.0, 0, 0]), NOISE_M2)
-    points = filter_fixes(fixes, SPEC)
+    # A refused one has no point.
+    points = filter_fixes([*fixes, Fix.refused(1e6, (0,), "misfit", "far off")], SPEC)
     assert [p.misses for p in points] == [0, 0, 0, 0, 0, 1, 0, 0, 0, 0]
     assert abs(points[5].mean[0] - 5) < 0.5
     jumped = fixes[:5] + [fix((5 + i) * 1e5, np.array([1000.0 + i, 0, 0]), NOISE_M2) for i in range(15)]
@@ -42,17 +43,6 @@ def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
     assert [i for i, p in enumerate(points) if p.starts] == [0, 10]
     smooth = smooth_trajectory(points, SPEC)
     assert max(p.mean[0] for p in smooth[:5]) < 10
-
-
-def test_refused_fixes_have_no_point_and_the_state_is_not_changed() -> None:
-    refused = Fix.refused(1e5, (0,), "misfit", "far off")
-    one, two, three = (fix(t, 1e-6 * t * np.ones(3), NOISE_M2) for t in (0.0, 2e5, 3e5))
-    points = filter_fixes([one, refused, two], SPEC)
-    assert [p.t_us for p in points] == [0, 2e5]
-    before = points[0].mean.copy(), points[0].covariance.copy()
-    trajectory_step(points[0], three, SPEC)
-    np.testing.assert_array_equal(before[0], points[0].mean)
-    np.testing.assert_array_equal(before[1], points[0].covariance)
 
 
 def moves_at(t_us: float, name: str) -> Floats:

@@ -97,13 +97,6 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
     assert shared(environment={"evlcp-sdk": "2"}) == 0
 
 
-def test_links_that_differ_in_name_only_are_one_task() -> None:
-    links = [Case({"variant": name}, 0, 0) for name in "ab"]
-    plan = make_plan("x", [Case({}, 0, 0)], links, [0])
-    assert [len(job.tasks) for job in plan.jobs] == [1]
-    assert plan.points[0].tasks == plan.points[1].tasks
-
-
 def test_scenes_that_look_the_same_are_one_job() -> None:
     scenes = [Case({"variant": name}, name, name, name == "other") for name in ("a", "b", "other")]
     links = [Case({"variant": n}, n, n) for n in (0, 1)]
@@ -112,17 +105,14 @@ def test_scenes_that_look_the_same_are_one_job() -> None:
     both = [("a", 0), ("a", 1), ("b", 0), ("b", 1)]
     other = [("other", 0), ("other", 1)]
     assert found == [("a", 0, both), ("other", 0, other), ("a", 1, both), ("other", 1, other)]
+    # Links that differ in name only are one task.
+    same = make_plan("x", scenes[:1], [Case({"variant": name}, 0, 0) for name in "ab"], [0])
+    assert [len(job.tasks) for job in same.jobs] == [1]
+    assert same.points[0].tasks == same.points[1].tasks
     for job in plan.jobs:
         for task in job.tasks:
             (point,) = (point for point in plan.points if task.id in point.tasks)
             assert plan.scenes[point.scene].value == task.scene
-
-
-def test_an_override_takes_the_place_of_an_axis(tmp_path: Path) -> None:
-    plan = plan_of(tmp_path, overrides=["scene.distance_m=45", "campaign.seeds=1"])
-    assert len(plan.points) == 4
-    assert plan.scenes[0].value[1][-1] == "speed_kmh=20"
-    assert "distance_m=45" in plan.scenes[0].value[1]
 
 
 @pytest.mark.parametrize(
