@@ -5,7 +5,8 @@ import dataclasses
 import io
 import json
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -33,13 +34,13 @@ from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.geojson import GeoJson
 from evlcp_sdk.results.nmea import Nmea
 from evlcp_sdk.results.position_tables import AlternativesCsv, FixesCsv, PointsCsv
-from evlcp_sdk.results.sink import Run
+from evlcp_sdk.results.sink import Run, Sink
 from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.trail import cut
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
-from evlcp_sdk.utc import ClockZero, PulseClock
+from evlcp_sdk.utc import PulseClock
 from evlcp_sdk.values import (
     Alternative,
     Events,
@@ -90,26 +91,27 @@ def satellites(times_us: Sequence[float], off_m: float = 0.0) -> GnssLog:
 
 
 def write(
-    folder: Path,
-    stream: Iterable[Packet],
-    plan: PositionPlan,
-    sinks: Sequence[str] = (),
-    attitude: Attitude = ATTITUDE,
-    zero: ClockZero = None,
-    span_us: tuple[int, int] | None = None,
+    folder: Path, stream: Iterable[Packet], plan: PositionPlan, *sinks: str, last_us: int = 0, **known: Any
 ) -> dict[str, Any]:
-    known = {"plan": plan, "attitude": attitude, "clock_zero": zero}
-    with ResultWriter(folder, LINK, sinks=sinks, **known) as results:  # type: ignore[arg-type]
-        if span_us is not None:
-            results.events(Events.of(span_us, [1, 1], [1, 1], [1, 1]))
+    """The position figures of a result, of a recording from 0 on where its last time is given."""
+    given = {"attitude": ATTITUDE, "plan": plan} | known
+    with ResultWriter(folder, LINK, sinks=sinks, **given) as results:
+        if last_us:
+            results.events(Events.of([0, last_us], [1, 1], [1, 1], [1, 1]))
         results.write(stream)
-        told: dict[str, Any] = results.finish(RunEnd("complete"))["positions"]
-    return told
+        return dict(results.finish(RunEnd("complete"))["positions"])
 
 
 def rows(path: Path) -> list[dict[str, str]]:
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
+
+
+@contextmanager
+def sink_of(kind: type[AlternativesCsv | PointsCsv], folder: Path) -> Iterator[Sink]:
+    with ResultFolder(folder, [kind.name]) as files:
+        yield kind(files, Run("", LINK))
+        files.finish()
 
 
 def check_places(found: list[dict[str, str]], most_sigma_m: float = math.inf) -> None:
@@ -132,7 +134,7 @@ def sentences(folder: Path) -> list[Any]:
 
 
 def test_files_of_a_drive(tmp_path: Path) -> None:
-    told = write(tmp_path, packets(13), PositionPlan((SITE,)), ["figures"], zero=ZERO)
+    told = write(tmp_path, packets(13), PositionPlan((SITE,)), "figures", clock_zero=ZERO)
     fixes = rows(tmp_path / "fixes.csv")
     assert told["fixes"] == len(fixes) == 12
     assert told["bars"] == {"0": 7}
@@ -226,9 +228,8 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
 def test_a_track_goes_on_between_bars(tmp_path: Path) -> None:
     """Bars at first and last, satellites all the time, and outside of the recording, which do not count."""
     stream = [p for p in packets(60) if not 15 <= p.packet < 45]
-    last_us = int(60 * PACKET_US)
     plan = PositionPlan((SITE,), satellites(np.arange(-5, 40) * 1e5 + 7))
-    told = write(tmp_path, stream, plan, ["figures", "mcap"], zero=ZERO, span_us=(0, last_us))
+    told = write(tmp_path, stream, plan, "figures", "mcap", clock_zero=ZERO, last_us=int(60 * PACKET_US))
     assert (told["gnss"], told["gnss_left_out"], told["gnss_without_heading"]) == (21, 0, 0)
     fixes, track = rows(tmp_path / "fixes.csv"), rows(tmp_path / "track.csv")
     assert told["gnss_outside"] == 24
@@ -244,7 +245,7 @@ def test_a_track_goes_on_between_bars(tmp_path: Path) -> None:
 
 def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None:
     plan = PositionPlan((SITE,), satellites(np.arange(5, 20) * 1e5 + 7, 20.0))
-    told = write(tmp_path, packets(60), plan, zero=ZERO, span_us=(0, int(60 * PACKET_US)))
+    told = write(tmp_path, packets(60), plan, clock_zero=ZERO, last_us=int(60 * PACKET_US))
     assert told["alarms"]["contradicted"] == told["gnss_left_out"] == told["gnss"] == 15
     fixes = rows(tmp_path / "fixes.csv")
     assert {r["contradicted"] for r in fixes if r["source"] == "gnss"} == {"bars"}
@@ -270,11 +271,9 @@ def test_the_poses_that_fit_are_a_file(tmp_path: Path) -> None:
         Alternative(35.1, 137.0, 5.0, np.ones(3), np.full((3, 3), math.nan), *turned, 0.25),
     )
     fix = dataclasses.replace(Fix.refused(2e6, (0, 1), "two-solutions", ""), alternatives=both)
-    with ResultFolder(tmp_path, ["alternatives.csv"]) as folder:
-        sink = AlternativesCsv(folder, Run("", LINK))
+    with sink_of(AlternativesCsv, tmp_path) as sink:
         sink.fix(fix, None)
         sink.fix(Fix.refused(3e6, (0,), "heading-unknown", ""), None)
-        folder.finish()
     first, second = rows(tmp_path / "alternatives.csv")
     assert (first["number"], first["likelihood"], first["sigma_up_m"]) == ("0", "1", "0.2000")
     assert (second["latitude_deg"], second["sigma_up_m"], second["bars"]) == ("35.1000000000", "", "0 1")
@@ -300,7 +299,7 @@ def test_the_figure_of_a_track(tmp_path: Path) -> None:
 def test_a_track_across_the_180th_meridian_is_cut(tmp_path: Path) -> None:
     metre = 1 / (111_319.5 * math.cos(math.radians(35)))
     site = dataclasses.replace(SITE, longitude_deg=180 - metre)
-    write(tmp_path, packets(4), PositionPlan((site,)), zero=ZERO)
+    write(tmp_path, packets(4), PositionPlan((site,)), clock_zero=ZERO)
     shapes = [shape["geometry"] for shape in features(tmp_path)]
     (line,) = (shape["coordinates"] for shape in shapes if shape["type"] == "LineString")
     assert all(-180 <= point[0] < -179.9999 for point in line)
@@ -322,10 +321,8 @@ def test_points_of_frames(tmp_path: Path) -> None:
         dataclasses.replace(f, range=Range(d, 0.2, 9), x_px=700.0, y_px=300.0, echo_of=e)
         for f, d, e in zip(packet.frames, (50.0, math.nan, 40.0), (None, None, 1), strict=False)
     ]
-    with ResultFolder(tmp_path, ["points.csv"]) as folder:
-        sink = PointsCsv(folder, Run("", LINK))
+    with sink_of(PointsCsv, tmp_path) as sink:
         sink.packet(dataclasses.replace(packet, frames=tuple(frames)))
-        folder.finish()
     (row,) = rows(tmp_path / "points.csv")
     point = np.array([float(row[f"{axis}_m"]) for axis in "xyz"])
     np.testing.assert_allclose(LINK.camera.project(point), [700, 300], atol=0.02)
@@ -368,7 +365,7 @@ def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.
 
 
 def test_kml_is_read_back(tmp_path: Path) -> None:
-    write(tmp_path, packets(6), PositionPlan((SITE,)), ["kml"], zero=ZERO)
+    write(tmp_path, packets(6), PositionPlan((SITE,)), "kml", clock_zero=ZERO)
     names = {"k": "http://www.opengis.net/kml/2.2"}
     placemarks = ElementTree.parse(tmp_path / "fixes.kml").getroot().findall("k:Document/k:Placemark", names)
 
@@ -511,7 +508,7 @@ def test_navsat_is_read_back(tmp_path: Path) -> None:
     """By `mcap` and the types of ROS 2 that `rosbags` brings."""
     reader = pytest.importorskip("mcap.reader", reason="the extra ros is not installed")
     typesys = pytest.importorskip("rosbags.typesys", reason="the extra ros is not installed")
-    write(tmp_path, packets(6), PositionPlan((SITE,)), ["navsat"], zero=ZERO)
+    write(tmp_path, packets(6), PositionPlan((SITE,)), "navsat", clock_zero=ZERO)
     store = typesys.get_typestore(typesys.Stores.ROS2_JAZZY)
     with (tmp_path / "navsat.mcap").open("rb") as file:
         source = reader.make_reader(file)
@@ -541,7 +538,7 @@ def test_times_by_pulses(tmp_path: Path) -> None:
     pulses = PulseClock(near=ZERO)
     t_us = [100_000 + round(k * 1_000_040) for k in range(3)]
     pulses.add(Triggers.of(t_us, [0, 0, 0], [1, 1, 1]), 0.0, 0.0)
-    write(tmp_path, packets(6), PositionPlan((SITE,)), ["kml", "mcap", "navsat"], zero=pulses)
+    write(tmp_path, packets(6), PositionPlan((SITE,)), "kml", "mcap", "navsat", clock_zero=pulses)
     fixes = rows(tmp_path / "fixes.csv")
     moved = [one for one in sentences(tmp_path) if one.sentence_type == "RMC"]
     told = [datetime.combine(one.datestamp, one.timestamp) for one in moved]

@@ -83,16 +83,9 @@ class Saying(Sink):
         return self.says
 
 
-class Unsayable(Saying):
-    says: Any = {"what": object()}  # noqa: RUF012
-
-
-class Nan(Saying):
-    says: Any = {"mean": float("nan")}  # noqa: RUF012
-
-
-class Counting(Saying):
-    says = 5
+Unsayable = type("Unsayable", (Saying,), {"says": {"what": object()}})
+Nan = type("Nan", (Saying,), {"says": {"mean": float("nan")}})
+Counting = type("Counting", (Saying,), {"says": 5})
 
 
 class Watching(Sink):
