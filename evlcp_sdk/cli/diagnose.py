@@ -76,19 +76,10 @@ def _show(found: Diagnosis) -> None:
     out.print(stages)
     if found.sources:
         sources = Table(box=None, pad_edge=False, header_style="dim")
-        for name in ("source", "rate", "columns", "rows", "size", "events", "negative"):
+        for name in found.sources[0].cells():
             sources.add_column(name, justify="right")
         for light in found.sources[:8]:
-            left, top, right, bottom = light.box_px
-            sources.add_row(
-                light.kind,
-                f"{light.rate_hz:,.0f} Hz",
-                f"{left} to {right}",
-                f"{top} to {bottom}",
-                f"{light.wide_px:.0f} x {light.high_px:.0f} px" if light.wide_px else "-",
-                f"{light.events:,}",
-                f"{light.negative_share:.0%}",
-            )
+            sources.add_row(*light.cells().values())
         out.print(sources)
         if len(found.sources) > 8:
             out.print(f"and {len(found.sources) - 8} more", style="dim")

@@ -127,6 +127,19 @@ class LightSource:
     blind_us: float
     intervals: NDArray[np.int64]
 
+    def cells(self) -> dict[str, str]:
+        """What tables show of it, by the heads of their columns."""
+        left, top, right, bottom = self.box_px
+        return {
+            "source": self.kind,
+            "rate": f"{self.rate_hz:,.0f} Hz",
+            "columns": f"{left} to {right}",
+            "rows": f"{top} to {bottom}",
+            "size": f"{self.wide_px:.0f} x {self.high_px:.0f} px" if self.wide_px else "-",
+            "events": f"{self.events:,}",
+            "negative": f"{self.negative_share:.0%}",
+        }
+
     def strength_at(self, rate_hz: float) -> float:
         """The mean of cos(2 pi f tau) at another rate."""
         return float(comb(self.intervals, np.array([rate_hz]))[0])

@@ -91,7 +91,6 @@ class LiveLoop:
 
     Attributes:
         delays: Of frames, by stage; `end_to_end` of messages `time`.
-        shed: What was left out so far.
     """
 
     def __init__(
@@ -167,15 +166,13 @@ class LiveLoop:
         now = time.monotonic()
         form = self._forms[frame.link]
         chips = form.frame_chips if form.has_pilot(frame.frame) else form.info_chips
-        last_us = frame.t_us + chips * form.chip_us
-        shone_s = self._shone_s(last_us)
+        shone_s = self._shone_s(frame.t_us + chips * form.chip_us)
         late_ms = None
         if self._arrived_s == self._arrived_s:  # not at the end, whose time says nothing
             parts_s = self._arrived_s - shone_s, self._taken_s - self._arrived_s, now - self._taken_s
             late_ms = (now - shone_s) * 1e3
             for stage, part_s in zip(STAGES, (*parts_s, now - shone_s), strict=True):
-                self.delays[stage].add(part_s * 1e3)
-                self._recent[stage].add(part_s * 1e3)
+                self._count(stage, part_s * 1e3)
         self._publisher.publish("frame", frame.t_us, frame, late_ms)
 
     def _shone_s(self, t_us: float) -> float:
@@ -272,9 +269,12 @@ class LiveLoop:
             late_ms = (time.time() - message.value) * 1e3
         else:
             return None
-        self.delays[_END_TO_END].add(late_ms)
-        self._recent[_END_TO_END].add(late_ms)
+        self._count(_END_TO_END, late_ms)
         return late_ms
+
+    def _count(self, stage: str, delay_ms: float) -> None:
+        self.delays[stage].add(delay_ms)
+        self._recent[stage].add(delay_ms)
 
     def _tell_status(self, *, now: bool = False) -> None:
         """Say how it goes, where it is time for that."""

@@ -304,6 +304,14 @@ function tile(label, value, unit, note) {
   return div;
 }
 
+function fill(id, rows) {
+  by(id).replaceChildren(...rows.map((texts) => {
+    const row = document.createElement("tr");
+    for (const text of texts) cell(row, text);
+    return row;
+  }));
+}
+
 function drawWords() {
   const tiles = [];
   if (status) {
@@ -331,7 +339,7 @@ function drawWords() {
   const alarms = [];
   if (status && status.level) {
     alarms.push(`The receiver cannot keep up: ${about.levels.slice(1, status.level + 1).join(", ")}.`);
-  };
+  }
   if (record && record.fault) alarms.push(`The recording ended: ${record.fault}`);
   if (untold) alarms.push(`Messages that cannot be shown: ${untold.count}. ${untold.fault}.`);
   if (ended) alarms.push(`The run has ended, ${ended.status}: ${ended.error || ended.result}.`);
@@ -355,14 +363,8 @@ function drawWords() {
   }
   by("frames").replaceChildren(frames);
 
-  const table = document.createDocumentFragment();
-  for (const message of messages) {
-    const row = document.createElement("tr");
-    for (const text of [fixed(message.t_us / 1e6, 2), message.transmitter, message.transmitter_id, message.kind,
-      message.trust, said(message)]) cell(row, text);
-    table.append(row);
-  }
-  by("messages").replaceChildren(table);
+  fill("messages", messages.map((one) =>
+    [fixed(one.t_us / 1e6, 2), one.transmitter, one.transmitter_id, one.kind, one.trust, said(one)]));
   by("silent").hidden = messages.length > 0;
 
   const lost = [];
@@ -375,13 +377,7 @@ function drawWords() {
   }
   if (shown.dropped) lost.push(["results this browser was too slow for", shown.dropped]);
   if (record && record.dropped) lost.push(["pieces the recording was too slow for", record.dropped]);
-  const losses = document.createDocumentFragment();
-  for (const [name, n] of lost) {
-    const row = document.createElement("tr");
-    cell(row, name.replaceAll("_", " ")); cell(row, n.toLocaleString("en"));
-    losses.append(row);
-  }
-  by("lost").replaceChildren(losses);
+  fill("lost", lost.map(([name, n]) => [name.replaceAll("_", " "), n.toLocaleString("en")]));
   by("whole").hidden = lost.length > 0;
 
   const button = by("record");

@@ -36,7 +36,6 @@ class Subscription:
 
     Attributes:
         dropped: News that were pushed out of the queue by newer ones, so far.
-        ended: Nothing more will come, and nothing is left.
     """
 
     def __init__(self, kinds: frozenset[str], most: int, wake: Callable[[], None] | None) -> None:

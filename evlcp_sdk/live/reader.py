@@ -77,7 +77,6 @@ class Reader:
     Attributes:
         dropped: Events that were dropped so, so far.
         fault: What ended the reading, where that was a fault.
-        ended: Nothing more will come, and nothing waits.
     """
 
     def __init__(self, source: EventSource, most_events: int = _MOST_EVENTS) -> None:

@@ -26,19 +26,8 @@ def page(diagnosis: Diagnosis) -> str:
     """The page's HTML."""
     name = Path(diagnosis.recording).name
     height, width = (n * diagnosis.cell_px for n in diagnosis.frequency_hz.shape)
-    sources = [
-        (
-            f"{number}",
-            one.kind,
-            f"{one.rate_hz:,.0f}",
-            f"{one.strength:.2f}",
-            f"{one.wide_px:.0f} x {one.high_px:.0f}" if one.wide_px else "-",
-            f"{one.box_px[0]} to {one.box_px[2]}, {one.box_px[1]} to {one.box_px[3]}",
-            f"{one.events:,}",
-            f"{1 - one.negative_share:.0%} / {one.negative_share:.0%}",
-        )
-        for number, one in enumerate(diagnosis.sources[:_MOST_SOURCES], 1)
-    ]
+    shown = diagnosis.sources[:_MOST_SOURCES]
+    sources = [(n, *one.cells().values(), f"{one.strength:.2f}") for n, one in enumerate(shown, 1)]
     trials = [
         (
             one.options(),
@@ -60,6 +49,7 @@ def page(diagnosis: Diagnosis) -> str:
         width=width,
         height=height,
         most=_MOST_SOURCES,
+        heads=["", *shown[0].cells(), "certainty"] if shown else [],
         sources=sources,
         trials=trials,
     )

@@ -151,6 +151,9 @@ def test_a_format_that_is_not_there(demo_raw: Path, tmp_path: Path) -> None:
     missing = bring("far", f"{__name__}:Failing", packages=("no_such_package",))
     with pytest.raises(ConfigError, match=r"sink 'far' of .* needs no_such_package, or leave --sink far out"):
         receive_to_folder(demo_raw, tmp_path / "out", registry=missing, sinks=["far"])
+    extra = bring("far", f"{__name__}:Failing", packages=("no_such_package",), extra="evlcp-sdk[far]")
+    with pytest.raises(ConfigError, match=r"needs the extra: pip install 'evlcp-sdk\[far\]'"):
+        receive_to_folder(demo_raw, tmp_path / "out", registry=extra, sinks=["far"])
     assert not (tmp_path / "out").exists()
 
 
