@@ -171,7 +171,7 @@ def measure_box(
     rows[:] = 0
     if last_column < first_column:
         return 0, 0.0, 0, 0, 0.0, 0.0
-    outside = min(columns[:seam].mean(), columns[-seam:].mean()) if columns.size > 2 * seam else 0.0
+    outside = min(columns[:seam].sum(), columns[-seam:].sum()) / seam if columns.size > 2 * seam else 0.0
     columns = np.maximum(columns - outside, 0.0)
     wide = int(min(2 * reach, columns.size))
     start, best, inside = 0, 0.0, 0.0
@@ -335,8 +335,10 @@ def add_polarity(
     row_us, row_px = row
     chips, height, width = sums.shape
     shift_x, shift_y = shift[0], shift[1]
-    upper = row_us * (shift_y.min() - row_px)
-    lower = row_us * (shift_y.max() + height - row_px)
+    highest, lowest = shift_y[0], shift_y[0]
+    for i in range(chips):
+        highest, lowest = min(highest, shift_y[i]), max(lowest, shift_y[i])
+    upper, lower = row_us * (highest - row_px), row_us * (lowest + height - row_px)
     first = np.searchsorted(t_us, min(start_on_us, start_off_us) + min(upper, lower))
     end = max(start_on_us, start_off_us) + max(upper, lower) + chips * chip_us
     last = np.searchsorted(t_us, end)
@@ -522,7 +524,7 @@ def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -
     of = np.empty((2, at.size), np.int64)
     done = np.zeros((rows, columns), np.bool_)
     found = np.empty((rows * columns, 2), np.int64)
-    n = 0
+    n, most = 0, 0
     for k in range(clusters):
         first, last = rows_of(selected[k])
         done[first:last] = False
@@ -537,9 +539,9 @@ def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -
                     right += found[i, 1]
                 some[n] = complex(right / count * grid + (grid - 1) / 2, down / count * grid + (grid - 1) / 2)
                 of[0, n], of[1, n] = k, count
+                most = max(most, count)
                 n += 1
     # Where those of a number of cells begin, behind those with more.
-    most = of[1, :n].max() if n else 0
     begin = np.zeros(most + 2, np.int64)
     for i in range(n):
         begin[most - of[1, i] + 1] += 1
@@ -632,7 +634,7 @@ def refined_similarity(
                 cross += cells[i] * d.conjugate() * (at[i] - image_mean)
                 power += cells[i] * (d.real * d.real + d.imag * d.imag)
         if abs(scale) > 0:
-            middle = layout.mean()
+            middle = layout.sum() / layout.size
             full = 0.0
             for c in layout:
                 full += abs(c - middle) ** 2
@@ -1090,10 +1092,12 @@ def middle_across(
         return 0.0
     wide = right - left + 1
     light = np.zeros((bottom - top + 1, wide))
-    ups, downs = max((edges > 0).sum(), 1), max((edges < 0).sum(), 1)
+    ups, downs = 0, 0
+    for edge in edges:
+        ups, downs = ups + int(edge > 0), downs + int(edge < 0)
     for j in range(edges.size):
-        weight, image = edges[j] / (ups if edges[j] > 0 else downs), heard[1 + j]
-        if weight != 0:
+        if edges[j] != 0:
+            weight, image = edges[j] / (ups if edges[j] > 0 else downs), heard[1 + j]
             for v in range(top, bottom + 1):
                 into, line = light[v - top], image[v, left:]
                 for u in range(wide):
@@ -1424,17 +1428,19 @@ def newest_on_parabola(
 @njit
 def _about_parabola(
     place: Array, weight: Array, off: Array, least: float, right: Array, inverse: Array
-) -> int:
+) -> tuple[int, float]:
     """Weighted least squares of a parabola: right sides (k, 3) for what lies off, (k, n), and the inverse.
 
     `off` is weighted. Boundaries of less than `least` of the heaviest weight are passed over; returns how
-    many are not, 0 where they are too few or lie on one place.
+    many are not, 0 where they are too few or lie on one place, and that weight.
     """
-    heaviest, n = weight.max(), 0
+    lightest, n = 0.0, 0
+    for i in range(place.size):
+        lightest = max(lightest, least * weight[i])
     normal = np.zeros((3, 3))
     right[:] = 0.0
     for i in range(place.size):
-        if weight[i] > least * heaviest:
+        if weight[i] > lightest:
             terms = place[i] ** 2, 1.0, place[i]
             n += 1
             for a in range(3):
@@ -1442,7 +1448,7 @@ def _about_parabola(
                     right[k, a] += terms[a] * off[k, i]
                 for b in range(3):
                     normal[a, b] += weight[i] * terms[a] * terms[b]
-    return n if n > 3 and inverted(normal, _ROUNDING, inverse) else 0
+    return (n if n > 3 and inverted(normal, _ROUNDING, inverse) else 0), lightest
 
 
 @njit
@@ -1457,7 +1463,7 @@ def bend_of(
     """
     right, inverse = np.empty((2, 3)), np.empty((3, 3))
     weight = sums[0]
-    n = _about_parabola(place, weight, sums[1:], least, right, inverse)
+    n, lightest = _about_parabola(place, weight, sums[1:], least, right, inverse)
     # The variance of a normal variable over an estimated sigma is finite from three degrees of freedom on.
     if n - 3 < 3:
         return np.nan, np.nan
@@ -1466,9 +1472,9 @@ def bend_of(
         by_wave += inverse[0, b] * right[1, b]
         for a in range(3):
             path[a] += inverse[a, b] * (right[0, b] - wave * right[1, b])
-    left, heaviest = 0.0, weight.max()
+    left = 0.0
     for i in range(place.size):
-        if weight[i] > least * heaviest:
+        if weight[i] > lightest:
             off = (sums[1, i] - wave * sums[2, i]) / weight[i]
             off -= path[0] * place[i] ** 2 + path[1] + path[2] * place[i]
             left += weight[i] * off * off
@@ -1485,12 +1491,11 @@ def wave_of(place: Array, sums: Array, least: float, out: Array) -> None:
     """
     right, inverse = np.empty((2, 3)), np.empty((3, 3))
     weight = sums[0]
-    n = _about_parabola(place, weight, sums[1:], least, right, inverse)
+    n, lightest = _about_parabola(place, weight, sums[1:], least, right, inverse)
     if n == 0:
         return
-    heaviest = weight.max()
     for i in range(place.size):
-        if weight[i] > least * heaviest:
+        if weight[i] > lightest:
             out[0] += sums[2, i] * sums[2, i] / weight[i]
             out[1] += sums[2, i] * sums[1, i] / weight[i]
             out[2] += sums[1, i] * sums[1, i] / weight[i]
@@ -1687,8 +1692,11 @@ def slope_of_rows(
     rest = place[:n] - slope * at[:n]
     rest = np.abs(rest - median(rest, n))
     spread = max(1.48 * median(rest, n), least)
-    mean = at[:n].mean()
-    return slope, spread / np.sqrt(((at[:n] - mean) ** 2).sum())
+    mean = at[:n].sum() / n
+    squares = 0.0
+    for i in range(n):
+        squares += (at[i] - mean) ** 2
+    return slope, spread / np.sqrt(squares)
 
 
 @njit
@@ -1707,9 +1715,10 @@ def delay_of_rows(
     fewest, chance, least = limits
     fit = np.empty((2, counts.shape[1], counts.shape[2] - chips.size * chip_steps + 1))
     fit_rows(counts, chips, chip_steps, fit)
-    total, weight = 0.0, 0.0
+    seen, total, weight = np.empty(counts.shape[1]), 0.0, 0.0
     for polarity in range(2):
-        seen = counts[polarity].sum(axis=1)
+        for b in range(seen.size):
+            seen[b] = counts[polarity, b].sum()
         lag, sigma = slope_of_rows(rows, fit[polarity], seen, fewest, chance, least)
         if np.isfinite(lag):
             total += lag * step_us / (sigma * step_us) ** 2

@@ -109,7 +109,8 @@ def _decide(
         count = _fork(metric, penalty, limit, alive, rows, fork)
         for path in range(size):
             if alive[path]:
-                codewords[path, :length] = fork[1, path]
+                for i in range(length):
+                    codewords[path, i] = fork[1, path]
     for split in range(splits):
         for path in range(size):
             if alive[path]:
@@ -119,8 +120,10 @@ def _decide(
         for path in range(size):
             other = fork[0, path]
             if alive[path] and other != path:
-                weakest[path] = weakest[other]
-                codewords[path, :length] = codewords[other, :length]
+                for i in range(splits):
+                    weakest[path, i] = weakest[other, i]
+                for i in range(length):
+                    codewords[path, i] = codewords[other, i]
         for path in range(size):
             if alive[path] and fork[1, path]:
                 codewords[path, weakest[path, split]] ^= 1
