@@ -6,8 +6,6 @@ from operator import xor
 
 from firmware_host.images import FLASH_BYTES, FLASH_START
 
-__all__ = ["RomEmulator", "RomLine"]
-
 _ACK, _NACK, _SYNC = 0x79, 0x1F, 0x7F
 _COMMANDS = bytes([0x00, 0x01, 0x02, 0x11, 0x21, 0x31, 0x44, 0x63, 0x73, 0x82, 0x92])
 _SECTOR_KIB = (16, 16, 16, 16, 64, 128, 128, 128, 128, 128, 128, 128)
@@ -17,19 +15,10 @@ Taking = Generator[None, int, bytes]
 
 
 class RomEmulator:
-    """Takes bytes, answers bytes; its flash only loses ones until it is erased.
+    """Takes bytes, answers bytes; its flash, 1 MiB, only loses ones until it is erased.
 
-    Args:
-        flash: What the flash holds, by default nothing.
-        protected: Whether read-out is protected.
-        product: What it says it is.
-
-    Attributes:
-        flash: The flash, 1 MiB.
-        options: The option bytes.
-        erased: Sectors that were erased, in order.
-        started: Where GO went, or None.
-        resets: Resets because of new option bytes.
+    What it was told: `erased` has the sectors, in order, `started` where GO went, and `resets` counts those
+    because of new option bytes.
     """
 
     def __init__(self, flash: bytes | None = None, protected: bool = False, product: int = 0x413) -> None:
@@ -141,12 +130,7 @@ def _sum(data: bytes) -> int:
 
 
 class RomLine:
-    """A line to the emulator, as a `Transport`; a byte takes eleven bits.
-
-    Args:
-        rom: The emulator.
-        baud: Line rate, bit/s.
-    """
+    """A line to the emulator, as a `Transport`; a byte takes eleven bits."""
 
     def __init__(self, rom: RomEmulator, baud: int = 115_200) -> None:
         self.name = "rom:"
@@ -163,9 +147,7 @@ class RomLine:
         """What of `data` arrives at the part; here everything."""
         return data
 
-    def to_host(self, data: bytes) -> bytes:
-        """What of `data` arrives at the host; here everything."""
-        return data
+    to_host = to_part
 
     def read(self, timeout_s: float) -> bytes:
         """Bytes of the part; or time passes."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from functools import partial
 from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import unicorn
@@ -185,16 +185,12 @@ class Dma:
         self.ahead = 0  # the word fetched ahead
         self.dead = False
 
+    OTHERS: ClassVar = {0x8C: "left", 0x90: "par", 0x94: "memory", 0x9C: "fcr"}
+
     def read(self, offset: int) -> int:
-        return {
-            0x04: self.flags,
-            0x0C: 0,
-            0x88: self.cr,
-            0x8C: self.left,
-            0x90: self.par,
-            0x94: self.memory,
-            0x9C: self.fcr,
-        }[offset]
+        if offset in self.OTHERS:
+            return int(getattr(self, self.OTHERS[offset]))
+        return {0x04: self.flags, 0x0C: 0, 0x88: self.cr}[offset]
 
     def write(self, offset: int, value: int) -> None:
         on = self.cr & 1
@@ -210,16 +206,7 @@ class Dma:
                 if not on:
                     self.start()
         elif not on:  # these are protected while the stream runs
-            if offset == 0x8C:
-                self.left = value
-            elif offset == 0x90:
-                self.par = value
-            elif offset == 0x94:
-                self.memory = value
-            elif offset == 0x9C:
-                self.fcr = value
-            else:
-                raise AssertionError(hex(offset))
+            setattr(self, self.OTHERS[offset], value)
         self.line()
 
     def start(self) -> None:

@@ -5,18 +5,11 @@ from collections import deque
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
 from firmware_host.protocol.generated.requests import DEFAULT_BAUD
 
-__all__ = ["UsbLine"]
-
 
 class UsbLine(SimulatedLine):
-    """A line of a certain rate behind a USB bridge, which hands what it receives on late.
+    """A line of `baud` behind a USB bridge, which keeps what the board sends for `latency_s`, its timer.
 
-    Args:
-        board: The board.
-        latency_s: Time that a bridge keeps what the board sends, s; its latency timer.
-        baud: Line rate, bit/s; a byte takes ten bits.
-        frame_s: Time that USB keeps what the host sends, s; a full-speed frame.
-        name: What to call it in messages.
+    What the host sends USB keeps for `frame_s`, a full-speed frame.
     """
 
     def __init__(
