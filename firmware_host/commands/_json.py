@@ -1,19 +1,13 @@
 """Commands with `--json`: what goes wrong is JSON on stdout, too, beside the line on stderr."""
 
-import json
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand
 
-from evlcp_sdk.cli._common import echo
+from evlcp_sdk.cli._common import echo, print_json
 
 AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, also of what goes wrong.")]
-
-
-def print_json(value: Any) -> None:
-    """Print a value as one line of JSON."""
-    echo(json.dumps(value))
 
 
 def say(text: str, table: dict[str, Any], as_json: bool) -> None:

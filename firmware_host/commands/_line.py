@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
-from evlcp_sdk.cli._common import echo
-from firmware_host.commands._json import JsonCommand, print_json
+from evlcp_sdk.cli._common import echo, print_json
+from firmware_host.commands._json import JsonCommand
 
 if TYPE_CHECKING:
     from firmware_host.board.board import Board

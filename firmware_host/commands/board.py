@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import LinkFile, Overrides, echo, progress_bar
+from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
 from firmware_host.commands import _firmware
-from firmware_host.commands._json import AsJson, JsonCommand, fault_table, print_json, say
+from firmware_host.commands._json import AsJson, JsonCommand, fault_table, say
 from firmware_host.commands._line import (
     LINE,
     BoardLine,

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import LinkFile, Overrides, echo, progress_bar
-from firmware_host.commands._json import AsJson, print_json, say
+from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
+from firmware_host.commands._json import AsJson, say
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, say_done
 from firmware_host.commands.stream import Ahead, said_of, table_of
 

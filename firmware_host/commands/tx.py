@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import echo
-from firmware_host.commands._json import AsJson, JsonCommand, print_json
+from evlcp_sdk.cli._common import echo, print_json
+from firmware_host.commands._json import AsJson, JsonCommand
 from firmware_host.commands._source import SymbolOptions
 from firmware_host.commands.message import keygen, message
 
