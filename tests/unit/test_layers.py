@@ -82,6 +82,24 @@ def test_imports_go_down_and_none_is_of_a_plugin() -> None:
                 assert not above, f"evlcp_sdk.{module} imports {name}, which stands above it"
 
 
+BOARD = ("errors build flicker images", "protocol", "ports", "emulators", "board", "loop", "commands")
+"""The layers of the board's host tool."""
+
+
+def test_imports_of_the_board_go_down() -> None:
+    def layer(module: str) -> int:
+        (level,) = (n for n, names in enumerate(BOARD) if module.split(".")[0] in names.split())
+        return level
+
+    found = modules(SDK.parent / "firmware_host")
+    for module, path in found.items():
+        for name in imports_of(path):
+            if name.startswith("firmware_host."):
+                other = name.removeprefix("firmware_host.")
+                assert layer(other) <= layer(module), f"{module} imports {other}, which is above"
+                assert other != "protocol.generate", "the generator is a developer's tool"
+
+
 @pytest.mark.parametrize("package", ["io", "rx", "place", "sim"])
 def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
     others = {"io", "rx", "place", "sim"} - {package}
