@@ -43,7 +43,7 @@ class Run:
     @property
     def filtered(self) -> bool:
         """Whether a link filters distances, so that there are columns for them."""
-        from evlcp_sdk.rx.steps import tracker_of
+        from evlcp_sdk.rx.guard import tracker_of
 
         links = self.links.values() or [self.link]
         return any(tracker_of(link).distance is not None for link in links)

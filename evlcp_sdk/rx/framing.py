@@ -27,10 +27,9 @@ from evlcp_sdk.rx.bars import BarFollower
 from evlcp_sdk.rx.framer import Framer, LitTimes, StreamContext
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.limits import Limits
-from evlcp_sdk.rx.reading import FrameReader
+from evlcp_sdk.rx.reading import FrameReader, Steps
 from evlcp_sdk.rx.reflections import LONGEST_ROW_US, FrameDetection, PacketAssembler, ReflectionQueue
 from evlcp_sdk.rx.regions import MARGIN_PX, SAME_PX, Followed, Places, RegionTracker, same_place
-from evlcp_sdk.rx.steps import Steps
 from evlcp_sdk.values import Events, Frame, Region, SyncLock, changed
 
 LOOKBACK_PACKETS = 2

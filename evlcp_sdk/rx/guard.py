@@ -17,6 +17,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError, PluginError
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Filter, Tracker
 from evlcp_sdk.spelling import hinted
 from evlcp_sdk.values import Bend, PresenceMap, Range, SoftSymbols, SyncLock
 
@@ -31,7 +32,8 @@ class Guard:
     """A context in which code of one algorithm runs: what it raises becomes a `PluginError` that names it.
 
     Interrupts pass, and `ConfigError` where an algorithm may refuse its configuration. The original exception
-    is the cause.
+    is the cause. What an algorithm gave is checked by `expect` and its like, which raise one that says what
+    it gave, and what was expected.
 
     Args:
         link: The configuration that names the algorithm.
@@ -75,31 +77,19 @@ class Guard:
             raise PluginError(self._said(f": {fault_text(fault)}")) from fault
 
     def refuse(self, gave: str, expected: str) -> NoReturn:
-        """Say what an algorithm gave, and what was expected.
-
-        Raises:
-            PluginError: With both.
-        """
+        """Raise what an algorithm gave, and what was expected, in words."""
         raise PluginError(self._said(f": gave {gave}, expected {expected}"))
 
     def _said(self, what: str) -> str:
         return hinted(f"{self._role} algorithm '{self._id}'{what}", self._role, self._id)
 
     def expect(self, found: object, kind: type) -> None:
-        """Check what an algorithm gave.
-
-        Raises:
-            PluginError: It is of another type.
-        """
+        """Check the type of what an algorithm gave."""
         if not isinstance(found, kind):
             self.refuse(type(found).__name__, kind.__name__)
 
     def expect_compiled(self, found: object, methods: tuple[str, ...]) -> None:
-        """Check what `compile` gave: a function, or an object with these methods.
-
-        Raises:
-            PluginError: It is neither.
-        """
+        """Check what `compile` gave: an object with these methods, or a function if there are none."""
         if methods and not all(callable(getattr(found, name, None)) for name in methods):
             expected = f"an object with {' and '.join(f'{name}()' for name in methods)}"
         elif not methods and not callable(found):
@@ -109,11 +99,7 @@ class Guard:
         self.refuse(f"{type(found).__name__} at compile()", expected)
 
     def expect_step(self, found: object, what: str) -> tuple[Any, list[Any]]:
-        """Check what a step function gave: its new state, and a list.
-
-        Raises:
-            PluginError: It gave anything else.
-        """
+        """Check what a step function gave: its new state, and a list."""
         if not isinstance(found, tuple) or len(found) != 2:
             self.refuse(f"{type(found).__name__} at {what}", "the state and a list")
         state, some = found
@@ -121,11 +107,7 @@ class Guard:
         return state, some
 
     def expect_array(self, found: object, name: str, shape: tuple[int, ...], kinds: str) -> None:
-        """Check an array's shape, and its type by NumPy's letters for kinds, e.g. `"iu"`.
-
-        Raises:
-            PluginError: It is none, or of another shape or type.
-        """
+        """Check an array's shape, and its type by NumPy's letters for kinds, e.g. `"iu"`."""
         if not isinstance(found, np.ndarray):
             self.refuse(f"{name} of type {type(found).__name__}", f"an array {shape}")
         if found.shape != shape:
@@ -136,11 +118,7 @@ class Guard:
     def expect_number(
         self, found: object, name: str, least: float, most: float, expected: str | None = None
     ) -> None:
-        """Check a number; `expected` says its range where the limits themselves would say it badly.
-
-        Raises:
-            PluginError: It is none, or out of range.
-        """
+        """Check a number; `expected` says its range where the limits themselves would say it badly."""
         try:
             fine = bool(least <= found <= most)  # type: ignore[operator]
         except (TypeError, ValueError):
@@ -151,33 +129,28 @@ class Guard:
             )
 
     def expect_locks(self, locks: list[SyncLock], until_us: float, packet: PacketFormat) -> None:
-        """Check what a synchronization found in a step, until a time, us.
-
-        Raises:
-            PluginError: It is no list of `SyncLock`, or longer than there is time for, or their times are not
-                those of such packets.
-        """
+        """Check the locks of a step that ends at a time, us: no more than there is time for, near to it."""
         self.expect(locks, list)
         if len(locks) > _MOST_LOCKS:
             self.refuse(f"{len(locks)} locks in a step", f"at most {_MOST_LOCKS}")
         chip_us, whole_us = packet.chip_us, packet.packet_chips * packet.chip_us
         far_us = _FAR_PACKETS * whole_us
+        ranges = {
+            "chip_us": (chip_us / 2, chip_us * 2),
+            "packet_t_us": (until_us - far_us, until_us + far_us),
+            "delay_on_us": (-whole_us, whole_us),
+            "delay_off_us": (-whole_us, whole_us),
+            "quality": (0.0, _ONE),
+            "row_us": (-chip_us, chip_us),
+            "last_row_us": (-whole_us, whole_us),
+        }
         for lock in locks:
             self.expect(lock, SyncLock)
-            self.expect_number(lock.chip_us, "chip_us", chip_us / 2, chip_us * 2)
-            self.expect_number(lock.packet_t_us, "packet_t_us", until_us - far_us, until_us + far_us)
-            self.expect_number(lock.delay_on_us, "delay_on_us", -whole_us, whole_us)
-            self.expect_number(lock.delay_off_us, "delay_off_us", -whole_us, whole_us)
-            self.expect_number(lock.quality, "quality", 0.0, _ONE)
-            self.expect_number(lock.row_us, "row_us", -chip_us, chip_us)
-            self.expect_number(lock.last_row_us, "last_row_us", -whole_us, whole_us)
+            for name, (least, most) in ranges.items():
+                self.expect_number(getattr(lock, name), name, least, most)
 
     def expect_presence(self, found: PresenceMap, clusters: int, height: int, width: int) -> None:
-        """Check what a separation gave of an image.
-
-        Raises:
-            PluginError: It is no `PresenceMap` of this image.
-        """
+        """Check what a separation gave of an image."""
         self.expect(found, PresenceMap)
         grid = found.grid_px
         if not isinstance(grid, int | np.integer) or grid < 1:
@@ -195,11 +168,7 @@ class Guard:
             self.refuse("pixels of other values", "finite ones")
 
     def expect_symbols(self, soft: SoftSymbols, codebook: Codebook) -> None:
-        """Check what a decoding gave.
-
-        Raises:
-            PluginError: It is not a `SoftSymbols`, or of other shapes or symbols than the codebook's.
-        """
+        """Check what a decoding gave."""
         self.expect(soft, SoftSymbols)
         self.expect_array(soft.symbols, "symbols", (codebook.clusters,), "iu")
         self.expect_array(soft.llr, "llr", (codebook.clusters, codebook.bits_per_symbol), "f")
@@ -213,11 +182,7 @@ class Guard:
         self.expect_number(soft.quality, "quality", 0.0, _ONE)
 
     def expect_range(self, found: Range) -> None:
-        """Check what a ranging gave.
-
-        Raises:
-            PluginError: It is no `Range`, or its numbers are not those of a distance.
-        """
+        """Check what a ranging gave."""
         self.expect(found, Range)
         if not _unknown(found.distance_m):
             above = f"a number above 0 and up to {_FARTHEST_M:g}, or NaN"
@@ -238,11 +203,7 @@ class Guard:
                 self.refuse(f"bend.place of shape {shape}", "one number a boundary")
 
     def expect_filtered(self, values: object, sigma: object, shape: tuple[int, ...]) -> None:
-        """Check what a filter of tracking gave.
-
-        Raises:
-            PluginError: Other than finite values of this shape, and a sigma.
-        """
+        """Check what a filter of tracking gave: finite values of this shape, and a sigma."""
         self.expect_array(values, "values", shape, "f")
         assert isinstance(values, np.ndarray)
         if not math.isfinite(values.sum()):
@@ -270,6 +231,48 @@ def compiled(link: Link, role: str, *given: object, methods: tuple[str, ...] = (
         found = link.algorithm(role).compile(*given)
         guard.expect_compiled(found, methods)
     return found
+
+
+def tracker_of(link: Link) -> Tracker:
+    """The filters of a link's tracking, whose faults are named."""
+    guard = Guard(link, "tracking", may_refuse=True)
+    with guard:
+        tracker: Tracker = link.algorithm("tracking").compile()
+        guard.expect(tracker, Tracker)
+        for filter_ in (tracker.position, tracker.distance):
+            if filter_ is not None:
+                guard.expect_compiled(filter_, ("init", "step", "predict"))
+    guard = Guard(link, "tracking")
+    filters = tracker.position, tracker.distance
+    return Tracker(*(None if one is None else _GuardedFilter(one, guard) for one in filters))
+
+
+class _GuardedFilter(Filter):
+    """A filter of tracking whose faults are named."""
+
+    def __init__(self, filter_: Filter, guard: Guard) -> None:
+        self._filter = filter_
+        self._guard = guard
+
+    def init(self) -> Any:
+        with self._guard:
+            return self._filter.init()
+
+    def predict(self, state: Any, t_us: float) -> tuple[NDArray[np.float64], float] | None:
+        with self._guard:
+            found = self._filter.predict(state, t_us)
+            if found is not None:
+                values, sigma = found
+                self._guard.expect_filtered(values, sigma, np.shape(values)[:1])
+        return found
+
+    def step(
+        self, state: Any, t_us: float, value: NDArray[np.float64], sigma: float
+    ) -> tuple[Any, NDArray[np.float64], float]:
+        with self._guard:
+            state, values, sigma = self._filter.step(state, t_us, value, sigma)
+            self._guard.expect_filtered(values, sigma, value.shape)
+        return state, values, sigma
 
 
 def _all_within(found: NDArray[np.floating[Any]], least: float, most: float) -> bool:

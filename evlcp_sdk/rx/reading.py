@@ -1,9 +1,10 @@
-"""What a frame says: its symbols, its distance, its points. Nothing of it moves regions."""
+"""What a frame says, as the link's algorithms read it, and how far that is believed."""
 
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,18 +12,133 @@ from numpy.typing import NDArray
 from evlcp_sdk.air.codebook import edges_of_chips
 from evlcp_sdk.air.frames import chips_behind
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import Tracker
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner
-from evlcp_sdk.rx.llr_calibration import calibrate_llr, still_lit
+from evlcp_sdk.rx.framer import Announcer
+from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
+from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
 from evlcp_sdk.rx.spread import Spread, neighbours
-from evlcp_sdk.rx.steps import Steps
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
-from evlcp_sdk.values import FrameView, Range, SoftSymbols
+from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
+
+_FRAME_WORTH = 6.0
+"""LLRs of a cluster that those of all its frame are worth: light and shaking are much the same for all,
+while a panel or leaves stand behind some."""
+
+_EXPECTED_SPREAD, _EXPECTED_WORTH = 0.4, 6.0
+"""Standard deviation of the sizes of LLRs, in their mean, before any is seen, and how many it is worth."""
+
+_LEAST_SURE = 0.6
+"""Probability of being right against its nearest rival below which a symbol is not given: it has others, too,
+and of those that are less sure, half or more are wrong in recordings."""
+
+_TOGETHER = 1.7
+"""Wrong symbols in a frame that has any: what makes one wrong, light, shaking, what stands behind, is there
+for others, too. In `examples/campaigns/road.toml` they are 1.9 to 2.2 by decoding, as `benchmarks/quality.py`
+prints; on a Gaussian channel 1 to 1.3, as long as less than half of the frames are wrong."""
+
+_LEAST_EVENTS = 0.5
+"""Share of the events due, by the edges of the codeword with the fewest, that may be missing by chance."""
 
 _NO_RANGE = Range(math.nan, math.nan, 0)
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
+
+
+class Steps:
+    """The roles that read a frame; it keeps no state of a stream.
+
+    Args:
+        link: The resolved configuration.
+        announcer: Gets every result but the filters'; None for nobody.
+        tracker: The filters of its tracking, as `tracker_of` gives them.
+    """
+
+    def __init__(self, link: Link, announcer: Announcer | None, tracker: Tracker) -> None:
+        self._codebook = link.codebook
+        self._keeper = RangeKeeper()
+        self._announcer = announcer
+        self._guards = {role: Guard(link, role) for role in ("separation", "decoding", "ranging")}
+        book = link.codebook
+        self._separate = compiled(link, "separation", book)
+        self._decode: Callable[..., SoftSymbols] = compiled(link, "decoding", book)
+        self._measure = compiled(link, "ranging", link.camera, link.bar, book)
+        self._distance = tracker.distance
+
+    def distance_init(self) -> tuple[Ranges, Any]:
+        """What is known of a transmitter's distance before its first frame."""
+        return Ranges(), None if self._distance is None else self._distance.init()
+
+    def separate(self, sums: NDArray[np.int16]) -> PresenceMap:
+        """Where the clusters are, from a pilot's polarity sums, int16 (chips, height, width)."""
+        guard = self._guards["separation"]
+        with guard:
+            presence: PresenceMap = self._separate(sums)
+        if guard.checks:
+            guard.expect_presence(presence, self._codebook.clusters, *sums.shape[1:])
+        if self._announcer is not None:
+            self._announcer.lap("separation", presence)
+        return presence
+
+    def decode(
+        self,
+        presence: PresenceMap,
+        sums: NDArray[np.int16],
+        before: NDArray[np.int8],
+        after: NDArray[np.int8],
+    ) -> SoftSymbols:
+        """What the clusters say, from the polarity sums of pilot and info, int16 (chips, height, width).
+
+        To codes that are no pair codes the chips sent before and after the info segment matter, and the sums
+        have the one after it, too.
+        """
+        guard = self._guards["decoding"]
+        more = () if self._codebook.pairs else (before, after)
+        with guard:
+            soft = self._decode(presence, sums, *more)
+        if guard.checks:
+            guard.expect_symbols(soft, self._codebook)
+        if self._announcer is not None:
+            self._announcer.lap("decoding", soft)
+        return soft
+
+    def measure(self, view: FrameView) -> Range:
+        """How far the bar is."""
+        guard = self._guards["ranging"]
+        if self._announcer is not None:
+            self._announcer.lap("view", view)
+        with guard:
+            distance: Range = self._measure(view)
+        if guard.checks:
+            guard.expect_range(distance)
+        if self._announcer is not None:
+            self._announcer.lap("ranging", distance)
+        return distance
+
+    def follow(
+        self, state: tuple[Ranges, Any], t_us: float, chip_us: float, measured: Range, sight: BarSight
+    ) -> tuple[tuple[Ranges, Any], Range, Range | None]:
+        """Take a frame's distance as the ranging gave it; the new state, the distance, and that filtered.
+
+        The sight says where its bar is seen, and what the attitude says of its lean. The filtered one is
+        the prediction where a frame allows no distance, None without tracking.
+        """
+        ranges, distance = self._keeper.step(state[0], t_us, chip_us, measured, sight)
+        filter_state, filtered = self._filter(state[1], t_us, distance)
+        return (ranges, filter_state), distance, filtered
+
+    def _filter(self, state: Any, t_us: float, measured: Range) -> tuple[Any, Range | None]:
+        if self._distance is None:
+            return state, None
+        if not (math.isfinite(measured.distance_m) and math.isfinite(measured.sigma_m)):
+            expected = self._distance.predict(state, t_us)
+            return state, None if expected is None else Range(float(expected[0][0]), expected[1], 0)
+        value = np.array([measured.distance_m])
+        state, value, sigma = self._distance.step(state, t_us, value, measured.sigma_m)
+        return state, Range(float(value[0]), sigma, measured.pairs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,3 +242,45 @@ class FrameReader:
         how = heard.copy(), self._pilots, self._every, self._layout, self._pairs, placement
         spread = cache(partial(Spread.of, *how))
         return Reading(soft.symbols, given, distance, points_px, sigma_px, flank_px, centre_px, sight, spread)
+
+
+def still_lit(
+    sums: NDArray[np.int16], presence: PresenceMap, pilot_chips: int, least_activity: float = 0.5
+) -> NDArray[np.bool_]:
+    """Which clusters have events in a frame's info segment as they have in its pilot, bool (K,).
+
+    Where a stream has a gap, or a pole passes, silence is not what a cluster says.
+
+    Args:
+        sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
+        presence: Where the clusters are.
+        pilot_chips: Chips of the pilot.
+        least_activity: Edges a chip of the codeword with the fewest, over those of a pilot; half of them in
+            pair codes.
+    """
+    over = np.empty(len(presence.probability))
+    least = _LEAST_EVENTS * least_activity
+    _kernels.info_activity(sums, presence.probability, presence.grid_px, pilot_chips, least, over)
+    return over > 0
+
+
+def calibrate_llr(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:
+    """A frame as a decoding read it, with what can be believed.
+
+    Decoders are surer than they are right, or less, each in its own way: pixels share light and motion.
+    Log-likelihood ratios that tell the truth have a variance of twice their mean, whatever the channel, if it
+    is near Gaussian: those of a cluster are scaled so that they do, by its own scatter, that of its frame,
+    and what is likely. What these are worth lies between what fits 20 000 symbols of `motion-feedback` in
+    recordings and in the harder scenes of `examples/campaigns/road.toml`, and what fits a Gaussian channel;
+    both are met within a factor of 2 where less than half of the frames are wrong. The nearest rival of a
+    symbol, at its least LLR, says how likely it is right; rather wrong ones are not given. `quality` is the
+    probability that all that are given are right, of errors that come together.
+
+    Args:
+        soft: What a decoding says.
+        seen: Clusters that are in sight, bool (K,); nothing is given of the others, and their LLRs are 0.
+    """
+    symbols, llr = np.empty_like(soft.symbols), np.empty_like(soft.llr)
+    expected, sure = (_FRAME_WORTH, _EXPECTED_WORTH, _EXPECTED_SPREAD), (_LEAST_SURE, _TOGETHER)
+    quality = _kernels.calibrate_llr(soft.symbols, soft.llr, seen, expected, sure, symbols, llr)
+    return SoftSymbols(symbols, llr, quality)

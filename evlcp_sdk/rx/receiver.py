@@ -16,13 +16,14 @@ from evlcp_sdk.rx.bars import BarFollower
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, on_camera
 from evlcp_sdk.rx.framing import LOOKBACK_PACKETS, PacketFraming
+from evlcp_sdk.rx.guard import tracker_of
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.multi import EarlyFrames, SeveralLinks, shared_rhythms
 from evlcp_sdk.rx.plugin_framing import PluginFraming
+from evlcp_sdk.rx.reading import Steps
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
 from evlcp_sdk.rx.regions import RegionTracker, Rhythm, same_place
-from evlcp_sdk.rx.steps import Steps, tracker_of
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Frame, Packet, Region, changed

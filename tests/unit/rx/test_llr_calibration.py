@@ -5,7 +5,7 @@ import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import hadamard
-from evlcp_sdk.rx.llr_calibration import calibrate_llr, still_lit
+from evlcp_sdk.rx.reading import calibrate_llr, still_lit
 from evlcp_sdk.values import PresenceMap, SoftSymbols
 
 ALL = np.ones(16, bool)
