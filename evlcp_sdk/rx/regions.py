@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 from typing import Any, Final
 
 import numpy as np
@@ -708,7 +709,7 @@ class RegionFollower(RegionTracker):
         if known is None or -STRAY_PX <= measured.height_px - whole_px <= 2 * _BLUR_PX:
             heights.append(measured.height_px)
         # A part of the bar says nothing of its height, once that is known.
-        height_px = _median(heights) if heights else whole_px
+        height_px = median(heights) if heights else whole_px
         excess_px = measured.height_px - height_px
         if excess_px > STRAY_PX:
             # What is not known yet may grow to either side.
@@ -818,24 +819,25 @@ class RegionFollower(RegionTracker):
         if not self._rhythm.may_open(newest) or not self._place_for_one(end_us):
             return
         self._next_id += 1
-        for like in self.alive:
-            if like.outgrown and region.t_us <= like.outgrown[4] and _lies_in_outgrown(like, region):
-                # It was seen as long as the one that it was taken to be a part of.
-                right, down = region.x_px - like.latest.x_px, region.y_px - like.latest.y_px
-                size_px = region.width_px, region.height_px
-                places = like.positions.moved(region.id, right, down, size_px)
-                pieces = deque((start, Events.empty()) for start, _ in self._recent)
-                followed = Followed(region.id, places, pieces[0][0], pieces, opened_us=end_us)
-                followed.filter = self._position.init() if self._position else None
-                self.gather(followed)
-                self.alive.append(followed)
-                return
-        recent = list(self._recent)[-BACKFILL_STEPS:]
-        pieces = deque((start, self._rhythm.of(select(events, reach))) for start, events in recent)
-        state = self._position.init() if self._position else None
-        self.alive.append(
-            Followed(region.id, Places([region]), pieces[0][0], pieces, filter=state, opened_us=end_us)
-        )
+        outgrown = [
+            one
+            for one in self.alive
+            if one.outgrown and region.t_us <= one.outgrown[4] and _lies_in_outgrown(one, region)
+        ]
+        if outgrown:
+            # It was seen as long as the one that it was taken to be a part of.
+            right, down = region.x_px - outgrown[0].latest.x_px, region.y_px - outgrown[0].latest.y_px
+            size_px = region.width_px, region.height_px
+            places = outgrown[0].positions.moved(region.id, right, down, size_px)
+            pieces = deque((start, Events.empty()) for start, _ in self._recent)
+        else:
+            places, recent = Places([region]), list(self._recent)[-BACKFILL_STEPS:]
+            pieces = deque((start, self._rhythm.of(select(events, reach))) for start, events in recent)
+        followed = Followed(region.id, places, pieces[0][0], pieces, opened_us=end_us)
+        followed.filter = self._position.init() if self._position else None
+        if outgrown:
+            self.gather(followed)
+        self.alive.append(followed)
 
     def _place_for_one(self, now_us: int) -> bool:
         """Whether a new region may be followed, maybe in place of one that had its time and shows no bar."""
@@ -884,9 +886,3 @@ def _lies_in_outgrown(like: Followed, region: Region) -> bool:
         return False
     x_px, y_px, width_px, height_px = _outgrown(like)
     return abs(region.x_px - x_px) <= width_px / 2 and abs(region.y_px - y_px) <= height_px / 2
-
-
-def _median(values: Iterable[float]) -> float:
-    ordered = sorted(values)
-    many = len(ordered)
-    return ordered[many // 2] if many % 2 else (ordered[many // 2 - 1] + ordered[many // 2]) / 2

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import rx_twins as twins
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_array_equal
 from rx_streams import LINK, frames_of, received
 
 from evlcp_sdk.rx import _kernels
@@ -82,14 +82,6 @@ def test_counts_of_blocks(seed):
     _kernels.count_rows(t, y, p, start, 10.1, 90.5, 8.3, counts)
     assert_array_equal(counts, twins.count_rows(t, y, p, start, 10.1, 90.5, 8.3, counts.shape))
     assert counts.sum() > 100
-
-
-def test_fit_of_blocks():
-    rng = np.random.default_rng(4)
-    counts = rng.poisson(2.0, (2, 5, 26 * 10 + 30)).astype(float)
-    chips, fit = rng.choice([-1.0, 1.0], 26), np.empty((2, 5, 31))
-    _kernels.fit_rows(counts, chips, 10, fit)
-    assert_allclose(fit, twins.fit_rows(counts, chips, 10, 31))
 
 
 @pytest.mark.parametrize("row_us", [-0.25, 0.25])

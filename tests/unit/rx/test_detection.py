@@ -376,7 +376,7 @@ def test_a_region_does_not_go_on_to_the_bar_below() -> None:
         ([(5, 105, 25, 200)], (0, 0, 30, 100)),
     ],
 )
-def test_what_other_barscut_off(others: list[tuple[int, int, int, int]], left: tuple[int, ...]) -> None:
+def test_what_other_bars_cut_off(others: list[tuple[int, int, int, int]], left: tuple[int, ...]) -> None:
     """Of a box with a seam of 5 px around a bar."""
     assert cut_off((0, 0, 30, 100), (5, 5, 25, 95), others) == left
 

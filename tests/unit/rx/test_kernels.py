@@ -276,51 +276,29 @@ def test_the_similarity_that_most_cells_are_for(seed, clusters, known):
 
 
 @pytest.mark.parametrize("grid", [1, 2, 3])
-@pytest.mark.parametrize("seed", SEEDS)
-def test_footprints(seed, grid):
-    rng = np.random.default_rng(seed)
-    unit = np.exp(1j * rng.uniform(0, 2 * np.pi))
-    spacing, shape = rng.uniform(1.5, 9), (5, 40 // grid, 30 // grid)
-    places = 15.3 + 20.2j + unit * spacing * (np.arange(5) - rng.uniform(1, 3))
-    probability = rng.random(shape).astype(np.float32)
-    seen = rng.random(5) < 0.8
-    core = np.empty(7)
-    n = _kernels.core_profile(probability, seen, places, unit, spacing, grid, 0.5, core)
-    hits, cells = twins.across_profile(probability, seen, places, unit, spacing, grid, 7)
-    if cells.any():
-        assert_allclose(core[:n], twins.core_profile(hits, cells, 0.5), rtol=1e-9, atol=1e-9)
-    profile, out = rng.random(7), np.zeros(shape, np.float32)
-    _kernels.place_prior(places, unit, spacing, grid, profile, out)
-    assert_allclose(out, twins.line_prior(shape, places, unit, spacing, grid, profile), rtol=1e-5, atol=1e-6)
-    out[:] = 0
-    _kernels.place_prior(places, unit, spacing, grid, profile[:0], out)
-    assert_allclose(out, twins.block_prior(shape, places, unit, spacing, grid), rtol=1e-5, atol=1e-6)
-    near = np.zeros(shape, np.float32)
-    _kernels.copy_near(probability, places, unit, spacing, 3.0, near)
-    assert_allclose(near, twins.copy_near(probability, places, unit, spacing, 3.0))
-
-
 @pytest.mark.parametrize("line", [False, True])
 @pytest.mark.parametrize("seed", SEEDS)
-def test_a_mask_is_the_layout_s_footprint(seed, line):
+def test_a_mask_is_the_layout_s_footprint(seed, line, grid):
     rng = np.random.default_rng(seed)
-    unit, spacing, shape = np.exp(1j * rng.uniform(0, 2 * np.pi)), rng.uniform(1.5, 9), (5, 40, 30)
+    unit, spacing = np.exp(1j * rng.uniform(0, 2 * np.pi)), rng.uniform(1.5, 9)
+    shape = (5, 40 // grid, 30 // grid)
     layout = Layout(np.arange(5) - rng.uniform(1, 3) + 0j, 1.0, line, 1 + 0j)
-    seen = np.ones(5, np.bool_)
+    seen = rng.random(5) < 0.8
+    seen[2] = True
     placement = Placement(unit * spacing, 15.3 + 20.2j, False, seen, 5.0, 0.0)
     places = placement.places(layout)
-    probability, pixels = rng.random((2, *shape)).astype(np.float32)
+    probability, pixels = rng.random(shape).astype(np.float32), rng.random((5, 40, 30)).astype(np.float32)
     selected = rng.random(shape) < 0.5
-    found = masked(PresenceMap(probability, 1, selected, pixels), layout, placement)
+    found = masked(PresenceMap(probability, grid, selected, pixels), layout, placement)
     across = spacing
     if line:
         bins = math.ceil(spacing + _WIDEST_PX)
-        hits, cells = twins.across_profile(probability, seen, places, unit, spacing, 1, bins)
+        hits, cells = twins.across_profile(probability, seen, places, unit, spacing, grid, bins)
         profile = twins.core_profile(hits, cells, 0.5)
         across = len(profile)
-        want = twins.line_prior(shape, places, unit, spacing, 1, profile)
+        want = twins.line_prior(shape, places, unit, spacing, grid, profile)
     else:
-        want = twins.block_prior(shape, places, unit, spacing, 1)
+        want = twins.block_prior(shape, places, unit, spacing, grid)
     assert_allclose(found.prior, want, rtol=1e-4, atol=1e-5)
     assert_array_equal(found.probability, np.where(found.prior > 0, probability, 0))
     assert_array_equal(found.selected, selected & (found.prior > 0))
@@ -512,14 +490,23 @@ def test_cells_that_boxes_touch_are_cleared(box):
 @pytest.mark.parametrize("blocks", [4, 9, 20])
 @pytest.mark.parametrize("seed", SEEDS)
 def test_rows_are_read_one_after_another(seed, blocks):
+    """Both polarities by their sigmas, in steps of 10 us; one with too few events says nothing."""
     rng = np.random.default_rng(seed)
-    rows, lags = (np.arange(blocks) + 0.5) * 8, np.arange(31)
-    middle = 15 + 0.03 * rows + rng.normal(0, 0.3, blocks)
-    fit = 50 * np.exp(-0.5 * ((lags - middle[:, None]) / 5) ** 2) + rng.normal(0, 1, (blocks, 31))
-    fit[rng.random(blocks) < 0.2] *= 0.05
-    seen = np.full(blocks, 100.0)
-    got = _kernels.slope_of_rows(rows, fit, seen, 4, 4.0, 0.2)
-    assert_allclose(got, twins.slope_of_rows(rows, fit, seen, 4, 4.0, 0.2), rtol=1e-9)
+    rows, chips = (np.arange(blocks) + 0.5) * 8, rng.choice([-1.0, 1.0], 26)
+    counts, limits = rng.poisson(0.3, (2, blocks, 26 * 10 + 30)).astype(float), (4, 4.0, 0.2)
+    for polarity, block in product(range(2 if seed % 2 else 1), range(blocks)):
+        first = round(15 + 0.03 * rows[block] + rng.normal(0, 0.3)) + 2
+        lit = (chips > 0) == polarity
+        counts[polarity, block, first : first + 260] += 3 * np.repeat(lit, 10) * (rng.random() > 0.2)
+    fit = twins.fit_rows(counts, chips, 10, 31)
+    found = [twins.slope_of_rows(rows, *one, *limits) for one in zip(fit, counts.sum(2), strict=True)]
+    lag, sigma = 10 * np.array(found)[np.isfinite(found).all(1)].reshape(-1, 2).T
+    got = _kernels.delay_of_rows(counts, chips, 10, 10.0, rows, limits)
+    if len(lag):
+        weight = (sigma**-2).sum()
+        assert_allclose(got, ((lag / sigma**2).sum() / weight, weight**-0.5), rtol=1e-9)
+    else:
+        assert np.isnan(got).all()
 
 
 @pytest.mark.parametrize("period_us", [200, 222, 300, 400, 500])
