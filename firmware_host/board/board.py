@@ -42,8 +42,6 @@ _MOST_HOLD = 255
 _LEAST = 32
 """Smallest piece that a noisy line is tried with, bytes."""
 
-_WRITE_OVERHEAD = protocol.WriteRequest.fixed_bytes()
-
 Progress = Callable[[int, int], None]
 """Called with bytes done and bytes in all."""
 
@@ -186,13 +184,9 @@ class Board:
         """A bank's bytes."""
         most = self.about.max_payload - protocol.ReadReply.fixed_bytes()
         found: dict[int, bytes] = {}
-
-        def handle(request: protocol.ReadRequest, outcome: RequestOutcome) -> None:
-            reply = self.session.checked(request, outcome)
-            found[reply.offset] = reply.data
-
         pieces = [(at, min(most, offset + length - at)) for at in range(offset, offset + length, most)]
-        self.session.run((protocol.ReadRequest(bank, at, n) for at, n in pieces), handle)
+        reads = (protocol.ReadRequest(bank, at, n) for at, n in pieces)
+        self.session.call_each(reads, lambda _, reply: found.update({reply.offset: reply.data}))
         data = b"".join(found.get(at, b"") for at, _ in pieces)
         if len(data) != length:
             raise LineError(f"{self.session.name}: READ gave {len(data)} bytes, expected {length}; try again")
@@ -524,28 +518,29 @@ class Board:
         missing = self._missing(bank, content)
         total = sum(n for _, n in missing)
         advance = progress or (lambda _done, _total: None)
-        advance(len(content) - total, len(content))
-        piece = self.session.max_payload - _WRITE_OVERHEAD
+        done = len(content) - total
+        advance(done, len(content))
+        piece = self.session.max_payload - protocol.WriteRequest.fixed_bytes()
         left = deque((at, at + n) for at, n in missing)
-        state = {"piece": piece, "done": 0}
 
         def requests() -> Iterator[protocol.WriteRequest]:
             while left:
                 at, end = left.popleft()
-                if end - at > state["piece"]:
-                    left.appendleft((at + state["piece"], end))
-                    end = at + state["piece"]
+                if end - at > piece:
+                    left.appendleft((at + piece, end))
+                    end = at + piece
                 yield protocol.WriteRequest(bank, at, content[at:end])
 
         def handle(request: protocol.WriteRequest, outcome: RequestOutcome) -> None:
+            nonlocal piece, done
             n = len(request.data)
             if outcome.status is None and n > _LEAST:
-                state["piece"] = max(_LEAST, min(state["piece"], n // 2))
+                piece = max(_LEAST, min(piece, n // 2))
                 left.append((request.offset, request.offset + n))
                 return
             self.session.checked(request, outcome)
-            state["done"] += n
-            advance(len(content) - total + state["done"], len(content))
+            done += n
+            advance(done, len(content))
 
         while left:
             self.session.run(requests(), handle)
@@ -555,13 +550,12 @@ class Board:
         """Blocks (offset, bytes) of a bank that are not `content`."""
         missing: list[tuple[int, int]] = []
 
-        def handle(request: protocol.CrcRequest, outcome: RequestOutcome) -> None:
-            crc = self.session.checked(request, outcome).crc
-            if zlib.crc32(content[request.offset : request.offset + request.length]) != crc:
+        def handle(request: protocol.CrcRequest, reply: protocol.CrcReply) -> None:
+            if zlib.crc32(content[request.offset : request.offset + request.length]) != reply.crc:
                 missing.append((request.offset, request.length))
 
-        blocks = [(at, min(_BLOCK, len(content) - at)) for at in range(0, len(content), _BLOCK)]
-        self.session.run((protocol.CrcRequest(bank, at, n) for at, n in blocks), handle)
+        blocks = ((at, min(_BLOCK, len(content) - at)) for at in range(0, len(content), _BLOCK))
+        self.session.call_each((protocol.CrcRequest(bank, at, n) for at, n in blocks), handle)
         return sorted(missing)
 
     def _settled(self) -> protocol.StatusReply:

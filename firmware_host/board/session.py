@@ -202,9 +202,13 @@ class Session:
             RefusedError: The board refuses; or the error that its status stands for.
             LineError: No answer came.
         """
-        found: list[RequestOutcome] = []
-        self.run([request], lambda _, outcome: found.append(outcome))
-        return self.checked(request, found[0])
+        replies: list[Reply] = []
+        self.call_each([request], lambda _, reply: replies.append(reply))
+        return replies[0]
+
+    def call_each(self, requests: Iterable[WireRequest[Reply]], handle: Callable[[Any, Reply], None]) -> None:
+        """Many requests; `handle` gets each with its answer. Faults as of `call`, and of `handle`, end it."""
+        self.run(requests, lambda request, outcome: handle(request, self.checked(request, outcome)))
 
     def status_when(
         self, done: Callable[[protocol.StatusReply], bool], timeout_s: float, pause_s: float = 0.005

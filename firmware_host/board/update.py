@@ -4,7 +4,7 @@ import base64
 import binascii
 import json
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Self
@@ -16,7 +16,6 @@ from firmware_host.board.board import Board, Progress
 from firmware_host.board.tables import about_table
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.images import FlashImage
-from firmware_host.protocol.client import RequestOutcome
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import Capability, Status
 
@@ -161,18 +160,14 @@ def update(
     piece = (board.session.max_payload - protocol.UpdateWriteRequest.fixed_bytes()) // 4 * 4
     done = 0
 
-    def requests() -> Iterator[protocol.UpdateWriteRequest]:
-        for at in range(0, len(data), piece):
-            yield protocol.UpdateWriteRequest(at, data[at : at + piece])
-
-    def handle(request: protocol.UpdateWriteRequest, outcome: RequestOutcome) -> None:
+    def handle(request: protocol.UpdateWriteRequest, _: protocol.UpdateWriteReply) -> None:
         nonlocal done
-        session.checked(request, outcome)
         done += len(request.data)
         advance(done, len(data))
 
+    pieces = (protocol.UpdateWriteRequest(at, data[at : at + piece]) for at in range(0, len(data), piece))
     try:
-        session.run(requests(), handle)
+        session.call_each(pieces, handle)
         sequence = session.call(protocol.UpdateCommitRequest()).sequence
     except LineError as fault:
         raise type(fault)(

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from evlcp_sdk.link.resolve import Link
+    from firmware_host.board.bank import Bank
     from firmware_host.board.messages import Content
 
 _MOST_NUMBER = 2**32 - 1
@@ -159,9 +160,14 @@ def message(
 
     A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
+    import json
+
     from evlcp_sdk.errors import ConfigError
+    from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
+    from firmware_host.board.bank import bank_of, symbol_chips
+    from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
     made = content.content()
@@ -170,24 +176,32 @@ def message(
     if every is not None:
         if out is not None or chips is not None:
             raise ConfigError("--every sends what changes, to a board: -o and --chips hold what stays")
-        line = board.line()
-        if line is None:
-            raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
-        _send_anew(made, link, line, repeat, every, count, ahead, as_json=as_json)
+        _send_anew(made, link, board.line(), repeat, every, count, ahead, as_json=as_json)
         return
     symbols, summary = _compose(made, link, repeat)
-    written = _write(symbols, link, out, chips)
+    table = symbols_table(symbols, link, messages=True)
+    with Outputs() as outputs:
+        if chips is not None:
+            outputs.write_array(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chips)
+        if out is not None:
+            outputs.write_text(json.dumps(table) + "\n", out)
+        outputs.commit()
+    written = [str(path) for path in (out, chips) if path is not None]
     line = board.line(only_named=bool(written))
-    if line is None and not written and not as_json:
+    if line is not None:
+        _program(bank_of(symbols, link), line, summary, table, written, stay=stay, as_json=as_json)
+    elif as_json:
+        print_json(summary | {"board": None} | table)
+    else:
         _tell(summary, written, plays=False)
-        raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
-    _program(symbols, link, line, summary, written, stay=stay, as_json=as_json)
+        if not written:
+            raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
 
 
 def _send_anew(
     content: Content,
     link: Link,
-    line: BoardLine,
+    line: BoardLine | None,
     repeat: int,
     every_s: float,
     count: int | None,
@@ -198,9 +212,12 @@ def _send_anew(
     """Send content anew until it ends; say how that went."""
     from contextlib import suppress
 
+    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.signals import stop_on_request
     from firmware_host.board.messages import check_interval, send_anew
 
+    if line is None:
+        raise ConfigError("--every sends to a board: give --port (or EVLCP_PORT)")
     # What is wrong is known before the board waits for it.
     check_interval(content, link, repeat, every_s)
     with line.open() as board:
@@ -234,48 +251,21 @@ def _compose(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int6
     }
 
 
-def _write(symbols: NDArray[np.int64], link: Link, out: Path | None, chips: Path | None) -> list[str]:
-    """Write symbols and chips where that is asked for; the files."""
-    import json
-
-    from evlcp_sdk.files import Outputs
-    from firmware_host.board.bank import symbol_chips
-    from firmware_host.board.symbols import symbols_table
-
-    with Outputs() as outputs:
-        if chips is not None:
-            outputs.write_array(symbol_chips(symbols, link.codebook, link.packet.pilot_every), chips)
-        if out is not None:
-            outputs.write_text(json.dumps(symbols_table(symbols, link, messages=True)) + "\n", out)
-        outputs.commit()
-    return [str(path) for path in (out, chips) if path is not None]
-
-
 def _program(
-    symbols: NDArray[np.int64],
-    link: Link,
-    line: BoardLine | None,
+    bank: Bank,
+    line: BoardLine,
     summary: dict[str, Any],
+    table: dict[str, Any],
     written: list[str],
     *,
     stay: bool,
     as_json: bool,
 ) -> None:
-    """Program a board, if there is one, with packets; say what was done."""
+    """Program a board with packets; say what was done."""
     import dataclasses
 
-    from firmware_host.board.bank import bank_of
     from firmware_host.board.board import Settings, provision
-    from firmware_host.board.symbols import symbols_table
 
-    table = symbols_table(symbols, link, messages=True)
-    if line is None:
-        if as_json:
-            print_json(summary | {"board": None} | table)
-        else:
-            _tell(summary, written, plays=False)
-        return
-    bank = bank_of(symbols, link)
     with line.open() as board:
         with progress_bar("programming") as progress:
             programmed = provision(board, bank, Settings(), True, progress)

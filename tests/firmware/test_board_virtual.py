@@ -280,6 +280,7 @@ def test_faults_show_and_darken_and_end_the_led_test(device: SimulatedBoard, boa
             board.start()
         health.faults = 0
         device.run(300_000)
+        assert tested or state_of(board) == (State.FAULT, BoardFault.OVER_TEMPERATURE), "until START"
         if not tested:
             board.test_leds(0, 95, 1000)
             assert device.shown().any()
