@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_uart.light import BEFORE
+from evlcp_uart.light import BEFORE, Floats, Ticks
 
 Parity = Literal["none", "even", "odd"]
 BitOrder = Literal["lowest", "highest"]
@@ -48,11 +48,11 @@ class Characters:
         return found
 
     @cached_property
-    def contexts(self) -> NDArray[np.int64]:
+    def contexts(self) -> Ticks:
         """Context of each bit of every character, int64 (2**data_bits, bits); before it there was mark."""
         return _contexts(self.levels())
 
-    def likelihoods(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
+    def likelihoods(self, evidence: Floats) -> Floats:
         """Log-likelihood of every character, float64 (n, 2**data_bits).
 
         Args:
@@ -60,7 +60,7 @@ class Characters:
         """
         return _likelihoods(evidence, self.contexts)
 
-    def wrong_parity(self, evidence: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def wrong_parity(self, evidence: Floats) -> NDArray[np.bool_]:
         """Whether the bits that are likeliest by themselves have the wrong parity, bool (n,)."""
         if self.parity == "none":
             return np.zeros(len(evidence), np.bool_)
@@ -70,7 +70,7 @@ class Characters:
         wrong: NDArray[np.bool_] = _likelihoods(evidence, _contexts(other)).max(1, initial=-np.inf) > right
         return wrong
 
-    def framed(self, evidence: NDArray[np.float64]) -> NDArray[np.float64]:
+    def framed(self, evidence: Floats) -> Floats:
         """How much likelier some character is than any bits, start, parity and stop bits free, float64 (n,).
 
         In nats: where the light says it all, ln 2 for each of these bits.
@@ -84,19 +84,17 @@ class Characters:
             states = np.logaddexp(grown[:, : contexts // 2], grown[:, contexts // 2 :])
         any_bits = np.logaddexp.reduce(states, 1) - bits * np.log(2)
         words = np.logaddexp.reduce(self.likelihoods(evidence), 1) - self.data_bits * np.log(2)
-        found: NDArray[np.float64] = words - any_bits
+        found: Floats = words - any_bits
         return found
 
-    def clearness(self, evidence: NDArray[np.float64]) -> float:
+    def clearness(self, evidence: Floats) -> float:
         """How clear the data bits of characters are, 0 to 1."""
         likelihoods = self.likelihoods(evidence)
         logs = likelihoods - np.logaddexp.reduce(likelihoods, 1)[:, None]
         unknown = -(np.exp(logs) * logs).sum() / np.log(2)
         return float(1 - unknown / (self.data_bits * len(evidence)))
 
-    def soft(
-        self, likelihoods: NDArray[np.float64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.float32], NDArray[np.float64]]:
+    def soft(self, likelihoods: Floats) -> tuple[Ticks, NDArray[np.float32], Floats]:
         """The likeliest of each, with how sure, from log-likelihoods of every character, (n, 2**data_bits).
 
         Returns:
@@ -114,7 +112,7 @@ class Characters:
         return best, llr.astype(np.float32), 1 / total
 
 
-def _contexts(levels: NDArray[np.uint8]) -> NDArray[np.int64]:
+def _contexts(levels: NDArray[np.uint8]) -> Ticks:
     known = np.pad(levels.astype(np.int64), ((0, 0), (BEFORE, 0)), constant_values=1)
     bits = levels.shape[1]
     found = np.zeros(levels.shape, np.int64)
@@ -123,7 +121,7 @@ def _contexts(levels: NDArray[np.uint8]) -> NDArray[np.int64]:
     return found
 
 
-def _likelihoods(evidence: NDArray[np.float64], contexts: NDArray[np.int64]) -> NDArray[np.float64]:
+def _likelihoods(evidence: Floats, contexts: Ticks) -> Floats:
     bits = np.arange(contexts.shape[1])
-    found: NDArray[np.float64] = evidence[:, bits, contexts].sum(2)
+    found: Floats = evidence[:, bits, contexts].sum(2)
     return found

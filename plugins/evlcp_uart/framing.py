@@ -15,7 +15,8 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Deframer, Framing
 from evlcp_sdk.values import DecodedFrame, Events, SoftSymbols
 from evlcp_uart.characters import BitOrder, Characters, Parity
-from evlcp_uart.decoder import CLOCK_SHARE, Character, CharacterDecoder, CharacterState
+from evlcp_uart.decoder import Character, CharacterDecoder, CharacterState
+from evlcp_uart.reader import CLOCK_SHARE, Reader
 
 _PIECE = 1 << 16
 """Events that are taken at once from an array."""
@@ -72,7 +73,9 @@ class Uart(Framing):
 
     def decoder(self, bit_rate_hz: float) -> CharacterDecoder:
         """What reads characters from events."""
-        return CharacterDecoder(self.characters, 1e6 / bit_rate_hz, self.idle == "on", self.pause_bits)
+        return CharacterDecoder(
+            Reader(self.characters, self.pause_bits), 1e6 / bit_rate_hz, self.idle == "on"
+        )
 
     def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer:
         """For the packet's length and the rate of its chips."""

@@ -7,6 +7,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+Floats = NDArray[np.float64]
+Ticks = NDArray[np.int64]
+
 TICKS = 16
 """Ticks of a bit."""
 
@@ -66,9 +69,9 @@ class Light:
         inverted: It is on when the link has it off, and off when on.
     """
 
-    events: NDArray[np.float64]
-    windows: NDArray[np.float64]
-    gains: NDArray[np.float64]
+    events: Floats
+    windows: Floats
+    gains: Floats
     rate: float = 1.0
     paused: tuple[float, float, float] = (0.0, 0.0, 0.0)
     most: float = _COUNTED
@@ -80,7 +83,7 @@ class Light:
         return float(self.windows.sum())
 
     @cached_property
-    def rates(self) -> NDArray[np.float64]:
+    def rates(self) -> Floats:
         """Mean events of each context, by polarity and tick, at a gain of one, float64 (C, 2, TICKS)."""
         mean = self.events.sum(0) / max(float(self.windows.sum()), 1.0)
         bits = self.gains.sum(1)
@@ -96,7 +99,7 @@ class Light:
             prior = np.tile(found, (2, 1, 1))
             found = (events + known[:, None, None] * prior) / (windows + known)[:, None, None]
         floor = _FLOOR * float(mean.mean()) + 1e-5
-        rates: NDArray[np.float64] = _smooth(found) + floor
+        rates: Floats = _smooth(found) + floor
         return rates
 
     @cached_property
@@ -107,20 +110,20 @@ class Light:
         return min(self.most, _ENOUGH / max(float(informative.sum((1, 2)).max()), 1e-9))
 
     @cached_property
-    def logs(self) -> NDArray[np.float64]:
+    def logs(self) -> Floats:
         """Logarithm of the rates, float64 (C, 2, TICKS)."""
-        found: NDArray[np.float64] = np.log(self.rates)
+        found: Floats = np.log(self.rates)
         return found
 
     @cached_property
-    def means(self) -> NDArray[np.float64]:
+    def means(self) -> Floats:
         """What a window costs by context and gain: its mean events, by what they count, and the gain.
 
         float64 (C, J).
         """
         shares = self.gains + _PRIOR_GAINS * _SHARES
         shares /= shares.sum(1, keepdims=True)
-        found: NDArray[np.float64] = self.rates.sum((1, 2))[:, None] * GAINS * self.share - np.log(shares)
+        found: Floats = self.rates.sum((1, 2))[:, None] * GAINS * self.share - np.log(shares)
         return found
 
     @property
@@ -132,9 +135,7 @@ class Light:
         after_idle = float(np.clip(np.log(length / share), 10.0, 12.0))
         return after_idle, float(np.clip(-np.log(1 - share), 0.1, 3.0)) if many else 1.0
 
-    def of_context(
-        self, windows: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    def of_context(self, windows: Floats) -> tuple[Floats, Floats, Ticks]:
         """Log-likelihood of windows by context, over gains, and how likely each gain is.
 
         What the gains make of a window depends on how many events it has, not on when they come.
@@ -153,7 +154,7 @@ class Light:
         alike = np.einsum("nk,ck->nc", flat, self.share * self.logs.reshape(CONTEXTS, -1))
         return alike + over[which], np.exp(worth - over[..., None]), which
 
-    def beside_mean(self, windows: NDArray[np.float64]) -> NDArray[np.float64]:
+    def beside_mean(self, windows: Floats) -> Floats:
         """Log-likelihood of windows, float64 (n, 2, TICKS), of each context beside steady events, (n, C)."""
         share = self.windows / self.windows.sum()
         mean = np.einsum("c,cpt->p", share, self.rates)[:, None] / TICKS * np.ones(TICKS)
@@ -164,7 +165,7 @@ class Light:
         worth = self.share * (alike[:, None] + flat.sum(1)[:, None] * LOG_GAINS) - costs
         return self.of_context(windows)[0] - log_sums(worth)[:, None]
 
-    def explained(self, windows: NDArray[np.float64], contexts: NDArray[np.float64]) -> float:
+    def explained(self, windows: Floats, contexts: Floats) -> float:
         """How much the events of bits tell of their contexts, in all: their mutual information.
 
         Args:
@@ -176,9 +177,7 @@ class Light:
         found: float = (contexts * np.log(likely + 1e-300)).sum() - np.log(any_of + 1e-300).sum()
         return found
 
-    def learn(
-        self, windows: NDArray[np.float64], contexts: NDArray[np.float64], memory: float, rate: float
-    ) -> "Light":
+    def learn(self, windows: Floats, contexts: Floats, memory: float, rate: float) -> "Light":
         """With what more bits teach.
 
         Args:
@@ -251,20 +250,20 @@ def guesses(counts: NDArray[np.int32], mark_on: bool) -> Iterator[Light]:
                 yield Light(2 * rates, np.full(CONTEXTS, 2.0), shares)
 
 
-def log_sums(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+def log_sums(logs: Floats) -> Floats:
     """Logarithms of sums along the last axis, from logarithms, of which one at least is finite."""
     top = logs.max(-1, keepdims=True)
-    found: NDArray[np.float64] = np.log(np.einsum("...j->...", np.exp(logs - top))) + top[..., 0]
+    found: Floats = np.log(np.einsum("...j->...", np.exp(logs - top))) + top[..., 0]
     return found
 
 
-def _likely(logs: NDArray[np.float64]) -> NDArray[np.float64]:
+def _likely(logs: Floats) -> Floats:
     """Likelihoods from their logarithms, float64 (n, C), the greatest of each window 1."""
-    likely: NDArray[np.float64] = np.exp(logs - logs.max(1, initial=-np.inf, keepdims=True))
+    likely: Floats = np.exp(logs - logs.max(1, initial=-np.inf, keepdims=True))
     return likely
 
 
-def _smooth(rates: NDArray[np.float64]) -> NDArray[np.float64]:
+def _smooth(rates: Floats) -> Floats:
     padded = np.pad(rates, ((0, 0), (0, 0), (len(_BLUR) // 2,) * 2), mode="edge")
-    found: NDArray[np.float64] = np.lib.stride_tricks.sliding_window_view(padded, len(_BLUR), 2) @ _BLUR
+    found: Floats = np.lib.stride_tricks.sliding_window_view(padded, len(_BLUR), 2) @ _BLUR
     return found
