@@ -1,6 +1,6 @@
 """How events become words and words events: EVT2, 32 bits an event; EVT3, 16 bits a change."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -169,25 +169,18 @@ class Columns:
     """Room for events and triggers, filled from the front by a decoder."""
 
     def __init__(self, events: int, triggers: int) -> None:
-        self.events = 0
-        self.triggers = 0
-        self.t_us = np.empty(events, np.int64)
-        self.x = np.empty(events, np.uint16)
-        self.y = np.empty(events, np.uint16)
-        self.p = np.empty(events, np.uint8)
-        self.trigger_t_us = np.empty(triggers, np.int64)
-        self.channel = np.empty(triggers, np.uint8)
-        self.value = np.empty(triggers, np.uint8)
+        self.events = self.triggers = 0
+        self.room, self.trigger_room = events, triggers
+        self.event_columns = tuple(np.empty(events, kind) for kind in ("i8", "u2", "u2", "u1"))
+        self.trigger_columns = tuple(np.empty(triggers, kind) for kind in ("i8", "u1", "u1"))
 
     def taken(self) -> tuple[Events, Triggers]:
         """Return what is filled, as views; as copies where it is little, so as not to hold all the room."""
-        n, m = self.events, self.triggers
-        columns = self.t_us[:n], self.x[:n], self.y[:n], self.p[:n]
-        if 2 * n < len(self.t_us):
-            columns = columns[0].copy(), columns[1].copy(), columns[2].copy(), columns[3].copy()
-        if not m:
-            return Events.as_is(*columns), NO_TRIGGERS
-        return Events.as_is(*columns), Triggers(self.trigger_t_us[:m], self.channel[:m], self.value[:m])
+        columns: Iterator[Any] = (column[: self.events] for column in self.event_columns)
+        if 2 * self.events < self.room:
+            columns = (column.copy() for column in columns)
+        edges: Iterator[Any] = (column[: self.triggers] for column in self.trigger_columns)
+        return Events.as_is(*columns), Triggers(*edges) if self.triggers else NO_TRIGGERS
 
 
 class Decoder:
@@ -232,8 +225,8 @@ class Decoder:
             self._bounds,
             self._state,
             self._tally,
-            (out.t_us, out.x, out.y, out.p),
-            (out.trigger_t_us, out.channel, out.value),
+            out.event_columns,
+            out.trigger_columns,
             (out.events, out.triggers),
         )
         used = int(used) * self.codec.word.itemsize

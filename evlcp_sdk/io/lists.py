@@ -63,17 +63,15 @@ def read_list(
     unit: str | None = None,
     inverted: bool = False,
 ) -> ColumnSource:
-    """A table of times and polarities of events, and of places where it has them.
-
-    An NPZ file of `t_us`, `x`, `y`, `p` may have the numbers `width` and `height`, and external triggers
-    in `trigger_t_us`, `trigger_channel`, `trigger_value`, by rising time.
+    """A table of times and polarities of events, and of places where it has them; see `ColumnSource`.
 
     CSV (`,` `;` `|` tab or blanks, UTF-8 or UTF-16, plain or gzipped, `#` `%` `//` before comments, up to
     ten lines of titles above), NPZ of arrays, of one structured or (n, 2) or (n, 4) array, and NPY of
-    such a one. Columns are known by their names, or else by their values. The unit of the times is the one
-    that the name says (`t_us`, `time [ms]`), or a line of units below the names, or else
-    guessed, see `time_unit`; `header` says which, and why. Without places every event is of pixel (0, 0).
-    Rows may be in any order as far as a million of them go; they are sorted, and counted.
+    such a one. Columns are known by their names, or else by their values; the unit of the times by their name
+    (`t_us`, `time [ms]`) or a line of units below. Without places every event is of pixel (0, 0).
+
+    An NPZ file of `t_us`, `x`, `y`, `p` may have the numbers `width` and `height`, and external triggers
+    in `trigger_t_us`, `trigger_channel`, `trigger_value`, by rising time.
 
     Args:
         path: The file.

@@ -320,7 +320,7 @@ class RawSource(EventSource):
 
         Of a pipe until there is something and more would have to be waited for.
         """
-        while out.events <= len(out.t_us) - self._codec.burst and out.triggers < len(out.channel):
+        while out.events <= out.room - self._codec.burst and out.triggers < out.trigger_room:
             words = self._words()
             if not len(words):
                 if self._exhausted:
@@ -401,17 +401,10 @@ class RawEncoder:
 
 
 class RawWriter(EventWriter):
-    """A RAW file being written.
+    """A RAW file being written, in the words of a codec, `EVT3` or `EVT2`.
 
     What is read back is what was written, in the same order, triggers too. Where triggers share their time
     with events, they come first.
-
-    Args:
-        path: The file.
-        width: Columns of the sensor.
-        height: Rows of the sensor.
-        codec: `EVT3` or `EVT2`.
-        outputs: See `EventWriter`.
 
     Raises:
         OutputError: The file cannot be written.
@@ -423,12 +416,7 @@ class RawWriter(EventWriter):
     times_us = (0, (1 << 40) - 1)
 
     def __init__(
-        self,
-        path: Path | str,
-        width: int,
-        height: int,
-        codec: Codec = EVT3,
-        outputs: Outputs | None = None,
+        self, path: Path | str, width: int, height: int, codec: Codec = EVT3, outputs: Outputs | None = None
     ) -> None:
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
@@ -440,6 +428,3 @@ class RawWriter(EventWriter):
     def _write(self, events: Events, triggers: Triggers) -> None:
         for words in self._encoder.encode(events, triggers):
             self._file.write(words)
-
-    def _finish(self) -> None:
-        """Every word is in the file already."""

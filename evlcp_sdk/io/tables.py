@@ -5,14 +5,12 @@ import shutil
 import tempfile
 import zipfile
 from contextlib import ExitStack
-from pathlib import Path
 from typing import IO, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import OutputError, StreamError
-from evlcp_sdk.files import Outputs, writing
+from evlcp_sdk.errors import StreamError
 from evlcp_sdk.plugin.writer import LAST_TIME_US, EventWriter
 from evlcp_sdk.values import Events, Triggers
 
@@ -42,35 +40,14 @@ class NpzWriter(EventWriter):
     """An NPZ file being written, with the arrays `COLUMNS` and `TRIGGER_COLUMNS`; not compressed.
 
     The columns grow in temporary files and are put together at the end.
-
-    Args:
-        path: The file.
-        width: Columns of the sensor, or None if unknown.
-        height: Rows of the sensor, or None.
-        outputs: See `EventWriter`.
-
-    Raises:
-        OutputError: The file cannot be written.
     """
 
-    def __init__(
-        self,
-        path: Path | str,
-        width: int | None = None,
-        height: int | None = None,
-        outputs: Outputs | None = None,
-    ) -> None:
-        super().__init__(path, width, height, outputs)
+    def _begin(self) -> None:
         self._stack = ExitStack()
-        try:
-            with writing(self.path):
-                self._spools: dict[str, IO[bytes]] = {
-                    name: self._stack.enter_context(tempfile.TemporaryFile(dir=self.path.parent))  # noqa: SIM115
-                    for name in WIRE_TYPES
-                }
-        except OutputError:
-            self.discard()
-            raise
+        self._spools: dict[str, IO[bytes]] = {}
+        for name in WIRE_TYPES:
+            spool = tempfile.TemporaryFile(dir=self.path.parent)  # noqa: SIM115
+            self._spools[name] = self._stack.enter_context(spool)
 
     def _write(self, events: Events, triggers: Triggers) -> None:
         event_columns = (events.t_us, events.x, events.y, events.p)
@@ -104,26 +81,9 @@ class NpzWriter(EventWriter):
 
 
 class CsvWriter(EventWriter):
-    """A CSV file being written; gzipped if its name ends in `.gz`. It has no place for triggers.
+    """A CSV file being written; gzipped if its name ends in `.gz`. It has no place for triggers or a size."""
 
-    Args:
-        path: The file.
-        width: Columns of the sensor, or None if unknown; only checked, the file does not say it.
-        height: Rows of the sensor, or None.
-        outputs: See `EventWriter`.
-
-    Raises:
-        OutputError: The file cannot be written.
-    """
-
-    def __init__(
-        self,
-        path: Path | str,
-        width: int | None = None,
-        height: int | None = None,
-        outputs: Outputs | None = None,
-    ) -> None:
-        super().__init__(path, width, height, outputs)
+    def _begin(self) -> None:
         self._out: IO[bytes] | gzip.GzipFile = self._file
         if self.path.suffix == ".gz":
             self._out = gzip.GzipFile("", "wb", 6, self._file, 0)  # no name, no time: same events, same bytes

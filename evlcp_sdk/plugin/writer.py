@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import OutputError, StreamError
+from evlcp_sdk.errors import EvlcpError, OutputError, StreamError
 from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.values import Events, Triggers
 
@@ -48,6 +48,12 @@ class EventWriter(ABC):
         self._outputs = Outputs() if outputs is None else outputs
         with writing(self.path):
             self._file = self._outputs.open_binary(self.path)
+        try:
+            with writing(self.path):
+                self._begin()
+        except EvlcpError:
+            self.discard()
+            raise
 
     def write(self, events: Events, triggers: Triggers | None = None) -> None:
         """Append events and triggers, each sorted by time and none before what was written before.
@@ -73,12 +79,14 @@ class EventWriter(ABC):
         if lasts:
             self._last_us = max(lasts)
 
+    def _begin(self) -> None:  # noqa: B027
+        """Write what belongs at the start to `_file`."""
+
     @abstractmethod
     def _write(self, events: Events, triggers: Triggers) -> None:
         """Append what has been checked to `_file`."""
 
-    @abstractmethod
-    def _finish(self) -> None:
+    def _finish(self) -> None:  # noqa: B027
         """Append what belongs at the end."""
 
     def close(self) -> None:

@@ -336,49 +336,32 @@ def _needed(path: Path, module: str) -> Any:
         raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[ros]'") from fault
 
 
-class _Fields:
-    """Reads the fields of a message one after another."""
-
-    def __init__(self, path: Path, data: bytes, order: str, start: int, *, aligned: bool) -> None:
-        self._path, self._data, self._order = path, memoryview(data), order
-        self._start = self._at = start
-        self._aligned = aligned
-
-    def number(self, code: str) -> int:
-        size = struct.calcsize(code)
-        if self._aligned:
-            self._at += -(self._at - self._start) % size
-        (value,) = struct.unpack(self._order + code, self.raw(size))
-        return int(value)
-
-    def raw(self, size: int) -> memoryview:
-        piece = self._data[self._at : self._at + size]
-        if len(piece) < size:
-            raise InputError(f"{self._path}: a message of {len(self._data)} bytes, expected more: it is cut")
-        self._at += size
-        return piece
-
-    def text(self) -> str:
-        return bytes(self.raw(self.number("I"))).rstrip(b"\0").decode("utf-8", "replace")
-
-
 def _of_cdr(path: Path, data: bytes) -> EventPacket:
     """A message of ROS 2: fields at multiples of their size, behind four bytes that say the byte order."""
-    fields = _Fields(path, data, "<" if data[1:2] == b"\x01" else ">", 4, aligned=True)
-    fields.number("i"), fields.number("I"), fields.text()
-    return _body(fields)
+    return _unpacked(path, data[4:], "<" if data[1:2] == b"\x01" else ">", "iIsIIQQsBs", aligned=True)
 
 
 def _of_ros1(path: Path, data: bytes) -> EventPacket:
     """A message of ROS 1: fields stand one behind another, and a header has a number of its own."""
-    fields = _Fields(path, data, "<", 0, aligned=False)
-    fields.number("I"), fields.number("I"), fields.number("I"), fields.text()
-    return _body(fields)
+    return _unpacked(path, data, "<", "IIIsIIQQsBs", aligned=False)
 
 
-def _body(fields: _Fields) -> EventPacket:
-    height, width, seq = fields.number("I"), fields.number("I"), fields.number("Q")
-    fields.number("Q")
-    encoding = fields.text()
-    fields.number("B")
-    return EventPacket(width, height, seq, encoding, fields.raw(fields.number("I")))
+def _unpacked(path: Path, data: bytes, order: str, codes: str, *, aligned: bool) -> EventPacket:
+    """A packet of its fields, as `struct` names them; `s` is a number of bytes, and these."""
+    fields: list[Any] = []
+    at = 0
+    try:
+        for code in codes:
+            kind = struct.Struct(order + code.replace("s", "I"))
+            at += -at % kind.size if aligned else 0
+            value: Any = kind.unpack_from(data, at)[0]
+            at += kind.size
+            if code == "s":
+                value, at = memoryview(data)[at : at + value], at + value
+            fields.append(value)
+    except struct.error:
+        at = len(data) + 1
+    if at > len(data):
+        raise InputError(f"{path}: a message of {len(data)} bytes, expected more: it is cut")
+    height, width, seq, _, encoding, _, words = fields[-7:]
+    return EventPacket(width, height, seq, bytes(encoding).rstrip(b"\0").decode("utf-8", "replace"), words)

@@ -74,12 +74,6 @@ class EventBagWriter(EventWriter):
 
     Messages are stamped by the camera's clock. What is read back is what was written.
 
-    Args:
-        path: The file.
-        width: Columns of the sensor.
-        height: Rows of the sensor.
-        outputs: See `EventWriter`.
-
     Raises:
         ConfigError: `mcap` or `rosbags` is not installed.
         OutputError: The file cannot be written.
@@ -94,14 +88,14 @@ class EventBagWriter(EventWriter):
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
         super().__init__(path, width, height, outputs)
-        self._size = width, height
         self._encoder = RawEncoder(EVT3, width)
         self._seq = 0
+
+    def _begin(self) -> None:
         try:
             self._bag = RosBag(self._file)
         except ConfigError as fault:
-            self.discard()
-            raise ConfigError(f"{path}: {fault}") from fault
+            raise ConfigError(f"{self.path}: {fault}") from fault
 
     def _write(self, events: Events, triggers: Triggers) -> None:
         turns = [np.unique(column // _PACKET_US) for column in (events.t_us, triggers.t_us)]
@@ -118,12 +112,11 @@ class EventBagWriter(EventWriter):
 
     def _packet(self, events: Events, triggers: Triggers, end_us: int) -> None:
         words = b"".join(self._encoder.encode(events, triggers))
-        width, height = self._size
         message = self._bag.make(
             EVENT_PACKET,
             header=self._bag.header(end_us * 1000, "camera"),
-            height=height,
-            width=width,
+            height=self.height,
+            width=self.width,
             seq=self._seq,
             time_base=0,
             encoding="evt3",
