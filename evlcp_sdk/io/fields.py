@@ -327,78 +327,55 @@ def time_unit(
     if named is not None:
         return TimeUnit(named, "as its column says")
     inside = np.sort(times[np.isfinite(times)])
-    rates = _Rates(inside, MOST_PLACED_HZ if placed else MOST_RATE_HZ)
+    span, most_hz = float(np.ptp(inside)) if len(inside) else 0.0, MOST_PLACED_HZ if placed else MOST_RATE_HZ
+    rates_hz = {
+        unit: (len(inside) - 1) / (span * length_us * 1e-6) if span > 0 else LEAST_RATE_HZ
+        for unit, length_us in UNITS_US.items()
+    }
+    likely = tuple(unit for unit, rate in rates_hz.items() if span > 0 and LEAST_RATE_HZ <= rate <= most_hz)
     if (blinks := _blinking_unit(inside)) is not None:
         unit, rate_hz = blinks
-        return TimeUnit(unit, f"guessed: a light blinks, a line at {rate_hz:.4g} Hz", rates.likely_units)
-    for unit in UNITS_US:
+        return TimeUnit(unit, f"guessed: a light blinks, a line at {rate_hz:.4g} Hz", likely)
+    for unit, length_us in UNITS_US.items():
         # Whole microseconds of twenty minutes on are no seconds of today: those lie near one another.
-        ends_s = [float(t) * UNITS_US[unit] * 1e-6 for t in (*inside[:1], *inside[-1:])]
-        near = unit != "s" or rates.span < 1e6
-        if near and ends_s and all(_EPOCH_S[0] < t < _EPOCH_S[1] for t in ends_s):
+        near = unit != "s" or span < 1e6
+        ends_s = inside[[0, -1]] * (length_us * 1e-6) if len(inside) and near else np.zeros(1)
+        if _EPOCH_S[0] < ends_s[0] and ends_s[-1] < _EPOCH_S[1]:
             return TimeUnit(unit, "guessed: times since 1970")
-    if times.dtype.kind != "f" or (inside == np.round(inside)).all():
-        return _unit_of_whole(inside, rates, share, placed)
-    return _unit_of_decimals(inside, rates, share, placed)
+    return _unit_of_digits(inside, rates_hz, likely, share, placed)
 
 
-class _Rates:
-    """Events a second of some times, by unit."""
-
-    def __init__(self, inside: NDArray[Any], most_hz: float) -> None:
-        self.span = float(inside[-1]) - float(inside[0]) if len(inside) > 1 else 0.0
-        self._intervals, self.most_hz = len(inside) - 1, most_hz
-
-    def of(self, unit: str) -> float:
-        """With a unit, Hz."""
-        return self._intervals / (self.span * UNITS_US[unit] * 1e-6) if self.span > 0 else LEAST_RATE_HZ
-
-    def are_likely(self, unit: str) -> bool:
-        """Whether a camera may give so many."""
-        return LEAST_RATE_HZ <= self.of(unit) <= self.most_hz
-
-    @property
-    def likely_units(self) -> tuple[str, ...]:
-        """All units by which they are."""
-        return tuple(unit for unit in UNITS_US if self.span > 0 and self.are_likely(unit))
-
-    def are_rounded(self, unit: str, longer: str, least_s: float) -> bool:
-        """Whether the longer of two units is likelier, though by it times are of whole milliseconds."""
-        least_hz, most_hz = _SURE_RATE_HZ
-        short = self.span * UNITS_US[unit] * 1e-6 < least_s
-        return self.span > 0 and (short or self.of(unit) > most_hz) and least_hz <= self.of(longer) <= most_hz
-
-
-def _unit_of_whole(inside: NDArray[Any], rates: _Rates, share: float, placed: bool) -> TimeUnit:
-    others = rates.likely_units
-    whole = inside - inside[:1]
-    if rates.span > 0 and (whole % 1000 == 0).all() and rates.of("ns") <= rates.most_hz:
-        if not placed and rates.are_rounded("ns", "us", _LEAST_SPAN_S * share):
-            return TimeUnit("us", "guessed: whole numbers, multiples of 1000, too close for ns", others)
-        return TimeUnit("ns", "guessed: whole numbers, all multiples of 1000", others)
-    if (
-        rates.of("us") > rates.most_hz and rates.are_likely("ms")
-        if placed
-        else rates.are_rounded("us", "ms", _LEAST_COUNTED_S * share)
-    ):
-        return TimeUnit("ms", "guessed: whole numbers, too close for us", others)
-    if not rates.are_likely("us") and rates.are_likely("ns"):
-        return TimeUnit("ns", "guessed: whole numbers, too far apart for us", others)
-    return TimeUnit("us", "guessed: whole numbers", others)
-
-
-def _unit_of_decimals(inside: NDArray[Any], rates: _Rates, share: float, placed: bool) -> TimeUnit:
-    others = rates.likely_units
-    decimals = 3 if np.abs(inside * 1e3 - np.round(inside * 1e3)).max() < 1e-4 else 6
-    if decimals == 3 and (
-        rates.of("ms") > MOST_PLACED_HZ if placed else rates.are_rounded("ms", "s", _LEAST_SPAN_S * share)
-    ):
-        return TimeUnit("s", "guessed: 3 decimals, too close for ms", others)
-    for unit in ("ms", "us") if decimals == 3 else ("s", "ms", "us"):
-        if rates.of(unit) >= LEAST_RATE_HZ:
-            why = f"guessed: {decimals} decimals or more, {rates.of(unit):.3g} events/s"
-            return TimeUnit(unit, why, others)
-    return TimeUnit("us", "guessed: too far apart for ms", others)
+def _unit_of_digits(
+    inside: NDArray[Any], rates_hz: dict[str, float], likely: tuple[str, ...], share: float, placed: bool
+) -> TimeUnit:
+    """The unit of which times show the digits, or the next one, if events would be too close or too far."""
+    most_hz = MOST_PLACED_HZ if placed else MOST_RATE_HZ
+    whole, since = bool((inside == np.round(inside)).all()), inside - inside[:1]
+    if whole and since.any() and (since % 1000 == 0).all() and rates_hz["ns"] <= most_hz:
+        shown, digits = "ns", "whole numbers, multiples of 1000"
+    elif whole:
+        shown, digits = "us", "whole numbers"
+    elif np.abs(inside * 1e3 - np.round(inside * 1e3)).max() < 1e-4:
+        shown, digits = "ms", "3 decimals"
+    else:
+        shown, digits = "s", "6 decimals or more"
+    units = list(UNITS_US)
+    at = units.index(shown)
+    if at:
+        longer, (least_hz, sure_hz) = units[at - 1], _SURE_RATE_HZ
+        if placed:
+            too_close = rates_hz[shown] > most_hz and longer in likely
+        else:
+            least_s = share * (_LEAST_COUNTED_S if shown == "us" else _LEAST_SPAN_S)
+            too_close = rates_hz[shown] > sure_hz or (len(inside) - 1) / rates_hz[shown] < least_s
+            too_close &= least_hz <= rates_hz[longer] <= sure_hz
+        if too_close:
+            return TimeUnit(longer, f"guessed: {digits}, too close for {shown}", likely)
+    # Decimals are of no nanosecond.
+    shorter, last = (units[at:], shown) if whole else (units[at:-1], "us")
+    unit = next((unit for unit in shorter if rates_hz[unit] >= LEAST_RATE_HZ), last)
+    why = f", too far apart for {shown}" if unit != shown else ""
+    return TimeUnit(unit, f"guessed: {digits}{why}, {rates_hz[unit]:.3g} events/s", likely)
 
 
 def _blinking_unit(inside: NDArray[Any]) -> tuple[str, float] | None:

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from evlcp_uart.light import CONTEXTS, OUTLIER, TICKS, Floats, Light, Ticks, guesses, log_sums
-from evlcp_uart.reader import LEAST_CHARACTERS, TAIL, Reader, Stretch
+from evlcp_uart.reader import LEAST_CHARACTERS, TAIL, CharacterReader, Stretch
 
 _LEAST_WORTH = 0.5
 """By how much each of half of a stretch's characters is to be likelier than without."""
@@ -51,7 +51,7 @@ _SHIFTS, _AS_GOOD = range(-14, 15, 2), 0.01
 that tells as much, but for a share."""
 
 
-def acquire(reader: Reader, mark_on: bool, stretch: Stretch) -> tuple[Light | None, bool]:
+def acquire(reader: CharacterReader, mark_on: bool, stretch: Stretch) -> tuple[Light | None, bool]:
     """Learn the light from a stretch of which nothing is known.
 
     The light is the other way round where its characters have their start, parity and stop bits clearly
@@ -79,7 +79,7 @@ def acquire(reader: Reader, mark_on: bool, stretch: Stretch) -> tuple[Light | No
     return _find(reader, mark_on, stretch) if found is None else (light, False)
 
 
-def _informative(reader: Reader, stretch: Stretch) -> Stretch:
+def _informative(reader: CharacterReader, stretch: Stretch) -> Stretch:
     """As much of it as tells what its light is like."""
     known = int(np.searchsorted(np.cumsum(stretch.counts.sum(0)), _LEARN_EVENTS))
     end = max(known, max(stretch.start, stretch.seen) + _LEARN_CHARACTERS * reader.length)
@@ -89,7 +89,7 @@ def _informative(reader: Reader, stretch: Stretch) -> Stretch:
     return Stretch(counts, stretch.start, stretch.seen, end)
 
 
-def _find(reader: Reader, mark_on: bool, stretch: Stretch) -> tuple[Light | None, bool]:
+def _find(reader: CharacterReader, mark_on: bool, stretch: Stretch) -> tuple[Light | None, bool]:
     """The light of a stretch as `acquire` gives it, whatever it costs."""
     upright, of_another = _best(reader, stretch, _candidates(reader, mark_on, stretch, inverted=False))
     other, _ = _best(reader, stretch, _candidates(reader, mark_on, stretch, inverted=True))
@@ -99,7 +99,10 @@ def _find(reader: Reader, mark_on: bool, stretch: Stretch) -> tuple[Light | None
 
 
 def _best(
-    reader: Reader, stretch: Stretch, learned: list[tuple[Light, Ticks]], least_framed: float = _FRAMED
+    reader: CharacterReader,
+    stretch: Stretch,
+    learned: list[tuple[Light, Ticks]],
+    least_framed: float = _FRAMED,
 ) -> tuple[tuple[Light, float] | None, bool]:
     """The light that explains most, and how much speaks for its characters' fixed bits, bits.
 
@@ -137,7 +140,9 @@ def _best(
     return dim, of_another
 
 
-def _candidates(reader: Reader, mark_on: bool, stretch: Stretch, inverted: bool) -> list[tuple[Light, Ticks]]:
+def _candidates(
+    reader: CharacterReader, mark_on: bool, stretch: Stretch, inverted: bool
+) -> list[tuple[Light, Ticks]]:
     """What the light may be like, as the link has it or the other way round, and its characters."""
     tried: list[tuple[float, Light]] = []
 
@@ -165,7 +170,7 @@ def _candidates(reader: Reader, mark_on: bool, stretch: Stretch, inverted: bool)
     return learned
 
 
-def _begun(reader: Reader, stretch: Stretch, light: Light, starts: Ticks, evidence: Floats) -> Light:
+def _begun(reader: CharacterReader, stretch: Stretch, light: Light, starts: Ticks, evidence: Floats) -> Light:
     """The light where bits begin so that events tell most of them: a burst is in its bit's window."""
     if len(starts) < LEAST_CHARACTERS:
         return light
@@ -180,7 +185,7 @@ def _begun(reader: Reader, stretch: Stretch, light: Light, starts: Ticks, eviden
     return [learned for worth, learned in found if worth >= most][-1]
 
 
-def _cross_explained(reader: Reader, stretch: Stretch, light: Light) -> float:
+def _cross_explained(reader: CharacterReader, stretch: Stretch, light: Light) -> float:
     """How much of each half of a stretch the light explains that the other one teaches."""
     starts, evidence, _ = reader.path(stretch, light, False)
     half = len(starts) // 2
@@ -196,7 +201,7 @@ def _cross_explained(reader: Reader, stretch: Stretch, light: Light) -> float:
     return total
 
 
-def _explained(reader: Reader, stretch: Stretch, light: Light, starts: Ticks) -> float:
+def _explained(reader: CharacterReader, stretch: Stretch, light: Light, starts: Ticks) -> float:
     """How much likelier the events are with the characters that start there than with no bits at all."""
     bits, begin = reader.characters.bits, max(stretch.start, stretch.seen)
     starts = starts[starts + bits * TICKS <= stretch.end]

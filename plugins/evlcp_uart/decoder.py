@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from evlcp_uart.acquire import acquire
 from evlcp_uart.light import EARLY, TICKS, Floats, Light, Ticks
-from evlcp_uart.reader import LEAST_CHARACTERS, NEAR, TAIL, Reader, Stretch
+from evlcp_uart.reader import LEAST_CHARACTERS, NEAR, TAIL, CharacterReader, Stretch
 
 _BLOCK = 32
 """Characters of a stretch that is decoded at once, if they follow one another."""
@@ -134,7 +134,7 @@ class CharacterDecoder:
         mark_on: The light is on for a mark, which is 1 and idle.
     """
 
-    reader: Reader
+    reader: CharacterReader
     bit_us: float
     mark_on: bool
 

@@ -16,7 +16,7 @@ from evlcp_sdk.plugin.roles import Deframer, Framing
 from evlcp_sdk.values import DecodedFrame, Events, SoftSymbols
 from evlcp_uart.characters import BitOrder, Characters, Parity
 from evlcp_uart.decoder import Character, CharacterDecoder, CharacterState
-from evlcp_uart.reader import CLOCK_SHARE, Reader
+from evlcp_uart.reader import CLOCK_SHARE, CharacterReader
 
 _PIECE = 1 << 16
 """Events that are taken at once from an array."""
@@ -74,7 +74,7 @@ class Uart(Framing):
     def decoder(self, bit_rate_hz: float) -> CharacterDecoder:
         """What reads characters from events."""
         return CharacterDecoder(
-            Reader(self.characters, self.pause_bits), 1e6 / bit_rate_hz, self.idle == "on"
+            CharacterReader(self.characters, self.pause_bits), 1e6 / bit_rate_hz, self.idle == "on"
         )
 
     def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer:

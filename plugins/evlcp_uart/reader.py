@@ -61,7 +61,7 @@ class Stretch:
 
 
 @dataclass(frozen=True)
-class Reader:
+class CharacterReader:
     """Reads characters of one format.
 
     Args:
