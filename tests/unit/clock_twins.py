@@ -4,38 +4,45 @@ import numpy as np
 
 
 def clock(rows, width, height):
-    """What `CameraClock` keeps of events (t, x, y, p): rows with times inside, and its counts."""
+    """What `CameraClock` keeps of events (t, x, y, p): rows inside, its counts, and first drops."""
     leap, setback, far = 1_000_000, 10_000, 2**62
     kept, held, last, offset = [], [], None, 0
     counts = dict.fromkeys(("backward", "off", "doubtful", "leaps", "restarts"), 0)
-    for row in rows:
+    firsts = {}
+
+    def drop(name, *numbers):
+        counts[name] += len(numbers)
+        firsts[name] = min([*numbers, firsts.get(name, len(rows))])
+
+    for number, row in enumerate(rows):
         t = row[0]
         if row[1] >= width or row[2] >= height:
-            counts["off"] += 1
+            drop("off", number)
             continue
         if abs(t) > far:
-            counts["doubtful"] += 1
+            drop("doubtful", number)
             continue
         if last is None:
             last = offset = t
         if last <= t <= last + leap:
-            counts["doubtful"] += len(held)
+            drop("doubtful", *(k for k, _ in held))
             held, last = [], t
             kept.append((t - offset, *row[1:]))
-        elif last - setback <= t < last or (held and held[-1][0] - setback <= t < held[-1][0]):
-            counts["backward"] += 1
+        elif last - setback <= t < last or (held and held[-1][1][0] - setback <= t < held[-1][1][0]):
+            drop("backward", number)
         else:
-            if held and not held[-1][0] <= t <= held[-1][0] + leap:
-                counts["doubtful"] += len(held)
+            if held and not held[-1][1][0] <= t <= held[-1][1][0] + leap:
+                drop("doubtful", *(k for k, _ in held))
                 held = []
-            held.append(row)
-            if len(held) >= 16 and t - held[0][0] >= 10_000:
-                counts["leaps" if held[0][0] > last else "restarts"] += 1
-                offset = held[0][0] - (kept[-1][0] + 4_000_000)
-                kept += [(h[0] - offset, *h[1:]) for h in held]
+            held.append((number, row))
+            begin = held[0][1][0]
+            if len(held) >= 16 and t - begin >= 10_000:
+                counts["leaps" if begin > last else "restarts"] += 1
+                offset = begin - (kept[-1][0] + 4_000_000)
+                kept += [(h[0] - offset, *h[1:]) for _, h in held]
                 held, last = [], t
-    counts["doubtful"] += len(held)
-    return kept, counts
+    drop("doubtful", *(k for k, _ in held))
+    return kept, counts, {name: first for name, first in firsts.items() if counts[name]}
 
 
 def ordered(t_us, x, y, width, height):

@@ -54,10 +54,11 @@ def taken(events: Events, cuts: list[int]) -> tuple[list[tuple[int, ...]], Camer
 @given(st.integers(0, 10_000), st.lists(st.integers(0, 300), max_size=30))
 def test_any_split_is_judged_event_by_event(seed: int, cuts: list[int]) -> None:
     events = stream(seed)
-    want, counts = twin(rows(events), WIDTH, HEIGHT)
+    want, counts, firsts = twin(rows(events), WIDTH, HEIGHT)
     got, clock = taken(events, sorted(min(cut, len(events)) for cut in cuts))
     assert got == want
     assert {name: clock.counts[told] for name, told in NAMES.items()} == counts
+    assert clock.firsts == {NAMES[name]: first for name, first in firsts.items()}
     dropped = sum(counts[name] for name in ("backward", "off", "doubtful"))
     assert clock.counts["events"] == len(events) == len(got) + dropped
     assert all(a[0] <= b[0] for a, b in pairwise(got))
@@ -98,40 +99,15 @@ def test_what_is_held_is_bounded() -> None:
     assert clock.counts["clock_restarts"] == 1
 
 
-def random_events(rng: np.random.Generator, n: int) -> Events:
-    t_us = 1000 + rng.integers(0, 4, n).cumsum()
-    return Events.of(t_us, rng.integers(0, WIDTH, n), rng.integers(0, HEIGHT, n), rng.integers(0, 2, n))
-
-
-def clock_faults(rng: np.random.Generator, n: int) -> Events:
-    """Events of which some run backward and some are off the sensor."""
-    t = np.arange(n) + rng.integers(-2, 2, n)
-    return Events.of(t, rng.integers(0, WIDTH + 2, n), rng.integers(0, HEIGHT + 2, n), np.ones(n))
-
-
 @pytest.mark.parametrize("n", [0, 1, 2, 3, 40])
 @pytest.mark.parametrize("seed", range(8))
 def test_order_is_checked_event_by_event(seed: int, n: int) -> None:
+    """Of events in order on the sensor, and of those of which some are not."""
     rng = np.random.default_rng(seed)
-    for e in (clock_faults(rng, n), random_events(rng, n)):
+    for back, off in ((0, 0), (2, 0), (0, 2)):
+        t_us = np.arange(n) + rng.integers(-back, back + 1, n)
+        e = Events.of(t_us, rng.integers(0, WIDTH + off, n), rng.integers(0, HEIGHT + off, n), np.ones(n))
         want = ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
         since = np.empty(n, np.int64)
         assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, -7, since) == want
         assert np.array_equal(since, e.t_us + 7)
-
-
-@pytest.mark.parametrize("size", [1, 17, 400])
-@pytest.mark.parametrize("seed", range(4))
-def test_the_first_of_each_loss_is_known(seed: int, size: int) -> None:
-    events = stream(seed)
-    clock = CameraClock(WIDTH, HEIGHT)
-    kept = [e for a in range(0, len(events), size) for e in clock.take(events[a : a + size])]
-    clock.close()
-    assert set(clock.firsts) == {n for n in NAMES.values() if n.startswith("dropped") and clock.counts[n]}
-    # None is dropped before the first.
-    told = CameraClock(WIDTH, HEIGHT)
-    for number in range(min(clock.firsts.values(), default=0)):
-        told.take(events[number : number + 1])
-    told_dropped = [told.counts[n] for n in clock.firsts]
-    assert sum(told_dropped) == 0
-    assert sum(map(len, kept)) == len(events) - sum(clock.counts[n] for n in clock.firsts)

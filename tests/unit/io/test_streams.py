@@ -47,30 +47,23 @@ def same(events: Events) -> bool:
     return all((getattr(events, name) == getattr(EVENTS, name)).all() for name in ("t_us", "x", "y", "p"))
 
 
-@pytest.mark.parametrize("scheme", ["tcp", "unix"])
-def test_a_stream_gives_what_is_in_the_file(scheme: str, recording: Path, tmp_path: Path) -> None:
-    if scheme == "tcp":
-        listening = socket.create_server(("localhost", 0))
-        url = f"tcp://localhost:{listening.getsockname()[1]}"
-    else:
-        listening = socket.socket(socket.AF_UNIX)
+@pytest.mark.parametrize("how", ["tcp", "unix", "without a header"])
+def test_a_stream_gives_what_is_in_the_file(how: str, recording: Path, tmp_path: Path) -> None:
+    data = recording.read_bytes()
+    if how == "unix":
+        listening, url = socket.socket(socket.AF_UNIX), f"unix:{tmp_path / 's'}"
         listening.bind(str(tmp_path / "s"))
         listening.listen()
-        url = f"unix:{tmp_path / 's'}"
-    with sent(listening, recording.read_bytes()), open_source(url) as source:
-        assert (source.live, source.format, source.width) == (True, recording.stem, 640)
+    else:
+        listening = socket.create_server(("localhost", 0))
+        url = f"tcp://localhost:{listening.getsockname()[1]}"
+    if how == "without a header":
+        data, url = data.partition(b"% end\n")[2], f"{url}?evt={recording.stem[-1]}&size=640x480"
+    with sent(listening, data), open_source(url) as source:
+        assert (source.live, source.format) == (True, recording.stem)
+        assert (source.width, source.height) == (640, 480)
         assert same(source.read()[0])
         assert source.losses == {}
-
-
-def test_a_stream_without_a_header_is_what_its_name_says(recording: Path) -> None:
-    words = recording.read_bytes().partition(b"% end\n")[2]
-    listening = socket.create_server(("localhost", 0))
-    port = listening.getsockname()[1]
-    url = f"tcp://localhost:{port}?evt={recording.stem[-1]}&size=640x480"
-    with sent(listening, words), open_source(url) as source:
-        assert (source.format, source.width, source.height) == (recording.stem, 640, 480)
-        assert same(source.read()[0])
 
 
 def test_datagrams_are_read_as_they_come(recording: Path) -> None:

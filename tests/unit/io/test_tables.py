@@ -174,11 +174,6 @@ def test_bad_csv_is_an_error(data, message, tmp_path):
     assert str(path) in str(caught.value)
 
 
-def test_an_empty_table_has_no_events(tmp_path):
-    (tmp_path / "a.csv").write_bytes(HEAD)
-    assert len(read_events(tmp_path / "a.csv")) == 0
-
-
 def test_csv_has_no_place_for_triggers(tmp_path):
     with pytest.raises(StreamError, match=r"a\.csv: 1 triggers, which a CSV file has no place for"):
         write_events(tmp_path / "a.csv", Events.empty(), triggers=Triggers.of([1], [0], [1]))

@@ -115,15 +115,24 @@ def test_bright_light_is_read_without_an_error(
     np.testing.assert_allclose(apart, 11 * bit_us, atol=bit_us / 5)
 
 
-@pytest.mark.parametrize("first_us", [40, -3_000_000])
-def test_a_list_is_read_from_its_first_character_wherever_time_begins(first_us: int) -> None:
-    sent = list(b"Shall I compare thee")
-    levels = levels_of(np.array(sent), 7, "even", 2)
+@pytest.mark.parametrize(
+    ("seed", "first_us", "text"),
+    [
+        (5, 40, b"Shall I compare thee"),
+        (5, -3_000_000, b"Shall I compare thee"),
+        # Falls late by a fifth of a bit: characters a bit late explain more events, but no stop bits.
+        (12, 0, b"y? Thou art more lovely and more temperate: rough winds do shake the darling bud"),
+    ],
+)
+def test_a_list_is_read_from_its_first_character_wherever_time_begins(
+    seed: int, first_us: int, text: bytes
+) -> None:
+    levels = levels_of(np.frombuffer(text, np.uint8), 7, "even", 2)
     # Edges are seen late, so the first character begins before the first event.
-    events = seen(np.random.default_rng(5), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
+    events = seen(np.random.default_rng(seed), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
     t_us = events.t_us - events.t_us[0] + first_us
     found = read_characters(t_us, events.p, 504.0, Uart(7, "even", 2))
-    assert [c.value for c in found] == sent
+    assert bytes(c.value for c in found) == text
     # It may start up to a bit before, as nothing was seen of the time before.
     assert -BIT_504_US <= found[0].t_us - first_us <= BIT_504_US / TICKS
 
@@ -159,15 +168,6 @@ def test_times_that_are_coarse_are_read_in_any_pieces(
         again += more
     again += decoder.close(state)[1]
     assert [(one.t_us, one.value) for one in again] == [(one.t_us, one.value) for one in found]
-
-
-def test_light_of_which_the_best_guess_is_an_illusion_is_read() -> None:
-    """Falls late by a fifth of a bit: characters a bit late explain more events, but no stop bits."""
-    sent = list(b"y? Thou art more lovely and more temperate: rough winds do shake the darling bud")
-    levels = levels_of(np.array(sent), 7, "even", 2)
-    events = seen(np.random.default_rng(12), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
-    found = read_characters(events.t_us - events.t_us[0], events.p, 504.0, Uart(7, "even", 2))
-    assert [c.value for c in found][: len(sent) - 1] == sent[: len(sent) - 1]
 
 
 @pytest.mark.parametrize("cut", [0, 3, 8])
