@@ -1,6 +1,8 @@
 """Every kernel of `evlcp_sdk.io`, what the words of a RAW file are, and what a decoder remembers and counts.
 
-Indices that advance in a loop are `uintp`: numba then leaves out its test for negative indices.
+Indices that advance in a loop are `uintp`: numba then leaves out its test for negative indices. A word has
+`size` bytes, and its type in the top 4 bits, which is 8 for TIME_HIGH in every encoding; `at` is the byte
+offset of words[0]; where they are `final` nothing comes behind, else -1 says that more are needed to tell.
 """
 
 from typing import Any, Final
@@ -134,18 +136,9 @@ def _note(tally: Column, row: Integer, at: Integer) -> None:
 def _judge_time(
     words: Column, i: Integer, size: Integer, before: Integer, low_bits: Integer, final: Any
 ) -> Integer:
-    """Whether words[i], a TIME_HIGH, is believed after the one before, by those that follow it.
+    """Whether words[i], a TIME_HIGH above `low_bits`, is believed after `before`, by those that follow it.
 
-    Args:
-        words: All that is known of what follows.
-        i: Which one.
-        size: Bytes of a word; its top 4 bits are its type, TIME_HIGH is 8 in every encoding.
-        before: The value believed so far.
-        low_bits: Bits of the time below it.
-        final: Nothing comes behind `words`.
-
-    Returns:
-        2 early by little, 1 believed, 0 not, -1 more words are needed to tell.
+    Returns 2 early by little, 1 believed, 0 not, -1.
     """
     shift = 8 * size - 4
     ring = (int64(1) << shift) - 1
@@ -195,20 +188,9 @@ def _unlevel(
     state: Column,
     final: Any,
 ) -> Integer:
-    """How many bytes behind words[i] words start that agree with one another, where these do not.
+    """How many bytes behind words[i], an odd one, words of `types` start that agree, where these do not.
 
-    Args:
-        words: All that is known.
-        i: A word that is odd.
-        at: Byte offset of words[0].
-        size: Bytes of a word; its top 4 bits are its type, TIME_HIGH is 8 in every encoding.
-        types: Those that exist, a bit each.
-        low_bits: Bits of the time below TIME_HIGH.
-        state: As of the decoder.
-        final: Nothing comes behind `words`.
-
-    Returns:
-        0 where these words stand as they should, or nothing tells; -1 more words are needed to tell.
+    Returns 0, too, where these words stand as they should, or nothing tells; or -1.
     """
     if at + size * i < state[LEVEL] and int64(words[i]) >> (8 * size - 4) != 8:
         return int64(0)
@@ -440,11 +422,9 @@ def _word_of_event(words: Column, word: Integer, event: Integer) -> Integer:
 def _take_time(
     words: Column, i: Integer, at: Integer, size: Integer, state: Column, tally: Column, final: Any
 ) -> Integer:
-    """Take words[i], a TIME_HIGH of `size` bytes, into the state, if those that follow it agree.
+    """Take words[i], a TIME_HIGH, into the state, if those that follow it agree.
 
-    Returns:
-        0; how many bytes behind it words start that agree with one another, where these do not; or -1 where
-        more words are needed to tell.
+    Returns 0; how many bytes behind it words start that agree with one another, where these do not; or -1.
     """
     low_bits, types = (12, EVT3_TYPES) if size == 2 else (6, EVT2_TYPES)
     ring = (int64(1) << (8 * size - 4)) - 1

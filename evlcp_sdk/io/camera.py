@@ -1,11 +1,11 @@
 """Cameras by the driver `neuromorphic-drivers`: the EVK4, others with its chip's bus, and the EVK3 HD."""
 
 import contextlib
-import dataclasses
 import importlib
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields, replace
 from typing import Any, Final
 
 import numpy as np
@@ -77,11 +77,8 @@ def open_camera(url: str) -> "CameraSource":
         raise ConfigError(
             f"{url}: needs the driver, which comes with the extra: pip install 'evlcp-sdk[camera]'"
         ) from fault
-    biases = [
-        field.name for kind in _KINDS.values() for field in dataclasses.fields(getattr(driver, kind).Biases)
-    ]
-    kinds = {"events_per_s": _rate, "area": _areas, "trigger": flag} | dict.fromkeys(biases, _whole)
-    named, options = split_options(url, kinds)
+    biases = [field.name for kind in _KINDS.values() for field in fields(getattr(driver, kind).Biases)]
+    named, options = split_options(url, _OPTIONS | dict.fromkeys(biases, _whole))
     serial = named.partition(":")[2].removeprefix("//") or None
     with _explained(url):
         listed = [one for one in driver.list_devices() if serial in (None, one.serial)]
@@ -97,9 +94,8 @@ def open_camera(url: str) -> "CameraSource":
     kind = getattr(driver, _KINDS[known[0].name.name])
     configuration = _configured(url, kind, options)
     with _explained(url):
-        plain = dataclasses.replace(configuration, biases=kind.Biases())
         device = driver.open(
-            plain,
+            replace(configuration, biases=kind.Biases()),
             raw=True,
             iterator_timeout=_WAIT_S,
             serial=serial or known[0].serial,
@@ -256,18 +252,18 @@ def _areas(text: str) -> list[tuple[int, int, int, int]]:
     return areas
 
 
+_OPTIONS: Final[dict[str, Callable[[str], Any]]] = {"events_per_s": _rate, "area": _areas, "trigger": flag}
+"""Those beside biases."""
+
+
 def _configured(url: str, kind: Any, options: Mapping[str, Any]) -> Any:
     """The driver's configuration of a camera."""
-    names = [field.name for field in dataclasses.fields(kind.Biases)]
-    biases = {
-        name: value for name, value in options.items() if name not in ("events_per_s", "area", "trigger")
-    }
-    for name in biases:
-        if name not in names:
-            raise InputError(
-                f"{url}: option {name!r}{nearest(name, ['events_per_s', 'area', 'trigger', *names])}"
-            )
-    chosen: dict[str, Any] = {"biases": dataclasses.replace(kind.Biases(), **biases)}
+    known = [*_OPTIONS, *(field.name for field in fields(kind.Biases))]
+    for name in options:
+        if name not in known:
+            raise InputError(f"{url}: option {name!r}{nearest(name, known)}")
+    biases = {name: value for name, value in options.items() if name not in _OPTIONS}
+    chosen: dict[str, Any] = {"biases": replace(kind.Biases(), **biases)}
     if "trigger" in options:
         chosen["enable_external_trigger"] = options["trigger"]
     if "events_per_s" in options:
@@ -297,16 +293,16 @@ def _set_biases(url: str, kind: Any, device: Any, configuration: Any) -> None:
         return
     with _explained(url):
         bounds = device.biases_bounds()
-    for field in dataclasses.fields(configuration.biases):
+    for field in fields(configuration.biases):
         value, default = (getattr(some, field.name) for some in (configuration.biases, kind.Biases()))
         limits = getattr(bounds, field.name)
         if value != default and not int(limits.minimum) <= value <= int(limits.maximum):
             raise ConfigError(
                 f"{url}: {field.name} = {value}: expected {int(limits.minimum)} to {int(limits.maximum)}"
             )
-    whole = {f.name: np.int16(getattr(configuration.biases, f.name)) for f in dataclasses.fields(kind.Biases)}
+    whole = {f.name: np.int16(getattr(configuration.biases, f.name)) for f in fields(kind.Biases)}
     with _explained(url):
-        device.update_configuration(dataclasses.replace(configuration, biases=kind.Biases(**whole)))
+        device.update_configuration(replace(configuration, biases=kind.Biases(**whole)))
 
 
 @contextlib.contextmanager
