@@ -375,7 +375,8 @@ def _unit_of_digits(
     shorter, last = (units[at:], shown) if whole else (units[at:-1], "us")
     unit = next((unit for unit in shorter if rates_hz[unit] >= LEAST_RATE_HZ), last)
     why = f", too far apart for {shown}" if unit != shown else ""
-    return TimeUnit(unit, f"guessed: {digits}{why}, {rates_hz[unit]:.3g} events/s", likely)
+    why += f", {rates_hz[unit]:.3g} events/s" if unit in likely else ""
+    return TimeUnit(unit, f"guessed: {digits}{why}", likely)
 
 
 def _blinking_unit(inside: NDArray[Any]) -> tuple[str, float] | None:

@@ -155,11 +155,10 @@ def _csv_pieces(
 ) -> Iterator[Piece]:
     above = 0
     while lines:
-        more = file.readlines(PIECE_CHARACTERS)
         numbers = [k for k, line in enumerate(lines, above + 1) if k >= table.first and _is_data(line)]
         rows = [lines[k - above - 1] for k in numbers]
         # Whoever wrote it was stopped.
-        cut = int(bool(rows) and not more and lines[-1][-1] != "\n" and not table.is_row(rows[-1], fields))
+        cut = int(bool(rows) and lines[-1][-1] != "\n" and not table.is_row(rows[-1], fields))
         good = len(rows) - cut
         columns = table.columns(rows[:good], fields)
         if columns is None:
@@ -170,7 +169,8 @@ def _csv_pieces(
         if good + cut < len(rows):
             what = "a time and a polarity" + (", x and y" if fields.places else "")
             raise InputError(f"{path}: line {numbers[good]}: found {_show(rows[good])}, expected {what}")
-        above, lines = above + len(lines), more
+        above += len(lines)
+        lines = file.readlines(PIECE_CHARACTERS)
 
 
 def _show(line: str) -> str:
