@@ -141,22 +141,14 @@ class Outputs:
         """Remove what is left of an earlier run when the files come into place."""
         self._dropped.append(target)
 
-    def close_files(self) -> None:
-        """Close what `open` gave.
-
-        Raises:
-            OSError: Something cannot be written any more, e.g. the disk is full.
-        """
-        for file in self._open:
-            file.close()
-
     def digests(self) -> dict[str, dict[str, Any]]:
         """Size and SHA-256 of each file that is written so far, by its name; closes those that `open` gave.
 
         Raises:
             OSError: Something cannot be written or read back.
         """
-        self.close_files()
+        for file in self._open:
+            file.close()
         found = {}
         for target, staged in self._staged.items():
             if staged.exists():
@@ -173,7 +165,8 @@ class Outputs:
                 came into place.
         """
         with writing(next(iter((*self._staged, *self._direct)), Path())):
-            self.close_files()
+            for file in self._open:
+                file.close()
         written = {target: staged for target, staged in self._staged.items() if staged.exists()}
         for target, staged in written.items():
             with writing(target):
@@ -182,21 +175,20 @@ class Outputs:
                 _sync(staged)
         gone = [*self._dropped, *(target for target in self._staged if target not in written)]
         gone = [target for target in gone if os.path.lexists(target)]
-        others, seals = [*written][:-1], [*written][-1:]
-        for seal in seals if others or gone else ():
+        seal = next(reversed(written), None)
+        if seal is not None and (gone or len(written) > 1):
             with writing(seal):
                 self._unseal(seal)
         for target in gone:
             with writing(target):
                 target.unlink()
-        for target in others:
+        for target, staged in written.items():
             with writing(target):
-                written[target].replace(target)
-        for seal in seals:
-            with writing(seal):
-                if others:
+                if target == seal and len(written) > 1:
                     self._sync_folders()
-                written[seal].replace(seal)
+                staged.replace(target)
+        if seal is not None:
+            with writing(seal):
                 self._sync_folders()
         self.discard()
 
