@@ -503,7 +503,7 @@ def decode_evt3(
         if state[DOUBT]:
             # No time is known of these.
             if n > first and tally[TIME_DOUBTFUL, 0] == 0:
-                tally[TIME_DOUBTFUL, 1] = at + 2 * _word_of_event(words, start, 0)
+                tally[TIME_DOUBTFUL, 1] = at + 2 * _word_of_event(words, start, int64(0))
             tally[TIME_DOUBTFUL, 0] += n - first
             n = first
         elif not _unpack_evt3(base, events, (first, n), size_px, state[LAST]):
@@ -516,7 +516,7 @@ def decode_evt3(
         kind = w >> 12
         if kind == EVT3_TIME_HIGH:
             before = state[HIGH]
-            askew = _take_time(words, i, at, 2, state, tally, final)
+            askew = _take_time(words, i, at, int64(2), state, tally, final)
             if askew:
                 break
             if state[HIGH] != before:
@@ -534,7 +534,7 @@ def decode_evt3(
         elif (EVT3_TYPES >> kind) & 1:
             _note(tally, int64(OTHER_WORDS), at + 2 * i)
         else:
-            askew = _unlevel(words, i, at, 2, EVT3_TYPES, 12, state, final)
+            askew = _unlevel(words, i, at, int64(2), int64(EVT3_TYPES), int64(12), state, final)
             if askew:
                 break
             _note(tally, int64(RESERVED), at + 2 * i)
@@ -573,7 +573,7 @@ def decode_evt2(
             if state[BASE] < 0:
                 state[BASE], state[HIGH] = 0, w & 0xFFFFFFF
             else:
-                askew = _take_time(words, i, at, 4, state, tally, final)
+                askew = _take_time(words, i, at, int64(4), state, tally, final)
                 if askew:
                     break
             base, doubt = state[BASE] + (state[HIGH] << 6), state[DOUBT]
@@ -597,7 +597,7 @@ def decode_evt2(
         elif (EVT2_TYPES >> kind) & 1:
             _note(tally, int64(OTHER_WORDS), here)
         else:
-            askew = _unlevel(words, i, at, 4, EVT2_TYPES, 6, state, final)
+            askew = _unlevel(words, i, at, int64(4), int64(EVT2_TYPES), int64(6), state, final)
             if askew:
                 break
             _note(tally, int64(RESERVED), here)

@@ -172,7 +172,8 @@ def measure_box(
     if last_column < first_column:
         return 0, 0.0, 0, 0, 0.0, 0.0
     outside = min(columns[:seam].sum(), columns[-seam:].sum()) / seam if columns.size > 2 * seam else 0.0
-    columns = np.maximum(columns - outside, 0.0)
+    for i in range(columns.size):
+        columns[i] = max(columns[i] - outside, 0.0)
     wide = int(min(2 * reach, columns.size))
     start, best, inside = 0, 0.0, 0.0
     for i in range(columns.size):
@@ -692,9 +693,11 @@ def core_profile(
                 many[k] += 1
     every = np.zeros((rows, columns))
     for k in range(places.size):
-        every += probability[k]
+        for r in range(rows):
+            for c in range(columns):
+                every[r, c] += probability[k, r, c]
     half = spacing / 2 + grid
-    wide, high = _strip(unit, half, hits.size)
+    wide, high = _strip(unit, half, float(hits.size))
     for k in range(places.size):
         if not seen[k]:
             continue
@@ -721,7 +724,9 @@ def core_profile(
                 out[j] = out[before] + part * (value - out[before]) if before >= 0 else value
             out[i] = value
             before = i
-    n = int(np.argmax(out))
+    n = 0
+    for i in range(out.size):
+        n = i if out[i] > out[n] else n
     highest = out[n]
     while n < out.size and not out[n] < edge * highest:
         n += 1
@@ -1664,7 +1669,8 @@ def slope_of_rows(
             top[b] = max(top[b], fit[b, lag])
     middle = median(top.copy(), blocks) if blocks else 0.0
     at, place = np.empty(blocks), np.empty(blocks)
-    n = 0
+    # A literal 0 would make a median of its own.
+    n: Any = np.int64(0)
     for b in range(blocks):
         if top[b] > max(middle / 4, chance * np.sqrt(seen[b])):
             # The top is flat where a window holds all events of an edge: its middle is the best window.
@@ -1679,7 +1685,6 @@ def slope_of_rows(
         return np.nan, np.nan
     # A median of pairs: blocks with a part of the bar hidden, or another's light, are outliers.
     slopes = np.empty(n * n)
-    # A literal 0 would make a median of its own.
     pairs: Any = np.int64(0)
     for i in range(n):
         for j in range(i + 1, n):
@@ -1689,13 +1694,14 @@ def slope_of_rows(
     if not pairs:
         return np.nan, np.nan
     slope = median(slopes, pairs)
-    rest = place[:n] - slope * at[:n]
-    rest = np.abs(rest - median(rest, n))
-    spread = max(1.48 * median(rest, n), least)
-    mean = at[:n].sum() / n
-    squares = 0.0
+    rest, mean, squares = np.empty(n), at[:n].sum() / n, 0.0
     for i in range(n):
+        rest[i] = place[i] - slope * at[i]
         squares += (at[i] - mean) ** 2
+    middle = median(rest, n)
+    for i in range(n):
+        rest[i] = abs(rest[i] - middle)
+    spread = max(1.48 * median(rest, n), least)
     return slope, spread / np.sqrt(squares)
 
 

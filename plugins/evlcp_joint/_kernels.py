@@ -118,7 +118,8 @@ def fit_line(middles: Array, line: Array) -> bool:
     """
     clusters = len(middles)
     points, values = np.empty((3, clusters)), np.empty(max(clusters * (clusters - 1) // 2, clusters))
-    n = 0
+    # A literal 0 would make a median of its own.
+    n: Any = np.int64(0)
     for k in range(clusters):
         if middles[k, 0] == middles[k, 0]:
             points[0, n], points[1, n], points[2, n] = k, middles[k, 0], middles[k, 1]
@@ -126,7 +127,6 @@ def fit_line(middles: Array, line: Array) -> bool:
     if n < 3:
         return False
     for axis in range(2):
-        # A literal 0 would make a median of its own.
         m: Any = np.int64(0)
         for i in range(n):
             for j in range(i + 1, n):
