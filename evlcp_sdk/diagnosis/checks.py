@@ -19,6 +19,11 @@ def _of_recording(facts: Facts) -> _Of:
     yield (facts,), {}
 
 
+def _of_bar(facts: Facts) -> _Of:
+    if (bar := facts.bar) is not None:
+        yield (facts, bar), {}
+
+
 def _of_links(facts: Facts) -> _Of:
     for name, part in (facts.parts or {"": facts}).items():
         yield (part,), {"link": name}
@@ -50,11 +55,11 @@ CHECKS: tuple[tuple[str, Callable[[Facts], _Of], tuple[Callable[..., Found], ...
     ("readout", _of_recording, (of_light.check_readout,)),
     ("light", _of_recording, (of_light.check_light,)),
     ("polarity", _of_links, (of_light.check_edges,)),
-    ("pixels", _of_recording, (of_light.check_pixels,)),
-    ("size", _of_recording, (of_light.check_size,)),
-    ("focus", _of_recording, (of_light.check_focus,)),
-    ("brightness", _of_recording, (of_light.check_brightness,)),
-    ("chip rate", _of_recording, (of_light.check_rate,)),
+    ("pixels", _of_bar, (of_light.check_pixels,)),
+    ("size", _of_bar, (of_light.check_size,)),
+    ("focus", _of_bar, (of_light.check_focus,)),
+    ("brightness", _of_bar, (of_light.check_brightness,)),
+    ("chip rate", _of_bar, (of_light.check_rate,)),
     ("preamble", _of_recording, (of_light.check_preamble,)),
     ("frames", _of_links, (of_frames.check_frames, of_frames.check_kinds_of_frames)),
     ("frames", _of_transmitters, (of_frames.check_reflection, of_frames.check_lit)),

@@ -287,11 +287,9 @@ def check_edges(facts: Facts) -> Found:
         yield f"{1 - on / events:.0%} of the bar's events are negative"
 
 
-def check_pixels(facts: Facts) -> Found:
+def check_pixels(facts: Facts, bar: LightSource) -> Found:
     """Pixels that are blind for longer than a chip."""
-    if facts.bar is None:
-        return
-    blind_us = facts.bar.blind_us
+    blind_us = bar.blind_us
     chips = blind_us / facts.link.packet.chip_us
     if chips > _BLIND_CHIPS:
         yield Diagnostic(
@@ -304,10 +302,10 @@ def check_pixels(facts: Facts) -> Found:
         yield f"pixels answer again within {blind_us:.0f} us" if blind_us else "pixels answer at once"
 
 
-def check_size(facts: Facts) -> Found:
+def check_size(facts: Facts, bar: LightSource) -> Found:
     """A bar that is too small in the picture, or of more rows than are read in a chip."""
-    bar, px, chip_us = facts.bar, facts.cluster_px, facts.link.packet.chip_us
-    if bar is None or not px > 0:
+    px, chip_us = facts.cluster_px, facts.link.packet.chip_us
+    if not px > 0:
         return
     text = f"{px:.1f} px a cluster"
     rows_us = bar.high_px * _ROW_US
@@ -327,10 +325,10 @@ def check_size(facts: Facts) -> Found:
         yield text
 
 
-def check_focus(facts: Facts) -> Found:
+def check_focus(facts: Facts, bar: LightSource) -> Found:
     """Clusters that cover one another."""
-    bar, px = facts.bar, facts.cluster_px
-    if bar is None or not px > 0:
+    px = facts.cluster_px
+    if not px > 0:
         return
     across_px = min(bar.wide_px, bar.high_px)
     text = f"{across_px:.0f} px across, {px:.1f} px a cluster along it"
@@ -345,11 +343,8 @@ def check_focus(facts: Facts) -> Found:
         yield text
 
 
-def check_brightness(facts: Facts) -> Found:
+def check_brightness(facts: Facts, bar: LightSource) -> Found:
     """Light that is too weak for its chips."""
-    bar = facts.bar
-    if bar is None:
-        return
     chips = bar.typical_us / facts.link.packet.chip_us
     text = f"a pixel of it rises every {chips:.1f} chips"
     if not facts.reads and chips > _RARE_CHIPS and bar.strength < _WEAK:
@@ -358,11 +353,9 @@ def check_brightness(facts: Facts) -> Found:
         yield text
 
 
-def check_rate(facts: Facts) -> Found:
+def check_rate(facts: Facts, bar: LightSource) -> Found:
     """Light of another rate than the link's."""
-    bar, link_hz = facts.bar, facts.link.packet.chip_rate_hz
-    if bar is None:
-        return
+    link_hz = facts.link.packet.chip_rate_hz
     better = facts.better_value("air.chip_rate_hz")
     if not facts.reads and (better is not None or not has_rate(bar, link_hz)):
         rate_hz = bar.rate_hz if better is None else better

@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,7 +26,7 @@ from evlcp_sdk.io.open import open_source
 from evlcp_sdk.live import Publisher, server
 from evlcp_sdk.live.recorder import Recorder
 from evlcp_sdk.live.services import Services, Serving, serve
-from evlcp_sdk.live.viewer import page
+from evlcp_sdk.live.viewer import Viewer, page
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
@@ -51,20 +51,15 @@ class Stage:
     services: Services
 
     @property
-    def url(self) -> str:
+    def view(self) -> Viewer:
         assert self.services.view is not None
-        return self.services.view.url
-
-    @property
-    def port(self) -> int:
-        assert self.services.view is not None
-        return self.services.view.port
+        return self.services.view
 
     def connect(self, **given: Any) -> ClientConnection:
-        return connect(self.url.replace("http", "ws") + "live", compression=None, max_size=None, **given)
+        return connect(self.view.url.replace("http", "ws") + "live", compression=None, max_size=None, **given)
 
     def ask(self, path: str, **headers: str) -> tuple[int, dict[str, str], str]:
-        link = http.client.HTTPConnection("127.0.0.1", self.port, timeout=10)
+        link = http.client.HTTPConnection("127.0.0.1", self.view.port, timeout=10)
         link.putrequest("GET", path, skip_host="Host" in headers)
         for name, value in headers.items():
             link.putheader(name, value)
@@ -84,12 +79,18 @@ class Stage:
         self.publisher.pictures.add(events, 1280, 720, ())
 
 
-@pytest.fixture
-def stage() -> Iterator[Stage]:
+@contextmanager
+def staged(**given: Any) -> Iterator[Stage]:
     publisher = Publisher()
-    with serve(Serving(view=True), publisher, LINKS, name="a name", sites=(SITE,)) as services:
+    with serve(Serving(view=True, **given), publisher, LINKS, name="a name", sites=(SITE,)) as services:
         yield Stage(publisher, services)
         publisher.close()
+
+
+@pytest.fixture
+def stage() -> Iterator[Stage]:
+    with staged() as one:
+        yield one
 
 
 def unpacked(bundle: str | bytes) -> tuple[dict[str, Any], bytes]:
@@ -113,28 +114,20 @@ def test_the_page_needs_nothing_else_and_names_cannot_write_it() -> None:
 
 
 def test_who_may_look_on(stage: Stage) -> None:
-    path = stage.url.split(str(stage.port), 1)[1]
+    path = stage.view.url.split(str(stage.view.port), 1)[1]
     status, headers, body = stage.ask(path)
     assert (status, headers["Content-Type"]) == (200, "text/html; charset=utf-8")
     assert (headers["Referrer-Policy"], headers["Cache-Control"]) == ("no-referrer", "no-store")
     assert "a name" in body
-    own = f"127.0.0.1:{stage.port}"
-    assert stage.ask(path, Host=f"localhost:{stage.port}")[0] == 200
-    for host in (
-        "evil.example",
-        f"evil.example:{stage.port}",
-        "127.0.0.1",
-        "127.0.0.1:1",
-        f"u@{own}",
-        "[",
-        "",
-    ):
+    own = f"127.0.0.1:{stage.view.port}"
+    assert stage.ask(path, Host=f"localhost:{stage.view.port}")[0] == 200
+    foreign = "evil.example", f"evil.example:{stage.view.port}"
+    for host in (*foreign, "127.0.0.1", "127.0.0.1:1", f"u@{own}", "[", ""):
         assert stage.ask(path, Host=host)[0] == 403, host
-    assert stage.ask(path, Origin="http://evil.example")[0] == 403
-    assert stage.ask(path, Origin="null")[0] == 403
-    assert stage.ask("/")[0] == 403
-    assert stage.ask("/wrong/")[0] == 403
-    assert stage.ask(path[:-2] + "/")[0] == 403
+    for origin in ("http://evil.example", "null"):
+        assert stage.ask(path, Origin=origin)[0] == 403
+    for wrong in ("/", "/wrong/", path[:-2] + "/"):
+        assert stage.ask(wrong)[0] == 403
     assert stage.ask(path + "else")[0] == 404
     with pytest.raises(InvalidStatus, match="403"):
         stage.connect(origin="http://evil.example")
@@ -233,26 +226,20 @@ class Failing(TextKind):
         return {"text": value}
 
 
-def test_a_message_that_cannot_be_shown_is_counted_and_said() -> None:
-    publisher = Publisher()
-    with serve(Serving(view=True), publisher, LINKS, name="a name") as services:
-        stage = Stage(publisher, services)
-        with stage.connect() as link:
-            link.recv(30)
-            for number, value in enumerate(("raises", math.nan, "read me")):
-                message = ReceivedMessage(
-                    0, 0, 5.0, Message(2, 7, number, b"-"), Failing(), value, "unverified", ""
-                )
-                publisher.publish("message", 5.0, message)
-            lines: list[dict[str, Any]] = []
-            while "message" not in [line["line"] for line in lines]:
-                lines += next_of(link)[0]["news"]
-        publisher.close()
+def test_a_message_that_cannot_be_shown_is_counted_and_said(stage: Stage) -> None:
+    with stage.connect() as link:
+        link.recv(30)
+        for number, value in enumerate(("raises", math.nan, "read me")):
+            sent = Message(2, 7, number, b"-")
+            message = ReceivedMessage(0, 0, 5.0, sent, Failing(), value, "unverified", "")
+            stage.publisher.publish("message", 5.0, message)
+        lines: list[dict[str, Any]] = []
+        while "message" not in [line["line"] for line in lines]:
+            lines += next_of(link)[0]["news"]
     assert [line["count"] for line in lines if line["line"] == "untold"] == [1, 2]
     assert "to_dict() fails: ZeroDivisionError: by nothing" in lines[0]["fault"]
     assert lines[-1]["text"] == "read me"
-    assert services.view is not None
-    assert services.view.fault == (
+    assert stage.view.fault == (
         "2 messages could not be shown on the page: a message kind shows NaN, which JSON has not"
     )
 
@@ -267,27 +254,23 @@ def test_browsers_only_look_on(stage: Stage) -> None:
 
 
 def test_a_recording_is_what_came(tmp_path: Path) -> None:
-    publisher = Publisher()
     folder = tmp_path / "not" / "made"
-    serving = Serving(view=True, record_to=folder)
-    with serve(serving, publisher, LINKS, name="x") as services:
-        stage = Stage(publisher, services)
-        with stage.connect() as link:
-            link.recv(30)
-            publish(publisher, 1_000)
-            link.send('{"record": true}')
-            until(lambda: publisher.wanted("events"))
-            publish(publisher, 2_000)
-            publisher.publish("triggers", 2_500, Triggers.of([2_500, 3_004], [0, 0], [1, 0]))
-            publish(publisher, 3_000)
-            link.send('{"record": false}')
-            until(lambda: not publisher.wanted("events"))
-            publish(publisher, 4_000)
-            until(lambda: any(folder.glob("live-*.raw")))
-            stage.frame(0)
-            assert next_of(link)[0]["record"]["events"] == 20
+    with staged(record_to=folder) as stage, stage.connect() as link:
+        publisher = stage.publisher
+        link.recv(30)
+        publish(publisher, 1_000)
+        link.send('{"record": true}')
+        until(lambda: publisher.wanted("events"))
+        publish(publisher, 2_000)
+        publisher.publish("triggers", 2_500, Triggers.of([2_500, 3_004], [0, 0], [1, 0]))
+        publish(publisher, 3_000)
+        link.send('{"record": false}')
+        until(lambda: not publisher.wanted("events"))
+        publish(publisher, 4_000)
+        until(lambda: any(folder.glob("live-*.raw")))
+        stage.frame(0)
+        assert next_of(link)[0]["record"]["events"] == 20
         (path,) = folder.iterdir()
-        publisher.close()
     with open_source(path) as source:
         events, triggers = source.read()
     assert events.t_us.tolist() == [*range(2_000, 2_010), *range(3_000, 3_010)]
@@ -319,13 +302,8 @@ def publish(publisher: Publisher, t_us: int) -> None:
 
 
 def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
-    with (
-        pytest.raises(
-            ConfigError,
-            match=rf"127.0.0.1:{stage.port}: .*expected an address of this machine and a port",
-        ),
-        serve(Serving(view=True, port=stage.port), Publisher(), LINKS, name="x"),
-    ):
+    told = rf"127.0.0.1:{stage.view.port}: .*expected an address of this machine and a port"
+    with pytest.raises(ConfigError, match=told), staged(port=stage.view.port):
         pass
 
 
@@ -336,7 +314,7 @@ def test_a_browser_shows_what_the_files_say(
     """Beside one that stalls: a lost link comes back, pictures change, numbers are those of frames.csv."""
     # A slow machine shows the last of it late.
     monkeypatch.setattr(server, "FINISH_S", 60.0)
-    publisher, summary, enough = Publisher(), {}, threading.Event()
+    summary, enough = {}, threading.Event()
 
     def pieces() -> Iterator[bytes]:
         """Yields the recording bit by bit, slowly until enough of it was seen."""
@@ -346,20 +324,19 @@ def test_a_browser_shows_what_the_files_say(
             enough.wait(0.2)
 
     with (
-        serve(Serving(view=True), publisher, LINKS, name=demo_raw.name) as services,
+        staged() as stage,
         Browser(tmp_path / "profile") as browser,
-        Stage(publisher, services).connect(),  # which never says that it is ready
+        stage.connect(),  # which never says that it is ready
         sender(pieces()) as source,
     ):
-        stage = Stage(publisher, services)
         browser.dress(390, dark=True)
-        browser.open(stage.url)
+        browser.open(stage.view.url)
         browser.until("shown.connects == 1")
         browser.value("socket.close()")
         browser.until("shown.connects == 2")
 
         def run() -> None:
-            given: dict[str, Any] = {"publisher": publisher, "budget": PATIENT}
+            given: dict[str, Any] = {"publisher": stage.publisher, "budget": PATIENT}
             summary.update(live(source, tmp_path / "out", list(LINKS.values()), **given, warm=False))
 
         runner = threading.Thread(target=run)
@@ -393,4 +370,4 @@ def test_a_browser_shows_what_the_files_say(
         assert shown == ["0.00", "-0.50", "0.00", "12.25", "0.00"]
         assert not [m for m in browser.faults if m["method"] == "Runtime.exceptionThrown"]
         asked = {url.split("/")[2] for url in browser.requests if not url.startswith("data:")}
-        assert asked <= {f"127.0.0.1:{stage.port}"}
+        assert asked <= {f"127.0.0.1:{stage.view.port}"}
