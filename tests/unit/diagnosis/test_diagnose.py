@@ -20,6 +20,7 @@ from evlcp_sdk.diagnosis.light import LightSource, LightSurvey, comb
 from evlcp_sdk.diagnosis.tallies import RunTally, TransmitterTally
 from evlcp_sdk.io.open import write_events
 from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.report.diagnosis_page import page
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.sim import load_scene
@@ -72,7 +73,7 @@ def test_what_is_wrong_is_named(code: str, changes: dict[str, Any], sent: tuple[
     wrong = [one for one in diagnosis.checks if one.verdict in ("fail", "doubt")]
     assert all(one.next_step for one in wrong)
     assert not code or step in next(one.next_step for one in wrong if one.code == code)
-    assert len([one for one in wrong if one.verdict == "fail"]) <= 1
+    assert not sent or [one.code for one in wrong if one.verdict == "fail"] == [code]
     assert diagnosis.headline
 
 
@@ -143,10 +144,15 @@ def judged(
         one.last_px = 410.0, 375.0
     counts = dict.fromkeys(("preambles", "regions_opened"), 3)
     counts |= {"frames": frames, "frames_rejected": rejected}
-    counts["events"] = 10**6
-    checks = find_stages(Facts(LINK, tally, counts, 0.0, duration_us, surveyed=True, sources=sources))
-    wrong = [one for one in checks if one.verdict in ("fail", "doubt")]
+    counts["events"], lost = 10**6, 2000
+    losses = [Loss(lost, 0, "byte", "odd words")]
+    facts = Facts(LINK, tally, counts, 0.0, duration_us, losses=losses, surveyed=True, sources=sources)
+    dropped, *wrong = [one for one in find_stages(facts) if one.verdict in ("fail", "doubt")]
+    # What is lost of a recording stops no light.
+    assert (dropped.code, dropped.verdict) == ("dropped", "doubt")
     assert all(one.next_step for one in wrong)
+    # What is wrong where frames are read all the same is a doubt.
+    assert not wrong or wrong[0].verdict == ("doubt" if frames > rejected else "fail")
     return wrong[0].code if wrong else ""
 
 
