@@ -213,9 +213,7 @@ def test_it_is_kept_over_a_reset(device: SimulatedBoard, board: Board) -> None:
 
 
 @pytest.mark.parametrize(("limit", "every"), [(0.5, 2), (0.3, 4), (0.001, 1000)])
-def test_the_idle_pattern_keeps_to_the_limits(
-    device: SimulatedBoard, board: Board, limit: float, every: int
-) -> None:
+def test_idle_keeps_to_the_limits(device: SimulatedBoard, board: Board, limit: float, every: int) -> None:
     """LEDs are on for no more of it than they may be, whatever the length of a packet."""
     packet = replace(PacketFormat.of(BOOK, 1), preamble_chips=103)
     bank = Bank.of_chips(np.zeros((151, 10), np.uint8), BOOK, packet, LED_CLUSTERS)
@@ -465,9 +463,7 @@ def test_a_text_by_a_board_and_a_camera(evlcp, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["7E2", "8O1, turned"])
-def test_a_stream_rests_while_there_is_nothing_to_send(
-    kind: str, device: SimulatedBoard, board: Board
-) -> None:
+def test_a_stream_rests_while_nothing_is_sent(kind: str, device: SimulatedBoard, board: Board) -> None:
     """The board's idle pattern would be characters: packets of pause keep it from being shown."""
     link, symbols, told = packet_of(kind)
     with board.stream(link) as stream:

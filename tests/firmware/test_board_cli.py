@@ -260,7 +260,7 @@ def test_trace_and_replay(evlcp, tmp_path: Path) -> None:
         check_fault(evlcp(*arguments, "--replay", trace), 3, f"{trace}: {says}")
 
 
-def test_options_of_the_line_stand_before_or_behind_the_command(
+def test_line_options_stand_anywhere(
     evlcp, native: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     before = evlcp("board", "--port", native, "hello", "--json")
@@ -388,9 +388,7 @@ def test_a_flash_file_is_replaced_whole(tmp_path: Path) -> None:
         ("long.bin", "long.bin: not a flash file of"),
     ],
 )
-def test_a_flash_file_that_cannot_be_used_is_told_and_left_alone(
-    evlcp, tmp_path: Path, name: str, says: str
-) -> None:
+def test_a_flash_file_that_cannot_be_used_is_left_alone(evlcp, tmp_path: Path, name: str, says: str) -> None:
     (tmp_path / "folder").mkdir()
     (tmp_path / "notes.txt").write_text("mine")
     (tmp_path / "long.bin").write_bytes(bytes(100_000))

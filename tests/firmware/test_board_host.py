@@ -115,7 +115,7 @@ def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp
 
 
 @pytest.mark.parametrize(("latency_s", "frame_s", "at_most"), [(0.0, 0.0, 1.15), (0.002, 0.001, 1.3)])
-def test_programming_is_near_the_wire_time(
+def test_programming_takes_the_wire_time(
     device: SimulatedBoard, latency_s: float, frame_s: float, at_most: float
 ) -> None:
     """By the board's own clock, over a line alone and behind a USB bridge: few waits for answers."""
@@ -144,9 +144,7 @@ def test_another_rate_while_it_plays_is_refused_before_anything_is_sent(device: 
     assert provision(board, fast, Settings()).swapped
 
 
-def test_a_bank_that_does_not_hold_is_not_blamed_on_the_rate(
-    board: Board, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bank_that_does_not_hold_is_told(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     crc = board.crc
     monkeypatch.setattr(board, "crc", lambda *place: crc(*place) ^ 1)
     with pytest.raises(VerifyError, match="does not hold what was sent") as told:
@@ -245,9 +243,7 @@ def test_what_is_bound_ends_with_its_parent() -> None:
             os.kill(child, signal.SIGKILL)
 
 
-def test_a_trace_follows_no_link_and_outlasts_what_ends_without_a_word(
-    device: SimulatedBoard, tmp_path: Path
-) -> None:
+def test_a_trace_follows_no_link_and_outlasts_its_host(device: SimulatedBoard, tmp_path: Path) -> None:
     def traced(path: Path) -> TraceTransport:
         return TraceTransport(SimulatedLine(device), path, 9600, 1, 2)
 

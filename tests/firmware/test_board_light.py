@@ -45,9 +45,7 @@ def test_the_oracle_counts_every_stretch() -> None:
     assert excess(rows, 0.4).max() == pytest.approx(every)
 
 
-def test_all_ones_at_full_current_are_refused_and_the_old_bank_plays_on(
-    device: SimulatedBoard, board: Board
-) -> None:
+def test_all_ones_at_full_current_are_refused(device: SimulatedBoard, board: Board) -> None:
     assert (board.about.level_max_ma, board.about.mean_max_ma, board.about.burst_chips) == (60, 30, BURST)
     provision(board, GOOD, Settings(level_ma=60))
     assert board.status().duty == 500

@@ -198,9 +198,7 @@ def test_another_link_is_refused_and_says_where(evlcp, tmp_path: Path, other: st
     assert done.out == ""
 
 
-def test_without_an_output_nothing_is_said_to_be_sent(
-    evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_without_an_output_nothing_is_sent(evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     done = evlcp("tx", "message", "--text", "hi")
     says = "evlcp: nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips\n"
     check_fault(done, 2, says)

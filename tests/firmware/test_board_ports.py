@@ -111,9 +111,7 @@ def test_only_likely_ports_are_opened(ports: list[SimpleNamespace], opened: Call
         survey.find(1_000_000)
 
 
-def test_the_command_shows_and_filters(
-    evlcp, ports: list[SimpleNamespace], opened: Callable[[], list[str]]
-) -> None:
+def test_board_ports(evlcp, ports: list[SimpleNamespace], opened: Callable[[], list[str]]) -> None:
     rows = json.loads(evlcp("board", "ports", "--json").out)
     assert [(r["port"], r["usb"], r["asked"]) for r in rows] == [
         ("COM3", None, False),

@@ -29,7 +29,7 @@ def times_us(device: SimulatedBoard, ppm: float) -> NDArray[np.float64]:
     return device.records().played().ticks / 10 / (1 + ppm * 1e-6)
 
 
-def test_two_boards_that_are_60_ppm_apart_stay_within_a_tenth_of_a_chip_until_the_pulses_cease() -> None:
+def test_boards_60_ppm_apart_stay_within_a_hundredth_of_a_chip_until_pulses_cease() -> None:
     found = []
     for ppm in (30.0, -30.0):
         device, board = crystal(ppm)

@@ -47,7 +47,7 @@ def expected(packets: np.ndarray, link: Link = LINK) -> list[bytes]:
 
 @pytest.mark.parametrize("link", [LINK, LONG], ids=["one piece a packet", "three pieces a packet"])
 @pytest.mark.parametrize(("latency_s", "ahead"), [(0.0, 5), (0.016, 2)])
-def test_packets_follow_each_other_without_a_gap(
+def test_packets_follow_without_a_gap(
     device: SimulatedBoard, link: Link, latency_s: float, ahead: int
 ) -> None:
     packets = symbols_of(30, 0, link)
@@ -311,9 +311,7 @@ def test_what_changes_is_right_at_its_first_chip(device: SimulatedBoard, latency
 
 @pytest.mark.parametrize("how", ["stop", "blank"])
 @pytest.mark.parametrize("at_once", [False, True])
-def test_a_stream_that_is_stopped_is_empty(
-    device: SimulatedBoard, board: Board, how: str, at_once: bool
-) -> None:
+def test_a_stopped_stream_is_empty(device: SimulatedBoard, board: Board, how: str, at_once: bool) -> None:
     """What waits is not played by another START, nor by one that comes before the board is dark."""
     sent = symbols_of(6)
     stream = board.stream(LINK, ahead=6)

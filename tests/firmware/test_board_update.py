@@ -151,9 +151,7 @@ def test_what_cannot_be_is_refused(device: SimulatedBoard, board: Board) -> None
     assert board.status().state == State.PLAYING
 
 
-def test_what_is_interrupted_keeps_the_old_one_and_ends_well_when_it_is_run_again(
-    device: SimulatedBoard,
-) -> None:
+def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device: SimulatedBoard) -> None:
     noisy = NoisyLine(device, flips=2e-4, drops=0.0, doubles=0.0, seed=3)
     assert update(board_on(noisy, latency_s=0.01), package(4, 20_000)).image == device.bench.running == 1
     assert noisy.counts["flipped"] > 2

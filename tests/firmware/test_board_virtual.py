@@ -195,9 +195,7 @@ def test_another_major_version_is_incompatible(
         board_on(device)
 
 
-def test_what_a_watchdog_did_is_told_to_the_host_that_comes_back(
-    device: SimulatedBoard, board: Board
-) -> None:
+def test_what_a_watchdog_did_is_told_to_who_comes_back(device: SimulatedBoard, board: Board) -> None:
     provision(board, some_bank(2), Settings())
     board.watchdog(Watchdog.DARK, 200)
     device.run(1_000_000)
