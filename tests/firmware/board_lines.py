@@ -81,6 +81,12 @@ def shown(device: SimulatedBoard) -> NDArray[np.uint8]:
     return device.records().played().chips(None)
 
 
+def well(done: Run) -> Run:
+    """A command that has ended well."""
+    assert done.code == 0, done.err
+    return done
+
+
 def check_fault(done: Run, code: int, *says: str) -> None:
     """See that a command ended with a code, and one line that says why."""
     assert (done.code, done.err.count("\n")) == (code, 1), done.err

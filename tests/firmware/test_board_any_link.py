@@ -15,6 +15,7 @@ from board_lines import (
     shown,
     some_bank,
     symbols_of,
+    well,
 )
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
@@ -352,11 +353,11 @@ def test_the_commands(evlcp, tmp_path: Path, device: SimulatedBoard, board: Boar
     device.run(200_000)
     record, out = tmp_path / "leds.bin", tmp_path / "chips.npy"
     record.write_bytes(device.records().to_bytes())
-    assert evlcp("board", "leds", record, "--chips", out, *OPTIONS).code == 0
+    well(evlcp("board", "leds", record, "--chips", out, *OPTIONS))
     chips, whole = np.load(out), symbol_chips(symbols, link.codebook)
     assert (chips == np.resize(whole, chips.shape)).all()
     assert len(np.load(tmp_path / "chips.ticks.npy")) == len(chips)
-    assert evlcp("board", "leds", record, "--chips", out, "--per-led").code == 0
+    well(evlcp("board", "leds", record, "--chips", out, "--per-led"))
     assert (np.load(out)[:, :90] == np.repeat(chips, 9, axis=1)).all()
     # those chips are what a board is sent for the same link, column by column
     np.save(out, whole)
@@ -453,8 +454,7 @@ def test_the_image_of_the_part_plays_them_too(kind: str, stm32) -> None:
 
 def test_a_text_by_a_board_and_a_camera(evlcp, tmp_path: Path) -> None:
     options = options_of(*SERIAL, "air.frames_per_packet=80")
-    done = evlcp("loop", "--text", "Tempo 30!", "--seed", 2, "--json", "-o", tmp_path, *options)
-    assert done.code == 0, done.err
+    done = well(evlcp("loop", "--text", "Tempo 30!", "--seed", 2, "--json", "-o", tmp_path, *options))
     said = {step.pop("step"): step for step in map(json.loads, done.out.splitlines())}
     assert said["text"]["texts"] == ["Tempo 30!"]
     receiver = said["receiver"]

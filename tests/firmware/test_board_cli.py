@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import typer
-from board_lines import Native, check_fault, some_bank
+from board_lines import Native, check_fault, some_bank, well
 
 from evlcp_sdk.errors import OutputError
 from firmware_host.board.board import Board
@@ -62,8 +62,7 @@ def test_a_users_first_hour(evlcp, native: str, tmp_path: Path) -> None:
     table("hello", hal="native", clusters=16, leds=96)
     check_fault(board("send", "--random", 1), 5, "'evlcp board program' first")
     eight = ("--random", 8, "--seed", 3)
-    done = board("program", *eight, "--level", 25, "--watchdog", "idle", "--watchdog-ms", 1500)
-    assert done.code == 0
+    done = well(board("program", *eight, "--level", 25, "--watchdog", "idle", "--watchdog-ms", 1500))
     sent, told = done.out.splitlines()
     assert sent == "sent 2560 of 2560 bytes; bank 0 is active"
     idle = "watchdog: the board shows its idle pattern once no host has spoken for 1.5 s;"
@@ -240,8 +239,7 @@ def test_a_record_that_is_written_is_the_one_that_is_read(tmp_path: Path) -> Non
 def test_trace_and_replay(evlcp, tmp_path: Path) -> None:
     trace = tmp_path / "wire.jsonl"
     arguments = ("board", "program", "--random", 8, "--seed", 3)
-    live = evlcp(*arguments, "--port", "native:", "--trace", trace)
-    assert live.code == 0, live.err
+    live = well(evlcp(*arguments, "--port", "native:", "--trace", trace))
     lines = [json.loads(x) for x in trace.read_text().splitlines()]
     assert lines[0]["evlcp_trace"] == 1
     assert {x["dir"] for x in lines[1:]} == {"tx", "rx"}
@@ -269,12 +267,12 @@ def test_line_options_stand_anywhere(
     # behind counts more, and either more than the environment
     assert evlcp("board", "--port", "unix:/nowhere", "start", "--port", native).code == 5
     monkeypatch.setenv("EVLCP_PORT", "unix:/nowhere")
-    assert evlcp("board", "--port", native, "hello").code == 0
+    well(evlcp("board", "--port", native, "hello"))
     monkeypatch.setenv("EVLCP_PORT", native)
-    assert evlcp("board", "hello").code == 0
+    well(evlcp("board", "hello"))
     trace = tmp_path / "wire.jsonl"
-    assert evlcp("board", "--port", native, "--trace", trace, "status").code == 0
-    assert evlcp("board", "--replay", trace, "status").code == 0
+    well(evlcp("board", "--port", native, "--trace", trace, "status"))
+    well(evlcp("board", "--replay", trace, "status"))
 
 
 def test_no_place_to_build_is_told(tmp_path: Path) -> None:
@@ -292,13 +290,13 @@ def test_an_emulator_does_not_take_anothers_place(evlcp, native: str, tmp_path: 
         says = f"--listen {native}: another program answers there; end it, or listen elsewhere"
         check_fault(done, 2, says)
         assert done.out == ""
-    assert evlcp("board", "hello", "--port", native).code == 0
+    well(evlcp("board", "hello", "--port", native))
     # what one that was killed leaves behind is no hindrance
     path = tmp_path / "stale"
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as left:
         left.bind(str(path))
     emulated = Emulated("native", "--listen", f"unix:{path}")
-    assert evlcp("board", "hello", "--port", f"unix:{path}").code == 0
+    well(evlcp("board", "hello", "--port", f"unix:{path}"))
     assert emulated.end() == 0
 
 
@@ -307,13 +305,13 @@ def test_pty_and_tcp(evlcp, tmp_path: Path) -> None:
     assert emulated.said == f"listening on {tmp_path / 'tty'}\n"
     done = evlcp("board", "program", "--random", 64, "--port", tmp_path / "tty")
     assert (done.code, done.err) == (0, "")
-    assert evlcp("board", "verify", "--random", 64, "--port", tmp_path / "tty").code == 0
+    well(evlcp("board", "verify", "--random", 64, "--port", tmp_path / "tty"))
     assert emulated.end() == 0
     with socket.create_server(("127.0.0.1", 0)) as free:
         place = f"127.0.0.1:{free.getsockname()[1]}"
     emulated = Emulated("native", "--listen", f"tcp:{place}")
-    assert evlcp("board", "hello", "--port", f"tcp:{place}").code == 0
-    assert evlcp("board", "hello", "--port", f"socket://{place}").code == 0
+    well(evlcp("board", "hello", "--port", f"tcp:{place}"))
+    well(evlcp("board", "hello", "--port", f"socket://{place}"))
     assert emulated.end() == 0
 
 

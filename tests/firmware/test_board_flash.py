@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import check_fault, needs
+from board_lines import check_fault, needs, well
 from test_board_cli import Emulated
 
 from evlcp_sdk.errors import InputError
@@ -28,8 +28,7 @@ def some(count: int, seed: int = 0, address: int = FLASH_START) -> FlashImage:
 def test_files_hold_one_image(evlcp, tmp_path: Path) -> None:
     needs("arm-none-eabi-gcc", "arm-none-eabi-objcopy")
     for target in build.TARGETS:
-        done = evlcp("board", "build", "--target", target, "-o", tmp_path / "new", "--json")
-        assert done.code == 0, done.err
+        done = well(evlcp("board", "build", "--target", target, "-o", tmp_path / "new", "--json"))
         table = json.loads(done.out)
         *files, package = (Path(file) for file in table["files"])
         assert Package.read(package) == Package.built(target)
@@ -166,8 +165,7 @@ def test_what_the_command_flashes_boots_where_it_was_flashed(evlcp, tmp_path: Pa
     emulated = Emulated("rom", "--listen", port, "--flash", kept)
     try:
         assert emulated.said == f"listening on {port}\n"
-        done = evlcp("board", "flash", "--target", "stm32f405-8mhz", "--port", port, "--json")
-        assert done.code == 0, done.err
+        done = well(evlcp("board", "flash", "--target", "stm32f405-8mhz", "--port", port, "--json"))
         table = json.loads(done.out)
         assert (table["verified"], table["started"], table["brown_out"]) == (True, True, False)
         assert table["sectors"][0] == 0

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from board_lines import SITE, Native, check_fault, options_of
+from board_lines import SITE, Native, check_fault, options_of, well
 
 from firmware_host.board.fleet import read_inventory
 from firmware_host.errors import IncompatibleError
@@ -53,7 +53,7 @@ def test_a_boards_link(tmp_path: Path) -> None:
 
 def test_a_payload_has_its_own_link(evlcp, tmp_path: Path) -> None:
     options = options_of("modulation.id=wh8", "air.chip_rate_hz=5000.0")
-    assert evlcp("tx", "message", "--text", "a", "-o", tmp_path / "m.json", *options).code == 0
+    well(evlcp("tx", "message", "--text", "a", "-o", tmp_path / "m.json", *options))
     file = tmp_path / "one.toml"
     entry = BOARD + 'payload = "m.json"\n'
     file.write_text(entry)
@@ -78,13 +78,11 @@ def test_two_of_four(evlcp, boards: list[Native], tmp_path: Path) -> None:
     assert "FAILED (5)" in refused
     assert "nearest value the board can take is 60" in refused
     check_fault(done, 4, f"evlcp: {file}: 2 of 4 boards failed (T01, T03)")
-    same = evlcp("board", "verify", "--random", 16, "--seed", 2, "--port", ports[2])
-    assert same.code == 0, same.err
+    well(evlcp("board", "verify", "--random", 16, "--seed", 2, "--port", ports[2]))
 
     # repaired, the next run does only what is missing
     inventory(file, ports, {})
-    again = evlcp("board", "program", "--inventory", file, "--json")
-    assert again.code == 0, again.err
+    again = well(evlcp("board", "program", "--inventory", file, "--json"))
     rows = [json.loads(x) for x in again.out.splitlines()]
     assert sorted(r["id"] for r in rows if r["written_bytes"]) == ["T01", "T03"]
     assert [r["ok"] for r in rows] == [True] * 4
@@ -100,8 +98,7 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards: list[Nativ
     file.write_text(text)
 
     def rows(*arguments: object) -> list[dict[str, Any]]:
-        done = evlcp("board", *arguments, "--inventory", file, "--json")
-        assert done.code == 0, done.err
+        done = well(evlcp("board", *arguments, "--inventory", file, "--json"))
         return sorted(map(json.loads, done.out.splitlines()), key=lambda row: row["id"])
 
     assert all(row["ok"] and row["swapped"] for row in rows("program"))
@@ -133,7 +130,7 @@ def test_an_inventory_for_all_that_is_done_with_boards(evlcp, boards: list[Nativ
 def test_the_packets_of_an_inventory_are_those_of_tx_message(evlcp, tmp_path: Path) -> None:
     pytest.importorskip("cryptography", reason="the extra sign is not installed")
     (tmp_path / "site.toml").write_text(SITE)
-    assert evlcp("tx", "keygen", tmp_path / "private.pem").code == 0
+    well(evlcp("tx", "keygen", tmp_path / "private.pem"))
     options = ("--beacon", tmp_path / "site.toml", "--key", tmp_path / "private.pem", "--user", "north")
     done = evlcp("tx", "message", "--text", "hi", *options, "--sequence", 9, "--repeat", 2, "--json")
     (tmp_path / "symbols.json").write_text(done.out)
@@ -192,4 +189,4 @@ def test_another_board_on_the_port_is_refused(evlcp, tmp_path: Path) -> None:
     assert done.code == 8
     assert "the inventory expects" in done.out
     file.write_text(GOOD + f'unique_id = "{"0" * 24}"\n')
-    assert evlcp("board", "program", "--inventory", file).code == 0
+    well(evlcp("board", "program", "--inventory", file))

@@ -13,7 +13,7 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 import pytest
-from board_lines import FatalLine, board_link, board_on, check_fault, recording, some_bank
+from board_lines import FatalLine, board_link, board_on, check_fault, recording, some_bank, well
 from test_board_cli import EVLCP
 
 from evlcp_sdk.errors import OutputError
@@ -74,8 +74,7 @@ def test_program_keeps_alive_until_it_is_ended(evlcp, monkeypatch: pytest.Monkey
         does(board)
 
     monkeypatch.setattr(Board, "stay", stay)
-    done = evlcp("board", "program", "--random", 1, "--port", "native:", "--keep-alive")
-    assert done.code == 0
+    done = well(evlcp("board", "program", "--random", 1, "--port", "native:", "--keep-alive"))
     assert done.err == "evlcp: native:: state dark, faults none\n"
 
 
@@ -97,13 +96,13 @@ def test_ctrl_c_ends_the_stream_of_a_message(evlcp, native: str, tmp_path: Path)
 
 def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp, native: str) -> None:
     board = ("board", "--port", native)
-    assert evlcp(*board, "program", "--random", 1, "--no-start").code == 0
+    well(evlcp(*board, "program", "--random", 1, "--no-start"))
     done = evlcp(*board, "start", "--pulse-hz", 2)
     assert (done.code, done.err) == (0, "")
     armed = f"armed: waits for a pulse on PPS ({native} for its pulse 3)"
     assert done.out == f"{armed}; 'evlcp board status' shows whether it has come\n"
     assert json.loads(evlcp(*board, "status", "--json").out)["state"] == "waiting"
-    assert evlcp(*board, "stop").code == 0
+    well(evlcp(*board, "stop"))
 
     done = evlcp(*board, "start", "--pulse-hz", 2, "--timeout", 0.2)
     assert (done.code, done.out) == (6, f"{armed}, for at most 0.2 s\n")

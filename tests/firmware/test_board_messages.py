@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, SITE, board_link, check_fault, options_of
+from board_lines import LINK, SITE, board_link, check_fault, options_of, well
 from test_board_cli import EVLCP
 
 from evlcp_sdk.air.beacons import Beacon
@@ -74,8 +74,7 @@ def test_a_text_a_file_and_a_beacon(evlcp, site: Path, tmp_path: Path) -> None:
     data, out, chips = tmp_path / "data.bin", tmp_path / "m.json", tmp_path / "c.npy"
     data.write_bytes(bytes(range(100)))
     sent = ("--text", "Tempo 30 für 2 km", "--file", data, "--beacon", site, "--user", "lane 2")
-    done = evlcp("tx", "message", *sent, "--sequence", "5", "-o", out, "--chips", chips)
-    assert done.code == 0, done.err
+    done = well(evlcp("tx", "message", *sent, "--sequence", "5", "-o", out, "--chips", chips))
     assert done.out.splitlines() == [
         "beacon       34 bytes, transmitter 7, sequence 5",
         "text         18 bytes, transmitter 7, sequence 5",
@@ -102,10 +101,8 @@ def test_a_text_a_file_and_a_beacon(evlcp, site: Path, tmp_path: Path) -> None:
 def test_any_link(evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
     chips, link = tmp_path / "c.npy", board_link(*settings)
     message = ("tx", "message", *options_of(*settings), "--text")
-    played = evlcp(*message, "Hello", "--port", "native:")
-    assert played.code == 0, played.err
-    done = evlcp(*message, "Hello " * 40, "--chips", chips, "--repeat", 2, "--json")
-    assert done.code == 0, done.err
+    well(evlcp(*message, "Hello", "--port", "native:"))
+    done = well(evlcp(*message, "Hello " * 40, "--chips", chips, "--repeat", 2, "--json"))
     symbols = symbols_of(np.load(chips), link)
     assert (symbols[::2] == symbols[1::2]).all()
     found = messages_of(symbols, link)[Kind.TEXT]
@@ -120,9 +117,8 @@ def test_any_link(evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
 def test_a_signed_beacon(evlcp, site: Path, tmp_path: Path) -> None:
     pytest.importorskip("cryptography", reason="the extra sign is not installed")
     key, out = tmp_path / "private.pem", tmp_path / "m.json"
-    made = evlcp("tx", "keygen", key)
-    assert made.code == 0
-    assert evlcp("tx", "message", "--beacon", site, "--key", key, "-o", out).code == 0
+    made = well(evlcp("tx", "keygen", key))
+    well(evlcp("tx", "message", "--beacon", site, "--key", key, "-o", out))
     found = messages_of(np.array(json.loads(out.read_text())["symbols"]))
     keys = TrustedKeys([TrustedKey(made.out.strip())])
     assert keys.check(found[Kind.BEACON], LINK.block_coder().digest, found[Kind.SIGNATURE]) is True
@@ -161,20 +157,19 @@ def test_faults_are_one_line(
     monkeypatch.chdir(tmp_path)
     Path("two.toml").write_text(TILTED + TILTED.replace("= 7", "= 8"))
     check_fault(evlcp("tx", "message", *options), code, says)
-    assert evlcp("tx", "message", "--beacon", "two.toml", "--id", 8, "--json").code == 0
+    well(evlcp("tx", "message", "--beacon", "two.toml", "--id", 8, "--json"))
 
 
 def test_what_tx_wrote_tx_shows(evlcp, tmp_path: Path) -> None:
     out, chips, again = tmp_path / "m.json", tmp_path / "c.npy", tmp_path / "again.npy"
     (tmp_path / "link.toml").write_text('[pilots]\nid = "barker13"\n')
     options = ("--set", "pilots.id=barker13")
-    assert evlcp("tx", "message", "--text", "hi", "-o", out, "--chips", chips, *options).code == 0
+    well(evlcp("tx", "message", "--text", "hi", "-o", out, "--chips", chips, *options))
     for named in ((), options, ("-c", tmp_path / "link.toml"), (*options, "--set", "camera.focal_mm=50.0")):
-        done = evlcp("tx", "frames", out, "--chips", again, *named)
-        assert done.code == 0, done.err
+        well(evlcp("tx", "frames", out, "--chips", again, *named))
         assert (np.load(again) == np.load(chips)).all()
         again.unlink()
-        assert evlcp("tx", "check", out, *named).code == 0
+        well(evlcp("tx", "check", out, *named))
     # a word is the chips, most significant first: the first pilot stands behind the preamble
     word = evlcp("tx", "frames", out, "--format", "json").out
     bits = "".join(str(chip) for chip in np.load(chips)[26:52, 0])
@@ -192,7 +187,7 @@ def test_what_tx_wrote_tx_shows(evlcp, tmp_path: Path) -> None:
 )
 def test_another_link_is_refused_and_says_where(evlcp, tmp_path: Path, other: str, differ: str) -> None:
     out = tmp_path / "m.json"
-    assert evlcp("tx", "message", "--text", "hi", "-o", out, "--set", "pilots.id=barker13").code == 0
+    well(evlcp("tx", "message", "--text", "hi", "-o", out, "--set", "pilots.id=barker13"))
     done = evlcp("tx", "frames", out, "--set", "pilots.id=barker13", "--set", other)
     check_fault(done, 8, f"evlcp: {out}: made with another link: ", differ)
     assert done.out == ""
@@ -203,19 +198,18 @@ def test_without_an_output_nothing_is_sent(evlcp, monkeypatch: pytest.MonkeyPatc
     says = "evlcp: nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips\n"
     check_fault(done, 2, says)
     assert done.out.splitlines()[-1] == "1 packet, 0.0346 s"
-    assert evlcp("tx", "message", "--text", "hi", "--json").code == 0
+    well(evlcp("tx", "message", "--text", "hi", "--json"))
     monkeypatch.setenv("EVLCP_PORT", "native:")
     assert "bank 0 is active" in evlcp("tx", "message", "--text", "hi").out
     monkeypatch.setenv("EVLCP_PORT", "unix:/nowhere")
     assert evlcp("tx", "message", "--text", "hi").code == 4
     # who asks for a file gets that, not lamps that blink
-    assert evlcp("tx", "message", "--text", "hi", "-o", tmp_path / "m.json").code == 0
+    well(evlcp("tx", "message", "--text", "hi", "-o", tmp_path / "m.json"))
 
 
 def test_a_board_plays_it(evlcp, native: str, site: Path, tmp_path: Path) -> None:
     text = "Tempo 30 " * 20
-    done = evlcp("tx", "message", "--text", text, "--beacon", site, "--sequence", 3, "--port", native)
-    assert done.code == 0, done.err
+    done = well(evlcp("tx", "message", "--text", text, "--beacon", site, "--sequence", 3, "--port", native))
     *_, again, sent = done.out.splitlines()
     assert sent == "sent 1920 of 1920 bytes; bank 0 is active"
     assert again.endswith(", again and again")
@@ -224,7 +218,7 @@ def test_a_board_plays_it(evlcp, native: str, site: Path, tmp_path: Path) -> Non
     refused = evlcp("tx", "message", "--file", tmp_path / "big", "--port", native)
     check_fault(refused, 2, "packets of 320 bytes, a bank of")
     time.sleep(0.5)
-    assert evlcp("board", "stop", "--port", native).code == 0
+    well(evlcp("board", "stop", "--port", native))
     found = messages_of(packets_on(tmp_path / "leds.bin"))
     assert found[Kind.TEXT].text == text
     assert Beacon.unpack(found[Kind.BEACON].payload).height_m == 52.4

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import board_link, state_of, symbols_of
+from board_lines import board_link, state_of, symbols_of, well
 from numpy.typing import NDArray
 from test_board_cli import Emulated
 
@@ -305,12 +305,10 @@ def test_emulate_serves_the_model(evlcp, stm32, tmp_path: Path) -> None:
         assert emulated.said == f"listening on {listen}\n"
         random = ("--random", 1, "--seed", 4, "--set", "air.frames_per_packet=2")
         for command in (("program", *random), ("stop",)):
-            done = evlcp("board", *command, "--port", listen)
-            assert done.code == 0, done.err
+            well(evlcp("board", *command, "--port", listen))
     finally:
         assert emulated.end() == 0
-    done = evlcp("board", "leds", record, "--chips", out)
-    assert done.code == 0, done.err
+    well(evlcp("board", "leds", record, "--chips", out))
     chips, link = np.load(out), board_link("air.frames_per_packet=2")
     once = symbol_chips(symbols_of(1, 4, link), link.codebook)
     start = int(chips.any(1).argmax()) - int(once.any(1).argmax())

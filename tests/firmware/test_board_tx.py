@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, board_link, check_fault, options_of, symbols_of
+from board_lines import LINK, board_link, check_fault, options_of, symbols_of, well
 
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
@@ -29,7 +29,7 @@ TWO_FRAMES = ("--set", "air.frames_per_packet=2")
 
 def test_chips_are_the_air_vectors(evlcp, example: Path, tmp_path: Path) -> None:
     out = tmp_path / "chips.npy"
-    assert evlcp("tx", "frames", example, "--chips", out, *TWO_FRAMES).code == 0
+    well(evlcp("tx", "frames", example, "--chips", out, *TWO_FRAMES))
     chips = np.load(out)
     assert chips.dtype == np.uint8
     assert chips.shape == (90, 16)
@@ -134,8 +134,7 @@ def test_wrong_masks_are_told(tmp_path: Path) -> None:
 
 
 def test_codebook_packets_are_balanced_and_do_not_flicker(evlcp) -> None:
-    done = evlcp("tx", "check", "--random", 40, "--json")
-    assert done.code == 0
+    done = well(evlcp("tx", "check", "--random", 40, "--json"))
     rows = json.loads(done.out)["clusters"]
     assert len(rows) == 16
     assert all(r["on_share"] == 0.5 and r["longest_run"] == 2 and r["low_risk"] for r in rows)
@@ -174,7 +173,7 @@ def test_pilots_in_some_frames_only(evlcp, tmp_path: Path) -> None:
     sparse = options_of(*settings)
     options = ("tx", "frames", "--random", 2, "--seed", 3, *sparse)
     link = board_link(*settings)
-    assert evlcp(*options, "--chips", file).code == 0
+    well(evlcp(*options, "--chips", file))
     expected = np.concatenate([packet_chips(packet, link.codebook, 4) for packet in symbols_of(2, 3, link)])
     assert np.load(file).tolist() == expected.tolist()
     masks = read_masks(file, link)
@@ -185,4 +184,4 @@ def test_pilots_in_some_frames_only(evlcp, tmp_path: Path) -> None:
     assert [len(line.split()[0]) for line in words] == [8, 4, 4, 4, 8, 4] * 2
     assert json.loads(evlcp(*options, "--format", "json").out)["link"]["air"]["pilot_every"] == 4
     for profile in ("wh4x2", "wh8", "raw8"):
-        assert evlcp("tx", "check", "--random", 20, *sparse, "--set", f"modulation.id={profile}").code == 0
+        well(evlcp("tx", "check", "--random", 20, *sparse, "--set", f"modulation.id={profile}"))

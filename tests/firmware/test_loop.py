@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, board_link, check_fault, symbols_of
+from board_lines import LINK, board_link, check_fault, symbols_of, well
 
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import symbol_chips
@@ -17,8 +17,9 @@ from firmware_host.loop import light_of
 
 def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    done = evlcp("loop", "--text", "Grüße [b]", "--distance", "80", "--seed", "3", "--report", "-o", out)
-    assert done.code == 0, done.err
+    done = well(
+        evlcp("loop", "--text", "Grüße [b]", "--distance", "80", "--seed", "3", "--report", "-o", out)
+    )
     assert "warning" not in done.out
     assert "received/report.html" in done.out
     assert (out / "received" / "report.html").is_file()
@@ -43,8 +44,7 @@ def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path
     scored = json.loads(evlcp("score", out / "received", out / "loop.truth.json", "--json").out)
     (bar,) = scored["bars"]
     assert (bar["frames_found"], bar["bit_errors"]) == (found, 0)
-    again = evlcp("board", "--replay", out / "wire.jsonl", "program", out / "message.json")
-    assert again.code == 0, again.err
+    well(evlcp("board", "--replay", out / "wire.jsonl", "program", out / "message.json"))
     assert evlcp("config", "-c", out / "link.toml", "--digest").out == evlcp("config", "--digest").out
 
 
