@@ -19,6 +19,9 @@ LEVELS: Final = (
 )
 """What each level of shedding says."""
 
+RANGING_EVERY: Final = 4
+"""From the second level on, distances are measured of every so manyth frame."""
+
 _MARGIN_PX: Final = 16
 """Around a region, which moves, and may be less than its bar."""
 
@@ -35,7 +38,6 @@ class Budget:
         waiting_ms: Of the oldest slice that waits, from which on rows outside of regions are shed; from twice
             that on distances, from four times on all outside of regions.
         most_ms: The same from which on the oldest slices are dropped whole: no result is later by more.
-        ranging_every: Under pressure, distances are measured of every n-th frame.
 
     Raises:
         ConfigError: A value is not positive, or `most_ms` is less than four times `waiting_ms`.
@@ -43,13 +45,12 @@ class Budget:
 
     waiting_ms: float = 20.0
     most_ms: float = 200.0
-    ranging_every: int = 4
 
     def __post_init__(self) -> None:
-        if not self.waiting_ms > 0 or self.ranging_every < 1 or not self.most_ms >= 4 * self.waiting_ms:
+        if not self.waiting_ms > 0 or not self.most_ms >= 4 * self.waiting_ms:
             raise ConfigError(
-                f"a budget of {self.waiting_ms:g} ms, {self.most_ms:g} ms at the most, every"
-                f" {self.ranging_every} frames: expected all positive, the most at least four times the first"
+                f"a budget of {self.waiting_ms:g} ms, {self.most_ms:g} ms at the most: expected both"
+                " positive, the most at least four times the first"
             )
 
     def level(self, waiting_ms: float, before: int) -> int:

@@ -9,7 +9,7 @@ from evlcp_sdk.air.blocks import Kind
 from evlcp_sdk.errors import UnpluggedError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
-from evlcp_sdk.live.budget import LEVELS, Budget, Shedder
+from evlcp_sdk.live.budget import LEVELS, RANGING_EVERY, Budget, Shedder
 from evlcp_sdk.live.delays import DelayTally
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.reader import Reader, Slice
@@ -48,9 +48,7 @@ class LiveStatus:
         events: Events so far, those shed too.
         events_per_s: In the time since the last status.
         waiting_ms: How long the oldest slice waits, ms.
-        waiting_events: Events that wait.
         level: What is shed, a number of `LEVELS`.
-        level_text: The same in words.
         shed: Events left out so far, by reason, and frames without a distance.
         delays: Of all frames so far, by stage, and of messages `time` from end to end: count, p50, p99 and
             maximum, ms.
@@ -66,9 +64,7 @@ class LiveStatus:
     events: int
     events_per_s: float
     waiting_ms: float
-    waiting_events: int
     level: int
-    level_text: str
     shed: Mapping[str, int]
     delays: Mapping[str, Mapping[str, float | int | None]]
     recent: Mapping[str, Mapping[str, float | int | None]]
@@ -226,7 +222,7 @@ class LiveLoop:
                 break
         self._arrived_s, self._taken_s = pieces[-1].arrived_s, taken_s
         regions = self._receiver.regions
-        self._receiver.ranging_every = self._budget.ranging_every if self._level >= 2 else 1
+        self._receiver.ranging_every = RANGING_EVERY if self._level >= 2 else 1
         for one in pieces:
             self._publish_raw(one)
             self._publisher.pictures.add(one.events, *self._size, regions)
@@ -282,16 +278,13 @@ class LiveLoop:
         since_s = at_s - self._status_s
         if (since_s < _STATUS_EVERY_S and not now) or not self._publisher.wanted("status"):
             return
-        waiting, oldest_s = self._reader.waiting
         status = LiveStatus(
             t_us=self._last_us,
             elapsed_s=at_s - self._start_s,
             events=self._events,
             events_per_s=(self._events - self._status_events) / since_s if since_s > 0 else 0.0,
-            waiting_ms=max(at_s - oldest_s, 0.0) * 1e3,
-            waiting_events=waiting,
+            waiting_ms=max(at_s - self._reader.oldest_s, 0.0) * 1e3,
             level=self._level,
-            level_text=LEVELS[self._level],
             shed=self.shed,
             delays={stage: tally.to_dict() for stage, tally in self.delays.items()},
             recent={stage: tally.to_dict() for stage, tally in self._recent.items()},

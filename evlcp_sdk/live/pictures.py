@@ -10,18 +10,20 @@ import numpy as np
 from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.values import Events, Region
 
+WINDOW_US = 10_000
+"""How much time a picture shows."""
+
 _FORGET_EVERY = 16
 """Slices after which what is too old for a picture is forgotten: to look with each takes longer."""
 
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """The events of a short time, and the regions in it.
+    """The events of `WINDOW_US`, and the regions in it.
 
     Attributes:
         t_us: Its end on the camera's clock, us.
-        window_us: How much time it shows, us.
-        pieces: These events; older ones may stand before them in the first piece.
+        pieces: Its events; older ones may stand before them in the first piece.
         width: Of the sensor, px.
         height: The same.
         regions: The regions that are followed.
@@ -29,7 +31,6 @@ class Picture:
     """
 
     t_us: int
-    window_us: int
     pieces: tuple[Events, ...]
     width: int
     height: int
@@ -41,21 +42,16 @@ class Picture:
         image = EventImage(self.width, self.height)
         # Pieces follow one another, and each reaches into the window.
         oldest = self.pieces[0]
-        first = int(np.searchsorted(oldest.t_us, self.t_us - self.window_us, "right"))
+        first = int(np.searchsorted(oldest.t_us, self.t_us - WINDOW_US, "right"))
         for piece in (oldest[first:], *self.pieces[1:]):
             image.paint(piece)
         return image
 
 
 class PictureSlot:
-    """Holds the newest picture, drawn only when it was asked for.
+    """Holds the newest picture, drawn only when it was asked for."""
 
-    Args:
-        window_us: How much time a picture shows, us.
-    """
-
-    def __init__(self, window_us: int = 10_000) -> None:
-        self.window_us = window_us
+    def __init__(self) -> None:
         self._recent: deque[Events] = deque()
         self._kept = 0
         self._asked = False
@@ -91,13 +87,13 @@ class PictureSlot:
             return
         self._kept = 0
         end_us = int(events.t_us[-1])
-        while int(self._recent[0].t_us[-1]) <= end_us - self.window_us:
+        while int(self._recent[0].t_us[-1]) <= end_us - WINDOW_US:
             self._recent.popleft()
         if not self._asked:
             return
         self._asked = False
         pieces = tuple(self._recent)
-        picture = Picture(end_us, self.window_us, pieces, width, height, tuple(regions), self._number)
+        picture = Picture(end_us, pieces, width, height, tuple(regions), self._number)
         self._number += 1
         with self._drawn:
             self._picture = picture

@@ -72,16 +72,14 @@ class Reader:
 
     Args:
         source: What is read; not closed.
-        most_events: Events that wait at the most.
 
     Attributes:
         dropped: Events that were dropped so, so far.
         fault: What ended the reading, where that was a fault.
     """
 
-    def __init__(self, source: EventSource, most_events: int = _MOST_EVENTS) -> None:
+    def __init__(self, source: EventSource) -> None:
         self._source = source
-        self._most = most_events
         self._waiting: deque[Slice] = deque()
         self._events = 0
         self._changed = threading.Condition()
@@ -101,10 +99,10 @@ class Reader:
         return self._over and not self._waiting
 
     @property
-    def waiting(self) -> tuple[int, float]:
-        """How many events wait, and since when the oldest does, s; now where nothing waits."""
+    def oldest_s(self) -> float:
+        """Since when the oldest slice waits, s; now where nothing does."""
         with self._changed:
-            return self._events, self._waiting[0].arrived_s if self._waiting else time.monotonic()
+            return self._waiting[0].arrived_s if self._waiting else time.monotonic()
 
     def take(self, timeout_s: float) -> Slice | None:
         """The next slice; None after the time-out, or at the end."""
@@ -146,10 +144,10 @@ class Reader:
             self.arrivals.arrived(float(piece.events.t_us[-1]), piece.arrived_s)
         with self._changed:
             if not self._source.live:
-                self._changed.wait_for(lambda: self._events < self._most or self._left)
+                self._changed.wait_for(lambda: self._events < _MOST_EVENTS or self._left)
             self._waiting.append(piece)
             self._events += len(piece.events)
-            while self._source.live and self._events > self._most and len(self._waiting) > 1:
+            while self._source.live and self._events > _MOST_EVENTS and len(self._waiting) > 1:
                 old = self._waiting.popleft()
                 self._events -= len(old.events)
                 self.dropped += len(old.events)

@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from evlcp_sdk.errors import PluginError
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.live.pictures import Picture
+from evlcp_sdk.live.pictures import WINDOW_US, Picture
 from evlcp_sdk.live.publisher import News
 from evlcp_sdk.results.columns import frame_columns
 from evlcp_sdk.results.lines import fix_line, format_frame
@@ -141,7 +141,7 @@ def _told(picture: Picture, bars: Sequence[Frame]) -> str:
         for one in picture.regions
     )
     return (
-        f'"picture": {{"number": {picture.number}, "t_us": {picture.t_us}, "window_us": {picture.window_us},'
+        f'"picture": {{"number": {picture.number}, "t_us": {picture.t_us}, "window_us": {WINDOW_US},'
         f' "regions": [{regions}]}}, "bars": [{", ".join(map(_bar, bars))}]'
     )
 

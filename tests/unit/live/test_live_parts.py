@@ -58,14 +58,13 @@ def test_quantiles_are_those_of_numpy_to_two_percent() -> None:
 
 
 def test_a_picture_shows_what_each_pixel_did() -> None:
-    slot = PictureSlot(window_us=1000)
+    slot = PictureSlot()
     slot.ask()
-    events = events_at(np.sort(np.random.default_rng(2).integers(0, 5000, 4000)))
-    asked_at = {3000, 5000}
+    events = events_at(np.sort(np.random.default_rng(2).integers(0, 50_000, 4000)))
     drawn = []
-    for from_us in range(0, 5000, 500):
-        piece = events[(events.t_us >= from_us) & (events.t_us < from_us + 500)]
-        if from_us + 500 in asked_at:
+    for from_us in range(0, 50_000, 5000):
+        piece = events[(events.t_us >= from_us) & (events.t_us < from_us + 5000)]
+        if from_us in (25_000, 45_000):
             slot.ask()
         before = slot.newest
         slot.add(piece, 1280, 720, [])
@@ -75,7 +74,7 @@ def test_a_picture_shows_what_each_pixel_did() -> None:
     for picture in drawn:
         assert picture is not None
         cells = np.zeros((720, 1280), np.uint8)
-        inside = (events.t_us > picture.t_us - 1000) & (events.t_us <= picture.t_us)
+        inside = (events.t_us > picture.t_us - 10_000) & (events.t_us <= picture.t_us)
         for polarity in (0, 1):
             some = events[inside & (events.p == polarity)]
             cells[some.y, some.x] |= 1 << polarity
@@ -169,16 +168,18 @@ def read_all(reader: Reader, source: Counted) -> list[int]:
     return got
 
 
-def test_a_file_waits_for_its_reader_and_a_camera_does_not() -> None:
+def test_a_file_waits_for_its_reader_and_a_camera_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("evlcp_sdk.live.reader._MOST_EVENTS", 50)
     source = Counted(live=False)
-    reader = Reader(source, most_events=50)
+    reader = Reader(source)
     assert read_all(reader, source) == list(range(1000))
     assert (reader.dropped, reader.fault) == (0, None)
     source = Counted(live=True)
-    reader = Reader(source, most_events=50)
+    reader = Reader(source)
     got = read_all(reader, source)
     assert got == list(range(1000 - len(got), 1000))
     assert reader.dropped == 10 * (1000 - len(got)) > 0
+    monkeypatch.undo()
     fault = InputError("unplugged")
     source = Counted(live=True, fault=fault)
     reader = Reader(source)
