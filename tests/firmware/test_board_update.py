@@ -75,6 +75,8 @@ def test_what_is_not_kept_is_left_at_the_third_reset(device: SimulatedBoard, boa
     assert update_status(board).trial == 1
     with pytest.raises(RefusedError, match="image 1 runs on trial; keep it first"):
         update(board, package(3))
+    with pytest.raises(RefusedError, match="BUSY"):
+        board.session.call(protocol.UpdateBeginRequest(update_status(board).next, 4, 0))
     assert resets(device, 4) == [1, 1, 2, 2]
     # and the place that it leaves takes the next one, which is confirmed by itself
     board = board_on(device)
