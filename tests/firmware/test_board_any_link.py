@@ -381,22 +381,16 @@ TURNED = [*LAMP, "framing.parity=odd", "framing.idle=off", "framing.first_bit=hi
 PULSES = ["modulation.id=ppm", "bar.rows=48"]
 
 
-def serial_chips(text: bytes) -> list[int]:
-    """7E2 as a serial port sends it behind a pause of 16 bits: marks are ones."""
-    bits = [1] * 16
-    for byte in text:
-        data = [byte >> k & 1 for k in range(7)]
-        bits += [0, *data, sum(data) % 2, 1, 1]
-    return bits
+def serial_chips(text: bytes, bits: int, odd: int, stops: int, turned: bool = False) -> list[int]:
+    """Characters as a serial port sends them behind a pause of 16 bits: marks are ones.
 
-
-def turned_chips(text: bytes) -> list[int]:
-    """8O1, highest bit first, by an LED that is dark in pauses: a start bit lights it."""
-    bits = [1] * 16
+    Turned, the highest bit goes first, by an LED that is dark in pauses: a start bit lights it.
+    """
+    chips = [1] * 16
     for byte in text:
-        data = [byte >> k & 1 for k in reversed(range(8))]
-        bits += [0, *data, 1 - sum(data) % 2, 1]
-    return [1 - bit for bit in bits]
+        data = [byte >> k & 1 for k in range(bits)]
+        chips += [0, *data[:: -1 if turned else 1], (sum(data) + odd) % 2, *[1] * stops]
+    return [chip ^ turned for chip in chips]
 
 
 def pulse_chips(symbols: NDArray[np.int64], link: Link) -> NDArray[np.uint8]:
@@ -418,9 +412,14 @@ def packet_of(kind: str) -> tuple[Link, NDArray[np.int64], NDArray[np.uint8]]:
         symbols = symbols_of(1, 2, link)[0]
         return link, symbols, np.repeat(pulse_chips(symbols, link), 6, axis=1)
     text = b"Tempo 30!"
-    overrides, chips = {"7E2": (SERIAL, serial_chips), "8O1, turned": (TURNED, turned_chips)}[kind]
+    ports = {"7E2": (SERIAL, (7, 0, 2)), "8O1, turned": (TURNED, (8, 1, 1, True))}
+    overrides, port = ports[kind]
     link = board_link(*overrides, f"air.frames_per_packet={len(text)}")
-    return link, np.array(list(text))[:, None], np.array([[chip] * 6 for chip in chips(text)], np.uint8)
+    return (
+        link,
+        np.array(list(text))[:, None],
+        np.array([[chip] * 6 for chip in serial_chips(text, *port)], np.uint8),
+    )
 
 
 KINDS = ["7E2", "8O1, turned", "4-PPM"]

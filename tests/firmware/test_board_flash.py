@@ -82,13 +82,8 @@ class BadLine(RomLine):
         self._rng, self._one_in = np.random.default_rng(seed), one_in
 
     def to_part(self, data: bytes) -> bytes:
-        out = bytearray()
-        for byte in data:
-            dice = self._rng.integers(0, 2 * self._one_in)
-            if dice == 0:
-                continue
-            out.append(byte ^ 0x10 if dice == 1 else byte)
-        return bytes(out)
+        dice = self._rng.integers(0, 2 * self._one_in, len(data))
+        return bytes(byte ^ (0x10 if n == 1 else 0) for byte, n in zip(data, dice, strict=True) if n)
 
     to_host = to_part
 

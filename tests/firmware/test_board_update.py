@@ -22,10 +22,11 @@ from evlcp_sdk.errors import InputError
 from firmware_host.board.bank import bank_of, symbol_chips
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.update import Package, confirm, update, update_status
-from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
+from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.errors import BoardError, IncompatibleError, LineError, RefusedError, VerifyError
 from firmware_host.protocol.generated import requests as protocol
 from firmware_host.protocol.generated.requests import BoardFault, State, Status
+from tests.models.usb import UsbLine
 
 
 def package(seed: int, count: int = 400) -> Package:
@@ -170,33 +171,18 @@ def test_what_is_interrupted_keeps_the_old_one_and_ends_well_later(device: Simul
     assert image_of(device, 2, 20_000) == new.images[2]
 
 
-class SlowLine(SimulatedLine):
+class SlowLine(UsbLine):
     """A line and a board that take two hundred times as long as they should."""
-
-    def __init__(self, board: SimulatedBoard) -> None:
-        super().__init__(board)
-        self.under_way: list[tuple[int, bytes]] = []
 
     def now(self) -> float:
         return 200 * super().now()
 
-    def write(self, data: bytes) -> None:
-        begins = max([self.board.now_us, *(at for at, _ in self.under_way)])
-        self.under_way.append((begins + 10 * len(data), data))
-
     def read(self, timeout_s: float) -> bytes:
-        end = self.board.now_us + max(self.step_us, int(timeout_s / 200 * 1e6))
-        while self.board.now_us < end:
-            while self.under_way and self.under_way[0][0] <= self.board.now_us:
-                self.board.receive(self.under_way.pop(0)[1])
-            self.board.run(self.step_us)
-            if data := self.board.sent():
-                return data
-        return b""
+        return super().read(timeout_s / 200)
 
 
 def test_a_slow_board_is_waited_for(device: SimulatedBoard) -> None:
-    board = board_on(SlowLine(device), latency_s=0.1)
+    board = board_on(SlowLine(device, 0.0), latency_s=0.1)
     done = update(board, package(3, 30_000))
     assert (done.image, device.bench.running) == (1, 1)
     # the first ones go out again; then it is known how long an answer takes
