@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from evlcp_sdk.cli._common import console, print_json
 from evlcp_sdk.cli._complain import complain
+from evlcp_sdk.cli._tables import print_table
 from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
@@ -77,25 +78,24 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
 
 def _show_transmitters(summary: Mapping[str, Any], out: "Console") -> None:
     """Print a row for each transmitter, and the texts that they say."""
-    from rich.table import Table
     from rich.text import Text
 
     if summary["transmitters"]:
-        table = Table(box=None, pad_edge=False, header_style="dim")
         several = ("link",) if "links" in summary else ()
-        for name in ("transmitter", *several, "frames", "not seen", "quality", "clock", "distance"):
-            table.add_column(name, justify="right")
-        for t in summary["transmitters"]:
-            table.add_row(
+        head = ("transmitter", *several, "frames", "not seen", "quality", "clock", "distance")
+        rows = [
+            (
                 _who(t),
-                *([t["link"]] if several else []),
+                *(t[name] for name in several),
                 f"{t['frames_found']} of {t['frames_expected']}",
                 _erased(t),
                 _or_dash(t["quality"], "{:.2f}"),
                 _or_dash(t["clock_ppm"], "{:+.0f} ppm"),
                 _distances(t["distance_first_m"], t["distance_last_m"]),
             )
-        out.print(table)
+            for t in summary["transmitters"]
+        ]
+        print_table(out, head, rows, names=0)
     for t in summary["transmitters"]:
         if said := t.get("text"):
             more = "..." if len(said) > _MOST_SAID else ""
@@ -166,7 +166,7 @@ def _erased(told: Mapping[str, Any]) -> str:
 
 def _positions(told: Mapping[str, Any]) -> str:
     """How many positions there are, and why not more, in one line."""
-    text = f"{told['fixes']} position{'s' * (told['fixes'] != 1)}"
+    text = counted(told["fixes"], "position")
     if told["fixes_verified"]:
         text += f", {told['fixes_verified']} verified"
     if told["gnss"]:
@@ -194,7 +194,7 @@ def _messages(counts: Mapping[str, int]) -> str:
     if not counts.get("blocks_decoded", 0) + counts.get("blocks_combined", 0):
         return ""
     number = counts["messages"]
-    text = f"{number} message{'s' * (number != 1)}"
+    text = counted(number, "message")
     trusts = {t: counts[f"beacons_{t}"] for t in ("verified", "unverified", "forged")}
     if any(trusts.values()):
         text += f"; beacons {', '.join(_times(n, t) for t, n in trusts.items() if n)}"
@@ -209,7 +209,7 @@ def _messages(counts: Mapping[str, int]) -> str:
         ("messages_undecodable", "message", "without meaning"),
     ):
         if counts[key]:
-            text += f"; {counts[key]} {what}{'s' * (counts[key] != 1)} {lost}"
+            text += f"; {counted(counts[key], what)} {lost}"
     return text
 
 

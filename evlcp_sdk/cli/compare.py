@@ -164,12 +164,14 @@ def _write(comparison: Comparison, paths: Sequence[Path]) -> None:
 
 
 def _show(comparison: Comparison, paths: Sequence[Path]) -> None:
+    from evlcp_sdk.study.comparison import MARK
+
     out = console()
     for one in comparison.tables:
         out.print(one.name, style="bold")
         head, lines = one.cells()
         # The best have a mark behind them.
-        print_table(out, head, [[(t if best else f"{t} ", best) for t, best in line] for line in lines])
+        print_table(out, head, [[t if best else f"{t} " for t, best in line] for line in lines], best=MARK)
         out.print()
     for note in comparison.notes:
         out.print(note, style="yellow")

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from evlcp_sdk.cli._common import Json, Workers, console, print_json
+from evlcp_sdk.cli._tables import print_table
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -105,8 +106,6 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
 
 def show_drive(summary: Summary) -> None:
     """Print wrong bits, BER with 95 % confidence, and RMSE of each segment of distance beside the paper's."""
-    from rich.table import Table
-
     from evlcp_sdk.study.intervals import measure
     from evlcp_sdk.study.summary import beside_paper
     from evlcp_sdk.study.tally import SEGMENT_M, Tally
@@ -117,23 +116,23 @@ def show_drive(summary: Summary) -> None:
         for c in beside_paper([series])
         for begin in range(c.reference.from_m, c.reference.to_m, SEGMENT_M)
     }
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    heads = ("distance", "frames", "wrong bits", "BER, 95 %", "paper", "RMSE, m", "paper")
-    for number, name in enumerate(heads):
-        table.add_column(name, justify="right" if number else "left", no_wrap=True)
+    rows = []
     for begin, recordings in reversed(series.segments):
         tally = Tally.together(recordings)
         ber, rmse = measure(recordings, "ber"), measure(recordings, "rmse_m")
-        table.add_row(
-            f"{begin} to {begin + SEGMENT_M} m",
-            f"{tally.frames_found} of {tally.frames_sent}",
-            f"{tally.bit_errors} of {tally.bits}",
-            f"≤ {ber.high:.2g}" if ber.count else "-",
-            paper.get(("ber", begin), "-"),
-            f"{rmse.value:.3f}" if rmse.count else "-",
-            paper.get(("rmse_m", begin), "-"),
+        rows.append(
+            (
+                f"{begin} to {begin + SEGMENT_M} m",
+                f"{tally.frames_found} of {tally.frames_sent}",
+                f"{tally.bit_errors} of {tally.bits}",
+                f"≤ {ber.high:.2g}" if ber.count else "-",
+                paper.get(("ber", begin), "-"),
+                f"{rmse.value:.3f}" if rmse.count else "-",
+                paper.get(("rmse_m", begin), "-"),
+            )
         )
-    console().print(table)
+    head = ("distance", "frames", "wrong bits", "BER, 95 %", "paper", "RMSE, m", "paper")
+    print_table(console(), head, rows)
 
 
 def _decode_recording(out: Path, as_json: bool) -> None:
@@ -170,27 +169,20 @@ def _show_score(found: Mapping[str, Any]) -> None:
 def _show_frames(file: Path) -> None:
     import csv
 
-    from rich.table import Table
-
-    table = Table(box=None, pad_edge=False, header_style="dim")
-    columns: tuple[tuple[str, Literal["left", "right"]], ...] = (
-        ("frame", "right"),
-        ("ms", "right"),
-        ("symbols of clusters 0 to 15", "left"),
-        ("distance, m", "right"),
-    )
-    for name, side in columns:
-        table.add_column(name, justify=side, no_wrap=True)
+    rows = []
     with file.open(newline="") as opened:
         for row in csv.DictReader(opened):
             if row["echo_of"]:
                 continue
             distance_m, sigma_m = row["distance_m"], row["distance_sigma_m"]
             sigma = f"{float(sigma_m):.2f}" if sigma_m else "?"
-            table.add_row(
-                f"{row['packet']}/{row['frame']}",
-                f"{float(row['t_us']) / 1e3:.1f}",
-                " ".join(f"{symbol:>2}" for symbol in row["symbols"].split()),
-                f"{float(distance_m):.2f} ± {sigma}" if distance_m else "-",
+            rows.append(
+                (
+                    f"{row['packet']}/{row['frame']}",
+                    f"{float(row['t_us']) / 1e3:.1f}",
+                    " ".join(f"{symbol:>2}" for symbol in row["symbols"].split()),
+                    f"{float(distance_m):.2f} ± {sigma}" if distance_m else "-",
+                )
             )
-    console().print(table)
+    head = ("frame", "ms", "symbols of clusters 0 to 15", "distance, m")
+    print_table(console(), head, rows, names=0)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, bytes_bar, console, print_json
+from evlcp_sdk.cli._tables import print_table
 
 if TYPE_CHECKING:
     from evlcp_sdk.diagnosis.diagnose import Diagnosis
@@ -75,12 +76,8 @@ def _show(found: Diagnosis) -> None:
         stages.add_row(one.stage, Text(word, style), one.statement)
     out.print(stages)
     if found.sources:
-        sources = Table(box=None, pad_edge=False, header_style="dim")
-        for name in found.sources[0].cells():
-            sources.add_column(name, justify="right")
-        for light in found.sources[:8]:
-            sources.add_row(*light.cells().values())
-        out.print(sources)
+        cells = [light.cells() for light in found.sources[:8]]
+        print_table(out, list(cells[0]), [list(one.values()) for one in cells], names=0)
         if len(found.sources) > 8:
             out.print(f"and {len(found.sources) - 8} more", style="dim")
     for one in found.checks:

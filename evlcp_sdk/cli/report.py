@@ -75,7 +75,7 @@ def show_tables(summary: Summary) -> None:
     for number, (head, rows, names) in enumerate(_tables(summary)):
         if number:
             console().print()
-        print_table(console(), head, [[(text, False) for text in row] for row in rows], names)
+        print_table(console(), head, rows, names)
 
 
 def as_markdown(summary: Summary) -> str:
