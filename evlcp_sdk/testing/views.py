@@ -124,23 +124,11 @@ def ideal_view(
     symbols: ArrayLike,
     *,
     cluster_px: int = 8,
-    width_px: int = 6,
     offset_px: tuple[int, int] = (0, 0),
     missing: float = 0.0,
-    seed: int = 0,
 ) -> FrameView:
     """All that ranging may use of one ideal frame; arguments as for `ideal_sums` and `ideal_presence`."""
-    sums = ideal_sums(
-        codebook,
-        symbols,
-        cluster_px=cluster_px,
-        width_px=width_px,
-        offset_px=offset_px,
-        missing=missing,
-        seed=seed,
-    )
-    presence = ideal_presence(
-        codebook.clusters, cluster_px=cluster_px, width_px=width_px, offset_px=offset_px
-    )
+    sums = ideal_sums(codebook, symbols, cluster_px=cluster_px, offset_px=offset_px, missing=missing)
+    presence = ideal_presence(codebook.clusters, cluster_px=cluster_px, offset_px=offset_px)
     still = np.zeros((2, len(sums)))
     return FrameView(sums, still, presence, ideal_soft(codebook, symbols))

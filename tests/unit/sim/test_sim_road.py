@@ -233,7 +233,7 @@ def panned(tmp_path: Path, **background: Any) -> Scene:
     motion = MotionSpec(vib_rate_rad_s=0.0, path_file=str(tmp_path / "path.csv"))
     return Scene(
         duration_s=0.06,
-        camera=CameraModel(width=320, height=200),
+        camera=CameraModel(width=160, height=100),
         sensor=replace(EXACT, refr_us=1.0),
         motion=motion,
         background=BackgroundSpec(light_w_m2=5.0, **background),
@@ -242,15 +242,15 @@ def panned(tmp_path: Path, **background: Any) -> Scene:
 
 
 def test_texture_that_moves_gives_the_events_of_its_own_contrast(tmp_path: Path) -> None:
-    scene = panned(tmp_path, texture=0.8, texture_px=8.0, texture_step_px=0.1, around_px=320)
+    scene = panned(tmp_path, texture=0.8, texture_px=8.0, texture_step_px=0.1, around_px=160)
     simulation = Simulation(scene)
     events = Events.concat(list(simulation.stream()))
-    net, count = np.zeros((2, 200, 320))
+    net, count = np.zeros((2, 100, 160))
     np.add.at(net, (events.y, events.x), np.where(events.p == 1, 1, -1))
     np.add.at(count, (events.y, events.x), 1)
     turned = math.radians(0.3) * FOCAL_PX
     field = simulation._texture
-    spots = [(int(x), int(y)) for x, y in np.random.default_rng(1).integers(0, (320, 200), (300, 2))]
+    spots = [(int(x), int(y)) for x, y in np.random.default_rng(1).integers(0, (160, 100), (300, 2))]
     for x, y in spots:
         across = x + np.linspace(0, turned, 400)
         path = np.log(map_coordinates(field, [np.full(400, y), across], order=1, mode="grid-wrap"))
@@ -283,19 +283,19 @@ def test_background_is_simulated_around_the_sources() -> None:
 def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
     scene = resolve_scene(
         {
-            "duration_s": 0.02,
-            "motion": {"pothole_s": [0.006]},
-            "wiper": {"share": 0.9, "at_s": 0.003, "lasts_s": 0.012},
+            "duration_s": 0.012,
+            "motion": {"pothole_s": [0.003]},
+            "wiper": {"share": 0.9, "at_s": 0.002, "lasts_s": 0.01},
             "lens": {"bloom": 0.1, "bloom_px": 5.0},
             "background": {"around_px": 20, "light_w_m2": 0.5},
-            "bars": [{"cover_s": [[0.002, 0.011, 0, 4]]}],
+            "bars": [{"cover_s": [[0.002, 0.006, 0, 4]]}],
             "reflections": [{}, {"kind": "rail"}, {"kind": "window", "shift_px": [5, 5]}],
         }
     )
     events = every(scene)
     assert rows(events) == rows(every(scene, threads=3))
-    long = every(replace(scene, duration_s=0.024))
-    until = 15_900
+    long = every(replace(scene, duration_s=0.014))
+    until = 7_900
     assert rows(events[events.t_us < until]) == rows(long[long.t_us < until])
     table = json.loads(json.dumps(truth_of(scene).to_table()))
     assert resolve_scene(table["simulator"]) == scene
