@@ -130,17 +130,20 @@ class LedRing:
         return np.round(place, 9), number // self.cluster_leds
 
 
+_Metres = Annotated[float, Field(ge=-_MOST_M, le=_MOST_M)]
+_Cluster = Annotated[int, Field(ge=0, lt=_MOST_LEDS)]
+
+
 @dataclass(frozen=True)
 class LedTable:
     """Any LEDs: one row each, in any order; clusters of any size, counted from 0.
 
     Raises:
-        ConfigError: There are none or more than 65536, a number lies beyond 100 m, a cluster has no LED, or
-            one is behind another.
+        ConfigError: There are none or more than 65536, a cluster has no LED, or one is behind another.
     """
 
     leds: Annotated[
-        tuple[tuple[float, float, float, int], ...],
+        tuple[tuple[_Metres, _Metres, _Metres, _Cluster], ...],
         Field(
             description="LEDs [x, y, z, cluster]: to the right, down, and towards who looks at them, m,"
             " from the transmitter's centre."
@@ -150,12 +153,6 @@ class LedTable:
 
     def __post_init__(self) -> None:
         _expect_number(len(self.leds), f"bar.leds: {len(self.leds)} LEDs")
-        for i, (*place, cluster) in enumerate(self.leds):
-            for axis, value in zip("xyz", place, strict=True):
-                if not abs(value) <= _MOST_M:
-                    raise ConfigError(f"bar.leds.{i}: {axis} = {value:g}: expected -100 to 100 m")
-            if not 0 <= cluster < _MOST_LEDS:
-                raise ConfigError(f"bar.leds.{i}: cluster = {cluster}: expected 0 to {_MOST_LEDS - 1}")
         here: dict[tuple[int, ...], int] = {}
         for i, led in enumerate(self.leds):
             first = here.setdefault(tuple(round(value * 1e6) for value in led[:3]), i)

@@ -188,15 +188,9 @@ class LocalAxes:
 
     def _in_ecef(self) -> NDArray[np.float64]:
         """East, north and up along the earth's axes (ECEF), as rows."""
-        sin_lat, sin_lon = np.sin(np.radians([self.latitude_deg, self.longitude_deg]))
-        cos_lat, cos_lon = np.cos(np.radians([self.latitude_deg, self.longitude_deg]))
-        return np.array(
-            [
-                [-sin_lon, cos_lon, 0.0],
-                [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat],
-                [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat],
-            ]
-        )
+        import pymap3d
+
+        return np.stack(pymap3d.enu2uvw(*np.eye(3), self.latitude_deg, self.longitude_deg), -1)
 
     def to_enu(
         self, latitude_deg: ArrayLike, longitude_deg: ArrayLike, height_m: ArrayLike

@@ -184,8 +184,14 @@ def test_a_fault_of_a_csv_file_is_one_line(text: str, said: str, tmp_path: Path)
             {"shape": "table", "leds": [[0, 0, 0, 0], [0.1, 0, 0, 1], [0, 0, 0.3, 2]]},
             "bar.leds: cluster 2 is behind cluster 0, LED by LED: expected clusters that a camera in front",
         ),
-        ({"shape": "table", "leds": [[0, 0, 200, 0]]}, "bar.leds.0: z = 200: expected -100 to 100 m"),
-        ({"shape": "table", "leds": [[0, 0, 0, -1]]}, "bar.leds.0: cluster = -1: expected 0 to 65535"),
+        (
+            {"shape": "table", "leds": [[0, 0, 200, 0]]},
+            "bar.leds.0.2 = 200: expected less than or equal to 100",
+        ),
+        (
+            {"shape": "table", "leds": [[0, 0, 0, -1]]},
+            "bar.leds.0.3 = -1: expected greater than or equal to 0",
+        ),
         (
             {"shape": "table", "leds": [[0, 0, 0, 0], [1e-8, 0, 0, 1]]},
             "bar.leds.1: stands where bar.leds.0 does, to the micrometre",
