@@ -178,6 +178,9 @@ def test_rows_are_read_one_after_another() -> None:
     assert events.t_us.tolist() == (11 + y).tolist()
     assert events.y.tolist() == y.tolist()
     assert events.x.tolist() == np.tile(np.arange(5), 100).tolist()
+    # A row that has been served waits no longer: the third in turn is passed over, not served again.
+    events, *_ = served(words_of(np.array([0.0, 5.0, 5.0, 6.5]), [3, 4, 2, 4], [0] * 4), 720, 1.0)
+    assert (events.t_us.tolist(), events.y.tolist()) == ([1, 6, 7, 8], [3, 4, 2, 4])
     # Columns of the widest sensor are told apart.
     words = words_of(np.full(4, 10.0), [719, 718, 718, 719], [8191, 0, 4096, 1])
     events, *_ = served(words, 720, 1.0)
