@@ -4,6 +4,8 @@ The part runs it when BOOT0 is high at reset. Bytes have even parity, the rate i
 """
 
 from collections.abc import Callable, Sequence
+from functools import reduce
+from operator import xor
 
 from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
 from firmware_host.images import FLASH_START, FlashImage
@@ -95,13 +97,19 @@ class RomLoader:
         self._drop()
         return answered
 
-    def _command(self, code: int, work: Callable[[], bytes], what: str) -> bytes:
+    def _command(
+        self, code: int, what: str, *parts: bytes, count: int = 0, timeout_s: float = _ANSWER_S
+    ) -> bytes:
+        """Send a command and its parts, each once the one before is acknowledged; bytes of the answer."""
         silent = False
         for _ in range(_TRIES):
             try:
                 self.line.write(bytes([code, code ^ 0xFF]))
                 self._acknowledged()
-                return work()
+                for part in parts:
+                    self.line.write(part)
+                    self._acknowledged(timeout_s)
+                return self._bytes(count)
             except _SilenceError:
                 silent = True
             except _RefusalError:
@@ -115,75 +123,38 @@ class RomLoader:
             _NACK,
         )
 
-    def _address(self, address: int) -> None:
-        place = address.to_bytes(4, "big")
-        self.line.write(place + bytes([_xor(place)]))
-        self._acknowledged()
-
     # -- commands
 
     def product(self) -> int:
         """Number of the part."""
-
-        def work() -> bytes:
-            count = self._bytes(1)[0] + 1
-            found = self._bytes(count)
-            self._acknowledged()
-            return found
-
-        return int.from_bytes(self._command(_GET_ID, work, "GET ID"), "big")
+        # one less than its bytes, these, and an acknowledgement
+        return int.from_bytes(self._command(_GET_ID, "GET ID", count=4)[1:3], "big")
 
     def read(self, address: int, count: int) -> bytes:
         """Up to 256 bytes."""
-
-        def work() -> bytes:
-            self._address(address)
-            self.line.write(bytes([count - 1, (count - 1) ^ 0xFF]))
-            self._acknowledged()
-            return self._bytes(count)
-
-        return self._command(_READ, work, f"READ at {address:#x}")
+        wanted = bytes([count - 1, (count - 1) ^ 0xFF])
+        return self._command(_READ, f"READ at {address:#x}", _place(address), wanted, count=count)
 
     def write(self, address: int, data: bytes) -> None:
         """Up to 256 bytes, a multiple of four, into erased flash."""
-        body = bytes([len(data) - 1]) + data
-
-        def work() -> bytes:
-            self._address(address)
-            self.line.write(body + bytes([_xor(body)]))
-            self._acknowledged()
-            return b""
-
-        self._command(_WRITE, work, f"WRITE at {address:#x}")
+        body = _checked(bytes([len(data) - 1]) + data)
+        self._command(_WRITE, f"WRITE at {address:#x}", _place(address), body)
 
     def erase(self, sectors: Sequence[int]) -> None:
         """Erase sectors."""
-        body = (len(sectors) - 1).to_bytes(2, "big") + b"".join(s.to_bytes(2, "big") for s in sectors)
-
-        def work() -> bytes:
-            self.line.write(body + bytes([_xor(body)]))
-            self._acknowledged(_ANSWER_S + 2.0 * len(sectors))
-            return b""
-
-        self._command(_ERASE, work, f"ERASE of sectors {', '.join(map(str, sectors))}")
+        body = _checked(b"".join(number.to_bytes(2, "big") for number in (len(sectors) - 1, *sectors)))
+        what = f"ERASE of sectors {', '.join(map(str, sectors))}"
+        self._command(_ERASE, what, body, timeout_s=_ANSWER_S + 2.0 * len(sectors))
 
     def go(self, address: int) -> None:
         """Run what stands there."""
-
-        def work() -> bytes:
-            self._address(address)
-            return b""
-
-        self._command(_GO, work, f"GO to {address:#x}")
-
-    def brown_out(self) -> int:
-        """Level of the brown-out reset in the option bytes: 0 resets below 2.7 V, 3 is off but for 1.7 V."""
-        return (self.read(_OPTIONS, 4)[0] & _BROWN_OUT) >> 2
+        self._command(_GO, f"GO to {address:#x}", _place(address))
 
     def has_brown_out(self) -> bool | None:
-        """Whether the part resets below 2.1 V, or above that; None: it does not say."""
+        """Whether the option bytes have the part reset below 2.1 V, or above that; None: it does not say."""
         try:
-            return self.brown_out() < 3
+            # level 3 is off but for 1.7 V, 0 resets below 2.7 V
+            return self.read(_OPTIONS, 4)[0] & _BROWN_OUT != _BROWN_OUT
         except RefusedError:
             return None
 
@@ -202,11 +173,13 @@ class _RefusalError(Exception):
     pass
 
 
-def _xor(data: bytes) -> int:
-    value = 0
-    for byte in data:
-        value ^= byte
-    return value
+def _checked(data: bytes) -> bytes:
+    """Bytes and their check sum."""
+    return data + bytes([reduce(xor, data)])
+
+
+def _place(address: int) -> bytes:
+    return _checked(address.to_bytes(4, "big"))
 
 
 def flash_image(

@@ -145,10 +145,10 @@ def test_brown_out_is_set_and_nothing_else() -> None:
     rom = RomEmulator()
     before = bytes(rom.options)
     loader = RomLoader(RomLine(rom))
-    assert loader.brown_out() == 3
+    assert loader.has_brown_out() is False
     loader.set_brown_out()
     assert rom.resets == 1
-    assert RomLoader(RomLine(rom)).brown_out() == 0
+    assert RomLoader(RomLine(rom)).has_brown_out() is True
     assert rom.options == bytes([before[0] & 0xF3]) + before[1:]
 
 
