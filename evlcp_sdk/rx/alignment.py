@@ -308,7 +308,7 @@ class FrameAligner:
         width_px, height_px = min(width_px, self._sensor_px[0]), min(height_px, self._sensor_px[1])
         # Twice an odd number: a bar of one or two columns stands in the middle of a cell of 2 px, not on the
         # edge of two, each of which would see half of it.
-        return 2 * (2 * math.ceil((width_px + seam_px - 2) / 4) + 1), _even(height_px + seam_px)
+        return 2 * (2 * math.ceil((width_px + seam_px - 2) / 4) + 1), 2 * math.ceil((height_px + seam_px) / 2)
 
 
 def polarity_sums(
@@ -347,7 +347,3 @@ def polarity_sums(
         columns = e.t_us, e.x, e.y, e.p
         _kernels.add_polarity(columns, (on_us, off_us), chip_us, (row_us, row_px), shift, sums)
     return sums, rest_px
-
-
-def _even(size: float) -> int:
-    return 2 * math.ceil(size / 2)

@@ -21,28 +21,21 @@ _MOST_LIT = 1024
 """Transmitters that are remembered: those seen last."""
 
 
-class LitTimes:
-    """Remembers of each transmitter its first and its last frame in which its light was there.
+def note_lit(lit: dict[int, tuple[float, float]], number: int, first_us: float, start_us: float) -> None:
+    """Remember of a transmitter its first and its last frame in which its light was there.
 
-    Attributes:
-        by_number: Transmitter number to start of the first and of the last such frame, camera clock, us.
+    `lit` are their starts by number, camera clock, us; `first_us` is the first one's if it is new there.
 
-    >>> lit = LitTimes()
-    >>> lit.note(3, 500.0, 500.0)
-    >>> lit.note(3, 500.0, 3700.0)
-    >>> lit.by_number
+    >>> lit = {}
+    >>> note_lit(lit, 3, 500.0, 500.0)
+    >>> note_lit(lit, 3, 500.0, 3700.0)
+    >>> lit
     {3: (500.0, 3700.0)}
     """
-
-    def __init__(self) -> None:
-        self.by_number: dict[int, tuple[float, float]] = {}
-
-    def note(self, number: int, first_us: float, start_us: float) -> None:
-        """Take a frame: when it starts, and when the first one did if the transmitter is new."""
-        first_us, _ = self.by_number.pop(number, (first_us, start_us))
-        self.by_number[number] = (first_us, start_us)
-        if len(self.by_number) > _MOST_LIT:
-            del self.by_number[next(iter(self.by_number))]
+    first_us, _ = lit.pop(number, (first_us, start_us))
+    lit[number] = (first_us, start_us)
+    if len(lit) > _MOST_LIT:
+        del lit[next(iter(lit))]
 
 
 def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
@@ -116,7 +109,7 @@ class Framer(ABC):
 
     Attributes:
         counts: What was found and dropped so far.
-        lit: When the light of its transmitters was there.
+        lit: When the light of its transmitters was there: see `note_lit`.
         ranging_every: See `Receiver`.
         patience_us: How late a frame may be given, us.
         cut_by_the_end: Frames whose late events the stream's end cuts off are not given.
@@ -124,7 +117,7 @@ class Framer(ABC):
 
     cut_by_the_end: ClassVar[bool]
     counts: dict[str, int]
-    lit: LitTimes
+    lit: dict[int, tuple[float, float]]
     ranging_every: int
     patience_us: float
 

@@ -24,7 +24,7 @@ from evlcp_sdk.plugin.roles import Synchronizer
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner, Pilot
 from evlcp_sdk.rx.bars import BarFollower
-from evlcp_sdk.rx.framer import Framer, LitTimes, StreamContext
+from evlcp_sdk.rx.framer import Framer, StreamContext, note_lit
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.reading import FrameReader, Steps
@@ -481,7 +481,7 @@ class PacketFraming(Framer):
         packets_us = LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us
         self.patience_us = packets_us + caught_up * self._step_us
         self.counts = dict.fromkeys(_COUNTS, 0)
-        self.lit = LitTimes()
+        self.lit: dict[int, tuple[float, float]] = {}
         self.ranging_every = 1
         self._measurable = 0
 
@@ -659,7 +659,7 @@ class PacketFraming(Framer):
         start_us = self._clock.camera_us(due.start_us)
         transmitter.lit_us = start_us if transmitter.lit_us is None else transmitter.lit_us
         if transmitter.number is not None:
-            self.lit.note(transmitter.number, transmitter.lit_us, start_us)
+            note_lit(self.lit, transmitter.number, transmitter.lit_us, start_us)
 
     def _decode(self, transmitter: Transmitter, due: DueFrame) -> FrameDetection | Skipped:
         """Read a frame, or say why it is not given."""
@@ -714,7 +714,9 @@ class PacketFraming(Framer):
             self._on_frame(frame)
         if self._announcer is not None:
             self._announcer.frame(frame)
-        return FrameDetection.of(frame, due, aligned.pilot.placement, reading.spread)
+        placed, times = aligned.pilot.placement, (due.start_us, due.end_us, due.packet_us, due.lock.chip_us)
+        seen = max(sum(placed.seen.tolist()), 1)
+        return FrameDetection(frame, *times, placed.cells / seen, seen, placed.mirrored, reading.spread)
 
     def _is_ranged(self) -> bool:
         """Whether the turn of a frame with a pilot has come to be ranged."""

@@ -10,7 +10,7 @@ import numpy as np
 from evlcp_sdk.clock import TimeStep
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Deframer
-from evlcp_sdk.rx.framer import Framer, LitTimes, StreamContext
+from evlcp_sdk.rx.framer import Framer, StreamContext, note_lit
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.reflections import FrameDetection, PacketAssembler, ReflectionQueue
 from evlcp_sdk.rx.regions import Followed
@@ -84,7 +84,7 @@ class PluginFraming(Framer):
         frames_us = _LOOKBACK_FRAMES * link.packet.info_chips * link.packet.chip_us
         self.patience_us = max(2 * link.packet.packet_chips * link.packet.chip_us, frames_us)
         self.counts = dict.fromkeys(_COUNTED, 0)
-        self.lit = LitTimes()
+        self.lit: dict[int, tuple[float, float]] = {}
         self.ranging_every = 1
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
@@ -180,7 +180,7 @@ class PluginFraming(Framer):
                 self._on_frame(frame)
             if self._announcer is not None:
                 self._announcer.frame(frame)
-            self.lit.note(listener.number, frame.t_us, frame.t_us)
+            note_lit(self.lit, listener.number, frame.t_us, frame.t_us)
             times, light = (one.t_us, end_us, one.packet_t_us, one.chip_us), listener.events / len(heard)
             self._queue.add(
                 listener.packets, FrameDetection(frame, *times, light, self._codebook.clusters, False)

@@ -107,7 +107,7 @@ class Receiver:
 
         Starts of the first and the last frame that was due while it was, given or not, camera clock, us.
         """
-        return {number: lit for one in self._receivers for number, lit in one.framing.lit.by_number.items()}
+        return {number: lit for one in self._receivers for number, lit in one.framing.lit.items()}
 
     @property
     def regions(self) -> tuple[Region, ...]:

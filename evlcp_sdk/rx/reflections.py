@@ -15,8 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.alignment import DueFrame
-from evlcp_sdk.rx.placement import Placement
 from evlcp_sdk.rx.regions import SAME_PX
 from evlcp_sdk.rx.spread import Spread, sharper
 from evlcp_sdk.values import Frame, Packet, changed
@@ -96,15 +94,6 @@ class FrameDetection:
     seen: int
     mirrored: bool
     spread: Callable[[], Spread] | None = None
-
-    @classmethod
-    def of(
-        cls, frame: Frame, due: DueFrame, placed: Placement, spread: Callable[[], Spread] | None
-    ) -> "FrameDetection":
-        """What a frame's image shows, by where it shows the layout."""
-        seen = max(sum(placed.seen.tolist()), 1)
-        times = due.start_us, due.end_us, due.packet_us, due.lock.chip_us
-        return cls(frame, *times, placed.cells / seen, seen, placed.mirrored, spread)
 
 
 def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:

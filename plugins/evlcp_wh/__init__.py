@@ -22,7 +22,7 @@ def evlcp_algorithms() -> Iterator[Algorithm]:
         "decoding", "wh-transform", "evlcp_wh.decoding:WhTransform", 1, "presence-weighted WH transform"
     )
     yield Algorithm(
-        "decoding", "ml-soft", "evlcp_wh.ml_soft:MlSoft", 1, "likelihoods learned from the pilots"
+        "decoding", "ml-soft", "evlcp_wh.decoding:MlSoft", 1, "likelihoods learned from the pilots"
     )
     yield Algorithm(
         "decoding",

@@ -1,7 +1,6 @@
 """What the info segment of each cluster says."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,41 +10,42 @@ from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
 from evlcp_wh import _kernels
 
-_MIN_WEIGHT = 0.01
-"""Presence probability below which a cell is passed over: it adds nothing that is seen, but takes time."""
+_MIN_WEIGHT, _MIN_LEARNT_WEIGHT = 0.01, 0.05
+"""Presence probability below which a cell is passed over by `wh-transform`, and by others: it adds nothing
+that is seen, but takes time."""
+
+MAX_EVENTS = 3
+"""Polarity sums beyond this many events count as this many: more are too rare to learn."""
+
+_PRIOR_COUNT = 1.0
+"""Observations added to every pair of sums: what was seen once or twice by chance is worth little."""
+
+INDEPENDENT_PIXELS = 0.25
+"""Share of the pixels that err by themselves; neighbours share light and motion."""
+
+_PIXEL_SHARE = 0.05
+"""Share of the pixels in a cluster's place that show it, before their pilots speak: a bar is narrow."""
 
 
-class WordMatch(NamedTuple):
-    """Nearest words of a frame's values.
-
-    Attributes:
-        symbols: Of each cluster, int64 (K,).
-        best: Their correlations, float64 (K,).
-        margins: By how much words with a bit 0 correlate better than those with 1, max-log, float64
-            (K, bits).
-        agreement: Share of the values' sizes that agrees with the words.
-        least: The least size of a margin.
-    """
-
-    symbols: NDArray[np.int64]
-    best: NDArray[np.float64]
-    margins: NDArray[np.float64]
-    agreement: float
-    least: float
-
-
-def match_words(values: NDArray[np.float64], by_value: NDArray[np.float64], bits: int) -> WordMatch:
-    """Nearest words of values, float64 (K, n).
+def match_words(
+    values: NDArray[np.float64], by_value: NDArray[np.float64], bits: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64], float, float]:
+    """Nearest words of each cluster's values, float64 (K, n).
 
     Args:
         values: Of each cluster.
         by_value: The words, float64 (n, 2**bits or more); those beyond 2**bits carry no bits.
         bits: Of a symbol.
+
+    Returns:
+        Their numbers, int64 (K,), and their correlations, float64 (K,); by how much words with a bit 0
+        correlate better than those with 1, max-log, float64 (K, bits); the share of the values' sizes that
+        agrees with the words; and the least size of a margin.
     """
     symbols, best = np.empty(len(values), np.int64), np.empty(len(values))
     margins = np.empty((len(values), bits))
     agreement, least = _kernels.match_words(values, by_value, symbols, best, margins)
-    return WordMatch(symbols, best, margins, agreement, least)
+    return symbols, best, margins, agreement, least
 
 
 @dataclass(frozen=True)
@@ -77,3 +77,62 @@ class WhTransform(Decoding):
             return SoftSymbols(symbols, (margins * scale).astype(np.float32), quality)
 
         return decode
+
+
+@dataclass(frozen=True)
+class MlSoft(Decoding):
+    """Sum of per-pixel log-likelihood ratios, by how many events of which sign a value's two chips have.
+
+    Pilots are known, so each frame shows how often a value of +1 or -1 comes with which pair of polarity
+    sums, missed and late events included: two histograms over the pixels of all clusters. Their
+    log ratio says what a pair of sums is worth, in the info segment of the same frame. Where the camera sends
+    no negative events, silence in both chips counts for what it is worth, too.
+
+    A pixel whose pilot does not fit its cluster shows something else, too, a panel or leaves, and one that is
+    dark shows nothing: each counts by the probability that it shows the cluster, by Bayes' rule.
+    """
+
+    def compile(self, codebook: Codebook) -> Decode:
+        """Precompute for a codebook's pilots and codewords."""
+        codebook.require_pairs("decoding", "ml-soft", "edges")
+        decoder = LearnedDecoder(codebook)
+
+        def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
+            return decoder.decode(presence.informed(), sums)[0]
+
+        return decode
+
+
+class LearnedDecoder:
+    """`MlSoft` for the pilots and codewords of a codebook of pair codes."""
+
+    def __init__(self, codebook: Codebook) -> None:
+        self._by_value = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
+        # Unsigned, as indices below 0 would count from the end.
+        self._signs = (codebook.pilot_edges > 0).astype(np.uint64)
+        self._bits = codebook.bits_per_symbol
+
+    def decode(
+        self, presence: PresenceMap, sums: NDArray[np.int16]
+    ) -> tuple[SoftSymbols, float, NDArray[np.float64]]:
+        """The likeliest codewords by what all pixels that show a cluster say.
+
+        Args:
+            presence: Of the frame.
+            sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
+
+        Returns:
+            The symbols; the least size of an LLR; and the log-likelihood ratio of a value of +1 against -1 by
+            its chips' polarity sums of -n to n events, float64 (2 n + 1, 2 n + 1), the first chip's first.
+        """
+        pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
+        seen, width, grid = plain(presence.probability), sums.shape[2], presence.grid_px
+        worth = np.empty((2 * MAX_EVENTS + 1) ** 2)
+        _kernels.learn_worth(plain(sums), MAX_EVENTS, self._signs, seen, grid, _PRIOR_COUNT, pairs, worth)
+        values = np.zeros((len(seen), len(pairs) - self._signs.shape[1]))
+        odds = (1 - _PIXEL_SHARE) / _PIXEL_SHARE
+        _kernels.sum_worth(pairs, width, self._signs, seen, grid, worth, (_MIN_LEARNT_WEIGHT, odds), values)
+        symbols, _, margins, agreement, least = match_words(values, self._by_value, self._bits)
+        scale = INDEPENDENT_PIXELS / 2
+        soft = SoftSymbols(symbols, (margins * scale).astype(np.float32), agreement)
+        return soft, least * scale, worth.reshape(2 * MAX_EVENTS + 1, -1)

@@ -12,7 +12,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
 from evlcp_wh import _kernels
-from evlcp_wh.ml_soft import INDEPENDENT_PIXELS, MAX_EVENTS, LearnedDecoder
+from evlcp_wh.decoding import INDEPENDENT_PIXELS, MAX_EVENTS, LearnedDecoder
 from evlcp_wh.separation import CellPosterior
 
 _UNSURE_LLR = 2.0
