@@ -4,14 +4,17 @@ import gc
 import os
 import signal
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import pytest
 import typer
 from hypothesis import settings
+
+from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 
 # A thread a core for matrices of a few rows takes ten times the processor, and each worker has a core: before
 # numpy is there, which asks once. Processes that tests start inherit it.
@@ -53,6 +56,18 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         items.sort(
             key=lambda item: next((k for k, at in enumerate(LONG) if item.nodeid.startswith(at)), len(LONG))
         )
+
+
+class Brings:
+    """A package with these algorithms."""
+
+    def __init__(self, *records: Any) -> None:
+        self.records = records
+
+    @hookimpl
+    def evlcp_algorithms(self) -> Iterator[Algorithm]:
+        """Its records."""
+        yield from self.records
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError, UnknownAlgorithmError
 from evlcp_sdk.link.resolve import _SPECS, load_link, resolve
 from evlcp_sdk.link.text import to_toml
-from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import (
     ROLES,
@@ -24,6 +24,7 @@ from evlcp_sdk.plugin.roles import (
 from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import build
+from tests.conftest import Brings
 
 
 @dataclass(frozen=True)
@@ -41,25 +42,20 @@ class FakeRanging(Ranging):
         raise NotImplementedError
 
 
-class Fakes:
+def fakes(revision: int = 1) -> Brings:
     """The defaults of each role, a fake for ranging among them, and another one."""
-
-    def __init__(self, revision: int = 1) -> None:
-        self.revision = revision
-
-    @hookimpl
-    def evlcp_algorithms(self) -> Iterator[Algorithm]:
-        installed = Registry.load()
-        fake = f"{__name__}:FakeRanging"
-        for role in set(ROLES.values()) - {ROLES["ranging"]}:
-            yield installed.find(role.name, role.default).algorithm
-        yield Algorithm("ranging", ROLES["ranging"].default, fake, self.revision, "a fake")
-        yield Algorithm("ranging", "centroid", fake, 3, "another fake")
+    installed, fake = Registry.load(), f"{__name__}:FakeRanging"
+    others = set(ROLES.values()) - {ROLES["ranging"]}
+    return Brings(
+        *(installed.find(role.name, role.default).algorithm for role in others),
+        Algorithm("ranging", ROLES["ranging"].default, fake, revision, "a fake"),
+        Algorithm("ranging", "centroid", fake, 3, "another fake"),
+    )
 
 
 @pytest.fixture
 def registry() -> Registry:
-    return Registry(Fakes())
+    return Registry(fakes())
 
 
 def faults_of(registry: Registry, text: str, tmp_path: Path, *overrides: str) -> list[str]:
@@ -207,7 +203,7 @@ def test_the_digest_holds_table_codebook_and_revisions(registry: Registry) -> No
     assert load_link(None, ["camera.focal_mm=35"], registry).digest == link.digest
     assert load_link(None, ["ranging.min_spacing=9"], registry).digest != link.digest
     assert load_link(None, ["ranging.id=centroid"], registry).digest != link.digest
-    assert load_link(None, (), Registry(Fakes(revision=2))).digest != link.digest
+    assert load_link(None, (), Registry(fakes(revision=2))).digest != link.digest
 
 
 OVERRIDES: list[list[str]] = [

@@ -12,11 +12,12 @@ from evlcp_uart.framing import Uart
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
-from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Detection, Modulation, Pilots, Ranging, Tracking
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.values import DecodedFrame, SoftSymbols
+from tests.conftest import Brings
 
 Evlcp = Callable[..., Any]
 
@@ -188,18 +189,13 @@ for (_role, _id), (_class, _) in CASES.items():
     globals()[f"{_role} {_id}"] = _class
 
 
-class Stranger:
-    """A package of broken algorithms."""
-
-    @hookimpl
-    def evlcp_algorithms(self) -> list[Algorithm]:
-        return [Algorithm(role, id, f"{HERE}:{role} {id}", 1, "broken") for role, id in CASES]
-
-
 @pytest.fixture(autouse=True)
 def _stranger(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stranger's package is installed."""
-    load, stranger = Registry.load, Stranger()
+    load, stranger = (
+        Registry.load,
+        Brings(*(Algorithm(role, id, f"{HERE}:{role} {id}", 1, "broken") for role, id in CASES)),
+    )
     monkeypatch.setattr(Registry, "load", lambda *plugins: load(stranger, *plugins))
 
 

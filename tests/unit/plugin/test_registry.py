@@ -12,17 +12,7 @@ from evlcp_sdk.errors import PluginError, PluginWarning, UnknownAlgorithmError
 from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
-
-
-class Brings:
-    """A plugin with these records."""
-
-    def __init__(self, *records: Any) -> None:
-        self.records = records
-
-    @hookimpl
-    def evlcp_algorithms(self) -> Iterator[Algorithm]:
-        yield from self.records
+from tests.conftest import Brings
 
 
 def ranging(name: str, target: str = "nowhere:Nothing") -> Algorithm:

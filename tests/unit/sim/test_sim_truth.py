@@ -9,25 +9,20 @@ import pytest
 
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.link.resolve import resolve
-from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.sim import Truth, load_scene, read_truth, resolve_scene, truth_from_table, truth_of
 from evlcp_sdk.study.score import score_frames
+from tests.conftest import Brings
 from tests.unit.mutants import mutants, refusal
 
 SHARED = Path(__file__).parents[4] / "shared" / "recordings"
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9}
 
 
-class Revised:
-    """A package whose algorithms have a revision."""
-
-    def __init__(self, role: str, target: str, revision: int) -> None:
-        self._record = Algorithm(role, "own", target, revision, "a test")
-
-    @hookimpl
-    def evlcp_algorithms(self) -> list[Algorithm]:
-        return [self._record]
+def with_revision(role: str, target: str, revision: int) -> Registry:
+    """What is installed, and a package whose algorithm has a revision."""
+    return Registry.load(Brings(Algorithm(role, "own", target, revision, "a test")))
 
 
 def plain(truth: Truth) -> dict[str, Any]:
@@ -136,12 +131,12 @@ def test_what_no_truth_says_is_refused_in_one_line(path: str, value: Any, says: 
 
 def test_codes_made_otherwise_here_are_refused() -> None:
     scene = {"duration_s": 0.05, "link": {"modulation": {"id": "own"}}}
-    there = Registry.load(Revised("modulation", "evlcp_wh.modulation:Wh8", 1))
+    there = with_revision("modulation", "evlcp_wh.modulation:Wh8", 1)
     table = plain(truth_of(resolve_scene(scene, there), registry=there))
     assert plain(truth_from_table(table, there)) == table
     with pytest.raises(InputError, match=r"links.*: not a link here: no modulation algorithm named 'own'"):
         truth_from_table(table)
-    here = Registry.load(Revised("modulation", "evlcp_wh.modulation:Raw8", 2))
+    here = with_revision("modulation", "evlcp_wh.modulation:Raw8", 2)
     with pytest.raises(InputError) as fault:
         truth_from_table(table, here, source="t.json")
     assert "its settings give" in str(fault.value)
@@ -151,7 +146,7 @@ def test_codes_made_otherwise_here_are_refused() -> None:
 def test_another_revision_with_the_same_codes_is_a_warning() -> None:
     scene = {"duration_s": 0.05, "link": {"ranging": {"id": "own"}}}
     target = "evlcp_poc.ranging:PocRanging"
-    there, here = (Registry.load(Revised("ranging", target, revision)) for revision in (1, 2))
+    there, here = (with_revision("ranging", target, revision) for revision in (1, 2))
     table = plain(truth_of(resolve_scene(scene, there), registry=there))
     assert truth_from_table(table, there).warnings == ()
     (warning,) = truth_from_table(table, here, source="t.json").warnings

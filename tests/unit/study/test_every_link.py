@@ -13,7 +13,7 @@ from evlcp_wh.pilots import WhPilots
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import chips_of_values, hadamard
-from evlcp_sdk.plugin.hooks import Algorithm, hookimpl
+from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Modulation
 from evlcp_sdk.rx.receiver import Receiver
@@ -24,6 +24,7 @@ from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.study.task import plan_of
 from evlcp_sdk.values import Events
+from tests.conftest import Brings
 
 Evlcp = Callable[..., Any]
 Settings = dict[str, Any]
@@ -37,18 +38,10 @@ class Four(Modulation):
         return chips_of_values(np.repeat(hadamard(4), 2, axis=1))
 
 
-class Stranger:
-    """A package with a modulation."""
-
-    @hookimpl
-    def evlcp_algorithms(self) -> list[Algorithm]:
-        return [Algorithm("modulation", "four", f"{__name__}:Four", 3, "two bits")]
-
-
 @pytest.fixture
 def _stranger(monkeypatch: pytest.MonkeyPatch) -> None:
     """The stranger's package is installed."""
-    load, stranger = Registry.load, Stranger()
+    load, stranger = Registry.load, Brings(Algorithm("modulation", "four", f"{__name__}:Four", 3, "two bits"))
     monkeypatch.setattr(Registry, "load", lambda *plugins: load(stranger, *plugins))
 
 
