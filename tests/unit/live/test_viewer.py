@@ -9,7 +9,7 @@ import struct
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -151,12 +151,10 @@ def test_a_credit_a_bundle(stage: Stage) -> None:
         assert told["symbols"] == FRAMES[0].soft.symbols.tolist()
         assert (head["picture"], picture) == (None, b"")
         link.send('{"next": true}')
-        picture = b""
         # One is drawn once it is asked for.
-        while not picture:
-            stage.picture(20_000)
-            with suppress(TimeoutError):
-                head, picture = unpacked(link.recv(0.1))
+        until(lambda: stage.publisher.pictures._asked)
+        stage.picture(20_000)
+        head, picture = unpacked(link.recv(30))
         assert (head["news"], head["picture"]["t_us"]) == ([], 20_000)
         with Image.open(io.BytesIO(picture)) as shown:
             assert np.argwhere(np.array(shown)).tolist() == [[7, 5]]
