@@ -223,27 +223,6 @@ class Facts:
         """What that link has other in a `table.key`; None where it does not, or there is none."""
         return None if self.better is None else dict(self.better.changes).get(key)
 
-    @property
-    def cluster_px(self) -> float:
-        """From cluster to cluster, px: in frames that are read, else by the bar's source; NaN without one."""
-        read = [one for one in self.tally.own if one.sized]
-        if read:
-            one = max(read, key=lambda tally: tally.sized)
-            return math.hypot(*one.along_px) / one.sized / self.steps_along
-        if self.bar is None:
-            return math.nan
-        # A source shows the clusters at the ends whole.
-        return max(self.bar.wide_px, self.bar.high_px) / (self.steps_along + 1)
-
-    @property
-    def steps_along(self) -> float:
-        """How many steps from cluster to neighbour it is from the link's first to its last."""
-        centres_m = self.link.bar.cluster_centres_m()
-        if len(centres_m) < 2:
-            return 1.0
-        step_m = min(math.dist(centres_m[0], other) for other in centres_m[1:])
-        return math.dist(centres_m[0], centres_m[-1]) / step_m
-
 
 def has_rate(source: LightSource, rate_hz: float) -> bool:
     """Whether a source may have a rate, or a multiple of it."""

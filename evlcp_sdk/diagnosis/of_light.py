@@ -304,13 +304,13 @@ def check_pixels(facts: Facts, bar: LightSource) -> Found:
 
 def check_size(facts: Facts, bar: LightSource) -> Found:
     """A bar that is too small in the picture, or of more rows than are read in a chip."""
-    px, chip_us = facts.cluster_px, facts.link.packet.chip_us
+    (px, steps), chip_us = _measure_clusters(facts, bar), facts.link.packet.chip_us
     if not px > 0:
         return
     text = f"{px:.1f} px a cluster"
     rows_us = bar.high_px * _ROW_US
     if px < (_SMALL_PX if facts.reads else _SMALLEST_PX):
-        far_m = facts.link.camera.focal_px * facts.link.bar.length_m / (px * (facts.steps_along + 1))
+        far_m = facts.link.camera.focal_px * facts.link.bar.length_m / (px * (steps + 1))
         step = "nearer, or a longer lens" + ("" if facts.reads else " (or fewer, larger clusters)")
         yield Diagnostic("far", f"{text}, as of a bar {far_m:.0f} m away", step)
     elif rows_us >= _SLOW_SHARE * chip_us and not facts.sure and facts.better is None:
@@ -327,7 +327,7 @@ def check_size(facts: Facts, bar: LightSource) -> Found:
 
 def check_focus(facts: Facts, bar: LightSource) -> Found:
     """Clusters that cover one another."""
-    px = facts.cluster_px
+    px, _ = _measure_clusters(facts, bar)
     if not px > 0:
         return
     across_px = min(bar.wide_px, bar.high_px)
@@ -341,6 +341,19 @@ def check_focus(facts: Facts, bar: LightSource) -> Found:
         )
     else:
         yield text
+
+
+def _measure_clusters(facts: Facts, bar: LightSource) -> tuple[float, float]:
+    """From cluster to cluster, px, by frames that are read or else by the source; steps from end to end."""
+    centres_m, steps = facts.link.bar.cluster_centres_m(), 1.0
+    if len(centres_m) > 1:
+        step_m = min(math.dist(centres_m[0], other) for other in centres_m[1:])
+        steps = math.dist(centres_m[0], centres_m[-1]) / step_m
+    one = max(facts.tally.own, key=lambda tally: tally.sized, default=None)
+    if one is not None and one.sized:
+        return math.hypot(*one.along_px) / one.sized / steps, steps
+    # A source shows the clusters at the ends whole.
+    return max(bar.wide_px, bar.high_px) / (steps + 1), steps
 
 
 def check_brightness(facts: Facts, bar: LightSource) -> Found:

@@ -69,11 +69,10 @@ def test_a_film_reads_no_further_than_it_shows() -> None:
             assert n < 5, "read on"
             yield Events.of([100 * n], [7], [7], [1])
 
-    assert (
-        len(list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), endless(), Footage(0.0), LINKS))) == 3
-    )
+    shown = Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0)
+    assert len(list(draw_film(shown, endless(), Footage(0.0), LINKS))) == 3
     # Pictures after the last event are dark.
-    dark = list(draw_film(Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0), [], Footage(0.0), LINKS))
+    dark = list(draw_film(shown, [], Footage(0.0), LINKS))
     assert [np.abs(kinds(p)).sum() for p in dark] == [0, 0, 0]
 
 
@@ -146,21 +145,32 @@ def test_a_film_for_programs_that_play_no_pictures(tmp_path: Path) -> None:
 
 
 def test_what_cannot_be_filmed(demo_raw: Path, tmp_path: Path) -> None:
+    few, no = tmp_path / "few.raw", tmp_path / "no.raw"
+    write_events(few, Events.of([10, 3010], [1, 2], [3, 4], [1, 0]), 1280, 720)
+    write_events(no, Events.empty(), 1280, 720)
+    given: dict[str, Any]
+    for recording, error, told, given in (
+        (demo_raw, ConfigError, "100 ms at 1/400 would be 1000 pictures, at most 500", {"for_ms": 100}),
+        (
+            demo_raw,
+            ConfigError,
+            "500 pictures of 1280 x 740 px are 474 megapixels, at most 160",
+            {"for_ms": 50, "whole": True, "longest_px": 1280},
+        ),
+        ("-", ConfigError, "a film needs a file", {}),
+        (
+            few,
+            InputError,
+            r"ends 3\.0 ms after its first event, nothing to show from 4 ms on",
+            {"from_ms": 4},
+        ),
+        (no, InputError, "no.raw: no events", {}),
+    ):
+        with pytest.raises(error, match=told):
+            film(recording, tmp_path / "a.gif", LINK, **given)
     with pytest.raises(ConfigError, match=r"a.avi: a film is written as NAME.webp or NAME.gif or NAME.mp4"):
         film(demo_raw, tmp_path / "a.avi", LINK)
-    with pytest.raises(ConfigError, match="100 ms at 1/400 would be 1000 pictures, at most 500"):
-        film(demo_raw, tmp_path / "a.gif", LINK, for_ms=100)
-    with pytest.raises(ConfigError, match="500 pictures of 1280 x 740 px are 474 megapixels, at most 160"):
-        film(demo_raw, tmp_path / "a.gif", LINK, for_ms=50, whole=True, longest_px=1280)
-    with pytest.raises(ConfigError, match="a film needs a file"):
-        film("-", tmp_path / "a.gif", LINK)
-    write_events(tmp_path / "few.raw", Events.of([10, 3010], [1, 2], [3, 4], [1, 0]), 1280, 720)
-    with pytest.raises(InputError, match=r"ends 3\.0 ms after its first event, nothing to show from 4 ms on"):
-        film(tmp_path / "few.raw", tmp_path / "a.gif", LINK, from_ms=4)
-    write_events(tmp_path / "no.raw", Events.empty(), 1280, 720)
-    with pytest.raises(InputError, match=r"no.raw: no events"):
-        film(tmp_path / "no.raw", tmp_path / "a.gif", LINK)
     assert not (tmp_path / "a.gif").exists()
-    told = film(tmp_path / "few.raw", tmp_path / "a.gif", LINK, for_ms=0.4)
-    assert (told["frames"], told["width"], told["pictures"]) == (0, 640, 4)
-    assert math.isclose(told["from_ms"], 0)
+    shown = film(few, tmp_path / "a.gif", LINK, for_ms=0.4)
+    assert (shown["frames"], shown["width"], shown["pictures"]) == (0, 640, 4)
+    assert math.isclose(shown["from_ms"], 0)

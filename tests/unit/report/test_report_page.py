@@ -1,9 +1,10 @@
 """The report of a recording: its numbers are those of the files, it is bounded, and a browser shows it."""
 
-import csv
 import json
 import math
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
 from tests.unit.report.test_pages import HOSTILE, Elements
-from tests.unit.results.test_positions import ATTITUDE, SITE, packets
+from tests.unit.results.test_positions import ATTITUDE, SITE, packets, rows
 from tests.unit.study.browser import CHROMIUM, Browser
 
 LINK = load_link()
@@ -57,17 +58,21 @@ def held(page: str) -> dict[str, Any]:
     return {"plots": plots} | report
 
 
-def rows_of(folder: Path) -> list[dict[str, str]]:
-    with (folder / "frames.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
+@contextmanager
+def reported(folder: Path, name: str = "a.raw", **summary: Any) -> Iterator[Report]:
+    with ResultFolder(folder, ["report.html"]) as files:
+        sink = Report(files, Run(name, LINK))
+        yield sink
+        sink.conclude(SUMMARY | summary)
+        files.finish()
 
 
 def test_numbers_are_those_of_the_files(result: Path) -> None:
     page = (result / "report.html").read_text()
-    rows = rows_of(result)
-    assert len(rows) == 21
+    given = rows(result / "frames.csv")
+    assert len(given) == 21
     body = re.findall(r"<tr><td>(\d+)/(\d+)</td>(.*?)</tr>", page)
-    for row, (packet, frame, cells) in zip(rows, body, strict=True):
+    for row, (packet, frame, cells) in zip(given, body, strict=True):
         values = re.findall(r"<td[^>]*>(.*?)</td>", cells)
         assert (packet, frame) == (row["packet"], row["frame"])
         assert values[3:] == row["symbols"].split()
@@ -75,16 +80,16 @@ def test_numbers_are_those_of_the_files(result: Path) -> None:
         told = [float(one) for one in values[1].split(" ± ")]
         assert told == pytest.approx([float(row["distance_m"]), float(row["distance_sigma_m"])], abs=0.0051)
     told = held(page)["plots"]
-    for row, (_, _, text, _) in zip(rows, told["distance-0"], strict=True):
+    for row, (_, _, text, _) in zip(given, told["distance-0"], strict=True):
         assert f"{row['distance_m']} ± {row['distance_sigma_m']} m" in text
         assert f"quality {row['quality']}" in text
         assert f"packet {row['packet']}, frame {row['frame']}," in text
     # Dots stand where their times are, to a thousandth of the chart.
     x = np.array([x for x, *_ in told["quality"]])
-    t_us = np.array([float(row["t_us"]) for row in rows])
+    t_us = np.array([float(row["t_us"]) for row in given])
     assert x == pytest.approx(np.polyval(np.polyfit(t_us, x, 1), t_us), abs=1.1)
     y = np.array([y for _, y, *_ in told["distance-0"]])
-    distance_m = np.array([float(row["distance_m"]) for row in rows])
+    distance_m = np.array([float(row["distance_m"]) for row in given])
     slope, above = np.polyfit(distance_m, y, 1)
     assert slope < 0
     assert y == pytest.approx(slope * distance_m + above, abs=1.1)
@@ -98,7 +103,7 @@ def test_numbers_are_those_of_the_files(result: Path) -> None:
 
 def test_the_slow_motion_is_what_was_sent(result: Path) -> None:
     (first,) = [m for m in held((result / "report.html").read_text())["motions"] if "frame 0" in m["name"]]
-    row = rows_of(result)[0]
+    row = rows(result / "frames.csv")[0]
     symbols = [int(s) for s in row["symbols"].split()]
     assert first["symbols"] == symbols
     sent = packet_chips(np.array([symbols]), LINK.codebook)[LINK.packet.preamble_chips :]
@@ -117,8 +122,8 @@ def test_the_slow_motion_is_what_was_sent(result: Path) -> None:
 def view_of(height: int, width: int, clusters: int = 16) -> FrameView:
     grid = 2
     probability = np.zeros((clusters, height // grid, width // grid), np.float32)
-    for k, rows in enumerate(np.array_split(np.arange(4, height // grid - 4), clusters)):
-        probability[k, rows, 4:-4] = 0.9
+    for k, inside in enumerate(np.array_split(np.arange(4, height // grid - 4), clusters)):
+        probability[k, inside, 4:-4] = 0.9
     presence = PresenceMap(
         probability, grid, probability > 0.5, np.zeros((clusters, height, width), np.float32)
     )
@@ -149,8 +154,7 @@ def test_a_picture_is_bounded_whatever_its_size() -> None:
 def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) -> None:
     """A long one is thinned: what is kept, and the page, do not grow."""
     soft = SoftSymbols(np.arange(16), np.zeros((16, 6), np.float32), 0.9)
-    with ResultFolder(tmp_path, ["report.html"]) as folder:
-        sink = Report(folder, Run("long.raw", LINK))
+    with reported(tmp_path) as sink:
         for n in range(4000):
             frames = tuple(
                 Frame(n % 9, n, k, 34e3 * n + 3200 * k, soft, Range(50 - n / 100, 0.1, 9), None, 5.0, 6.0)
@@ -159,21 +163,15 @@ def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) ->
             sink.packet(Packet(n % 9, n, 34e3 * n, 100.0, frames, 10))
         assert len(sink._seen) == 6
         assert all(len(seen.frames) <= 512 and len(seen.first) == 40 for seen in sink._seen.values())
-        sink.conclude(SUMMARY)
-        folder.finish()
     page = (tmp_path / "report.html").read_text()
     assert len(page) < 1_500_000
     assert re.search(r"[\d,]+ of 26,6\d0 frames are shown", page)
 
 
 def test_what_others_wrote_stays_text(tmp_path: Path) -> None:
-    with ResultFolder(tmp_path, ["report.html"]) as folder:
-        sink = Report(folder, Run(HOSTILE, LINK))
-        for _ in range(101):
-            sink._many_messages += 1
+    with reported(tmp_path, HOSTILE) as sink:
+        sink._many_messages = 101
         sink._messages.append(("1.0", HOSTILE, "7", "unverified", HOSTILE))
-        sink.conclude(SUMMARY)
-        folder.finish()
     page = Elements((tmp_path / "report.html").read_text())
     assert not [tag for tag, _ in page.tags if tag in ("img", "iframe")]
     assert len(page.scripts) == 4
@@ -187,8 +185,7 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
         recording = {"path": "a.raw", "duration_s": 0.5, "counts": {"events": 1}}
         summary = out.finish(RunEnd("complete", recording, {"times_real_time": 1.0}))
     told = held((tmp_path / "report.html").read_text())["plots"]
-    with (tmp_path / "fixes.csv").open(newline="") as file:
-        fixes = list(csv.DictReader(file))
+    fixes = rows(tmp_path / "fixes.csv")
     assert summary["positions"]["fixes"] == len(fixes) == len(told["track"]) == len(told["map"]) - 1
     for fix, (_, _, text, _) in zip(fixes, told["track"], strict=True):
         east, north, up = (float(value) for value in re.findall(r"± (\S+) m", text))
@@ -202,19 +199,15 @@ def test_the_same_recording_has_the_same_page(tmp_path: Path) -> None:
     """However long it took: a result's digests can be compared."""
     pages = []
     for speed in (0.5, 2.0):
-        with ResultFolder(tmp_path, ["report.html"]) as folder:
-            sink = Report(folder, Run("a.raw", LINK))
+        with reported(tmp_path, processing={"times_real_time": speed, "elapsed_s": 1 / speed}) as sink:
             sink.packet(packets(1)[0])
-            sink.conclude(SUMMARY | {"processing": {"times_real_time": speed, "elapsed_s": 1 / speed}})
-            folder.finish()
         pages.append((tmp_path / "report.html").read_bytes())
     assert pages[0] == pages[1]
 
 
 def test_nothing_found_has_a_page(tmp_path: Path) -> None:
-    events = Events.empty()
     with ResultWriter(tmp_path, LINK, sinks=["report"]) as out:
-        out.events(events)
+        out.events(Events.empty())
         recording = {"path": "a.raw", "duration_s": 0.0, "counts": {"events": 0}}
         out.finish(RunEnd("complete", recording, {"times_real_time": None}))
     text = Elements((tmp_path / "report.html").read_text()).text
