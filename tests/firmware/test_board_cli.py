@@ -128,6 +128,7 @@ EMULATE = ("board", "emulate", "native")
         ((*HELLO, "unix:"), 4, "NoBoardError", "expected unix:PATH"),
         ((*HELLO, "tcp:127.0.0.1:1"), 4, "NoBoardError", "no board listens there"),
         ((*HELLO, "tcp:what"), 4, "NoBoardError", "expected tcp:HOST:PORT with a port from 1 to 65535"),
+        ((*HELLO, "tcp:127.0.0.1:65536"), 4, "NoBoardError", "with a port from 1 to 65535"),
         ((*HELLO, "socket://localhost"), 4, "NoBoardError", "expected socket://HOST:PORT"),
         ((*HELLO, "rfc2217://:1"), 4, "NoBoardError", "expected rfc2217://HOST:PORT"),
         ((*HELLO, "socket://127.0.0.1:1"), 4, "NoBoardError", "start what listens there"),
