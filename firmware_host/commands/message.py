@@ -13,7 +13,7 @@ from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
 from firmware_host.commands._json import AsJson, say
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, say_done
-from firmware_host.commands.stream import Ahead, said_of, table_of
+from firmware_host.commands.stream import Ahead, say_stream
 
 if TYPE_CHECKING:
     import numpy as np
@@ -224,7 +224,7 @@ def _send_anew(
         stream = board.stream(link, ahead)
         with suppress(KeyboardInterrupt), stop_on_request() as stopped, stream:
             send_anew(stream, content, link, repeat, every_s, count, stopped)
-    say(said_of(stream), table_of(stream), as_json)
+    say_stream(stream, as_json)
 
 
 def _compose(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int64], dict[str, Any]]:

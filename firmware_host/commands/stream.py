@@ -87,25 +87,19 @@ def stream(
                     continue
                 for packet in takewhile(lambda _: not asked(), some):
                     started.send(packet)
-    say(said_of(started), table_of(started), as_json)
+    say_stream(started, as_json)
 
 
-def said_of(stream: Stream) -> str:
-    """What a stream did, for a person."""
-    table = table_of(stream)
-    said = f"{table['packets']} packets, {table['round_trips']:.2f} round trips a packet"
+def say_stream(stream: Stream, as_json: bool) -> None:
+    """Say what a stream did."""
+    round_trips = round(stream.requests / max(1, stream.sent + stream.pauses), 3)
+    said = f"{stream.sent} packets, {round_trips:.2f} round trips a packet"
     if stream.underruns:
-        return f"{said}; the board had none to play {stream.underruns} times and showed its idle pattern"
-    return f"{said}, no underrun"
-
-
-def table_of(stream: Stream) -> dict[str, Any]:
-    """The same as plain values."""
-    return {
-        "packets": stream.sent,
-        "underruns": stream.underruns,
-        "round_trips": round(stream.requests / max(1, stream.sent + stream.pauses), 3),
-    }
+        said += f"; the board had none to play {stream.underruns} times and showed its idle pattern"
+    else:
+        said += ", no underrun"
+    table = {"packets": stream.sent, "underruns": stream.underruns, "round_trips": round_trips}
+    say(said, table, as_json)
 
 
 def _packets(
