@@ -242,6 +242,8 @@ def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
 
     >>> fields_of_values([np.array([1, 0, 1]), np.array([7, 9, 12])])
     Fields(time=1, polarity=0, places=None, unit=None)
+    >>> fields_of_values([np.array(c) for c in ([0, 1], [1, 1], [1, 0], [70_000, 90_000])]).which
+    (3, 2, 0, 1)
     """
     if len(columns) in (3, 5):
         return _fields_without_one(columns)
