@@ -166,10 +166,10 @@ class Fields:
         """Numbers of the columns: time, polarity, and x and y where there are places."""
         return (self.time, self.polarity, *(self.places or ()))
 
-    def behind(self, many: int) -> "Fields":
-        """The same behind so many other columns."""
-        places = (self.places[0] + many, self.places[1] + many) if self.places else None
-        return Fields(self.time + many, self.polarity + many, places, self.unit)
+    def of(self, numbers: Sequence[int]) -> "Fields":
+        """The same where the columns have these numbers."""
+        places = (numbers[self.places[0]], numbers[self.places[1]]) if self.places else None
+        return Fields(numbers[self.time], numbers[self.polarity], places, self.unit)
 
 
 def fields_of(names: Sequence[str]) -> Fields | None:
@@ -264,10 +264,7 @@ def _fields_without_one(columns: Sequence[NDArray[Any]]) -> Fields | None:
     if len(kept) == len(columns):
         kept = [k for k, column in enumerate(columns) if (column != column[0]).any()]
     found = fields_of_values([columns[k] for k in kept]) if len(kept) == len(columns) - 1 else None
-    if found is None:
-        return None
-    places = (kept[found.places[0]], kept[found.places[1]]) if found.places else None
-    return Fields(kept[found.time], kept[found.polarity], places)
+    return None if found is None else found.of(kept)
 
 
 def _fields_of_four(columns: Sequence[NDArray[Any]], signs: list[int]) -> Fields | None:

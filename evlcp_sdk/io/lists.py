@@ -45,24 +45,7 @@ SUFFIXES: Final = (".csv", ".csv.gz", ".tsv", ".txt", ".txt.gz", ".dat", ".npy")
 Read = Callable[[Path, ExitStack, Fields | None], EventTable]
 
 
-def open_list(url: str, read: Read | None = None) -> ColumnSource:
-    """Open `list:PATH`, with `?columns=t,p`, `unit=ms` and `inverted=1` where the file does not say so.
-
-    Raises:
-        InputError: As for `read_list`, or an option is wrong.
-    """
-    name, options = split_options(url, {"columns": _order, "unit": unit_named, "inverted": flag})
-    return read_list(name.partition(":")[2], read, **options)
-
-
-def read_list(
-    path: Path | str,
-    read: Read | None = None,
-    *,
-    columns: Fields | None = None,
-    unit: str | None = None,
-    inverted: bool = False,
-) -> ColumnSource:
+def open_list(url: Path | str, read: Read | None = None) -> ColumnSource:
     """A table of times and polarities of events, and of places where it has them; see `ColumnSource`.
 
     CSV (`,` `;` `|` tab or blanks, UTF-8 or UTF-16, plain or gzipped, `#` `%` `//` before comments, up to
@@ -74,20 +57,23 @@ def read_list(
     in `trigger_t_us`, `trigger_channel`, `trigger_value`, by rising time.
 
     Args:
-        path: The file.
+        url: The file; or `list:PATH`, with `?columns=t,p`, `unit=ms` and `inverted=1` (the larger polarity is
+            OFF) where the file does not say so.
         read: What reads it; None: by what it is.
-        columns: Which column is what; None: as the file says or shows.
-        unit: Of the times, `s`, `ms`, `us` or `ns`; None likewise.
-        inverted: The larger polarity is OFF.
 
     Raises:
-        InputError: The file cannot be read, or has no such columns.
+        InputError: The file cannot be read, or has no such columns, or an option is wrong.
     """
+    name, options = url, dict[str, Any]()
+    if isinstance(url, str) and url.lower().startswith("list:"):
+        name, options = split_options(url, {"columns": _order, "unit": unit_named, "inverted": flag})
+        name = name.partition(":")[2]
+    columns = options.pop("columns", None)
 
     def opened(path: Path, stack: ExitStack) -> EventTable:
         return (read or _READERS[_kind(path)])(path, stack, columns)
 
-    return ColumnSource(path, opened, unit=unit, inverted=inverted)
+    return ColumnSource(name, opened, **options)
 
 
 def _order(text: str) -> Fields:
@@ -233,7 +219,7 @@ class _Text:
         rows = [self.cells(line) for line in lines[1 + bool(unit) : 9]]
         if rows and all(len(row) == len(head) + 1 for row in rows):
             # Without a name for the numbers of rows, as R writes it.
-            named = named.behind(1)
+            named = named.of(range(1, len(head) + 1))
         return replace(named, unit=named.unit or unit), 1 + bool(unit)
 
     def _recognize_values(self, sample: list[str]) -> Fields | None:

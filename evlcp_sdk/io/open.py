@@ -166,7 +166,7 @@ def _open_file(name: str) -> EventSource:
         zipped = start.startswith((b"PK\x03\x04", b"\x1f\x8b"))
         named = suffix in (".csv", ".csv.gz", ".npz")
         if not is_raw and (zipped or named or (start and lists.is_list(path))):
-            return lists.read_list(path)
+            return lists.open_list(path)
     except OSError as error:
         raise InputError(f"{name}: {error.strerror}") from error
     return RawSource(name)  # which says what is wrong

@@ -13,7 +13,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.io.arrays import choose_columns, pieces_of, upright
 from evlcp_sdk.io.columns import ColumnSource, EventTable, one_line
 from evlcp_sdk.io.fields import Fields
-from evlcp_sdk.io.lists import open_list, read_list
+from evlcp_sdk.io.lists import open_list
 
 _VALUE_BYTES: Final = 8
 _MOST_BYTES: Final = 300_000_000
@@ -21,7 +21,7 @@ _MOST_BYTES: Final = 300_000_000
 
 def open_mat(url: str) -> ColumnSource:
     """Open a file, or `list:PATH` with options."""
-    return open_list(url, _read) if url.startswith("list:") else read_list(url, _read)
+    return open_list(url, _read)
 
 
 def _read(path: Path, _: ExitStack, fields: Fields | None) -> EventTable:
