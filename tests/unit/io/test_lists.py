@@ -11,7 +11,7 @@ import pytest
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import EventSource, open_source, read_events
 from evlcp_sdk.io.columns import PIECE_ROWS
-from evlcp_sdk.io.fields import fields_of
+from evlcp_sdk.io.fields import fields_of, time_unit
 from evlcp_sdk.values import Events
 from tests.unit.io.writers import (
     Arrays,
@@ -366,6 +366,21 @@ def test_a_last_line_that_is_cut_is_left_out_and_counted(tmp_path: Path) -> None
 
 def test_names_that_do_not_tell() -> None:
     assert fields_of(["t", "x", "y"]) is None
+    assert fields_of(["t_frame", "p"]) is None
     fields = fields_of(["timestamp_ms", "t", "sign", "p"])
     assert fields is not None
     assert fields.which == (1, 3)
+
+
+@pytest.mark.parametrize(
+    ("times", "unit"),
+    [
+        # Too close for us; not so far apart in ms; too far apart for us; decimals are of no ns.
+        (np.arange(100), "ms"),
+        (np.arange(0, 600, 6), "us"),
+        (np.array([0, 10**7 + 1, 2 * 10**7 + 3]), "ns"),
+        (np.array([0.5, 1e7 + 0.25, 2e7 + 0.125]), "us"),
+    ],
+)
+def test_few_times_say_their_unit(times: np.ndarray, unit: str) -> None:
+    assert time_unit(times, None).name == unit

@@ -14,7 +14,7 @@ import pytest
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.io import LoopSource, StreamSource, open_source, write_events
 from evlcp_sdk.io.streams import SocketBytes
-from evlcp_sdk.values import Events, Triggers
+from evlcp_sdk.values import Events
 
 EVENTS = Events.of(np.arange(3000) * 7, np.arange(3000) % 640, np.arange(3000) % 480, np.arange(3000) % 2)
 
@@ -149,11 +149,13 @@ def test_a_pipe_in_the_dark_is_opened_at_once(recording: Path) -> None:
 
 
 def test_a_loop_goes_on_with_its_clock(tmp_path: Path) -> None:
-    events = Events.of([1000, 2000, 4000], [1, 2, 3], [0] * 3, [1] * 3)
-    write_events(tmp_path / "a.npz", events, 640, 480, Triggers.of([4500], [1], [1]))
+    table = {"t_us": [1000, 2000, 3000, 4000], "x": [1, 2, 700, 3], "y": [0] * 4, "p": [1] * 4}
+    edge = {"trigger_t_us": [4500], "trigger_channel": [1], "trigger_value": [1]}
+    np.savez(tmp_path / "a.npz", width=640, height=480, **table, **edge)
     with LoopSource(lambda: open_source(tmp_path / "a.npz"), seam_us=500, for_us=8000) as source:
         got, triggers = source.read()
     assert got.t_us.tolist() == [1000, 2000, 4000, 5000, 6000, 8000, 9000, 10000, 12000]
     assert got.x.tolist() == [1, 2, 3] * 3
     assert triggers.t_us.tolist() == [4500, 8500, 12500]
     assert source.counts == {"events": 9, "triggers": 3}
+    assert source.losses["outside_sensor"].count == 3
