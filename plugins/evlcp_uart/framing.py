@@ -3,6 +3,7 @@
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -106,20 +107,15 @@ def read_characters(
 
 
 @dataclass(frozen=True, eq=False)
-class _Grid:
-    """Where packets stand: the start of the first character of one, us, and its number."""
+class _State:
+    """State of the decoder, characters that wait for a packet to begin, and where packets stand.
 
-    t_us: float
-    packet: int
-
-
-@dataclass(frozen=True, eq=False)
-class _Heard:
-    """State of the decoder, grid of packets, characters that wait for one, and the last one's place."""
+    That is the start of the first character of one, us, and its number; and packet and place of the last one.
+    """
 
     decoder: CharacterState
-    grid: _Grid | None = None
     waiting: tuple[Character, ...] = ()
+    grid: tuple[float, int] | None = None
     last: tuple[int, int] = (-1, -1)
 
 
@@ -130,77 +126,55 @@ class _Packets:
     decoder: CharacterDecoder
     packet: PacketFormat
 
-    def init(self) -> _Heard:
-        return _Heard(self.decoder.init())
+    def init(self) -> _State:
+        return _State(self.decoder.init())
 
-    def step(self, state: _Heard, events: Events, until_us: int) -> tuple[_Heard, list[DecodedFrame]]:
+    def step(self, state: _State, events: Events, until_us: int) -> tuple[_State, list[DecodedFrame]]:
         decoder, found = self.decoder.step(state.decoder, events.t_us, events.p, until_us)
         return self._number(replace(state, decoder=decoder), found)
 
-    def close(self, state: _Heard) -> tuple[_Heard, list[DecodedFrame]]:
+    def close(self, state: _State) -> tuple[_State, list[DecodedFrame]]:
         decoder, found = self.decoder.close(state.decoder)
-        state, heard = self._number(replace(state, decoder=decoder), found)
-        if state.waiting:
-            # There was no pause by which to tell where a packet begins.
-            state, more = self._give(self._begun(state, state.waiting[0].t_us), state.waiting)
-            heard += more
-        return state, heard
+        return self._number(replace(state, decoder=decoder), found, is_last=True)
 
-    def counts(self, state: _Heard) -> Mapping[str, int]:
+    def counts(self, state: _State) -> Mapping[str, int]:
         return state.decoder.given
 
-    def _number(self, state: _Heard, found: list[Character]) -> tuple[_Heard, list[DecodedFrame]]:
-        heard: list[DecodedFrame] = []
-        for one in found:
-            if state.grid is not None:
-                state, more = self._give(state, (one,))
-                heard += more
-                continue
-            before = state.waiting[-1] if state.waiting else None
-            state = replace(state, waiting=(*state.waiting, one))
-            start_us = None
-            if before is not None and self._paused(before, one):
-                # Those before it are the last ones of the packet before.
-                start_us = one.t_us
-            elif len(state.waiting) > self.packet.frames:
-                start_us = state.waiting[0].t_us
-            if start_us is not None:
-                state, more = self._give(self._begun(state, start_us), state.waiting)
-                heard += more
-        return state, heard
-
-    def _paused(self, before: Character, one: Character) -> bool:
-        """Whether there is the pause between two characters that is sent before a packet."""
-        pause = (one.t_us - before.t_us) / one.bit_us - self.packet.info_chips
-        return abs(pause - self.packet.preamble_chips) < 0.75
-
-    def _begun(self, state: _Heard, t_us: float) -> _Heard:
-        """With a packet whose first character begins at a time; packets before it count from 0."""
-        earlier = (t_us - state.waiting[0].t_us) / (state.waiting[0].bit_us * self.packet.packet_chips)
-        return replace(state, grid=_Grid(t_us, math.ceil(earlier - 0.05)))
-
-    def _give(self, state: _Heard, found: tuple[Character, ...]) -> tuple[_Heard, list[DecodedFrame]]:
-        """Characters by packet and place in it; one off the grid begins a packet."""
-        heard = []
-        grid, last = state.grid, state.last
-        assert grid is not None
-        for one in found:
-            bits = (one.t_us - grid.t_us) / one.bit_us
-            packets, rest = divmod(bits + 1, self.packet.packet_chips)
+    def _number(
+        self, state: _State, found: list[Character], is_last: bool = False
+    ) -> tuple[_State, list[DecodedFrame]]:
+        """Characters by packet and place in it, once one begins; one off the grid begins the next."""
+        waiting, grid, last = (*state.waiting, *found), state.grid, state.last
+        if grid is None and waiting:
+            start_us = self._find_start(waiting)
+            if start_us is None and not is_last:
+                return replace(state, waiting=waiting), []
+            # Without a pause nothing tells where a packet begins; those before it count from 0.
+            start_us = waiting[0].t_us if start_us is None else start_us
+            earlier = (start_us - waiting[0].t_us) / (waiting[0].bit_us * self.packet.packet_chips)
+            grid = start_us, math.ceil(earlier - 0.05)
+        frames = []
+        for one in waiting:
+            assert grid is not None
+            packets, rest = divmod((one.t_us - grid[0]) / one.bit_us + 1, self.packet.packet_chips)
             place = (rest - 1) / self.packet.info_chips
-            frame, packet = round(place), grid.packet + int(packets)
+            frame, packet = round(place), grid[1] + int(packets)
             off = abs(place - frame) * self.packet.info_chips
             if off > 0.75 or frame >= self.packet.frames or (packet, frame) <= last:
                 packet, frame = last[0] + 1, 0
-                grid = _Grid(one.t_us, packet)
-            else:
-                start = one.t_us - frame * self.packet.info_chips * one.bit_us
-                grid = _Grid(start, packet)
+            grid = one.t_us - frame * self.packet.info_chips * one.bit_us, packet
             last = packet, frame
-            heard.append(self._heard(one, packet, frame, grid.t_us))
-        return replace(state, grid=grid, waiting=(), last=last), heard
+            soft = SoftSymbols(np.array([one.value]), one.llr[None], one.quality)
+            start_us = grid[0] - self.packet.preamble_chips * one.bit_us
+            frames.append(DecodedFrame(packet, frame, start_us, one.t_us, one.bit_us, soft))
+        return replace(state, grid=grid, waiting=(), last=last), frames
 
-    def _heard(self, one: Character, packet: int, frame: int, first_us: float) -> DecodedFrame:
-        soft = SoftSymbols(np.array([one.value]), one.llr[None], one.quality)
-        start_us = first_us - self.packet.preamble_chips * one.bit_us
-        return DecodedFrame(packet, frame, start_us, one.t_us, one.bit_us, soft)
+    def _find_start(self, waiting: tuple[Character, ...]) -> float | None:
+        """Where a packet begins, us: behind the pause before it, or the first of more than it has."""
+        for k, (before, one) in enumerate(pairwise(waiting), 1):
+            pause = (one.t_us - before.t_us) / one.bit_us - self.packet.info_chips
+            if abs(pause - self.packet.preamble_chips) < 0.75:
+                return one.t_us
+            if k == self.packet.frames:
+                return waiting[0].t_us
+        return None

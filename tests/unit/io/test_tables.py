@@ -127,17 +127,6 @@ BAD_NPZ = {
 }
 
 
-@pytest.mark.parametrize(("data", "message"), BAD_NPZ.values(), ids=BAD_NPZ.keys())
-def test_bad_npz_is_an_error(data, message, tmp_path):
-    path = tmp_path / "bad.npz"
-    path.write_bytes(data)
-    with pytest.raises(InputError, match=message) as caught:
-        read_events(path)
-    assert str(path) in str(caught.value)
-    assert len(str(caught.value)) < len(str(path)) + 300
-    assert "\n" not in str(caught.value)
-
-
 HEAD = b"t_us,x,y,p\n"
 TEN_THOUSAND = b"".join(b"%d,1,1,1\n" % t for t in range(10_000))
 BAD_CSV = {
@@ -165,13 +154,22 @@ BAD_CSV = {
 }
 
 
-@pytest.mark.parametrize(("data", "message"), BAD_CSV.values(), ids=BAD_CSV.keys())
-def test_bad_csv_is_an_error(data, message, tmp_path):
-    path = tmp_path / "bad.csv"
+BAD = {
+    f"{kind}: {name}": (kind, *bad)
+    for kind, every in (("npz", BAD_NPZ), ("csv", BAD_CSV))
+    for name, bad in every.items()
+}
+
+
+@pytest.mark.parametrize(("kind", "data", "message"), BAD.values(), ids=BAD.keys())
+def test_a_bad_table_is_an_error(kind, data, message, tmp_path):
+    path = tmp_path / f"bad.{kind}"
     path.write_bytes(data)
     with pytest.raises(InputError, match=message) as caught:
         read_events(path)
     assert str(path) in str(caught.value)
+    assert len(str(caught.value)) < len(str(path)) + 300
+    assert "\n" not in str(caught.value)
 
 
 def test_csv_has_no_place_for_triggers(tmp_path):
