@@ -120,7 +120,7 @@ def _open_text(path: Path, stack: ExitStack) -> tuple[IO[bytes], TextIO]:
 def read_csv(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
     """A table of text."""
     raw, file = _open_text(path, stack)
-    lines = file.readlines(PIECE_CHARACTERS)
+    lines = _read_lines(file)
     table = _Text(lines, fields)
     if table.fields is None:
         raise InputError(
@@ -144,7 +144,8 @@ def _csv_pieces(
         numbers = [k for k, line in enumerate(lines, above + 1) if k >= table.first and _is_data(line)]
         rows = [lines[k - above - 1] for k in numbers]
         # Whoever wrote it was stopped.
-        cut = int(bool(rows) and lines[-1][-1] != "\n" and not table.is_row(rows[-1], fields))
+        is_cut = bool(rows) and lines[-1][-1] != "\n" and len(lines[-1]) < PIECE_CHARACTERS
+        cut = int(is_cut and not table.is_row(rows[-1], fields))
         good = len(rows) - cut
         columns = table.columns(rows[:good], fields)
         if columns is None:
@@ -156,7 +157,13 @@ def _csv_pieces(
             what = "a time and a polarity" + (", x and y" if fields.places else "")
             raise InputError(f"{path}: line {numbers[good]}: found {_show(rows[good])}, expected {what}")
         above += len(lines)
-        lines = file.readlines(PIECE_CHARACTERS)
+        lines = _read_lines(file)
+
+
+def _read_lines(file: TextIO) -> list[str]:
+    """The next lines, whole but for one without an end, which would take all memory."""
+    text = file.read(PIECE_CHARACTERS)
+    return [*io.StringIO(text + file.readline(PIECE_CHARACTERS))]
 
 
 def _show(line: str) -> str:

@@ -148,6 +148,10 @@ BAD_CSV = {
     "a number without end": (HEAD + b"9" * 30 + b",2,3,1\n", r"line 2: time 1e\+30 us, expected a number"),
     "a time beyond": (b"t_s,p\n99999999999999999,1\n", "line 2: time 9{17} s, expected a number up to"),
     "a line without end": (HEAD + b"1" * 3_000_000 + b"\n", "line 2: found '1{60}\\.\\.\\.', expected"),
+    "nothing but such a line": (
+        b"1" * 9_000_000,
+        "line 1: found '1{60}\\.\\.\\.', expected the columns t and p",
+    ),
     "bytes": (HEAD + b"\xff\xfe\n", "line 2: found '.*', expected"),
     "damaged gzip": (b"\x1f\x8bnothing", "damaged or closed file"),
     "cut gzip": (gzip.compress(HEAD + TEN_THOUSAND)[:10_000], r"bad\.csv: damaged or closed file"),
