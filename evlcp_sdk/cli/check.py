@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -75,27 +75,19 @@ def _check_link(link_file: str | None, overrides: Sequence[str], as_json: bool) 
     from evlcp_sdk.testing.suite import check_link
 
     link = load_link(link_file, overrides)
-    found: list[tuple[str, Verdict]] = []
+    ids = {role: link.table[role]["id"] for role in link.algorithms}
+    outcomes: list[Verdict] = []
+    laws: list[dict[str, str | None]] = []
     for role, outcome in check_link(link):
-        if role != "link":
-            outcome = _alone(outcome, role, link.table[role]["id"])
-        if not as_json and role not in [other for other, _ in found]:
-            head = "the link" if role == "link" else f"{role} '{link.table[role]['id']}'"
-            console().print(head, style="bold")
-        found.append((role, outcome))
+        id = ids.get(role)
+        outcome = outcome if id is None else _alone(outcome, role, id)
+        if not as_json and (not laws or laws[-1]["role"] != role):
+            console().print("the link" if id is None else f"{role} '{id}'", style="bold")
+        outcomes.append(outcome)
+        laws.append({"role": role, "id": id, **_law(outcome)})
         if not as_json:
             _show([outcome], _WIDTH)
-    outcomes = [outcome for _, outcome in found]
-    failed = sum(outcome.status == "failed" for outcome in outcomes)
-    if as_json:
-        laws = [
-            {"role": role, "id": None if role == "link" else link.table[role]["id"]} | _law(outcome)
-            for role, outcome in found
-        ]
-        print_json({"link": link.digest, "failed": failed, "laws": laws}, 2)
-    else:
-        console().print(f"{link_file or 'the default link'}: {_counted(outcomes)}")
-    raise typer.Exit(1 if failed else 0)
+    _end(outcomes, link_file or "the default link", {"link": link.digest}, laws, as_json)
 
 
 def _check_one(
@@ -126,34 +118,36 @@ def _check_one(
     except (ConfigError, PluginError) as fault:
         raise type(fault)(unhinted(str(fault), role, id)) from fault
     outcomes = [_alone(outcome, role, id) for outcome in hold(role, algorithm, reasons, link)]
+    if not as_json:
+        _show(outcomes, max(len(o.law.name) for o in outcomes))
+    table = {
+        "role": role,
+        "id": id,
+        "distribution": entry.distribution,
+        "version": entry.version,
+        "link": link.digest,
+        "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
+    }
+    name = f"{role} '{id}' of {entry.distribution} {entry.version}"
+    _end(outcomes, name, table, [_law(outcome) for outcome in outcomes], as_json)
+
+
+def _end(
+    outcomes: Sequence[Verdict], name: str, table: dict[str, Any], laws: Sequence[Any], as_json: bool
+) -> None:
+    """Say how many laws were kept, or everything as JSON; end with 1 where one is broken."""
     failed = sum(outcome.status == "failed" for outcome in outcomes)
     if as_json:
-        print_json(
-            {
-                "role": role,
-                "id": id,
-                "distribution": entry.distribution,
-                "version": entry.version,
-                "link": link.digest,
-                "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
-                "failed": failed,
-                "laws": [_law(outcome) for outcome in outcomes],
-            },
-            2,
-        )
+        print_json(table | {"failed": failed, "laws": laws}, 2)
     else:
-        _show(outcomes, max(len(o.law.name) for o in outcomes))
-        console().print(f"{role} '{id}' of {entry.distribution} {entry.version}: {_counted(outcomes)}")
+        counts = (f"{n} {s}" for s in _STYLES if (n := sum(o.status == s for o in outcomes)))
+        console().print(f"{name}: {', '.join(counts)}")
     raise typer.Exit(1 if failed else 0)
 
 
 def _law(outcome: Verdict) -> dict[str, str]:
     law = outcome.law
     return {"law": law.name, "says": law.says, "status": outcome.status, "detail": outcome.detail}
-
-
-def _counted(outcomes: Sequence[Verdict]) -> str:
-    return ", ".join(f"{n} {s}" for s in _STYLES if (n := sum(o.status == s for o in outcomes)))
 
 
 def _link(role: str, id: str, link_file: str | None, overrides: Sequence[str], registry: Registry) -> Link:
