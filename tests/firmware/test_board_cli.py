@@ -134,6 +134,12 @@ EMULATE = ("board", "emulate", "native")
         ((*HELLO, "socket://127.0.0.1:1"), 4, "NoBoardError", "start what listens there"),
         ((*HELLO, "/dev/nowhere"), 4, "NoBoardError", "cannot be opened"),
         ((*HELLO, "what://ever"), 4, "NoBoardError", "cannot be opened"),
+        (
+            (*HELLO, "native:", "--trace", "no/wire.jsonl"),
+            1,
+            "OutputError",
+            "no/wire.jsonl: cannot be written",
+        ),
         (("board", "start", "--port", "native:"), 5, "RefusedError", "NOTHING_COMMITTED"),
         (("board", "start", "--timeout", "1"), 2, "ConfigError", "--timeout belongs to --pulse-hz"),
         (

@@ -41,6 +41,8 @@ def test_a_host_that_stays_keeps_the_watchdog_still(device: SimulatedBoard, boar
     assert after.requests - status.requests < 40
     device.run(1_000_000)
     assert board.status().faults & BoardFault.WATCHDOG
+    with pytest.raises(LineError, match="still PLAYING; try 'evlcp board blank'"):
+        board.wait_dark(0.1)
     # one that plays on is asked nothing
     board.watchdog(Watchdog.KEEP, 0)
     before = board.status()
