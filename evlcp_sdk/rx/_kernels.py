@@ -350,31 +350,43 @@ def add_polarity(
     which, where, flat = np.empty(_MANY, np.int32), np.empty(_MANY, np.uint32), sums.reshape(-1)
     columns, rows, many = np.uint32(width), np.uint32(height), np.uint32(chips)
     for begin in range(first, last, _MANY):
-        end = min(begin + _MANY, last)
-        _chips_of(t_us[begin:end], y[begin:end], p[begin:end], origin, row_us, apart, rate, which)
-        low, high = _outermost(which[: end - begin], many)
+        n = min(_MANY, last - begin)
+        t, line, column, sign = t_us[begin:], y[begin:], x[begin:], p[begin:]
+        for i in range(n):
+            late = t[i] - origin - row_us * line[i] - apart * sign[i]
+            chip = np.int32(min(late * rate, 1e9))
+            which[i] = np.int32(-1) if late < 0 else chip
+        # The first and the last chip of those that there are.
+        low, high = _NOWHERE, np.uint32(0)
+        for i in range(n):
+            c = np.uint32(which[i])
+            low = min(low, c)
+            high = max(high, c if c < many else np.uint32(0))
         still = low < many
         for k in range(low + 1, high + 1):
             still &= shift_x[k] == shift_x[low] and shift_y[k] == shift_y[low]
         if still:
             # In the chips of so few events, the image seldom moves by a pixel.
             left, top = np.int32(shift_x[low]), np.int32(shift_y[low])
-            _pixels_of(x[begin:end], y[begin:end], which, (left, top), (many, rows, columns), where)
-            for i in range(begin, end):
-                at = where[i - begin]
-                if at != _NOWHERE:
-                    flat[at] += np.int16(2 * np.int16(p[i]) - 1)
+            for i in range(n):
+                c = np.uint32(which[i])
+                u, v = np.uint32(np.int32(column[i]) - left), np.uint32(np.int32(line[i]) - top)
+                inside = (c < many) & (u < columns) & (v < rows)
+                where[i] = (c * rows + v) * columns + u if inside else _NOWHERE
+            for i in range(n):
+                if where[i] != _NOWHERE:
+                    flat[where[i]] += np.int16(2 * np.int16(sign[i]) - 1)
             continue
-        for i in range(begin, end):
-            c = np.uint32(which[i - begin])
-            if c >= np.uint32(chips):
+        for i in range(n):
+            c = np.uint32(which[i])
+            if c >= many:
                 continue
             # Unsigned, a pixel to the left of the image is far to its right: one comparison for both edges.
-            u = np.uint32(np.int32(x[i]) - np.int32(shift_x[c]))
-            v = np.uint32(np.int32(y[i]) - np.int32(shift_y[c]))
+            u = np.uint32(np.int32(column[i]) - np.int32(shift_x[c]))
+            v = np.uint32(np.int32(line[i]) - np.int32(shift_y[c]))
             if u < columns and v < rows:
                 # Arithmetic, not a branch: polarity is as good as random.
-                sums[c, v, u] += np.int16(2 * np.int16(p[i]) - 1)
+                sums[c, v, u] += np.int16(2 * np.int16(sign[i]) - 1)
 
 
 _ROUNDING = 1e-13
@@ -385,52 +397,6 @@ _MANY = 512
 
 _NOWHERE = np.uint32((1 << 32) - 1)
 """Number of no pixel."""
-
-
-@njit
-def _chips_of(
-    t_us: Array,
-    y: Array,
-    p: Array,
-    origin: float,
-    row_us: float,
-    apart: float,
-    rate: float,
-    out: Array,
-) -> None:
-    """Number of each event's chip, `out` int32 (n,); -1 before the first."""
-    for i in range(t_us.size):
-        late = t_us[i] - origin - row_us * y[i] - apart * p[i]
-        chip = np.int32(min(late * rate, 1e9))
-        out[i] = np.int32(-1) if late < 0 else chip
-
-
-@njit
-def _outermost(which: Array, chips: np.uint32) -> tuple[np.uint32, np.uint32]:
-    """The first and the last chip of those from 0 to `chips` - 1; the first is beyond where there is none."""
-    low, high = _NOWHERE, np.uint32(0)
-    for i in range(which.size):
-        c = np.uint32(which[i])
-        low = min(low, c)
-        high = max(high, c if c < chips else np.uint32(0))
-    return low, high
-
-
-@njit
-def _pixels_of(
-    x: Array, y: Array, which: Array, place: tuple[np.int32, np.int32], size: tuple[Any, Any, Any], out: Array
-) -> None:
-    """Number of each event's pixel in images one after the other, `out` uint32 (n,); `_NOWHERE` outside.
-
-    `place` is the sensor pixel of (0, 0), `size` are the chips, rows and columns of the images.
-    """
-    left, top = place
-    chips, rows, columns = size
-    for i in range(x.size):
-        c = np.uint32(which[i])
-        u, v = np.uint32(np.int32(x[i]) - left), np.uint32(np.int32(y[i]) - top)
-        inside = (c < chips) & (u < columns) & (v < rows)
-        out[i] = (c * rows + v) * columns + u if inside else _NOWHERE
 
 
 @njit
@@ -446,27 +412,6 @@ def count_rows(
         b = int(np.floor((y[i] - top) / block))
         if 0 <= s < steps and 0 <= b < blocks:
             counts[p[i], b, s] += 1
-
-
-@njit
-def fit_rows(counts: Array, chips: Array, chip_steps: int, fit: Array) -> None:
-    """How well each block's counts (polarity, blocks, steps) fit chips (-1, +1) at each lag: `fit`.
-
-    Positive events are where chips are +1, negative ones where they are -1.
-    """
-    steps = counts.shape[2]
-    running = np.empty(steps + 1)
-    for polarity in range(2):
-        for b in range(counts.shape[1]):
-            running[0] = 0.0
-            for s in range(steps):
-                running[s + 1] = running[s] + counts[polarity, b, s]
-            for lag in range(fit.shape[2]):
-                total = 0.0
-                for c in range(chips.size):
-                    at = lag + c * chip_steps
-                    total += chips[c] * (running[at + chip_steps] - running[at])
-                fit[polarity, b, lag] = total if polarity else -total
 
 
 @njit
@@ -736,28 +681,6 @@ def core_profile(
 
 
 @njit
-def place_prior(places: Array, unit: complex, spacing: float, grid: int, profile: Array, out: Array) -> None:
-    """Probability of each cluster in each cell, by its share of the cell, into zeros.
-
-    Of a line it goes by the distance off its axis, too, as the profile says; of a panel there is none.
-    """
-    _, rows, columns = out.shape
-    half = spacing / 2 + grid
-    wide, high = _strip(unit, half, profile.size if profile.size else half)
-    for k in range(places.size):
-        x, y = places[k].real, places[k].imag
-        for r in range(max(int((y - high) / grid), 0), min(int((y + high) / grid) + 1, rows)):
-            for c in range(max(int((x - wide) / grid), 0), min(int((x + wide) / grid) + 1, columns)):
-                off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
-                off *= unit.conjugate()
-                share = _share(off.real, spacing / 2, grid)
-                if profile.size == 0:
-                    out[k, r, c] = share * _share(off.imag, spacing / 2, grid)
-                elif abs(off.imag) < profile.size:
-                    out[k, r, c] = share * profile[int(abs(off.imag))]
-
-
-@njit
 def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, out: Array) -> None:
     """How far the pixels in each cluster's place follow its pilot, -1 to 1, `out` (K,); 0 without a place.
 
@@ -919,20 +842,6 @@ def spread_across(
 
 
 @njit
-def copy_near(pixels: Array, places: Array, unit: complex, along: float, across: float, out: Array) -> None:
-    """Copy what lies within reach of each cluster's place, along a direction and across it."""
-    _, height, width = pixels.shape
-    wide, high = _strip(unit, along, across)
-    for k in range(places.size):
-        x, y = places[k].real, places[k].imag
-        for v in range(max(int(y - high), 0), min(int(y + high) + 2, height)):
-            for u in range(max(int(x - wide), 0), min(int(x + wide) + 2, width)):
-                off = (complex(u, v) - places[k]) * unit.conjugate()
-                if abs(off.real) <= along and abs(off.imag) <= across:
-                    out[k, v, u] = pixels[k, v, u]
-
-
-@njit
 def mask(
     presence: tuple[Array, Array, Array],
     seen: Array,
@@ -944,7 +853,8 @@ def mask(
     """Probability, choice and pixels with a layout's place taken in, and its prior, into zeros.
 
     Of a line, whose width shows within `bins` px from its axis and is that at `edge` of its peak; of a
-    layout of squares where there are none. The place is the clusters', a direction, spacing and grid.
+    layout of squares where there are none. The place is the clusters', a direction, spacing and grid. A
+    cluster's prior in a cell is its share of it; its pixels are those within reach of its place.
     """
     (likely, selected, pixels), (prior, probability, chosen, near) = presence, out
     places, unit, spacing, grid = place
@@ -956,14 +866,30 @@ def mask(
         if wide == 0:
             # A line that shows nowhere is still none of a panel, which is what no profile says.
             wide, profile[0] = 1, 0.0
-    place_prior(places, unit, spacing, grid, profile[:wide], prior)
-    copy_near(pixels, places, unit, spacing, across, near)
-    clusters, rows, columns = prior.shape
+    (clusters, rows, columns), (_, height, width) = prior.shape, pixels.shape
+    half = spacing / 2 + grid
+    cells_right, cells_down = _strip(unit, half, float(wide) if bins else half)
+    right, down = _strip(unit, spacing, across)
     for k in range(clusters):
-        for r in range(rows):
-            for c in range(columns):
-                if prior[k, r, c] > 0:
+        x, y = places[k].real, places[k].imag
+        for r in range(max(int((y - cells_down) / grid), 0), min(int((y + cells_down) / grid) + 1, rows)):
+            left = max(int((x - cells_right) / grid), 0)
+            for c in range(left, min(int((x + cells_right) / grid) + 1, columns)):
+                off = complex(c * grid + (grid - 1) / 2, r * grid + (grid - 1) / 2) - places[k]
+                off *= unit.conjugate()
+                share = _share(off.real, spacing / 2, grid)
+                if not bins:
+                    share *= _share(off.imag, spacing / 2, grid)
+                else:
+                    share *= profile[int(abs(off.imag))] if abs(off.imag) < wide else 0.0
+                if share > 0:
+                    prior[k, r, c] = share
                     probability[k, r, c], chosen[k, r, c] = likely[k, r, c], selected[k, r, c]
+        for v in range(max(int(y - down), 0), min(int(y + down) + 2, height)):
+            for u in range(max(int(x - right), 0), min(int(x + right) + 2, width)):
+                off = (complex(u, v) - places[k]) * unit.conjugate()
+                if abs(off.real) <= spacing and abs(off.imag) <= across:
+                    near[k, v, u] = pixels[k, v, u]
 
 
 _BEYOND_PX = 2.0
@@ -1719,14 +1645,23 @@ def delay_of_rows(
     `counts` are those of `count_rows`, in steps of `step_us`; `rows` and `limits` those of `slope_of_rows`.
     """
     fewest, chance, least = limits
-    fit = np.empty((2, counts.shape[1], counts.shape[2] - chips.size * chip_steps + 1))
-    fit_rows(counts, chips, chip_steps, fit)
-    seen, total, weight = np.empty(counts.shape[1]), 0.0, 0.0
+    _, blocks, steps = counts.shape
+    fit = np.empty((blocks, steps - chips.size * chip_steps + 1))
+    running, seen, total, weight = np.zeros(steps + 1), np.empty(blocks), 0.0, 0.0
     for polarity in range(2):
-        for b in range(seen.size):
-            seen[b] = counts[polarity, b].sum()
-        lag, sigma = slope_of_rows(rows, fit[polarity], seen, fewest, chance, least)
-        if np.isfinite(lag):
-            total += lag * step_us / (sigma * step_us) ** 2
+        # How well each block fits at each lag: positive events are where chips are +1, negative ones at -1.
+        sign = 1 if polarity else -1
+        for b in range(blocks):
+            for s in range(steps):
+                running[s + 1] = running[s] + counts[polarity, b, s]
+            seen[b] = running[steps]
+            for lag in range(fit.shape[1]):
+                fit[b, lag] = 0.0
+                for c in range(chips.size):
+                    at = lag + c * chip_steps
+                    fit[b, lag] += sign * chips[c] * (running[at + chip_steps] - running[at])
+        slope, sigma = slope_of_rows(rows, fit, seen, fewest, chance, least)
+        if np.isfinite(slope):
+            total += slope * step_us / (sigma * step_us) ** 2
             weight += 1 / (sigma * step_us) ** 2
     return (total / weight, 1 / np.sqrt(weight)) if weight else (np.nan, np.nan)
