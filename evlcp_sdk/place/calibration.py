@@ -132,7 +132,7 @@ _MOST_AWAY = 10.0
 _MOST_USUAL = 4.0
 """Sigmas of what is usual, 1 in 16 000, beyond which it is not the lens or its mount that is off."""
 
-_MOST_MISFIT = 4.0
+MOST_MISFIT = 4.0
 """Mean square of the misses, in sigmas, above which nothing is believed."""
 
 _OF_BAR = 8
@@ -232,7 +232,7 @@ def calibrate(
             "the views do not determine the focal length: the image's corners stay uncertain by"
             f" {corner['focal_mm']:.1f} px, {limit_px:g} px allowed"
         )
-    if misfit > _MOST_MISFIT:
+    if misfit > MOST_MISFIT:
         raise ConfigError(
             f"the views miss their places by {math.sqrt(misfit):.1f} sigmas (rms):"
             " a site or pose is not as was said"
@@ -336,7 +336,11 @@ class SeenView:
         shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
         sigma = math.hypot(math.radians(view.attitude_sigma_deg), shaken_rad)
         if rotation is None:
-            rotation, sigma = _turned(flat - view.enu_m, seen, camera), _FREE_SIGMA_RAD
+            # Brings sights best onto directions.
+            sights = np.column_stack([camera.undistort(seen), np.ones(len(seen))])
+            world = flat - view.enu_m
+            sights, world = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (sights, world))
+            rotation, sigma = Rotation.align_vectors(world, sights)[0].as_matrix(), _FREE_SIGMA_RAD
         return cls(
             flat,
             seen,
@@ -365,16 +369,6 @@ def _bend(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
     modes, _ = np.linalg.qr(np.stack([np.ones_like(along), along, along**2], 1))
     way = points_px[seen][-1] - points_px[seen][0]
     return np.asarray(modes[seen, 2][:, None] * (way / max(float(np.linalg.norm(way)), 1e-9)))
-
-
-def _turned(offset_m: Floats, points_px: Floats, camera: CameraModel) -> Floats:
-    """The attitude that brings sights best onto directions (Kabsch)."""
-    flat = camera.undistort(points_px)
-    sights = np.concatenate([flat, np.ones((len(flat), 1))], 1)
-    sights /= np.linalg.norm(sights, axis=1, keepdims=True)
-    world = offset_m / np.linalg.norm(offset_m, axis=1, keepdims=True)
-    left, _, right = np.linalg.svd(world.T @ sights)
-    return np.asarray(left @ np.diag([1, 1, np.linalg.det(left @ right)]) @ right)
 
 
 def _slopes(camera: CameraModel, direction: Floats) -> Floats:

@@ -39,15 +39,13 @@ def geoid_m(latitude_deg: float, longitude_deg: float) -> float:
     >>> geoid_m(35.68, 139.77)
     36.8
     """
-    grid = _grid()
-    rows, columns = grid.shape
+    # SciPy's filters take a while to load.
+    from scipy.ndimage import map_coordinates
+
     row = (90.0 - min(max(latitude_deg, -90.0), 90.0)) / _STEP_DEG
-    column = longitude_deg % 360.0 / _STEP_DEG
-    north, west = min(math.floor(row), rows - 2), math.floor(column)
-    down, right = row - north, column - west
-    (a, b), (c, d) = (grid[i, [west % columns, (west + 1) % columns]].tolist() for i in (north, north + 1))
-    height: float = (1 - down) * ((1 - right) * a + right * b) + down * ((1 - right) * c + right * d)
-    return round((height - _ZERO_DM) / 10, 1)
+    place = [[row], [longitude_deg % 360.0 / _STEP_DEG]]
+    (height_dm,) = map_coordinates(_grid(), place, np.float64, order=1, mode="grid-wrap")
+    return round((float(height_dm) - _ZERO_DM) / 10, 1)
 
 
 @cache

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.place.calibration import CalibrationView, KnownPose, SeenView, solve_views
+from evlcp_sdk.place.calibration import MOST_MISFIT, CalibrationView, KnownPose, SeenView, solve_views
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.navigator import Navigator, Placed, Settled
 from evlcp_sdk.scene.attitude import Attitude
@@ -132,9 +132,6 @@ _PASSES, _TURNED_RAD = 8, 1e-4
 _EXACT = 1e-9
 """Sigma of a camera's parameter that is exact, so that it stays solvable."""
 
-_MOST_MISFIT = 4.0
-"""Mean square of the misses, in sigmas, above which nothing is believed."""
-
 
 @dataclass(frozen=True, eq=False)
 class SurveyedBar:
@@ -201,7 +198,7 @@ def survey(
             started[number] = centre + _PLACE_M * moved[:3], there
         if turned < _TURNED_RAD:
             break
-    if solved.misfit > _MOST_MISFIT:
+    if solved.misfit > MOST_MISFIT:
         raise ConfigError(
             f"the views miss one another by {math.sqrt(solved.misfit):.1f} sigmas (rms):"
             " a pose is not as was said"
