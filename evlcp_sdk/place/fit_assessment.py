@@ -89,6 +89,8 @@ class Pose:
         hidden_m: By how much one part that is wrong, and whose test just passed, moves the position at the
             most: east, north, up, m, float64 (3,).
         failed: The bar that was left out; None where none was.
+        doubt: Why it is not to be believed, in words; empty where all tests pass.
+        tests: Of each part that could be tested: how much smaller the cost is without it.
     """
 
     enu_m: Floats
@@ -107,25 +109,12 @@ class Pose:
     standing_slope: Mapping[str, Floats] = field(default_factory=dict)
     hidden_m: Floats = field(default_factory=lambda: np.full(3, math.inf))
     failed: FailedBar | None = None
+    doubt: str = ""
+    tests: Mapping[str, float] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class AssessedPose:
-    """A pose with what its tests say.
-
-    Attributes:
-        pose: The pose.
-        doubt: Why it is not to be believed, in words; empty where all tests pass.
-        tests: Of each part that could be tested: how much smaller the cost is without it.
-    """
-
-    pose: Pose
-    doubt: str
-    tests: Mapping[str, float]
-
-
-def assess_fit(fit: Equations) -> AssessedPose | Rejection:
-    """The pose with its covariance and tests, or why it cannot be trusted."""
+def assess_fit(fit: Equations) -> Pose | Rejection:
+    """The pose with its covariance and tests, or why there is none."""
     problem, spread = fit.problem, fit.spread
     spec, freedom = problem.spec, problem.freedom
     if spread is None:
@@ -154,7 +143,7 @@ def assess_fit(fit: Equations) -> AssessedPose | Rejection:
     standing = _named(problem, *moves)
     if doubted.any():
         standing = {"doubt": symmetric_root(doubted[:3, :3]), **standing}
-    pose = Pose(
+    return Pose(
         fit.at.position,
         fit.at.rotation,
         spread[:6, :6] + doubted,
@@ -169,8 +158,9 @@ def assess_fit(fit: Equations) -> AssessedPose | Rejection:
         along=axes[:, -1],
         standing_slope=_named(problem, *slopes),
         hidden_m=hidden_m,
+        doubt=worst or doubt,
+        tests=tests,
     )
-    return AssessedPose(pose, worst or doubt, tests)
 
 
 Levels = tuple[float, float, Floats]

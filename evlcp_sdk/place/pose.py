@@ -17,7 +17,7 @@ import numpy as np
 
 from evlcp_sdk.place.error_model import ErrorModel, chi_square
 from evlcp_sdk.place.fit import ODDS, Equations, fit_pose, likely_fits, misfits
-from evlcp_sdk.place.fit_assessment import FOCAL, AssessedPose, Pose, assess_fit, covering
+from evlcp_sdk.place.fit_assessment import FOCAL, Pose, assess_fit, covering
 from evlcp_sdk.place.observations import BarView, Candidate, Problem, Rejection, project_bars
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -80,20 +80,16 @@ def solve_pose(
         return problem
     mixed_up = partial(_mixed_up, views, camera, attitude, spec, sigma)
     found = _plain(problem)
-    tests: Mapping[str, float]
     if isinstance(found, Rejection):
         if found.kind != "not-determined":
             return found
-        doubt, tests = found.detail, {}
-    elif found.doubt:
-        doubt, tests = found.doubt, found.tests
-    else:
-        pose = found.pose
+    elif not found.doubt:
         # Two bars on gravity do not show which is which.
-        if problem.angles.known == 2 == len(pose.transmitters) and math.isfinite(pose.hpl_m + pose.vpl_m):
+        if problem.angles.known == 2 == len(found.transmitters) and math.isfinite(found.hpl_m + found.vpl_m):
             for _, behind in mixed_up():
-                pose = covering(pose, behind, spec)
-        return pose
+                found = covering(found, behind, spec)
+        return found
+    doubt, tests = (found.detail, {}) if isinstance(found, Rejection) else (found.doubt, found.tests)
     fits, unsure = _fits_without_one(problem, sigma, tests)
     names = [name for name, _ in fits]
     if "heading" in names:
@@ -220,7 +216,7 @@ def fitting_focal_mm(
         return math.nan
     given = tried(around, _FREE_FOCAL / 5)
     found = given if isinstance(given, Rejection) else _plain(given)
-    return around if isinstance(found, AssessedPose) and not found.doubt else math.nan
+    return around if isinstance(found, Pose) and not found.doubt else math.nan
 
 
 def _mixed_up(
@@ -248,7 +244,7 @@ def _mixed_up(
     return found
 
 
-def _plain(problem: Problem) -> AssessedPose | Rejection:
+def _plain(problem: Problem) -> Pose | Rejection:
     """The pose by all that is given, whether it is to be believed or not."""
     fits = likely_fits(problem)
     if isinstance(fits, Rejection) or not misfits(fits[0]):
@@ -256,7 +252,7 @@ def _plain(problem: Problem) -> AssessedPose | Rejection:
     # What is off matters, not whether it is as much off from elsewhere, nor how surely it is there.
     fitted, _ = fit_pose(problem, fits[0].at)
     found = assess_fit(fitted or fits[0])
-    if isinstance(found, AssessedPose):
+    if isinstance(found, Pose):
         return found
     return Rejection("not-determined", "nothing explains what is seen")
 
@@ -267,18 +263,18 @@ def _explained(problem: Problem) -> Pose | Rejection | None:
     if isinstance(fits, Rejection):
         return fits
     found = None if misfits(fits[0]) else _settled(fits)
-    if isinstance(found, AssessedPose):
-        return None if found.doubt else found.pose
+    if isinstance(found, Pose):
+        return None if found.doubt else found
     return found
 
 
-def _settled(fits: Sequence[Equations]) -> AssessedPose | Rejection:
+def _settled(fits: Sequence[Equations]) -> Pose | Rejection:
     """The likeliest of some fits, which is the first, assessed; refused where another one is as likely."""
     best = fits[0]
     found = assess_fit(best)
     if isinstance(found, Rejection) or len(fits) == 1:
         return found
-    known, inverse = [best], np.linalg.pinv(found.pose.covariance[:3, :3])
+    known, inverse = [best], np.linalg.pinv(found.covariance[:3, :3])
     for other in fits[1:]:
         away = [other.at.position - one.at.position for one in known]
         # By the covariance of the likeliest one.
@@ -290,8 +286,8 @@ def _settled(fits: Sequence[Equations]) -> AssessedPose | Rejection:
     candidates = []
     for fit in known:
         one, spread = assess_fit(fit), np.full((3, 3), math.nan)
-        if isinstance(one, AssessedPose):
-            spread = one.pose.covariance[:3, :3]
+        if isinstance(one, Pose):
+            spread = one.covariance[:3, :3]
         likelihood = math.exp((best.cost - fit.cost) / 2)
         candidates.append(Candidate(fit.at.position, fit.at.rotation, spread, likelihood))
     apart_m = float(np.linalg.norm(known[1].at.position - best.at.position))

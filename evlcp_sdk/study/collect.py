@@ -111,7 +111,7 @@ def collect(
     """
     store.adopt(plan)
     results = store.results()
-    points = _counted(plan, results)
+    points = [Counted(point.tasks, plan.rule, results) for point in plan.points]
     points_of: dict[str, list[Counted]] = {}
     for point in points:
         for task in point.tasks:
@@ -149,10 +149,6 @@ def collect(
     return _progress(points, faults)
 
 
-def _counted(plan: Plan, results: Mapping[str, Statistics]) -> list[Counted]:
-    return [Counted(point.tasks, plan.rule, results) for point in plan.points]
-
-
 def _progress(points: Sequence[Counted], faults: Sequence[tuple[Job, Fault]] = ()) -> Progress:
     return Progress(
         tasks=sum(point.needed for point in points),
@@ -167,4 +163,4 @@ def _progress(points: Sequence[Counted], faults: Sequence[tuple[Job, Fault]] = (
 
 def progress_of(plan: Plan, results: Mapping[str, Statistics]) -> Progress:
     """How far a campaign is with these results."""
-    return _progress(_counted(plan, results))
+    return _progress([Counted(point.tasks, plan.rule, results) for point in plan.points])

@@ -17,7 +17,7 @@ from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.stopwatch import times_real_time
 from evlcp_sdk.study.intervals import FEWEST_RECORDINGS, Figure, measure, number_text
 from evlcp_sdk.study.summary import Series, Summary
-from evlcp_sdk.study.tally import Statistics, Tally
+from evlcp_sdk.study.tally import Statistics, Tally, known
 
 STAGES = ("separation", "decoding", "ranging")
 """The stages that every frame goes through, and whose time is measured."""
@@ -314,16 +314,16 @@ class Table:
         """Every figure of each row as plain values; None where it was not measured."""
         found = []
         for (name, m), keys in zip(self.rows.items(), self.best(), strict=True):
-            tally, known = m.tally, m.tally.frames_sent > 0
+            tally, truth = m.tally, m.tally.frames_sent > 0
             low, high = (m.ber.low, m.ber.high) if _interval(m) != "-" else (math.nan, math.nan)
             values: dict[str, Any] = {
                 "recording": self.name,
                 "variant": name,
                 "frames": m.statistics.rows,
-                "frames_sent": tally.frames_sent if known else None,
-                "frames_found": tally.frames_found if known else None,
+                "frames_sent": tally.frames_sent if truth else None,
+                "frames_found": tally.frames_found if truth else None,
                 "found_share": tally.found_share,
-                "unmatched": m.statistics.unmatched if known else None,
+                "unmatched": m.statistics.unmatched if truth else None,
                 "echoes": m.statistics.echoes,
                 "packets": m.statistics.packets,
                 "bits": tally.bits,
@@ -344,14 +344,12 @@ class Table:
                 "us_per_frame": m.us_per_frame,
                 **{f"{stage}_us": median(m.times.stage_us[stage]) for stage in STAGES},
                 "recorded_s": m.times.recorded_s,
-                "cpu_s": m.times.cpu_s if m.times.cpu_s else None,
+                "cpu_s": m.times.cpu_s or None,
                 "times_real_time": m.times_real_time,
                 "cramer_rao_bound_m": rms(self.bounds_m),
                 "best": sorted(keys),
             }
-            found.append(
-                {k: None if isinstance(v, float) and math.isnan(v) else v for k, v in values.items()}
-            )
+            found.append({key: known(value) for key, value in values.items()})
         return found
 
 

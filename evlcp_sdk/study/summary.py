@@ -4,7 +4,6 @@ Recordings with the same seed shake alike, at whatever distance: a seed counts a
 """
 
 import json
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cached_property
@@ -17,7 +16,7 @@ from evlcp_sdk.study.collect import Counted
 from evlcp_sdk.study.intervals import Figure, measure
 from evlcp_sdk.study.plan import Plan
 from evlcp_sdk.study.store import Store
-from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally
+from evlcp_sdk.study.tally import SEGMENT_M, Statistics, Tally, known
 
 
 @dataclass(frozen=True)
@@ -147,7 +146,7 @@ class Summary:
             ],
             "paper": [
                 asdict(c.reference)
-                | {"series": c.series, "ours": _plain(asdict(c.ours)), "ours_at_m": [c.from_m, c.to_m]}
+                | {"series": c.series, "ours": _known(c.ours), "ours_at_m": [c.from_m, c.to_m]}
                 | {"verdict": c.verdict}
                 for c in beside_paper(self.series)
             ],
@@ -168,12 +167,12 @@ def _figures(recordings: Sequence[Tally]) -> dict[str, Any]:
         *("position_median_m", "position_95_m", "position_nees"),
         *("kept_share", "track_rmse_m", "track_nees", "smoothed_rmse_m", "smoothed_nees"),
     )
-    found = _plain({name: getattr(tally, name) for name in (*names, *figures)})
-    return found | {kind: _plain(asdict(measure(recordings, kind))) for kind in kinds}
+    found = {name: known(getattr(tally, name)) for name in (*names, *figures)}
+    return found | {kind: _known(measure(recordings, kind)) for kind in kinds}
 
 
-def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
-    return {k: None if isinstance(v, float) and not math.isfinite(v) else v for k, v in values.items()}
+def _known(figure: Figure) -> dict[str, Any]:
+    return {name: known(value) for name, value in asdict(figure).items()}
 
 
 def summarize(store: Store) -> Summary:
@@ -293,21 +292,12 @@ def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAP
                 continue
             if reference.speed_kmh is not None and one.speed_kmh != reference.speed_kmh:
                 continue
-            ours = measure(one.between(reference.from_m, reference.to_m), reference.measure)
-            at = (reference.from_m, reference.to_m)
-            if reference.bound:
-                ours, at = _worst(one, reference)
-            if ours.count:
+            # Of a bound, the largest figure of a segment within.
+            at = reference.from_m, reference.to_m
+            parts = [(m, m + SEGMENT_M) for m in range(*at, SEGMENT_M)] if reference.bound else [at]
+            measured = [(measure(one.between(*part), reference.measure), part) for part in parts]
+            if some := [pair for pair in measured if pair[0].count]:
+                ours, at = max(some, key=lambda pair: pair[0].value)
                 verdict = verdict_of(ours.value, reference)
                 found.append(PaperComparison(reference, one.name, ours, *at, verdict))
     return found
-
-
-def _worst(series: Series, reference: Reference) -> tuple[Figure, tuple[int, int]]:
-    """The largest figure of a segment within a reference's distances, and where the segment lies."""
-    worst, at = measure((), reference.measure), (reference.from_m, reference.to_m)
-    for begin in range(reference.from_m, reference.to_m, SEGMENT_M):
-        ours = measure(series.between(begin, begin + SEGMENT_M), reference.measure)
-        if ours.count and (not worst.count or ours.value > worst.value):
-            worst, at = ours, (begin, begin + SEGMENT_M)
-    return worst, at

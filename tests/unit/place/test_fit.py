@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.fit import FOCAL_UNIT, Equations, Fit, fit_pose, linearize
-from evlcp_sdk.place.fit_assessment import AssessedPose, _doubted, _test, assess_fit
+from evlcp_sdk.place.fit_assessment import Pose, _doubted, _test, assess_fit
 from evlcp_sdk.place.observations import (
     BarView,
     Problem,
@@ -281,8 +281,8 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     p, position, rotation = problem(np.random.default_rng(12), bars, noise=1.0)
     equations = fitted(p, position, rotation)
     found = assess_fit(equations)
-    assert isinstance(found, AssessedPose)
-    pose, keep = found.pose, free_of(p)
+    assert isinstance(found, Pose)
+    pose, keep = found, free_of(p)
     rows, matrix, _ = whole(p, equations)
     spread = np.zeros((14 + 9 * bars, 14 + 9 * bars))
     spread[np.ix_(keep, keep)] = np.linalg.inv(matrix[np.ix_(keep, keep)])
@@ -308,7 +308,7 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
     p = dataclasses.replace(p, spec=dataclasses.replace(p.spec, bar_fault_m=0.0))
     fit = fitted(p, position, rotation)
     found, spread = assess_fit(fit), fit.spread
-    assert isinstance(found, AssessedPose)
+    assert isinstance(found, Pose)
     assert spread is not None
     risk = stats.chi2.isf(SPEC.risk, 1)
     for b in range(3):
@@ -318,9 +318,9 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
         value, freedom, added, unseen = _test(own, column, side, spread, np.zeros((6, 6)))
         assert value == pytest.approx(found.tests[f"bar {b}"])
         hidden = np.sqrt(stats.chi2.isf(SPEC.false_alarm / 2 / len(found.tests), freedom) * np.diag(unseen))
-        assert (found.pose.hidden_m >= hidden * (1 - 1e-9)).all()
+        assert (found.hidden_m >= hidden * (1 - 1e-9)).all()
         height_m = hidden[2] + math.sqrt(risk * (spread[2, 2] + added[2, 2]))
-        assert found.pose.vpl_m >= height_m * (1 - 1e-9)
+        assert found.vpl_m >= height_m * (1 - 1e-9)
 
 
 @pytest.mark.parametrize("off", [0.0, 2.0, 6.0])
