@@ -93,7 +93,7 @@ def _tables(summary: Summary) -> list[tuple[Sequence[str], Sequence[Sequence[str
     from evlcp_sdk.study import report as of_campaign
     from evlcp_sdk.study.summary import beside_paper
 
-    tables = [
+    tables: list[tuple[Sequence[str], Sequence[Sequence[str]], int]] = [
         (*of_campaign.figure_rows(summary), 2),
         (of_campaign.POSITION_HEAD, of_campaign.position_rows(summary), 1),
         (of_campaign.PAPER_HEAD, of_campaign.comparison_rows(beside_paper(summary.series)), 3),

@@ -10,15 +10,19 @@ from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import SCRIPT
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.study.charts import charts_of
-from evlcp_sdk.study.intervals import INTERVALS, Figure, measure, number_text
+from evlcp_sdk.study.intervals import INTERVALS, measure, number_text
 from evlcp_sdk.study.plan import digest_of
-from evlcp_sdk.study.summary import AGREEMENT, PAPER_NAME, PaperComparison, Series, Summary, beside_paper
+from evlcp_sdk.study.summary import AGREEMENT, PAPER_NAME, PaperComparison, Summary, beside_paper
 from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
 
 def page(summary: Summary) -> str:
     """The page's HTML."""
     charts, beside = charts_of(summary), beside_paper(summary.series)
+
+    def marked(verdict: str) -> Markup:
+        return Markup('<span class="{}">{}</span>').format(_MARKED[verdict], verdict)
+
     # Labels are known once a chart is drawn.
     drawn = [(chart, chart.markup()) for chart in charts]
     rule = summary.plan.rule
@@ -31,7 +35,7 @@ def page(summary: Summary) -> str:
         about=_about(summary),
         figures=_headlines(summary, beside),
         charts=drawn,
-        beside=_paper_rows(beside),
+        beside=[[*row[:-1], marked(row[-1])] for row in comparison_rows(beside)],
         paper=PAPER_NAME,
         paper_head=PAPER_HEAD,
         agreement=AGREEMENT,
@@ -66,21 +70,15 @@ def _about(summary: Summary) -> list[str]:
     events, seconds = sum(s.events for s in statistics), sum(s.duration_us for s in statistics) * 1e-6
     told = [f"{done}, {seconds:,.1f} s received, {events / 1e6:,.1f} million events."]
     if len(summary.series) > 1:
-        told.append(f"{len(summary.series)} series: {'; '.join(_varied(summary.series))}.")
+        varied = []
+        for key in dict.fromkeys(key for one in summary.series for key in one.labels):
+            labelled = [one for one in summary.series if key in one.labels]
+            values = dict.fromkeys(replace(one, labels={key: one.labels[key]}).name for one in labelled)
+            if len(values) > 1:
+                *most, last = values
+                varied.append(f"{', '.join(most)} or {last}")
+        told.append(f"{len(summary.series)} series: {'; '.join(varied)}.")
     return told
-
-
-def _varied(series: Sequence[Series]) -> list[str]:
-    """Each thing that series differ in, and its values."""
-    found = []
-    for key in dict.fromkeys(key for one in series for key in one.labels):
-        values = dict.fromkeys(
-            replace(one, labels={key: one.labels[key]}).name for one in series if key in one.labels
-        )
-        if len(values) > 1:
-            *most, last = values
-            found.append(f"{', '.join(most)} or {last}")
-    return found
 
 
 def _headlines(summary: Summary, beside: Sequence[PaperComparison]) -> list[tuple[str, str, str]]:
@@ -120,14 +118,6 @@ def _headlines(summary: Summary, beside: Sequence[PaperComparison]) -> list[tupl
 
 
 _SAID = {"better": "better", "agrees": "agree", "worse": "worse"}
-
-
-def _paper_rows(comparisons: Sequence[PaperComparison]) -> list[list[str]]:
-    rows = []
-    for cells, one in zip(comparison_rows(comparisons), comparisons, strict=True):
-        verdict = Markup('<span class="{}">{}</span>').format(_MARKED[one.verdict], cells[-1])
-        rows.append([*cells[:-1], verdict])
-    return rows
 
 
 _MARKED = {"better": "yes", "agrees": "", "worse": "no"}
@@ -196,54 +186,47 @@ def position_rows(summary: Summary) -> list[tuple[str, ...]]:
     return rows
 
 
-def figure_rows(summary: Summary) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def figure_rows(summary: Summary) -> tuple[list[str], list[list[str]]]:
     """Head and rows of the table of each series and segment, as text."""
     tallies = [t for one in summary.series for t in one.statistics.segments.values()]
     messages = any(t.messages_sent for t in tallies)
     positions = any(t.fixes or t.fixes_refused for t in tallies)
+    head = ["series", "distance", "frames", "bit errors", "BER", "RMSE, m", "bias, m", "0.5 m or more"]
+    head += ["messages", "read wrong"] if messages else []
+    head += _POSITION_HEAD if positions else []
     rows = []
     for one in summary.series:
         for begin, recordings in one.segments:
-            tally = Tally.together(recordings)
-            rows.append(
-                (
-                    one.name,
-                    f"{begin} to {begin + SEGMENT_M} m",
-                    f"{tally.frames_found} of {tally.frames_sent}",
-                    f"{tally.bit_errors} of {tally.bits}",
-                    _shown(measure(recordings, "ber"), ".2g"),
-                    _shown(measure(recordings, "rmse_m"), ".3f"),
-                    number_text(tally.bias_m, "+.3f"),
-                    _shown(measure(recordings, "gross_share"), ".2%"),
-                    *((f"{tally.messages_found} of {tally.messages_sent}",) if messages else ()),
-                    *((f"{tally.messages_wrong}",) if messages else ()),
-                    *(_positions(recordings) if positions else ()),
-                )
-            )
-    head = (
-        *("series", "distance", "frames", "bit errors", "BER", "RMSE, m", "bias, m", "0.5 m or more"),
-        *(("messages", "read wrong") if messages else ()),
-        *(_POSITION_HEAD if positions else ()),
-    )
+            t = Tally.together(recordings)
+            row = [
+                one.name,
+                f"{begin} to {begin + SEGMENT_M} m",
+                f"{t.frames_found} of {t.frames_sent}",
+                f"{t.bit_errors} of {t.bits}",
+                _shown(recordings, "ber", ".2g"),
+                _shown(recordings, "rmse_m", ".3f"),
+                number_text(t.bias_m, "+.3f"),
+                _shown(recordings, "gross_share", ".2%"),
+            ]
+            if messages:
+                row += [f"{t.messages_found} of {t.messages_sent}", f"{t.messages_wrong}"]
+            if positions:
+                row += [
+                    f"{t.fixes} of {t.fixes + t.fixes_refused}",
+                    _shown(recordings, "position_rmse_m", ".3f"),
+                    number_text(t.position_median_m, ".3f"),
+                    number_text(t.position_95_m, ".3f"),
+                    number_text(t.position_nees, ".2f"),
+                ]
+            rows.append(row)
     return head, rows
 
 
-_POSITION_HEAD = ("positions", "RMSE in space, m", "half within, m", "95 % within, m", "NEES, ideally 3")
+_POSITION_HEAD = ["positions", "RMSE in space, m", "half within, m", "95 % within, m", "NEES, ideally 3"]
 
 
-def _positions(recordings: Sequence[Tally]) -> tuple[str, ...]:
-    """Positions given of those due, and their errors, as text."""
-    tally = Tally.together(recordings)
-    return (
-        f"{tally.fixes} of {tally.fixes + tally.fixes_refused}",
-        _shown(measure(recordings, "position_rmse_m"), ".3f"),
-        number_text(tally.position_median_m, ".3f"),
-        number_text(tally.position_95_m, ".3f"),
-        number_text(tally.position_nees, ".2f"),
-    )
-
-
-def _shown(figure: Figure, form: str) -> str:
+def _shown(recordings: Sequence[Tally], kind: str, form: str) -> str:
+    figure = measure(recordings, kind)
     return f"{figure.value:{form}} {figure.interval(form)}".rstrip() if figure.count else "-"
 
 

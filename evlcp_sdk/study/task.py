@@ -13,7 +13,6 @@ from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.sim import Scene, Simulation, load_scene, truth_of
-from evlcp_sdk.sim.truth import Truth
 from evlcp_sdk.sim.world import attitude_log, rendered, sites_said
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.match import check_link
@@ -142,6 +141,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         if key not in received:
             received[key] = Receiver(link, attitude=attitude), []
         decoded.append(received[key][1])
+    messages = any(bar.sends_frames and bar.payload != "symbols" for bar in truth.bars)
     number = 0
     for events in simulation.stream():
         number += len(events)
@@ -151,14 +151,10 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         packets += receiver.close()
     results = []
     for task, link, attitude, packets in zip(job.tasks, links, attitudes, decoded, strict=True):
-        others = message_tallies(packets, truth, link.block_coder()) if _sends_messages(truth) else []
+        others = message_tallies(packets, truth, link.block_coder()) if messages else []
         if scene.world is not None:
             sites = sites_said(_sending(task.scene, task.link[0]), job.seed, registry)
             others += position_tallies(packets, truth, link, attitude, sites)
         counted = statistics_of(frames_of(packets), truth, events=number, packets=len(packets), others=others)
         results.append((task.id, counted))
     return results
-
-
-def _sends_messages(truth: Truth) -> bool:
-    return any(bar.sends_frames and bar.payload != "symbols" for bar in truth.bars)
