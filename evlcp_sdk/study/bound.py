@@ -199,10 +199,12 @@ def frame_bound(link: Link, *, full_events: float = 3.0) -> Callable[[FrameView]
 
 
 def _bound_bar_frame(link: Link, full_events: float, view: FrameView) -> Range:
-    place = _place(view.presence)
-    if place is None:
+    seen, middles = _middles(view.presence)
+    if int((seen[1:] & seen[:-1]).sum()) < _LEAST_BOUNDARIES:
         return _NONE
-    upright, at_row, seen = place
+    wide, high = np.ptp(middles[seen], axis=0)
+    upright = bool(high >= wide)
+    at_row = middles[:, 1 if upright else 0]
     behind = link.codebook.edge_chips
     sums, offset = view.sums[behind], (view.offset_px[:, behind - 1] + view.offset_px[:, behind]) / 2
     light = view.presence.pixels.sum(0)
@@ -363,21 +365,15 @@ def _fit(
     return found.x[:known], float(np.sqrt(variance))
 
 
-def _place(presence: PresenceMap) -> tuple[bool, Array, NDArray[np.bool_]] | None:
-    """How a bar lies: upright or not, the clusters' middles along it, which are seen.
-
-    None where too few clusters are seen.
-    """
-    selected, grid = presence.selected, presence.grid_px
-    seen: NDArray[np.bool_] = np.any(selected.reshape(len(selected), -1), axis=1)
-    if int((seen[1:] & seen[:-1]).sum()) < _LEAST_BOUNDARIES:
-        return None
-    middle = np.zeros((2, len(selected)))
+def _middles(presence: PresenceMap) -> tuple[NDArray[np.bool_], Array]:
+    """Which clusters are seen, bool (K,), and their middles, column and row, px, float64 (K, 2)."""
+    seen: NDArray[np.bool_] = np.any(presence.selected, axis=(1, 2))
+    grid = presence.grid_px
+    middles = np.zeros((len(seen), 2))
     for k in np.flatnonzero(seen):
         # Medians are robust against stray cells.
-        middle[:, k] = np.median(np.nonzero(selected[k]), axis=1) * grid + (grid - 1) / 2
-    upright = bool(np.ptp(middle[0][seen]) >= np.ptp(middle[1][seen]))
-    return upright, middle[0 if upright else 1], seen
+        middles[k] = np.median(np.nonzero(presence.selected[k]), axis=1)[::-1] * grid + (grid - 1) / 2
+    return seen, middles
 
 
 def _line(light: NDArray[np.float32]) -> tuple[float, float]:
@@ -577,14 +573,11 @@ def _bound_layout_frame(link: Link, full_events: float, view: FrameView) -> Rang
 
 def _start(presence: PresenceMap, centres_m: NDArray[np.complex128]) -> tuple[complex, complex, int] | None:
     """Scale, px a metre with the turn, place, px, and how many clusters are seen, by the cells' medians."""
-    selected, grid = presence.selected, presence.grid_px
-    seen = np.flatnonzero(selected.any((1, 2)))
-    at = np.array([complex(*np.median(np.nonzero(selected[k]), axis=1)[::-1]) for k in seen], np.complex128)
-    at = at * grid + (grid - 1) / 2 * (1 + 1j)
-    layout = centres_m[seen]
-    spread = layout - layout.mean() if len(seen) else layout
+    seen, middles = _middles(presence)
+    at, layout = middles[seen] @ np.array([1, 1j]), centres_m[seen]
+    spread = layout - layout.mean() if len(at) else layout
     power = float((np.abs(spread) ** 2).sum())
-    if len(seen) < 2 or power <= 0:
+    if len(at) < 2 or power <= 0:
         return None
     scale = complex(np.conj(spread) @ at) / power
-    return (scale, complex(at.mean() - scale * layout.mean()), len(seen)) if abs(scale) > 0 else None
+    return (scale, complex(at.mean() - scale * layout.mean()), len(at)) if abs(scale) > 0 else None

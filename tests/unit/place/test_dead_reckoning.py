@@ -5,9 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from evlcp_sdk.place.dead_reckoning import imu_sigmas, reckon
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.trajectory import IMU, filter_fixes, smooth_trajectory
+from evlcp_sdk.place.trajectory import IMU, filter_fixes, imu_sigmas, reckon, smooth_trajectory
 from evlcp_sdk.scene.attitude import AttitudeLog, Swing
 from evlcp_sdk.values import Fix
 from tests.unit.place.place_scenes import Floats, by_chance, fix, square

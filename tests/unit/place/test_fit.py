@@ -13,7 +13,7 @@ from scipy.optimize import approx_fprime, least_squares
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
-from evlcp_sdk.place.fit import FOCAL_UNIT, Equations, Fit, fit_pose, linearize
+from evlcp_sdk.place.fit import FOCAL_UNIT, Equations, Fit, fit_pose, linearize, nearest_to_sights
 from evlcp_sdk.place.fit_assessment import Pose, _doubted, _test, assess_fit
 from evlcp_sdk.place.observations import (
     BarView,
@@ -23,7 +23,6 @@ from evlcp_sdk.place.observations import (
     shared_sigmas,
     whole_clusters,
 )
-from evlcp_sdk.place.starts import nearest_to_sights
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma

@@ -12,10 +12,10 @@ from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.fit import three_point_poses
 from evlcp_sdk.place.fit_assessment import Pose
 from evlcp_sdk.place.observations import REJECTION_REASONS, BarView, Problem, Rejection, project_bars
 from evlcp_sdk.place.pose import estimate_fault, fitting_focal_mm, solve_pose
-from evlcp_sdk.place.starts import three_point_poses
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from tests.unit.place.place_scenes import POINTS_ONLY, Floats, bar, by_chance, square
