@@ -20,7 +20,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import check_columns, csv_number, read_csv
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.gnss import PLACE
-from evlcp_sdk.place.observations import BarView, between_of, project_bars, shared_sigmas
+from evlcp_sdk.place.observations import BarView, between_of, project_bars, shared_errors
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
@@ -325,8 +325,11 @@ class SeenView:
             number.append(np.full(int(good.sum()), bar.transmitter))
             arm.append(bar.enu_m[good] - bar.enu_m.mean(0))
             bend.append(spec.bend_sigma_px * _bend(bar.enu_m, good, bar.points_px))
-            shift, *site = shared_sigmas(bar, good, spec, between)
-            survey[bar.transmitter] = (site[0], site[1], site[2])
+            shared = shared_errors(bar, good, spec, between)
+            place, turn, length = shared.survey.tolist()
+            survey[bar.transmitter] = place, turn, length
+            # In any direction at most.
+            shift = float(np.linalg.eigvalsh(shared.root)[-1])
             covariance = np.diag((max(bar.across, 1.0) * bar.sigma_px[good]) ** 2) + shift**2
             whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
         if not enu:

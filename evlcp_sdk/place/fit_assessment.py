@@ -63,7 +63,7 @@ degrees, 13 px, says so much of what the image of a bar says that is seen to .01
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """A camera's position and attitude.
+    """A camera's position and attitude; what is not said here is as in a `Fix`.
 
     Attributes:
         enu_m: Position in the local axes, m, float64 (3,).
@@ -76,19 +76,6 @@ class Pose:
             `camera`, its seven parameters; of `attitude`, biases of pitch, roll and heading, and the offset
             in time; of `bar N`, its length, and its place and turn where these have a sigma; `doubt` whether
             the attitude errs more than its sigmas say.
-        misfit: Mean square of the misses in sigmas, over the degrees of freedom.
-        freedom: Degrees of freedom.
-        transmitters: The bars that count.
-        hpl_m: Horizontal protection level, m; infinite where the geometry protects from no fault.
-        vpl_m: The vertical one, m.
-        excluded: What was left out as the rest contradicts it: `bar N`, `heading`, `attitude`, `focal
-            length`.
-        along: The direction in which the position is the least certain, a unit vector, float64 (3,).
-        standing_slope: How the moves of `standing`, but for `doubt`, change with the position along it, a
-            metre, float64 (3, k).
-        hidden_m: By how much one part that is wrong, and whose test just passed, moves the position at the
-            most: east, north, up, m, float64 (3,).
-        failed: The bar that was left out; None where none was.
         doubt: Why it is not to be believed, in words; empty where all tests pass.
         tests: Of each part that could be tested: how much smaller the cost is without it.
     """
@@ -384,8 +371,7 @@ def _named(problem: Problem, camera: Floats, attitude: Floats, bars: Floats) -> 
         standing["camera"] = camera
     if problem.attitude is not None and problem.free[3:6].any():
         standing["attitude"] = attitude
-    for moves, sigma, number in zip(bars, problem.bar_sigma.tolist(), problem.transmitters, strict=True):
-        survey = sigma[:3]
+    for moves, survey, number in zip(bars, problem.errors.survey.tolist(), problem.transmitters, strict=True):
         if any(survey):
             # Its length, by which it also looks too long; place and turn where these have a sigma.
             standing[f"bar {number}"] = moves if any(survey[:2]) else moves[:, :1].copy()

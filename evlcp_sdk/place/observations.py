@@ -143,6 +143,21 @@ def skewed(vectors: Floats) -> Floats:
     return (vectors @ _LEVI_CIVITA).reshape(-1, 3, 3)
 
 
+class SharedErrors(NamedTuple):
+    """What the points of a bar share, and how they err; of several bars, arrays of these.
+
+    Attributes:
+        survey: Sigmas of the bar's place, m, its turn, radians, and its length, a share, to which is added by
+            how much it looks too long, float64 (3,).
+        root: A root of the covariance of its image's shift, px, float64 (2, 2).
+        even: What makes errors of a point even in all directions and of sigma 1, float64 (2, 2).
+    """
+
+    survey: Floats
+    root: Floats
+    even: Floats
+
+
 @dataclass(frozen=True, eq=False)
 class KnownSigmas:
     """What is the same of a problem wherever it is made linear: of each point, with the sigmas of its bar.
@@ -190,16 +205,19 @@ class KnownAngles(NamedTuple):
             return cls()
         compass = attitude.heading_deg is not None
         turns = (True, True, True)
-        if (
-            shaken_rad
-            == attitude.gravity_sigma_deg
-            == attitude.white_sigma_deg
-            == attitude.time_sigma_us
-            == 0
-        ):
+        unsure = (attitude.gravity_sigma_deg, attitude.white_sigma_deg, attitude.time_sigma_us)
+        if not any((shaken_rad, *unsure)):
             turns = (False, False, not compass or attitude.heading_sigma_deg > 0)
         causes, known = attitude.standing(), 3 if compass else 2
-        white = _whitening(attitude, causes, known, shaken_rad)
+        # All err anew with each time, too: as the attitude's own noise does, and what shifts an image down or
+        # aside, as a camera turns about its own axes across and upright: the second is not the world's.
+        pitch = math.radians(attitude.pitch_deg)
+        aside = [[1.0, 0.0], [0.0, math.tan(pitch)], [0.0, 1 / math.cos(pitch)]]
+        moves = np.concatenate([causes, shaken_rad * np.array(aside)], 1)
+        least = math.radians(attitude.white_sigma_deg) ** 2 + EXACT_RAD**2
+        white = np.linalg.inv(np.linalg.cholesky(moves @ moves.T + least * np.eye(3)))
+        if known < 3:
+            white[2] = (0.0, 0.0, 1.0)
         heading_rad = math.radians(attitude.heading_deg or 0.0)
         return cls(attitude.rotation(), heading_rad, known, white, white @ causes, turns)
 
@@ -215,8 +233,7 @@ class Problem:
         points: A row a cluster that is seen: its place in the local axes and from its bar's centre, m, where
             it is seen, px, 1 / sigma, and the share of its variance that stands for a while, float64 (n, 10).
         bar: Number of each point's bar, rising, int64 (n,).
-        bar_sigma: Of each bar: its survey, a root of the covariance of its image's shift, px, and what makes
-            errors of points even in all directions, float64 (bars, 9): see `_sigmas_of`.
+        errors: What the points of each bar share, float64 (bars, 3), (bars, 2, 2), (bars, 2, 2).
         transmitters: Number of each bar.
         lens_root: A lower root of the covariance of the camera's `CAMERA_PARAMETERS`, float64 (7, 7).
         shaken_rad: Sigma of what shifts the images of all bars alike.
@@ -227,7 +244,7 @@ class Problem:
     spec: ErrorModel
     points: Floats
     bar: NDArray[np.int64]
-    bar_sigma: Floats
+    errors: SharedErrors
     transmitters: tuple[int, ...]
     lens_root: Floats
     shaken_rad: float
@@ -247,14 +264,13 @@ class Problem:
     @cached_property
     def parts(self) -> list[slice]:
         """Where each bar's points are."""
-        ends = np.cumsum(np.bincount(self.bar, minlength=len(self.bar_sigma))).tolist()
+        ends = np.cumsum(np.bincount(self.bar, minlength=len(self.transmitters))).tolist()
         return [slice(first, end) for first, end in zip([0, *ends], ends, strict=False)]
 
     @cached_property
     def known(self) -> KnownSigmas:
         """What is the same wherever it is made linear."""
-        sigma, arm_m = self.bar_sigma[self.bar], self.points[:, 3:6]
-        root, even = (sigma[:, k : k + 3][:, [0, 1, 1, 2]].reshape(-1, 2, 2) for k in (3, 6))
+        arm_m, (sigma, root, even) = self.points[:, 3:6], (one[self.bar] for one in self.errors)
         return KnownSigmas(sigma[:, :1], sigma[:, 1:2], arm_m * sigma[:, 2:3], skewed(arm_m), root, even)
 
     @classmethod
@@ -270,7 +286,7 @@ class Problem:
         between = between_of(views)
         kept: list[int] = []
         parts: list[Floats] = []
-        sigmas: list[Floats] = []
+        errors: list[SharedErrors] = []
         most = 0
         for view in views:
             whole = whole_clusters(view.points_px, view.sigma_px, camera.width, camera.height)
@@ -285,7 +301,7 @@ class Problem:
                 kept.append(view.transmitter)
                 columns = [view.enu_m[whole], arm, view.points_px[whole], 1 / sigma_px, share]
                 parts.append(np.concatenate(columns, 1))
-                sigmas.append(_sigmas_of(view, whole, spec, between))
+                errors.append(shared_errors(view, whole, spec, between))
         if not kept:
             return Rejection(
                 "too-few-clusters", f"{most} whole clusters of a bar seen, {spec.min_points} needed"
@@ -296,7 +312,7 @@ class Problem:
             spec=spec,
             points=np.concatenate(parts),
             bar=np.repeat(np.arange(len(parts)), [len(part) for part in parts]),
-            bar_sigma=np.array(sigmas),
+            errors=SharedErrors(*map(np.array, zip(*errors, strict=True))),
             transmitters=tuple(kept),
             lens_root=sigma.root(camera),
             shaken_rad=between * spec.shaken_sigma_px / camera.focal_px,
@@ -324,7 +340,7 @@ class Problem:
             self,
             points=self.points[kept],
             bar=others - (others > bar),
-            bar_sigma=np.delete(self.bar_sigma, bar, 0),
+            errors=SharedErrors(*(np.delete(one, bar, 0) for one in self.errors)),
             transmitters=self.transmitters[:bar] + self.transmitters[bar + 1 :],
         )
         return fewer._determined()
@@ -356,22 +372,12 @@ class Problem:
     @cached_property
     def surveyed(self) -> bool:
         """Whether places or attitudes of bars are not exact."""
-        return bool(self.bar_sigma[:, :2].any())
+        return bool(self.errors.survey[:, :2].any())
 
 
 def between_of(views: Sequence[BarView]) -> float:
     """Of what moved between frames, the part that all bars have in common, see `BarView.between`."""
     return sum([view.between for view in views]) / max(len(views), 1)
-
-
-def shared_sigmas(
-    view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, between: float
-) -> tuple[float, ...]:
-    """Of a bar: its image's shift, px, in any direction at most; its place, m, turn, radians, and length, a
-    share. `between` is what it has in common with others, see `between_of`.
-    """
-    place, turn, length, columns, both, rows = _sigmas_of(view, seen, spec, between)[:6].tolist()
-    return float(np.linalg.eigvalsh([[columns, both], [both, rows]])[-1]), place, turn, length
 
 
 def whole_clusters(points_px: Floats, sigma_px: Floats, width: int, height: int) -> NDArray[np.bool_]:
@@ -390,18 +396,14 @@ def whole_clusters(points_px: Floats, sigma_px: Floats, width: int, height: int)
     return counted
 
 
-def _sigmas_of(view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, between: float) -> Floats:
-    """What a bar's points share, and how they err across it, by those `seen`, bool (K,), float64 (9,).
+def shared_errors(view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, between: float) -> SharedErrors:
+    """How a bar errs, by its clusters that are seen, bool (K,).
 
-    The first three are its survey's, place, m, turn, radians, and length, a share, to which is added by how
-    much it looks too long; the next are of a root of the covariance of its image's shift, px: of columns, of
-    both, of rows. Of a layout that is no line, what is along it holds in all directions. The whole is as long
-    as from one of its clusters to the farthest other, and a cluster's own part; its image is so by what is
-    seen of it. The last, of columns, of both, of rows, make a point's errors even in all directions and of
-    sigma 1.
+    Of a layout that is no line, what is along it holds in all directions. The whole is as long as from one of
+    its clusters to the farthest other, and a cluster's own part; its image is so by what is seen of it.
 
     The image moves as one: of what is not known of it, a bar has for its own what it has more or less than
-    others. These count as independent, so that two bars differ by as much as they do.
+    others, see `between_of`. These count as independent, so that two bars differ by as much as they do.
     """
     moved = math.hypot(math.sqrt(2) * spec.shaken_sigma_px * abs(view.between - between), view.early_px)
     count, points = len(seen), view.points_px
@@ -417,21 +419,12 @@ def _sigmas_of(view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, between
     line = size > 0 and bool((np.abs(aside) <= 0.5 * size * share / count).all())
     across = math.hypot(spec.shared_sigma_px, view.shift_px, moved) if line else along
     sideways = 1 / view.across if line else 1 / max(view.across, 1.0)
-    place, turn, length = view.survey
-    return np.array(
-        [
-            *(place, turn, math.hypot(length, spec.stretch_share)),
-            *_root_along(axis, along, across),
-            *_root_along(axis, 1.0 if line else sideways, sideways),
-        ]
+    way, (place, turn, length) = np.outer(axis, axis), view.survey
+    return SharedErrors(
+        np.array([place, turn, math.hypot(length, spec.stretch_share)]),
+        across * np.eye(2) + (along - across) * way,
+        sideways * np.eye(2) + ((1.0 if line else sideways) - sideways) * way,
     )
-
-
-def _root_along(axis: Floats, along: float, across: float) -> tuple[float, float, float]:
-    """Of a matrix with these values along an axis and across it: of columns, of both, of rows."""
-    x, y = axis.tolist()
-    more = along - across
-    return across + more * x * x, more * x * y, across + more * y * y
 
 
 def _ends(places: Floats, counted: NDArray[np.int64]) -> tuple[int, int]:
@@ -441,20 +434,3 @@ def _ends(places: Floats, counted: NDArray[np.int64]) -> tuple[int, int]:
         away = np.linalg.norm(places[counted] - places[other], axis=1)
         one, other = other, int(counted[away.argmax()])
     return one, other
-
-
-def _whitening(attitude: Attitude, causes: Floats, angles: int, shaken_rad: float) -> Floats:
-    """What makes errors of pitch, roll and heading, `causes` (3, 4), independent and of sigma 1: (3, 3).
-
-    All have those that are new with each time, too: the attitude's own and, of what shifts an image down or
-    aside, `shaken_rad`.
-    """
-    least = math.radians(attitude.white_sigma_deg) ** 2 + EXACT_RAD**2
-    pitch = math.radians(attitude.pitch_deg)
-    # As a camera turns about its own axes across and upright: the second is not the world's.
-    aside = [[1.0, 0.0], [0.0, math.tan(pitch)], [0.0, 1 / math.cos(pitch)]]
-    moves = np.concatenate([causes, shaken_rad * np.array(aside)], 1)
-    white = np.linalg.inv(np.linalg.cholesky(moves @ moves.T + least * np.eye(3)))
-    if angles < 3:
-        white[2] = (0.0, 0.0, 1.0)
-    return white

@@ -175,7 +175,7 @@ def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: i
         missed = (weight @ (rows[:, 6:8] - points)[:, :, None]).ravel()
         follow = np.linalg.solve(by_place.T @ whole @ by_place, by_place.T @ whole)
         off_m = off_m + follow @ missed
-    place_m = problem.bar_sigma[bar, 0]
+    place_m = problem.errors.survey[bar, 0]
     by_camera = follow @ by_pose
     covariance = follow @ np.linalg.inv(whole) @ follow.T + by_camera @ pose.covariance @ by_camera.T
     covariance = covariance + place_m**2 * np.eye(3)

@@ -13,19 +13,11 @@ from evlcp_sdk.values import Frame, Packet
 
 @dataclass(frozen=True)
 class FrameRow:
-    """One decoded frame.
+    """One decoded frame, as `Frame` has it.
 
     Attributes:
-        transmitter: Number of the transmitter.
-        t_us: Start of the frame's first chip on the camera's clock, us.
         symbols: Symbol of each cluster, cluster 0 first; -1 for one that is not given.
-        distance_m: Distance along the optical axis, m; NaN for none.
-        sigma_m: Its standard deviation, m; NaN for none.
-        filtered_m: The distance filtered over time, m; NaN for none.
-        x_px: Column of the bar's centre, px.
-        y_px: Row of the same, px.
-        echo_of: Transmitter whose reflection this is declared; None for a frame of its own.
-        link: Name of the link, where a receiver has several; empty where it has one.
+        distance_m: Distance along the optical axis, m; as its sigma, and as filtered, NaN for none.
     """
 
     transmitter: int

@@ -20,7 +20,7 @@ from evlcp_sdk.place.observations import (
     Problem,
     Rejection,
     project_bars,
-    shared_sigmas,
+    shared_errors,
     whole_clusters,
 )
 from evlcp_sdk.scene.attitude import Attitude
@@ -75,13 +75,13 @@ def misses(p: Problem, at: Fit, change: Floats) -> Floats:
         own = at.local[b] + change[14 + 9 * b : 23 + 9 * b]
         rows = p.points[p.bar == b]
         arm = rows[:, 3:6]
-        place, lean, length, columns, both, rows_px, *even = p.bar_sigma[b]
+        (place, lean, length), root, even = (one[b] for one in p.errors)
         stands = rows[:, :3] + place * own[3:6] + np.cross(lean * own[6:9], arm) + length * own[2] * arm
         points, _ = project_bars(stands, position, rotation, camera)
         centre = np.array(camera.centre_px)
         points = centre + (points - centre) * (1 + FOCAL_UNIT * change[6])
-        points = points + np.array([[columns, both], [both, rows_px]]) @ own[:2]
-        white = np.array([even[:2], even[1:]]) * rows[:, 8, None, None]
+        points = points + root @ own[:2]
+        white = even * rows[:, 8, None, None]
         found.append(np.einsum("nij,nj->ni", white, rows[:, 6:8] - points).ravel())
         found.append(-own)
     found.append(-z)
@@ -392,6 +392,8 @@ def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -
     points = np.where(seen[:, None], 300 + 250 * centres_m, np.nan)
     spec = ErrorModel(shared_along_px=0.05, shared_share=0.002, stretch_share=0.003)
     view = BarView(0, enu_m, points, np.full(len(enu_m), 0.1), (0.1, 0.2, 0.004))
-    shift, *site = shared_sigmas(view, seen, spec, 1.0)
-    assert shift == pytest.approx(math.hypot(0.05, 0.002 * 250 * length_m), rel=1e-9)
-    assert site == pytest.approx([0.1, 0.2, 0.005])
+    found = shared_errors(view, seen, spec, 1.0)
+    assert np.linalg.eigvalsh(found.root)[-1] == pytest.approx(
+        math.hypot(0.05, 0.002 * 250 * length_m), rel=1e-9
+    )
+    assert found.survey == pytest.approx([0.1, 0.2, 0.005])
