@@ -78,6 +78,9 @@ triangle of 10 m at 50 m is seen to better than a pixel of 7000 px."""
 EXACT_RAD = 1e-7
 """Least sigma of an angle, so that exact knowledge stays solvable: 5 um at 50 m."""
 
+_BOTH = np.eye(2)
+"""Columns and rows alike."""
+
 _LEVI_CIVITA = np.zeros((3, 9))
 for _i, _j, _k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
     _LEVI_CIVITA[_i, 3 * _j + _k], _LEVI_CIVITA[_i, 3 * _k + _j] = -1.0, 1.0
@@ -419,11 +422,12 @@ def shared_errors(view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, betw
     line = size > 0 and bool((np.abs(aside) <= 0.5 * size * share / count).all())
     across = math.hypot(spec.shared_sigma_px, view.shift_px, moved) if line else along
     sideways = 1 / view.across if line else 1 / max(view.across, 1.0)
-    way, (place, turn, length) = np.outer(axis, axis), view.survey
+    (x, y), (place, turn, length) = axis.tolist(), view.survey
+    way = np.array([[x * x, x * y], [x * y, y * y]])
     return SharedErrors(
         np.array([place, turn, math.hypot(length, spec.stretch_share)]),
-        across * np.eye(2) + (along - across) * way,
-        sideways * np.eye(2) + ((1.0 if line else sideways) - sideways) * way,
+        across * _BOTH + (along - across) * way,
+        sideways * _BOTH + ((1.0 if line else sideways) - sideways) * way,
     )
 
 
