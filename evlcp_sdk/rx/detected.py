@@ -30,12 +30,7 @@ when it is found, and a shaking camera has seen it elsewhere before."""
 
 
 class DetectedRegions(RegionTracker):
-    """Holds the events of the regions that a detector gives; they stay where it has them.
-
-    Args:
-        link: The resolved configuration.
-        limits: How much is held.
-    """
+    """Holds the events of the regions that a detector gives; they stay where it has them."""
 
     def __init__(self, link: Link, limits: Limits = LIMITS) -> None:
         self._guard = Guard(link, "detection")

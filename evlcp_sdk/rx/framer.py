@@ -49,12 +49,7 @@ def on_camera(value: Any, camera_us: Callable[[float], float]) -> Any:
 
 
 class Announcer:
-    """Says of each finished stage what it gave and how long it took.
-
-    Args:
-        hook: Where that is heard.
-        camera_us: Gives the camera clock's time of a time inside.
-    """
+    """Says of each finished stage what it gave, in times of the camera's clock, and how long it took."""
 
     def __init__(self, hook: Callable[..., Any], camera_us: Callable[[float], float]) -> None:
         self._hook, self._camera_us = hook, camera_us

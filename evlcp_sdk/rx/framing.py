@@ -219,12 +219,8 @@ def measure_row_delay(
 ) -> tuple[float, float]:
     """Delay from one row to the next in a preamble, and its sigma, us; NaN where too few rows show it.
 
-    Args:
-        chips: Of the preamble, -1 and +1, float64 (P,).
-        lock: As synchronization gave it.
-        pieces: Events of the region, (start us, events) a time step, those of the preamble among them.
-        centre_px: Row of the bar's centre.
-        height_px: Its height.
+    `chips` are those of the preamble, -1 and +1, float64 (P,); its events are among the `pieces` of the
+    region, (start us, events) a time step. The bar's centre lies in row `centre_px`.
     """
     blocks = round(height_px / _BLOCK_PX)
     if blocks < _FEWEST_BLOCKS:
@@ -281,18 +277,7 @@ class Transmitter:
 
 
 class Transmitters:
-    """Regions with what is known of them, by the region's number.
-
-    Args:
-        packet: What is on air.
-        step_us: Length of a time step, us.
-        limits: How many are remembered.
-        numbers: Where their numbers come from.
-        chips_after: Chips after a frame that are read with it.
-
-    Attributes:
-        alive: Those in sight, by the number of their region.
-    """
+    """Regions with what is known of them; those in sight are `alive`, by the number of their region."""
 
     def __init__(
         self,
@@ -415,15 +400,8 @@ class Transmitters:
 class PacketFraming(Framer):
     """Finds the packets of the regions of a stream, decodes their frames, and sets the regions right by them.
 
-    Args:
-        link: The resolved configuration.
-        name: Name of the link, that its frames have; empty for none.
-        stream: What it is a part of.
-        steps: The algorithms that read a frame.
-        regions: The regions of the stream.
-        follower: The same where frames correct them; None where they stay as a detector has them.
-        queue: Where decoded frames go.
-        on_frame: Gets each frame as soon as it is decoded; None for nobody.
+    The `follower` is the same as the regions where frames correct them; None where they stay as a detector
+    has them. Decoded frames go to the `queue`.
     """
 
     cut_by_the_end = True

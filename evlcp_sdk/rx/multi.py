@@ -35,12 +35,7 @@ _MOST_FRAMES = 4096
 
 
 def explained_us(packet: Packet, form: PacketFormat) -> float:
-    """How much of the light a packet explains: the time of each cluster in which its symbols are right, us.
-
-    Args:
-        packet: As it was decoded.
-        form: Lengths of its parts.
-    """
+    """The light that a packet explains: the time of each cluster in which its symbols are right, us."""
     total = 0.0
     for frame in packet.frames:
         chips = form.info_chips + form.has_pilot(frame.frame) * form.pilot_chips
@@ -75,11 +70,7 @@ class Shown:
 
 
 class SeveralLinks:
-    """Lets packets of several links wait, and says which of them fit their place best.
-
-    Args:
-        links: The links.
-        patience_us: How late the slowest of them answers, us.
+    """Lets packets of several links wait until the slowest has answered, and says which fit their place best.
 
     Attributes:
         owning: Numbers of the transmitters that hold their places.
@@ -227,12 +218,7 @@ class EarlyFrames:
         self.withdrawn = 0
 
     def decoded(self, frame: Frame, *, owns: bool) -> None:
-        """Take a frame, in order of its transmitter's.
-
-        Args:
-            frame: The frame, on the camera's clock.
-            owns: Its transmitter owns its place now.
-        """
+        """Take a frame, in order of its transmitter's, which owns its place now or not."""
         known = self._known.setdefault(frame.transmitter, OrderedDict())
         known[frame.packet, frame.frame] = frame
         if len(known) > _MOST_FRAMES:

@@ -48,15 +48,7 @@ class _Listener:
 
 
 class PluginFraming(Framer):
-    """Lets a plugin's framing listen to the regions of a stream, and puts its frames on the way of all.
-
-    Args:
-        link: The resolved configuration.
-        name: Name of the link, that its frames have; empty for none.
-        stream: What it is a part of.
-        queue: Where frames go.
-        on_frame: Gets each frame as soon as it is decoded; None for nobody.
-    """
+    """Lets a plugin's framing listen to the regions of a stream, and puts its frames on the way of all."""
 
     cut_by_the_end = False
 

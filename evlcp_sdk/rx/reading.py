@@ -49,13 +49,7 @@ _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
 
 class Steps:
-    """The roles that read a frame; it keeps no state of a stream.
-
-    Args:
-        link: The resolved configuration.
-        announcer: Gets every result but the filters'; None for nobody.
-        tracker: The filters of its tracking, as `tracker_of` gives them.
-    """
+    """The roles that read a frame; it keeps no state of a stream."""
 
     def __init__(self, link: Link, announcer: Announcer | None, tracker: Tracker) -> None:
         self._codebook = link.codebook
@@ -171,13 +165,7 @@ class Reading:
 
 
 class FrameReader:
-    """Reads one frame after the other; it keeps no state of a stream.
-
-    Args:
-        link: The resolved configuration.
-        steps: Its algorithms.
-        aligner: What the frames were aligned by.
-    """
+    """Reads one frame after the other, as the aligner aligned it; it keeps no state of a stream."""
 
     def __init__(self, link: Link, steps: Steps, aligner: FrameAligner) -> None:
         centres_m, book = link.bar.cluster_centres_m(), link.codebook
@@ -206,15 +194,8 @@ class FrameReader:
     ) -> Reading:
         """What a frame that shows its clusters says; one without a pilot has no distance and no points.
 
-        Args:
-            aligned: What it shows.
-            due: Which frame it is.
-            before: The chip that each cluster sent before its info segment, int8 (K,); -1 if not known.
-            attitude: The camera's, as far as it is known.
-            ranged: Its distance is asked for.
-
-        Raises:
-            PluginError: The decoding or the ranging fails, or gives what it may not.
+        `before` is the chip that each cluster sent before its info segment, int8 (K,), -1 if not known; the
+        distance is asked for where it is `ranged`.
         """
         sums, presence, placement = aligned.sums, aligned.pilot.presence, aligned.pilot.placement
         soft = self._steps.decode(presence, aligned.sums_and_next, before, self._behind[due.index])

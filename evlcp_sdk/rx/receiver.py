@@ -226,15 +226,8 @@ class Receiver:
 class LinkReceiver:
     """Follows the regions of a stream by one link, receives and decodes what they send, reads its messages.
 
-    Args:
-        link: The resolved configuration.
-        name: Name of the link, that its frames have; empty for none.
-        stream: What it is a part of.
-        rhythm: Scores of the pixels, of another link in the same rhythm; None for its own.
-        on_frame: Gets each frame as soon as it is decoded; None for nobody.
-
-    Attributes:
-        framing: What reads its frames.
+    Its frames have the name of the link, empty for none, and come to `on_frame` as soon as they are decoded;
+    `rhythm` are the scores of the pixels, of another link in the same rhythm.
     """
 
     def __init__(
@@ -308,10 +301,7 @@ class LinkReceiver:
     ) -> list[Packet]:
         """Follow the regions through a time step; receive and decode what they send.
 
-        Args:
-            step: The events.
-            taken: Places that other links hold.
-            owning: Numbers of the transmitters that own theirs.
+        `taken` are places that other links hold, `owning` the numbers of the transmitters that own theirs.
         """
         if step.after_gap:
             self._regions.skip()

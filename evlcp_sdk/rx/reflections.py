@@ -99,12 +99,7 @@ class FrameDetection:
 def repeats(one: NDArray[np.int64], other: NDArray[np.int64], codewords: int) -> float:
     """Log-likelihood ratio of one frame repeating another's symbols against being independent of it.
 
-    Clusters that are not given in either, -1, say nothing.
-
-    Args:
-        one: Symbols of a frame, int64 (K,).
-        other: Symbols of another at the same time.
-        codewords: How many symbols there are.
+    Both are symbols of clusters, int64 (K,), of so many codewords; -1, one not given in either, says nothing.
 
     >>> said = np.arange(16)
     >>> repeats(said, said, 64) > 20, repeats(said, said[::-1], 64) < -3
@@ -216,12 +211,7 @@ class _Pair:
 
 
 class Reflections:
-    """Judges which transmitter is a reflection of which, from the frames that they have in common.
-
-    Args:
-        packet: Lengths of a packet's parts.
-        codewords: How many symbols there are.
-    """
+    """Judges which transmitter is a reflection of which, from the frames that they have in common."""
 
     def __init__(self, packet: PacketFormat, codewords: int) -> None:
         self._codewords = codewords
@@ -247,11 +237,7 @@ class Reflections:
         return False
 
     def judge(self, seen: Iterable[FrameDetection]) -> None:
-        """Take the frames of a time step, in any order.
-
-        Args:
-            seen: Of one transmitter in order of time.
-        """
+        """Take the frames of a time step in any order, those of one transmitter in order of time."""
         fresh = sorted(seen, key=lambda s: (s.t_us, s.frame.transmitter))
         if not fresh:
             return
@@ -308,12 +294,9 @@ class Reflections:
 
 
 class PacketAssembler:
-    """Collects a transmitter's frames until their packet is over.
+    """Collects a transmitter's frames until their packet, of so many frames, is over.
 
     A packet is a reflection as a whole, as its last frame, which knows most, says.
-
-    Args:
-        sent: Frames of a packet.
     """
 
     def __init__(self, sent: int) -> None:
