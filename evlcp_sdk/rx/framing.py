@@ -209,6 +209,10 @@ class RowDelay:
         gain = variance / (variance + sigma_us**2)
         return RowDelay(self.row_us + gain * (row_us - self.row_us), (1 - gain) * variance)
 
+    def delayed(self, lock: SyncLock, height_px: float) -> SyncLock:
+        """A lock with this delay, of a bar of some height."""
+        return changed(lock, row_us=self.row_us, last_row_us=abs(self.row_us) * height_px / 2)
+
 
 def measure_row_delay(
     chips: NDArray[np.float64],
@@ -583,8 +587,7 @@ class PacketFraming(Framer):
         row_us, sigma_us = measure_row_delay(self._preamble, lock, region.pieces, y_px, height_px)
         if math.isfinite(row_us):
             transmitter.rows = transmitter.rows.measured(row_us, sigma_us)
-        row_us = transmitter.rows.row_us
-        return changed(lock, row_us=row_us, last_row_us=abs(row_us) * height_px / 2)
+        return transmitter.rows.delayed(lock, height_px)
 
     def _decode_ahead(self, transmitter: Transmitter, until_us: float) -> None:
         """Decode the next frame before its time step is over.

@@ -1,5 +1,6 @@
 """Packet grids against a walk through the chips on air; delays by row, on bars whose rows come late."""
 
+from dataclasses import replace
 from itertools import takewhile
 
 import numpy as np
@@ -164,6 +165,12 @@ def test_nothing_to_see_is_nothing_known(events):
     assert np.isnan(measured(events)).all()
     # A small bar has no rows to tell apart.
     assert np.isnan(measured(EVENTS, 20.0)[0])
+
+
+@pytest.mark.parametrize("row_us", [-0.15, 0.15])
+def test_the_last_row_is_late_by_half_a_bar(row_us):
+    lock = RowDelay(row_us, 1e-4).delayed(LOCK, HEIGHT_PX)
+    assert lock == replace(LOCK, row_us=row_us, last_row_us=0.15 * HEIGHT_PX / 2)
 
 
 def test_packets_are_averaged_and_changes_followed():
