@@ -31,7 +31,7 @@ from firmware_host.commands._source import BankOptions
 from firmware_host.commands.stream import stream
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Sequence
+    from collections.abc import Callable, Mapping, Sequence
 
     from firmware_host.board.bank import Bank
     from firmware_host.board.board import Board
@@ -228,18 +228,14 @@ def _beside_inventory(context: typer.Context, *allowed: str) -> None:
 
 def _report(as_json: bool) -> Callable[[Result], None]:
     """Prints the result of each board of an inventory."""
-
-    def report(result: Result) -> None:
-        say(result.line, result.to_dict(), as_json)
-
-    return report
+    return lambda result: say(result.line, result.to_dict(), as_json)
 
 
 def _each(
     context: typer.Context,
     inventory: Path | None,
     as_json: bool,
-    work: Callable[[Board], tuple[str, dict[str, Any]]],
+    work: Callable[[Entry | None, Board], tuple[str, dict[str, Any]]],
     *allowed: str,
 ) -> None:
     """Do something with a board, or with all of an inventory, and say what.
@@ -248,13 +244,13 @@ def _each(
     """
     if inventory is None:
         with open_board(context) as board:
-            said, table = work(board)
+            said, table = work(None, board)
         say(said, table, as_json)
         return
     from firmware_host.board.fleet import read_entries, run_fleet
 
     _beside_inventory(context, *allowed)
-    run_fleet(inventory, read_entries(inventory), lambda _, board: work(board), _report(as_json))
+    run_fleet(inventory, read_entries(inventory), work, _report(as_json))
 
 
 @app.command(cls=LineCommand)
@@ -379,7 +375,7 @@ def _simple(
 ) -> None:
     """A request or two, after which a board, or all of an inventory, is in a state."""
 
-    def work(board: Board) -> tuple[str, dict[str, Any]]:
+    def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
         ask(board)
         return state if inventory else "", {"state": state}
 
@@ -433,7 +429,7 @@ def status(
             _show(status_table(board.status()), as_json)
         return
 
-    def work(board: Board) -> tuple[str, dict[str, Any]]:
+    def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
         found = status_table(board.status())
         faults = f", faults {', '.join(found['faults'])}" if found["faults"] else ""
         return f"{found['state']}, {found['packets_sent']} packets sent{faults}", {"status": found}
@@ -557,26 +553,21 @@ def verify(
 
     For example: [bold]evlcp board --port /dev/ttyUSB0 verify SYMBOLS.json[/]
     """
+    if inventory is None:
+        banks: Mapping[str, Bank] = {"": payload.bank()}
+    else:
+        from firmware_host.board.fleet import read_inventory
 
-    def compare(bank: Bank, board: Board) -> tuple[str, dict[str, Any]]:
+        _beside_inventory(context)
+        banks = read_inventory(inventory).banks
+
+    def compare(entry: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
+        bank = banks[entry.id if entry else ""]
         number = board.verify(bank)
         table = {"bytes": len(bank.content), "bank": number, "crc": f"{bank.crc:08x}"}
         return f"same: {len(bank.content)} bytes in bank {number}, CRC {bank.crc:08x}", table
 
-    if inventory is not None:
-        from firmware_host.board.fleet import read_inventory, run_fleet
-
-        _beside_inventory(context)
-        found = read_inventory(inventory)
-        report = _report(as_json)
-        run_fleet(
-            inventory, found.entries, lambda entry, board: compare(found.banks[entry.id], board), report
-        )
-        return
-    bank = payload.bank()
-    with open_board(context) as board:
-        said, table = compare(bank, board)
-    say(said, table, as_json)
+    _each(context, inventory, as_json, compare)
 
 
 @app.command("test-leds", cls=LineCommand)
@@ -611,7 +602,7 @@ def save(
     For example: [bold]evlcp board --port /dev/ttyUSB0 save --autostart[/]
     """
 
-    def work(board: Board) -> tuple[str, dict[str, Any]]:
+    def work(_: Entry | None, board: Board) -> tuple[str, dict[str, Any]]:
         reply = board.save(autostart)
         table = {"slot": reply.slot, "save_sequence": reply.save_sequence, "autostart": autostart}
         return f"saved in slot {reply.slot}, number {reply.save_sequence}", table
