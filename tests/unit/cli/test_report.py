@@ -76,6 +76,8 @@ def test_the_paper_is_held_beside_the_series_it_speaks_of(summary: Summary) -> N
     assert by_name["rmse_m", 30, 16].startswith("30 km/h, 16")
     assert by_name["rmse_m", 30, 2].startswith("30 km/h, two")
     assert sum(c.reference.measure == "ber" for c in found) == 2
+    # Beside a bound stands the worst segment; the scenes are the harder, the farther.
+    assert {c.from_m for c in found if c.reference.measure == "ber"} == {70}
     ours = Series({}, {"speed_kmh": 30}, summary.series[0].link, ())
     assert beside_paper([ours]) == []
 

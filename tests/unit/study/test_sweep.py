@@ -51,7 +51,7 @@ def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) ->
     assert dry.code == 0
     assert "short: 0 of 4 tasks" in dry.out
     assert not results.exists()
-    done = evlcp("sweep", campaign, "-o", results, "--workers", "2")
+    done = evlcp("sweep", campaign, "-o", results, "--workers", "1")
     assert (done.code, done.err) == (0, "")
     assert "short: 4 of 4 tasks, 4 of 4 points" in done.out
     with Store(results) as store:
