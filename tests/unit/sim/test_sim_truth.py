@@ -73,6 +73,9 @@ def test_a_file_without_a_link_is_of_the_default_link() -> None:
     known = plain(truth_of(load_scene("night", {"link": other})))
     del known["links"], known["bars"][0]["link"]
     assert truth_from_table(known).bars[0].link == resolve(other)
+    del known["bars"][0]["profile"]
+    with pytest.raises(InputError, match=r"bars\.0\.profile: missing; expected it, or a link"):
+        truth_from_table(known)
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
@@ -101,6 +104,8 @@ def test_files_of_another_generator_are_read(path: Path) -> None:
         ("scene.duration_s", -1.0, "scene.duration_s = -1.0: expected greater than or equal to 0"),
         ("t_s", [1.0, 0.5], "t_s = [1.0, 0.5]: expected rising times"),
         ("distance_m.0", [1.0], "distance_m.0 = [1.0]: expected 50 numbers"),
+        ("distance_m", [], "distance_m = []: expected one list a bar, 1"),
+        ("camera_path.attitude_deg", [[1.0], []], "camera_path = {"),
         ("bar_centre_px.0", [[1.0]], "bar_centre_px.0.1: missing"),
         ("bars.0.start_chip", -3, "bars.0.start_chip = -3: expected greater than or equal to 0"),
         ("bars.0.payload", "songs", "bars.0.payload = \"songs\": expected 'symbols', 'data' or 'messages'"),
