@@ -617,15 +617,8 @@ def provision(
     if most_ma is not None or (duty is not None and not last):
         board.limit(bank, most_ma, None if last else duty)
         status = board.status()
-    level, later = settings.level_ma, False
-    if level is not None and status.level_ma != level:
-        try:
-            board.level(level)
-        except RefusedError as fault:
-            # too much for what plays, but perhaps not for what comes
-            if fault.status != Status.TOO_BRIGHT:
-                raise
-            later = True
+    level = settings.level_ma
+    later = level is not None and status.level_ma != level and not _set_level(board, level)
     wanted = (settings.watchdog, settings.watchdog_ms)
     if settings.watchdog is not None and (status.watchdog, status.watchdog_ms) != wanted:
         board.watchdog(settings.watchdog, settings.watchdog_ms)
@@ -643,6 +636,17 @@ def provision(
     if settings.start and status.state != State.PLAYING:
         board.start()
     return done
+
+
+def _set_level(board: Board, level_ma: int) -> bool:
+    """Set the LED current; False where it is too much for what plays, but perhaps not for what comes."""
+    try:
+        board.level(level_ma)
+    except RefusedError as fault:
+        if fault.status != Status.TOO_BRIGHT:
+            raise
+        return False
+    return True
 
 
 def _frames(bank: Bank) -> tuple[int, int]:
