@@ -6,6 +6,7 @@
 import json
 import math
 from collections.abc import Mapping
+from importlib import import_module
 from itertools import pairwise
 from typing import Any
 
@@ -100,7 +101,6 @@ class Mcap(Sink):
 
     def fix(self, fix: Fix, filtered: Place | None) -> None:
         """Write a fix that is given, and the filtered place at its time."""
-        from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
         from scipy.spatial.transform import Rotation
 
         self._integrity(fix)
@@ -115,7 +115,7 @@ class Mcap(Sink):
             return
         axes = Attitude(fix.pitch_deg, fix.roll_deg, fix.heading_deg).rotation()
         turn = Rotation.from_matrix(axes).as_quat()
-        pose = PoseInFrame(frame_id=FRAME_ID)
+        pose = _schema("PoseInFrame")(frame_id=FRAME_ID)
         pose.timestamp.FromNanoseconds(self._at_ns(fix.t_us))
         where, how = pose.pose.position, pose.pose.orientation
         where.x, where.y, where.z = fix.enu_m.tolist()
@@ -132,16 +132,15 @@ class Mcap(Sink):
     def _location(
         self, topic: str, t_us: float, place: tuple[float, float, float], covariance_m2: NDArray[np.float64]
     ) -> None:
-        from foxglove_schemas_protobuf.LocationFix_pb2 import LocationFix
-
         latitude, longitude, height = place
-        message = LocationFix(
+        fix = _schema("LocationFix")
+        message = fix(
             frame_id=FRAME_ID,
             latitude=latitude,
             longitude=longitude,
             altitude=height,
             position_covariance=covariance_m2.ravel().tolist(),
-            position_covariance_type=LocationFix.KNOWN,
+            position_covariance_type=fix.KNOWN,
         )
         message.timestamp.FromNanoseconds(self._at_ns(t_us))
         self._write(topic, t_us, message)
@@ -154,27 +153,22 @@ class Mcap(Sink):
         self._write("/integrity", fix.t_us, message)
 
     def _write_picture(self) -> None:
-        from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
-
         if self._picture is None:
             return
         end_us = (self._picture + 1) * _PICTURE_US
-        image = CompressedImage(frame_id=CAMERA_ID, data=self._image.png(), format="png")
+        image = _schema("CompressedImage")(frame_id=CAMERA_ID, data=self._image.png(), format="png")
         image.timestamp.FromNanoseconds(self._at_ns(end_us))
         self._write("/image", end_us, image)
         self._image.clear()
         self._picture = None
 
     def _write_regions(self) -> None:
-        from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
-        from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
-
         if self._turn is None:
             return
         end_us = (self._turn + 1) * _PICTURE_US
-        message = ImageAnnotations()
+        message, loop = _schema("ImageAnnotations")(), _schema("PointsAnnotation").LINE_LOOP
         for region in self._regions.values():
-            box = message.points.add(type=PointsAnnotation.LINE_LOOP, thickness=1)
+            box = message.points.add(type=loop, thickness=1)
             box.timestamp.FromNanoseconds(self._at_ns(end_us))
             box.outline_color.r, box.outline_color.g, box.outline_color.b, box.outline_color.a = _WHITE
             for right, down in ((-1, -1), (1, -1), (1, 1), (-1, 1)):
@@ -188,19 +182,16 @@ class Mcap(Sink):
 
     def _scene(self, t_us: float) -> None:
         """Write the bars whose places have become known, or changed."""
-        from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
-        from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
-
         assert self.run.navigator is not None
         positioner = self.run.navigator.positioner
         axes, bars = positioner.axes, dict(positioner.bars.stands_at)
         if axes is None or bars == self._bars:
             return
-        message = SceneUpdate()
+        message = _schema("SceneUpdate")()
         for number, site in bars.items():
             bar = message.entities.add(frame_id=FRAME_ID, id=f"bar {number}", frame_locked=True)
             bar.timestamp.FromNanoseconds(self._at_ns(t_us))
-            line = bar.lines.add(type=LinePrimitive.LINE_STRIP, thickness=0.05)
+            line = bar.lines.add(type=_schema("LinePrimitive").LINE_STRIP, thickness=0.05)
             line.pose.orientation.w = 1
             line.color.r, line.color.g, line.color.b, line.color.a = _AMBER
             middle = axes.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
@@ -235,3 +226,8 @@ class Mcap(Sink):
 
     def _at_ns(self, t_us: float) -> int:
         return at_ns(self.run.clock_zero, t_us)
+
+
+def _schema(name: str) -> Any:
+    """The type of a message."""
+    return getattr(import_module(f"foxglove_schemas_protobuf.{name}_pb2"), name)

@@ -12,6 +12,9 @@ from evlcp_sdk.io.arrays import ArrayColumn, choose_columns, pieces_of
 from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, one_line
 from evlcp_sdk.io.fields import Fields, fields_of, unit_named
 from evlcp_sdk.io.urls import flag, split_options
+from evlcp_sdk.late import Late
+
+h5py: Any = Late("h5py")
 
 _PLACES: Final = ("events", "raw_events", "CD/events")
 _ECF: Final = 36559
@@ -54,16 +57,14 @@ def _read(path: Path, stack: ExitStack, order: str | None, swapped: bool) -> Eve
     External storage, links to other files and virtual data sets are refused.
     """
     try:
-        import h5py
-    except ImportError as fault:
-        raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[hdf5]'") from fault
-    try:
         file = stack.enter_context(h5py.File(path, "r"))
         columns, found = _columns_of(path, file, order)
         size = [file.attrs.get(name) for name in ("width", "height")]
         width, height = (int(side) if side is not None else None for side in size)
     except InputError:
         raise
+    except ImportError as fault:
+        raise InputError(f"{path}: needs the extra: pip install 'evlcp-sdk[hdf5]'") from fault
     except Exception as fault:
         # A damaged file makes h5py fail in any way.
         raise InputError(f"{path}: found no HDF5 file, or a damaged one ({one_line(fault)})") from fault
@@ -98,8 +99,6 @@ class _DataSet:
 
 def _columns_of(path: Path, file: Any, order: str | None) -> tuple[list[ArrayColumn], Fields]:
     """Time, polarity and, if there are any, x and y."""
-    import h5py
-
     at, node = _place_of(path, file)
     is_group = isinstance(node, h5py.Group)
     names = [name for name in node if _is_own(node, name)] if is_group else list(node.dtype.names or ())
@@ -119,8 +118,6 @@ def _columns_of(path: Path, file: Any, order: str | None) -> tuple[list[ArrayCol
 
 def _place_of(path: Path, file: Any) -> tuple[str, Any]:
     """Where the columns are: in one of `_PLACES`, or at the top, as in files of MATLAB."""
-    import h5py
-
     for place in _PLACES:
         node = file
         for part in place.split("/"):
@@ -144,8 +141,6 @@ def _place_of(path: Path, file: Any) -> tuple[str, Any]:
 
 def _is_own(group: Any, name: str) -> bool:
     """Whether it lies in the file itself, not behind a link to another."""
-    import h5py
-
     return isinstance(group.get(name, getlink=True), h5py.HardLink)
 
 
@@ -155,8 +150,6 @@ def _check(path: Path, dataset: Any) -> None:
     Raises:
         InputError: Which it is.
     """
-    import h5py
-
     is_column = (
         isinstance(dataset, h5py.Dataset) and dataset.shape is not None and 1 <= len(dataset.shape) <= 2
     )
