@@ -196,13 +196,13 @@ class RawSource(EventSource):
     _gives_bits = True
 
     def __init__(self, path: Path | str, file: RawBytes | None = None) -> None:
-        self._path = Path(path)
+        self.path = Path(path)
         self._buffer = np.empty(2 * _kernels.LOOK_BYTES, np.uint8)
         self._position = 0  # byte offset in the file of the first byte not decoded
         self._start = self._end = 0  # the bytes of the buffer not decoded
         self._exhausted = False
         try:
-            self._file: RawBytes = self._path.open("rb", buffering=0) if file is None else file
+            self._file: RawBytes = self.path.open("rb", buffering=0) if file is None else file
             self._number: int | None = getattr(self._file, "fileno", lambda: None)()
             status = None if self._number is None else os.fstat(self._number)
         except OSError as error:
@@ -210,12 +210,12 @@ class RawSource(EventSource):
         self._is_pipe = status is None or not stat.S_ISREG(status.st_mode)
         try:
             self._fill_header()
-            header = parse_header(self._buffer[: self._end].tobytes(), self._path)
+            header = parse_header(self._buffer[: self._end].tobytes(), self.path)
             size = None if status is None or self._is_pipe else status.st_size
             self._codec = header.codec
             self._decoder = Decoder(header.codec, header.width, header.height)
             shape = header.width, header.height
-            super().__init__(self._path, header.codec.name, *shape, header.fields, size, self._decoder)
+            super().__init__(self.path, header.codec.name, *shape, header.fields, size, self._decoder)
             if not header.closed:
                 self._decoder.note(_kernels.HEADER_OPEN, header.size_bytes)
             self._start = self._position = self._data_start = header.size_bytes
@@ -229,9 +229,6 @@ class RawSource(EventSource):
 
     def _fill_header(self) -> None:
         """Read until the header is there; of a file all that there is room for."""
-        if not self._is_pipe:
-            self._fill()
-            return
         while not self._exhausted and self._end < MAX_HEADER_BYTES:
             self._fill()
             start = self._buffer[: self._end].tobytes()
@@ -282,7 +279,7 @@ class RawSource(EventSource):
             try:
                 size = self._file.readinto(view[self._end :])
             except (OSError, ValueError) as error:  # ValueError: the file is closed
-                raise InputError(f"{self._path}: at byte {self._position + left}: {error}") from error
+                raise InputError(f"{self.path}: at byte {self._position + left}: {error}") from error
             self._exhausted = not size
             self._end += size or 0
 
