@@ -1,16 +1,19 @@
 """Listeners, delays, pictures, the budget and the reader of a live run, one by one."""
 
+import io
 import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.live import Budget, DelayTally, PictureSlot, Publisher, Shedder
 from evlcp_sdk.live.reader import ArrivalClock, Reader
 from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.results.picture import EventImage
 from evlcp_sdk.values import Events, Region, Triggers
 
 
@@ -55,6 +58,32 @@ def test_quantiles_are_those_of_numpy_to_two_percent() -> None:
     assert told["count"] == 5000
     assert told["max_ms"] == round(float(delays_ms.max()), 3)
     assert DelayTally().to_dict()["p50_ms"] is None
+
+
+@pytest.mark.parametrize("size", [(5, 4), (3, 7), (16, 1), (1, 2), (1, 1), (34, 50), (640, 480)])
+@pytest.mark.parametrize("density", [0.0, 0.0003, 0.01, 0.3, 3.0])
+def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
+    width, height = size
+    rng = np.random.default_rng(1)
+    image, cells = EventImage(width, height), np.zeros((height, width), np.uint8)
+    for _ in range(2):
+        n = int(width * height * density)
+        # Some lie outside.
+        x, y, p = rng.integers(0, width + 2, n), rng.integers(0, height + 1, n), rng.integers(0, 2, n)
+        image.paint(Events.of(np.arange(n), x, y, p))
+        for column, row, sign in zip(x.tolist(), y.tolist(), p.tolist(), strict=True):
+            if row < height and column < width:
+                cells[row, column] |= 1 << sign
+    assert (image.cells == cells).all()
+    told = image.png()
+    with Image.open(io.BytesIO(told)) as picture:
+        picture.load()
+        assert picture.mode == "P"
+        assert (np.array(picture) == cells).all()
+        assert told[24] == 2, "bits a pixel"
+        assert picture.getpalette()[:12] == [16, 16, 20, 70, 150, 255, 255, 205, 70, 235, 235, 235]
+    image.clear()
+    assert not image.cells.any()
 
 
 def test_a_picture_shows_what_each_pixel_did() -> None:

@@ -19,12 +19,14 @@ from evlcp_sdk.diagnosis.tallies import TransmitterTally
 from evlcp_sdk.errors import InputError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.source import Loss
-from evlcp_sdk.results.columns import FRAME_COLUMNS
+from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_columns, frame_value
+from evlcp_sdk.results.lines import format_frame
 from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
 from tests.conftest import ROOT
+from tests.unit.results.test_positions import packets
 
 LINK = load_link(overrides=["modulation.id=wh8", "air.frames_per_packet=3", "messages.decode=false"])
 
@@ -208,3 +210,31 @@ def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path) -> None:
     assert told == [("51.0000", "0.0250"), ("", "")]
     table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
     assert [row["distance_filtered_m"] for row in table] == [51.0, None]
+
+
+def test_a_line_has_all_columns() -> None:
+    (one,) = packets(1)
+    soft = one.frames[3].soft
+    soft = replace(soft, symbols=np.where(np.arange(16) == 1, -1, soft.symbols))
+    found = replace(one.frames[3], soft=soft, filtered=Range(12.34567, 0.1, 3), echo_of=2)
+    told = json.loads(format_frame(found, (*FRAME_COLUMNS, *FILTERED_COLUMNS)))
+    assert list(told) == ["line", *FRAME_COLUMNS, *FILTERED_COLUMNS]
+    for name in (*FRAME_COLUMNS, *FILTERED_COLUMNS):
+        value = frame_value(found, name)
+        if isinstance(value, float):
+            assert told[name] == (None if math.isnan(value) else pytest.approx(value, abs=6e-3))
+        else:
+            assert told[name] == value
+    assert told["symbols"][1] is None
+
+
+def test_what_is_no_number_is_null() -> None:
+    (one,) = packets(1)
+    found = one.frames[0]
+    for value in (math.nan, math.inf, -math.inf):
+        soft = replace(found.soft, quality=value)
+        odd = replace(found, soft=soft, range=Range(value, value, 0), x_px=value, link="nan inf None")
+        told = json.loads(format_frame(odd, frame_columns(filtered=False, links=True)))
+        names = ("quality", "distance_m", "distance_sigma_m", "x_px", "echo_of")
+        assert [told[name] for name in names] == [None] * 5
+        assert (told["line"], told["link"], told["y_px"]) == ("frame", "nan inf None", round(found.y_px, 3))
