@@ -46,7 +46,6 @@ class Trial:
         rejected: Frames rejected.
         quality: Mean quality of the frames; 0 without any.
         never: Codewords that never occur though they should have, by far.
-        codewords: How many the modulation has.
     """
 
     changes: tuple[tuple[str, Any], ...]
@@ -55,7 +54,6 @@ class Trial:
     rejected: int
     quality: float
     never: int
-    codewords: int
 
     @property
     def share(self) -> float:
@@ -75,7 +73,7 @@ class Trial:
     @property
     def rank(self) -> tuple[bool, float, float, int]:
         """What trials are sorted by, the best largest."""
-        return self.fits, round(self.share, 2), round(self.quality, 1), -self.codewords
+        return self.fits, round(self.share, 2), round(self.quality, 1), -self.link.codebook.carrying
 
     def options(self) -> str:
         """The changes as options of the command line; empty for the link as it was given."""
@@ -103,7 +101,6 @@ def try_link(link: Link, events: Events, changes: Sequence[tuple[str, Any]] = ()
         receiver.counts.get("frames_rejected", 0),
         tally.quality,
         max((count_missing_codewords(one, link) for one in tally.own), default=0),
-        link.codebook.carrying,
     )
 
 

@@ -52,32 +52,21 @@ class ResultFolder:
         Raises:
             ValueError: It is not among the files that a run may leave, or was opened before.
             OutputError: It cannot be written.
-            OSError: Likewise.
         """
-        return self._outputs.open(self._once(name))
+        return self._outputs.open(self._place(name, opened=True))
 
     def open_binary(self, name: str) -> BinaryIO:
-        """A binary file; it is closed with the folder.
+        """A binary file; else like `open`."""
+        return self._outputs.open_binary(self._place(name, opened=True))
 
-        Raises:
-            ValueError: It is not among the files that a run may leave, or was opened before.
-            OutputError: It cannot be written.
-            OSError: Likewise.
-        """
-        return self._outputs.open_binary(self._once(name))
-
-    def _place(self, name: str) -> Path:
+    def _place(self, name: str, *, opened: bool = False) -> Path:
         if name not in self._files:
             raise ValueError(f"'{name}' is not among the files of its record")
-        self._used.add(name)
-        return self.folder / name
-
-    def _once(self, name: str) -> Path:
-        if name in self._opened:
+        if opened and name in self._opened:
             raise ValueError(f"'{name}' was opened before")
-        place = self._place(name)
-        self._opened.add(name)
-        return place
+        self._used.add(name)
+        self._opened |= {name} if opened else set()
+        return self.folder / name
 
     def digests(self) -> dict[str, dict[str, Any]]:
         """Size in bytes and SHA-256 of each file, by name; they are closed.
