@@ -67,9 +67,8 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
     from evlcp_sdk.cli._common import make_executor
     from evlcp_sdk.files import Outputs, writing
     from evlcp_sdk.report.drawing import save_plots
-    from evlcp_sdk.study.charts import charts_of
     from evlcp_sdk.study.collect import collect
-    from evlcp_sdk.study.report import page
+    from evlcp_sdk.study.report import charts_of, page
     from evlcp_sdk.study.store import Store
     from evlcp_sdk.study.summary import summarize
     from evlcp_sdk.study.task import plan_of, run_job

@@ -42,8 +42,7 @@ def report(
     """
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.report.drawing import save_plots
-    from evlcp_sdk.study.charts import charts_of
-    from evlcp_sdk.study.report import page
+    from evlcp_sdk.study.report import charts_of, page
     from evlcp_sdk.study.store import Store
     from evlcp_sdk.study.summary import summarize
 

@@ -9,12 +9,11 @@ import pytest
 from evlcp_sdk.cli.report import as_markdown
 from evlcp_sdk.files import Outputs
 from evlcp_sdk.report.drawing import save_plots
-from evlcp_sdk.study.charts import charts_of
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.plan import Case, Job, Plan, make_plan
-from evlcp_sdk.study.report import POSITION_HEAD, page, position_rows
+from evlcp_sdk.study.report import POSITION_HEAD, charts_of, page, position_rows
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import PAPER, Series, Summary, beside_paper, summarize, verdict_of
 from evlcp_sdk.study.tally import Statistics, Tally

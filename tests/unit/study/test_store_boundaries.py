@@ -14,12 +14,11 @@ import pytest
 
 from evlcp_sdk.cli.report import as_markdown, show_tables
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.study.charts import charts_of
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.plan import Case, make_plan
-from evlcp_sdk.study.report import page
+from evlcp_sdk.study.report import charts_of, page
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import Summary, summarize
 from tests.unit.mutants import mutants, refusal
