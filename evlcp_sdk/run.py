@@ -310,10 +310,10 @@ def live(
 ) -> dict[str, Any]:
     """Receive in real time: results to listeners as they come, delays measured, what is too much left out.
 
-    See `evlcp_sdk.live` for how to listen. A recording that has no pace of its own is replayed at that of its
-    clock. Arguments are as of `receive_to_folder`, and three more: `publisher` is where listeners subscribe
-    and pictures are drawn, and is closed at the end; `budget` says when what is left out; `warm` is to load
-    all kernels before the first event, and before a source that does not wait is opened.
+    See `evlcp_sdk.live` for how to listen. A recording is replayed at the pace of its clock. Arguments are as
+    of `receive_to_folder`, and three more: `publisher` is where listeners subscribe and pictures are drawn,
+    and is closed at the end; `budget` says when what is left out; `warm` is to load all kernels before the
+    first event, and before a source that does not wait is opened.
 
     Returns:
         The summary, as of `receive_to_folder`, with `live`: delays by stage, and what was shed.
@@ -366,10 +366,8 @@ def live(
                 )
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
                 loop = LiveLoop(opened, receiver, links, publisher, budget, pulses=pulses)
-                pieces = loop.run(stopped)
-                table = _run(
-                    opened, url, receiver, writer, pieces, loop.close, _say_nothing, stopped, loop.summary
-                )
+                ends = loop.close, _say_nothing, stopped, loop.summary
+                table = _run(opened, url, receiver, writer, loop.run(stopped), *ends)
         publisher.publish("end", float(table["recording"]["last_us"] or 0), table)
         return table
     finally:
