@@ -204,8 +204,10 @@ def masked(presence: PresenceMap, layout: Layout, placement: Placement) -> Prese
     spacing_px = abs(placement.scale) * layout.spacing_m
     places = placement.places(layout)
     given = presence.probability, presence.selected, presence.pixels
-    prior, probability = np.zeros_like(given[0]), np.zeros_like(given[0])
-    selected, pixels = np.zeros_like(given[1]), np.zeros_like(given[2])
+    # Most of them stays 0, and is not written, as `zeros_like` does.
+    cells, dtype = given[0].shape, given[0].dtype
+    prior, probability, selected = np.zeros(cells, dtype), np.zeros(cells, dtype), np.zeros(cells, np.bool_)
+    pixels = np.zeros(given[2].shape, given[2].dtype)
     bins = math.ceil(spacing_px + _WIDEST_PX) if layout.line else 0
     place, out = (places, unit, spacing_px, presence.grid_px), (prior, probability, selected, pixels)
     _kernels.mask(given, placement.seen, place, bins, _EDGE, out)
