@@ -114,8 +114,8 @@ def evlcp_stage_finished(stage: str, value: Any, elapsed_s: float) -> None:
     """Watch the receiver: called once after each stage, never once an event.
 
     Args:
-        stage: `regions`, `synchronization`, `separation`, `decoding`, `view`, `ranging`, `frame` or
-            `message`.
+        stage: `regions`, `synchronization`, `separation`, `decoding`, `view`, `ranging`, `frame`,
+            `skipped` or `message`.
         value: What the stage produced.
         elapsed_s: How long it took, s.
     """

@@ -25,7 +25,7 @@ _EVEN = 0.01
 
 @dataclass(frozen=True)
 class DueFrame:
-    """A frame whose events are all there.
+    """The next frame of a grid of packets, and when its events are all there.
 
     Attributes:
         number: Counted from the first frame of the grid's packet 0.

@@ -108,6 +108,27 @@ class Skipped(StrEnum):
     """It shows them, and no symbol that is sure."""
 
 
+@dataclass(frozen=True)
+class SkippedFrame:
+    """A frame that was due and is not given: what the stage `skipped` announces.
+
+    Attributes:
+        transmitter: Number of the transmitter; None before its first frame.
+        packet: Number of the packet since the transmitter's first; None before that.
+        frame: Number of the frame in its packet.
+        t_us: Start of its first chip on the camera's clock, us.
+        why: The count that it belongs to, such as `frames_dark`.
+        link: Name of the link, of a receiver of several.
+    """
+
+    transmitter: int | None
+    packet: int | None
+    frame: int
+    t_us: float
+    why: str
+    link: str
+
+
 @dataclass
 class PacketGrid:
     """Packets and frames by number, and the next frame to decode.
@@ -117,7 +138,7 @@ class PacketGrid:
         chips_after: Chips after a frame that are read with it (`Codebook.chips_after`).
         lock: The newest lock; None before the first.
         packet: Number of the lock's packet, counted from the first that may have a frame here.
-        frame: Next frame to decode, counted from that packet's first.
+        frame: Next frame to decode, counted from the first of packet 0.
     """
 
     format: PacketFormat
@@ -160,8 +181,8 @@ class PacketGrid:
         """Start of a frame's first chip, us."""
         lock = self.lock
         assert lock is not None
-        number, index = divmod(frame, self.format.frames)
-        chips = (number - self.packet) * self.format.packet_chips + self.format.frame_starts[index]
+        packet, index = divmod(frame, self.format.frames)
+        chips = (packet - self.packet) * self.format.packet_chips + self.format.frame_starts[index]
         return lock.packet_t_us + chips * lock.chip_us
 
     def due(self, until_us: float = math.inf) -> DueFrame | None:
@@ -172,13 +193,13 @@ class PacketGrid:
         # Asked for again and again before it is due.
         if known is None or known.lock is not lock or known.number != self.frame:
             start_us = self.start_us(self.frame)
-            number, index = divmod(self.frame, self.format.frames)
+            packet, index = divmod(self.frame, self.format.frames)
             begin, end = self.format.frame_starts[index : index + 2]
             late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
             end_us = start_us + (end - begin) * lock.chip_us + late_us
             self._known = known = DueFrame(
                 number=self.frame,
-                packet=number,
+                packet=packet,
                 index=index,
                 chips=end - begin,
                 has_pilot=end - begin > self.format.info_chips,
@@ -625,8 +646,16 @@ class PacketFraming(Framer):
                     self._lit_in(transmitter, due)
                     transmitter.missed[found] += 1
                 self.counts[found] += 1
+                self._announce_skipped(transmitter, due, found)
                 continue
             self._take(transmitter, due, found)
+
+    def _announce_skipped(self, transmitter: Transmitter, due: DueFrame, why: Skipped) -> None:
+        if self._announcer is not None:
+            packet = None if transmitter.first is None else due.packet - transmitter.first
+            t_us = self._clock.camera_us(due.start_us)
+            skipped = SkippedFrame(transmitter.number, packet, due.index, t_us, why.value, self._name)
+            self._announcer.lap("skipped", skipped)
 
     def _take(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         """Hand a frame on."""

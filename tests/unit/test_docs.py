@@ -170,7 +170,7 @@ def test_every_stage_is_in_the_docs() -> None:
     page = (ROOT / "docs" / "hooks.md").read_text()
     doc = hookspecs.evlcp_stage_finished.__doc__ or ""
     stages = re.findall(r"`(\w+)`", doc.split("stage:")[1].split("value:")[0])
-    assert len(stages) == 8
+    assert len(stages) == 9
     for stage in stages:
         assert f"| `{stage}` |" in page
 

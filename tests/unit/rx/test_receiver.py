@@ -12,6 +12,7 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.rx.framing import SkippedFrame
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.testing.recordings import (
@@ -100,13 +101,24 @@ def frame_chip(link: Link, packet: int, frame: int) -> int:
 def test_a_bar_in_the_dark(
     every: int, first: tuple[int, int], end: tuple[int, int], given_: list[int], count: dict[str, int]
 ) -> None:
-    """A dark pilot takes its frames with it; a bar out of sight is not rejected."""
+    """A dark pilot takes its frames with it; a bar out of sight is not rejected; each says why."""
     link = load_link(overrides=[f"air.pilot_every={every}"])
     bar = IdealBar(random_symbols(link, 3))
     events = ideal_events(link, bar)
     chips = [frame_chip(link, 1, frame) + more for frame, more in (first, end)]
-    receiver, packets = received(link, events[~between(events, bar, *chips)])
+    probe = Probe()
+    hook = Registry.load(probe).hook
+    receiver, packets = received(link, events[~between(events, bar, *chips)], hook=hook)
     assert [f.frame for f in packets[1].frames] == given_
+    why = next(name for name, many in count.items() if many)
+    missing = [n for n in range(10) if n not in given_]
+    skipped = [one for one in probe.seen["skipped"] if isinstance(one, SkippedFrame)]
+    assert [(one.transmitter, one.packet, one.frame, one.why) for one in skipped] == [
+        (0, 1, n, why) for n in missing
+    ]
+    starts_us = [bar.start_us + 100 * frame_chip(link, 1, n) for n in missing]
+    # To a quarter of a chip.
+    assert_allclose([one.t_us for one in skipped], starts_us, atol=25)
     assert right_frames(packets, bar, link) == 20 + len(given_)
     assert {name: receiver.counts[name] for name in count} == count
 
