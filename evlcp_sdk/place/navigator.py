@@ -255,7 +255,7 @@ class Navigator:
         self._attitude: Attitude | None = None
         self._standing: dict[str, tuple[Floats, Floats]] = {}
         self._counts = dict.fromkeys(("gnss", "gnss_left_out", "gnss_without_heading", "attitude_missing"), 0)
-        self._apart: deque[Floats] = deque(maxlen=_BLOCK)
+        self._contradictions_m: deque[Floats] = deque(maxlen=_BLOCK)
         self._state: TrajectoryPoint | None = None
         self._window: list[tuple[Fix, TrajectoryPoint, Place]] = []
 
@@ -280,9 +280,9 @@ class Navigator:
 
         The median of the last thousand times, float64 (3,); None for none.
         """
-        return np.median(self._apart, 0) if self._apart else None
+        return np.median(self._contradictions_m, 0) if self._contradictions_m else None
 
-    def seen(self, first_us: float, last_us: float) -> None:
+    def note_span(self, first_us: float, last_us: float) -> None:
         """Take note that the recording has events from one time to another: fixes of satellites count in it.
 
         Without it, those from the first fix of bars to the last one count.
@@ -308,7 +308,7 @@ class Navigator:
                 self._span = (fix.t_us, fix.t_us)
             placed += self._satellites(fix.t_us)
             self._counts["attitude_missing"] += self._log is not None and self._log.at(fix.t_us) is None
-            placed.append(self._placed(fix))
+            placed.append(self._filter(fix))
         return placed
 
     def _satellites(self, until_us: float) -> list[Placed]:
@@ -326,7 +326,7 @@ class Navigator:
             fix = gnss_fix(log, row, self.positioner.axes, attitude, self._spec)
             self._counts["gnss" if fix is not None else "gnss_without_heading"] += 1
             if fix is not None:
-                placed.append(self._placed(fix))
+                placed.append(self._filter(fix))
         return placed
 
     def estimated_biases(self) -> list[EstimatedBias]:
@@ -346,7 +346,7 @@ class Navigator:
             for number, site in self.positioner.bars.stands_at.items()
         }
 
-    def _placed(self, fix: Fix) -> Placed:
+    def _filter(self, fix: Fix) -> Placed:
         if fix.refusal:
             return Placed(fix, None)
         point = self._state = trajectory_step(self._state, fix, self._spec, self._imu)
@@ -359,7 +359,7 @@ class Navigator:
             others = tuple(n for n, t in taken if n != fix.source and fix.t_us - t <= _STANDS_US)
             if others:
                 off = fix.enu_m - point.mean[:3]
-                self._apart.append(off if fix.source == GNSS else -off)
+                self._contradictions_m.append(off if fix.source == GNSS else -off)
             fix = replace(fix, contradicted=others)
         else:
             self._taken[fix.source] = fix.t_us
@@ -370,7 +370,7 @@ class Navigator:
             self._standing[cause.name] = point.standing(cause.name)  # type: ignore[assignment]
         while len(self._standing) > _MOST_PARTS:
             del self._standing[next(iter(self._standing))]
-        filtered = self._place(point)
+        filtered = self._to_place(point)
         self._window.append((fix, point, filtered))
         return Placed(fix, filtered, self._settle(_BLOCK) if len(self._window) == 2 * _BLOCK else ())
 
@@ -378,13 +378,13 @@ class Navigator:
         """Smooth the window, and drop its first points from it."""
         smoothed = smooth_trajectory([point for _, point, _ in self._window], self._spec)
         settled = tuple(
-            Settled(fix, filtered, self._place(point))
+            Settled(fix, filtered, self._to_place(point))
             for (fix, _, filtered), point in zip(self._window[:count], smoothed, strict=False)
         )
         self._window = self._window[count:]
         return settled
 
-    def _place(self, point: TrajectoryPoint) -> Place:
+    def _to_place(self, point: TrajectoryPoint) -> Place:
         axes = self.positioner.axes
         assert axes is not None
         latitude, longitude, height = axes.to_geodetic(point.mean[:3])

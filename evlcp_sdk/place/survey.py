@@ -60,7 +60,7 @@ class OwnPoses:
             if spans and start <= spans[-1][1] + _PAUSE_US:
                 start = spans.pop()[0]
             spans.append((start, max(times)))
-        self._navigator.seen(packet.t_us, packet.t_us)
+        self._navigator.note_span(packet.t_us, packet.t_us)
         self._settle(self._navigator.feed([packet]))
 
     def close(self) -> list[KnownPose]:

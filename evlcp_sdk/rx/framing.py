@@ -542,7 +542,7 @@ class PacketFraming(Framer):
         return None if transmitter is None else transmitter.number
 
     def discard(self, *, place: Region | None = None, number: int | None = None) -> int:
-        """Count no frame that was not read where another link's packet was; return how many they were."""
+        """Take frames missed where another link's packet was, or of a number, out of the counts; how many."""
         missed: Counter[str] = Counter()
         for one in self._transmitters.alive.values():
             if one.number == number if place is None else same_place(one.region.latest, place):

@@ -265,7 +265,8 @@ class Session:
     def run(self, requests: Iterable[Request], handle: Callable[[Request, RequestOutcome], None]) -> None:
         """Send requests, as many at once as the board takes; `handle` gets each with its outcome.
 
-        `requests` may be a generator that goes on while outcomes come in. What `handle` raises ends the run.
+        The next of `requests` is asked for when there is room for it, so that a generator may go by what has
+        come in. What `handle` raises ends the run.
 
         Raises:
             LineError: The line went away.
@@ -289,7 +290,6 @@ class Session:
                 received = self.transport.read(wait) if sent else b""
                 for outcome in self.client.receive(received, self.transport.now()):
                     handle(sent.pop(outcome.token), outcome)
-                    more = True
                 if not sent and not more:
                     return
         finally:

@@ -256,7 +256,7 @@ def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None
     plan = PositionPlan((SITE,), satellites([1e6]))
     link = load_link(overrides=["position.antenna_m=[1,0,0]"])
     way = Navigator(link, plan, Attitude(5.0, 0.0))
-    way.seen(0, 2e6)
+    way.note_span(0, 2e6)
     assert way.close() == ([], ())
     assert way.counts["gnss_without_heading"] == 1
     write(tmp_path / "late", packets(4), PositionPlan((SITE,), satellites([1e9, 2e9])))
