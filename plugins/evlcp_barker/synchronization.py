@@ -14,7 +14,7 @@ from evlcp_sdk.air.codebook import Codebook, are_pairs
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Synchronization
-from evlcp_sdk.values import SyncLock, changed
+from evlcp_sdk.values import SyncLock, changed, plain
 
 Floats = NDArray[np.float64]
 
@@ -200,7 +200,7 @@ class BarkerSynchronizer:
         locks: list[SyncLock] = []
         power, known, clock, stray = state.power, state.known, state.clock, state.stray
         lo = state.next_bin - state.first_bin
-        _kernels.count_bins(t_us, p, state.first_bin, self._bin_us, state.counts, counts)
+        _kernels.count_bins(plain(t_us), plain(p), state.first_bin, self._bin_us, state.counts, counts)
         if lags - guard > lo:
             rho, squares = np.empty(lags), np.empty(lags - guard - lo)
             top = _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)
