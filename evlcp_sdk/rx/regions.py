@@ -488,7 +488,11 @@ class Rhythm:
         return bool(self._rhythmic(events, SAME).any())
 
     def _rhythmic(self, events: Events, most_same: int) -> NDArray[np.bool_]:
-        state = self._pixels[events.y, events.x]
+        # By one index, which takes a third of the time of two.
+        at = events.y.astype(np.intp)
+        at *= self._pixels.shape[1]
+        at += events.x
+        state = self._pixels.take(at)
         rhythmic: NDArray[np.bool_] = (state & _kernels.SCORES) >= self._min_score
         rhythmic &= (state >> _kernels.SAME_AT) & _kernels.MOST_SAME < most_same
         return rhythmic
