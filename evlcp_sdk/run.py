@@ -15,7 +15,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
-from evlcp_sdk.errors import ConfigError, InputError, PluginError, UnpluggedError
+from evlcp_sdk.errors import ConfigError, InputError, InterruptedRunError, PluginError, UnpluggedError
 from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
 from evlcp_sdk.io.describe import check_sensor
@@ -393,7 +393,8 @@ def convert(
         size: Columns and rows of the sensor, where the source does not say them.
         format: As for `open_writer`.
         advance: Says how far the reading is.
-        stopped: Ends the run early; what was read until then is written.
+        stopped: Ends the run early; what was read of a camera or a stream until then is written, and nothing
+            of a recording.
 
     Returns:
         Counts of what was written, losses of the source, `error`: what ended the reading early, or None, and
@@ -402,6 +403,7 @@ def convert(
     Raises:
         InputError: The source cannot be opened.
         OutputError: The recording cannot be written.
+        InterruptedRunError: It was stopped while it read a recording.
         StreamError: The format is unknown, or has no place for a value.
     """
     registry = Registry.load() if registry is None else registry
@@ -420,6 +422,8 @@ def convert(
                         break
             except InputError as fault:
                 error = fault
+            if stopped() and not isinstance(source, EventSource) and is_recording(source):
+                raise InterruptedRunError(f"interrupted; {out} is not written")
         losses = {kind: asdict(loss) for kind, loss in opened.losses.items()}
     return {
         "counts": counts,

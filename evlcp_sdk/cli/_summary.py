@@ -45,9 +45,10 @@ def show(summary: dict[str, Any], folder: Path | None, *, stderr: bool = False) 
     _show_transmitters(summary, out)
     if text := _messages(summary["counts"]):
         out.print(text)
-    for told in summary["messages"][-_MOST_SHOWN:]:
+    shown = summary["messages"][-_MOST_SHOWN:]
+    for told in shown:
         out.print(f"  {_message(told)}")
-    if (more := summary["counts"].get("messages", 0) - _MOST_SHOWN) > 0:
+    if (more := summary["counts"].get("messages", 0) - len(shown)) > 0:
         out.print(f"  {more} before that: packets.jsonl" if folder else f"  {more} before that", style="dim")
     if "positions" in summary:
         out.print(_positions(summary["positions"]))

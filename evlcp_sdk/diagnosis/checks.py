@@ -121,6 +121,7 @@ def find_stages(facts: Facts) -> list[Diagnostic]:
     shown: list[Diagnostic] = []
     for stage in dict.fromkeys(name for name, subjects, _ in CHECKS if subjects is not _of_positions):
         failed = any(one.verdict == "fail" for one in shown)
-        skipped = Diagnostic("", "not reached", verdict="skip", stage=stage)
+        text = "not reached" if failed else "too little to tell"
+        skipped = Diagnostic("", text, verdict="skip", stage=stage)
         shown += [skipped] if failed else by_stage[stage] or [skipped]
     return shown

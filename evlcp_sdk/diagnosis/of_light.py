@@ -82,9 +82,7 @@ _SHARPER = "focus the lens, clean it and the window; a smaller aperture is sharp
 def check_events(facts: Facts) -> Found:
     """What there is, and what of it did not count for other reasons than room."""
     events = facts.counts.get("events", 0)
-    if not events and facts.surveyed:
-        step = "record again: `evlcp info` says what is in the file"
-        yield Diagnostic("empty", "no events", step, verdict="fail")
+    losses = f"; lost: {'; '.join(map(str, facts.losses))}" if facts.losses else ""
     no_room = [name for name, _ in _NO_ROOM]
     dropped = {n: k for n, k in facts.counts.items() if n.startswith("dropped_") and k and n not in no_room}
     lost = sum(loss.count for loss in facts.losses)
@@ -97,8 +95,11 @@ def check_events(facts: Facts) -> Found:
             f"{number} events or words dropped ({', '.join(kinds)})",
             "losses and counts in summary.json say where and why; `evlcp info` says what is in the recording",
         )
-    text = f"{events:,} events in {facts.duration_us * 1e-6:.3f} s"
-    yield text + (f"; lost: {'; '.join(map(str, facts.losses))}" if facts.losses else "")
+    if events or not facts.surveyed:
+        yield f"{events:,} events in {facts.duration_us * 1e-6:.3f} s{losses}"
+    else:
+        step = "record again: `evlcp info` says what is in the file"
+        yield Diagnostic("empty", f"no events{losses}", step, verdict="fail")
 
 
 def check_times(facts: Facts) -> Found:

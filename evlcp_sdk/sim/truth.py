@@ -282,7 +282,7 @@ class _BarTable(_Table):
     ppm: Annotated[float, Field(ge=-_MOST_PPM, le=_MOST_PPM)]
     payload: Literal["symbols", "data", "messages"] | None = None
     led_w_m2: _Number | None = None
-    chips_file: Any = None
+    chips_file: str | None = None
     covered: list[_Cluster] | None = None
     cover_s: list[tuple[_Number, _Number, _Cluster, _Cluster]] | None = None
     pole_s: list[tuple[_Number, _Number]] | None = None

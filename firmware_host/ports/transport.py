@@ -217,8 +217,12 @@ class ReplayTransport:
         self._events: list[tuple[float, str, bytes]] = []
         try:
             lines = path.read_text(encoding="utf-8").splitlines()
-        except (OSError, UnicodeDecodeError) as fault:
-            raise InputError(f"{path}: cannot be read: {fault}") from fault
+        except OSError as fault:
+            raise InputError(f"{path}: {fault.strerror}") from fault
+        except UnicodeDecodeError as fault:
+            raise InputError(f"{path}: not a trace of the wire: it is no text") from fault
+        if not lines:
+            raise InputError(f"{path}: empty, expected a trace of the wire")
         self._number = 0
         try:
             head = json.loads(lines[0])
@@ -230,7 +234,7 @@ class ReplayTransport:
                 if event["dir"] not in ("tx", "rx"):
                     raise ValueError(f"dir = {event['dir']!r}, expected 'tx' or 'rx'")
                 self._events.append((float(event["t"]), event["dir"], bytes.fromhex(event["hex"])))
-        except (ValueError, KeyError, TypeError, IndexError, OverflowError, RecursionError) as fault:
+        except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as fault:
             raise InputError(
                 f"{path}: line {self._number + 1}: not a trace of the wire: {fault!r}"
             ) from fault

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 import evlcp_sdk
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import InputError, InterruptedRunError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.run import receive
+from evlcp_sdk.run import convert, receive
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events, Triggers
 
@@ -24,6 +24,19 @@ def by_hand(path: Path) -> list[tuple[int, int, list[int]]]:
     with RawSource(path) as source:
         packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
     return [(p.transmitter, p.packet, [f.frame for f in p.frames]) for p in packets]
+
+
+def test_a_recording_that_is_converted_in_part_is_not_written(demo_raw: Path, tmp_path: Path) -> None:
+    asked = iter([False, True])
+    with pytest.raises(InterruptedRunError, match=r"out\.csv is not written"):
+        convert(demo_raw, tmp_path / "out.csv", stopped=lambda: next(asked, True))
+    assert list(tmp_path.iterdir()) == []
+    # Of a source with a pace of its own, what came until then is the recording.
+    asked = iter([False] * 3)
+    with RawSource(demo_raw) as source:
+        counts = convert(source, tmp_path / "part.raw", stopped=lambda: next(asked, True))["counts"]
+    with RawSource(tmp_path / "part.raw") as part:
+        assert sum(map(len, part.chunks())) == counts["events"] > 0
 
 
 def test_the_last_packet_comes_too_and_the_source_is_closed(demo_raw: Path) -> None:

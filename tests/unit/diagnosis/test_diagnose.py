@@ -290,6 +290,12 @@ def test_picture_upside_down_is_noticed(tmp_path: Path) -> None:
     assert diagnosis.counts["frames_rejected"] == 0
 
 
+def test_a_recording_without_events_fails_once(tmp_path: Path) -> None:
+    (path := tmp_path / "none.csv").write_text("t_us,x,y,p\n")
+    verdicts = [one.verdict for one in diagnose(path, LINK).checks]
+    assert (verdicts[0], set(verdicts[1:])) == ("fail", {"skip"})
+
+
 def test_command_says_it_in_words_as_json_and_on_a_page(tmp_path: Path) -> None:
     recording, page = written(tmp_path, ("air.chip_rate_hz=8000",)), tmp_path / "slow.html"
     shown = run("diagnose", recording, "-o", page).stdout
