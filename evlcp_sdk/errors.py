@@ -9,7 +9,7 @@ EvlcpError                     1   anything the SDK raises on purpose
 ├── InputError                 3   a file or stream that cannot be read
 │   ├── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
 │   └── UnpluggedError         5   a camera that went away while it was read
-├── InterruptedRunError      130   the user stopped the run; what was done until then is kept
+├── InterruptedRunError      130   the user stopped the run; it says what was kept
 └── StreamError                1   events fed in an order or shape the receiver cannot take
 ```
 

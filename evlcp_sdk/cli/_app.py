@@ -25,7 +25,7 @@ HELP = """Read data and distance from blinking LEDs with an event camera.
 
 Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] failed,
 [bold]2[/] usage, configuration or an algorithm that cannot be used, [bold]3[/] input that cannot be read,
-[bold]5[/] a camera that went away,
+[bold]4[/] much of a recording dropped, [bold]5[/] a camera that went away,
 [bold]70[/] a fault of evlcp itself, [bold]130[/] interrupted. A broken plugin is left out with a warning.
 """
 

@@ -228,7 +228,10 @@ def open_writer(
             " plugin writes, as .mcap"
         )
     if width is None or height is None:
-        raise StreamError(f"{path}: sensor of {width}x{height}, expected a width and a height for {name}")
+        raise StreamError(
+            f"{path}: the size of the sensor is not known, expected a width and a height for {name}, as"
+            " `--size 1280x720` gives them"
+        )
     return RawWriter(path, width, height, CODECS[name], outputs)
 
 
