@@ -23,13 +23,20 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Synchronizer
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner, Pilot
-from evlcp_sdk.rx.bars import BarFollower
 from evlcp_sdk.rx.framer import Framer, StreamContext, note_lit
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.reading import FrameReader, Steps
 from evlcp_sdk.rx.reflections import LONGEST_ROW_US, FrameDetection, PacketAssembler, ReflectionQueue
-from evlcp_sdk.rx.regions import MARGIN_PX, SAME_PX, Followed, Places, RegionTracker, same_place
+from evlcp_sdk.rx.regions import (
+    MARGIN_PX,
+    SAME_PX,
+    Followed,
+    Places,
+    RegionFollower,
+    RegionTracker,
+    same_place,
+)
 from evlcp_sdk.values import Events, Frame, Region, SyncLock, changed
 
 LOOKBACK_PACKETS = 2
@@ -438,7 +445,7 @@ class PacketFraming(Framer):
         stream: StreamContext,
         steps: Steps,
         regions: RegionTracker,
-        follower: BarFollower | None,
+        follower: RegionFollower | None,
         queue: ReflectionQueue,
         on_frame: Callable[[Frame], None] | None,
     ) -> None:

@@ -12,7 +12,6 @@ from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.plugin.roles import STEPS
-from evlcp_sdk.rx.bars import BarFollower
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, on_camera
 from evlcp_sdk.rx.framing import LOOKBACK_PACKETS, PacketFraming
@@ -23,7 +22,7 @@ from evlcp_sdk.rx.multi import EarlyFrames, SeveralLinks, shared_rhythms
 from evlcp_sdk.rx.plugin_framing import PluginFraming
 from evlcp_sdk.rx.reading import Steps
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
-from evlcp_sdk.rx.regions import RegionTracker, Rhythm, same_place
+from evlcp_sdk.rx.regions import RegionFollower, RegionTracker, Rhythm, same_place
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Frame, Packet, Region, changed
@@ -242,9 +241,9 @@ class LinkReceiver:
         self._clock, self._announcer = stream.clock, stream.announcer
         tracker = tracker_of(link)
         self._regions: RegionTracker
-        follower: BarFollower | None = None
+        follower: RegionFollower | None = None
         if link.algorithm("detection").rhythmic:
-            self._regions = follower = BarFollower(
+            self._regions = follower = RegionFollower(
                 link.regions,
                 link.camera,
                 link.packet.chip_us,

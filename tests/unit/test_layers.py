@@ -112,7 +112,7 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 RX = (
     {"boxes", "limits", "rhythm"},
     {"guard", "regions", "trust"},
-    {"bars", "detected", "framer"},
+    {"detected", "framer"},
     {"inbox", "placement", "ranges"},
     {"points", "spread"},
     {"alignment"},

@@ -12,7 +12,6 @@ from rx_streams import LINK
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
-from evlcp_sdk.rx.bars import BarFollower
 from evlcp_sdk.rx.boxes import clear_of, cut_off
 from evlcp_sdk.rx.regions import Followed, Places, RegionFollower, Rhythm
 from evlcp_sdk.scene.camera import CameraModel
@@ -33,8 +32,8 @@ BAR_EVENTS = ideal_events(LINK, BAR)
 CENTRE, SIZE = (BAR.x_px - 0.5, BAR.y_px - 0.5), (4.0, 128.0)
 
 
-def follower(spec: RegionSpec = SPEC, **options: Any) -> BarFollower:
-    return BarFollower(spec, CameraModel(), LINK.packet.chip_us, **options)
+def follower(spec: RegionSpec = SPEC, **options: Any) -> RegionFollower:
+    return RegionFollower(spec, CameraModel(), LINK.packet.chip_us, **options)
 
 
 def steps(events: Events, until_us: int) -> Iterator[tuple[int, Events]]:

@@ -11,10 +11,10 @@ from rx_streams import LINK, frames_of, received, said
 from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import Link, load_link, resolve
-from evlcp_sdk.rx.bars import BarFollower
 from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.multi import EarlyFrames
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.rx.regions import RegionFollower
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, changed
@@ -187,7 +187,7 @@ def test_frames_that_another_link_takes_are_counted_where_they_were_told() -> No
 
 def test_a_look_ahead_leaves_no_trace_in_the_regions() -> None:
     """Regions that are shown parts of each step go on as those that are not."""
-    one, two = (BarFollower(LINK.regions, LINK.camera, LINK.packet.chip_us) for _ in range(2))
+    one, two = (RegionFollower(LINK.regions, LINK.camera, LINK.packet.chip_us) for _ in range(2))
     step_us, ahead = LINK.regions.step_us, 0
     bounds = np.searchsorted(BOTH.t_us, np.arange(0, 60_000, step_us))
     for step, (a, b) in enumerate(pairwise(bounds.tolist())):
