@@ -1,80 +1,152 @@
-"""The whole receiver, from RAW file to frames.csv, ranging included: events a second, and real time.
+"""What a frame costs the receiver of the processor's time, and how that compares with an earlier commit.
 
-    python benchmarks/receive.py [RECORDING ...] [--events 20000000]
+    python benchmarks/receive.py                    of ../shared, and made: clutter, four bars
+    python benchmarks/receive.py REC.raw -c examples/links/paper.toml
+    python benchmarks/receive.py --against 9c93e22  the same beside that commit, built by git
 
-Without names, all recordings of `../shared`. Each is received in turn by what `evlcp receive` calls, in
-one process, one thread, kernels warm; times are processor times, and the best of the rounds counts. Then the
-first is tiled in time to `--events` and received once, beside the plain decoding of the same file (0 leaves
-it out). Memory is measured by `memory.py`.
+Events are received from memory, kernels warm. Each version is a process of its own, on one thread; they take
+turns scene by scene, so that both meet the same pace of the machine. Printed of each scene: the least time a
+frame, how many times real time that is, and the median of the pairs' ratios (new over old) with the least and
+the greatest. `noise` and `lamps` are night-50m with ten million events a second more, and with eight lamps.
 """
 
 import argparse
+import json
+import os
+import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from statistics import median
+from typing import Any
 
-from evt3_decode import tile
+import numpy as np
 
-from evlcp_sdk.io import open_source, read_events
-from evlcp_sdk.link.resolve import Link, load_link
-from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.stopwatch import Stopwatch
+from evlcp_sdk.io import read_events, write_events
+from evlcp_sdk.simulated import simulate
+from evlcp_sdk.values import Events
 
-SHARED = Path(__file__).parents[2] / "shared" / "recordings"
-FIRST = "night-50m-30kmh.raw"
+ROOT = Path(__file__).parents[1]
+SHARED = ROOT.parent / "shared" / "recordings"
+NAMES = "night-50m-30kmh", "two-bars-60m-75m", "tunnel-90m-30kmh", "day-35m-20kmh"
+
+CHILD = """
+import json, sys, time
+import evlcp_sdk as evlcp
+chunks = {}
+for line in sys.stdin:
+    path, link = json.loads(line)
+    if path not in chunks:
+        with evlcp.open(path) as source:
+            chunks[path] = list(source.chunks())
+    receiver = evlcp.Receiver(evlcp.load_link(link))
+    begin_s = time.process_time()
+    for events in chunks[path]:
+        receiver.feed(events)
+    receiver.close()
+    print(json.dumps([time.process_time() - begin_s, receiver.counts["frames"]]), flush=True)
+"""
 
 
-def link_of(path: Path) -> Link:
-    """Return the configuration that fits a recording's name: its profile, if it says one."""
-    profile = next((p for p in ("wh8", "raw8") if path.name.startswith(p)), "wh4x2")
-    return load_link(overrides=[f"modulation.id={profile}"])
+def started(*folders: Path) -> subprocess.Popen[str]:
+    """A process of the version of the SDK that is found in some folders."""
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(map(str, folders)), "OMP_NUM_THREADS": "1"}
+    command, pipe = [sys.executable, "-P", "-c", CHILD], subprocess.PIPE
+    return subprocess.Popen(command, stdin=pipe, stdout=pipe, env=environment, cwd="/", text=True)
 
 
-def receive(path: Path, folder: Path) -> dict[str, float]:
-    """Receive a recording; return its times."""
-    summary = receive_to_folder(path, folder, link_of(path))
-    return summary["processing"] | {"events": summary["recording"]["counts"]["events"]}
+def receive(child: subprocess.Popen[str], *scene: Any) -> tuple[float, int]:
+    """Processor time, s, to receive a scene (recording, link), and its frames."""
+    assert child.stdin is not None
+    assert child.stdout is not None
+    print(json.dumps(scene), file=child.stdin, flush=True)
+    spent_s, frames = json.loads(child.stdout.readline())
+    return spent_s, frames
 
 
-def plain_decoding(path: Path) -> float:
-    """Processor time, s, to read a file's events and drop them: the file's part of the receiver's time."""
-    watch = Stopwatch()
-    with open_source(path) as source, watch.running():
-        for _ in source.chunks():
-            pass
-    return watch.processor_s
+def merged(*parts: Events) -> Events:
+    """The events of all, in order."""
+    every = Events.concat(parts)
+    return every[np.argsort(every.t_us, kind="stable")]
+
+
+def noise(like: Events, rng: np.random.Generator) -> Events:
+    """Ten million events a second all over the image, for as long as others."""
+    first, last = int(like.t_us[0]), int(like.t_us[-1])
+    n = (last - first) * 10
+    return Events.of(
+        np.sort(rng.integers(first, last + 1, n)),
+        rng.integers(0, 1280, n),
+        rng.integers(0, 720, n),
+        rng.integers(0, 2, n),
+    )
+
+
+def lamps(like: Events, rng: np.random.Generator) -> Events:
+    """Eight lamps in the upper part of the image, each chip of which is a coin toss."""
+    first, last = int(like.t_us[0]), int(like.t_us[-1])
+    v, u = np.indices((12, 12)).reshape(2, -1)
+    parts = []
+    for left in range(100, 100 + 8 * 140, 140):
+        edges = np.flatnonzero(np.diff(light := rng.integers(0, 2, (last - first) // 100))) + 1
+        t_us = first + edges[:, None] * 100 + rng.integers(0, 25, (len(edges), u.size))
+        columns = np.broadcast_arrays(t_us, left + u, 40 + v, light[edges][:, None])
+        parts.append(Events.of(*(column.ravel() for column in columns)))
+    every = merged(*parts)
+    return every[every.t_us <= last]
+
+
+def four_bars() -> Events:
+    """The events of four bars 60 m ahead, 8 m from the first to the last."""
+    bars = [{"x_m": 8 / 3 * i - 4, "y_m": -0.3, "seed": i + 1} for i in range(4)]
+    motion = {"distance_m": 60.0, "speed_mps": 10.0}
+    scene: dict[str, Any] = {"name": "beside", "duration_s": 0.4, "motion": motion, "bars": bars}
+    return Events.concat(list(simulate(scene, seed=1).chunks()))
+
+
+def usual_recordings(folder: Path) -> list[Path]:
+    """The recordings of `../shared`, and those made by this script."""
+    if not SHARED.exists():
+        sys.exit(f"no recording named, and {SHARED} is not there")
+    night, rng = read_events(SHARED / f"{NAMES[0]}.raw"), np.random.default_rng(0)
+    made = {
+        "noise": merged(night, noise(night, rng)),
+        "lamps": merged(night, lamps(night, rng)),
+        "four-bars": four_bars(),
+    }
+    for name, events in made.items():
+        write_events(folder / f"{name}.raw", events, 1280, 720)
+    return [*(SHARED / f"{name}.raw" for name in NAMES), *(folder / f"{name}.raw" for name in made)]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("recordings", nargs="*", type=Path)
-    parser.add_argument("--events", type=int, default=20_000_000)
-    parser.add_argument("--rounds", type=int, default=5)
-    args = parser.parse_args()
-    recordings = args.recordings or sorted(SHARED.glob("*.raw"), key=lambda p: (p.name != FIRST, p.name))
-    if not recordings:
-        sys.exit("no recording named, and ../shared/recordings is not there")
-    with tempfile.TemporaryDirectory() as folder:
-        out = Path(folder) / "out"
-        for path in recordings:
-            receive(path, out)
-            best = min((receive(path, out) for _ in range(args.rounds)), key=lambda r: r["processor_s"])
-            print(
-                f"{path.name:32} {best['events_per_s'] / 1e6:6.1f} Mev/s"
-                f"  {best['times_real_time']:6.2f} x real time",
-                flush=True,
-            )
-        big = Path(folder) / recordings[0].name
-        if args.events:
-            tile(read_events(recordings[0]), big, args.events)
-            file_s = min(plain_decoding(big) for _ in range(2))
-            result = receive(big, out)
-            rate = result["events_per_s"] / 1e6
-            print(
-                f"{big.name} tiled to {result['events'] / 1e6:.0f} Mev: {rate:.1f} Mev/s,"
-                f" {result['times_real_time']:.2f} x real time; decoding alone is"
-                f" {file_s / result['processor_s']:.0%} of the time"
-            )
+    parser.add_argument("-c", "--config", type=Path, help="a link.toml")
+    parser.add_argument("--against", help="a commit of this repository")
+    parser.add_argument("--pairs", type=int, default=10)
+    given = parser.parse_args()
+    link = None if given.config is None else str(given.config.resolve())
+    with tempfile.TemporaryDirectory() as name:
+        versions = [started(ROOT, ROOT / "plugins")]
+        if given.against:
+            old, source = Path(name, "old"), f"evlcp-sdk @ git+file://{ROOT}@{given.against}"
+            install = sys.executable, "-m", "pip", "install", "-q", "--no-deps", "--target"
+            subprocess.run([*install, old, source], check=True)
+            versions.append(started(old))
+        for path in given.recordings or usual_recordings(Path(name)):
+            scene = str(path.resolve()), link
+            # The first loads, or compiles, the kernels.
+            turns = [[receive(child, *scene) for child in versions] for _ in range(given.pairs + 1)]
+            rounds = turns[1:]
+            best_s, frames = min(pair[0] for pair in rounds)
+            t_us = read_events(path).t_us
+            line = f"{path.stem:24} {best_s / max(frames, 1) * 1e6:6.0f} us/frame"
+            line += f"  {(t_us[-1] - t_us[0]) * 1e-6 / best_s:6.2f} x real time"
+            if given.against:
+                ratios = [one[0] / other[0] for one, other in rounds]
+                line += f"  {median(ratios):5.3f} of {given.against} ({min(ratios):.2f} to {max(ratios):.2f})"
+            print(line, flush=True)
 
 
 if __name__ == "__main__":

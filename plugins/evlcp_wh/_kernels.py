@@ -340,6 +340,24 @@ def sum_worth(
 
 
 @njit
+def worth_images(sums: Array, worth: Array, seam: int, out: Array) -> None:
+    """What each pixel's pair of sums says of each value, `out` (height + 2 seam, width + 2 seam, values).
+
+    `worth` (n, n) is by pair, from -(n // 2) on and none beyond. The seam is 0, and so is a pixel without
+    events: what it is worth adds the same wherever the bar is.
+    """
+    _, height, width = sums.shape
+    most = len(worth) // 2
+    for v in range(height):
+        for u in range(width):
+            for i in range(out.shape[2]):
+                first, second = sums[2 * i, v, u], sums[2 * i + 1, v, u]
+                if first != 0 or second != 0:
+                    first, second = min(max(first, -most), most) + most, min(max(second, -most), most) + most
+                    out[v + seam, u + seam, i] = worth[first, second] - worth[most, most]
+
+
+@njit
 def cluster_matches(maps: Array, prior: Array, grid: int, images: Array, out: Array) -> None:
     """Add what the pixels of each cluster say of each value if the bar is off its place, (K, n, n, values).
 
@@ -366,3 +384,54 @@ def cluster_matches(maps: Array, prior: Array, grid: int, images: Array, out: Ar
                                 total = sums[k, a]
                                 for i in range(run):
                                     total[i] += weight * line[i]
+
+
+@njit
+def smooth_path(matches: Array, known: Array, step_cost: float, place_cost: float, path: Array) -> None:
+    """Shifts (down, right) of all values that fit best together (Viterbi), `path` (values, 2), px.
+
+    `matches` are those of `cluster_matches`, `known` the codes of the first values, (K, m); of the others,
+    each cluster's is what fits better. A shift costs its square times `place_cost`, a change from value to
+    value its square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then
+    along the other.
+    """
+    clusters, side, _, values = matches.shape
+    first, reach = known.shape[1], side // 2
+    best, half, score = np.zeros((side, side)), np.empty((side, side)), np.empty((side, side, values))
+    down, right = np.empty((values, side, side), np.int8), np.empty((values, side, side), np.int8)
+    for a in range(side):
+        for b in range(side):
+            score[a, b] = 0.0
+            for k in range(clusters):
+                for i in range(values):
+                    match = np.float64(matches[k, a, b, i])
+                    score[a, b, i] += known[k, i] * match if i < first else abs(match)
+    for i in range(values):
+        if i > 0:
+            # To row a from row c, then to column b from column d.
+            for a in range(side):
+                for d in range(side):
+                    half[a, d] = -np.inf
+                    for c in range(side):
+                        total = best[c, d] - step_cost * (a - c) ** 2
+                        if total > half[a, d]:
+                            half[a, d], down[i, a, d] = total, c
+            for a in range(side):
+                for b in range(side):
+                    best[a, b] = -np.inf
+                    for d in range(side):
+                        total = half[a, d] - step_cost * (b - d) ** 2
+                        if total > best[a, b]:
+                            best[a, b], right[i, a, b] = total, d
+        for a in range(side):
+            for b in range(side):
+                best[a, b] += score[a, b, i] - place_cost * ((a - reach) ** 2 + (b - reach) ** 2)
+    a, b = 0, 0
+    for c in range(side):
+        for d in range(side):
+            if best[c, d] > best[a, b]:
+                a, b = c, d
+    for i in range(values - 1, -1, -1):
+        path[i, 0], path[i, 1] = a - reach, b - reach
+        b = right[i, a, b]
+        a = down[i, a, b]

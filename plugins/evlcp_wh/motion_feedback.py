@@ -12,7 +12,7 @@ from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Decode, Decoding
 from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
 from evlcp_wh import _kernels
-from evlcp_wh.decoding import INDEPENDENT_PIXELS, MAX_EVENTS, LearnedDecoder
+from evlcp_wh.decoding import INDEPENDENT_PIXELS, LearnedDecoder
 from evlcp_wh.separation import CellPosterior
 
 _UNSURE_LLR = 2.0
@@ -60,7 +60,7 @@ class MotionFeedback(Decoding):
         """Precompute for a codebook's pilots and codewords."""
         codebook.require_pairs("decoding", "motion-feedback", "edges")
         decoder, posterior = LearnedDecoder(codebook), CellPosterior(codebook.pilot_edges.astype(np.int64))
-        pilots, words = codebook.pilot_edges, codebook.codeword_edges
+        pilots, words = codebook.pilot_edges.copy(), codebook.codeword_edges
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence, sums = presence.informed(), plain(sums)
@@ -109,19 +109,15 @@ def match_shifts(
 ) -> NDArray[np.float32]:
     """Log-likelihood ratio of each value of each cluster, by the shift of the bar from its place.
 
-    A pixel without events counts 0: what it is worth adds the same wherever the bar is.
-
     Returns:
         float32 (K, n, n, values), from `reach_px` up and left to as much down and right.
     """
-    pairs = np.clip(sums, -MAX_EVENTS, MAX_EVENTS) + MAX_EVENTS
-    single = worth.astype(np.float32)
-    beside = single - single[MAX_EVENTS, MAX_EVENTS]
-    images = np.moveaxis(beside[pairs[::2], pairs[1::2]], 0, -1)
-    images = np.pad(images, ((reach_px, reach_px), (reach_px, reach_px), (0, 0)))
+    single, (_, height, width) = worth.astype(np.float32), sums.shape
+    side, values = 2 * reach_px + 1, len(sums) // 2
+    images = np.zeros((height + 2 * reach_px, width + 2 * reach_px, values), np.float32)
+    _kernels.worth_images(sums, single, reach_px, images)
     prior = presence.probability if presence.prior is None else presence.prior
-    side = 2 * reach_px + 1
-    out = np.zeros((len(prior), side, side, images.shape[2]), np.float32)
+    out = np.zeros((len(prior), side, side, values), np.float32)
     _kernels.cluster_matches(presence.pixels, prior, presence.grid_px, images, out)
     out *= INDEPENDENT_PIXELS
     return out
@@ -132,41 +128,10 @@ def find_path(matches: NDArray[np.float32], known: NDArray[np.signedinteger]) ->
 
     `known` are the codes of the first n values, (K, n); of the others, each cluster's is what fits better.
     """
-    values, first = matches.shape[3], known.shape[1]
-    # Twice a log-likelihood, as the costs are.
-    scores = np.abs(matches).sum(0, np.float64)
-    scores[..., :first] = (known[:, None, None] * matches[..., :first]).sum(0, np.float64)
-    return smooth_path(scores, 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values)
-
-
-def smooth_path(scores: NDArray[np.float64], step_cost: float, place_cost: float) -> NDArray[np.int64]:
-    """Shifts (down, right) of all values that score best together (Viterbi), int64 (values, 2), px.
-
-    `scores` are (n, n, values). A shift costs its square times `place_cost`, a change from value to value its
-    square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then along the
-    other.
-    """
-    side, _, values = scores.shape
-    at = np.arange(side) - side // 2
-    scores = scores - place_cost * (at[:, None] ** 2 + at**2)[..., None]
-    steps = step_cost * (at[:, None] - at) ** 2
-    best = scores[..., 0]
-    down = np.empty((values, side, side), np.int64)
-    right = np.empty_like(down)
-    for i in range(1, values):
-        # To row a from row c, then to column b from column d.
-        by_row = best - steps[..., None]
-        down[i] = by_row.argmax(1)
-        by_column = by_row.max(1)[:, None] - steps
-        right[i] = by_column.argmax(2)
-        best = by_column.max(2) + scores[..., i]
-    a, b = np.unravel_index(best.argmax(), best.shape)
+    values = matches.shape[3]
     path = np.empty((values, 2), np.int64)
-    for i in range(values - 1, -1, -1):
-        path[i] = at[a], at[b]
-        if i:
-            b = right[i, a, b]
-            a = down[i, a, b]
+    # Twice a log-likelihood is scored, and so are the costs.
+    _kernels.smooth_path(matches, known, 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values, path)
     return path
 
 

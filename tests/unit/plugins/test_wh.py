@@ -8,7 +8,7 @@ import wh_twins as twins
 from evlcp_wh import _kernels
 from evlcp_wh.decoding import INDEPENDENT_PIXELS, LearnedDecoder, MlSoft, WhTransform, match_words
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
-from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts, smooth_path
+from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts
 from evlcp_wh.pilots import WhPilots
 from evlcp_wh.separation import WhCorrelation
 from numpy.testing import assert_allclose, assert_array_equal
@@ -170,9 +170,16 @@ def test_what_clusters_say_off_their_places(seed, reach):
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("step_cost", "place_cost"), [(0.0, 0.0), (0.5, 0.1), (3.0, 0.0), (0.1, 2.0)])
 def test_the_smooth_path_is_the_best_of_all(seed, step_cost, place_cost):
-    scores = np.random.default_rng(seed).normal(0, 2, (4, 3, 3))
-    path = smooth_path(np.moveaxis(scores, 0, -1), step_cost, place_cost)
-    assert_array_equal(path, twins.best_path(scores, step_cost, place_cost))
+    rng = np.random.default_rng(seed)
+    matches, known = (
+        rng.normal(0, 1, (3, 3, 3, 4)).astype(np.float32),
+        rng.choice([-1, 1], (3, 2)).astype("i1"),
+    )
+    scores = np.abs(matches).sum(0, float)
+    scores[..., :2] = (known[:, None, None] * matches[..., :2]).sum(0, float)
+    path = np.empty((4, 2), np.int64)
+    _kernels.smooth_path(matches, known, step_cost, place_cost, path)
+    assert_array_equal(path, twins.best_path(np.moveaxis(scores, -1, 0), step_cost, place_cost))
 
 
 # Separation
