@@ -146,6 +146,7 @@ class PacketGrid:
         lock: The newest lock; None before the first.
         packet: Number of the lock's packet, counted from the first that may have a frame here.
         frame: Next frame to decode, counted from the first of packet 0.
+        next: What is known of it; None before the first lock.
     """
 
     format: PacketFormat
@@ -153,7 +154,7 @@ class PacketGrid:
     lock: SyncLock | None = None
     packet: int = 0
     frame: int = 0
-    _known: DueFrame | None = field(default=None, init=False, repr=False)
+    next: DueFrame | None = None
 
     def follow(self, lock: SyncLock) -> bool:
         """Take a lock, frames going on where they are; False, and nothing taken, where it is off the grid."""
@@ -164,6 +165,7 @@ class PacketGrid:
             return False
         self.packet += round(apart)
         self.lock = lock
+        self.go_to(self.frame)
         return True
 
     def restart(self, lock: SyncLock, earliest_us: float) -> None:
@@ -179,10 +181,11 @@ class PacketGrid:
 
     def skip_before(self, earliest_us: float) -> int:
         """Pass over the frames that start before a time; how many."""
-        first = self.frame
-        while self.start_us(self.frame) < earliest_us:
-            self.frame += 1
-        return self.frame - first
+        first = frame = self.frame
+        while self.start_us(frame) < earliest_us:
+            frame += 1
+        self.go_to(frame)
+        return frame - first
 
     def start_us(self, frame: int) -> float:
         """Start of a frame's first chip, us."""
@@ -192,31 +195,32 @@ class PacketGrid:
         chips = (packet - self.packet) * self.format.packet_chips + self.format.frame_starts[index]
         return lock.packet_t_us + chips * lock.chip_us
 
-    def due(self, until_us: float = math.inf) -> DueFrame | None:
-        """The next frame, if it lies before a time with all that is read with it; None before a lock."""
-        lock, known = self.lock, self._known
-        if lock is None:
-            return None
-        # Asked for again and again before it is due.
-        if known is None or known.lock is not lock or known.number != self.frame:
-            start_us = self.start_us(self.frame)
-            packet, index = divmod(self.frame, self.format.frames)
-            begin, end = self.format.frame_starts[index : index + 2]
-            late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
-            end_us = start_us + (end - begin) * lock.chip_us + late_us
-            self._known = known = DueFrame(
-                number=self.frame,
-                packet=packet,
-                index=index,
-                chips=end - begin,
-                has_pilot=end - begin > self.format.info_chips,
-                packet_us=start_us - begin * lock.chip_us,
-                start_us=start_us,
-                end_us=end_us,
-                lock=lock,
-                read_us=end_us + self.chips_after * lock.chip_us,
-            )
-        return known if known.read_us <= until_us else None
+    def go_to(self, frame: int) -> None:
+        """Another frame is the next one, or it stands at another time."""
+        lock = self.lock
+        assert lock is not None
+        self.frame, start_us = frame, self.start_us(frame)
+        packet, index = divmod(frame, self.format.frames)
+        begin, end = self.format.frame_starts[index : index + 2]
+        late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
+        end_us = start_us + (end - begin) * lock.chip_us + late_us
+        self.next = DueFrame(
+            number=frame,
+            packet=packet,
+            index=index,
+            chips=end - begin,
+            has_pilot=end - begin > self.format.info_chips,
+            packet_us=start_us - begin * lock.chip_us,
+            start_us=start_us,
+            end_us=end_us,
+            lock=lock,
+            read_us=end_us + self.chips_after * lock.chip_us,
+        )
+
+    def due(self, until_us: float) -> DueFrame | None:
+        """The next frame, if it lies before a time with all that is read with it."""
+        known = self.next
+        return known if known is not None and known.read_us <= until_us else None
 
 
 @dataclass(frozen=True)
@@ -320,6 +324,7 @@ class Transmitters:
         chips_after: int,
     ) -> None:
         self._packet = packet
+        self._lookback_us = LOOKBACK_PACKETS * packet.packet_chips * packet.chip_us
         self._chips_after = chips_after
         self._remembered = limits.remembered
         self._step_us = step_us
@@ -396,19 +401,17 @@ class Transmitters:
 
     def forget(self, transmitter: Transmitter, now_us: float) -> None:
         """Drop the events that no frame can need any more."""
-        region, grid = transmitter.region, transmitter.grid
-        oldest_us = now_us - LOOKBACK_PACKETS * self._packet.packet_chips * self._packet.chip_us
-        if grid.lock is None:
+        region, due = transmitter.region, transmitter.grid.next
+        oldest_us = now_us - self._lookback_us
+        if due is None:
             keep_us = oldest_us
             region.first_us = max(region.first_us, int(keep_us))
         else:
             # A later lock may move the next frame's start by a chip; the preamble before a packet's first
             # frame has yet to say how late the rows are.
-            due = grid.due()
-            assert due is not None
-            keep_us = due.start_us - grid.lock.chip_us
+            keep_us = due.start_us - due.lock.chip_us
             if due.index == 0:
-                keep_us -= self._packet.preamble_chips * grid.lock.chip_us
+                keep_us -= self._packet.preamble_chips * due.lock.chip_us
         region.forget_before(keep_us, self._step_us, min(keep_us, oldest_us))
 
     def release(self, transmitter: Transmitter) -> None:
@@ -525,8 +528,9 @@ class PacketFraming(Framer):
             return math.inf
         due_us = math.inf
         for one in self._transmitters.alive.values():
-            if _in_time(one) and (due := one.grid.due()) is not None:
-                due_us = min(due_us, due.read_us)
+            due = one.grid.next
+            if due is not None and due.read_us < due_us and _in_time(one):
+                due_us = due.read_us
         return due_us + self._tail_us
 
     def ahead(self, step: TimeStep) -> None:
@@ -537,11 +541,12 @@ class PacketFraming(Framer):
         self._due.clear()
         until_us = step.end_us - self._tail_us
         alive = self._transmitters.alive.values()
-        due = [one for one in alive if _in_time(one) and one.grid.due(until_us) is not None]
+        due = [one for one in alive if one.grid.due(until_us) is not None and _in_time(one)]
         meant = {one.region.id for one in due}
-        with self._follower.ahead(step.start_us, step.end_us, step.events, meant):
-            for transmitter in due:
-                self._decode_ahead(transmitter, until_us)
+        self._follower.begin_part(step.start_us, step.end_us, step.events, meant)
+        for transmitter in due:
+            self._decode_ahead(transmitter, until_us)
+        self._follower.end_part(step.end_us)
 
     def number_of(self, region: Followed) -> int | None:
         """Number of a region's transmitter; None before its first frame."""
@@ -645,12 +650,12 @@ class PacketFraming(Framer):
                 continue
             if transmitter.region.id in self._joined:
                 # Another region shows the frame.
-                transmitter.grid.frame += 1
+                transmitter.grid.go_to(due.number + 1)
                 return
             if isinstance(found, Skipped):
-                transmitter.grid.frame += 1
+                transmitter.grid.go_to(due.number + 1)
                 if found is not Skipped.DARK:
-                    self._lit_in(transmitter, due)
+                    self._lit_in(transmitter, self._clock.camera_us(due.start_us))
                     transmitter.missed[found] += 1
                 self.counts[found] += 1
                 self._announce_skipped(transmitter, due, found)
@@ -666,15 +671,15 @@ class PacketFraming(Framer):
 
     def _take(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         """Hand a frame on."""
-        transmitter.grid.frame += 1
-        self._lit_in(transmitter, due)
+        transmitter.grid.go_to(due.number + 1)
+        self._lit_in(transmitter, found.frame.t_us)
         self.counts["frames"] += 1
         self._queue.add(transmitter.packets, found)
 
-    def _lit_in(self, transmitter: Transmitter, due: DueFrame) -> None:
-        """Note that a transmitter's light is there in a frame that is due."""
-        start_us = self._clock.camera_us(due.start_us)
-        transmitter.lit_us = start_us if transmitter.lit_us is None else transmitter.lit_us
+    def _lit_in(self, transmitter: Transmitter, start_us: float) -> None:
+        """Note that a transmitter's light is there in a frame that is due, by its start, camera clock, us."""
+        if transmitter.lit_us is None:
+            transmitter.lit_us = start_us
         if transmitter.number is not None:
             note_lit(self.lit, transmitter.number, transmitter.lit_us, start_us)
 
@@ -691,7 +696,8 @@ class PacketFraming(Framer):
             self.let_go(transmitter.region)
             return Skipped.REJECTED
         ranged = due.has_pilot and self._is_ranged()
-        attitude = self._attitude_at(self._clock.camera_us(aligned.middle_us)) if due.has_pilot else None
+        middle_us = self._clock.camera_us(aligned.middle_us)
+        attitude = self._attitude_at(middle_us) if due.has_pilot else None
         before = self._before(transmitter, due)
         reading = self._reader.read(aligned, due, before, attitude, ranged=ranged)
         transmitter.said = due.number, reading.symbols
@@ -723,7 +729,7 @@ class PacketFraming(Framer):
             points_px=reading.points_px,
             points_sigma_px=reading.sigma_px,
             points_flank_px=reading.flank_px,
-            points_t_us=self._clock.camera_us(aligned.middle_us),
+            points_t_us=middle_us,
             echo_of=self._reflections.echo_of(number),
             link=self._name,
         )

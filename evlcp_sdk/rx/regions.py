@@ -4,9 +4,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
 from dataclasses import dataclass, field
-from statistics import median
 from typing import Any, Final
 
 import numpy as np
@@ -101,6 +99,9 @@ PIECE_BYTES: Final = 768
 
 Piece = tuple[int, Events]
 
+Place = tuple[float, float, float, float]
+"""Column and row of a centre, width and height, px."""
+
 
 class Places:
     """Centres and sizes of a region, oldest first, never none.
@@ -110,6 +111,7 @@ class Places:
 
     Attributes:
         latest: The newest.
+        before: The one before it; the same where there is no other.
 
     >>> places = Places([Region(0, 0.0, 5.0, 7.0, 4.0, 9.0), Region(0, 100.0, 6.0, 7.0, 4.0, 9.0)])
     >>> len(places), places.place_at(50.0), places.place_at(1000.0), places.size_at(70.0)
@@ -118,7 +120,7 @@ class Places:
 
     def __init__(self, regions: Iterable[Region]) -> None:
         regions = list(regions)
-        self.latest = regions[-1]
+        self.before, self.latest = [regions[0], *regions][-2:]
         self._first, self._end = 0, len(regions)
         self._columns = np.empty((5, max(2 * len(regions), _ROOM)))
         for column, p in zip(self._columns.T, regions, strict=False):
@@ -143,12 +145,13 @@ class Places:
             self._first = 0
         columns[:, end] = region.t_us, region.x_px, region.y_px, region.width_px, region.height_px
         self._end = end + 1
-        self.latest = region
+        self.before, self.latest = self.latest, region
 
     def take_back(self) -> None:
         """Drop the newest, as if it had not been taken."""
         self._end -= 1
-        self.latest = region_of(self.latest.id, *self._columns[:, self._end - 1].tolist())
+        self.latest = self.before
+        self._set_before()
 
     def forget_before(self, t_us: float) -> None:
         """Drop those older than a time but for the newest of them, and two in any case."""
@@ -192,17 +195,17 @@ class Places:
         if size_px is not None:
             columns[3, :many], columns[4, :many] = size_px
         other.latest = region_of(id, *columns[:, many - 1].tolist())
+        other._set_before()
         return other
 
     def expected(self, t_us: float) -> tuple[float, float]:
         """Centre (column, row) at a time soon, if it goes on as between the two newest, px."""
-        last = self.latest
-        if self._end - self._first < 2:
+        last, before = self.latest, self.before
+        if before is last:
             return last.x_px, last.y_px
-        before_us, x_px, y_px = self._columns[:3, self._end - 2].tolist()
         # Further ahead than that, a shaking camera has turned back.
-        ahead = min((t_us - last.t_us) / (last.t_us - before_us), 1.0)
-        return last.x_px + ahead * (last.x_px - x_px), last.y_px + ahead * (last.y_px - y_px)
+        ahead = min((t_us - last.t_us) / (last.t_us - before.t_us), 1.0)
+        return last.x_px + ahead * (last.x_px - before.x_px), last.y_px + ahead * (last.y_px - before.y_px)
 
     def at(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
         """Centre (column, row) at times, float64 (2, n), px: interpolated, straight on for a little."""
@@ -239,6 +242,13 @@ class Places:
         width_px, height_px = self._columns[3:, i].tolist()
         return width_px, height_px
 
+    def _set_before(self) -> None:
+        """Find the one before the newest."""
+        if self._end - self._first > 1:
+            self.before = region_of(self.latest.id, *self._columns[:, self._end - 2].tolist())
+        else:
+            self.before = self.latest
+
     def _held(self) -> NDArray[np.float64]:
         """Times, columns, rows, widths and heights, float64 (5, n)."""
         return self._columns[:, self._first : self._end]
@@ -253,7 +263,7 @@ def region_of(id: int, t_us: float, x_px: float, y_px: float, width_px: float, h
 
 def held_bytes(events: Events) -> int:
     """Bytes that some events take."""
-    return PIECE_BYTES + EVENT_BYTES * len(events.t_us)
+    return PIECE_BYTES + EVENT_BYTES * events.t_us.size
 
 
 @dataclass
@@ -591,8 +601,7 @@ class RegionFollower(RegionTracker):
         rises = self._rhythm.step(start_us, events, self._hits, CELL_SHIFT)
         end_us = start_us + spec.step_us
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
-        owned = self._own(boxes) if len(boxes) > 1 else boxes
-        for followed, box, own in zip(self.alive, boxes, owned, strict=True):
+        for followed, box, own in zip(self.alive, boxes, self._own(boxes), strict=True):
             inside = select(events, box)
             # Before a frame shows where in its box a bar is, panels and moving textures around it would drown
             # it: only what blinks in rhythm counts.
@@ -635,13 +644,13 @@ class RegionFollower(RegionTracker):
 
         Rows of a bar below would be as good as its own, so that a region would move on to them.
         """
+        if len(boxes) < 2:
+            return boxes
         tight = [
             grown(box, -MARGIN_PX) if one.size_px else None
             for box, one in zip(boxes, self.alive, strict=True)
         ]
         bars = [bar for bar in tight if bar is not None]
-        if len(bars) < 2:
-            return boxes
         return [
             box if bar is None else cut_off(box, bar, bars) for box, bar in zip(boxes, tight, strict=True)
         ]
@@ -657,15 +666,14 @@ class RegionFollower(RegionTracker):
 
     def _remember(self, start_us: int, events: Events) -> None:
         """Keep a step's events of the whole image, and as many before it as there is room for."""
-        self._recent.append((start_us, events))
+        recent = self._recent
+        recent.append((start_us, events))
         self._recent_bytes += held_bytes(events)
-        most_bytes = self._limits.recent_bytes
-        while len(self._recent) > self._most_recent or (
-            self._recent_bytes > most_bytes and len(self._recent) > 1
+        while (many := len(recent)) > self._most_recent or (
+            self._recent_bytes > self._limits.recent_bytes and many > 1
         ):
-            self.counts["steps_forgotten"] += len(self._recent) <= self._most_recent
-            _, forgotten = self._recent.popleft()
-            self._recent_bytes -= held_bytes(forgotten)
+            self.counts["steps_forgotten"] += many <= self._most_recent
+            self._recent_bytes -= held_bytes(recent.popleft()[1])
 
     def skip(self) -> None:
         """Pass over a gap in time, with no region alive."""
@@ -793,13 +801,11 @@ class RegionFollower(RegionTracker):
         self.counts["regions_left_out"] += not room
         return room
 
-    @contextmanager
-    def ahead(self, start_us: int, until_us: int, events: Events, meant: Collection[int]) -> Iterator[None]:
+    def begin_part(self, start_us: int, until_us: int, events: Events, meant: Collection[int]) -> None:
         """Let some regions have what there is so far of a time step, and their places by that.
 
         They have the events of the whole image, of which a frame takes those in its own: to select them takes
-        longer, and they are selected with the whole step. Behind it, all is as if the step had not begun, but
-        for what frames showed in the meantime.
+        longer, and they are selected with the whole step.
 
         Args:
             start_us: Start of the step, us.
@@ -807,7 +813,6 @@ class RegionFollower(RegionTracker):
             events: Those in it, in order; they come again with the whole step.
             meant: Numbers of regions that are alive, of known size.
         """
-        seen_us = until_us - self._age_us
         for followed in self.alive:
             if followed.id in meant:
                 followed.pieces.append((start_us, events))
@@ -816,21 +821,22 @@ class RegionFollower(RegionTracker):
             self._rhythm.step(start_us, events, self._hits, CELL_SHIFT)
             boxes = self._boxes(start_us + self._spec.step_us / 2, ())
             for followed, own in zip(self.alive, self._own(boxes), strict=True):
-                if followed.id not in meant:
-                    continue
-                heights = followed.heights.copy()
-                if (found := self._locate(followed, own, until_us)) is not None:
-                    followed.positions.append(found[1])
-                followed.heights = heights
+                if followed.id in meant:
+                    heights = followed.heights.copy()
+                    if (found := self._locate(followed, own, until_us)) is not None:
+                        followed.positions.append(found[1])
+                    followed.heights = heights
         self._recent.append((start_us, events))
-        yield
-        self._recent.pop()
+
+    def end_part(self, until_us: int) -> None:
+        """Let all be as if the step had not begun, but for what frames showed in its part until a time."""
+        start_us, events = self._recent.pop()
         for followed in self.alive:
             if followed.pieces and followed.pieces[-1][0] == start_us:
                 _, part = followed.pieces.pop()
                 # What a frame's look gathered anew was counted; the whole image's events were not.
                 followed.held_bytes -= 0 if part is events else held_bytes(part)
-            if followed.positions.latest.t_us == seen_us:
+            if followed.positions.latest.t_us == until_us - self._age_us:
                 followed.positions.take_back()
 
     def _expected(self, followed: Followed, t_us: float) -> tuple[float, float]:
@@ -839,7 +845,9 @@ class RegionFollower(RegionTracker):
             return followed.positions.expected(t_us)
         return float(expected[0][0]), float(expected[0][1])
 
-    def _whole(self, followed: Followed, measured: Region, top: int, rows: NDArray[np.int64]) -> Region:
+    def _whole(
+        self, followed: Followed, t_us: float, place: Place, top: int, rows: NDArray[np.int64]
+    ) -> Region:
         """A region of the height that it lately had; `rows`: its pixels in each row from `top` on.
 
         Where few pixels are awake, an end is dark; where noise wakes pixels that a fast bar has left, there
@@ -847,36 +855,37 @@ class RegionFollower(RegionTracker):
         rows than the bar has, those that are likeliest to be its own. Where more of a bar of known size is
         missing, an end is hidden: the one that is nearer to its place counts alone.
         """
+        x_px, middle_px, width_px, seen_px = place
         known, lit = followed.size_px, followed.lit_px
-        _, expected_px = self._expected(followed, measured.t_us)
+        _, expected_px = self._expected(followed, t_us)
         heights = followed.heights
         if lit is not None and known is not None and shows_again(rows, expected_px - top, known[1], lit):
             # Those before are of the part.
             lit, heights = None, deque()
-        whole_px = measured.height_px if known is None else known[1] if lit is None else lit[1] - lit[0]
+        whole_px = seen_px if known is None else known[1] if lit is None else lit[1] - lit[0]
         # Of a bar with a hidden end, the part that is seen is found, and says where the whole is.
         off_px = 0.0 if lit is None else (lit[0] + lit[1]) / 2
         expected_px += off_px
-        if known is None or -STRAY_PX <= measured.height_px - whole_px <= 2 * _BLUR_PX:
-            heights.append(measured.height_px)
+        if known is None or -STRAY_PX <= seen_px - whole_px <= 2 * _BLUR_PX:
+            heights.append(seen_px)
         # A part of the bar says nothing of its height, once that is known.
-        height_px = median(heights) if heights else whole_px
-        excess_px = measured.height_px - height_px
+        height_px = _median(heights) if heights else whole_px
+        excess_px = seen_px - height_px
         if excess_px > STRAY_PX:
             # What is not known yet may grow to either side.
             sized = known is not None
             y_px = likeliest_row(rows, top, round(height_px), expected_px, STRAY_PX, sized=sized)
         elif known is not None and excess_px < -2 * MARGIN_PX:
             # By its upper end, and by its lower one.
-            ends_px = measured.y_px - excess_px / 2, measured.y_px + excess_px / 2
+            ends_px = middle_px - excess_px / 2, middle_px + excess_px / 2
             y_px = min(ends_px, key=lambda end_px: abs(end_px - expected_px))
             if abs(y_px - expected_px) > MARGIN_PX:
                 y_px = followed.latest.y_px + off_px
         else:
             slack_px = abs(excess_px) / 2
-            y_px = measured.y_px + min(max(expected_px - measured.y_px, -slack_px), slack_px)
-        size_px = known or (measured.width_px, height_px + min(max(excess_px, 0.0), STRAY_PX))
-        return region_of(measured.id, measured.t_us, measured.x_px, y_px - off_px, *size_px)
+            y_px = middle_px + min(max(expected_px - middle_px, -slack_px), slack_px)
+        size_px = known or (width_px, height_px + min(max(excess_px, 0.0), STRAY_PX))
+        return region_of(followed.id, t_us, x_px, y_px - off_px, *size_px)
 
     def _locate(self, followed: Followed, box: Box, now_us: int) -> tuple[Any, Region] | None:
         """State of a region's filter after it was measured in a box, and its place by it; None if unseen."""
@@ -884,7 +893,7 @@ class RegionFollower(RegionTracker):
         seen = self._measure(followed, box, now_us, rows)
         if seen is None:
             return None
-        measured = self._whole(followed, seen, box[1], rows)
+        measured = self._whole(followed, now_us - self._age_us, seen, box[1], rows)
         if self._position is None:
             return followed.filter, measured
         centre = np.array([measured.x_px, measured.y_px])
@@ -906,17 +915,17 @@ class RegionFollower(RegionTracker):
 
     def _measure(
         self, followed: Followed | None, box: Box, end_us: int, rows: NDArray[np.int64] | None = None
-    ) -> Region | None:
-        """Centre and size of what blinks in a box at the end of a step; `rows`: its pixels in each row.
+    ) -> Place | None:
+        """Where something blinks in a box at the end of a step; `rows`: its pixels in each row.
 
         Of a bar of known width, rows count no pixels beside it, and of strips none between them.
         """
         width_px, strips = math.inf, None
         if followed is not None and followed.size_px is not None:
             width_px = followed.size_px[0]
-        if followed is not None and followed.strips_px is not None:
-            expected_px, _ = self._expected(followed, end_us - self._age_us)
-            strips = expected_px, float(MARGIN_PX), followed.strips_px
+            if followed.strips_px is not None:
+                expected_px, _ = self._expected(followed, end_us - self._age_us)
+                strips = expected_px, float(MARGIN_PX), followed.strips_px
         if rows is None:
             rows = np.empty(box[3] - box[1], np.int64)
         total, column, left, right, upper, lower = self._rhythm.measure(
@@ -924,10 +933,7 @@ class RegionFollower(RegionTracker):
         )
         if total < _MIN_PIXELS:
             return None
-        id = self._next_id if followed is None else followed.id
-        return region_of(
-            id, end_us - self._age_us, column, (upper + lower - 1) / 2, right - left + 1.0, lower - upper
-        )
+        return column, (upper + lower - 1) / 2, right - left + 1.0, lower - upper
 
     def _open(self, end_us: int, rises: int, taken: Sequence[Region]) -> None:
         """Open a region where something blinks in two steps on end outside those known, and `taken` places.
@@ -948,8 +954,8 @@ class RegionFollower(RegionTracker):
         if rises >= _LEAST_RISES:
             areas, left_out = find_areas(hits, self._limits.areas, (self._camera.width, self._camera.height))
             self.counts["areas_left_out"] += left_out
-            lit = [region for area in areas if (region := self._measure(None, area, end_us)) is not None]
-            boxes = [box for box in joined(map(box_of, lit), merge_px) if hits_in(hits, box) >= _LEAST_RISES]
+            lit = [box_around(*at) for area in areas if (at := self._measure(None, area, end_us)) is not None]
+            boxes = [box for box in joined(lit, merge_px) if hits_in(hits, box) >= _LEAST_RISES]
         else:
             boxes = []
         if rises:
@@ -961,10 +967,11 @@ class RegionFollower(RegionTracker):
                 self._fresh.append(box)
 
     def _start(self, box: Box, end_us: int) -> None:
-        region = self._measure(None, box, end_us)
-        if region is None:
+        place = self._measure(None, box, end_us)
+        if place is None:
             return
-        reach = self._reach(region.x_px, region.y_px, region.width_px, region.height_px)
+        region = region_of(self._next_id, end_us - self._age_us, *place)
+        reach = self._reach(*place)
         # Lamps whose pixels were not known as such in the step before are now.
         newest = select(self._recent[-1][1], reach)
         if not self._rhythm.may_open(newest) or not self._place_for_one(end_us):
@@ -1023,7 +1030,7 @@ class RegionFollower(RegionTracker):
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
 
 
-def _outgrown(followed: Followed) -> tuple[float, float, float, float]:
+def _outgrown(followed: Followed) -> Place:
     """Column, row, width and height that a region would have now if no frame had shown its size, px."""
     assert followed.outgrown is not None
     right, down, width, height, _ = followed.outgrown
@@ -1037,6 +1044,12 @@ def _lies_in_outgrown(like: Followed, region: Region) -> bool:
         return False
     x_px, y_px, width_px, height_px = _outgrown(like)
     return abs(region.x_px - x_px) <= width_px / 2 and abs(region.y_px - y_px) <= height_px / 2
+
+
+def _median(values: Collection[float]) -> float:
+    """That of `statistics`, in a third of the time."""
+    ordered = sorted(values)
+    return (ordered[(len(ordered) - 1) // 2] + ordered[len(ordered) // 2]) / 2
 
 
 def _height(lit_px: tuple[float, float] | None) -> float:

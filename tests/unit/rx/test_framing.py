@@ -47,7 +47,7 @@ def due_until(grid: PacketGrid, until_us: float) -> list[DueFrame]:
     found = []
     while (due := grid.due(until_us)) is not None:
         found.append(due)
-        grid.frame += 1
+        grid.go_to(due.number + 1)
     return found
 
 
@@ -80,14 +80,14 @@ def test_frames_are_due_as_they_are_on_air(
 def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat, after: int) -> None:
     """And the chips after it that are read with it."""
     grid = PacketGrid(form, chips_after=after)
-    assert grid.due() is None
+    assert grid.next is None
     grid.restart(lock_of(form, 0, delay_us=35.0), ZERO_US)
     _, _, start_us, end_us = on_air(form, 1)[0]
     read_us = end_us + 35 + after * CHIP_US
     assert grid.due(read_us - 1) is None
     due = grid.due(read_us + 1)
     assert due is not None
-    assert due is grid.due()
+    assert due is grid.next
     assert (due.start_us, due.end_us, due.read_us) == pytest.approx((start_us, end_us + 35, read_us))
 
 

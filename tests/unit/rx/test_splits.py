@@ -195,13 +195,14 @@ def test_a_look_ahead_leaves_no_trace_in_the_regions() -> None:
         for until_us in (start_us + 400, start_us + 1300):
             part = events[: np.searchsorted(events.t_us, until_us)]
             places = [len(region.positions) for region in two.alive]
-            with two.ahead(start_us, until_us, part, {region.id for region in two.alive}):
-                for region, before in zip(two.alive, places, strict=True):
-                    # Soon after the start of a step its beginning says nothing new of the place.
-                    ahead += (moved := len(region.positions) - before)
-                    assert moved <= (until_us == start_us + 1300)
-                    assert region.pieces[-1][0] == start_us
-                    assert region.pieces[-1][1].t_us.max(initial=0) < until_us
+            two.begin_part(start_us, until_us, part, {region.id for region in two.alive})
+            for region, before in zip(two.alive, places, strict=True):
+                # Soon after the start of a step its beginning says nothing new of the place.
+                ahead += (moved := len(region.positions) - before)
+                assert moved <= (until_us == start_us + 1300)
+                assert region.pieces[-1][0] == start_us
+                assert region.pieces[-1][1].t_us.max(initial=0) < until_us
+            two.end_part(until_us)
         for mine, other in zip(one.step(start_us, events), two.step(start_us, events), strict=True):
             assert [vars(p) for p in mine.positions] == [vars(p) for p in other.positions]
             assert (mine.latest, mine.heights) == (other.latest, other.heights)
