@@ -4,6 +4,7 @@ import math
 from cmath import isfinite
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,7 @@ _EVEN = 0.01
 """Steps from cluster to cluster are a spacing where they are longer by rounding only."""
 
 
-@dataclass(frozen=True)
+@dataclass(eq=False)
 class DueFrame:
     """The next frame of a grid of packets, and when its events are all there.
 
@@ -52,8 +53,7 @@ class DueFrame:
     read_us: float
 
 
-@dataclass(frozen=True, eq=False)
-class Pilot:
+class Pilot(NamedTuple):
     """The pilot that the frames up to the next one go by.
 
     Attributes:
@@ -75,8 +75,7 @@ class Pilot:
     others: tuple[Placement, ...]
 
 
-@dataclass(frozen=True, eq=False)
-class AlignedFrame:
+class AlignedFrame(NamedTuple):
     """A frame with the bar held still.
 
     Attributes:
@@ -137,6 +136,7 @@ class FrameAligner:
         self._apart = bool((across_m > (1 + _EVEN) * self._layout.spacing_m).any())
         self._edges = codebook.pilot_edges.astype(np.int64)
         self._every = codebook.edge_every
+        self._telling = slice(1, packet.pilot_chips, self._every)
         self._after = codebook.chips_after
         self._separate = separate
         self._sensor_px = sensor_px
@@ -184,7 +184,7 @@ class FrameAligner:
         chips = len(sums) - self._after
         # The image shows the pilot's mean, read from the chips behind edges that tell codes apart: it lies
         # where these were looked for in the mean, however much the region's track trembles between chips.
-        told = slice(1, packet.pilot_chips, self._every)
+        told = self._telling
         rests_x, rests_y = pilot.offset_px[:, told].tolist()
         many = len(rests_x)
         if due.has_pilot:
@@ -206,11 +206,13 @@ class FrameAligner:
         """
         placed = aligned.pilot.placement
         places = placed.places(self._layout).tolist()
-        off = [complex(*at) - place for at, place in zip(points_px.tolist(), places, strict=True)]
-        off = [one for one in off if isfinite(one)]
-        if not off:
-            return aligned.centre_px
-        centre = placed.shift + sum(off) / len(off)
+        off = [complex(x, y) - place for (x, y), place in zip(points_px.tolist(), places, strict=True)]
+        if not isfinite(total := sum(off)):
+            off = [one for one in off if isfinite(one)]
+            if not off:
+                return aligned.centre_px
+            total = sum(off)
+        centre = placed.shift + total / len(off)
         return centre.real, centre.imag
 
     def box(

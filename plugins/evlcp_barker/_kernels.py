@@ -15,13 +15,18 @@ _STRIDE = 16
 
 
 @njit
-def count_bins(t_us: Array, p: Array, first_bin: int, bin_us: float, known: Array, counts: Array) -> None:
-    """Add events to `known` counts: by polarity (row) and time (column, `bin_us` each from `first_bin`)."""
+def count_bins(t_us: Array, p: Array, where: tuple[int, float, int], known: Array, counts: Array) -> None:
+    """Add events to `known` counts, by polarity (row) and time (column).
+
+    Of `where` are the number of the first column, the length of each, us, and how many of those known are
+    before it.
+    """
+    first_bin, bin_us, skipped = where
     bins = counts.shape[1]
-    before = min(known.shape[1], bins)
+    before = min(known.shape[1] - skipped, bins)
     for row in range(2):
         for b in range(bins):
-            counts[row, b] = known[row, b] if b < before else 0.0
+            counts[row, b] = known[row, skipped + b] if b < before else 0.0
     first_us = first_bin * bin_us
     i, after = 0, t_us.size
     while i < after:

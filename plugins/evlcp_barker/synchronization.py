@@ -1,8 +1,8 @@
 """Packet timing: where preambles are in a sliding correlation, when, and the clock that they show."""
 
 import math
-from dataclasses import dataclass, field
-from typing import Annotated
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +14,7 @@ from evlcp_sdk.air.codebook import Codebook, are_pairs
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Synchronization
-from evlcp_sdk.values import SyncLock, changed, plain
+from evlcp_sdk.values import SyncLock, plain
 
 Floats = NDArray[np.float64]
 
@@ -139,15 +139,14 @@ class _Clock:
     quality: float
 
 
-@dataclass(frozen=True, eq=False)
-class SyncState:
+class SyncState(NamedTuple):
     """What synchronization remembers: recent event counts (OFF, ON) a step, its lock, and a preamble off it.
 
     `power` and `known` are the mean square of the positive correlations lately, and their number.
     """
 
     first_bin: int | None = None
-    counts: Floats = field(default_factory=lambda: np.zeros((2, 0)))
+    counts: Floats = np.zeros((2, 0))
     next_bin: int = 0
     power: float = 0.0
     known: int = 0
@@ -171,7 +170,8 @@ class BarkerSynchronizer:
             raise ConfigError("synchronization 'barker': a preamble without a rise finds no time")
         self._least = spec.min_correlation or least_correlation(codebook, packet.frames, packet.pilot_every)
         # A correlation peak stands alone within this distance.
-        self._guard_chips = guard_chips(codebook.preamble, self._least)
+        self._guard = _STEPS * guard_chips(codebook.preamble, self._least)
+        self._span = _STEPS * len(self._chips)
 
     def init(self) -> SyncState:
         """State before the first event."""
@@ -181,26 +181,26 @@ class BarkerSynchronizer:
         self, state: SyncState, t_us: NDArray[np.int64], p: NDArray[np.uint8], until_us: int
     ) -> tuple[SyncState, list[SyncLock]]:
         """Count events, correlate what is complete, give a lock for each preamble (see `Synchronizer`)."""
-        span, guard = _STEPS * len(self._chips), _STEPS * self._guard_chips
+        span, guard = self._span, self._guard
+        before_bin, before, next_bin, power, known, clock, stray = state
         until_bin = int(until_us // self._bin_us)
-        if state.first_bin is None:
+        if before_bin is None:
             # A preamble starts with a dark chip: the first event may already be the edge at its end.
-            first = (int(t_us[0] // self._bin_us) if len(t_us) else until_bin) - guard
-            state = changed(state, first_bin=first, next_bin=first)
-        assert state.first_bin is not None
-        bins = max(until_bin - state.first_bin, state.counts.shape[1] - 1)
+            before_bin = next_bin = (int(t_us[0] // self._bin_us) if t_us.size else until_bin) - guard
+        # What no peak can be near to any more is left out.
+        first_bin = max(next_bin - guard, before_bin)
+        lo, bins = next_bin - first_bin, max(until_bin, before_bin + before.shape[1] - 1) - first_bin
         lags = bins - span + 1
-        if not len(t_us) and lags - guard > state.next_bin - state.first_bin and not state.counts.any():
+        if not t_us.size and lags - guard > lo and not before[:, first_bin - before_bin :].any():
             # Silence correlates with nothing, and most regions that are no bar are silent.
-            first = max(state.first_bin + lags - 2 * guard, state.first_bin)
-            counts = np.zeros((2, state.first_bin + bins + 1 - first))
-            return changed(state, first_bin=first, counts=counts, next_bin=state.first_bin + lags - guard), []
+            first = max(first_bin + lags - 2 * guard, first_bin)
+            counts = np.zeros((2, first_bin + bins + 1 - first))
+            return state._replace(first_bin=first, counts=counts, next_bin=first_bin + lags - guard), []
         # The last bin is still open: its events count, but it is not correlated yet.
         counts = np.empty((2, bins + 1))
         locks: list[SyncLock] = []
-        power, known, clock, stray = state.power, state.known, state.clock, state.stray
-        lo = state.next_bin - state.first_bin
-        _kernels.count_bins(plain(t_us), plain(p), state.first_bin, self._bin_us, state.counts, counts)
+        where = first_bin, self._bin_us, first_bin - before_bin
+        _kernels.count_bins(plain(t_us), plain(p), where, before, counts)
         if lags - guard > lo:
             rho, squares = np.empty(lags), np.empty(lags - guard - lo)
             top = _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)
@@ -209,24 +209,13 @@ class BarkerSynchronizer:
             power, known = _kernels.mean_squares(rho, counts, span, lo, past, squares)
             if 2 * top >= self._least:
                 for lag in find_peaks(rho, lo, guard, squares, self._least):
-                    found = self._refine(lag, counts, state.first_bin, float(rho[lag]))
-                    before = clock
+                    found = self._refine(lag, counts, first_bin, float(rho[lag]))
+                    old = clock
                     clock, stray = self._accept(clock, stray, found)
-                    if clock is not None and clock is not before:
+                    if clock is not None and clock is not old:
                         locks.append(self._lock(clock, found.quality))
             lo = lags - guard
-        drop = max(lo - guard, 0)
-        state = SyncState(
-            first_bin=state.first_bin + drop,
-            # A view would have kernels compiled once more, for arrays that are not in one piece.
-            counts=counts[:, drop:].copy(),
-            next_bin=state.first_bin + lo,
-            power=power,
-            known=known,
-            clock=clock,
-            stray=stray,
-        )
-        return state, locks
+        return SyncState(first_bin, counts, first_bin + lo, power, known, clock, stray), locks
 
     def _refine(self, lag: int, counts: Floats, first_bin: int, quality: float) -> _Preamble:
         """Times of one preamble, for positive and negative events apart, us."""

@@ -64,16 +64,17 @@ def test_more_clusters_than_codes_are_refused():
 
 
 @pytest.mark.parametrize("n", [0, 1, 400])
+@pytest.mark.parametrize("skipped", [0, 3])
 @pytest.mark.parametrize(("first", "known", "bins"), [(0, 0, 50), (90, 7, 40), (105, 40, 40), (-20, 3, 0)])
-def test_counts(n, first, known, bins):
+def test_counts(n, first, known, bins, skipped):
     rng = np.random.default_rng(n)
     t = 1000 + rng.integers(0, 4, n).cumsum()
     p = rng.integers(0, 2, n).astype(np.uint8)
-    before = rng.integers(0, 9, (2, known)).astype(float)
+    before = rng.integers(0, 9, (2, skipped + known)).astype(float)
     # Quarters of us are exact in binary: the twin may divide where the kernel compares.
-    want = twins.count_bins(t, p, first, 11.25, before, bins)
+    want = twins.count_bins(t, p, first, 11.25, before[:, skipped:], bins)
     counts = np.empty((2, bins))
-    _kernels.count_bins(t, p, first, 11.25, before, counts)
+    _kernels.count_bins(t, p, (first, 11.25, skipped), before, counts)
     assert_array_equal(counts, want)
 
 
