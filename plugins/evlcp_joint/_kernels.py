@@ -142,30 +142,56 @@ def fit_line(middles: Array, line: Array) -> bool:
 
 
 @njit
-def cells_in_place(selected: Array, line: Array, reach: float, across: Array, out: Array) -> None:
-    """Mean row and column of each cluster's cells that lie where it is expected, `out` (K, 2), NaN of none.
+def find_line(selected: Array, grid: int, middles: Array, line: Array, seen: Array) -> bool:
+    """Line of a bar along the rows of cells, `line` (5,) as `read_rows` takes it; False of fewer than three.
 
-    By a `line` of `fit_line` cluster k is expected in row line[0] + k * line[1], to within `reach`, and a
-    row's middle in column line[2] + line[3] * row, to within half of `across`, which is added the cells by
-    their distance from there. All in cells.
+    `middles` (K, 2) are as of `find_middles`; they become those of each cluster's cells that lie where it is
+    expected. `seen` (K,) takes which clusters have any.
     """
+    if not fit_line(middles, line):
+        return False
     clusters, rows, columns = selected.shape
-    half = across.size // 2
-    for k in range(clusters):
-        expected = line[0] + k * line[1]
-        top, bottom = max(int(np.ceil(expected - reach)), 0), min(int(expected + reach), rows - 1)
-        n, sum_r, sum_c = 0, 0.0, 0.0
-        for r in range(top, bottom + 1):
-            for c in range(columns):
-                if selected[k, r, c]:
-                    off = int(np.rint(c - line[2] - line[3] * r))
-                    if -half <= off <= half:
-                        across[half + off] += 1
-                        n += 1
-                        sum_r += r
-                        sum_c += c
-        out[k, 0] = sum_r / n if n else np.nan
-        out[k, 1] = sum_c / n if n else np.nan
+    # A cluster is as long as the spacing; half of it and a cell of blur. Cells as wide as the bar is long are
+    # looked at first: it is narrower.
+    reach, half, wide = abs(line[1]) / 2 + 1, int(abs(line[1]) * clusters / 2) + 1, 0.0
+    for again in range(2):
+        across = np.zeros(2 * half + 1, np.int64)
+        for k in range(clusters):
+            expected = line[0] + k * line[1]
+            n, sum_r, sum_c = 0, 0.0, 0.0
+            for r in range(max(int(np.ceil(expected - reach)), 0), min(int(expected + reach), rows - 1) + 1):
+                for c in range(columns):
+                    if selected[k, r, c]:
+                        off = int(np.rint(c - line[2] - line[3] * r))
+                        if -half <= off <= half:
+                            across[half + off] += 1
+                            n += 1
+                            sum_r += r
+                            sum_c += c
+            seen[k] = n > 0
+            middles[k, 0] = sum_r / n if n else np.nan
+            middles[k, 1] = sum_c / n if n else np.nan
+        if not again:
+            # The cells about the fullest that have three tenths of it: stray cells beside a bar, and the
+            # dimmer ones of its reflection, are fewer or apart.
+            fullest = 0
+            for i in range(across.size):
+                fullest = i if across[i] > across[fullest] else fullest
+            low, high, least = fullest, fullest, 0.3 * across[fullest]
+            while low > 0 and across[low - 1] >= least:
+                low -= 1
+            while high + 1 < across.size and across[high + 1] >= least:
+                high += 1
+            line[2] += (low + high) / 2 - half
+            wide = (high - low) / 2
+            half = int(wide + 1)
+    if not fit_line(middles, line):
+        return False
+    # In pixels; in whole cells, as wide as the core is.
+    middle = (grid - 1) / 2
+    line[0], line[1] = line[0] * grid + middle, line[1] * grid
+    line[2], line[4] = line[2] * grid + middle - line[3] * middle, (wide + 0.5) * grid
+    return True
 
 
 @njit
@@ -316,7 +342,9 @@ def list_steps(codes: Array, known: Array, motion: Array, reach: float, fit: Arr
 
 
 @njit
-def _levels(column: Array, fit: Array, row: int, lens: Array, profile: Array, work: Array) -> None:
+def _levels(
+    column: Array, fit: Array, row: int, lens: tuple[float, float], profile: Array, work: Array
+) -> None:
     """What each step's boundary makes of a row, counted from its first, for a gain of 1, and the slope there.
 
     With the first row, how far that lies beyond the boundary. By straight pieces of the profile; `lens` as of
@@ -352,7 +380,13 @@ def _levels(column: Array, fit: Array, row: int, lens: Array, profile: Array, wo
 
 @njit
 def equations(
-    steps: Array, seen: Array, profile: Array, lens: Array, fit: Array, normal: Array, right: Array
+    steps: Array,
+    seen: Array,
+    profile: Array,
+    lens: tuple[float, float],
+    fit: Array,
+    normal: Array,
+    right: Array,
 ) -> float:
     """Normal equations of a robust least-squares step, `normal` (7, 7), `right` (7,); the cost.
 
@@ -424,7 +458,7 @@ def leftovers(
     steps: Array,
     seen: Array,
     profile: Array,
-    lens: Array,
+    lens: tuple[float, float],
     fit: Array,
     by_boundary: Array,
     by_value: Array,
@@ -435,7 +469,8 @@ def leftovers(
     `by_boundary` (3, K + 1) and `by_value` (2, values) take the shift of the centre, px, and its information,
     in units of the variance of one value; the third row the sine of the boundary's places on the pixels, 0 in
     the middle of one, mean over its values; `scores` (rows, 7) the slopes times the residuals, clipped to
-    `HUBER`, over a row's values, which share one pixel phase and so one error.
+    `HUBER`, over a row's values, which share one pixel phase and so one error. Scores of no row ask for
+    neither of these two.
 
     Returns:
         Mean square of the clipped residuals, sum of the squares of residuals, and of the values.
@@ -465,6 +500,8 @@ def leftovers(
                 by_value[0, i] += pull
                 by_value[1, i] += steep * steep
                 information[j] += steep * steep
+                if len(scores) == 0:
+                    continue
                 scores[v, 0] += pull * column[_PLACE + j]
                 scores[v, 1] += pull
                 scores[v, 2] += pull * column[_WHEN + j]
@@ -476,7 +513,8 @@ def leftovers(
             if information[j] > 0:
                 b = int(column[_BOUNDARY + j])
                 by_boundary[1, b] += information[j]
-                by_boundary[2, b] -= information[j] * sin(2 * np.pi * work[_AT + j])
+                if len(scores):
+                    by_boundary[2, b] -= information[j] * sin(2 * np.pi * work[_AT + j])
     for b in range(by_boundary.shape[1]):
         by_boundary[0, b] /= max(by_boundary[1, b], 1e-12)
         by_boundary[2, b] /= max(by_boundary[1, b], 1e-12)
@@ -487,7 +525,13 @@ def leftovers(
 
 @njit
 def solve(
-    steps: Array, seen: Array, profile: Array, lens: Array, tolerance: float, fit: Array, normal: Array
+    steps: Array,
+    seen: Array,
+    profile: Array,
+    lens: tuple[float, float],
+    tolerance: float,
+    fit: Array,
+    normal: Array,
 ) -> bool:
     """Levenberg-Marquardt from `fit`, which is changed; False where there is no fit.
 
@@ -557,65 +601,6 @@ def own_motion(shift: Array, information: Array, when: Array, out: Array) -> Non
 
 
 @njit
-def fit_bar(
-    codes: Array,
-    known: Array,
-    motion: Array,
-    values: Array,
-    profile: Array,
-    lens: Array,
-    least: int,
-    fit: Array,
-) -> tuple[bool, Array, Array, Array]:
-    """Fit again and again, each time with the motion and without the boundaries that the last one showed.
-
-    Args:
-        codes: What each cluster sends, (K, values).
-        known: Between which clusters that is known, (K + 1, values).
-        motion: Where the centre is in each value, rows, and when that is; (2, values).
-        values: Of each row, (values, rows).
-        profile: To one side of a boundary, -1 to 1, and its slope, (2, n), from 0 to `REACH` widths.
-        lens: A boundary's width, px, of which `fit` has the logarithm of what it is more; and how large
-            negative values are, as a share of positive ones.
-        least: Boundaries that a fit needs.
-        fit: What it begins with; changed.
-
-    Returns:
-        Whether there is a fit; `by_boundary` and `scores` of `leftovers`; its normal equations.
-    """
-    clusters, n = codes.shape
-    by_boundary, by_value = np.empty((3, clusters + 1)), np.empty((2, n))
-    scores, normal = np.empty((values.shape[1], FITTED)), np.empty((FITTED, FITTED))
-    counted, moved, own, sizes = known.copy(), motion.copy(), np.zeros(n), np.empty(clusters + 1)
-    spent, squares = 0.0, 0.0
-    for left in range(_ROUNDS, -1, -1):
-        reach = REACH * lens[0] * exp(fit[4])
-        steps, seen = list_steps(codes, counted, moved, reach, fit, values)
-        if not solve(steps, seen, profile, lens, CLOSE if left else EXACT, fit, normal):
-            return False, by_boundary, scores, normal
-        noise, spent, squares = leftovers(steps, seen, profile, lens, fit, by_boundary, by_value, scores)
-        used: Any = np.int64(0)
-        for b in range(clusters + 1):
-            if by_boundary[1, b] > 0:
-                sizes[used] = abs(by_boundary[0, b])
-                used += 1
-        if used < least:
-            return False, by_boundary, scores, normal
-        if left:
-            most = max(_OUTLIER * 1.4826 * median(sizes, used), _LEAST_OUTLIER_PX)
-            for b in range(clusters + 1):
-                if abs(by_boundary[0, b]) > most:
-                    counted[b] = False
-            for i in range(n):
-                own[i] += by_value[0, i]
-                by_value[1, i] /= max(noise, 1e-12)
-            own_motion(own, by_value[1], motion[1], own)
-            for i in range(n):
-                moved[0, i] = motion[0, i] + own[i]
-    return spent <= (1 - _LEAST_EXPLAINED) * squares, by_boundary, scores, normal
-
-
-@njit
 def assess_fit(by_boundary: Array, scores: Array, normal: Array) -> tuple[float, int, float]:
     """Variance of the spacing, px2, of `leftovers`; NaN where the normal equations have no root.
 
@@ -655,3 +640,83 @@ def assess_fit(by_boundary: Array, scores: Array, normal: Array) -> tuple[float,
         return np.nan, n, 0.0
     variance = (by_row * rows / max(rows - FITTED, 1) + left_over / max(n - 2, 1) / spread) / 2
     return variance, n, wave / spread
+
+
+_NO_FIT = (np.nan, 0, 0.0)
+"""As `assess_fit` has it, of no boundaries."""
+
+
+@njit
+def fit_bar(
+    said: tuple[Array, Array, Array, Array],
+    offset_px: Array,
+    values: Array,
+    profile: Array,
+    lens: tuple[float, float],
+    least: int,
+    fit: Array,
+) -> tuple[tuple[float, int, float], Array]:
+    """Fit again and again, each time with the motion and without the boundaries that the last one showed.
+
+    Args:
+        said: Pilots (K, values) and words (symbols, values), their values -1 and 1; the symbol of each
+            cluster, int64 (K,), -1 of those not known, of which the pilot counts alone; which are seen (K,).
+        offset_px: Of the centre in each chip, rows, (chips,), two of a value. Images are held still by whole
+            pixels, so these jump by one.
+        values: Of each row, (values, rows).
+        profile: To one side of a boundary, -1 to 1, and its slope, (2, n), from 0 to `REACH` widths.
+        lens: A boundary's width, px, of which `fit` has the logarithm of what it is more; and how large
+            negative values are, as a share of positive ones.
+        least: Boundaries that a fit needs.
+        fit: What it begins with; changed.
+
+    Returns:
+        As `assess_fit`, NaN without a fit; and `by_boundary` of `leftovers`.
+    """
+    pilots, words, symbols, seen = said
+    clusters, n = len(pilots), len(values)
+    codes, known = np.empty((clusters, n)), np.zeros((clusters + 1, n), np.bool_)
+    for k in range(clusters):
+        for i in range(n):
+            of_pilot = i < pilots.shape[1]
+            codes[k, i] = pilots[k, i] if of_pilot else words[symbols[k], i - pilots.shape[1]]
+            if k and seen[k - 1] and seen[k]:
+                known[k, i] = of_pilot or min(symbols[k - 1], symbols[k]) >= 0
+    motion = np.empty((2, n))
+    for i in range(n):
+        # A value is read from its second chip, whose events follow the edge at its start, half a chip before
+        # the middle that an offset is for.
+        second = offset_px[2 * i + 1]
+        step = second - offset_px[2 * i]
+        motion[0, i], motion[1, i] = second - (step - np.rint(step)) / 2, (i + 0.5) / n - 0.5
+    by_boundary, by_value = np.empty((3, clusters + 1)), np.empty((2, n))
+    scores, normal = np.empty((values.shape[1], FITTED)), np.empty((FITTED, FITTED))
+    moved, own, sizes = motion.copy(), np.zeros(n), np.empty(clusters + 1)
+    spent, squares = 0.0, 0.0
+    for left in range(_ROUNDS, -1, -1):
+        reach = REACH * lens[0] * exp(fit[4])
+        steps, rows = list_steps(codes, known, moved, reach, fit, values)
+        if not solve(steps, rows, profile, lens, CLOSE if left else EXACT, fit, normal):
+            return _NO_FIT, by_boundary
+        asked = scores[: 0 if left else len(scores)]
+        noise, spent, squares = leftovers(steps, rows, profile, lens, fit, by_boundary, by_value, asked)
+        used: Any = np.int64(0)
+        for b in range(clusters + 1):
+            if by_boundary[1, b] > 0:
+                sizes[used] = abs(by_boundary[0, b])
+                used += 1
+        if used < least:
+            return _NO_FIT, by_boundary
+        if left:
+            most = max(_OUTLIER * 1.4826 * median(sizes, used), _LEAST_OUTLIER_PX)
+            for b in range(clusters + 1):
+                if abs(by_boundary[0, b]) > most:
+                    known[b] = False
+            for i in range(n):
+                own[i] += by_value[0, i]
+                by_value[1, i] /= max(noise, 1e-12)
+            own_motion(own, by_value[1], motion[1], own)
+            for i in range(n):
+                moved[0, i] = motion[0, i] + own[i]
+    explained = spent <= (1 - _LEAST_EXPLAINED) * squares
+    return assess_fit(by_boundary, scores, normal) if explained else _NO_FIT, by_boundary

@@ -107,8 +107,8 @@ class JointScaleRanging(Ranging):
         pilots = codebook.pilot_values[column].astype(np.float64)
         words = codebook.codeword_values.astype(np.float64)
         boundaries = np.arange(1.0, clusters) - clusters / 2
-        when = (np.arange(n := pilots.shape[1] + words.shape[1]) + 0.5) / n - 0.5
-        chips, late_chips = 2 * n, float(n - pilots.shape[1])
+        n = pilots.shape[1] + words.shape[1]
+        chips, late_chips = 2 * n, float(words.shape[1])
 
         def measure(view: FrameView) -> Range:
             found = find_bar(view, chips)
@@ -118,27 +118,21 @@ class JointScaleRanging(Ranging):
             height, (first, spacing, _, tilt, _) = sums.shape[1], line.tolist()
             values = np.empty((n, height))
             _kernels.read_rows(sums, line, clusters, values)
-            lens = np.array([self.blur_px, _kernels.measure_dim(sums, pilots, seen, line)])
-            motion = np.empty((2, n))
-            motion[0], motion[1] = _second_chips(offset_px), when
+            dim = _kernels.measure_dim(sums, pilots, seen, line)
             if spacing < 0:
                 # A bar upside down is mirrored.
                 spacing, first = -spacing, height - 1 - first
-                values = plain(values[:, ::-1])
-                motion[0] *= -1
-            codes, known = known_codes(pilots, words, view.soft.symbols, seen)
+                values, offset_px = plain(values[:, ::-1]), -offset_px
+            said = pilots, words, view.soft.symbols, seen
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
             fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
-            fitted, by_boundary, scores, normal = _kernels.fit_bar(
-                codes, known, motion, values, profile(_CORE_SHARE), lens, least, fit
+            (variance, seen_boundaries, wider_px), by_boundary = _kernels.fit_bar(
+                said, offset_px, values, profile(_CORE_SHARE), (self.blur_px, dim), least, fit
             )
-            spacing_px, centre_px = fit[:2].tolist()
+            spacing_px, centre_px, *_ = fit.tolist()
             # From the start, which cells gave, an end moves by the size of a cell and a pixel of blur.
             farthest = abs(spacing_px - spacing) * (clusters - 1) / 2 + abs(centre_px - centre)
-            if not fitted or farthest > view.presence.grid_px + 1:
-                return _NONE
-            variance, seen_boundaries, wider_px = _kernels.assess_fit(by_boundary, scores, normal)
-            if math.isnan(variance):
+            if math.isnan(variance) or farthest > view.presence.grid_px + 1:
                 return _NONE
             # Rows measure the bar along one axis; a tilted bar is longer by its slope.
             stretch = math.hypot(1.0, tilt)
@@ -176,75 +170,9 @@ def find_bar(
     if _kernels.find_middles(selected, middles):
         selected, sums = plain(selected.swapaxes(1, 2)), plain(sums.swapaxes(1, 2))
         offset_px, middles = view.offset_px[0, :chips], plain(middles[:, ::-1])
-    line = np.empty(5)
-    if not _kernels.fit_line(middles, line):
-        return None
-    # A cluster is as long as the spacing; half of it and a cell of blur. Cells as wide as the bar is long are
-    # looked at first: it is narrower.
-    reach = abs(float(line[1])) / 2 + 1
-    across = np.zeros(2 * int(abs(float(line[1])) * len(selected) / 2) + 3, np.int64)
-    _kernels.cells_in_place(selected, line, reach, across, middles)
-    shift, half = core_of(across)
-    line[2] += shift
-    _kernels.cells_in_place(selected, line, reach, np.zeros(2 * int(half + 1) + 1, np.int64), middles)
-    if not _kernels.fit_line(middles, line):
-        return None
-    # In pixels; in whole cells, as wide as the core is.
-    grid = view.presence.grid_px
-    middle = (grid - 1) / 2
-    first, spacing, left, tilt, _ = line.tolist()
-    line = np.array(
-        [
-            first * grid + middle,
-            spacing * grid,
-            left * grid + middle - tilt * middle,
-            tilt,
-            (half + 0.5) * grid,
-        ]
-    )
-    return sums, offset_px, line, ~np.isnan(middles[:, 0])
-
-
-def core_of(counts: NDArray[np.int64]) -> tuple[float, float]:
-    """Middle and half the extent of the cells about the fullest that have three tenths of it.
-
-    The middle is given from that of `counts`. Stray cells beside a bar, and the dimmer ones of its
-    reflection, are fewer or apart.
-    """
-    cells = counts.tolist()
-    least = 0.3 * max(cells)
-    low = high = cells.index(max(cells))
-    while low > 0 and cells[low - 1] >= least:
-        low -= 1
-    while high + 1 < len(cells) and cells[high + 1] >= least:
-        high += 1
-    return (low + high) / 2 - len(cells) // 2, (high - low) / 2
-
-
-def _second_chips(offset_px: Floats) -> Floats:
-    """Offset of each value from those of its chips, (2 n,) -> (n,).
-
-    A value is read from its second chip, whose events follow the edge at its start, half a chip before the
-    middle that an offset is for. Images are held still by whole pixels, so offsets jump by one.
-    """
-    second = offset_px[1::2]
-    step = second - offset_px[::2]
-    return second - (step - np.rint(step)) / 2
-
-
-def known_codes(
-    pilots: Floats, words: Floats, symbols: NDArray[np.int64], seen: NDArray[np.bool_]
-) -> tuple[Floats, NDArray[np.bool_]]:
-    """What each cluster sends in a frame, (K, values), and between which it is known, (K + 1, values).
-
-    A boundary lies between clusters that are seen; in info values, those whose symbol is known, too.
-    """
-    codes = np.concatenate([pilots, words[np.maximum(symbols, 0)]], axis=1)
-    known = np.zeros((len(pilots) + 1, codes.shape[1]), np.bool_)
-    read = seen & (symbols >= 0)
-    known[1:-1, : pilots.shape[1]] = (seen[1:] & seen[:-1])[:, None]
-    known[1:-1, pilots.shape[1] :] = (read[1:] & read[:-1])[:, None]
-    return codes, known
+    line, seen = np.empty(5), np.empty(len(selected), np.bool_)
+    found = _kernels.find_line(selected, view.presence.grid_px, middles, line, seen)
+    return (sums, offset_px, line, seen) if found else None
 
 
 @cache

@@ -212,15 +212,22 @@ class Twin:
     def __init__(self, seed: int, rows: int = 90) -> None:
         rng = np.random.default_rng(seed)
         self.codes = rng.choice([-1.0, 1.0], (K, 6))
-        self.known = rng.random((K + 1, 6)) > 0.1
-        self.known[[0, K]] = False
-        self.offset, self.when = rng.uniform(-0.5, 0.5, 6), np.linspace(-0.5, 0.5, 6)
+        # Four values of a pilot, two of each cluster's own word.
+        read, seen = rng.random((2, K)) > 0.05
+        self.said = self.codes[:, :4].copy(), self.codes[:, 4:].copy(), np.where(read, np.arange(K), -1), seen
+        shown = np.repeat(np.stack([seen, seen & read], 1), [4, 2], axis=1)
+        self.known = np.zeros((K + 1, 6), np.bool_)
+        self.known[1:-1] = shown[1:] & shown[:-1]
+        self.offset_px, self.when = rng.uniform(-0.6, 0.6, 12), (np.arange(6) + 0.5) / 6 - 0.5
+        first, second = self.offset_px.reshape(6, 2).T
+        # Half a chip before the second one's middle, but for the whole pixels that images are moved by.
+        self.offset = second - (second - first - np.rint(second - first)) / 2
         self.fit = np.array([5.3, 0.2, 0.1, 0.7, 0.2, 0.07, -0.03])
         self.rows = rows
         reach = _kernels.REACH * BLUR * np.exp(0.2)
         self.reach = min(reach, 5.3 / 2)
         self.seen = 0.7 * rng.choice([-1.0, 1.0], (6, rows)) + rng.normal(0, 0.5, (6, rows))
-        self.motion, self.lens = np.stack([self.offset, self.when]), np.array([BLUR, DIM])
+        self.motion, self.lens = np.stack([self.offset, self.when]), (BLUR, DIM)
         self.profile = profile(SHARE)
 
     def steps(self, seen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -339,17 +346,44 @@ def test_cells_out_of_place_do_not_count() -> None:
         # Within the half cell that the bins leave.
         assert abs(medians[k, 0] - np.median(rows)) <= 1
         assert abs(medians[k, 1] - np.median(columns)) <= 1
-    line = np.array([5.0, 3.0, 10.5, 0.0])
-    across, found = np.zeros(5, np.int64), np.empty((K, 2))
-    _kernels.cells_in_place(selected, line, 2.5, across, found)
-    counts = np.zeros(5, np.int64)
-    for k in range(K):
-        rows, columns = np.nonzero(selected[k])
-        off = np.rint(columns - 10.5).astype(int)
-        near = (np.abs(rows - 5 - 3 * k) <= 2.5) & (np.abs(off) <= 2)
-        counts += np.bincount(off[near] + 2, minlength=5)
-        assert_allclose(found[k], [rows[near].mean(), columns[near].mean()])
-    assert np.array_equal(across, counts)
+    at, line, seen = line_of(medians), np.empty(5), np.empty(K, np.bool_)
+    assert _kernels.find_line(selected, 2, medians, line, seen)
+    assert seen.all()
+
+    def in_place(half: int) -> tuple[np.ndarray, np.ndarray]:
+        """Means of rows and columns of the cells in place, and how many are in each column."""
+        off = np.rint(np.arange(30) - at[2] - at[3] * np.arange(60)[:, None]).astype(int)
+        beyond = np.abs(np.arange(60)[:, None] - (at[0] + at[1] * np.arange(K))[:, None, None])
+        near = selected & (beyond <= reach) & (np.abs(off) <= half)
+        columns = np.broadcast_to(off, near.shape)[near] + half
+        means = [[places.mean() for places in np.nonzero(one)] for one in near]
+        return np.array(means), np.bincount(columns, minlength=2 * half + 1)
+
+    reach, half = at[1] / 2 + 1, int(at[1] * K / 2) + 1
+    counts = in_place(half)[1]
+    # The run about the fullest column that has three tenths of it.
+    dim = np.flatnonzero(np.concatenate([[True], counts < 0.3 * counts.max(), [True]]))
+    after = np.searchsorted(dim, counts.argmax() + 1)
+    low, high = dim[after - 1], dim[after] - 2
+    at[2] += (low + high) / 2 - half
+    wide = (high - low) / 2
+    want = in_place(int(wide + 1))[0]
+    assert_allclose(medians, want)
+    first, spacing, left, tilt = line_of(want)
+    # Cells of two pixels.
+    assert_allclose(line, [2 * first + 0.5, 2 * spacing, 2 * left + 0.5 - tilt / 2, tilt, 2 * wide + 1])
+    selected[2:] = False
+    _kernels.find_middles(selected, medians)
+    assert not _kernels.find_line(selected, 2, medians, line, seen)
+
+
+def line_of(middles: np.ndarray) -> list[float]:
+    """Theil and Sen's lines of rows by clusters, and of columns by rows."""
+    out = []
+    for x, y in ((np.arange(len(middles)), middles[:, 0]), middles.T):
+        slope = theilslopes(y, x)[0]
+        out += [float(np.median(y - slope * x)), float(slope)]
+    return out
 
 
 def test_the_line_is_theil_sen() -> None:
@@ -399,11 +433,9 @@ def test_rounds_of_fits(seed: int) -> None:
     seen[:, v[b == 5]] = rng.normal(0, 0.5, seen[:, v[b == 5]].shape)
     start = twin.fit * [1.003, 1, 1, 1, 1, 1, 1]
     fit, light = start.copy(), (twin.profile, twin.lens)
-    fitted, by_boundary, got, equations = _kernels.fit_bar(
-        twin.codes, twin.known, twin.motion, seen, *light, 6, fit
+    (variance, seen_boundaries, wider_px), by_boundary = _kernels.fit_bar(
+        twin.said, twin.offset_px, seen, *light, 6, fit
     )
-    assert fitted
-    variance, seen_boundaries, wider_px = _kernels.assess_fit(by_boundary, got, equations)
     known, motion, want = twin.known, twin.motion.copy(), start.copy()
     by, by_value, scores, normal = (np.empty(n) for n in ((3, K + 1), (2, 6), (110, 7), (7, 7)))
     for left in (2, 1, 0):
@@ -452,23 +484,18 @@ def test_how_dim_negative_values_are(spacing: float) -> None:
     assert _kernels.measure_dim(-np.abs(sums), pilots, seen, place) == 1.0
 
 
-KNOWN = np.ones((K + 1, 16), np.bool_)
-KNOWN[[0, K]] = False
-
-
 def random_codes(rng):
     return np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1)
 
 
 def fit_of(codes, dim, values, spacing):
     """The fit of a frame's values, of boundaries .45 px wide without tails, and where they lie off it."""
-    motion = np.stack([np.zeros(16), (np.arange(16) + 0.5) / 16 - 0.5])
+    said = codes, codes[:, :0].copy(), np.zeros(K, np.int64), np.ones(K, np.bool_)
     fit = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    fitted, by_boundary, scores, normal = _kernels.fit_bar(
-        codes, KNOWN, motion, values, profile(1.0), np.array([0.45, dim]), 6, fit
+    (variance, *_), by_boundary = _kernels.fit_bar(
+        said, np.zeros(32), values, profile(1.0), (0.45, dim), 6, fit
     )
-    assert fitted
-    assert _kernels.assess_fit(by_boundary, scores, normal)[0] > 0
+    assert variance > 0
     return fit, by_boundary[:, 1:-1]
 
 
