@@ -7,7 +7,7 @@
 Events are received from memory, kernels warm. Each version is a process of its own, on one thread; they take
 turns scene by scene, so that both meet the same pace of the machine. Printed of each scene: the least time a
 frame, how many times real time that is, and the median of the pairs' ratios (new over old) with the least and
-the greatest. `noise` and `lamps` are night-50m with ten million events a second more, and with eight lamps.
+the greatest. To night-50m are added ten million events a second, or eight lamps.
 """
 
 import argparse
@@ -21,6 +21,7 @@ from statistics import median
 from typing import Any
 
 import numpy as np
+from memory import CHIP_US, in_order, noise
 
 from evlcp_sdk.io import read_events, write_events
 from evlcp_sdk.simulated import simulate
@@ -64,36 +65,23 @@ def receive(child: subprocess.Popen[str], *scene: Any) -> tuple[float, int]:
     return spent_s, frames
 
 
-def merged(*parts: Events) -> Events:
-    """The events of all, in order."""
-    every = Events.concat(parts)
-    return every[np.argsort(every.t_us, kind="stable")]
+def merged(one: Events, other: Events) -> Events:
+    """The events of both, in order."""
+    return in_order(*vars(Events.concat([one, other])).values())
 
 
-def noise(like: Events, rng: np.random.Generator) -> Events:
-    """Ten million events a second all over the image, for as long as others."""
-    first, last = int(like.t_us[0]), int(like.t_us[-1])
-    n = (last - first) * 10
-    return Events.of(
-        np.sort(rng.integers(first, last + 1, n)),
-        rng.integers(0, 1280, n),
-        rng.integers(0, 720, n),
-        rng.integers(0, 2, n),
-    )
-
-
-def lamps(like: Events, rng: np.random.Generator) -> Events:
-    """Eight lamps in the upper part of the image, each chip of which is a coin toss."""
-    first, last = int(like.t_us[0]), int(like.t_us[-1])
+def lamps(duration_us: int, *, steady: bool) -> Events:
+    """Eight lamps of 12 x 12 px that blink with a period of two chips, or each chip by a coin toss."""
+    rng, chips = np.random.default_rng(0), np.arange(duration_us // CHIP_US - 1)
     v, u = np.indices((12, 12)).reshape(2, -1)
     parts = []
     for left in range(100, 100 + 8 * 140, 140):
-        edges = np.flatnonzero(np.diff(light := rng.integers(0, 2, (last - first) // 100))) + 1
-        t_us = first + edges[:, None] * 100 + rng.integers(0, 25, (len(edges), u.size))
+        light = chips % 2 if steady else rng.integers(0, 2, len(chips))
+        edges = np.flatnonzero(np.diff(light)) + 1
+        t_us = edges[:, None] * CHIP_US + rng.integers(0, 25, (len(edges), u.size))
         columns = np.broadcast_arrays(t_us, left + u, 40 + v, light[edges][:, None])
-        parts.append(Events.of(*(column.ravel() for column in columns)))
-    every = merged(*parts)
-    return every[every.t_us <= last]
+        parts.append(in_order(*(column.ravel() for column in columns)))
+    return Events.concat(parts)
 
 
 def four_bars() -> Events:
@@ -108,10 +96,13 @@ def usual_recordings(folder: Path) -> list[Path]:
     """The recordings of `../shared`, and those made by this script."""
     if not SHARED.exists():
         sys.exit(f"no recording named, and {SHARED} is not there")
-    night, rng = read_events(SHARED / f"{NAMES[0]}.raw"), np.random.default_rng(0)
+    night = read_events(SHARED / f"{NAMES[0]}.raw")
+    night = Events.of(night.t_us - night.t_us[0], night.x, night.y, night.p)
+    long_us = int(night.t_us[-1])
     made = {
-        "noise": merged(night, noise(night, rng)),
-        "lamps": merged(night, lamps(night, rng)),
+        "noise": merged(night, Events.concat(list(noise(1e7, long_us)))),
+        "steady-lamps": merged(night, lamps(long_us, steady=True)),
+        "random-lamps": merged(night, lamps(long_us, steady=False)),
         "four-bars": four_bars(),
     }
     for name, events in made.items():
