@@ -106,6 +106,7 @@ class Framer(ABC):
         counts: What was found and dropped so far.
         lit: When the light of its transmitters was there: see `note_lit`.
         ranging_every: See `Receiver`.
+        due_us: When the next frame can be decoded, us; infinite where that waits for the end of a time step.
         patience_us: How late a frame may be given, us.
         cut_by_the_end: Frames whose late events the stream's end cuts off are not given.
     """
@@ -114,16 +115,12 @@ class Framer(ABC):
     counts: dict[str, int]
     lit: dict[int, tuple[float, float]]
     ranging_every: int
+    due_us: float = math.inf
     patience_us: float
 
     @abstractmethod
     def step(self, regions: list[Followed], step: TimeStep) -> None:
         """Receive and decode what the regions of a time step send."""
-
-    @property
-    def due_us(self) -> float:
-        """When the next frame can be decoded, us; infinite where that waits for the end of a time step."""
-        return math.inf
 
     def ahead(self, step: TimeStep) -> None:
         """Decode the frames that are due in the part so far of a time step, if there can be any."""

@@ -520,18 +520,16 @@ class PacketFraming(Framer):
                 if region.id not in self._joined:
                     self.counts["regions_released"] += 1
                     self._transmitters.release(transmitter)
+        self._find_due()
 
-    @property
-    def due_us(self) -> float:
-        """When the next frame can be decoded, us; infinite where that waits for the end of a time step."""
-        if self._follower is None:
-            return math.inf
+    def _find_due(self) -> None:
+        """Find out when the next frame is due whose region is set right by its frames."""
         due_us = math.inf
-        for one in self._transmitters.alive.values():
+        for one in self._transmitters.alive.values() if self._follower is not None else ():
             due = one.grid.next
             if due is not None and due.read_us < due_us and _in_time(one):
                 due_us = due.read_us
-        return due_us + self._tail_us
+        self.due_us = due_us + self._tail_us
 
     def ahead(self, step: TimeStep) -> None:
         """Decode the frames that are due in the part so far of a time step."""
@@ -547,6 +545,7 @@ class PacketFraming(Framer):
         for transmitter in due:
             self._decode_ahead(transmitter, until_us)
         self._follower.end_part(step.end_us)
+        self._find_due()
 
     def number_of(self, region: Followed) -> int | None:
         """Number of a region's transmitter; None before its first frame."""

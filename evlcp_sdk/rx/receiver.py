@@ -183,7 +183,10 @@ class Receiver:
 
     def _due_us(self) -> float:
         """When the next frame can be decoded, us."""
-        return min([one.framing.due_us for one in self._receivers])
+        due_us = math.inf
+        for one in self._receivers:
+            due_us = min(due_us, one.framing.due_us)
+        return due_us
 
     def _run(self, step: TimeStep) -> list[Packet]:
         """Give each link a time step; give the packets that are complete, of the links that fit."""

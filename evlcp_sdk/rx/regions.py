@@ -599,7 +599,7 @@ class RegionFollower(RegionTracker):
         spec = self._spec
         self._remember(start_us, events)
         rises = self._rhythm.step(start_us, events, self._hits, CELL_SHIFT)
-        end_us = start_us + spec.step_us
+        end_us, held = start_us + spec.step_us, 0
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
         for followed, box, own in zip(self.alive, boxes, self._own(boxes), strict=True):
             inside = select(events, box)
@@ -609,9 +609,11 @@ class RegionFollower(RegionTracker):
             if (found := self._locate(followed, own, end_us)) is not None:
                 followed.filter, place = found
                 followed.positions.append(place)
+            held += followed.held_bytes
         if len(self.alive) > 1:
             self._merge()
-        self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, spec.step_us)
+        if held > self._limits.region_bytes:
+            self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, spec.step_us)
         self._open(end_us, rises, taken)
         seen = list(self.alive)
         gone = False
@@ -624,19 +626,18 @@ class RegionFollower(RegionTracker):
 
     def _boxes(self, t_us: float, taken: Sequence[Region]) -> list[Box]:
         """Where each region should be in the middle of a step; one of unknown size beside the others."""
-        boxes, known, unknown = [], [], []
-        for number, followed in enumerate(self.alive):
+        places, all_known = [], True
+        for followed in self.alive:
             last = followed.positions.latest
-            place = *self._expected(followed, t_us), last.width_px, last.height_px
-            boxes.append(self._reach(*place))
-            if followed.size_px is None:
-                unknown.append(number)
-            else:
-                known.append(place)
-        if unknown:
-            others = [box_of(place) for place in taken] + [box_around(*place) for place in known]
-            for number in unknown:
-                boxes[number] = clear_of(boxes[number], others)
+            places.append((*self._expected(followed, t_us), last.width_px, last.height_px))
+            all_known &= followed.size_px is not None
+        boxes = [self._reach(*place) for place in places]
+        if not all_known:
+            others = [box_of(place) for place in taken]
+            others += [box_around(*at) for at, one in zip(places, self.alive, strict=True) if one.size_px]
+            for number, followed in enumerate(self.alive):
+                if followed.size_px is None:
+                    boxes[number] = clear_of(boxes[number], others)
         return boxes
 
     def _own(self, boxes: list[Box]) -> list[Box]:
