@@ -123,7 +123,7 @@ class JointScaleRanging(Ranging):
                 # A bar upside down is mirrored.
                 spacing, first = -spacing, height - 1 - first
                 values, offset_px = plain(values[:, ::-1]), -offset_px
-            said = pilots, words, view.soft.symbols, seen
+            said = pilots, words, plain(view.soft.symbols), seen
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
             fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
             (variance, seen_boundaries, wider_px), by_boundary = _kernels.fit_bar(
@@ -166,10 +166,10 @@ def find_bar(
         along the rows; its line, float64 (5,), as `_kernels.read_rows` takes it; and which clusters are seen.
     """
     selected, sums = plain(view.presence.selected), plain(view.sums[:chips])
-    offset_px, middles = view.offset_px[1, :chips], np.empty((len(selected), 2))
+    offset_px, middles = plain(view.offset_px[1, :chips]), np.empty((len(selected), 2))
     if _kernels.find_middles(selected, middles):
         selected, sums = plain(selected.swapaxes(1, 2)), plain(sums.swapaxes(1, 2))
-        offset_px, middles = view.offset_px[0, :chips], plain(middles[:, ::-1])
+        offset_px, middles = plain(view.offset_px[0, :chips]), plain(middles[:, ::-1])
     line, seen = np.empty(5), np.empty(len(selected), np.bool_)
     found = _kernels.find_line(selected, view.presence.grid_px, middles, line, seen)
     return (sums, offset_px, line, seen) if found else None

@@ -43,47 +43,70 @@ def find_middles(maps: Array, min_pixels: int, out: Array) -> None:
 
 
 @njit
-def fit_peaks(samples: Array, size: int, band: int, shifts: Array) -> None:
-    """Shift of the Dirichlet kernel that fits samples (n, m) around the middle one best (least squares), px.
+def fit_peaks(
+    correlation: Array,
+    size: tuple[int, int],
+    most: tuple[int, int],
+    far: tuple[int, int],
+    samples: int,
+    shifts: Array,
+) -> None:
+    """Peaks of correlations, `shifts` (pairs, 2): down and right, px, within `far` of none.
 
-    It is the sum of `band` (odd) harmonics out of `size`, band / size at 0. The gain that fits best follows
-    from the shift, so Gauss-Newton steps run over the shift alone (variable projection). The sines of the
-    samples follow from those of the first by rotation.
+    Of `correlation`, (pairs, rows, columns), rows begin `samples` before those that a peak may be in. The row
+    and the column of a peak, so many samples to each side, are fitted (least squares) by the Dirichlet kernel
+    of their band: the sum of 2 `most` + 1 harmonics out of `size`. The gain that fits best follows from the
+    shift, so Gauss-Newton steps run over the shift alone (variable projection). The sines of the samples
+    follow from those of the first by rotation.
     """
-    n, many = samples.shape
-    half, turn = many // 2, np.pi / size
-    ds, dc, dsb, dcb = np.sin(turn), np.cos(turn), np.sin(band * turn), np.cos(band * turn)
-    for q in range(n):
-        left, middle, right = samples[q, half - 1], samples[q, half], samples[q, half + 1]
-        # For a kernel between two samples, the neighbours' ratio is that of their distances.
-        side = right if right > left else left
-        shift = 0.0
-        if middle > 0 and side > 0:
-            shift = (1 if right >= left else -1) * side / (middle + side)
-        for _ in range(12):
-            mm, ms, ss, mv, sv = 0.0, 0.0, 0.0, 0.0, 0.0
-            start = (-half - shift) * turn
-            s, c, sb, cb = np.sin(start), np.cos(start), np.sin(band * start), np.cos(band * start)
+    many, zero, seen = 2 * samples + 1, far[0] + samples, np.empty(2 * samples + 1)
+    peaks = np.zeros((len(correlation), 2), np.int64)
+    for q in range(len(correlation)):
+        # No shift comes first: where nothing is seen, all are alike.
+        for a in range(2 * far[0] + 1):
+            for b in range(2 * far[1] + 1):
+                v = a if a <= far[0] else a - 2 * far[0] - 1
+                u = b if b <= far[1] else b - 2 * far[1] - 1
+                if correlation[q, zero + v, u] > correlation[q, zero + peaks[q, 0], peaks[q, 1]]:
+                    peaks[q, 0], peaks[q, 1] = v, u
+    for axis in range(2):
+        turn, band = np.pi / size[axis], 2 * most[axis] + 1
+        ds, dc, dsb, dcb = np.sin(turn), np.cos(turn), np.sin(band * turn), np.cos(band * turn)
+        for q in range(len(correlation)):
             for i in range(many):
-                value, slope = band / size, 0.0
-                if abs(s) >= 1e-9:
-                    value = sb / (size * s)
-                    slope = turn * (band * cb * s - sb * c) / (size * s * s)
-                mm += value * value
-                ms += value * slope
-                ss += slope * slope
-                mv += value * samples[q, i]
-                sv += slope * samples[q, i]
-                s, c = s * dc + c * ds, c * dc - s * ds
-                sb, cb = sb * dcb + cb * dsb, cb * dcb - sb * dsb
-            gain = mv / mm
-            # The slope with its part along the kernel removed: what the gain cannot explain.
-            curvature = gain * (ss - ms * ms / mm)
-            if gain <= 0 or curvature < 1e-30:
-                break
-            move = min(max(-(sv - gain * ms) / curvature, -0.25), 0.25)
-            shift = min(max(shift + move, -1.0), 1.0)
-            # Steps shrink quadratically: the next one would be some 1e-6 px.
-            if abs(move) < 1e-3:
-                break
-        shifts[q] = shift
+                v, u = zero + peaks[q, 0], peaks[q, 1]
+                v, u = (v, (u + i - samples) % size[1]) if axis else (v + i - samples, u)
+                seen[i] = correlation[q, v, u]
+            left, middle, right = seen[samples - 1], seen[samples], seen[samples + 1]
+            # For a kernel between two samples, the neighbours' ratio is that of their distances.
+            side = right if right > left else left
+            shift = 0.0
+            if middle > 0 and side > 0:
+                shift = (1 if right >= left else -1) * side / (middle + side)
+            for _ in range(12):
+                mm, ms, ss, mv, sv = 0.0, 0.0, 0.0, 0.0, 0.0
+                start = (-samples - shift) * turn
+                s, c, sb, cb = np.sin(start), np.cos(start), np.sin(band * start), np.cos(band * start)
+                for i in range(many):
+                    value, slope = band / size[axis], 0.0
+                    if abs(s) >= 1e-9:
+                        value = sb / (size[axis] * s)
+                        slope = turn * (band * cb * s - sb * c) / (size[axis] * s * s)
+                    mm += value * value
+                    ms += value * slope
+                    ss += slope * slope
+                    mv += value * seen[i]
+                    sv += slope * seen[i]
+                    s, c = s * dc + c * ds, c * dc - s * ds
+                    sb, cb = sb * dcb + cb * dsb, cb * dcb - sb * dsb
+                gain = mv / mm
+                # The slope with its part along the kernel removed: what the gain cannot explain.
+                curvature = gain * (ss - ms * ms / mm)
+                if gain <= 0 or curvature < 1e-30:
+                    break
+                move = min(max(-(sv - gain * ms) / curvature, -0.25), 0.25)
+                shift = min(max(shift + move, -1.0), 1.0)
+                # Steps shrink quadratically: the next one would be some 1e-6 px.
+                if abs(move) < 1e-3:
+                    break
+            shifts[q, axis] = peaks[q, axis] + shift

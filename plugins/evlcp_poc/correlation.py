@@ -19,7 +19,11 @@ Images = NDArray[np.float32]
 
 
 def phase_only_correlation(
-    images: Images, first: Indices, second: Indices, most: tuple[int, int] | None = None
+    images: Images,
+    first: Indices,
+    second: Indices,
+    most: tuple[int, int] | None = None,
+    rows: Indices | None = None,
 ) -> NDArray[np.floating]:
     """Phase-only correlation of pairs of images, float32 (n, height, width) -> (pairs, height, width).
 
@@ -31,50 +35,51 @@ def phase_only_correlation(
         first: First image of each pair.
         second: Second image of each pair.
         most: Highest harmonics kept, down and across; None for all but Nyquist's, which have no phase.
+        rows: Which rows to give; None for all.
     """
     _, height, width = images.shape
     down, across = most or full_band(height, width)
-    spectra = np.fft.rfft2(images)
+    spectra = np.fft.fft(np.fft.rfft(images)[:, :, : across + 1], axis=1)
     spectra[:, down + 1 : height - down] = 0
-    spectra[:, :, across + 1 :] = 0
     size = np.abs(spectra)
     has_phase = size > _NO_PHASE * size.max((1, 2), keepdims=True)
-    unit = np.divide(spectra, size, out=np.zeros_like(spectra), where=has_phase)
-    return np.fft.irfft2(unit[first].conj() * unit[second], (height, width))
+    unit = spectra * (1 / np.where(has_phase, size, np.float32(np.inf)))
+    columns = np.fft.ifft(unit.conj()[first] * unit[second], axis=1)
+    return np.fft.irfft(columns if rows is None else columns.take(rows, 1), width)
 
 
-def pair_shifts(correlation: NDArray[np.floating], most: tuple[int, int], reach: int, samples: int) -> Floats:
-    """Peaks of phase-only correlations within `reach` of no shift, (pairs, 2): down, right, px.
+def pair_shifts(
+    images: Images, first: Indices, second: Indices, most: tuple[int, int], reach: int, samples: int
+) -> Floats:
+    """Shifts of pairs of images within `reach`, (pairs, 2): down, right, px.
 
     Args:
-        correlation: Of each pair, (pairs, height, width).
-        most: The highest harmonics that it holds, down and across.
+        images: The images.
+        first: First image of each pair.
+        second: Second image of each pair.
+        most: The highest harmonics to correlate, down and across.
         reach: How far a peak may be.
         samples: On each side of a peak, to which the Dirichlet kernel is fitted.
     """
-    pairs, *shape = correlation.shape
-    # No shift comes first: where nothing is seen, all are alike.
-    far = [min(reach, n // 2 - 1) for n in shape]
-    ways = [(np.arange(2 * n + 1) + n) % (2 * n + 1) - n for n in far]
-    near = correlation[:, ways[0][:, None], ways[1]].reshape(pairs, -1)
-    peaks = [way[at] for way, at in zip(ways, np.divmod(near.argmax(1), len(ways[1])), strict=True)]
-    around, every = np.arange(-samples, samples + 1), np.arange(pairs)[:, None]
-    column = correlation[every, (peaks[0][:, None] + around) % shape[0], peaks[1][:, None]]
-    row = correlation[every, peaks[0][:, None], (peaks[1][:, None] + around) % shape[1]]
-    shifts = np.empty((2, pairs))
-    for axis, values in enumerate((column, row)):
-        _kernels.fit_peaks(values.astype(np.float64), shape[axis], 2 * most[axis] + 1, shifts[axis])
-    return np.stack([peak + shift for peak, shift in zip(peaks, shifts, strict=True)], 1)
+    _, height, width = images.shape
+    far = min(reach, height // 2 - 1), min(reach, width // 2 - 1)
+    rows = np.arange(-far[0] - samples, far[0] + samples + 1) % height
+    correlation = phase_only_correlation(images, first, second, most, rows)
+    shifts = np.empty((len(first), 2))
+    _kernels.fit_peaks(correlation, (height, width), most, far, samples, shifts)
+    return shifts
 
 
 def cut_maps(maps: Images, middles: Indices, height: int, width: int) -> Images:
     """Windows of maps around their middles, 0 outside a map and where a middle is -1, (n, height, width)."""
     out = np.zeros((len(maps), height, width), np.float32)
-    for cut, image, (v, u) in zip(out, maps, middles.tolist(), strict=True):
-        top, left = v - height // 2, u - width // 2
+    for k, (v, u) in enumerate(middles.tolist()):
         if v >= 0:
-            part = image[max(top, 0) : top + height, max(left, 0) : left + width]
-            cut[max(-top, 0) :, max(-left, 0) :][: part.shape[0], : part.shape[1]] = part
+            top, left = v - height // 2, u - width // 2
+            row, column = max(top, 0), max(left, 0)
+            part = maps[k, row : top + height, column : left + width]
+            rows, columns = part.shape
+            out[k, row - top : row - top + rows, column - left : column - left + columns] = part
     return out
 
 

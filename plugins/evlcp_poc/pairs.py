@@ -1,5 +1,8 @@
 """Which pairs of clusters are measured, and the mean of what they say."""
 
+import math
+from bisect import bisect_left, bisect_right
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,52 +20,59 @@ def far_pairs(pairs: Pairs, counts: NDArray[np.bool_], share: float) -> NDArray[
     return both & far
 
 
-def choose_pairs(
-    middles: Indices,
-    every: Pairs,
-    used: Indices,
-    skip: int,
-    pairs: Pairs,
-    share: float,
-    neighbour_m: float,
-) -> tuple[float, Indices]:
-    """The pairs to measure: of clusters that are seen, far apart, and where the scale of all has them.
+def seen_pairs(
+    lit: NDArray[np.bool_], every: Pairs, used: Indices, skip: int, pairs: Pairs, share: float
+) -> tuple[Pairs, Pairs]:
+    """Pairs that show the scale of all clusters, and those to measure: of clusters that are seen, far apart.
 
     Args:
-        middles: Of the maps of all clusters, int64 (K, 2), -1 of those not seen.
+        lit: Which clusters are seen, bool (K,).
         every: All pairs of clusters.
         used: Clusters to use, rising.
         skip: How many of those that are seen are left out at each end.
         pairs: The pairs of clusters that may be used.
         share: Least spacing of a pair, as a share of the longest.
-        neighbour_m: Spacing of neighbours, by how much a pair may be out of place.
-
-    Returns:
-        Scale, px a metre, the median over all pairs that are seen, 0 without any; numbers of those chosen.
     """
-    lit = middles[:, 0] >= 0
-    wide = far_pairs(every, lit, 0.5)
-    if not wide.any():
-        return 0.0, np.empty(0, np.int64)
-    first, second, apart_m = every
-    scale = _quantile(np.sort(_lengths(middles, first[wide], second[wide]) / apart_m[wide]), 0.5)
     seen = used[lit[used]]
     inner = np.zeros(len(lit), np.bool_)
     inner[seen[skip : max(len(seen) - skip, 0)]] = True
+    return taken(every, far_pairs(every, lit, 0.5)), taken(pairs, far_pairs(pairs, inner, share))
+
+
+def pairs_in_place(middles: Indices, wide: Pairs, far: Pairs, neighbour_m: float) -> tuple[float, Pairs]:
+    """The scale of all clusters, px a metre, 0 where none shows it, and the pairs that lie where it has them.
+
+    Args:
+        middles: Of the maps of all clusters, int64 (K, 2).
+        wide: Pairs whose median is the scale.
+        far: Pairs to choose from.
+        neighbour_m: Spacing of neighbours, by how much a pair may be out of place.
+    """
+    if not len(wide[0]):
+        return 0.0, wide
+    scale = _quantile(np.sort(_lengths(middles, wide) / wide[2]).tolist(), 0.5)
+    off_px = np.abs(_lengths(middles, far) - scale * far[2])
+    return scale, taken(far, off_px <= scale * neighbour_m)
+
+
+def taken(pairs: Pairs, which: NDArray[np.bool_]) -> Pairs:
+    """Some of the pairs."""
     first, second, apart_m = pairs
-    off_px = np.abs(_lengths(middles, first, second) - scale * apart_m)
-    return scale, np.flatnonzero(far_pairs(pairs, inner, share) & (off_px <= scale * neighbour_m))
+    return first[which], second[which], apart_m[which]
 
 
-def _lengths(middles: Indices, first: Indices, second: Indices) -> Floats:
+def _lengths(middles: Indices, pairs: Pairs) -> Floats:
     """Distances between middles, px."""
-    down, right = (middles[second] - middles[first]).T
+    down, right = (middles[pairs[1]] - middles[pairs[0]]).T
     found: Floats = np.hypot(down, right)
     return found
 
 
-def _quantile(ordered: Floats, share: float) -> float:
-    return float(np.interp(share * (len(ordered) - 1), np.arange(len(ordered)), ordered))
+def _quantile(ordered: list[float], share: float) -> float:
+    place = share * (len(ordered) - 1)
+    below = int(place)
+    above = min(below + 1, len(ordered) - 1)
+    return (ordered[above] - ordered[below]) * (place - below) + ordered[below]
 
 
 def robust_mean(
@@ -76,21 +86,21 @@ def robust_mean(
     order = np.argsort(values)
     if len(values) > 2 * drop + 1:
         order = order[drop : len(values) - drop]
-    ordered = values[order]
+    ordered = values[order].tolist()
     low, high = _quantile(ordered, 0.25), _quantile(ordered, 0.75)
     room = iqr * (high - low)
-    inside = (ordered >= low - room) & (ordered <= high + room)
-    if not inside.any():
+    begin, end = bisect_left(ordered, low - room), bisect_right(ordered, high + room)
+    if begin >= end:
         # Narrow bounds may call all of a few values outliers of one another: keep the middle half then.
-        inside = (ordered >= 2 * low - high) & (ordered <= 2 * high - low)
-    order = order[inside]
-    mass, weighted = weights[order], weights[order] * values[order]
-    sums = []
-    for one in (mass, weighted):
-        touched = np.concatenate([first[order], second[order]])
-        sums.append(np.bincount(touched, np.concatenate([one, one])))
+        begin, end = bisect_left(ordered, 2 * low - high), bisect_right(ordered, 2 * high - low)
+    order = order[begin:end]
+    mass, touched = weights[order], np.concatenate([first[order], second[order]])
+    weighted = mass * values[order]
+    own, own_weighted = (np.bincount(touched, np.concatenate([one, one])) for one in (mass, weighted))
     total, whole = float(weighted.sum()), float(mass.sum())
-    left = (sums[0] > 0) & (whole - sums[0] > 1e-9 * whole)
-    without = (total - sums[1][left]) / (whole - sums[0][left])
+    left = (own > 0) & (whole - own > 1e-9 * whole)
+    without = (total - own_weighted[left]) / (whole - own[left])
     m = len(without)
-    return total / whole, float(np.sqrt((m - 1) * without.var())) if m > 1 else np.nan, len(order)
+    off = without - without.sum() / max(m, 1)
+    sigma = math.sqrt((m - 1) * (float((off * off).sum()) / m)) if m > 1 else math.nan
+    return total / whole, sigma, end - begin

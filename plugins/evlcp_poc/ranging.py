@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -9,14 +10,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_poc import _kernels
-from evlcp_poc.correlation import (
-    blob_band,
-    cut_maps,
-    full_band,
-    pair_shifts,
-    phase_only_correlation,
-)
-from evlcp_poc.pairs import choose_pairs, far_pairs, robust_mean
+from evlcp_poc.correlation import blob_band, cut_maps, full_band, pair_shifts
+from evlcp_poc.pairs import Pairs, far_pairs, pairs_in_place, robust_mean, seen_pairs
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
@@ -133,25 +128,28 @@ class PocRanging(Ranging):
         inner = np.isin(np.arange(bar.clusters), used[skip : len(used) - skip])
         least = min(self.min_pairs, max(int(far_pairs(pairs, inner, self.min_spacing).sum()), 1))
 
+        @lru_cache(maxsize=256)
+        def known_pairs(lit: bytes) -> tuple[Pairs, Pairs]:
+            """As `seen_pairs`: of most frames, the same clusters are seen."""
+            seen = np.frombuffer(lit, np.bool_)
+            return seen_pairs(seen, all_pairs, used, skip, pairs, self.min_spacing)
+
         def measure(view: FrameView) -> Range:
             maps, middles = plain(view.presence.pixels), np.empty((bar.clusters, 2), np.int64)
             _kernels.find_middles(maps, self.min_pixels, middles)
-            px_per_m, chosen = choose_pairs(
-                middles, all_pairs, used, skip, pairs, self.min_spacing, neighbour
-            )
-            if len(chosen) < least or px_per_m <= 0:
+            wide, far = known_pairs((middles[:, 0] >= 0).tobytes())
+            px_per_m, (first, second, apart_m) = pairs_in_place(middles, wide, far, neighbour)
+            if len(first) < least or px_per_m <= 0:
                 return _NONE
-            first, second, apart_m = pairs[0][chosen], pairs[1][chosen], pairs[2][chosen]
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             neighbour_px = px_per_m * neighbour
             height = cut_size(2 * neighbour_px + 8)
             width = min(height, cut_size(maps.shape[2]))
             cuts = cut_maps(maps, middles, height, width)
             most = full_band(height, width) if self.band == "full" else blob_band(cuts)
-            correlation = phase_only_correlation(cuts, first, second, most)
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
             reach = max(int(neighbour_px / 2), 2)
-            beyond_px = pair_shifts(correlation, most, reach, self.peak_samples)
+            beyond_px = pair_shifts(cuts, first, second, most, reach, self.peak_samples)
             down, right = (middles[second] - middles[first] + beyond_px).T
             length_px = np.hypot(down, right)
             distance_m = camera.focal_px * apart_m / np.maximum(length_px, 1e-9)
@@ -159,7 +157,7 @@ class PocRanging(Ranging):
             mean, sigma, kept = robust_mean(
                 distance_m, weights, first, second, self.drop_extremes, self.outlier_iqr
             )
-            rim = mean * (rim_px / (px_per_m * float(apart_m.mean())))
+            rim = mean * (rim_px / (px_per_m * float(apart_m.mean()))) if rim_px else 0.0
             return Range(mean, math.hypot(sigma, rim), kept)
 
         return measure
