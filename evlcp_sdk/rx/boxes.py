@@ -58,7 +58,7 @@ def cut_off(box: Box, bar: Box, others: list[Box]) -> Box:
     return (left, top, right, bottom) if left < right and top < bottom else box
 
 
-def hits_in(hits: NDArray[np.int32], box: Box) -> int:
+def hits_in(hits: NDArray[np.int16], box: Box) -> int:
     """How many there are in the cells that a box touches."""
     left, top, right, bottom = (edge >> CELL_SHIFT for edge in (box[0], box[1], box[2] - 1, box[3] - 1))
     return int(hits[top : bottom + 1, left : right + 1].sum())
@@ -107,11 +107,11 @@ def overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def find_areas(hits: NDArray[np.int32], most: int, size_px: tuple[int, int]) -> tuple[list[Box], int]:
+def find_areas(hits: NDArray[np.int16], most: int, size_px: tuple[int, int]) -> tuple[list[Box], int]:
     """Boxes around connected cells with hits, those with the most of too many; and how many are left out.
 
     Args:
-        hits: Of cells of 2^`CELL_SHIFT` px, int32 (rows, columns).
+        hits: Of cells of 2^`CELL_SHIFT` px, int16 (rows, columns).
         most: How many boxes there may be.
         size_px: Columns and rows of the sensor.
     """

@@ -459,15 +459,15 @@ class Rhythm:
         self._seen: int | None = None
         self._open_us, self._taken, self._rises = -1, 0, 0
         self._shared = shared
-        self._kept: tuple[tuple[int, int], int, NDArray[np.int32]] | None = None
+        self._kept: tuple[tuple[int, int], int, NDArray[np.int16]] | None = None
 
-    def step(self, start_us: int, events: Events, hits: NDArray[np.int32], cell_shift: int) -> int:
+    def step(self, start_us: int, events: Events, hits: NDArray[np.int16], cell_shift: int) -> int:
         """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
 
         Args:
             start_us: Start of the step, us.
             events: Those in it, in order; a part of a step comes again with the rest, and counts once.
-            hits: Of cells of 2^cell_shift px, int32 (rows, columns).
+            hits: Of cells of 2^cell_shift px, int16 (rows, columns).
             cell_shift: See there.
         """
         if self._kept is not None and self._kept[0] == (start_us, len(events)):
@@ -584,7 +584,8 @@ class RegionFollower(RegionTracker):
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
         self._rhythm = rhythm or Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
-        self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in shape], np.int32)
+        # Emptied once a step; no sensor's pixel rises a thousand times in one.
+        self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in shape], np.int16)
         self._fresh: list[Box] = []
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
         self._recent: deque[Piece] = deque()

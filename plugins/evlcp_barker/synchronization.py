@@ -165,13 +165,16 @@ class BarkerSynchronizer:
         self._pair = 2 if are_pairs(codebook.preamble) else 1
         self._due = due_chips(codebook.preamble)
         self._bin_us = packet.chip_us / _STEPS
-        self._rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
-        if not len(self._rising):
+        rising = np.flatnonzero(np.diff(self._chips) > 0) + 1
+        if not len(rising):
             raise ConfigError("synchronization 'barker': a preamble without a rise finds no time")
         self._least = spec.min_correlation or least_correlation(codebook, packet.frames, packet.pilot_every)
         # A correlation peak stands alone within this distance.
         self._guard = _STEPS * guard_chips(codebook.preamble, self._least)
         self._span = _STEPS * len(self._chips)
+        # In a preamble from lag 0 on: of each chip, where it may begin; of each rise, the steps around it.
+        self._begins = np.arange(2 * _STEPS + 1) + _STEPS * np.arange(len(self._chips))[:, None]
+        self._near_rises = _STEPS * rising[:, None] + np.arange(-_STEPS, _STEPS)
 
     def init(self) -> SyncState:
         """State before the first event."""
@@ -219,20 +222,42 @@ class BarkerSynchronizer:
 
     def _refine(self, lag: int, counts: Floats, first_bin: int, quality: float) -> _Preamble:
         """Times of one preamble, for positive and negative events apart, us."""
-        found = time_preamble(counts, lag, self._chips, _STEPS, self._pair, self._rising)
-        (on, on_noise), (off, off_noise), (onset, onset_noise) = found
+        (off, off_noise), (on, on_noise) = self._fit(counts, lag)
+        response = counts[1].take(lag + self._near_rises, mode="clip")
+        onset, onset_noise = _jackknife(_onsets(_without_each(response)))
         if math.isnan(on):
             on, on_noise = off, off_noise
         bin_us, least = self._bin_us, _TIMING_SIGMA_US**2
         return _Preamble(
             on_us=(first_bin + on) * bin_us,
             off_us=(first_bin + off) * bin_us,
-            onset_us=(first_bin + onset) * bin_us,
+            onset_us=(first_bin + (lag - _STEPS + onset)) * bin_us,
             quality=quality,
             on_noise=least + on_noise * bin_us**2,
             off_noise=least + off_noise * bin_us**2,
             onset_noise=least + onset_noise * bin_us**2,
         )
+
+    def _fit(self, counts: Floats, lag: int) -> list[tuple[float, float]]:
+        """Where near a lag negative events fit a preamble best, and positive ones; NaN where none do.
+
+        In steps, each with its variance by what is found without each pair of chips, as pair codes are made
+        of, or without each chip.
+        """
+        first, last = max(lag - _STEPS, 0), min(lag + _STEPS + 1, counts.shape[1] - self._span + 1)
+        running = np.zeros((2, last - first + self._span))
+        np.cumsum(counts[:, first : first + running.shape[1] - 1], axis=1, out=running[:, 1:])
+        chips = running[:, _STEPS:] - running[:, :-_STEPS]
+        fits = []
+        for windows, signs in zip(
+            chips[:, self._begins[:, : last - first]], (-self._chips, self._chips), strict=True
+        ):
+            parts = signs[:, None] * windows
+            if self._pair > 1:
+                parts = parts.reshape(-1, self._pair, last - first).sum(1)
+            found, noise = _jackknife(_middles(_without_each(parts)))
+            fits.append((first + found, noise))
+        return fits
 
     def _accept(
         self, clock: _Clock | None, stray: _Preamble | None, found: _Preamble
@@ -348,35 +373,6 @@ def find_peaks(rho: Floats, first: int, guard: int, squares: Floats, least: floa
         if lag == low + int(rho[low : lag + guard + 1].argmax()):
             found.append(lag)
     return found
-
-
-def time_preamble(
-    counts: Floats, lag: int, chips: Floats, steps: int, pair: int, rising: NDArray[np.int64]
-) -> tuple[tuple[float, float], tuple[float, float], tuple[float, float]]:
-    """Times of a preamble found at a lag in counts of OFF and ON, float64 (2, bins), `steps` a chip.
-
-    `pair` chips, a pair of pair codes, are left out together to see how sure the first two are; the third is
-    by the chips that are `rising`.
-
-    Returns:
-        Where positive events fit best, and negative ones, NaN where none do; and where positive ones first
-        reach half of their most, over what comes all the time; in steps. Each with its jackknife's variance.
-    """
-    first, last = max(lag - steps, 0), min(lag + steps + 1, counts.shape[1] - steps * len(chips) + 1)
-    running = np.zeros((2, last - first + steps * len(chips)))
-    np.cumsum(counts[:, first : first + running.shape[1] - 1], axis=1, out=running[:, 1:])
-    bounds = np.arange(last - first) + steps * np.arange(len(chips) + 1)[:, None]
-    windows = running[:, bounds]
-    # Of negative and positive events: what may be left out, by lags.
-    values = np.array([[[-1.0]], [[1.0]]]) * chips[:, None] * (windows[:, 1:] - windows[:, :-1])
-    if pair > 1:
-        values = values.reshape(2, -1, pair, last - first).sum(2)
-    off, off_noise = _jackknife(_middles(_without_each(values[0])))
-    on, on_noise = _jackknife(_middles(_without_each(values[1])))
-    at = lag + steps * rising[:, None] + np.arange(-steps, steps)
-    response = counts[1, np.clip(at, 0, counts.shape[1] - 1)]
-    onset, onset_noise = _jackknife(_onsets(_without_each(response)))
-    return (first + on, on_noise), (first + off, off_noise), (lag - steps + onset, onset_noise)
 
 
 def _without_each(parts: Floats) -> Floats:

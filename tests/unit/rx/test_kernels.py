@@ -52,7 +52,7 @@ def rhythm_of(pixels, chip_us=CHIP_US, min_score=8):
 
 
 def scored(events, pixels, min_score=8, cell_shift=2):
-    hits = np.zeros((HEIGHT >> cell_shift, WIDTH >> cell_shift), np.int32)
+    hits = np.zeros((HEIGHT >> cell_shift, WIDTH >> cell_shift), np.int16)
     assert rhythm_of(pixels, min_score=min_score).step(0, events, hits, cell_shift) == hits.sum()
     return hits
 
@@ -88,7 +88,7 @@ def test_times_count_alike_at_every_chip_rate(chip_us):
         pixels[:] = states(start_us >> rhythm._shift, 9, 10)
         rhythm._seen = start_us >> rhythm._shift
         rise = Events.of([start_us + round(chips * chip_us)], [3], [2], [1])
-        rhythm.step(start_us, rise, np.zeros((4, 6), np.int32), 2)
+        rhythm.step(start_us, rise, np.zeros((4, 6), np.int16), 2)
         assert pixels[2, 3] & _kernels.SCORES == 10 + score, chips
 
 
@@ -97,7 +97,7 @@ def test_no_rise_grows_young(gap_us):
     """The clock goes round in 2^17 us, while a pixel's age never goes below a quarter of that again."""
     rng = np.random.default_rng(0)
     rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 8)
-    hits, events = np.zeros((4, 6), np.int32), random_events(rng, 500)
+    hits, events = np.zeros((4, 6), np.int16), random_events(rng, 500)
     rhythm.step(1000, events, hits, 2)
     low = rhythm._pixels & LOW
     rose = np.full((HEIGHT, WIDTH), -(2**40))
@@ -239,7 +239,7 @@ def test_connected_cells_of_each_cluster(seed, clusters, grid):
 @pytest.mark.parametrize("seed", SEEDS)
 def test_rectangles_around_connected_cells(seed, share, shape):
     rng = np.random.default_rng(seed)
-    hits = (rng.integers(1, 9, shape) * (rng.random(shape) < share)).astype(np.int32)
+    hits = (rng.integers(1, 9, shape) * (rng.random(shape) < share)).astype(np.int16)
     most = (shape[0] + 1) // 2 * ((shape[1] + 1) // 2)
     boxes, total = np.empty((most, 4), np.int64), np.empty(most, np.int64)
     n = _kernels.areas(hits > 0, hits, boxes, total)
@@ -477,7 +477,7 @@ def test_cells_in_and_out_of_place(seed, clusters):
 
 @pytest.mark.parametrize("box", [(0, 0, 24, 16), (3, 5, 9, 6), (4, 4, 8, 8), (20, 8, 40, 30)])
 def test_cells_that_boxes_touch_are_cleared(box):
-    hits = np.random.default_rng(0).integers(1, 9, (4, 6)).astype(np.int32)
+    hits = np.random.default_rng(0).integers(1, 9, (4, 6)).astype(np.int16)
     left, top, right, bottom = box
     v, u = np.mgrid[:4, :6]
     inside = (4 * v < bottom) & (4 * v + 4 > top) & (4 * u < right) & (4 * u + 4 > left)
@@ -522,7 +522,7 @@ def test_a_lamp_of_whole_chips_is_no_candidate(period_us):
     order = np.argsort(t, kind="stable")
     x = np.repeat([3, 9], [len(lamp), len(code)])
     events = Events.of(t[order], x[order], np.full(len(t), 5), np.ones(len(t)))
-    rhythm.step(0, events, np.zeros((4, 6), np.int32), 2)
+    rhythm.step(0, events, np.zeros((4, 6), np.int16), 2)
     assert set(rhythm.of(events).x.tolist()) == {9}
 
 

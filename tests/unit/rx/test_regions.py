@@ -253,7 +253,7 @@ def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz: int, jitter_us:
     )
     rhythm = Rhythm(1280, 720, LINK.packet.chip_us, SPEC.min_score)
     for start, part in steps(events, 40_000):
-        rhythm.step(start, part, np.zeros((180, 320), np.int32), 2)
+        rhythm.step(start, part, np.zeros((180, 320), np.int16), 2)
         if start >= 20_000:
             assert len(rhythm.of(part)) < 0.15 * len(part)
 
@@ -270,7 +270,7 @@ def test_a_code_is_hardly_taken_for_a_lamp(jitter_us: int) -> None:
     rhythm = Rhythm(1280, 720, packet.chip_us, SPEC.min_score)
     kept = np.zeros(codebook.clusters, int)
     for start, part in steps(rises, int(t.max())):
-        rhythm.step(start, part, np.zeros((180, 320), np.int32), 2)
+        rhythm.step(start, part, np.zeros((180, 320), np.int16), 2)
         kept += np.bincount(rhythm.of(part).x, minlength=len(kept))
     lost = 1 - kept / np.bincount(cluster)
     assert lost.mean() < 0.02
