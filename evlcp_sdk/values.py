@@ -117,10 +117,14 @@ class Events:
 
     def __getitem__(self, rows: Any) -> "Events":
         """The events of a slice or a mask (a view for a slice)."""
-        if isinstance(rows, slice):
-            # Columns of one type and length stay so.
-            return Events.as_is(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
-        return Events(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
+        if not isinstance(rows, slice):
+            rows = np.asarray(rows)
+            if rows.dtype != np.bool_ or rows.shape != self.t_us.shape:
+                return Events(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
+            # By their numbers, events are taken several times as fast as by a mask.
+            (rows,) = rows.nonzero()
+        # Columns of one type and length stay so.
+        return Events.as_is(self.t_us[rows], self.x[rows], self.y[rows], self.p[rows])
 
 
 @dataclass(frozen=True, eq=False)

@@ -372,7 +372,9 @@ def add_polarity(
                 c = np.uint32(which[i])
                 u, v = np.uint32(np.int32(column[i]) - left), np.uint32(np.int32(line[i]) - top)
                 inside = (c < many) & (u < columns) & (v < rows)
-                where[i] = (c * rows + v) * columns + u if inside else _NOWHERE
+                # Products have 64 bits, of which half as many are calculated at a time.
+                line_at = np.uint32(np.uint32(c * rows) + v)
+                where[i] = np.uint32(np.uint32(line_at * columns) + u) if inside else _NOWHERE
             for i in range(n):
                 if where[i] != _NOWHERE:
                     flat[where[i]] += np.int16(2 * np.int16(sign[i]) - 1)

@@ -336,9 +336,8 @@ def polarity_sums(
     width, height = size_px
     chips = centre_px.shape[1]
     # The image's pixel (0, 0) on the sensor.
-    corner_px = centre_px - np.array([[width - 1], [height - 1]]) / 2
-    whole_px = np.rint(corner_px)
-    shift, rest_px = whole_px.astype(np.int64), corner_px - whole_px
+    corner_px = centre_px - [[(width - 1) / 2], [(height - 1) / 2]]
+    shift = np.rint(corner_px)
     # Rows wait for the bar's own, wherever they are.
     row_px = sum(centre_px[1].tolist()) / chips
     sums = np.zeros((chips, height, width), np.int16)
@@ -348,4 +347,4 @@ def polarity_sums(
     for e in events:
         columns = e.t_us, e.x, e.y, e.p
         _kernels.add_polarity(columns, (on_us, off_us), chip_us, (row_us, row_px), shift, sums)
-    return sums, rest_px
+    return sums, corner_px - shift

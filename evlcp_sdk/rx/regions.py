@@ -513,7 +513,7 @@ class Rhythm:
         at += events.x
         state = self._pixels.take(at)
         rhythmic: NDArray[np.bool_] = (state & _kernels.SCORES) >= self._min_score
-        rhythmic &= (state >> _kernels.SAME_AT) & _kernels.MOST_SAME < most_same
+        rhythmic &= state & (_kernels.MOST_SAME << _kernels.SAME_AT) < most_same << _kernels.SAME_AT
         return rhythmic
 
     def measure(

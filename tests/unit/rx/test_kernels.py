@@ -203,7 +203,7 @@ def test_polarity_sums(seed, freeze):
     chip_us = rng.integers(8 * 60, 8 * 140) / 8
     row_us, row_px = rng.integers(-3 * 8, 3 * 8) / 8, float(rng.integers(0, 12))
     shape = (24, 9, 7)
-    moving = rng.integers(-3, 12, (2, shape[0]))
+    moving = rng.integers(-3, 12, (2, shape[0])).astype(float)
     still = np.repeat(moving[:, :1], shape[0], axis=1)
     jolted = np.where(np.arange(shape[0]) < 12, still, moving[:, -1:])
     sums = np.zeros(shape, np.int16)
@@ -212,7 +212,9 @@ def test_polarity_sums(seed, freeze):
         sums[:] = 0
         columns = e.t_us, e.x, e.y, e.p
         _kernels.add_polarity(columns, (start_on, start_off), chip_us, (row, row_px), shifts, sums)
-        want = twins.polarity_sums(events, start_on, start_off, chip_us, *shifts, shape, row, row_px)
+        want = twins.polarity_sums(
+            events, start_on, start_off, chip_us, *shifts.astype(int), shape, row, row_px
+        )
         assert_array_equal(sums, want)
         assert sums.any()
 
