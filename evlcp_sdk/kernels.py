@@ -137,13 +137,13 @@ def njit(**options: Any) -> Callable[[F], F]: ...
 def njit(function: Any = None, /, **options: Any) -> Any:
     """As `numba.njit`, without the GIL, and cached; where no folder can be written, compiled in each process.
 
-    To divide by 0 gives what NumPy gives, which is quicker to compile than an error.
+    To divide by 0 gives what NumPy gives, which is quicker to compile than an error. None is called by C.
 
     Args:
         function: What is compiled at its first call.
         options: Others of `numba.njit`.
     """
-    chosen: dict[str, Any] = {"nogil": True, "error_model": "numpy"} | options
+    chosen: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True} | options
     return (lambda given: _Kernel(given, chosen)) if function is None else _Kernel(function, chosen)
 
 
