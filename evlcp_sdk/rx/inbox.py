@@ -195,9 +195,9 @@ class MessageAssembler:
         llr = np.zeros((packet.sent, self._coder.bits // packet.sent), np.float32)
         for frame in packet.frames:
             llr[frame.frame] = frame.soft.llr.ravel()
-        known = np.nan_to_num(llr.ravel(), nan=0.0)
-        size = np.minimum(np.abs(known) ** _LLR_POWER, _MOST_LLR)
-        return np.copysign(size, known).astype(np.float32)
+        llr[np.isnan(llr)] = 0
+        size = np.minimum(np.abs(llr) ** _LLR_POWER, _MOST_LLR)
+        return np.copysign(size, llr).ravel()
 
     def _content(self, inbox: _Inbox, llr: NDArray[np.float32]) -> tuple[bytes | None, int]:
         """The bytes of a packet's block and the packets it took; None if that is not known yet."""

@@ -131,12 +131,13 @@ class RangeKeeper:
             new = _weighed(measured.bend, (sight.sine or 0.0) + sight.bow)
             wave = wave * faded
             _kernels.wave_of(measured.bend.place, new, _LEAST_WEIGHT, wave)
-            height = _height(wave)
+            sums = wave.tolist()
+            height = _height(sums)
             goes_on = bend.shape == new.shape and told == (sight.sine is not None)
             bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.sine is not None
             distance_m -= _WAVE_SHARE * height[0] * measured.bend.wave_m
             # The ranging's sigma is of boundaries with the wave.
-            sigma_m *= math.sqrt(_left_over(wave, height[0]))
+            sigma_m *= math.sqrt(_left_over(sums, height[0]))
             unsure_m = math.hypot(_WAVE_SHARE * math.sqrt(height[1]), _WAVE_REST_PX) * measured.bend.wave_m
         sigma_m = max(sigma_m, _LEAST_SIGMA * abs(distance_m))
         n = len(state.past)
@@ -192,7 +193,7 @@ def _weighed(bend: Bend, sine: float) -> Floats:
     return sums
 
 
-def _height(wave: Floats) -> tuple[float, float]:
+def _height(wave: list[float]) -> tuple[float, float]:
     """How high the pixels' wave is, px, and the variance of that, by what frames show and what is likely."""
     squares, products, left, freedom = wave
     if not (squares > 0 and freedom > 1):
@@ -202,9 +203,9 @@ def _height(wave: Floats) -> tuple[float, float]:
     return products / noise * variance, variance
 
 
-def _left_over(wave: Floats, height_px: float) -> float:
+def _left_over(wave: list[float], height_px: float) -> float:
     """Share of the boundaries' scatter that is left when a wave of that height is taken out."""
     squares, products, left, _ = wave
     if not left > 0:
         return 1.0
-    return float(min(max(1 - height_px * (2 * products - height_px * squares) / left, 0.0), 1.0))
+    return min(max(1 - height_px * (2 * products - height_px * squares) / left, 0.0), 1.0)

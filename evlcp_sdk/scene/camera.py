@@ -1,6 +1,7 @@
 """The camera: a pinhole with distortion, its sensor and its lens."""
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Annotated
 
 import numpy as np
@@ -55,12 +56,12 @@ class CameraModel:
     p2: Annotated[float, Field(ge=-1, le=1, description="Distortion of a lens tilted to a side.")] = 0.0
     k3: Annotated[float, Field(ge=-1000, le=1000, description="Radial distortion by the sixth power.")] = 0.0
 
-    @property
+    @cached_property
     def focal_px(self) -> float:
         """Focal length in pixels."""
         return self.focal_mm * 1e3 / self.pitch_um
 
-    @property
+    @cached_property
     def centre_px(self) -> tuple[float, float]:
         """Column and row where the optical axis meets the image."""
         x, y = self.centre_x_px, self.centre_y_px
@@ -161,7 +162,7 @@ class CameraModel:
         away = np.abs(self.distort(found) - points_px).max(-1, keepdims=True)
         return np.where(away < 1e-6, found, np.nan)
 
-    @property
+    @cached_property
     def is_pinhole(self) -> bool:
         """Whether there is no distortion."""
         return self.k1 == self.k2 == self.p1 == self.p2 == self.k3 == 0

@@ -1,7 +1,7 @@
 """CRC-aided polar code."""
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import ceil, floor, inf, log
 from typing import Annotated
 
@@ -213,6 +213,12 @@ def list_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
     return np.array(nodes, np.int64)
 
 
+@lru_cache(maxsize=16)
+def _known_nodes(information: bytes) -> NDArray[np.int64]:
+    """As `list_nodes`: they take a millisecond, and a link is compiled again and again."""
+    return list_nodes(np.frombuffer(information, np.bool_))
+
+
 @dataclass(frozen=True, eq=False)
 class _PolarCode:
     """A block of codewords; `log_share` is the share of random words that may be taken for one codeword."""
@@ -230,7 +236,7 @@ class _PolarCode:
     @cached_property
     def nodes(self) -> NDArray[np.int64]:
         """The order of decoding; found with the first block."""
-        return list_nodes(self.information)
+        return _known_nodes(self.information.tobytes())
 
     def encode(self, bits: NDArray[np.uint8]) -> NDArray[np.uint8]:
         if bits.shape != (self.message_bits,):
@@ -278,9 +284,10 @@ class _PolarCode:
             most = np.inf if size == 1 else limit
             found = _kernels.list_decode(mother, self.nodes, size, most, codewords, metric)
             for path in np.argsort(metric[:found], kind="stable"):
-                inputs = transform(codewords[path])[self.information]
-                if metric[path] <= limit and not crc24(inputs).any():
-                    return codewords[path], inputs, True
+                if metric[path] <= limit:
+                    inputs = transform(codewords[path])[self.information]
+                    if not crc24(inputs).any():
+                        return codewords[path], inputs, True
                 if metric[path] < least:
                     guess, least = codewords[path], metric[path]
             # Whatever a longer list found would most likely be as far off as all that this one has found.
