@@ -156,9 +156,9 @@ class FrameAligner:
         middles: NDArray[np.float64] = due.start_us + self._halves[: due.chips + self._after] * lock.chip_us
         centre_px = region.positions.at(middles)
         middle = min(due.chips, packet.pilot_chips) // 2
-        chip_us = float(middles[middle])
+        seen_us = float(middles[middle])
         if due.has_pilot:
-            size = self._size(*region.positions.size_at(chip_us))
+            size = self._size(*region.positions.size_at(seen_us))
         elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
             return None
         else:
@@ -196,7 +196,7 @@ class FrameAligner:
             centre_x - (size[0] - 1) / 2 - sum(rests_x) / many,
             centre_y - (size[1] - 1) / 2 - sum(rests_y) / many,
         )
-        middle_us = chip_us - lock.chip_us / 2
+        middle_us = seen_us - lock.chip_us / 2
         return AlignedFrame(pilot, sums, offset_px[:, :chips], corner_px, middle_us)
 
     def centre(self, aligned: AlignedFrame, points_px: NDArray[np.float64]) -> tuple[float, float]:

@@ -181,13 +181,13 @@ class Places:
         many = held.shape[1]
         other._columns = columns = np.empty((5, max(2 * many, _ROOM)))
         other._first, other._end = 0, many
-        columns[0, :many] = held[0]
-        share = np.ones(many)
+        columns[:, :many] = held
+        share: NDArray[np.float64] | float = 1.0
         if grown_us is not None and grown_us[1] > grown_us[0]:
-            share = np.clip((held[0] - grown_us[0]) / (grown_us[1] - grown_us[0]), 0.0, 1.0)
-        columns[1, :many] = held[1] + share * right_px
-        columns[2, :many] = held[2] + share * down_px
-        columns[3:, :many] = held[3:]
+            share = (held[0] - grown_us[0]) / (grown_us[1] - grown_us[0])
+            share = np.minimum(np.maximum(share, 0.0), 1.0)
+        columns[1, :many] += share * right_px
+        columns[2, :many] += share * down_px
         if size_px is not None and most_px < np.inf:
             slack_px = np.maximum(np.abs(held[4] - size_px[1]) - most_px, 0.0) / 2
             off_px = row_px - columns[2, :many]
@@ -324,7 +324,7 @@ class Followed:
         """Drop the events of the oldest step; how many they were."""
         _, events = self.pieces.popleft()
         self.held_bytes -= held_bytes(events)
-        return len(events)
+        return events.t_us.size
 
     def events_between(self, from_us: float, until_us: float) -> int:
         """How many of its events there are from one time to before another."""
@@ -579,7 +579,7 @@ class RegionFollower(RegionTracker):
         self._limits = limits
         self._keep_us = keep_us
         self._position = position
-        self._camera = camera
+        self._sensor_px = camera.width, camera.height
         self._measure_us = round(_MEASURE_GAPS * gap_chips * chip_us)
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
@@ -627,18 +627,22 @@ class RegionFollower(RegionTracker):
 
     def _boxes(self, t_us: float, taken: Sequence[Region]) -> list[Box]:
         """Where each region should be in the middle of a step; one of unknown size beside the others."""
-        places, all_known = [], True
+        boxes, unknown = [], []
         for followed in self.alive:
             last = followed.positions.latest
-            places.append((*self._expected(followed, t_us), last.width_px, last.height_px))
-            all_known &= followed.size_px is not None
-        boxes = [self._reach(*place) for place in places]
-        if not all_known:
+            x_px, y_px = self._expected(followed, t_us)
+            boxes.append(self._reach(x_px, y_px, last.width_px, last.height_px))
+            if followed.size_px is None:
+                unknown.append(len(boxes) - 1)
+        if unknown:
             others = [box_of(place) for place in taken]
-            others += [box_around(*at) for at, one in zip(places, self.alive, strict=True) if one.size_px]
-            for number, followed in enumerate(self.alive):
-                if followed.size_px is None:
-                    boxes[number] = clear_of(boxes[number], others)
+            for followed in self.alive:
+                if followed.size_px is not None:
+                    last = followed.positions.latest
+                    x_px, y_px = self._expected(followed, t_us)
+                    others.append(box_around(x_px, y_px, last.width_px, last.height_px))
+            for number in unknown:
+                boxes[number] = clear_of(boxes[number], others)
         return boxes
 
     def _own(self, boxes: list[Box]) -> list[Box]:
@@ -907,7 +911,7 @@ class RegionFollower(RegionTracker):
         """The box in which a region's events lie within the next step; an empty one off the sensor."""
         m = MARGIN_PX
         half_w, half_h = width_px / 2 + m, height_px / 2 + m
-        width, height = self._camera.width, self._camera.height
+        width, height = self._sensor_px
         left, top = int(x_px - half_w), int(y_px - half_h)
         right, bottom = int(x_px + half_w) + 1, int(y_px + half_h) + 1
         if left < 0 or top < 0 or right > width or bottom > height:
@@ -954,7 +958,7 @@ class RegionFollower(RegionTracker):
             rises -= _kernels.clear_cells(hits, np.array(known, np.int64), CELL_SHIFT)
         fresh, self._fresh = self._fresh, []
         if rises >= _LEAST_RISES:
-            areas, left_out = find_areas(hits, self._limits.areas, (self._camera.width, self._camera.height))
+            areas, left_out = find_areas(hits, self._limits.areas, self._sensor_px)
             self.counts["areas_left_out"] += left_out
             lit = [box_around(*at) for area in areas if (at := self._measure(None, area, end_us)) is not None]
             boxes = [box for box in joined(lit, merge_px) if hits_in(hits, box) >= _LEAST_RISES]

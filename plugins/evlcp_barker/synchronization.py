@@ -172,6 +172,8 @@ class BarkerSynchronizer:
         # A correlation peak stands alone within this distance.
         self._guard = _STEPS * guard_chips(codebook.preamble, self._least)
         self._span = _STEPS * len(self._chips)
+        # Half of a packet's correlations are positive.
+        self._most_known = _STEPS * packet.packet_chips // 2
         # In a preamble from lag 0 on: of each chip, where it may begin; of each rise, the steps around it.
         self._begins = np.arange(2 * _STEPS + 1) + _STEPS * np.arange(len(self._chips))[:, None]
         self._near_rises = _STEPS * rising[:, None] + np.arange(-_STEPS, _STEPS)
@@ -207,8 +209,7 @@ class BarkerSynchronizer:
         if lags - guard > lo:
             rho, squares = np.empty(lags), np.empty(lags - guard - lo)
             top = _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)
-            # Half of a packet's correlations are positive.
-            past = power, known, _STEPS * self._packet.packet_chips // 2
+            past = power, known, self._most_known
             power, known = _kernels.mean_squares(rho, counts, span, lo, past, squares)
             if 2 * top >= self._least:
                 for lag in find_peaks(rho, lo, guard, squares, self._least):
