@@ -39,45 +39,45 @@ def _fit(code: Array, values: Array, begin: int, out: Array) -> None:
 
 
 @njit
-def cell_values(sums: Array, grid: int, columns: int, out: Array) -> None:
-    """Values of the cells' polarity sums (chips, height, width), `out` int8 (values, rows * columns)."""
-    chips, height, width = sums.shape
-    size = height * width
-    flat = sums.reshape(chips, size)
-    # Sums of the square of pixels that begins at each; where it leaves the image, there is no cell.
-    most = max(size - (grid - 1) * (width + 1), 0)
-    squares, values = np.empty((2, size), np.int16), np.empty(size, np.int8)
-    for i in range(len(out)):
-        for chip in range(2):
-            square = squares[chip]
-            for j in range(size):
-                square[j] = 0
-            for down in range(grid):
-                for right in range(grid):
-                    part = flat[2 * i + chip, down * width + right :]
-                    for j in range(most):
-                        square[j] = np.int16(square[j] + part[j])
-        _values(squares[0], squares[1], values)
-        for r in range(out.shape[1] // max(columns, 1)):
-            for c in range(columns):
-                out[i, r * columns + c] = values[(r * width + c) * grid]
+def presence(
+    sums: Array, codes: Array, grid: int, beside: Array, none: Array, min_seen: int, out: Array
+) -> None:
+    """Posterior probability of each cluster in each cell, `out` (K, rows, columns), of its values.
 
-
-@njit
-def presence(values: Array, codes: Array, beside: Array, none: Array, min_seen: int, out: Array) -> None:
-    """Posterior probability of each cluster in each cell, `out` (K, cells), of its values (n, cells).
-
-    A cluster whose fit is d below the best is `beside[d]` times as likely as that, and `no cluster`
-    `none[seen, best + n]` times. Cells in which fewer than `min_seen` values are seen are left as they are.
+    These are of the cells' polarity sums, of `sums` (chips, height, width). A cluster whose fit is d below
+    the best is `beside[d]` times as likely as that, and `no cluster` `none[seen, best + n]` times. Cells in
+    which fewer than `min_seen` of n values are seen are left as they are.
     """
     clusters, length = codes.shape
-    n = values.shape[1]
-    # The cells in which enough is seen, side by side.
-    which, seen = np.empty(n + 1, np.int64), np.zeros(n, np.int64)
+    _, height, width = sums.shape
+    _, rows, columns = out.shape
+    size, n = height * width, rows * columns
+    flat, into = sums.reshape(-1, size), out.reshape(clusters, n)
+    # Sums of the square of pixels that begins at each; where it leaves the image, there is no cell.
+    square = np.zeros((2, 2, size), np.int16)
+    by_pixel, values = np.empty(size, np.int8), np.empty((length, n), np.int8)
+    seen = np.zeros(n, np.int16)
     for i in range(length):
-        for j in range(n):
-            seen[j] += abs(values[i, j])
-    m = 0
+        for chip in range(2):
+            part, most = flat[2 * i + chip], size
+            for axis in range(2):
+                total, step = square[axis, chip], 1 if axis else width
+                most -= (grid - 1) * step
+                for j in range(most):
+                    total[j] = part[j]
+                for away in range(step, grid * step, step):
+                    other = part[away:]
+                    for j in range(most):
+                        total[j] = np.int16(total[j] + other[j])
+                part = total
+        _values(square[1, 0], square[1, 1], by_pixel)
+        for r in range(rows):
+            for c in range(columns):
+                j = r * columns + c
+                values[i, j] = by_pixel[(r * width + c) * grid]
+                seen[j] = np.int16(seen[j] + abs(values[i, j]))
+    # The cells in which enough is seen, side by side.
+    which, m = np.empty(n + 1, np.int64), 0
     for j in range(n):
         which[m] = j
         m += int(seen[j] >= min_seen)
@@ -86,9 +86,7 @@ def presence(values: Array, codes: Array, beside: Array, none: Array, min_seen: 
         for j in range(m):
             some[i, j] = values[i, which[j]]
     # A literal 0 would compile the fit once more.
-    best, begin = np.empty(m, np.int16), n - n
-    for j in range(m):
-        best[j] = -length
+    best, begin = np.full(m, -length, np.int16), n - n
     for k in range(clusters):
         _fit(codes[k], some, begin, fits[k])
         for j in range(m):
@@ -101,7 +99,7 @@ def presence(values: Array, codes: Array, beside: Array, none: Array, min_seen: 
             norm[j] += beside[np.uint32(best[j] - fits[k, j])]
     for k in range(clusters):
         for j in range(m):
-            out[k, which[j]] = beside[np.uint32(best[j] - fits[k, j])] / norm[j]
+            into[k, which[j]] = beside[np.uint32(best[j] - fits[k, j])] / norm[j]
 
 
 @njit
@@ -340,35 +338,31 @@ def sum_worth(
 
 
 @njit
-def worth_images(sums: Array, worth: Array, seam: int, out: Array) -> None:
-    """What each pixel's pair of sums says of each value, `out` (height + 2 seam, width + 2 seam, values).
-
-    `worth` (n, n) is by pair, from -(n // 2) on and none beyond. The seam is 0, and so is a pixel without
-    events: what it is worth adds the same wherever the bar is.
-    """
-    _, height, width = sums.shape
-    most = len(worth) // 2
-    for v in range(height):
-        for u in range(width):
-            for i in range(out.shape[2]):
-                first, second = sums[2 * i, v, u], sums[2 * i + 1, v, u]
-                if first != 0 or second != 0:
-                    first, second = min(max(first, -most), most) + most, min(max(second, -most), most) + most
-                    out[v + seam, u + seam, i] = worth[first, second] - worth[most, most]
-
-
-@njit
-def cluster_matches(maps: Array, prior: Array, grid: int, images: Array, out: Array) -> None:
+def match_shifts(
+    pairs: Array, worth: Array, share: float, maps: Array, prior: Array, grid: int, out: Array
+) -> None:
     """Add what the pixels of each cluster say of each value if the bar is off its place, (K, n, n, values).
 
-    Shifts (down, right) go from -(n // 2) to n // 2 px, the seam of the images. Pixels count where a cluster
-    may be, by the prior of their cell: those of its neighbours tell nothing.
+    Shifts (down, right) go from -(n // 2) to n // 2 px. `pairs` and `worth` are those of `learn_worth`; of
+    what is said, beyond what a pixel without events says, so large a share counts. Pixels count where a
+    cluster may be, by the prior of their cell: those of its neighbours tell nothing.
     """
     clusters, rows, columns = prior.shape
+    _, height, width = maps.shape
     _, side, _, values = out.shape
+    seam = side // 2
+    beside, part = worth.astype(np.float32), np.float32(share)
+    silent = beside[worth.size // 2]
+    for pair in range(worth.size):
+        beside[pair] = (beside[pair] - silent) * part
     # Values lie side by side, and so do those of neighbouring pixels.
     run = side * values
-    lines = images.reshape(images.shape[0], images.shape[1] * values)
+    lines = np.zeros((height + 2 * seam, (width + 2 * seam) * values), np.float32)
+    for v in range(height):
+        line = lines[seam + v, seam * values :]
+        for u in range(width):
+            for i in range(values):
+                line[u * values + i] = beside[pairs[i, v * width + u]]
     sums = out.reshape(clusters, side, run)
     for k in range(clusters):
         for r in range(rows):
@@ -387,51 +381,51 @@ def cluster_matches(maps: Array, prior: Array, grid: int, images: Array, out: Ar
 
 
 @njit
-def smooth_path(matches: Array, known: Array, step_cost: float, place_cost: float, path: Array) -> None:
-    """Shifts (down, right) of all values that fit best together (Viterbi), `path` (values, 2), px.
+def find_path(matches: Array, known: Array, step_cost: float, place_cost: float, path: Array) -> None:
+    """Shifts (down, right) of all values that match best together (Viterbi), `path` (values, 2), px.
 
-    `matches` are those of `cluster_matches`, `known` the codes of the first values, (K, m); of the others,
-    each cluster's is what fits better. A shift costs its square times `place_cost`, a change from value to
-    value its square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then
-    along the other.
+    `matches` are (K, n, n, values), `known` the codes of the first values, (K, ...); of the others, each
+    cluster's is what fits better. A shift costs its square times `place_cost`, a change from value to value
+    its square times `step_cost`. Squares add, so the best predecessor is sought along one axis, then along
+    the other.
     """
     clusters, side, _, values = matches.shape
-    first, reach = known.shape[1], side // 2
-    best, half, score = np.zeros((side, side)), np.empty((side, side)), np.empty((side, side, values))
-    down, right = np.empty((values, side, side), np.int8), np.empty((values, side, side), np.int8)
+    first, half = known.shape[1], side // 2
+    scores, steps = np.zeros((side, side, values)), np.empty((side, side))
+    best, turned, top = np.empty((side, side)), np.empty((side, side)), np.empty(side)
     for a in range(side):
         for b in range(side):
-            score[a, b] = 0.0
+            steps[a, b] = step_cost * ((a - b) * (a - b))
             for k in range(clusters):
-                for i in range(values):
-                    match = np.float64(matches[k, a, b, i])
-                    score[a, b, i] += known[k, i] * match if i < first else abs(match)
-    for i in range(values):
-        if i > 0:
-            # To row a from row c, then to column b from column d.
+                for i in range(first):
+                    scores[a, b, i] += known[k, i] * matches[k, a, b, i]
+                for i in range(first, values):
+                    scores[a, b, i] += abs(matches[k, a, b, i])
+            for i in range(values):
+                scores[a, b, i] -= place_cost * ((a - half) * (a - half) + (b - half) * (b - half))
+            best[a, b] = scores[a, b, 0]
+    # From which row the best way comes to a row, in each column; then from which column to a column.
+    ways = np.zeros((values, 2, side, side), np.int64)
+    for i in range(1, values):
+        for axis in range(2):
             for a in range(side):
-                for d in range(side):
-                    half[a, d] = -np.inf
-                    for c in range(side):
-                        total = best[c, d] - step_cost * (a - c) ** 2
-                        if total > half[a, d]:
-                            half[a, d], down[i, a, d] = total, c
-            for a in range(side):
+                came = ways[i, axis, a]
                 for b in range(side):
-                    best[a, b] = -np.inf
-                    for d in range(side):
-                        total = half[a, d] - step_cost * (b - d) ** 2
-                        if total > best[a, b]:
-                            best[a, b], right[i, a, b] = total, d
-        for a in range(side):
-            for b in range(side):
-                best[a, b] += score[a, b, i] - place_cost * ((a - reach) ** 2 + (b - reach) ** 2)
-    a, b = 0, 0
+                    top[b] = best[0, b] - steps[a, 0]
+                for c in range(1, side):
+                    for b in range(side):
+                        value = best[c, b] - steps[a, c]
+                        came[b] = c if value > top[b] else came[b]
+                        top[b] = max(top[b], value)
+                for b in range(side):
+                    turned[b, a] = top[b] + (scores[b, a, i] if axis else 0.0)
+            best, turned = turned, best
+    a = b = 0
     for c in range(side):
         for d in range(side):
             if best[c, d] > best[a, b]:
                 a, b = c, d
     for i in range(values - 1, -1, -1):
-        path[i, 0], path[i, 1] = a - reach, b - reach
-        b = right[i, a, b]
-        a = down[i, a, b]
+        path[i, 0], path[i, 1] = a - half, b - half
+        b = ways[i, 1, b, a]
+        a = ways[i, 0, a, b]

@@ -114,7 +114,7 @@ class LearnedDecoder:
 
     def decode(
         self, presence: PresenceMap, sums: NDArray[np.int16]
-    ) -> tuple[SoftSymbols, float, NDArray[np.float64]]:
+    ) -> tuple[SoftSymbols, float, NDArray[np.uint16], NDArray[np.float64]]:
         """The likeliest codewords by what all pixels that show a cluster say.
 
         Args:
@@ -122,8 +122,9 @@ class LearnedDecoder:
             sums: The frame's polarity sums, pilot first, int16 (chips, height, width).
 
         Returns:
-            The symbols; the least size of an LLR; and the log-likelihood ratio of a value of +1 against -1 by
-            its chips' polarity sums of -n to n events, float64 (2 n + 1, 2 n + 1), the first chip's first.
+            The symbols; the least size of an LLR; the pair of its chips' polarity sums of -n to n events that
+            each value has in each pixel, uint16 (values, pixels), (first + n) * (2 n + 1) + second + n; and
+            the log-likelihood ratio of a value of +1 against -1 by its pair, float64 ((2 n + 1)^2,).
         """
         pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
         seen, width, grid = plain(presence.probability), sums.shape[2], presence.grid_px
@@ -135,4 +136,4 @@ class LearnedDecoder:
         symbols, _, margins, agreement, least = match_words(values, self._by_value, self._bits)
         scale = INDEPENDENT_PIXELS / 2
         soft = SoftSymbols(symbols, (margins * scale).astype(np.float32), agreement)
-        return soft, least * scale, worth.reshape(2 * MAX_EVENTS + 1, -1)
+        return soft, least * scale, pairs, worth

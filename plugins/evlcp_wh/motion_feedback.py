@@ -1,6 +1,7 @@
 """What the info segment of each cluster says, after the bar's motion within the frame is taken out."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from itertools import groupby
 from math import inf
 from typing import Annotated
 
@@ -10,7 +11,7 @@ from pydantic import Field
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.plugin.roles import Decode, Decoding
-from evlcp_sdk.values import PresenceMap, SoftSymbols, plain
+from evlcp_sdk.values import PresenceMap, SoftSymbols, changed, plain
 from evlcp_wh import _kernels
 from evlcp_wh.decoding import INDEPENDENT_PIXELS, LearnedDecoder
 from evlcp_wh.separation import CellPosterior
@@ -60,44 +61,44 @@ class MotionFeedback(Decoding):
         """Precompute for a codebook's pilots and codewords."""
         codebook.require_pairs("decoding", "motion-feedback", "edges")
         decoder, posterior = LearnedDecoder(codebook), CellPosterior(codebook.pilot_edges.astype(np.int64))
-        pilots, words = codebook.pilot_edges.copy(), codebook.codeword_edges
+        pilots, words = plain(codebook.pilot_edges), codebook.codeword_edges
 
         def decode(presence: PresenceMap, sums: NDArray[np.int16]) -> SoftSymbols:
             presence, sums = presence.informed(), plain(sums)
-            soft, least, worth = decoder.decode(presence, sums)
+            soft, least, pairs, worth = decoder.decode(presence, sums)
             if least >= _SURE_LLR:
                 return soft
-            read, beyond = feed_back(presence, sums, soft, worth, self.reach_px)
+            matches = match_shifts(presence, pairs, worth, self.reach_px)
+            read, beyond = feed_back(presence, sums, soft, matches)
             if beyond and self.far_px > self.reach_px:
-                read, _ = feed_back(presence, sums, soft, worth, self.far_px)
+                matches = match_shifts(presence, pairs, worth, self.far_px)
+                read, _ = feed_back(presence, sums, soft, matches)
             return read
 
         def feed_back(
             presence: PresenceMap,
             sums: NDArray[np.int16],
             soft: SoftSymbols,
-            worth: NDArray[np.float64],
-            reach_px: int,
+            matches: NDArray[np.float32],
         ) -> tuple[SoftSymbols, bool]:
-            """What is read with the path taken back, and whether the path may lie beyond `reach_px`.
+            """What is read with the path taken back, and whether the path may lie beyond what is searched.
 
             The best path may go on beyond the border. Where it does not come there, it may have gone over to
             the same clusters a spacing back: what it passed on the way contradicts what it reads, and leaves
             a bit unsure. What was read until then does not count.
             """
-            matches = match_shifts(presence, sums, worth, reach_px)
-            known, least = pilots, inf
-            done = np.zeros((len(sums) // 2, 2), np.int64)
+            known, least, reach_px = pilots, inf, matches.shape[1] // 2
+            done = [[0, 0]] * matches.shape[3]
             for _ in range(_ROUNDS):
-                path = find_path(matches, known)
-                if reach_px < self.far_px and np.abs(path).max() >= reach_px - 1:
+                path = find_path(matches, known).tolist()
+                if reach_px < self.far_px and max(abs(px) for at in path for px in at) >= reach_px - 1:
                     return soft, True
-                if (path == done).all():
+                if path == done:
                     break
                 still, done = take_back(sums, path), path
                 probability = posterior.probability(still, presence.grid_px)
-                presence = replace(presence, probability=probability).informed()
-                soft, least, _ = decoder.decode(presence, still)
+                presence = changed(presence, probability=probability).informed()
+                soft, least, *_ = decoder.decode(presence, still)
                 known = np.concatenate([pilots, words[soft.symbols]], axis=1)
             return soft, least < _UNSURE_LLR
 
@@ -105,44 +106,46 @@ class MotionFeedback(Decoding):
 
 
 def match_shifts(
-    presence: PresenceMap, sums: NDArray[np.int16], worth: NDArray[np.float64], reach_px: int
+    presence: PresenceMap, pairs: NDArray[np.uint16], worth: NDArray[np.float64], reach_px: int
 ) -> NDArray[np.float32]:
     """Log-likelihood ratio of each value of each cluster, by the shift of the bar from its place.
+
+    A pixel without events counts 0: what it is worth adds the same wherever the bar is.
 
     Returns:
         float32 (K, n, n, values), from `reach_px` up and left to as much down and right.
     """
-    single, (_, height, width) = worth.astype(np.float32), sums.shape
-    side, values = 2 * reach_px + 1, len(sums) // 2
-    images = np.zeros((height + 2 * reach_px, width + 2 * reach_px, values), np.float32)
-    _kernels.worth_images(sums, single, reach_px, images)
     prior = presence.probability if presence.prior is None else presence.prior
-    out = np.zeros((len(prior), side, side, values), np.float32)
-    _kernels.cluster_matches(presence.pixels, prior, presence.grid_px, images, out)
-    out *= INDEPENDENT_PIXELS
+    side = 2 * reach_px + 1
+    out = np.zeros((len(prior), side, side, len(pairs)), np.float32)
+    maps, grid = plain(presence.pixels), presence.grid_px
+    _kernels.match_shifts(pairs, worth, INDEPENDENT_PIXELS, maps, plain(prior), grid, out)
     return out
 
 
-def find_path(matches: NDArray[np.float32], known: NDArray[np.signedinteger]) -> NDArray[np.int64]:
+def find_path(matches: NDArray[np.float32], known: NDArray[np.int8]) -> NDArray[np.int64]:
     """Shift (down, right) of the bar from its place in each value, int64 (values, 2), px.
 
     `known` are the codes of the first n values, (K, n); of the others, each cluster's is what fits better.
     """
     values = matches.shape[3]
     path = np.empty((values, 2), np.int64)
-    # Twice a log-likelihood is scored, and so are the costs.
-    _kernels.smooth_path(matches, known, 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values, path)
+    # Twice a log-likelihood, as the costs are.
+    _kernels.find_path(matches, known, 1 / _STEP_PX**2, 1 / _PLACE_PX**2 / values, path)
     return path
 
 
-def take_back(sums: NDArray[np.int16], path: NDArray[np.int64]) -> NDArray[np.int16]:
+def take_back(sums: NDArray[np.int16], path: list[list[int]]) -> NDArray[np.int16]:
     """Polarity sums with each value's shift (down, right) taken back; 0 where there was no pixel."""
     _, height, width = sums.shape
-    out = np.zeros_like(sums)
-    for i, (down, right) in enumerate(path.tolist()):
+    out, first = np.zeros_like(sums), 0
+    # Neighbouring values mostly share a shift.
+    for (down, right), alike in groupby(path):
+        last = first + 2 * sum(1 for _ in alike)
         top, bottom = max(-down, 0), max(min(height - down, height), 0)
         left, end = max(-right, 0), max(min(width - right, width), 0)
         if bottom > top and end > left:
-            there = sums[2 * i : 2 * i + 2, top + down : bottom + down, left + right : end + right]
-            out[2 * i : 2 * i + 2, top:bottom, left:end] = there
+            there = sums[first:last, top + down : bottom + down, left + right : end + right]
+            out[first:last, top:bottom, left:end] = there
+        first = last
     return out

@@ -36,14 +36,10 @@ class CellPosterior:
 
     def probability(self, sums: NDArray[np.int16], grid_px: int) -> NDArray[np.float32]:
         """Of each cluster in each cell, float32 (K, rows, columns), by polarity sums, pilot first."""
-        clusters, n = self._pilots.shape
         _, height, width = sums.shape
-        rows, columns = height // grid_px, width // grid_px
-        values = np.empty((n, rows * columns), np.int8)
-        _kernels.cell_values(sums, grid_px, columns, values)
-        out = np.zeros((clusters, rows * columns), np.float32)
-        _kernels.presence(values, self._pilots, self._beside, self._none, _MIN_VALUES, out)
-        return out.reshape(clusters, rows, columns)
+        out = np.zeros((len(self._pilots), height // grid_px, width // grid_px), np.float32)
+        _kernels.presence(sums, self._pilots, grid_px, self._beside, self._none, _MIN_VALUES, out)
+        return out
 
 
 @dataclass(frozen=True)

@@ -159,7 +159,7 @@ def test_what_clusters_say_off_their_places(seed, reach):
     maps = (rng.random((4, 11, 7)) * (rng.random((4, 11, 7)) < 0.4)).astype(np.float32)
     prior = (rng.random((4, 5, 3)) * (rng.random((4, 5, 3)) < 0.7)).astype(np.float32)
     presence = PresenceMap(prior, 2, prior > 0.5, maps, prior)
-    out = match_shifts(presence, sums, worth, reach)
+    out = match_shifts(presence, twins.pairs_of(sums, 3), worth.ravel(), reach)
     own = np.zeros(maps.shape, bool)
     own[:, :10, :6] = (prior > 0).repeat(2, 1).repeat(2, 2)
     pixels = twins.worth_of(sums, worth) - worth[3, 3]
@@ -170,15 +170,11 @@ def test_what_clusters_say_off_their_places(seed, reach):
 @pytest.mark.parametrize("seed", SEEDS)
 @pytest.mark.parametrize(("step_cost", "place_cost"), [(0.0, 0.0), (0.5, 0.1), (3.0, 0.0), (0.1, 2.0)])
 def test_the_smooth_path_is_the_best_of_all(seed, step_cost, place_cost):
-    rng = np.random.default_rng(seed)
-    matches, known = (
-        rng.normal(0, 1, (3, 3, 3, 4)).astype(np.float32),
-        rng.choice([-1, 1], (3, 2)).astype("i1"),
-    )
-    scores = np.abs(matches).sum(0, float)
-    scores[..., :2] = (known[:, None, None] * matches[..., :2]).sum(0, float)
-    path = np.empty((4, 2), np.int64)
-    _kernels.smooth_path(matches, known, step_cost, place_cost, path)
+    rng, path = np.random.default_rng(seed), np.empty((4, 2), np.int64)
+    matches, known = rng.normal(size=(3, 3, 3, 4)).astype(np.float32), rng.choice([-1, 1], (3, 2))
+    _kernels.find_path(matches, known.astype(np.int8), step_cost, place_cost, path)
+    scores = np.abs(matches).sum(0)
+    scores[..., :2] = (known[:, None, None] * matches[..., :2]).sum(0)
     assert_array_equal(path, twins.best_path(np.moveaxis(scores, -1, 0), step_cost, place_cost))
 
 
@@ -293,12 +289,12 @@ def test_a_drift_within_the_frame_is_found_and_taken_back(profile, right_down, s
     assert_array_equal(soft.llr < 0, bits_of(symbols, book.bits_per_symbol) == 1)
     if right_down[1]:
         assert (MlSoft().compile(book)(presence, sums).symbols != symbols).any()
-    _, _, worth = LearnedDecoder(book).decode(presence, sums)
-    matches = match_shifts(presence, sums, worth, 4)
+    _, _, *learnt = LearnedDecoder(book).decode(presence, sums)
+    matches = match_shifts(presence, *learnt, 4)
     known = np.concatenate([book.pilot_edges, book.codeword_edges[symbols]], axis=1)
     assert_array_equal(find_path(matches, known), path)
     # Blind to what the clusters say, it is found as well.
-    assert_array_equal(find_path(matches, book.pilot_edges), path)
+    assert_array_equal(find_path(matches, book.pilot_edges.copy()), path)
 
 
 @pytest.mark.parametrize("right_down", [(0, -6), (6, 0), (5, -6), (0, 7)])

@@ -97,6 +97,12 @@ def worth_of(sums, worth):
     return worth[clipped[::2], clipped[1::2]]
 
 
+def pairs_of(sums, most):
+    """The pair of sums of each value in each pixel, as one number, uint16 (values, pixels)."""
+    clipped = np.clip(sums.astype(int), -most, most) + most
+    return (clipped[::2] * (2 * most + 1) + clipped[1::2]).reshape(len(sums) // 2, -1).astype(np.uint16)
+
+
 def sum_worth(sums, codes, probability, grid, least, worth, share):
     """Pixel by pixel: how likely it shows the cluster, by Bayes' rule of its pilot, times its worth."""
     pixels, known = worth_of(sums, worth), codes.shape[1]
