@@ -39,12 +39,13 @@ def phase_only_correlation(
     """
     _, height, width = images.shape
     down, across = most or full_band(height, width)
-    spectra = np.fft.fft(np.fft.rfft(images)[:, :, : across + 1], axis=1)
-    spectra[:, down + 1 : height - down] = 0
+    # Columns side by side, which are transformed in two thirds of the time.
+    spectra = np.fft.fft(np.fft.rfft(images)[:, :, : across + 1].swapaxes(1, 2).copy())
+    spectra[:, :, down + 1 : height - down] = 0
     size = np.abs(spectra)
     has_phase = size > _NO_PHASE * size.max((1, 2), keepdims=True)
     unit = spectra * (1 / np.where(has_phase, size, np.float32(np.inf)))
-    columns = np.fft.ifft(unit.conj()[first] * unit[second], axis=1)
+    columns = np.fft.ifft(unit.conj()[first] * unit[second]).swapaxes(1, 2)
     return np.fft.irfft(columns if rows is None else columns.take(rows, 1), width)
 
 
