@@ -50,20 +50,6 @@ _ROUND = np.uint32(CLOCK_ROUND - 1)
 
 
 @njit
-def grow_old(pixels: Array, first: int, many: int, now: int, least: int, age: int) -> None:
-    """In so many rows from the first on, round and round, set rises of `least` ticks ago or more to `age`."""
-    then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK)
-    today, oldest = np.uint32(now), np.uint32(least)
-    height = len(pixels)
-    for row in range(first, first + many):
-        line = pixels[row % height]
-        for u in range(line.size):
-            state = line[u]
-            ago = np.uint32(np.uint32(today - np.uint32(state >> _CLOCK)) & _ROUND)
-            line[u] = np.uint32(then | np.uint32(state & _LOW)) if ago >= oldest else state
-
-
-@njit
 def score_rises(
     events: Columns,
     pixels: Array,
@@ -80,10 +66,20 @@ def score_rises(
     the first of `limits`, is the same; `kinds` says what a number of ticks is, the last, 0, for all beyond,
     and `lows` what becomes of time and score, and in the bits above whether it is `AGAIN` the same time. Of
     `shifts`, a tick is 2^first us, a cell 2^second px wide. A rise with less than the least score is no hit,
-    nor is one beyond, or after the same time so often; these are the other `limits`. First, what is `old`
-    grows no older: see `grow_old`.
+    nor is one beyond, or after the same time so often; these are the other `limits`.
+
+    First, what is `old` grows no older: (first row; how many from there on, round and round; ticks now; how
+    many ticks ago a rise is old; how many ago it is then).
     """
-    grow_old(pixels, *old)
+    first_row, many_rows, now, least_old, age = old
+    then = np.uint32((np.uint32(now) - np.uint32(age)) << _CLOCK)
+    today, oldest = np.uint32(now), np.uint32(least_old)
+    for row in range(first_row, first_row + many_rows):
+        line = pixels[row % len(pixels)]
+        for u in range(line.size):
+            state = line[u]
+            ago = np.uint32(np.uint32(today - np.uint32(state >> _CLOCK)) & _ROUND)
+            line[u] = np.uint32(then | np.uint32(state & _LOW)) if ago >= oldest else state
     t_us, x, y, p = events
     soon, min_score, most_same = limits
     tick_shift, cell_shift = shifts
@@ -315,6 +311,48 @@ def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) ->
         out_p[n] = p[i]
         n += np.uint64(np.uint16(x[i] - left) < width) & np.uint64(np.uint16(y[i] - top) < height)
     return int(np.int64(n))
+
+
+MOST_BOXES = 8
+"""Boxes that events are handed to in one pass: a bit each."""
+
+_LOWEST = np.array([MOST_BOXES, *((n & -n).bit_length() - 1 for n in range(1, 1 << MOST_BOXES))], np.uint8)
+"""Number of the lowest bit that is set; of none, one beyond."""
+
+
+@njit
+def select_boxes(events: Columns, boxes: Array, size: tuple[int, int], apart: int, out: Columns) -> Array:
+    """Copy the events inside each of some boxes (n, 4), `MOST_BOXES` at the most; how many, (n,).
+
+    Of each box, they begin `apart` events behind where those of the one before do; behind all is room for one
+    more. `size` are the columns and rows of the sensor.
+    """
+    t_us, x, y, p = events
+    out_t, out_x, out_y, out_p = out
+    # By a column's bits and a row's, boxes are found in the same time however many they are.
+    columns, rows = np.zeros(size[0], np.uint8), np.zeros(size[1], np.uint8)
+    for k in range(len(boxes)):
+        left, top, right, bottom = boxes[k]
+        for u in range(left, right):
+            columns[u] |= np.uint8(1 << k)
+        for v in range(top, bottom):
+            rows[v] |= np.uint8(1 << k)
+    ends = np.arange(MOST_BOXES + 1) * apart
+    for i in range(t_us.size):
+        inside = columns[x[i]] & rows[y[i]]
+        while True:
+            # Written always, kept if inside; of two boxes that overlap, in both.
+            box = _LOWEST[inside]
+            n = np.uint64(ends[box])
+            out_t[n] = t_us[i]
+            out_x[n] = x[i]
+            out_y[n] = y[i]
+            out_p[n] = p[i]
+            ends[box] += inside != 0
+            inside &= np.uint8(inside - 1)
+            if not inside:
+                break
+    return ends[: len(boxes)] - np.arange(len(boxes)) * apart
 
 
 @njit

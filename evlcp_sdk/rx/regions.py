@@ -537,14 +537,57 @@ class Rhythm:
         return _kernels.measure_box(self._pixels, box, awake, _SEAM_PX, reach_px, rows)
 
 
-def select(events: Events, box: Box) -> Events:
-    """Those inside a box (left, top, right, bottom), in no more memory than twice what they need."""
-    room = events.t_us.size + 1
-    into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
-    n = _kernels.select_box((events.t_us, events.x, events.y, events.p), box, into)
-    t_us, x, y, p = into
-    inside = Events.as_is(t_us[:n], x[:n], y[:n], p[:n])
-    return Events.concat([inside]) if 2 * n < room else inside
+class Selector:
+    """Selects the events inside boxes, by way of columns that live as long as it does.
+
+    Args:
+        size_px: Columns and rows of the sensor.
+
+    >>> selector = Selector((1280, 720))
+    >>> events = Events.of([0, 1, 2], x=[5, 90, 6], y=[5, 5, 5], p=[1, 1, 0])
+    >>> [e.t_us.tolist() for e in selector.each(events, [(0, 0, 10, 10), (80, 0, 100, 9)])]
+    [[0, 2], [1]]
+    """
+
+    def __init__(self, size_px: tuple[int, int]) -> None:
+        self._size_px = size_px
+        self._apart = -1
+        self._columns: _kernels.Columns
+
+    def each(self, events: Events, boxes: Sequence[Box]) -> list[Events]:
+        """Those inside each of some boxes (left, top, right, bottom), copied."""
+        most = _kernels.MOST_BOXES
+        if len(boxes) > most:
+            return self.each(events, boxes[:most]) + self.each(events, boxes[most:])
+        if events.t_us.size > self._apart:
+            self._apart = events.t_us.size + events.t_us.size // 4
+            room = most * self._apart + 1
+            self._columns = (
+                np.empty(room, np.int64),
+                *np.empty((2, room), np.uint16),
+                np.empty(room, np.uint8),
+            )
+        columns, apart = (events.t_us, events.x, events.y, events.p), self._apart
+        if len(boxes) > 1:
+            ends = _kernels.select_boxes(
+                columns, np.array(boxes), self._size_px, apart, self._columns
+            ).tolist()
+        else:
+            # Of a bar alone, whole blocks of events.
+            ends = [_kernels.select_box(columns, box, self._columns) for box in boxes]
+        t_us, x, y, p = self._columns
+        first = 0
+        found = []
+        for many in ends:
+            end = first + many
+            inside = t_us[first:end].copy(), x[first:end].copy(), y[first:end].copy(), p[first:end].copy()
+            found.append(Events.as_is(*inside))
+            first += apart
+        return found
+
+    def one(self, events: Events, box: Box) -> Events:
+        """The same of a single box."""
+        return self.each(events, [box])[0]
 
 
 class RegionFollower(RegionTracker):
@@ -584,6 +627,7 @@ class RegionFollower(RegionTracker):
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
         self._rhythm = rhythm or Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
+        self._selector = Selector((camera.width, camera.height))
         # Emptied once a step; no sensor's pixel rises a thousand times in one.
         self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in shape], np.int16)
         self._fresh: list[Box] = []
@@ -602,8 +646,8 @@ class RegionFollower(RegionTracker):
         rises = self._rhythm.step(start_us, events, self._hits, CELL_SHIFT)
         end_us, held = start_us + spec.step_us, 0
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
-        for followed, box, own in zip(self.alive, boxes, self._own(boxes), strict=True):
-            inside = select(events, box)
+        selected = self._selector.each(events, boxes)
+        for followed, inside, own in zip(self.alive, selected, self._own(boxes), strict=True):
             # Before a frame shows where in its box a bar is, panels and moving textures around it would drown
             # it: only what blinks in rhythm counts.
             followed.add(start_us, inside if followed.size_px else self._rhythm.of(inside))
@@ -707,7 +751,7 @@ class RegionFollower(RegionTracker):
         x, y = followed.positions.at(np.array([start + step_us / 2 for start, _ in kept]))
         for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
             box = self._reach(x_px, y_px, last.width_px, last.height_px)
-            gathered[start] = select(events, box)
+            gathered[start] = self._selector.one(events, box)
         followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
         self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, step_us)
 
@@ -979,7 +1023,7 @@ class RegionFollower(RegionTracker):
         region = region_of(self._next_id, end_us - self._age_us, *place)
         reach = self._reach(*place)
         # Lamps whose pixels were not known as such in the step before are now.
-        newest = select(self._recent[-1][1], reach)
+        newest = self._selector.one(self._recent[-1][1], reach)
         if not self._rhythm.may_open(newest) or not self._place_for_one(end_us):
             return
         self._next_id += 1
@@ -996,7 +1040,9 @@ class RegionFollower(RegionTracker):
             pieces = deque((start, Events.empty()) for start, _ in self._recent)
         else:
             places, recent = Places([region]), list(self._recent)[-BACKFILL_STEPS:]
-            pieces = deque((start, self._rhythm.of(select(events, reach))) for start, events in recent)
+            pieces = deque(
+                (start, self._rhythm.of(self._selector.one(events, reach))) for start, events in recent
+            )
         followed = Followed(region.id, places, pieces[0][0], pieces, opened_us=end_us)
         followed.filter = self._position.init() if self._position else None
         if outgrown:

@@ -12,7 +12,7 @@ from scipy import stats
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.placement import _WIDEST_PX, Layout, Placement, masked
-from evlcp_sdk.rx.regions import Rhythm
+from evlcp_sdk.rx.regions import Rhythm, Selector
 from evlcp_sdk.scene.lean import BarSight, foreshortening
 from evlcp_sdk.values import Events, PresenceMap
 
@@ -121,7 +121,10 @@ def test_old_rises(seed):
     same = rng.integers(0, 32, rose.shape)
     pixels = states(rose, time, score, same)
     # Rows 10 to 15, and 0 to 4.
-    _kernels.grow_old(pixels, 10, 11, now, 3000, 4000)
+    none, tables = Events.empty(), rhythm_of(pixels)._tables
+    columns, hits = (none.t_us, none.x, none.y, none.p), np.zeros((4, 6), np.int16)
+    old = 10, 11, now, 3000, 4000
+    _kernels.score_rises(columns, pixels, hits, tables.kinds, tables.lows, (150, 8, 7), (0, 2), old)
     looked_at = np.isin(np.arange(HEIGHT), [*range(10, 16), *range(5)])
     old = (now - rose >= 3000) & looked_at[:, None]
     assert_array_equal(pixels, states(np.where(old, now - 4000, rose), time, score, same))
@@ -180,17 +183,16 @@ def test_strips_are_measured_whatever_each_has_awake():
 
 
 @pytest.mark.parametrize("n", [0, 1, 500])
-@pytest.mark.parametrize("freeze", [1, 2])
-def test_events_in_boxes(n, freeze):
-    events = random_events(np.random.default_rng(n), n)
-    e = frozen(events, freeze)
-    for box in [(0, 0, WIDTH, HEIGHT), (0, 0, 1, 1), (3, 2, 17, 9), (10, 5, 30, 20), (4, 4, 4, 9)]:
-        columns = [np.empty(n + 1, c.dtype) for c in (events.t_us, events.x, events.y, events.p)]
-        taken = _kernels.select_box((e.t_us, e.x, e.y, e.p), box, tuple(columns))
-        want = twins.select_box(events, box)
-        for got, name in zip(columns, ("t_us", "x", "y", "p"), strict=True):
-            assert_array_equal(got[:taken], getattr(want, name))
-        assert taken == len(want)
+def test_events_in_boxes(n):
+    events, selector = random_events(np.random.default_rng(n), n), Selector((WIDTH, HEIGHT))
+    boxes = [(0, 0, WIDTH, HEIGHT), (0, 0, 1, 1), (3, 2, 17, 9), (10, 5, WIDTH, HEIGHT), (4, 4, 4, 9)]
+    # One by one, some that overlap, more than one pass takes, and none.
+    for given in [*([box] for box in boxes), boxes, [*boxes, *boxes], []]:
+        taken = selector.each(events, given)
+        for got, box in zip(taken, given, strict=True):
+            want = twins.select_box(events, box)
+            for name in ("t_us", "x", "y", "p"):
+                assert_array_equal(getattr(got, name), getattr(want, name))
 
 
 @pytest.mark.parametrize("freeze", [1, 2])
