@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from itertools import accumulate
 
 import numpy as np
 from numpy.typing import NDArray
@@ -135,19 +136,19 @@ def likeliest_row(
     more inside says for a place. Of a bar that is not `sized`, whose height may be wrong, the places of the
     most pixels count alone, and of them the nearest one. `stray_px` is how far it is off as a rule.
     """
-    n = min(height, len(rows))
-    total = np.concatenate([[0], np.cumsum(rows)])
-    inside = total[n:] - total[:-n]
-    most, beyond = int(inside.max()), max(len(rows) - n, 1)
-    other = (int(total[-1]) - most) / beyond
+    # Of a few dozen places: lists are quicker than arrays.
+    n, total = min(height, len(rows)), [0, *accumulate(rows.tolist())]
+    inside = [below - above for above, below in zip(total[:-n], total[n:], strict=True)]
+    most, beyond = max(inside), max(len(rows) - n, 1)
+    other = (total[-1] - most) / beyond
     told = max(math.log((most / n + 0.5 / n) / (other + 0.5 / n)), 0.0) if sized else 0.0
     first_px = top + (n - 1) / 2
-    off = np.arange(len(inside)) - (expected_px - first_px)
+    places = [(held, at - (expected_px - first_px)) for at, held in enumerate(inside)]
     if told == 0:
-        at = np.where(inside == most, np.abs(off), np.inf).argmin()
+        worth = [-abs(off) if held == most else -math.inf for held, off in places]
     else:
-        at = (told * inside - (off / stray_px) ** 2 / 2).argmax()
-    return first_px + int(at)
+        worth = [told * held - (off / stray_px) * (off / stray_px) / 2 for held, off in places]
+    return first_px + worth.index(max(worth))
 
 
 def shows_again(
