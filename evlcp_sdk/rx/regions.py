@@ -5,6 +5,7 @@ from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from itertools import combinations
 from typing import Any, Final
 
 import numpy as np
@@ -356,8 +357,9 @@ class Followed:
 
     def forget_before(self, t_us: float, step_us: int, places_us: float) -> None:
         """Drop events older than a time, and positions older than another: others ask where it was."""
-        while self.pieces and self.pieces[0][0] + step_us <= t_us:
-            self.forget()
+        pieces = self.pieces
+        while pieces and pieces[0][0] + step_us <= t_us:
+            self.held_bytes -= held_bytes(pieces.popleft()[1])
         self.positions.forget_before(places_us)
 
 
@@ -694,7 +696,7 @@ class RegionFollower(RegionTracker):
 
         Rows of a bar below would be as good as its own, so that a region would move on to them.
         """
-        if len(boxes) < 2:
+        if not any(overlap(one, other) for one, other in combinations(boxes, 2)):
             return boxes
         tight = [
             grown(box, -MARGIN_PX) if one.size_px else None
