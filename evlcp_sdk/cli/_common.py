@@ -92,8 +92,8 @@ def log_on_stderr() -> "Iterator[None]":
         log.setLevel(before)
 
 
-_GARBAGE = 50_000
-"""New objects before the collector of garbage looks for cycles, of which a run makes few."""
+_GARBAGE = 250_000
+"""New objects before the collector of garbage looks for cycles: to load Numba makes 170 000, a run few."""
 
 
 def loaded() -> None:
