@@ -508,7 +508,7 @@ def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -
     clusters, rows, columns = selected.shape
     some = np.empty(at.size, np.complex128)
     of = np.empty((2, at.size), np.int64)
-    done = np.zeros((rows, columns), np.bool_)
+    done = np.empty((rows, columns), np.bool_)
     found = np.empty((rows * columns, 2), np.int64)
     n, most = 0, 0
     for k in range(clusters):
@@ -1192,10 +1192,11 @@ def meet_neighbours(
     heard, edges, every = pilot
     rows = abs(along.imag) >= abs(along.real)
     lines = heard.shape[1] if rows else heard.shape[2]
-    lights, lit = np.empty((clusters, lines)), np.zeros(clusters, np.bool_)
+    lights, lit = np.empty((clusters, lines)), np.empty(clusters, np.bool_)
     centres = np.empty(clusters, np.complex128)
-    before, after = np.full(clusters, np.nan), np.full(clusters, np.nan)
+    before, after = np.empty(clusters), np.empty(clusters)
     for k in range(clusters):
+        lit[k], before[k], after[k] = False, np.nan, np.nan
         if not np.isnan(mean[k, 0]):
             off = (complex(mean[k, 0], mean[k, 1]) - places[k]) * along.conjugate()
             centres[k] = places[k] + along * complex(0.0, off.imag)

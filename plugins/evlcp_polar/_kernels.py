@@ -24,7 +24,10 @@ def _fork(metric: Array, penalty: Array, limit: float, alive: Array, rows: Array
     size, origin, bit = len(metric), fork[0], fork[1]
     cost, which = np.empty(2 * size), np.empty(2 * size, np.int64)
     found = 0
+    # Bit 1 of `kept` stands for the continuation by 0, bit 2 for that by 1.
+    kept = np.empty(size, np.int64)
     for path in range(size):
+        kept[path] = 0
         if alive[path]:
             for value in range(2):
                 c = metric[path] + penalty[value, path]
@@ -37,8 +40,6 @@ def _fork(metric: Array, penalty: Array, limit: float, alive: Array, rows: Array
                 cost[i] = c
                 which[i] = 2 * path + value
                 found += 1
-    # Bit 1 of `kept` stands for the continuation by 0, bit 2 for that by 1.
-    kept = np.zeros(size, np.uint8)
     count = 0
     while count < min(found, size) and cost[count] <= limit:
         kept[which[count] >> 1] |= 1 << (which[count] & 1)
@@ -154,7 +155,7 @@ def list_decode(llr: Array, nodes: Array, size: int, limit: float, codewords: Ar
     # only the stages above (LLRs) or below (partial sums), so that a clone can share rows with its parent:
     # `rows` of `alpha` and of `beta`.
     alpha, beta = np.empty((size, 2 * n), np.float32), np.empty((size, n), np.uint8)
-    rows, alive = np.zeros((2, size, stages + 1), np.int64), np.zeros(size, np.bool_)
+    rows, alive = np.zeros((2, size, stages + 1), np.int64), np.empty(size, np.bool_)
     penalty, fork = np.empty((2, size)), np.empty((2, size), np.int64)
     for i in range(n):
         alpha[0, n + i] = llr[i]
