@@ -1485,6 +1485,11 @@ def mean_length(
 ) -> tuple[float, float]:
     """Mean and variance of a leaning bar's foreshortening, by what is likely of its sines and what was seen.
 
+    That is how long it looks, in what one parallel to the sensor does at the same depth: exact, of a pinhole.
+    A bar whose direction has the part -sine along the optical axis, and whose middle is seen at tangents
+    (along, across) of the axis, looks sqrt(1 - sine^2 (1 + across^2)) + along sine times as long: in the
+    middle of the image cos(lean), elsewhere by `along` times the lean more or less, which is of first order.
+
     Args:
         sine: Sines of leans, float64 (n,).
         likely: How likely each is before, float64 (n,).

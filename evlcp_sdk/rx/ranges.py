@@ -1,7 +1,7 @@
 """A transmitter's distances together: when they hold, how the bar leans, and how much they scatter."""
 
 import math
-from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,8 +62,7 @@ _LEAST_WEIGHT = 0.1
 Floats = NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
-class Ranges:
+class Ranges(NamedTuple):
     """What is remembered of a transmitter's distances.
 
     Attributes:
@@ -75,11 +74,11 @@ class Ranges:
         wave: Sums that say how high the pixels' wave is, of `_kernels.wave_of`, float64 (4,).
     """
 
-    past: Floats = field(default_factory=lambda: np.empty((0, 3)))
-    bend: Floats = field(default_factory=lambda: np.empty((3, 0)))
+    past: Floats = np.empty((0, 3))
+    bend: Floats = np.empty((3, 0))
     bend_s: float = math.nan
     told: bool = False
-    wave: Floats = field(default_factory=lambda: np.zeros(4))
+    wave: Floats = np.zeros(4)
 
 
 class RangeKeeper:

@@ -10,6 +10,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,8 +70,7 @@ _REMEMBER_US = 1e6
 """How long two transmitters stay one without a frame in common; so long one lost from sight is remembered."""
 
 
-@dataclass(frozen=True, eq=False)
-class FrameDetection:
+class FrameDetection(NamedTuple):
     """A decoded frame, and what tells a bar from its reflection.
 
     Attributes:

@@ -1,7 +1,7 @@
 """A bar that leans against the sensor: how much shorter it looks, and how a plumb one must lean."""
 
 import math
-from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +18,7 @@ _ASKEW = 4.0
 """Sigmas off the vertical in the image, 1 of 16000 by chance, beyond which a bar is not meant to be plumb."""
 
 
-@dataclass(frozen=True)
-class BarSight:
+class BarSight(NamedTuple):
     """Where a bar is seen, and how it leans as far as the camera's attitude says so.
 
     Attributes:
@@ -43,27 +42,6 @@ class BarSight:
     askew: bool = False
     magnification: float = 1.0
     bow: float = 0.0
-
-
-def foreshortening(sine: Floats, sight: BarSight) -> Floats:
-    """How long a bar looks, in what one parallel to the sensor does at the same depth: exact, of a pinhole.
-
-    A bar whose direction has the part -sine along the optical axis, and whose middle is seen at tangents
-    (along, across) of the axis, looks sqrt(1 - sine^2 (1 + across^2)) + along sine times as long: in the
-    middle of the image cos(lean), elsewhere by `along` times the lean more or less, which is of first order.
-
-    Args:
-        sine: Sines of leans, float64 (n,).
-        sight: Where the bar is seen.
-
-    >>> lean = np.sin(np.radians([4.0]))
-    >>> foreshortening(lean, BarSight()).round(5).tolist()
-    [0.99756]
-    >>> foreshortening(lean, BarSight(along=-0.03)).round(5).tolist()
-    [0.99547]
-    """
-    flat = np.maximum(1 - sine**2 * (1 + sight.across**2), 0.0)
-    return np.asarray(np.sqrt(flat) + sight.along * sine)
 
 
 def sight_of(
@@ -106,9 +84,9 @@ def sight_of(
     lean_rad = math.radians(math.hypot(attitude.gravity_sigma_deg, _PLUMB_DEG))
     image_rad = math.hypot(sigma_px[first], sigma_px[last]) / (length * camera.focal_px)
     if off_rad > _ASKEW * math.hypot(lean_rad, image_rad):
-        return replace(sight, askew=True)
+        return sight._replace(askew=True)
     sine = float(-up[2] if upside_down else up[2])
-    return replace(sight, sine=sine, sigma=lean_rad * math.sqrt(max(1 - sine**2, 0.0)))
+    return sight._replace(sine=sine, sigma=lean_rad * math.sqrt(max(1 - sine**2, 0.0)))
 
 
 def magnification_of(camera: CameraModel, points_px: Floats) -> float:

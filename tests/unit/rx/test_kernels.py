@@ -13,7 +13,6 @@ from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.placement import _WIDEST_PX, Layout, Placement, masked
 from evlcp_sdk.rx.regions import Rhythm, Selector
-from evlcp_sdk.scene.lean import BarSight, foreshortening
 from evlcp_sdk.values import Events, PresenceMap
 
 WIDTH, HEIGHT = 24, 16
@@ -313,14 +312,13 @@ def test_a_mask_is_the_layout_s_footprint(seed, line, grid):
 def test_the_mean_length_of_a_leaning_bar(seed):
     rng = np.random.default_rng(seed)
     sine, likely, along, across = np.sin(rng.uniform(-0.1, 0.1, 50)), rng.random(50), -0.04, 0.05
-    sight = BarSight(along, across)
     for seen, chance in (
         (0.03, likely * stats.norm.pdf(sine, 0.03, 0.02)),
         (math.nan, likely),
         # What no lean explains says nothing.
         (9.0, likely),
     ):
-        length = foreshortening(sine, sight)
+        length = np.sqrt(1 - sine**2 * (1 + across**2)) + along * sine
         mean = np.average(length, weights=chance)
         spread = np.average((length - mean) ** 2, weights=chance)
         found = _kernels.mean_length(sine, likely, seen, 0.02 if seen != 9 else 0.01, along, across)

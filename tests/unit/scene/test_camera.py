@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from scipy.optimize import approx_fprime, root
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.rx import _kernels
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
-from evlcp_sdk.scene.lean import BarSight, foreshortening, magnification_of, sight_of
+from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
 
 BENT = CameraModel(
     focal_mm=4.0, centre_x_px=650.5, centre_y_px=340.25, k1=-0.21, k2=0.06, p1=1.1e-3, p2=-7e-4, k3=-0.004
@@ -170,16 +171,21 @@ def test_a_plumb_bar(
     assert sight.sine == pytest.approx(-direction[2], abs=1e-12)
     # The length in the image says the depth, once it is known how much of it the lean takes.
     spacing_px = np.hypot(*(points[-1] - points[0])) / 15
-    length = foreshortening(np.array([sight.sine]), sight)[0]
+    length = foreshortening(sight.sine, sight.along, sight.across)
     assert CAMERA.distance_m(0.06, spacing_px) * length == pytest.approx(depth_m, abs=1e-3)
+
+
+def foreshortening(sine: float, along: float, across: float) -> float:
+    """As the receiver has it: by one sine that is all that is likely, the others none."""
+    sines, likely = np.array([sine, 0.5]), np.array([1.0, 0.0])
+    length, _ = _kernels.mean_length(sines, likely, math.nan, 1.0, along, across)
+    return float(length)
 
 
 def test_a_lean_beside_the_middle_counts_at_once() -> None:
     """200 px above the middle 4 degrees make 0.44 % of the distance, below it 0.05 %."""
-    lean = np.array([math.sin(math.radians(4))])
-    above, middle, below = (
-        1 - foreshortening(lean, BarSight(px / CAMERA.focal_px))[0] for px in (-200, 0, 200)
-    )
+    sine = math.sin(math.radians(4))
+    above, middle, below = (1 - foreshortening(sine, px / CAMERA.focal_px, 0.0) for px in (-200, 0, 200))
     assert (above, middle, below) == pytest.approx((0.00437, 0.00244, 0.00050), abs=1e-5)
 
 
