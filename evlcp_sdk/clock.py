@@ -9,7 +9,7 @@ import math
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -186,10 +186,12 @@ class CameraClock:
     def _first(self, events: Events) -> int | None:
         """Time of the first event that has one and is on the sensor; those before it are dropped later."""
         width, height = self._size
-        seen = (events.x < width) & (events.y < height)
-        good = seen & (events.t_us <= _FARTHEST_US) & (events.t_us >= -_FARTHEST_US)
-        if good.any():
-            return int(events.t_us[int(good.argmax())])
+        # As a rule, it is the very first.
+        for some in (events[:1], events):
+            seen = (some.x < width) & (some.y < height)
+            good = seen & (some.t_us <= _FARTHEST_US) & (some.t_us >= -_FARTHEST_US)
+            if good.any():
+                return int(some.t_us[int(good.argmax())])
         number = self._counts["events"] - len(events)
         for name, lost in (("dropped_off_sensor", ~seen), ("dropped_time_doubtful", seen)):
             if lost.any():
@@ -219,8 +221,7 @@ class CameraClock:
         return Events(t_us, events.x, events.y, events.p)
 
 
-@dataclass(frozen=True, eq=False)
-class TimeStep:
+class TimeStep(NamedTuple):
     """The events of one time step, or of its part so far.
 
     Attributes:

@@ -23,6 +23,7 @@ opened by rises only that come soon after the one before. One pass, four bytes a
 
 import math
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -86,6 +87,7 @@ class RhythmTables:
     lows: NDArray[np.uint16]
 
     @classmethod
+    @lru_cache(maxsize=4)
     def of(cls, chip_us: float, gap_chips: int) -> "RhythmTables":
         """By the length of a chip, us, and the longest time from rise to rise in the codes, chips."""
         late_us = (min(3 * gap_chips, _MOST_CHIPS) + 0.5) * chip_us
