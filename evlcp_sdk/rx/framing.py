@@ -197,11 +197,11 @@ class PacketGrid:
 
     def go_to(self, frame: int) -> None:
         """Another frame is the next one, or it stands at another time."""
-        lock = self.lock
+        lock, form = self.lock, self.format
         assert lock is not None
         self.frame, start_us = frame, self.start_us(frame)
-        packet, index = divmod(frame, self.format.frames)
-        begin, end = self.format.frame_starts[index : index + 2]
+        packet, index = divmod(frame, form.frames)
+        begin, end = form.frame_starts[index : index + 2]
         late_us = max(lock.delay_on_us, lock.delay_off_us, 0.0) + lock.last_row_us
         end_us = start_us + (end - begin) * lock.chip_us + late_us
         self.next = DueFrame(
@@ -209,7 +209,7 @@ class PacketGrid:
             packet=packet,
             index=index,
             chips=end - begin,
-            has_pilot=end - begin > self.format.info_chips,
+            has_pilot=end - begin > form.info_chips,
             packet_us=start_us - begin * lock.chip_us,
             start_us=start_us,
             end_us=end_us,

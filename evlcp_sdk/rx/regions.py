@@ -696,7 +696,7 @@ class RegionFollower(RegionTracker):
 
         Rows of a bar below would be as good as its own, so that a region would move on to them.
         """
-        if not any(overlap(one, other) for one, other in combinations(boxes, 2)):
+        if len(boxes) < 2 or not any(overlap(one, other) for one, other in combinations(boxes, 2)):
             return boxes
         tight = [
             grown(box, -MARGIN_PX) if one.size_px else None

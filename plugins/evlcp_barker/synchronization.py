@@ -175,6 +175,7 @@ class BarkerSynchronizer:
         # Half of a packet's correlations are positive.
         self._most_known = _STEPS * packet.packet_chips // 2
         # In a preamble from lag 0 on: of each chip, where it may begin; of each rise, the steps around it.
+        self._signs = np.stack([-self._chips, self._chips])[:, :, None]
         self._begins = np.arange(2 * _STEPS + 1) + _STEPS * np.arange(len(self._chips))[:, None]
         self._near_rises = _STEPS * rising[:, None] + np.arange(-_STEPS, _STEPS)
 
@@ -225,7 +226,7 @@ class BarkerSynchronizer:
         """Times of one preamble, for positive and negative events apart, us."""
         (off, off_noise), (on, on_noise) = self._fit(counts, lag)
         response = counts[1].take(lag + self._near_rises, mode="clip")
-        onset, onset_noise = _jackknife(_onsets(_without_each(response)))
+        onset, onset_noise = _jackknife([_onset(one) for one in _without_each(response).tolist()])
         if math.isnan(on):
             on, on_noise = off, off_noise
         bin_us, least = self._bin_us, _TIMING_SIGMA_US**2
@@ -249,16 +250,11 @@ class BarkerSynchronizer:
         running = np.zeros((2, last - first + self._span))
         np.cumsum(counts[:, first : first + running.shape[1] - 1], axis=1, out=running[:, 1:])
         chips = running[:, _STEPS:] - running[:, :-_STEPS]
-        fits = []
-        for windows, signs in zip(
-            chips[:, self._begins[:, : last - first]], (-self._chips, self._chips), strict=True
-        ):
-            parts = signs[:, None] * windows
-            if self._pair > 1:
-                parts = parts.reshape(-1, self._pair, last - first).sum(1)
-            found, noise = _jackknife(_middles(_without_each(parts)))
-            fits.append((first + found, noise))
-        return fits
+        parts = self._signs * chips[:, self._begins[:, : last - first]]
+        if self._pair > 1:
+            parts = parts.reshape(2, -1, self._pair, last - first).sum(2)
+        found = map(_jackknife, _middles(_without_each(parts)).tolist())
+        return [(first + middle, noise) for middle, noise in found]
 
     def _accept(
         self, clock: _Clock | None, stray: _Preamble | None, found: _Preamble
@@ -377,41 +373,35 @@ def find_peaks(rho: Floats, first: int, guard: int, squares: Floats, least: floa
 
 
 def _without_each(parts: Floats) -> Floats:
-    """The sum of parts (n, m), then the sums without each of them, (1 + n, m)."""
-    out = np.empty((len(parts) + 1, parts.shape[1]))
-    out[0] = parts.sum(0)
-    np.subtract(out[0], parts, out=out[1:])
-    return out
+    """The sum of parts (..., n, m), then the sums without each of them, (..., 1 + n, m)."""
+    whole = parts.sum(-2, keepdims=True)
+    return np.concatenate([whole, whole - parts], -2)
 
 
 def _middles(fits: Floats) -> Floats:
-    """Where correlations (n, lags) are best; NaN where one is positive nowhere.
+    """Where correlations (..., lags) are best; NaN where one is positive nowhere.
 
     The top is flat where a window holds all events of an edge: its middle is the best window.
     """
-    top = fits.max(1)
-    weight = np.maximum(fits - 0.9 * top[:, None], 0)
-    total = weight.sum(1)
-    total[top <= 0] = np.nan
-    found: Floats = weight @ np.arange(fits.shape[1]) / total
+    top = fits.max(-1, keepdims=True)
+    weight = np.maximum(fits - 0.9 * top, 0)
+    total = np.where(top[..., 0] > 0, weight.sum(-1), np.nan)
+    found: Floats = weight @ np.arange(fits.shape[-1]) / total
     return found
 
 
-def _onsets(responses: Floats) -> Floats:
-    """Where counts (n, steps) first reach half of their most, over what comes always: a quartile."""
-    ordered = np.sort(responses, axis=1)
-    half = (ordered[:, ordered.shape[1] // 4] + ordered[:, -1]) / 2
-    k = (responses >= half[:, None]).argmax(1)
-    rows = np.arange(len(responses))
-    reached, below = responses[rows, k], np.where(k > 0, responses[rows, k - 1], 0.0)
-    rises = reached > below
-    found: Floats = k - 0.5 + rises * (half - below) / np.where(rises, reached - below, 1.0)
-    return found
+def _onset(response: list[float]) -> float:
+    """Where counts first reach half of their most, over what comes always: a quartile."""
+    ordered = sorted(response)
+    half = (ordered[len(ordered) // 4] + ordered[-1]) / 2
+    at, reached = next((at, count) for at, count in enumerate(response) if count >= half)
+    below = response[at - 1] if at else 0.0
+    return at - 0.5 + ((half - below) / (reached - below) if reached > below else 0.0)
 
 
-def _jackknife(found: Floats) -> tuple[float, float]:
+def _jackknife(found: list[float]) -> tuple[float, float]:
     """What was found of all, and its variance by what was found without each; NaN of these says nothing."""
-    whole, *without = found.tolist()
+    whole, *without = found
     many, total, squares = 0, 0.0, 0.0
     for value in without:
         if value == value:
