@@ -676,11 +676,11 @@ def core_profile(
             if abs(places[other] - places[k]) <= 1.5 * spacing:
                 near[k, many[k]] = other
                 many[k] += 1
-    every = np.zeros((rows, columns))
+    every = np.zeros(rows * columns)
     for k in range(places.size):
-        for r in range(rows):
-            for c in range(columns):
-                every[r, c] += probability[k, r, c]
+        cells_of = np.ascontiguousarray(probability[k]).reshape(-1)
+        for j in range(every.size):
+            every[j] += cells_of[j]
     half = spacing / 2 + grid
     wide, high = _strip(unit, half, float(hits.size))
     for k in range(places.size):
@@ -695,7 +695,7 @@ def core_profile(
                 if share > 0 and abs(off.imag) < hits.size:
                     i = int(abs(off.imag))
                     cells[i] += share * share
-                    far = every[r, c]
+                    far = every[r * columns + c]
                     for i_near in range(many[k]):
                         far -= probability[near[k, i_near], r, c]
                     hits[i] += share * probability[k, r, c] - share * share * far

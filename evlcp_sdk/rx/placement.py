@@ -95,16 +95,8 @@ class Placement:
         return known[1]
 
 
-@dataclass(frozen=True, eq=False)
-class _Blobs:
-    """Connected cells of one cluster: centre in px, cluster, number of cells."""
-
-    at: NDArray[np.complex128]
-    cluster: NDArray[np.int64]
-    cells: NDArray[np.int64]
-
-    def __getitem__(self, rows: NDArray[np.int64]) -> "_Blobs":
-        return _Blobs(self.at[rows], self.cluster[rows], self.cells[rows])
+_Blobs = tuple[NDArray[np.complex128], NDArray[np.int64], NDArray[np.int64]]
+"""Of connected cells of one cluster: centre in px, cluster, number of cells."""
 
 
 def layout_of(centres_m: NDArray[np.float64]) -> Layout:
@@ -148,15 +140,12 @@ def placements(
     """
     blobs = _blobs_of(presence)
     clusters = len(layout.at_m)
-    if not len(blobs.at):
+    at, _, many = blobs
+    if not len(at):
         return []
     if clusters == 1:
-        share = blobs.cells / blobs.cells.sum()
-        return [
-            Placement(
-                0j, complex(share @ blobs.at), False, np.ones(1, np.bool_), float(blobs.cells.sum()), 1.0
-            )
-        ]
+        total = float(many.sum())
+        return [Placement(0j, complex(many / total @ at), False, np.ones(1, np.bool_), total, 1.0)]
     slack_px = presence.grid_px / 2
     found: list[Placement] = []
     while len(found) < _MOST:
@@ -178,8 +167,9 @@ def placements(
         if cells < _OTHER_CELLS * found[0].cells:
             break
         # What a placement has not used up, neither in its clusters' places nor elsewhere in the bar.
-        off = np.abs(blobs.at[:, None] - best.places(layout))
-        blobs = blobs[np.flatnonzero(off.min(1) > _reach(best.scale, layout, slack_px))]
+        at, cluster, many = blobs
+        off = np.abs(at[:, None] - best.places(layout)).min(1) > _reach(best.scale, layout, slack_px)
+        blobs = at[off], cluster[off], many[off]
     return found
 
 
@@ -240,7 +230,7 @@ def lit(
     usual = median(in_place, len(in_place)) if len(in_place) else 0.0
     seen = light >= max(_LEAST_LIGHT * usual, 1e-9)
     placement = changed(placement, seen=seen)
-    if seen.all():
+    if False not in seen.tolist():
         return presence, placement
     return without(presence, ~seen), placement
 
@@ -264,7 +254,7 @@ def _blobs_of(presence: PresenceMap) -> _Blobs:
     most = int(np.count_nonzero(selected))
     at, cluster, cells = np.empty(most, np.complex128), np.empty(most, np.int64), np.empty(most, np.int64)
     n = _kernels.blobs(selected, presence.grid_px, at, cluster, cells)
-    return _Blobs(at[:n], cluster[:n], cells[:n])
+    return at[:n], cluster[:n], cells[:n]
 
 
 def _voted(
@@ -276,11 +266,10 @@ def _voted(
     for mirrored in ways if before is None or layout.line else (before.mirrored,):
         at_m = _turned(layout, mirrored)
         scale = 0j if before is None else before.scale
-        seen, place = (blobs.at, blobs.cluster, blobs.cells), (at_m, layout.spacing_m, slack_px)
-        proposers = min(len(blobs.at), _PROPOSERS)
-        score, s, shift = _kernels.best_similarity(seen, proposers, *place, _LEAST_SPACING_PX, scale)
+        place, proposers = (at_m, layout.spacing_m, slack_px), min(len(blobs[0]), _PROPOSERS)
+        score, s, shift = _kernels.best_similarity(blobs, proposers, *place, _LEAST_SPACING_PX, scale)
         if score > 0:
-            s, shift = _kernels.refined_similarity(seen, *place, scale, s, shift)
+            s, shift = _kernels.refined_similarity(blobs, *place, scale, s, shift)
         if score > best_score * (_MIRRORED if mirrored else 1):
             best_score, best = score, (s, shift, mirrored)
     if best is None:
@@ -303,9 +292,7 @@ def _judged(
     places = scale * _turned(layout, mirrored) + shift
     spacing_px, reach = abs(scale) * layout.spacing_m, _reach(scale, layout, slack_px)
     seen = np.empty(clusters, np.bool_)
-    shown, many, cells, left = _kernels.cells_by_place(
-        blobs.at, blobs.cluster, blobs.cells, places, reach, spacing_px / 2, seen
-    )
+    shown, many, cells, left = _kernels.cells_by_place(*blobs, places, reach, spacing_px / 2, seen)
     # Where clusters are small, a cell stands in the place of two.
     odds = min(1.0, (2 * reach / spacing_px) ** (1 if layout.line else 2) / clusters)
     # As many similarities could have been proposed as there are choices of the clusters that fix one.

@@ -71,11 +71,11 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
         flank_px = _kernels.seek_clusters(
             presence.pixels, placement.seen, places, reach_px, heard, edges, line, points
         )
-        unseen = np.isnan(points[:, 0])
-        seen = clusters - int(np.count_nonzero(unseen))
+        # 1 of those with a boundary on one side only, NaN of those unseen.
+        ends, mean = 0 * points[:, 0], points.copy()
+        seen = clusters - int(np.count_nonzero(np.isnan(ends)))
         if seen < 3:
             return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan
-        ends, mean = np.where(unseen, np.nan, 0.0), points.copy()
         for axis, way in ways:
             _kernels.meet_neighbours(
                 mean, places, neighbours[axis], (unit * way, reach_px), (heard, edges, every), points, ends

@@ -308,15 +308,15 @@ def sum_worth(
     for pair in range(worth.size):
         ratio = np.exp(min(max(worth[pair], -50.0), 50.0))
         unlike[0, pair], unlike[1, pair] = (1 + ratio) / 2, (1 + 1 / ratio) / 2
-    top = np.zeros((rows, columns), probability.dtype)
+    top = np.zeros(rows * columns, probability.dtype)
     for k in range(clusters):
-        for r in range(rows):
-            for c in range(columns):
-                top[r, c] = max(top[r, c], probability[k, r, c])
+        cells = probability[k].reshape(-1)
+        for j in range(cells.size):
+            top[j] = max(top[j], cells[j])
     which, values = np.empty(clusters, np.int64), np.empty(length)
     for r in range(rows):
         for c in range(columns):
-            if top[r, c] < least:
+            if top[r * columns + c] < least:
                 continue
             n = 0
             for k in range(clusters):
