@@ -5,7 +5,8 @@
 Each command runs in a process of its own, and all its children count, orphans, too. Bytecode is kept, as that
 of an installed package is; an interpreter that does nothing stands beside. Warm: the kernels are kept by an
 earlier run. Cold: none are; tried once, as it takes long; `--warm` leaves it out. The first event: a
-recording that has no other, and its result. Printed are the least time and the median.
+recording that has no other, and its result. Printed are the least time and the median. Numba and NumPy
+import what they find of coverage, cffi, PyYAML and charset-normalizer: without, a start takes .06 s less.
 """
 
 import argparse
