@@ -278,6 +278,7 @@ def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) ->
     out_t, out_x, out_y, out_p = out
     left, top = np.uint16(box[0]), np.uint16(box[1])
     width, height = np.uint16(box[2] - box[0]), np.uint16(box[3] - box[1])
+    which = np.empty(_BLOCK + 1, np.uint8)
     n = np.uint64(0)
     size = t_us.size
     whole = size - size % _BLOCK
@@ -297,13 +298,19 @@ def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) ->
                 out_p[n + np.uint64(i)] = p[first + i]
             n += np.uint64(_BLOCK)
         elif many:
-            for i in range(first, first + _BLOCK):
-                # Written always, kept if inside: between two bars, a branch would be a coin toss.
+            # Which is written always, kept if inside: between two bars, a branch would be a coin toss.
+            k = np.uint64(0)
+            for i in range(_BLOCK):
+                which[k] = i
+                u, v = np.uint16(x[first + i] - left), np.uint16(y[first + i] - top)
+                k += np.uint64(u < width) & np.uint64(v < height)
+            for j in range(many):
+                i = first + which[j]
                 out_t[n] = t_us[i]
                 out_x[n] = x[i]
                 out_y[n] = y[i]
                 out_p[n] = p[i]
-                n += np.uint64(np.uint16(x[i] - left) < width) & np.uint64(np.uint16(y[i] - top) < height)
+                n += np.uint64(1)
     for i in range(whole, size):
         out_t[n] = t_us[i]
         out_x[n] = x[i]
