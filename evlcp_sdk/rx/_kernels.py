@@ -151,14 +151,14 @@ def measure_box(
     """
     now, span, min_score = awake
     left, top, right, bottom = box
-    # Many pixels at a time: all of them first, then what they say.
     blinks, counts = np.empty((bottom - top, right - left), np.uint8), np.zeros(right - left, np.int32)
     for v in range(top, bottom):
         line, row = pixels[v, left:right], blinks[v - top]
+        # Many pixels at a time, in one loop: rows are short.
         for u in range(line.size):
-            row[u] = _blinks(line[u], now, span, min_score)
-        for u in range(line.size):
-            counts[u] += np.int32(row[u])
+            blink = _blinks(line[u], now, span, min_score)
+            row[u] = blink
+            counts[u] += np.int32(blink)
     columns, first_column, last_column = np.empty(counts.size), right, left
     for u in range(left, right):
         columns[u - left] = counts[u - left]
