@@ -12,7 +12,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
-from evlcp_poc.correlation import phase_only_correlation
+from evlcp_poc.correlation import full_band, phase_only_correlation
 from matplotlib import pyplot as plt
 from matplotlib.figure import Figure
 
@@ -238,7 +238,9 @@ def distance(r: Recording) -> Figure:
     """Phase-only correlation of two clusters, and errors of two rangings beside their bound."""
     maps = r.view.presence.pixels
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
-    peak = phase_only_correlation(maps, np.array([2]), np.array([13]))[0]
+    shifts = [range(size) for size in maps.shape[1:]]
+    band = full_band(*maps.shape[1:])
+    peak = phase_only_correlation(maps, np.array([2]), np.array([13]), band, *shifts)[0]
     left.plot(peak.max(1), ".-", color=INK, lw=0.8, ms=3)
     left.set(xlabel="shift down, px", ylabel="correlation")
     titled(left, "Phase-only correlation, clusters 2 and 13")

@@ -680,8 +680,8 @@ def fit_bar(
         for i in range(n):
             of_pilot = i < pilots.shape[1]
             codes[k, i] = pilots[k, i] if of_pilot else words[symbols[k], i - pilots.shape[1]]
-            if k and seen[k - 1] and seen[k]:
-                known[k, i] = of_pilot or min(symbols[k - 1], symbols[k]) >= 0
+            read = of_pilot | (min(symbols[k - 1], symbols[k]) >= 0)
+            known[k, i] = (k > 0) & seen[k - 1] & seen[k] & read
     motion = np.empty((2, n))
     for i in range(n):
         # A value is read from its second chip, whose events follow the edge at its start, half a chip before

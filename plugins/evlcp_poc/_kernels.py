@@ -44,39 +44,32 @@ def find_middles(maps: Array, min_pixels: int, out: Array) -> None:
 
 @njit
 def fit_peaks(
-    correlation: Array,
-    size: tuple[int, int],
-    most: tuple[int, int],
-    far: tuple[int, int],
-    samples: int,
-    shifts: Array,
+    correlation: Array, size: tuple[int, int], most: tuple[int, int], samples: int, shifts: Array
 ) -> None:
-    """Peaks of correlations, `shifts` (pairs, 2): down and right, px, within `far` of none.
+    """Peaks of correlations (pairs, 2 n + 1, 2 m + 1), `shifts` (pairs, 2): down and right of the middle, px.
 
-    Of `correlation`, (pairs, rows, columns), rows begin `samples` before those that a peak may be in. The row
-    and the column of a peak, so many samples to each side, are fitted (least squares) by the Dirichlet kernel
-    of their band: the sum of 2 `most` + 1 harmonics out of `size`. The gain that fits best follows from the
-    shift, so Gauss-Newton steps run over the shift alone (variable projection). The sines of the samples
-    follow from those of the first by rotation.
+    A peak is sought where there are so many `samples` to each side; these, of its row and its column, are
+    fitted (least squares) by the Dirichlet kernel of their band: the sum of 2 `most` + 1 harmonics out of
+    `size`. The gain that fits best follows from the shift, so Gauss-Newton steps run over the shift alone
+    (variable projection). The sines of the samples follow from those of the first by rotation.
     """
-    many, zero, seen = 2 * samples + 1, far[0] + samples, np.empty(2 * samples + 1)
-    peaks = np.zeros((len(correlation), 2), np.int64)
-    for q in range(len(correlation)):
-        # No shift comes first: where nothing is seen, all are alike.
-        for a in range(2 * far[0] + 1):
-            for b in range(2 * far[1] + 1):
-                v = a if a <= far[0] else a - 2 * far[0] - 1
-                u = b if b <= far[1] else b - 2 * far[1] - 1
-                if correlation[q, zero + v, u] > correlation[q, zero + peaks[q, 0], peaks[q, 1]]:
+    pairs, rows, columns = correlation.shape
+    v0, u0, many, seen = rows // 2, columns // 2, 2 * samples + 1, np.empty(2 * samples + 1)
+    peaks = np.empty((pairs, 2), np.int64)
+    for q in range(pairs):
+        # Where nothing is seen, all are alike, and there is no shift.
+        peaks[q, 0], peaks[q, 1] = v0, u0
+        for v in range(samples, rows - samples):
+            for u in range(samples, columns - samples):
+                if correlation[q, v, u] > correlation[q, peaks[q, 0], peaks[q, 1]]:
                     peaks[q, 0], peaks[q, 1] = v, u
     for axis in range(2):
         turn, band = np.pi / size[axis], 2 * most[axis] + 1
         ds, dc, dsb, dcb = np.sin(turn), np.cos(turn), np.sin(band * turn), np.cos(band * turn)
-        for q in range(len(correlation)):
-            for i in range(many):
-                v, u = zero + peaks[q, 0], peaks[q, 1]
-                v, u = (v, (u + i - samples) % size[1]) if axis else (v + i - samples, u)
-                seen[i] = correlation[q, v, u]
+        for q in range(pairs):
+            v, u = peaks[q, 0], peaks[q, 1]
+            for i in range(-samples, samples + 1):
+                seen[samples + i] = correlation[q, v, u + i] if axis else correlation[q, v + i, u]
             left, middle, right = seen[samples - 1], seen[samples], seen[samples + 1]
             # For a kernel between two samples, the neighbours' ratio is that of their distances.
             side = right if right > left else left
@@ -109,4 +102,4 @@ def fit_peaks(
                 # Steps shrink quadratically: the next one would be some 1e-6 px.
                 if abs(move) < 1e-3:
                     break
-            shifts[q, axis] = peaks[q, axis] + shift
+            shifts[q, axis] = (u - u0 if axis else v - v0) + shift

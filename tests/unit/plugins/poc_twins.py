@@ -40,6 +40,14 @@ def shifted(spectrum, shape, down, right):
     return np.fft.irfft2(spectrum * np.exp(-2j * np.pi * (down * v + right * u)), shape).astype(np.float32)
 
 
+def correlation(one, other, down, across):
+    """Of the phases of whole spectra, in double precision."""
+    spectra = np.fft.rfft2(one.astype(float)).conj() * np.fft.rfft2(other.astype(float))
+    spectra[:, down + 1 : one.shape[1] - down] = spectra[:, :, across + 1 :] = 0
+    size = np.abs(spectra)
+    return np.fft.irfft2(np.divide(spectra, size, out=0 * spectra, where=size > 0), one.shape[1:])
+
+
 def middle(image, min_pixels):
     """Weighted median (row, column): every lit pixel at its place, as often as it weighs."""
     if (image > 0).sum() < min_pixels:

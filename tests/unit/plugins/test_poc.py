@@ -35,10 +35,10 @@ SHAPES = [(24, 20), (25, 21), (16, 17), (48, 40)]
 def fit_peak(samples, size, band):
     """By samples of a row about no shift, and the same of a column."""
     half = len(samples) // 2
-    correlation, shifts = np.zeros((2, 2 * half + 1, size), np.float32), np.empty((2, 2))
-    correlation[0, half, np.arange(-half, half + 1)] = samples
-    correlation[1, :, 0] = samples
-    _kernels.fit_peaks(correlation, (size, size), (band // 2, band // 2), (0, 0), half, shifts)
+    correlation, shifts = np.zeros((2, len(samples), len(samples)), np.float32), np.empty((2, 2))
+    correlation[0, half] = samples
+    correlation[1, :, half] = samples
+    _kernels.fit_peaks(correlation, (size, size), (band // 2, band // 2), half, shifts)
     assert shifts[0, 1] == shifts[1, 0]
     return shifts[0, 1]
 
@@ -62,7 +62,8 @@ def test_no_peak_is_no_shift(samples):
 def test_what_has_no_phase_counts_for_nothing():
     images = np.ones((2, 6, 8), np.float32)
     images[1] = 0
-    found = phase_only_correlation(images, np.array([0, 0]), np.array([0, 1]))
+    first, second = np.array([0, 0]), np.array([0, 1])
+    found = phase_only_correlation(images, first, second, full_band(6, 8), range(6), range(8))
     # Of an even image, the mean alone.
     assert_allclose(found[0], 1 / 48, rtol=1e-6)
     assert not found[1].any()
@@ -101,10 +102,11 @@ def test_exact_shifts_are_recovered(samples, shape, most):
     first, second = np.triu_indices(len(by), 1)
     near = np.abs(by[second] - by[first]).max(1) < 5
     first, second = first[near], second[near]
-    shifts = pair_shifts(images, first, second, most or full_band(*shape), 5, samples)
-    if most is None:
-        whole, rows = phase_only_correlation(images, first, second), np.array([3, -1])
-        assert_array_equal(phase_only_correlation(images, first, second, None, rows), whole[:, rows])
+    most_of_all = most or full_band(*shape)
+    shifts = pair_shifts(images, first, second, most_of_all, 5, samples)
+    correlation = phase_only_correlation(images, first, second, most_of_all, range(-3, 5), range(-2, 2))
+    want = twins.correlation(images[first], images[second], *most_of_all)
+    assert_allclose(correlation, want[:, np.arange(-3, 5)[:, None], np.arange(-2, 2)], atol=2e-6)
     # The images are float32: 3e-7 px were seen with the full band. The less band, the flatter the peak, and
     # the last step, below 1e-3 px, leaves more.
     assert_allclose(shifts, by[second] - by[first], atol=2e-6 if most is None else 2e-5)
