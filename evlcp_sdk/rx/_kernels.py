@@ -96,6 +96,10 @@ def score_rises(
         where[n] = np.uint32(y[i]) * width + np.uint32(x[i])
         runs[n] = np.uint32(np.uint64(t_us[i]) >> ticks)
         n += np.uint64(p[i])
+    # All states are fetched before one is changed, many at a time: those of noise may be far away.
+    fetched = np.empty(n, np.uint32)
+    for i in range(n):
+        fetched[i] = states[where[i]]
     new = np.uint64(0)
     for i in range(n):
         at, tick = where[i], runs[i]
