@@ -199,15 +199,6 @@ class Places:
         other._set_before()
         return other
 
-    def expected(self, t_us: float) -> tuple[float, float]:
-        """Centre (column, row) at a time soon, if it goes on as between the two newest, px."""
-        last, before = self.latest, self.before
-        if before is last:
-            return last.x_px, last.y_px
-        # Further ahead than that, a shaking camera has turned back.
-        ahead = min((t_us - last.t_us) / (last.t_us - before.t_us), 1.0)
-        return last.x_px + ahead * (last.x_px - before.x_px), last.y_px + ahead * (last.y_px - before.y_px)
-
     def at(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
         """Centre (column, row) at times, float64 (2, n), px: interpolated, straight on for a little."""
         centre = np.empty((2, len(t_us)))
@@ -892,10 +883,17 @@ class RegionFollower(RegionTracker):
                 followed.positions.take_back()
 
     def _expected(self, followed: Followed, t_us: float) -> tuple[float, float]:
-        """Where a region's centre should be soon: by its filter, or else straight on."""
-        if self._position is None or (expected := self._position.predict(followed.filter, t_us)) is None:
-            return followed.positions.expected(t_us)
-        return float(expected[0][0]), float(expected[0][1])
+        """Centre (column, row) of a region soon, px: by its filter, or as between its two newest places."""
+        if self._position is not None:
+            predicted = self._position.predict(followed.filter, t_us)
+            if predicted is not None:
+                return float(predicted[0][0]), float(predicted[0][1])
+        last, before = followed.positions.latest, followed.positions.before
+        if before is last:
+            return last.x_px, last.y_px
+        # Further ahead than that, a shaking camera has turned back.
+        ahead = min((t_us - last.t_us) / (last.t_us - before.t_us), 1.0)
+        return last.x_px + ahead * (last.x_px - before.x_px), last.y_px + ahead * (last.y_px - before.y_px)
 
     def _whole(
         self, followed: Followed, t_us: float, place: Place, top: int, rows: NDArray[np.int64]
