@@ -732,8 +732,12 @@ def core_profile(
 
 
 @njit
-def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, out: Array) -> None:
+def pilot_light(
+    sums: Array, codes: Array, every: int, prior: Array, grid: int, seen: Array, out: Array
+) -> float:
     """How far the pixels in each cluster's place follow its pilot, -1 to 1, `out` (K,); 0 without a place.
+
+    It returns the median of those that are `seen` (K,); 0 without any.
 
     `codes` are edges, (K, n), `every` so many chips. A pixel's value is the sign of the sum of the chip
     behind one, or 0; where edges are in the middle of pairs, else the opposite of that of the chip before.
@@ -780,6 +784,12 @@ def pilot_light(sums: Array, codes: Array, every: int, prior: Array, grid: int, 
                         both += agree[v * width + u]
                 total += weight * both
         out[k] = total / (edges * place) if place > 0 else 0.0
+    among, many = np.empty(clusters), 0
+    for k in range(clusters):
+        if seen[k]:
+            among[many] = out[k]
+            many += 1
+    return median(among, many) if many else 0.0
 
 
 @njit

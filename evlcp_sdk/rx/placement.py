@@ -6,7 +6,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk._kernels import median
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.values import PresenceMap, changed
 
@@ -225,9 +224,7 @@ def lit(
     if presence.prior is None:
         return presence, placement
     light = np.empty(len(edges))
-    _kernels.pilot_light(sums, edges, every, presence.prior, presence.grid_px, light)
-    in_place = light[placement.seen]
-    usual = median(in_place, len(in_place)) if len(in_place) else 0.0
+    usual = _kernels.pilot_light(sums, edges, every, presence.prior, presence.grid_px, placement.seen, light)
     seen = light >= max(_LEAST_LIGHT * usual, 1e-9)
     placement = changed(placement, seen=seen)
     if False not in seen.tolist():

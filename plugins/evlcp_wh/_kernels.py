@@ -151,14 +151,16 @@ def weighted_values(sums: Array, probability: Array, grid: int, least: float, ou
     _, height, width = sums.shape
     flat = sums.reshape(-1, height * width)
     by_pixel, values = np.empty((length, height * width), np.int8), np.empty(length, np.int64)
+    top = np.zeros(rows * columns, probability.dtype)
+    for k in range(clusters):
+        cells = probability[k].reshape(-1)
+        for j in range(cells.size):
+            top[j] = max(top[j], cells[j])
     for i in range(length):
         _values(flat[2 * i], flat[2 * i + 1], by_pixel[i])
     for r in range(rows):
         for c in range(columns):
-            top = probability[0, r, c]
-            for k in range(1, clusters):
-                top = max(top, probability[k, r, c])
-            if top < least:
+            if top[r * columns + c] < least:
                 continue
             for i in range(length):
                 values[i] = 0
@@ -235,12 +237,12 @@ def learn_worth(
 
     Args:
         sums: Polarity sums, int16 (chips, height, width).
-        most: They are clipped to -most to most.
+        most: They are clipped to -most to most; 7 at the most.
         signs: Whether the pilots' values are +1, uint64 (K, values).
         probability: Of each cluster in each cell, (K, rows, columns).
         grid: Side of a cell.
         prior: Observations added.
-        pairs: Takes the pair of each value in each pixel, uint16 (values, pixels).
+        pairs: Takes the pair of each value in each pixel, uint8 (values, pixels).
         out: Takes the log ratios.
     """
     clusters, known = signs.shape
@@ -252,7 +254,7 @@ def learn_worth(
         for j in range(size):
             a = np.int16(min(max(flat[2 * i, j], low), high) - low)
             b = np.int16(min(max(flat[2 * i + 1, j], low), high) - low)
-            pairs[i, j] = np.uint16(np.int16(a * side) + b)
+            pairs[i, j] = np.uint8(np.int16(a * side) + b)
     counts, total, more = np.zeros((2, out.size)), np.zeros(2), np.empty(2)
     for k in range(clusters):
         for r in range(rows):

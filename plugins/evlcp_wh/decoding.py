@@ -114,7 +114,7 @@ class LearnedDecoder:
 
     def decode(
         self, presence: PresenceMap, sums: NDArray[np.int16]
-    ) -> tuple[SoftSymbols, float, NDArray[np.uint16], NDArray[np.float64]]:
+    ) -> tuple[SoftSymbols, float, NDArray[np.uint8], NDArray[np.float64]]:
         """The likeliest codewords by what all pixels that show a cluster say.
 
         Args:
@@ -123,10 +123,10 @@ class LearnedDecoder:
 
         Returns:
             The symbols; the least size of an LLR; the pair of its chips' polarity sums of -n to n events that
-            each value has in each pixel, uint16 (values, pixels), (first + n) * (2 n + 1) + second + n; and
+            each value has in each pixel, uint8 (values, pixels), (first + n) * (2 n + 1) + second + n; and
             the log-likelihood ratio of a value of +1 against -1 by its pair, float64 ((2 n + 1)^2,).
         """
-        pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
+        pairs = np.empty((len(sums) // 2, sums[0].size), np.uint8)
         seen, width, grid = plain(presence.probability), sums.shape[2], presence.grid_px
         worth = np.empty((2 * MAX_EVENTS + 1) ** 2)
         _kernels.learn_worth(plain(sums), MAX_EVENTS, self._signs, seen, grid, _PRIOR_COUNT, pairs, worth)

@@ -106,7 +106,7 @@ class MotionFeedback(Decoding):
 
 
 def match_shifts(
-    presence: PresenceMap, pairs: NDArray[np.uint16], worth: NDArray[np.float64], reach_px: int
+    presence: PresenceMap, pairs: NDArray[np.uint8], worth: NDArray[np.float64], reach_px: int
 ) -> NDArray[np.float32]:
     """Log-likelihood ratio of each value of each cluster, by the shift of the bar from its place.
 

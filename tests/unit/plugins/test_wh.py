@@ -126,7 +126,7 @@ def test_worth_is_learned_and_summed(seed, grid, most, prior):
     probability = rng.dirichlet(np.full(CLUSTERS + 1, 0.1), (13 // grid, 10 // grid)).T[:-1].swapaxes(1, 2)
     probability = np.ascontiguousarray(probability, np.float32)
     assert ((probability > 0.5).sum((1, 2)) > 0).any()
-    pairs, signs, worth = np.empty((14, 130), np.uint16), signs_of(CODES), np.empty((2 * most + 1) ** 2)
+    pairs, signs, worth = np.empty((14, 130), np.uint8), signs_of(CODES), np.empty((2 * most + 1) ** 2)
     _kernels.learn_worth(sums, most, signs, probability, grid, prior, pairs, worth)
     counts = twins.count_pairs(sums[:16], CODES, probability, grid, most, 0.0)
     worth = worth.reshape(counts.shape[1:])
@@ -146,7 +146,7 @@ def test_a_pilot_of_one_value_says_of_the_other_the_same_with_signs_changed(valu
     known = int(value > 0)
     assert not counts[1 - known].any()
     counts[1 - known] = counts[known, ::-1, ::-1]
-    pairs = np.empty((len(sums) // 2, sums[0].size), np.uint16)
+    pairs = np.empty((len(sums) // 2, sums[0].size), np.uint8)
     _kernels.learn_worth(sums, 3, signs_of(codes), cells, 2, 1.0, pairs, worth)
     assert_allclose(worth.reshape(7, 7), twins.log_ratio(counts, 1.0), rtol=1e-9, atol=1e-12)
 

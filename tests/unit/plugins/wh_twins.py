@@ -98,9 +98,9 @@ def worth_of(sums, worth):
 
 
 def pairs_of(sums, most):
-    """The pair of sums of each value in each pixel, as one number, uint16 (values, pixels)."""
+    """The pair of sums of each value in each pixel, as one number, uint8 (values, pixels)."""
     clipped = np.clip(sums.astype(int), -most, most) + most
-    return (clipped[::2] * (2 * most + 1) + clipped[1::2]).reshape(len(sums) // 2, -1).astype(np.uint16)
+    return (clipped[::2] * (2 * most + 1) + clipped[1::2]).reshape(len(sums) // 2, -1).astype(np.uint8)
 
 
 def sum_worth(sums, codes, probability, grid, least, worth, share):
