@@ -39,7 +39,9 @@ def seen_pairs(
     return taken(every, far_pairs(every, lit, 0.5)), taken(pairs, far_pairs(pairs, inner, share))
 
 
-def pairs_in_place(middles: Indices, wide: Pairs, far: Pairs, neighbour_m: float) -> tuple[float, Pairs]:
+def pairs_in_place(
+    middles: Indices, wide: Pairs, far: Pairs, neighbour_m: float
+) -> tuple[float, Pairs, Indices]:
     """The scale of all clusters, px a metre, 0 where none shows it, and the pairs that lie where it has them.
 
     Args:
@@ -47,25 +49,23 @@ def pairs_in_place(middles: Indices, wide: Pairs, far: Pairs, neighbour_m: float
         wide: Pairs whose median is the scale.
         far: Pairs to choose from.
         neighbour_m: Spacing of neighbours, by how much a pair may be out of place.
+
+    Returns:
+        Them, and what lies between the middles of each pair, int64 (pairs, 2).
     """
+    between = middles[far[1]] - middles[far[0]]
     if not len(wide[0]):
-        return 0.0, wide
-    scale = _quantile(np.sort(_lengths(middles, wide) / wide[2]).tolist(), 0.5)
-    off_px = np.abs(_lengths(middles, far) - scale * far[2])
-    return scale, taken(far, off_px <= scale * neighbour_m)
+        return 0.0, far, between
+    lengths = np.hypot(*(middles[wide[1]] - middles[wide[0]]).T)
+    scale = _quantile(np.sort(lengths / wide[2]).tolist(), 0.5)
+    near = np.abs(np.hypot(*between.T) - scale * far[2]) <= scale * neighbour_m
+    return (scale, far, between) if near.all() else (scale, taken(far, near), between[near])
 
 
 def taken(pairs: Pairs, which: NDArray[np.bool_]) -> Pairs:
     """Some of the pairs."""
     first, second, apart_m = pairs
     return first[which], second[which], apart_m[which]
-
-
-def _lengths(middles: Indices, pairs: Pairs) -> Floats:
-    """Distances between middles, px."""
-    down, right = (middles[pairs[1]] - middles[pairs[0]]).T
-    found: Floats = np.hypot(down, right)
-    return found
 
 
 def _quantile(ordered: list[float], share: float) -> float:

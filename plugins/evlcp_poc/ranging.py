@@ -138,7 +138,7 @@ class PocRanging(Ranging):
             maps, middles = plain(view.presence.pixels), np.empty((bar.clusters, 2), np.int64)
             _kernels.find_middles(maps, self.min_pixels, middles)
             wide, far = known_pairs((middles[:, 0] >= 0).tobytes())
-            px_per_m, (first, second, apart_m) = pairs_in_place(middles, wide, far, neighbour)
+            px_per_m, (first, second, apart_m), between = pairs_in_place(middles, wide, far, neighbour)
             if len(first) < least or px_per_m <= 0:
                 return _NONE
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
@@ -150,8 +150,7 @@ class PocRanging(Ranging):
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
             reach = max(int(neighbour_px / 2), 2)
             beyond_px = pair_shifts(cuts, first, second, most, reach, self.peak_samples)
-            down, right = (middles[second] - middles[first] + beyond_px).T
-            length_px = np.hypot(down, right)
+            length_px = np.hypot(*(between + beyond_px).T)
             distance_m = camera.focal_px * apart_m / np.maximum(length_px, 1e-9)
             weights = apart_m**self.weight_power
             mean, sigma, kept = robust_mean(
