@@ -415,8 +415,9 @@ def find_path(matches: Array, known: Array, step_cost: float, place_cost: float,
                 for b in range(side):
                     top[b] = best[0, b] - steps[a, 0]
                 for c in range(1, side):
+                    other, step = best[c], steps[a, c]
                     for b in range(side):
-                        value = best[c, b] - steps[a, c]
+                        value = other[b] - step
                         came[b] = c if value > top[b] else came[b]
                         top[b] = max(top[b], value)
                 for b in range(side):
