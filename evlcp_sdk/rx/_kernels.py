@@ -332,16 +332,20 @@ _LOWEST = np.array([MOST_BOXES, *((n & -n).bit_length() - 1 for n in range(1, 1 
 
 
 @njit
-def select_boxes(events: Columns, boxes: Array, size: tuple[int, int], apart: int, out: Columns) -> Array:
+def select_boxes(
+    events: Columns, boxes: Array, pixels: Array, rhythmic: tuple[int, int, int], apart: int, out: Columns
+) -> Array:
     """Copy the events inside each of some boxes (n, 4), `MOST_BOXES` at the most; how many, (n,).
 
     Of each box, they begin `apart` events behind where those of the one before do; behind all is room for one
-    more. `size` are the columns and rows of the sensor.
+    more. `rhythmic` are (boxes of which only those in rhythm are meant, a bit each; the least score of
+    their pixels; how often, or more, the same time must not have come again).
     """
     t_us, x, y, p = events
     out_t, out_x, out_y, out_p = out
     # By a column's bits and a row's, boxes are found in the same time however many they are.
-    columns, rows = np.zeros(size[0], np.uint8), np.zeros(size[1], np.uint8)
+    columns, rows = np.zeros(pixels.shape[1], np.uint8), np.zeros(pixels.shape[0], np.uint8)
+    filtered, least, most_same = np.uint8(rhythmic[0]), np.uint32(rhythmic[1]), np.uint32(rhythmic[2])
     for k in range(len(boxes)):
         left, top, right, bottom = boxes[k]
         for u in range(left, right):
@@ -351,6 +355,11 @@ def select_boxes(events: Columns, boxes: Array, size: tuple[int, int], apart: in
     ends = np.arange(MOST_BOXES + 1) * apart
     for i in range(t_us.size):
         inside = columns[x[i]] & rows[y[i]]
+        if inside & filtered:
+            state = pixels[y[i], x[i]]
+            same = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
+            is_rhythmic = ((state & np.uint32(SCORES)) >= least) & (same < most_same)
+            inside = inside if is_rhythmic else np.uint8(inside & ~filtered)
         while True:
             # Written always, kept if inside; of two boxes that overlap, in both.
             box = _LOWEST[inside]

@@ -452,6 +452,7 @@ class Rhythm:
         self._seen: int | None = None
         self._open_us, self._taken, self._rises = -1, 0, 0
         self._shared = shared
+        self._apart = -1
         self._kept: tuple[tuple[int, int], int, NDArray[np.int16]] | None = None
 
     def step(self, start_us: int, events: Events, hits: NDArray[np.int16], cell_shift: int) -> int:
@@ -487,27 +488,51 @@ class Rhythm:
             self._kept = (start_us, len(events)), self._rises, hits.copy()
         return self._rises
 
-    def of(self, events: Events) -> Events:
-        """Those of candidates that are no lamps.
+    def select(
+        self, events: Events, boxes: Sequence[Box], rhythmic: Sequence[bool], most_same: int = LAMP
+    ) -> list[Events]:
+        """Those inside each of some boxes (left, top, right, bottom), copied.
 
         Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
         all of it.
+
+        Args:
+            events: Those of a step.
+            boxes: Which boxes.
+            rhythmic: Of which of them only those of candidates are meant that are no lamps.
+            most_same: How often a candidate's time must not have come again.
         """
-        return events[self._rhythmic(events, LAMP)]
+        most = _kernels.MOST_BOXES
+        if len(boxes) > most:
+            first = self.select(events, boxes[:most], rhythmic[:most], most_same)
+            return first + self.select(events, boxes[most:], rhythmic[most:], most_same)
+        if events.t_us.size > self._apart:
+            self._apart = events.t_us.size + events.t_us.size // 4
+            room = most * self._apart + 1
+            into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
+            self._columns: _kernels.Columns = into
+        columns, apart = (events.t_us, events.x, events.y, events.p), self._apart
+        if len(boxes) == 1 and not rhythmic[0]:
+            # Of a bar alone, whole blocks of events.
+            ends = [_kernels.select_box(columns, boxes[0], self._columns)]
+        else:
+            filtered = sum(one << k for k, one in enumerate(rhythmic)), self._min_score, most_same
+            ends = _kernels.select_boxes(
+                columns, np.array(boxes), self._pixels, filtered, apart, self._columns
+            ).tolist()
+        t_us, x, y, p = self._columns
+        begin, found = 0, []
+        for many in ends:
+            end = begin + many
+            inside = t_us[begin:end].copy(), x[begin:end].copy(), y[begin:end].copy(), p[begin:end].copy()
+            found.append(Events.as_is(*inside))
+            begin += apart
+        return found
 
-    def may_open(self, events: Events) -> bool:
-        """Whether any of them is of a candidate that opens a region."""
-        return bool(self._rhythmic(events, SAME).any())
-
-    def _rhythmic(self, events: Events, most_same: int) -> NDArray[np.bool_]:
-        # By one index, which takes a third of the time of two.
-        at = events.y.astype(np.intp)
-        at *= self._pixels.shape[1]
-        at += events.x
-        state = self._pixels.take(at)
-        rhythmic: NDArray[np.bool_] = (state & _kernels.SCORES) >= self._min_score
-        rhythmic &= state & (_kernels.MOST_SAME << _kernels.SAME_AT) < most_same << _kernels.SAME_AT
-        return rhythmic
+    def of(self, events: Events) -> Events:
+        """Those of candidates that are no lamps."""
+        height, width = self._pixels.shape
+        return self.select(events, [(0, 0, width, height)], [True])[0]
 
     def measure(
         self,
@@ -528,59 +553,6 @@ class Rhythm:
         if strips is not None:
             return _kernels.measure_strips(self._pixels, box, awake, *strips, rows)
         return _kernels.measure_box(self._pixels, box, awake, _SEAM_PX, reach_px, rows)
-
-
-class Selector:
-    """Selects the events inside boxes, by way of columns that live as long as it does.
-
-    Args:
-        size_px: Columns and rows of the sensor.
-
-    >>> selector = Selector((1280, 720))
-    >>> events = Events.of([0, 1, 2], x=[5, 90, 6], y=[5, 5, 5], p=[1, 1, 0])
-    >>> [e.t_us.tolist() for e in selector.each(events, [(0, 0, 10, 10), (80, 0, 100, 9)])]
-    [[0, 2], [1]]
-    """
-
-    def __init__(self, size_px: tuple[int, int]) -> None:
-        self._size_px = size_px
-        self._apart = -1
-        self._columns: _kernels.Columns
-
-    def each(self, events: Events, boxes: Sequence[Box]) -> list[Events]:
-        """Those inside each of some boxes (left, top, right, bottom), copied."""
-        most = _kernels.MOST_BOXES
-        if len(boxes) > most:
-            return self.each(events, boxes[:most]) + self.each(events, boxes[most:])
-        if events.t_us.size > self._apart:
-            self._apart = events.t_us.size + events.t_us.size // 4
-            room = most * self._apart + 1
-            self._columns = (
-                np.empty(room, np.int64),
-                *np.empty((2, room), np.uint16),
-                np.empty(room, np.uint8),
-            )
-        columns, apart = (events.t_us, events.x, events.y, events.p), self._apart
-        if len(boxes) > 1:
-            ends = _kernels.select_boxes(
-                columns, np.array(boxes), self._size_px, apart, self._columns
-            ).tolist()
-        else:
-            # Of a bar alone, whole blocks of events.
-            ends = [_kernels.select_box(columns, box, self._columns) for box in boxes]
-        t_us, x, y, p = self._columns
-        first = 0
-        found = []
-        for many in ends:
-            end = first + many
-            inside = t_us[first:end].copy(), x[first:end].copy(), y[first:end].copy(), p[first:end].copy()
-            found.append(Events.as_is(*inside))
-            first += apart
-        return found
-
-    def one(self, events: Events, box: Box) -> Events:
-        """The same of a single box."""
-        return self.each(events, [box])[0]
 
 
 class RegionFollower(RegionTracker):
@@ -620,7 +592,6 @@ class RegionFollower(RegionTracker):
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
         self._rhythm = rhythm or Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
-        self._selector = Selector((camera.width, camera.height))
         # Emptied once a step; no sensor's pixel rises a thousand times in one.
         self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in shape], np.int16)
         self._fresh: list[Box] = []
@@ -639,11 +610,12 @@ class RegionFollower(RegionTracker):
         rises = self._rhythm.step(start_us, events, self._hits, CELL_SHIFT)
         end_us, held = start_us + spec.step_us, 0
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
-        selected = self._selector.each(events, boxes)
+        # Before a frame shows where in its box a bar is, panels and moving textures around it would drown it:
+        # only what blinks in rhythm counts.
+        unknown = [followed.size_px is None for followed in self.alive]
+        selected = self._rhythm.select(events, boxes, unknown) if boxes else []
         for followed, inside, own in zip(self.alive, selected, self._own(boxes), strict=True):
-            # Before a frame shows where in its box a bar is, panels and moving textures around it would drown
-            # it: only what blinks in rhythm counts.
-            followed.add(start_us, inside if followed.size_px else self._rhythm.of(inside))
+            followed.add(start_us, inside)
             if (found := self._locate(followed, own, end_us)) is not None:
                 followed.filter, place = found
                 followed.positions.append(place)
@@ -744,7 +716,7 @@ class RegionFollower(RegionTracker):
         x, y = followed.positions.at(np.array([start + step_us / 2 for start, _ in kept]))
         for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
             box = self._reach(x_px, y_px, last.width_px, last.height_px)
-            gathered[start] = self._selector.one(events, box)
+            gathered[start] = self._rhythm.select(events, [box], [False])[0]
         followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
         self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, step_us)
 
@@ -1023,8 +995,8 @@ class RegionFollower(RegionTracker):
         region = region_of(self._next_id, end_us - self._age_us, *place)
         reach = self._reach(*place)
         # Lamps whose pixels were not known as such in the step before are now.
-        newest = self._selector.one(self._recent[-1][1], reach)
-        if not self._rhythm.may_open(newest) or not self._place_for_one(end_us):
+        (newest,) = self._rhythm.select(self._recent[-1][1], [reach], [True], SAME)
+        if not len(newest) or not self._place_for_one(end_us):
             return
         self._next_id += 1
         outgrown = [
@@ -1041,7 +1013,7 @@ class RegionFollower(RegionTracker):
         else:
             places, recent = Places([region]), list(self._recent)[-BACKFILL_STEPS:]
             pieces = deque(
-                (start, self._rhythm.of(self._selector.one(events, reach))) for start, events in recent
+                (start, self._rhythm.select(events, [reach], [True])[0]) for start, events in recent
             )
         followed = Followed(region.id, places, pieces[0][0], pieces, opened_us=end_us)
         followed.filter = self._position.init() if self._position else None

@@ -12,7 +12,7 @@ from scipy import stats
 from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.placement import _WIDEST_PX, Layout, Placement, masked
-from evlcp_sdk.rx.regions import Rhythm, Selector
+from evlcp_sdk.rx.regions import Rhythm
 from evlcp_sdk.values import Events, PresenceMap
 
 WIDTH, HEIGHT = 24, 16
@@ -183,13 +183,17 @@ def test_strips_are_measured_whatever_each_has_awake():
 
 @pytest.mark.parametrize("n", [0, 1, 500])
 def test_events_in_boxes(n):
-    events, selector = random_events(np.random.default_rng(n), n), Selector((WIDTH, HEIGHT))
+    rng = np.random.default_rng(n)
+    events, score, same = random_events(rng, n), rng.integers(0, 41, (HEIGHT, WIDTH)), rng.integers(0, 32)
+    in_rhythm = ((score >= 20) & (same < 14))[events.y, events.x]
+    rhythm = rhythm_of(states(np.zeros(score.shape, int), 0, score, same), min_score=20)
     boxes = [(0, 0, WIDTH, HEIGHT), (0, 0, 1, 1), (3, 2, 17, 9), (10, 5, WIDTH, HEIGHT), (4, 4, 4, 9)]
-    # One by one, some that overlap, more than one pass takes, and none.
-    for given in [*([box] for box in boxes), boxes, [*boxes, *boxes], []]:
-        taken = selector.each(events, given)
-        for got, box in zip(taken, given, strict=True):
-            want = twins.select_box(events, box)
+    # One by one, some that overlap, and more than one pass takes.
+    for given in [*([box] for box in boxes), boxes, [*boxes, *boxes]]:
+        rhythmic = (rng.random(len(given)) < 0.5).tolist()
+        taken = rhythm.select(events, given, rhythmic)
+        for got, box, filtered in zip(taken, given, rhythmic, strict=True):
+            want = twins.select_box(events[in_rhythm] if filtered else events, box)
             for name in ("t_us", "x", "y", "p"):
                 assert_array_equal(getattr(got, name), getattr(want, name))
 
