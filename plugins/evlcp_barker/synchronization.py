@@ -226,7 +226,7 @@ class BarkerSynchronizer:
         """Times of one preamble, for positive and negative events apart, us."""
         (off, off_noise), (on, on_noise) = self._fit(counts, lag)
         response = counts[1].take(lag + self._near_rises, mode="clip")
-        onset, onset_noise = _jackknife([_onset(one) for one in _without_each(response).tolist()])
+        onset, onset_noise = _jackknife(_onsets(_without_each(response)))
         if math.isnan(on):
             on, on_noise = off, off_noise
         bin_us, least = self._bin_us, _TIMING_SIGMA_US**2
@@ -390,13 +390,18 @@ def _middles(fits: Floats) -> Floats:
     return found
 
 
-def _onset(response: list[float]) -> float:
-    """Where counts first reach half of their most, over what comes always: a quartile."""
-    ordered = sorted(response)
-    half = (ordered[len(ordered) // 4] + ordered[-1]) / 2
-    at, reached = next((at, count) for at, count in enumerate(response) if count >= half)
-    below = response[at - 1] if at else 0.0
-    return at - 0.5 + ((half - below) / (reached - below) if reached > below else 0.0)
+def _onsets(responses: Floats) -> list[float]:
+    """Where counts (n, steps) first reach half of their most, over what comes always: a quartile."""
+    found = []
+    for response in responses.tolist():
+        ordered = sorted(response)
+        half, at = (ordered[len(ordered) // 4] + ordered[-1]) / 2, 0
+        while response[at] < half:
+            at += 1
+        below = response[at - 1] if at else 0.0
+        rise = response[at] - below
+        found.append(at - 0.5 + ((half - below) / rise if rise > 0 else 0.0))
+    return found
 
 
 def _jackknife(found: list[float]) -> tuple[float, float]:
