@@ -26,8 +26,8 @@ def phase_only_correlation(
     """Phase-only correlation of pairs of images, float32 (n, height, width) -> (pairs, shifts, shifts).
 
     The peak of a pair lies where its second image lies relative to its first, and has the shape of the
-    Dirichlet kernel of the band kept. Of few shifts, products with matrices transform it back in a third of
-    the time that a fast transform takes for all of them.
+    Dirichlet kernel of the band kept. Images are small, and of their shifts only few are asked for: products
+    with matrices transform them there and back in a third of the time that fast transforms of all take.
 
     Args:
         images: The images.
@@ -37,30 +37,40 @@ def phase_only_correlation(
         down: Shifts down.
         right: Shifts to the right.
     """
-    _, height, width = images.shape
-    spectra = np.fft.fft(np.fft.rfft(images)[:, :, : most[1] + 1], axis=1)
-    spectra[:, most[0] + 1 : height - most[0]] = 0
+    n, *shape = images.shape
+    (turn_down, turn_across), (back_down, back_across) = _turns(*shape, most, down, right)
+    half = (turn_down @ images).reshape(n, most[0] + 1, -1)
+    spectra = (half @ turn_across).view(np.complex64)
     size = np.abs(spectra)
     has_phase = size > _NO_PHASE * size.max((1, 2), keepdims=True)
     unit = spectra * (1 / np.where(has_phase, size, np.float32(np.inf)))
-    cross = np.multiply(unit.conj()[first], unit[second], order="C")
-    turn_down, turn_across = _turns(height, width, most[1], down, right)
-    rows: Images = cross.view(np.float32) @ turn_across
-    return turn_down @ rows.reshape(len(first), -1, len(right))
+    cross = unit.conj()[first] * unit[second]
+    rows: Images = cross.view(np.float32) @ back_across
+    return back_down @ rows.reshape(len(first), -1, len(right))
 
 
 @lru_cache(maxsize=64)
-def _turns(height: int, width: int, most: int, down: range, right: range) -> tuple[Images, Images]:
-    """What transforms spectra, real and imaginary parts in turn, back across and then down, to some shifts.
+def _turns(
+    height: int, width: int, most: tuple[int, int], down: range, right: range
+) -> tuple[tuple[Images, Images], tuple[Images, Images]]:
+    """What transforms images, real numbers, down and then across, and what transforms spectra back.
 
-    Of harmonics across those from 0 up to the highest are given: the others are their conjugates.
+    Of harmonics down those from 0 on are computed: the others are their conjugates. Where real and imaginary
+    parts go, the middle axes say.
     """
-    cosine, sine = _cosine_and_sine(width, range(most + 1), right)
-    weight = np.where(np.arange(most + 1), 2, 1)[:, None, None, None] / (height * width)
-    across = weight * np.array([[cosine, sine], [-sine, cosine]]).transpose(2, 0, 1, 3)
-    cosine, sine = _cosine_and_sine(height, down, range(height))
-    turn_down = np.stack([cosine, -sine], 2).reshape(len(down), -1)
-    return turn_down.astype(np.float32), across.reshape(-1, 2 * len(right)).astype(np.float32)
+    harmonics = range(most[0] + 1), range(-most[1], most[1] + 1)
+    cosine, sine = _cosine_and_sine(height, harmonics[0], range(height))
+    there_down = np.stack([cosine, -sine], 1).reshape(-1, height)
+    cosine, sine = _cosine_and_sine(width, range(width), harmonics[1])
+    there_across = np.array([[cosine, -sine], [sine, cosine]]).transpose(0, 2, 3, 1).reshape(2 * width, -1)
+    cosine, sine = _cosine_and_sine(width, harmonics[1], right)
+    back_across = np.array([[cosine, sine], [-sine, cosine]]).transpose(2, 0, 1, 3)
+    cosine, sine = _cosine_and_sine(height, down, harmonics[0])
+    weight = np.where(np.arange(most[0] + 1), 2, 1) / (height * width)
+    back_down = np.stack([weight * cosine, -weight * sine], 2).reshape(len(down), -1)
+    turns = there_down, there_across, back_down, back_across.reshape(-1, 2 * len(right))
+    one, two, three, four = (np.ascontiguousarray(turn, np.float32) for turn in turns)
+    return (one, two), (three, four)
 
 
 def _cosine_and_sine(size: int, one: range, other: range) -> tuple[Floats, Floats]:
