@@ -5,7 +5,6 @@ from collections import Counter
 from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 
-import numpy as np
 import pluggy
 
 from evlcp_sdk.clock import Timeline, TimeStep
@@ -27,10 +26,6 @@ from evlcp_sdk.rx.regions import RegionFollower, RegionTracker, Rhythm, same_pla
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Frame, Packet, Region, changed
-
-_KEPT_BYTES = 1 << 24
-"""What malloc of Linux keeps for the next frame, from when it has freed an array of this size on: until then
-it gives the images of a frame back to the system, and fetches them again for the next page by page."""
 
 
 class Receiver:
@@ -104,7 +99,6 @@ class Receiver:
             self._several = SeveralLinks(links.values(), patience_us)
         self._closed = False
         self.left: list[Packet] = []
-        np.empty(_KEPT_BYTES, np.uint8)
 
     @property
     def lit_us(self) -> dict[int, tuple[float, float]]:
