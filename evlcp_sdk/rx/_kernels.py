@@ -381,19 +381,26 @@ def add_polarity(
     starts_us: tuple[float, float],
     chip_us: float,
     row: tuple[float, float],
-    shift: Array,
+    centre: Array,
+    offset: Array,
     sums: Array,
 ) -> None:
-    """Add events to polarity sums (chips, height, width); `shift` (2, chips): the sensor pixel of (0, 0).
+    """Add events to polarity sums (chips, height, width), what is at `centre` (2, chips) held in the middle.
 
-    The starts, of positive and of negative events, hold in a row of the sensor; in each one after it, events
-    come later: `row` are by how much, us, and which that is.
+    `offset` (2, chips) takes how far right and down from it that is then, as pixels are whole. The starts, of
+    positive and of negative events, hold in a row of the sensor; in each one after it, events come later:
+    `row` are by how much, us, and which that is.
     """
     t_us, x, y, p = events
     start_on_us, start_off_us = starts_us
     row_us, row_px = row
     chips, height, width = sums.shape
-    shift_x, shift_y = shift[0], shift[1]
+    shift_x, shift_y = np.empty(chips), np.empty(chips)
+    for i in range(chips):
+        # The image's pixel (0, 0) on the sensor.
+        left, top = centre[0, i] - (width - 1) / 2, centre[1, i] - (height - 1) / 2
+        shift_x[i], shift_y[i] = np.rint(left), np.rint(top)
+        offset[0, i], offset[1, i] = left - shift_x[i], top - shift_y[i]
     highest, lowest = shift_y[0], shift_y[0]
     for i in range(chips):
         highest, lowest = min(highest, shift_y[i]), max(lowest, shift_y[i])
@@ -1289,10 +1296,12 @@ def squares_left(points: Array, layout: Array) -> float:
 
 
 @njit
-def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least: float, out: Array) -> None:
-    """Share of info chips with events, less `least` of pilot chips': weighted sum of pixels, `out` (K,).
+def still_lit(
+    sums: Array, weight: Array, grid: int, pilot_chips: int, least: float, seen: Array, out: Array
+) -> None:
+    """Whether those `seen` (K,) have events in more info chips than `least` of the pilot's: `out` (K,).
 
-    `weight` (K, rows, columns) is that of cells.
+    Of a sum over pixels, by shares of the chips; `weight` (K, rows, columns) is that of cells.
     """
     chips, height, width = sums.shape
     clusters, rows, columns = weight.shape
@@ -1317,7 +1326,7 @@ def info_activity(sums: Array, weight: Array, grid: int, pilot_chips: int, least
             for c in range(columns):
                 if weight[k, r, c] != 0:
                     total += weight[k, r, c] * over[r, c]
-        out[k] = total
+        out[k] = seen[k] and total > 0
 
 
 @njit
@@ -1609,20 +1618,23 @@ def cells_by_place(
 
 
 @njit
-def places_at(t_us: Array, places: Array, ahead: float, centre: Array) -> None:
+def places_at(
+    times: Array, start_us: float, unit_us: float, places: Array, ahead: float, centre: Array
+) -> None:
     """Centre (2, m) at times (m,), on straight lines between `places` (5, n): times, columns, rows, ...
 
+    Times are in units, from a start on.
     Before the first place and after the last it goes on for `ahead` times as long as to its neighbour.
     """
     n = places.shape[1]
     for a in range(2):
         at = places[a + 1]
         j = 0
-        for i in range(t_us.size):
+        for i in range(times.size):
             if n == 1:
                 centre[a, i] = at[0]
                 continue
-            t = t_us[i]
+            t = start_us + times[i] * unit_us
             while j > 0 and places[0, j] > t:
                 j -= 1
             while j < n - 2 and places[0, j + 1] <= t:

@@ -153,10 +153,10 @@ class FrameAligner:
             pilot: The newest one of the bar that showed it.
         """
         lock, packet = due.lock, self._packet
-        middles: NDArray[np.float64] = due.start_us + self._halves[: due.chips + self._after] * lock.chip_us
-        centre_px = region.positions.at(middles)
+        start_us, chip_us = float(due.start_us), float(lock.chip_us)
+        centre_px = region.positions.at(self._halves[: due.chips + self._after], start_us, chip_us)
         middle = min(due.chips, packet.pilot_chips) // 2
-        seen_us = float(middles[middle])
+        seen_us = start_us + (middle + 0.5) * chip_us
         if due.has_pilot:
             size = self._size(*region.positions.size_at(seen_us))
         elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
@@ -196,7 +196,7 @@ class FrameAligner:
             centre_x - (size[0] - 1) / 2 - sum(rests_x) / many,
             centre_y - (size[1] - 1) / 2 - sum(rests_y) / many,
         )
-        middle_us = seen_us - lock.chip_us / 2
+        middle_us = seen_us - chip_us / 2
         return AlignedFrame(pilot, sums, offset_px[:, :chips], corner_px, middle_us)
 
     def centre(self, aligned: AlignedFrame, points_px: NDArray[np.float64]) -> tuple[float, float]:
@@ -335,16 +335,13 @@ def polarity_sums(
     """
     width, height = size_px
     chips = centre_px.shape[1]
-    # The image's pixel (0, 0) on the sensor.
-    corner_px = centre_px - [[(width - 1) / 2], [(height - 1) / 2]]
-    shift = np.rint(corner_px)
     # Rows wait for the bar's own, wherever they are.
     row_px = sum(centre_px[1].tolist()) / chips
-    sums = np.zeros((chips, height, width), np.int16)
+    sums, offset_px = np.zeros((chips, height, width), np.int16), np.zeros((2, chips))
     # Whatever kinds of numbers a synchronization gives.
     on_us, off_us = float(start_us + lock.delay_on_us), float(start_us + lock.delay_off_us)
     chip_us, row_us = float(lock.chip_us), float(lock.row_us)
     for e in events:
         columns = e.t_us, e.x, e.y, e.p
-        _kernels.add_polarity(columns, (on_us, off_us), chip_us, (row_us, row_px), shift, sums)
-    return sums, corner_px - shift
+        _kernels.add_polarity(columns, (on_us, off_us), chip_us, (row_us, row_px), centre_px, offset_px, sums)
+    return sums, offset_px

@@ -196,8 +196,8 @@ class FrameReader:
         """
         sums, presence, placement = aligned.sums, aligned.pilot.presence, aligned.pilot.placement
         soft = self._steps.decode(presence, aligned.sums_and_next, before, self._behind[due.index])
-        lit = still_lit(sums, presence, self._pilot_chips, self._least_activity)
-        given = calibrate_llr(soft, placement.seen & lit)
+        lit = still_lit(sums, presence, placement.seen, self._pilot_chips, self._least_activity)
+        given = calibrate_llr(soft, lit)
         if not due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             return Reading(
@@ -222,23 +222,27 @@ class FrameReader:
 
 
 def still_lit(
-    sums: NDArray[np.int16], presence: PresenceMap, pilot_chips: int, least_activity: float = 0.5
+    sums: NDArray[np.int16],
+    presence: PresenceMap,
+    seen: NDArray[np.bool_],
+    pilot_chips: int,
+    least_activity: float = 0.5,
 ) -> NDArray[np.bool_]:
-    """Which clusters have events in a frame's info segment as they have in its pilot, bool (K,).
+    """Which clusters in sight have events in a frame's info segment as they have in its pilot, bool (K,).
 
     Where a stream has a gap, or a pole passes, silence is not what a cluster says.
 
     Args:
         sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
         presence: Where the clusters are.
+        seen: Those in sight, bool (K,).
         pilot_chips: Chips of the pilot.
         least_activity: Edges a chip of the codeword with the fewest, over those of a pilot; half of them in
             pair codes.
     """
-    over = np.empty(len(presence.probability))
-    least = _LEAST_EVENTS * least_activity
-    _kernels.info_activity(sums, presence.probability, presence.grid_px, pilot_chips, least, over)
-    return over > 0
+    lit, least = np.empty_like(seen), _LEAST_EVENTS * least_activity
+    _kernels.still_lit(sums, presence.probability, presence.grid_px, pilot_chips, least, seen, lit)
+    return lit
 
 
 def calibrate_llr(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:

@@ -199,10 +199,15 @@ class Places:
         other._set_before()
         return other
 
-    def at(self, t_us: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Centre (column, row) at times, float64 (2, n), px: interpolated, straight on for a little."""
-        centre = np.empty((2, len(t_us)))
-        _kernels.places_at(t_us, self._held(), _MOST_AHEAD_STEPS, centre)
+    def at(
+        self, times: NDArray[np.float64], start_us: float = 0.0, unit_us: float = 1.0
+    ) -> NDArray[np.float64]:
+        """Centre (column, row) at times, float64 (2, n), px: interpolated, straight on for a little.
+
+        Times are in units of so many us, from a start on.
+        """
+        centre = np.empty((2, len(times)))
+        _kernels.places_at(times, start_us, unit_us, self._held(), _MOST_AHEAD_STEPS, centre)
         return centre
 
     def place_at(self, t_us: float) -> tuple[float, float]:

@@ -107,7 +107,9 @@ class LearnedDecoder:
     """`MlSoft` for the pilots and codewords of a codebook of pair codes."""
 
     def __init__(self, codebook: Codebook) -> None:
-        self._by_value = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
+        # As large as LLRs are by what matches them.
+        words = np.ascontiguousarray(codebook.codeword_edges.T, np.float64)
+        self._by_value = words * (INDEPENDENT_PIXELS / 2)
         # Unsigned, as indices below 0 would count from the end.
         self._signs = (codebook.pilot_edges > 0).astype(np.uint64)
         self._bits = codebook.bits_per_symbol
@@ -134,6 +136,4 @@ class LearnedDecoder:
         odds = (1 - _PIXEL_SHARE) / _PIXEL_SHARE
         _kernels.sum_worth(pairs, width, self._signs, seen, grid, worth, (_MIN_LEARNT_WEIGHT, odds), values)
         symbols, _, margins, agreement, least = match_words(values, self._by_value, self._bits)
-        scale = INDEPENDENT_PIXELS / 2
-        soft = SoftSymbols(symbols, (margins * scale).astype(np.float32), agreement)
-        return soft, least * scale, pairs, worth
+        return SoftSymbols(symbols, margins.astype(np.float32), agreement), least, pairs, worth

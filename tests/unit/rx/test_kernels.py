@@ -211,12 +211,14 @@ def test_polarity_sums(seed, freeze):
     moving = rng.integers(-3, 12, (2, shape[0])).astype(float)
     still = np.repeat(moving[:, :1], shape[0], axis=1)
     jolted = np.where(np.arange(shape[0]) < 12, still, moving[:, -1:])
-    sums = np.zeros(shape, np.int16)
+    sums, offset = np.zeros(shape, np.int16), np.empty((2, shape[0]))
     e = frozen(events, freeze)
     for row, shifts in product((0.0, row_us), (moving, still, jolted)):
         sums[:] = 0
-        columns = e.t_us, e.x, e.y, e.p
-        _kernels.add_polarity(columns, (start_on, start_off), chip_us, (row, row_px), shifts, sums)
+        columns, off = (e.t_us, e.x, e.y, e.p), rng.integers(-3, 4, (2, shape[0])) / 8
+        centre = shifts + off + np.array([[(shape[2] - 1) / 2], [(shape[1] - 1) / 2]])
+        _kernels.add_polarity(columns, (start_on, start_off), chip_us, (row, row_px), centre, offset, sums)
+        assert_array_equal(offset, off)
         want = twins.polarity_sums(
             events, start_on, start_off, chip_us, *shifts.astype(int), shape, row, row_px
         )
@@ -395,9 +397,10 @@ def test_events_in_pilot_and_info(seed, grid):
     rng = np.random.default_rng(seed)
     sums = (rng.integers(-2, 3, (20, 11, 9)) * (rng.random((20, 11, 9)) < 0.4)).astype(np.int16)
     weight = rng.random((3, 11 // grid, 9 // grid)).astype(np.float32)
-    out = np.empty(3)
-    _kernels.info_activity(sums, weight, grid, 12, 0.25, out)
-    assert_allclose(out, twins.info_activity(sums, weight, grid, 12, 0.25), rtol=1e-6)
+    seen, out = np.array([True, True, False]), np.empty(3, np.bool_)
+    sums[12:] *= rng.random((8, 11, 9)) < 0.25
+    _kernels.still_lit(sums, weight, grid, 12, 0.25, seen, out)
+    assert_array_equal(out, seen & (twins.info_activity(sums, weight, grid, 12, 0.25) > 0))
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.3, 20.0])
@@ -543,7 +546,7 @@ def test_places_are_interpolated_and_go_straight_on(seed, n):
     if seed % 2:
         rng.shuffle(asked)
     centre = np.empty((2, len(asked)))
-    _kernels.places_at(asked, places, 2, centre)
+    _kernels.places_at((asked - 40) / 4, 40.0, 4.0, places, 2, centre)
     way = places[:3]
     if n > 1:
         before, after = way[:, 0] - 2 * (way[:, 1] - way[:, 0]), way[:, -1] + 2 * (way[:, -1] - way[:, -2])

@@ -83,4 +83,5 @@ def test_silence_is_not_what_a_cluster_says() -> None:
     probability[0, :, :2] = probability[1, :, 2:] = 0.9
     nothing = np.zeros((3, 6, 8), np.float32)
     presence = PresenceMap(probability, 2, probability > 0.5, nothing)
-    assert still_lit(sums, presence, 16).tolist() == [True, False, False]
+    assert still_lit(sums, presence, ALL[:3], 16).tolist() == [True, False, False]
+    assert not still_lit(sums, presence, ~ALL[:3], 16).any()
