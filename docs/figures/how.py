@@ -238,9 +238,9 @@ def distance(r: Recording) -> Figure:
     """Phase-only correlation of two clusters, and errors of two rangings beside their bound."""
     maps = r.view.presence.pixels
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4))
-    shifts = [range(size) for size in maps.shape[1:]]
-    band = full_band(*maps.shape[1:])
-    peak = phase_only_correlation(maps, np.array([2]), np.array([13]), band, *shifts)[0]
+    size, pair = maps.shape[1:], (np.array([2]), np.array([13]))
+    images, shifts = np.ascontiguousarray(maps.swapaxes(0, 1)), [range(n) for n in size]
+    peak = phase_only_correlation(images, size, pair, full_band(*size), *shifts)[:, 0]
     left.plot(peak.max(1), ".-", color=INK, lw=0.8, ms=3)
     left.set(xlabel="shift down, px", ylabel="correlation")
     titled(left, "Phase-only correlation, clusters 2 and 13")

@@ -719,49 +719,6 @@ def _shine(
             part[i] += room.halo[a, h, 0, i]
 
 
-@njit
-def _pick_entries(line: TimeLine, mask: Any, stride: int, mine: Array) -> int:
-    """The entries that a batch sees, into `mine`: of its sources, and every so many poses; how many."""
-    own = 0
-    for e in range(line.t_us.size):
-        what = line.kind[e]
-        if what == -2:
-            takes = line.pose[e] % stride == 0
-        else:
-            takes = what == -1 or (mask >> np.uint64(what)) & np.uint64(1) != np.uint64(0)
-        mine[own] = e
-        own += takes
-    return own
-
-
-@njit(fastmath={"contract"})
-def _look_around(lanes: int, f: Array, pose: int, scenery: Scenery) -> None:
-    """The light of the background and the dark current on each lane: bilinear in the periodic texture."""
-    field, last = scenery.field, scenery.field.shape[0] - 1
-    for i in range(lanes):
-        u, v = f[_X + i] + scenery.turn_px[pose, 0], f[_Y + i] + scenery.turn_px[pose, 1]
-        below, right = math.floor(v), math.floor(u)
-        down, aside = v - below, u - right
-        i0, j0 = int(below) & last, int(right) & last
-        i1, j1 = (i0 + 1) & last, (j0 + 1) & last
-        top = field[i0, j0] + aside * (field[i0, j1] - field[i0, j0])
-        low = field[i1, j0] + aside * (field[i1, j1] - field[i1, j0])
-        f[_AROUND + i] = scenery.light[1] + scenery.light[0] * (top + down * (low - top))
-
-
-@njit
-def _begin_new(pixels: int, batch: Batch, sensor: Array) -> None:
-    """Pixels that were not active before are at rest in their light, and armed."""
-    f = batch.f
-    for i in range(pixels):
-        if f[_NEW + i] > 0.0:
-            now = f[_TOTAL + i]
-            f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = now, 1.0 / now, math.log(now)
-            f[_READY + i], f[_ARMED + i] = -1e18, 1.0
-            f[_REFERENCE + i] = f[_FOLLOWER + i] if sensor[12] > 0.0 else f[_U + i]
-            batch.draw[i] += 1
-
-
 @njit(fastmath={"contract"})
 def _run_batch(
     size: tuple[int, int],
@@ -779,24 +736,39 @@ def _run_batch(
     lanes, _ = size
     mask, stride = of_batch
     f, poses, many = batch.f, scenery.turn_px.shape[0], 0
+    field, last = scenery.field, scenery.field.shape[0] - 1
     for g in range(strips.gain.size):
-        if (mask >> np.uint64(g)) & np.uint64(1):
-            lit[many] = g
-            many += 1
-    own, pose = _pick_entries(line, mask, stride, mine), -1
+        lit[many], shining.clusters[many, 2] = g, -1
+        many += int((mask >> np.uint64(g)) & np.uint64(1))
+    # The entries that it sees: of its sources, and every so many poses.
+    own, pose = 0, -1
+    for e in range(line.t_us.size):
+        what = line.kind[e]
+        is_own = (mask >> np.uint64(max(what, 0))) & np.uint64(what >= 0)
+        mine[own] = e
+        own += int(is_own) | (what == -1) | ((what == -2) & (line.pose[e] % stride == 0))
     for q in range(own):
         e = mine[q]
         t_us, until = line.t_us[e], line.t_us[mine[q + 1]] if q + 1 < own else end_us
         before, pose = pose, line.pose[e] // stride * stride
         # Where the sources are in the middle of these poses.
         here = min(pose + stride // 2, poses - 1)
-        if before < 0 or pose // scenery.every != before // scenery.every:
-            _look_around(lanes, f, pose, scenery)
+        if pose // scenery.every != before // scenery.every:
+            # The light of the background and the dark current: bilinear in the periodic texture.
+            for i in range(lanes):
+                u, v = f[_X + i] + scenery.turn_px[pose, 0], f[_Y + i] + scenery.turn_px[pose, 1]
+                below, right = math.floor(v), math.floor(u)
+                down, aside = v - below, u - right
+                i0, j0 = int(below) & last, int(right) & last
+                i1, j1 = (i0 + 1) & last, (j0 + 1) & last
+                top = field[i0, j0] + aside * (field[i0, j1] - field[i0, j0])
+                low = field[i1, j0] + aside * (field[i1, j1] - field[i1, j0])
+                f[_AROUND + i] = scenery.light[1] + scenery.light[0] * (top + down * (low - top))
         for i in range(lanes):
             f[_TOTAL + i] = f[_AROUND + i]
         for a in range(many):
             row = line.row[lit[a], e]
-            if q == 0 or row != shining.clusters[a, 2]:
+            if row != shining.clusters[a, 2]:
                 shining.clusters[a, 2] = -1 - row
             _shine(a, lit[a], (before, pose, here), size, f, (strips, halos), near, shining)
             for i in range(lanes):
@@ -806,13 +778,20 @@ def _run_batch(
             for i in range(lanes):
                 f[_TOTAL + i] = scenery.light[1] + shade * (f[_TOTAL + i] - scenery.light[1])
         if q == 0:
-            _begin_new(size[1], batch, model.sensor)
+            # Pixels that were not active before are at rest in their light, and armed.
+            for i in range(size[1]):
+                if f[_NEW + i] > 0.0:
+                    now = f[_TOTAL + i]
+                    f[_NOW + i], f[_U + i], f[_FOLLOWER + i] = now, 1.0 / now, math.log(now)
+                    f[_READY + i], f[_ARMED + i] = -1e18, 1.0
+                    f[_REFERENCE + i] = f[_FOLLOWER + i] if model.sensor[12] > 0.0 else f[_U + i]
+                    batch.draw[i] += 1
         redraw = int(line.kind[e] >= 0)
         for i in range(lanes):
             total, now = f[_TOTAL + i], f[_NOW + i]
             changes = abs(total - now) > LIGHT_STEP * now
             f[_NOW + i] = total if changes else now
-            batch.draw[i] += redraw if changes else 0
+            batch.draw[i] += redraw * changes
         if until > t_us:
             _run_piece(lanes, t_us, until, batch, model, out)
 

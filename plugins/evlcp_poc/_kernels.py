@@ -1,27 +1,31 @@
-"""Weighted medians of maps, and the sub-pixel peak fit: compiled."""
+"""Middles and cuts of maps, cross spectra, the sub-pixel peak fit and a robust mean: compiled."""
 
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk._kernels import median
 from evlcp_sdk.kernels import njit
 
 Array = NDArray[Any]
 
 
 @njit
-def find_middles(maps: Array, min_pixels: int, out: Array) -> None:
-    """Weighted median (row, column) of maps, -1 where one has too few lit pixels.
+def find_middles(maps: Array, apart_m: Array, min_pixels: int, out: Array) -> tuple[float, int, int]:
+    """Weighted median (row, column) of maps, -1 where one has too few lit pixels, `out` (K, 2).
 
     Unlike the mean, the median is robust against stray pixels.
+
+    Returns:
+        The scale that all clusters agree on, px a metre, of those `apart_m` (K, K): the median of the farther
+        half of pairs, 0 without any; how far from their middles maps are lit, down or up and to a side.
     """
     clusters, height, width = maps.shape
-    light, lengths = np.empty((2, max(height, width))), (height, width)
+    many, seen, reach = 0, np.empty(clusters + 1, np.int64), np.zeros(2, np.int64)
+    lengths = height, width
     for k in range(clusters):
-        lit, total = 0, 0.0
-        for i in range(light.shape[1]):
-            light[0, i] = light[1, i] = 0.0
+        light, lit, total = np.zeros((2, max(height, width))), 0, 0.0
         for v in range(height):
             some = False
             for u in range(width):
@@ -34,26 +38,102 @@ def find_middles(maps: Array, min_pixels: int, out: Array) -> None:
                     light[1, u] += w
                     lit += 1
             total += light[0, v]
+        seen[many] = k
+        many += int(lit >= min_pixels)
         for axis in range(2):
             place, upto = -1, 0.0
-            while lit >= min_pixels and place < lengths[axis] - 1 and (place < 0 or upto < total / 2):
+            while lit >= min_pixels and place < lengths[axis] - 1 and upto < total / 2:
                 place += 1
                 upto += light[axis, place]
             out[k, axis] = place
+            for i in range(lengths[axis]):
+                if place >= 0 and light[axis, i] > 0:
+                    reach[axis] = max(reach[axis], abs(i - place))
+    longest, n, scales = 0.0, 0, np.empty(clusters * clusters)
+    for i in range(many):
+        for k in range(i):
+            longest = max(longest, apart_m[seen[i], seen[k]])
+    for i in range(many):
+        for k in range(i):
+            one, other, apart = out[seen[i]], out[seen[k]], apart_m[seen[i], seen[k]]
+            if apart >= longest / 2 - 1e-12:
+                scales[n] = np.hypot(float(one[0] - other[0]), float(one[1] - other[1])) / apart
+                n += 1
+    return median(scales, n) if n > 0 else 0.0, reach[0], reach[1]
+
+
+@njit
+def cut_maps(maps: Array, middles: Array, out: Array) -> None:
+    """Windows of maps around their middles, `out` (height, n, width): dark outside a map, or without one."""
+    n, height, width = maps.shape
+    rows, _, columns = out.shape
+    for k in range(n):
+        top, left = middles[k, 0] - rows // 2, middles[k, 1] - columns // 2
+        for v in range(rows):
+            for u in range(columns):
+                y, x = top + v, left + u
+                inside = middles[k, 0] >= 0 and 0 <= y < height and 0 <= x < width
+                out[v, k, u] = maps[k, y, x] if inside else 0.0
+
+
+@njit
+def cross_spectra(turned: Array, first: Array, second: Array, no_phase: float, out: Array) -> None:
+    """Phases of pairs of images, conj(first) * second, of their harmonics (down, images, across).
+
+    `turned` (2, 2, down, images, across) are images turned across by cosine and sine, of what was turned down
+    by cosine and sine; `out` (2, down, pairs, 2, across) makes real and imaginary parts if it is turned back
+    across by cosine and sine: it is of harmonics to both sides. What is less than `no_phase` of the largest
+    of a spectrum has no phase, and becomes 0.
+    """
+    _, _, down, n, across = turned.shape
+    many, flat = n * across, turned.reshape(4, down, n * across)
+    # Real and imaginary parts of harmonics to the right, and of those to the left.
+    unit, power = np.empty((4, down, many), np.float32), np.empty((2, down, many), np.float32)
+    top = np.zeros(many, np.float32)
+    for y in range(down):
+        for j in range(many):
+            real, imaginary = flat[0, y, j] - flat[3, y, j], -flat[1, y, j] - flat[2, y, j]
+            unit[0, y, j], unit[1, y, j], power[0, y, j] = real, imaginary, real**2 + imaginary**2
+            real, imaginary = flat[0, y, j] + flat[3, y, j], flat[2, y, j] - flat[1, y, j]
+            unit[2, y, j], unit[3, y, j], power[1, y, j] = real, imaginary, real**2 + imaginary**2
+            top[j] = max(top[j], power[0, y, j], power[1, y, j])
+    for k in range(n):
+        of_image, most = top[k * across : (k + 1) * across], np.float32(0)
+        for x in range(across):
+            most = max(most, of_image[x])
+        for x in range(across):
+            of_image[x] = np.float32(no_phase * no_phase) * most
+    for y in range(down):
+        for way in range(2):
+            for j in range(many):
+                size = np.sqrt(max(power[way, y, j], np.float32(1e-37)))
+                by = np.float32(power[way, y, j] > top[j]) / size
+                unit[2 * way, y, j] *= by
+                unit[2 * way + 1, y, j] *= by
+        for q in range(first.size):
+            for x in range(across):
+                # Unsigned, as indices below 0 would count from the end.
+                one, other = np.uint64(across * first[q] + x), np.uint64(across * second[q] + x)
+                a = unit[0, y, one] * unit[0, y, other] + unit[1, y, one] * unit[1, y, other]
+                b = unit[0, y, one] * unit[1, y, other] - unit[1, y, one] * unit[0, y, other]
+                c = unit[2, y, one] * unit[2, y, other] + unit[3, y, one] * unit[3, y, other]
+                d = unit[2, y, one] * unit[3, y, other] - unit[3, y, one] * unit[2, y, other]
+                out[0, y, q, 0, x], out[0, y, q, 1, x] = a + c, d - b
+                out[1, y, q, 0, x], out[1, y, q, 1, x] = b + d, a - c
 
 
 @njit
 def fit_peaks(
     correlation: Array, size: tuple[int, int], most: tuple[int, int], samples: int, shifts: Array
 ) -> None:
-    """Peaks of correlations (pairs, 2 n + 1, 2 m + 1), `shifts` (pairs, 2): down and right of the middle, px.
+    """Peaks of correlations (2 n + 1, pairs, 2 m + 1), `shifts` (pairs, 2): down and right of the middle, px.
 
     A peak is sought where there are so many `samples` to each side; these, of its row and its column, are
     fitted (least squares) by the Dirichlet kernel of their band: the sum of 2 `most` + 1 harmonics out of
     `size`. The gain that fits best follows from the shift, so Gauss-Newton steps run over the shift alone
     (variable projection). The sines of the samples follow from those of the first by rotation.
     """
-    pairs, rows, columns = correlation.shape
+    rows, pairs, columns = correlation.shape
     v0, u0, many, seen = rows // 2, columns // 2, 2 * samples + 1, np.empty(2 * samples + 1)
     peaks = np.empty((pairs, 2), np.int64)
     for q in range(pairs):
@@ -61,7 +141,7 @@ def fit_peaks(
         peaks[q, 0], peaks[q, 1] = v0, u0
         for v in range(samples, rows - samples):
             for u in range(samples, columns - samples):
-                if correlation[q, v, u] > correlation[q, peaks[q, 0], peaks[q, 1]]:
+                if correlation[v, q, u] > correlation[peaks[q, 0], q, peaks[q, 1]]:
                     peaks[q, 0], peaks[q, 1] = v, u
     for axis in range(2):
         turn, band = np.pi / size[axis], 2 * most[axis] + 1
@@ -69,7 +149,7 @@ def fit_peaks(
         for q in range(pairs):
             v, u = peaks[q, 0], peaks[q, 1]
             for i in range(-samples, samples + 1):
-                seen[samples + i] = correlation[q, v, u + i] if axis else correlation[q, v + i, u]
+                seen[samples + i] = correlation[v, q, u + i] if axis else correlation[v + i, q, u]
             left, middle, right = seen[samples - 1], seen[samples], seen[samples + 1]
             # For a kernel between two samples, the neighbours' ratio is that of their distances.
             side = right if right > left else left
@@ -103,3 +183,74 @@ def fit_peaks(
                 if abs(move) < 1e-3:
                     break
             shifts[q, axis] = (u - u0 if axis else v - v0) + shift
+
+
+@njit
+def mean_distance(
+    middles: Array,
+    beyond_px: Array,
+    pairs: tuple[Array, Array, Array],
+    focal_px: float,
+    places: tuple[float, float, int],
+    rules: tuple[float, int, float],
+) -> tuple[float, float, int]:
+    """Weighted mean of pairs' distances, m, without extremes and outliers, and its delete-one-cluster sigma.
+
+    `pairs` are first and second cluster, and spacing, m; images lie as far apart as middles (K, 2) of maps,
+    and `beyond_px` (pairs, 2). `places` are the scale of all clusters, px a metre; by how much, m, pairs may
+    be out of the place that it gives; and how many must not be. `rules` are the power of a spacing to which
+    it counts, how many are dropped at each end, and interquartile ranges beyond the quartiles for an outlier.
+
+    Returns:
+        (mean, sigma, values kept), NaN and 0 of too few; sigma is NaN if no two clusters can be left out.
+    """
+    first, second, apart_m = pairs
+    scale, seam_m, least = places
+    power, drop, iqr = rules
+    n, clusters = 0, len(middles)
+    values, order = np.empty(first.size), np.empty(first.size, np.int64)
+    for q in range(first.size):
+        down = float(middles[second[q], 0] - middles[first[q], 0])
+        right = float(middles[second[q], 1] - middles[first[q], 1])
+        if abs(np.hypot(down, right) - scale * apart_m[q]) > scale * seam_m:
+            continue
+        length_px = np.hypot(down + beyond_px[q, 0], right + beyond_px[q, 1])
+        values[q] = focal_px * apart_m[q] / max(length_px, 1e-9)
+        i = n
+        while i > 0 and values[order[i - 1]] > values[q]:
+            order[i] = order[i - 1]
+            i -= 1
+        order[i] = q
+        n += 1
+    if n < least:
+        return np.nan, np.nan, 0
+    begin, end = (drop, n - drop) if n > 2 * drop + 1 else (0, n)
+    quartiles = np.empty(2)
+    for i in range(2):
+        place = begin + (0.25 + 0.5 * i) * (end - begin - 1)
+        below, above = values[order[int(place)]], values[order[min(int(place) + 1, end - 1)]]
+        quartiles[i] = (above - below) * (place - int(place)) + below
+    low, high = quartiles
+    room, kept, total, weighted = iqr * (high - low), 0, 0.0, 0.0
+    own, own_weighted = np.zeros(clusters), np.zeros(clusters)
+    for _ in range(2):
+        for i in range(begin, end):
+            q = order[i]
+            if low - room <= values[q] <= high + room:
+                weight = apart_m[q] ** power
+                kept, total, weighted = kept + 1, total + weight, weighted + weight * values[q]
+                for k in (first[q], second[q]):
+                    own[k] += weight
+                    own_weighted[k] += weight * values[q]
+        if kept > 0:
+            break
+        # Narrow bounds may call all of a few values outliers of one another: keep the middle half then.
+        room = high - low
+    m, mean, squares = 0, 0.0, 0.0
+    for k in range(clusters):
+        if own[k] > 0 and total - own[k] > 1e-9 * total:
+            without = (weighted - own_weighted[k]) / (total - own[k])
+            m += 1
+            squares += (without - mean) ** 2 * (m - 1) / m
+            mean += (without - mean) / m
+    return weighted / total, np.sqrt((m - 1) / m * squares) if m > 1 else np.nan, kept

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_poc import _kernels
-from evlcp_poc.correlation import blob_band, cut_maps, full_band, pair_shifts
-from evlcp_poc.pairs import Pairs, far_pairs, pairs_in_place, robust_mean, seen_pairs
+from evlcp_poc.correlation import blob_band, full_band, pair_shifts
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
@@ -107,10 +106,8 @@ class PocRanging(Ranging):
         if not all_count:
             same = bar.sides[used[a]] == bar.sides[used[b]]
             a, b = a[same], b[same]
-        pairs = used[a], used[b], np.hypot(*(centres[used[b]] - centres[used[a]]).T)
-        # The scale that all clusters agree on shows which ones are out of place.
-        i, j = np.triu_indices(bar.clusters, 1)
-        apart = np.hypot(*(centres[j] - centres[i]).T)
+        a, b = used[a], used[b]
+        apart = np.hypot(*(centres[:, None] - centres).T)
         instead = f"use '{ROLES['ranging'].default_for(bar, codebook.of_chips)}' for this layout"
         if not (bar.alike and bar.apart):
             raise ConfigError(
@@ -124,39 +121,41 @@ class PocRanging(Ranging):
         neighbour = float(apart[apart > 0].min())
 
         rim_px = _RIM_PX if (bar.sides & 3).any() and (bar.sides & 12).any() else 0.0
-        all_pairs = i, j, apart
-        inner = np.isin(np.arange(bar.clusters), used[skip : len(used) - skip])
-        least = min(self.min_pairs, max(int(far_pairs(pairs, inner, self.min_spacing).sum()), 1))
+        rules = self.weight_power, self.drop_extremes, self.outlier_iqr
 
         @lru_cache(maxsize=256)
-        def known_pairs(lit: bytes) -> tuple[Pairs, Pairs]:
-            """As `seen_pairs`: of most frames, the same clusters are seen."""
-            seen = np.frombuffer(lit, np.bool_)
-            return seen_pairs(seen, all_pairs, used, skip, pairs, self.min_spacing)
+        def known_pairs(lit: bytes) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
+            """Pairs far apart of clusters that are seen, and their spacing: of most frames, the same are."""
+            seen = used[np.frombuffer(lit, np.bool_)[used]]
+            inner = seen[skip : max(len(seen) - skip, 0)]
+            both = np.isin(a, inner) & np.isin(b, inner)
+            far = both & (apart[a, b] >= self.min_spacing * (apart[a, b] * both).max() - 1e-12)
+            return a[far], b[far], apart[a, b][far]
+
+        least = min(self.min_pairs, max(len(known_pairs(b"\1" * bar.clusters)[0]), 1))
 
         def measure(view: FrameView) -> Range:
             maps, middles = plain(view.presence.pixels), np.empty((bar.clusters, 2), np.int64)
-            _kernels.find_middles(maps, self.min_pixels, middles)
-            wide, far = known_pairs((middles[:, 0] >= 0).tobytes())
-            px_per_m, (first, second, apart_m), between = pairs_in_place(middles, wide, far, neighbour)
-            if len(first) < least or px_per_m <= 0:
+            px_per_m, *lit_px = _kernels.find_middles(maps, apart, self.min_pixels, middles)
+            far = known_pairs((middles[:, 0] >= 0).tobytes())
+            if len(far[0]) < least or px_per_m <= 0:
                 return _NONE
             # A cut of two spacings and a seam holds a cluster's blob with its blur, wherever it sits in it.
             neighbour_px = px_per_m * neighbour
             height = cut_size(2 * neighbour_px + 8)
-            width = min(height, cut_size(maps.shape[2]))
-            cuts = cut_maps(maps, middles, height, width)
-            most = full_band(height, width) if self.band == "full" else blob_band(cuts)
+            size = height, min(height, cut_size(maps.shape[2]))
+            rows, columns = (min(2 * far_px + 1, n) for far_px, n in zip(lit_px, size, strict=True))
+            cuts = np.empty((rows, bar.clusters, columns), np.float32)
+            _kernels.cut_maps(maps, middles, cuts)
+            most = full_band(*size) if self.band == "full" else blob_band(cuts, size)
             # Two medians of blobs of one spacing are wrong by half a spacing at the most.
             reach = max(int(neighbour_px / 2), 2)
-            beyond_px = pair_shifts(cuts, first, second, most, reach, self.peak_samples)
-            length_px = np.hypot(*(between + beyond_px).T)
-            distance_m = camera.focal_px * apart_m / np.maximum(length_px, 1e-9)
-            weights = apart_m**self.weight_power
-            mean, sigma, kept = robust_mean(
-                distance_m, weights, first, second, self.drop_extremes, self.outlier_iqr
+            beyond_px = pair_shifts(cuts, size, far[:2], most, reach, self.peak_samples)
+            places = px_per_m, neighbour, least
+            mean, sigma, kept = _kernels.mean_distance(
+                middles, beyond_px, far, camera.focal_px, places, rules
             )
-            rim = mean * (rim_px / (px_per_m * float(apart_m.mean()))) if rim_px else 0.0
+            rim = mean * (rim_px / (px_per_m * float(far[2].mean()))) if rim_px else 0.0
             return Range(mean, math.hypot(sigma, rim), kept)
 
         return measure
@@ -189,11 +188,6 @@ class PocRanging(Ranging):
 def cut_size(least: float) -> int:
     """An even length that transforms fast, as in the paper: its half has no factors but 2, 3 and 5."""
     half = math.ceil(least / 2)
-    while True:
-        rest = half
-        for factor in (2, 3, 5):
-            while rest % factor == 0:
-                rest //= factor
-        if rest == 1:
-            return 2 * half
+    while 30**16 % half:
         half += 1
+    return 2 * half

@@ -58,6 +58,24 @@ def middle(image, min_pixels):
     ]
 
 
+def scale(middles, apart, seen):
+    """The median, px a metre, of pairs that are half as far apart as the farthest, or more."""
+    pairs = [(a, b) for a in seen for b in seen if a < b]
+    far = max((apart[pair] for pair in pairs), default=0) / 2
+    return np.median(
+        [np.hypot(*(middles[a] - middles[b])) / apart[a, b] for a, b in pairs if apart[a, b] >= far]
+    )
+
+
+def jackknife(values, weights, first, second, kept):
+    """Sigma of a weighted mean of pairs by leaving out one cluster after another."""
+    means = []
+    for k in np.union1d(first[kept], second[kept]):
+        rest = kept[(first[kept] != k) & (second[kept] != k)]
+        means.append(np.average(values[rest], weights=weights[rest]))
+    return np.sqrt((len(means) - 1) * np.var(means))
+
+
 def cut(image, at, rows, columns):
     if at[0] < 0:
         return np.zeros((rows, columns), image.dtype)

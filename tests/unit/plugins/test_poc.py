@@ -5,14 +5,7 @@ import poc_twins as twins
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
-from evlcp_poc.correlation import (
-    blob_band,
-    cut_maps,
-    full_band,
-    pair_shifts,
-    phase_only_correlation,
-)
-from evlcp_poc.pairs import robust_mean
+from evlcp_poc.correlation import blob_band, full_band, pair_shifts, phase_only_correlation
 from evlcp_poc.ranging import PocRanging
 from numpy.testing import assert_allclose, assert_array_equal
 
@@ -35,9 +28,9 @@ SHAPES = [(24, 20), (25, 21), (16, 17), (48, 40)]
 def fit_peak(samples, size, band):
     """By samples of a row about no shift, and the same of a column."""
     half = len(samples) // 2
-    correlation, shifts = np.zeros((2, len(samples), len(samples)), np.float32), np.empty((2, 2))
-    correlation[0, half] = samples
-    correlation[1, :, half] = samples
+    correlation, shifts = np.zeros((len(samples), 2, len(samples)), np.float32), np.empty((2, 2))
+    correlation[half, 0] = samples
+    correlation[:, 1, half] = samples
     _kernels.fit_peaks(correlation, (size, size), (band // 2, band // 2), half, shifts)
     assert shifts[0, 1] == shifts[1, 0]
     return shifts[0, 1]
@@ -60,13 +53,13 @@ def test_no_peak_is_no_shift(samples):
 
 
 def test_what_has_no_phase_counts_for_nothing():
-    images = np.ones((2, 6, 8), np.float32)
-    images[1] = 0
-    first, second = np.array([0, 0]), np.array([0, 1])
-    found = phase_only_correlation(images, first, second, full_band(6, 8), range(6), range(8))
+    images = np.ones((6, 2, 8), np.float32)
+    images[:, 1] = 0
+    pairs = np.array([0, 0]), np.array([0, 1])
+    found = phase_only_correlation(images, (6, 8), pairs, full_band(6, 8), range(6), range(8))
     # Of an even image, the mean alone.
-    assert_allclose(found[0], 1 / 48, rtol=1e-6)
-    assert not found[1].any()
+    assert_allclose(found[:, 0], 1 / 48, rtol=1e-6)
+    assert not found[:, 1].any()
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -76,16 +69,20 @@ def test_medians_and_cuts_of_maps(seed):
     maps[1] = 0
     maps[2], maps[2, 0, :4] = 0, 1
     maps[3], maps[3, -1, -3:] = 0, 1
-    middle = np.empty((6, 2), np.int64)
-    _kernels.find_middles(maps, 4, middle)
+    middle, apart = np.empty((6, 2), np.int64), np.abs(np.subtract.outer(np.arange(6.0), np.arange(6)))
+    scale, *reach = _kernels.find_middles(maps, apart, 4, middle)
     want = [twins.middle(image, 4) for image in maps]
     assert middle.tolist() == want
     assert want[1] == want[3] == [-1, -1]
+    seen = [k for k in range(6) if want[k][0] >= 0]
+    assert reach == np.max([np.abs(np.argwhere(maps[k]) - want[k]).max(0) for k in seen], axis=0).tolist()
+    assert scale == pytest.approx(twins.scale(middle, apart, seen))
     # Larger and smaller than the maps, even and odd.
     for rows, columns in [(4, 3), (14, 12), (5, 8), (30, 30)]:
-        out = cut_maps(maps, middle, rows, columns)
+        out = np.empty((rows, 6, columns), np.float32)
+        _kernels.cut_maps(maps, middle, out)
         for n, image in enumerate(maps):
-            assert_array_equal(out[n], twins.cut(image, middle[n], rows, columns))
+            assert_array_equal(out[:, n], twins.cut(image, middle[n], rows, columns))
 
 
 # Exact shifts
@@ -98,15 +95,17 @@ def test_exact_shifts_are_recovered(samples, shape, most):
     rng = np.random.default_rng(samples)
     spectrum = twins.band_limited(rng, *shape)
     by = np.array([[0, 0], *rng.uniform(-4, 4, (3, 2)), [1, -2], [0.5, -0.5]])
-    images = np.stack([twins.shifted(spectrum, shape, *d) for d in by])
+    images = np.stack([twins.shifted(spectrum, shape, *d) for d in by], axis=1)
     first, second = np.triu_indices(len(by), 1)
     near = np.abs(by[second] - by[first]).max(1) < 5
     first, second = first[near], second[near]
     most_of_all = most or full_band(*shape)
-    shifts = pair_shifts(images, first, second, most_of_all, 5, samples)
-    correlation = phase_only_correlation(images, first, second, most_of_all, range(-3, 5), range(-2, 2))
-    want = twins.correlation(images[first], images[second], *most_of_all)
-    assert_allclose(correlation, want[:, np.arange(-3, 5)[:, None], np.arange(-2, 2)], atol=2e-6)
+    pairs = first, second
+    shifts = pair_shifts(images, shape, pairs, most_of_all, 5, samples)
+    correlation = phase_only_correlation(images, shape, pairs, most_of_all, range(-3, 5), range(-2, 2))
+    want = twins.correlation(*(images.swapaxes(0, 1)[some] for some in pairs), *most_of_all)
+    want = want[:, np.arange(-3, 5)[:, None], np.arange(-2, 2)]
+    assert_allclose(correlation, want.swapaxes(0, 1), atol=2e-6)
     # The images are float32: 3e-7 px were seen with the full band. The less band, the flatter the peak, and
     # the last step, below 1e-3 px, leaves more.
     assert_allclose(shifts, by[second] - by[first], atol=2e-6 if most is None else 2e-5)
@@ -127,11 +126,11 @@ def test_a_shift_in_noise_and_its_bound(spacing_px, noise):
     # Two images in white noise, each of known shape: the variances of their places add up.
     information = (slopes**2).sum((1, 2)) / noise**2
     bound = np.sqrt((1 / information).reshape(pairs, 2).sum(1).mean())
-    noisy = (images + rng.normal(0, noise, images.shape)).astype(np.float32)
-    first = 2 * np.arange(pairs)
-    ratio = {}
-    for name, most in {"full": full_band(rows, columns), "blob": blob_band(images)}.items():
-        shifts = pair_shifts(noisy, first, first + 1, most, 4, 2)
+    noisy = (images + rng.normal(0, noise, images.shape)).astype(np.float32).swapaxes(0, 1)
+    first, size, ratio = 2 * np.arange(pairs), (rows, columns), {}
+    blob = blob_band(images.swapaxes(0, 1), size)
+    for name, most in {"full": full_band(rows, columns), "blob": blob}.items():
+        shifts = pair_shifts(noisy, size, (first, first + 1), most, 4, 2)
         ratio[name] = np.sqrt(((shifts[:, 0] - by[:, 0]) ** 2).mean()) / bound
     # Seen: 4.9 to 6.7, and 1.3 to 2.5.
     assert ratio["full"] > 4
@@ -273,9 +272,16 @@ def test_too_few_clusters_are_refused(bar, skip, said):
 
 def test_extremes_of_both_sides_and_outliers_are_left_out():
     first, second = np.triu_indices(6, 1)
-    values, weights = 50 + 0.01 * np.arange(15), (second - first) ** 2.0
+    values, apart = 50 + 0.01 * np.arange(15), (second - first).astype(float)
     values[[0, 5, 9]] = 40, 70, 51
-    mean, _, kept = robust_mean(values, weights, first, second, 1, 1.5)
+    beyond = np.stack([apart / values, np.zeros(15)], axis=1)
+    nowhere, pairs = np.zeros((6, 2), np.int64), (first, second, apart)
+
+    def mean(scale, least):
+        return _kernels.mean_distance(nowhere, beyond, pairs, 1.0, (scale, 0.5, least), (2.0, 1, 1.5))
+
     rest = np.delete(np.arange(15), [0, 5, 9])
-    assert kept == len(rest)
-    assert mean == pytest.approx(np.average(values[rest], weights=weights[rest]))
+    want = np.average(values[rest], weights=apart[rest] ** 2)
+    assert mean(0.0, 15) == pytest.approx((want, twins.jackknife(values, apart**2, first, second, rest), 12))
+    # Two clusters farther apart than half a metre are out of place; too few are left, then.
+    assert np.isnan(mean(1.0, 1)[0])
