@@ -526,20 +526,25 @@ def areas(selected: Array, hits: Array, boxes: Array, total: Array) -> int:
 
 
 @njit
-def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -> int:
+def blobs(selected: Array, grid: int) -> tuple[Array, Array, Array]:
     """Connected cells (8 neighbours) of each cluster, most first: mean column + row * 1j, cluster, number.
 
     Means are those of pixels, `grid` to a cell's side. Of as many cells, in the order of clusters, rows and
-    columns. It returns how many there are.
+    columns.
     """
     clusters, rows, columns = selected.shape
-    some = np.empty(at.size, np.complex128)
-    of = np.empty((2, at.size), np.int64)
+    room, lit = 0, np.empty((clusters, 2), np.int64)
+    for k in range(clusters):
+        lit[k, 0], lit[k, 1] = rows_of(selected[k])
+        for r in range(lit[k, 0], lit[k, 1]):
+            for c in range(columns):
+                room += selected[k, r, c]
+    some, of = np.empty(room, np.complex128), np.empty((2, room), np.int64)
     done = np.empty((rows, columns), np.bool_)
     found = np.empty((rows * columns, 2), np.int64)
     n, most = 0, 0
     for k in range(clusters):
-        first, last = rows_of(selected[k])
+        first, last = lit[k]
         done[first:last] = False
         for r in range(first, last):
             for c in range(columns):
@@ -560,11 +565,12 @@ def blobs(selected: Array, grid: int, at: Array, cluster: Array, cells: Array) -
         begin[most - of[1, i] + 1] += 1
     for size in range(most):
         begin[size + 1] += begin[size]
+    at, cluster, cells = np.empty(n, np.complex128), np.empty(n, np.int64), np.empty(n, np.int64)
     for i in range(n):
         place = begin[most - of[1, i]]
         begin[most - of[1, i]] += 1
         at[place], cluster[place], cells[place] = some[i], of[0, i], of[1, i]
-    return n
+    return at, cluster, cells
 
 
 @njit
@@ -749,11 +755,20 @@ def core_profile(
 
 @njit
 def pilot_light(
-    sums: Array, codes: Array, every: int, prior: Array, grid: int, seen: Array, out: Array
-) -> float:
+    sums: Array,
+    codes: Array,
+    every: int,
+    prior: Array,
+    grid: int,
+    seen: Array,
+    least: float,
+    out: Array,
+    lit: Array,
+) -> bool:
     """How far the pixels in each cluster's place follow its pilot, -1 to 1, `out` (K,); 0 without a place.
 
-    It returns the median of those that are `seen` (K,); 0 without any.
+    Those are `lit` (K,) that do so at all, and `least` as far as the median of those `seen` (K,); it returns
+    whether all are.
 
     `codes` are edges, (K, n), `every` so many chips. A pixel's value is the sign of the sum of the chip
     behind one, or 0; where edges are in the middle of pairs, else the opposite of that of the chip before.
@@ -805,7 +820,11 @@ def pilot_light(
         if seen[k]:
             among[many] = out[k]
             many += 1
-    return median(among, many) if many else 0.0
+    dim, every_one = max(least * median(among, many), 1e-9) if many else 1e-9, True
+    for k in range(clusters):
+        lit[k] = out[k] >= dim
+        every_one &= lit[k]
+    return every_one
 
 
 @njit
@@ -1172,23 +1191,24 @@ def seek_clusters(
     edges: Array,
     line: tuple[complex, float],
     points: Array,
-) -> float:
+    wider: Array,
+) -> tuple[int, float]:
     """Mean places of the clusters' pixels about where they should be, `points` (K, 2), NaN where unseen.
 
     `shown` (K,) says which clusters to seek about their `places`, half of `reach`, their spacing, and 1.5 px
     around. `heard` are the polarity sums of a pilot, `edges` the codes' (K, n), the first that into chip 1.
     Of a `line` (its direction in the image, how far across it light counts, px, 0 for none), the middles
-    across it are those of `middle_across`.
+    across it are those of `middle_across`. `wider` (K,) becomes 1, NaN where unseen.
 
     Returns:
-        How wide a line's flanks are, px, see `flank_px`, NaN of no line.
+        How many are seen; how wide a line's flanks are, px, see `flank_px`, NaN of no line.
     """
     clusters, height, width = pixels.shape
     unit, across = line
     window = 0.5 * reach + 1.5
-    profile = np.zeros(max(height, width))
+    profile, seen = np.zeros(max(height, width)), 0
     for k in range(clusters):
-        points[k, 0] = points[k, 1] = np.nan
+        points[k, 0] = points[k, 1] = wider[k] = np.nan
         if not shown[k]:
             continue
         x, y = places[k].real, places[k].imag
@@ -1200,13 +1220,14 @@ def seek_clusters(
                 sum_x += w * u
                 sum_y += w * v
         if sum_w > 0:
+            seen, wider[k] = seen + 1, 1.0
             points[k, 0], points[k, 1] = sum_x / sum_w, sum_y / sum_w
             if across > 0:
                 x, y = points[k, 0], points[k, 1]
                 off = middle_across(heard, edges[k], x, y, unit, 0.5 * reach, across, profile)
                 points[k, 0] -= off * unit.imag
                 points[k, 1] += off * unit.real
-    return flank_px(profile)
+    return seen, flank_px(profile)
 
 
 @njit
@@ -1217,14 +1238,15 @@ def meet_neighbours(
     way: tuple[complex, float],
     pilot: tuple[Array, Array, int],
     points: Array,
-    ends: Array,
+    by_one: float,
+    wider: Array,
 ) -> None:
     """Move clusters along a way to midway between their boundaries with their neighbours: `points` (K, 2).
 
     `mean` (K, 2) are the middles of their pixels, NaN where unseen, `places` where they should be, and
-    `neighbours` (K,) the cluster beside each in the `way` (direction, spacing in px), -1 for none. `ends`
-    (K,) becomes 1 where a cluster has a boundary on one side only. `pilot` is as of `seek_clusters`, and
-    every how many edges tell clusters apart.
+    `neighbours` (K,) the cluster beside each in the `way` (direction, spacing in px), -1 for none. `wider`
+    (K,) becomes `by_one` where a cluster has a boundary on one side only. `pilot` is as of `seek_clusters`,
+    and every how many edges tell clusters apart.
     """
     clusters = len(mean)
     along, reach = way
@@ -1264,15 +1286,22 @@ def meet_neighbours(
         if has_before and has_after:
             centre = (before[k] + after[k]) / 2
         else:
-            ends[k] = 1
+            wider[k] = by_one
         move = centre - (complex(mean[k, 0], mean[k, 1]) * along.conjugate()).real
         points[k, 0] += move * along.real
         points[k, 1] += move * along.imag
 
 
 @njit
-def squares_left(points: Array, layout: Array) -> float:
-    """Squares, px2, that the similarity leaves that fits points (K, 2) best, without those that are NaN."""
+def settle_points(
+    points: Array, layout: Array, places: Array, corner: tuple[float, float]
+) -> tuple[float, float, float]:
+    """Move points (K, 2) from an image to the sensor, on which its `corner` is; without those that are NaN.
+
+    Returns:
+        Squares, px2, that the similarity leaves that fits them best; how far right and down of their places
+        (K,) in the image they are on the sensor in the mean.
+    """
     n = 0
     image_mean, layout_mean = complex(0.0, 0.0), complex(0.0, 0.0)
     for k in range(layout.size):
@@ -1292,7 +1321,14 @@ def squares_left(points: Array, layout: Array) -> float:
         if not np.isnan(points[k, 0]):
             off = complex(points[k, 0], points[k, 1]) - image_mean - cross / power * (layout[k] - layout_mean)
             squares += abs(off) * abs(off)
-    return squares
+    right, down = 0.0, 0.0
+    for k in range(layout.size):
+        points[k, 0] += corner[0]
+        points[k, 1] += corner[1]
+        if not np.isnan(points[k, 0]):
+            right += points[k, 0] - places[k].real
+            down += points[k, 1] - places[k].imag
+    return squares, right / n, down / n
 
 
 @njit

@@ -1,7 +1,6 @@
 """A frame with the bar held still: the image of a moving bar, chip by chip, and where its clusters are."""
 
 import math
-from cmath import isfinite
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -198,22 +197,6 @@ class FrameAligner:
         )
         middle_us = seen_us - chip_us / 2
         return AlignedFrame(pilot, sums, offset_px[:, :chips], corner_px, middle_us)
-
-    def centre(self, aligned: AlignedFrame, points_px: NDArray[np.float64]) -> tuple[float, float]:
-        """Column and row of the bar's centre on the sensor, px, by its clusters' points, float64 (K, 2).
-
-        Points are finer than the cells that placed the layout; without any, those count.
-        """
-        placed = aligned.pilot.placement
-        places = placed.places(self._layout).tolist()
-        off = [complex(x, y) - place for (x, y), place in zip(points_px.tolist(), places, strict=True)]
-        if not isfinite(total := sum(off)):
-            off = [one for one in off if isfinite(one)]
-            if not off:
-                return aligned.centre_px
-            total = sum(off)
-        centre = placed.shift + total / len(off)
-        return centre.real, centre.imag
 
     def box(
         self, aligned: AlignedFrame, placement: Placement

@@ -137,7 +137,7 @@ def placements(
         before: In a frame shortly before: its scale still holds.
         min_share: Least share of the clusters in place that counts without a doubt.
     """
-    blobs = _blobs_of(presence)
+    blobs: _Blobs = _kernels.blobs(presence.selected, presence.grid_px)
     clusters = len(layout.at_m)
     at, _, many = blobs
     if not len(at):
@@ -223,13 +223,11 @@ def lit(
     """
     if presence.prior is None:
         return presence, placement
-    light = np.empty(len(edges))
-    usual = _kernels.pilot_light(sums, edges, every, presence.prior, presence.grid_px, placement.seen, light)
-    seen = light >= max(_LEAST_LIGHT * usual, 1e-9)
-    placement = changed(placement, seen=seen)
-    if False not in seen.tolist():
-        return presence, placement
-    return without(presence, ~seen), placement
+    light, seen = np.empty(len(edges)), np.empty(len(edges), np.bool_)
+    images, out = (presence.prior, presence.grid_px, placement.seen), (light, seen)
+    if not _kernels.pilot_light(sums, edges, every, *images, _LEAST_LIGHT, *out):
+        presence = without(presence, ~seen)
+    return presence, changed(placement, seen=seen)
 
 
 def without(presence: PresenceMap, clusters: NDArray[np.bool_]) -> PresenceMap:
@@ -243,15 +241,6 @@ def without(presence: PresenceMap, clusters: NDArray[np.bool_]) -> PresenceMap:
 
 def _turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:
     return np.conj(layout.at_m) if mirrored and not layout.line else layout.at_m
-
-
-def _blobs_of(presence: PresenceMap) -> _Blobs:
-    """Connected cells of one cluster, those of most cells first."""
-    selected = presence.selected
-    most = int(np.count_nonzero(selected))
-    at, cluster, cells = np.empty(most, np.complex128), np.empty(most, np.int64), np.empty(most, np.int64)
-    n = _kernels.blobs(selected, presence.grid_px, at, cluster, cells)
-    return at[:n], cluster[:n], cells[:n]
 
 
 def _voted(

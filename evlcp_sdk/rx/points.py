@@ -11,11 +11,12 @@ from evlcp_sdk.rx.placement import Layout, Placement
 from evlcp_sdk.values import PresenceMap
 
 FindPoints = Callable[
-    [PresenceMap, Placement, NDArray[np.int16]], tuple[NDArray[np.float64], NDArray[np.float64], float]
+    [PresenceMap, Placement, NDArray[np.int16], tuple[float, float]],
+    tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]],
 ]
-"""Presence of a pilot, where it shows the layout, and its polarity sums (chips, rows, columns) -> points
-(K, 2) in the image and sigmas (K,), px, NaN where unseen; over how many pixels a line's image fades out
-across it, NaN of no line."""
+"""Presence of a pilot, where it shows the layout, its polarity sums (chips, rows, columns), and where on the
+sensor the image begins -> points (K, 2) on the sensor and sigmas (K,), px, NaN where unseen; over how many
+pixels a line's image fades out across it, NaN of no line; the bar's centre on the sensor, px."""
 
 _SIGMA_PX = 0.08
 """Error expected before any is seen: a boundary inside a pixel, found from the events of a few columns in
@@ -42,6 +43,9 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
     without a neighbour moves outward by a third of a pixel, is not used: beyond the last boundary the spacing
     of the others counts. Pixels out of place do not, as a window about the cluster's place leaves them out.
 
+    The bar's centre is where the points put it, as they are finer than the cells that placed the layout;
+    without any, those count.
+
     `edges` are those of the clusters' pilots, from each chip to the next, int64 (K, n); `every` is the number
     of chips from one of those that tell clusters apart to the next, the first of which is that into chip 1.
 
@@ -59,30 +63,32 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
     ways = [(axis, way) for axis, way in enumerate((1 + 0j, 1j)) if neighbours[axis].max() >= 0]
 
     def find(
-        presence: PresenceMap, placement: Placement, heard: NDArray[np.int16]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-        if sum(placement.seen.tolist()) < 3:
-            return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan
-        unit = placement.scale / abs(placement.scale)
+        presence: PresenceMap,
+        placement: Placement,
+        heard: NDArray[np.int16],
+        corner_px: tuple[float, float],
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:
+        # One cluster alone has no direction.
+        unit = placement.scale / (abs(placement.scale) or 1.0)
         reach_px, places = abs(placement.scale) * spacing_m, placement.scale * layout.at_m + placement.shift
         across_px = max(_ACROSS_PX, reach_px / 2) if layout.line else 0.0
-        points = np.empty((clusters, 2))
+        mean, wider = np.empty((clusters, 2)), np.empty(clusters)
         line = unit * layout.way, across_px
-        flank_px = _kernels.seek_clusters(
-            presence.pixels, placement.seen, places, reach_px, heard, edges, line, points
+        seen, flank_px = _kernels.seek_clusters(
+            presence.pixels, placement.seen, places, reach_px, heard, edges, line, mean, wider
         )
-        # 1 of those with a boundary on one side only, NaN of those unseen.
-        ends, mean = 0 * points[:, 0], points.copy()
-        seen = clusters - int(np.count_nonzero(np.isnan(ends)))
+        x, y = placement.shift.real, placement.shift.imag
         if seen < 3:
-            return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan
+            centre_px = x + corner_px[0], y + corner_px[1]
+            return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan, centre_px
+        points = mean.copy()
         for axis, way in ways:
-            _kernels.meet_neighbours(
-                mean, places, neighbours[axis], (unit * way, reach_px), (heard, edges, every), points, ends
-            )
-        squares = _kernels.squares_left(points, layout.at_m)
+            along, pilot = (unit * way, reach_px), (heard, edges, every)
+            _kernels.meet_neighbours(mean, places, neighbours[axis], along, pilot, points, _OUTER, wider)
+        there = placement.places(layout)
+        squares, right_px, down_px = _kernels.settle_points(points, layout.at_m, there, corner_px)
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)
-        return points, variance**0.5 * (1 + (_OUTER - 1) * ends), flank_px
+        return points, variance**0.5 * wider, flank_px, (x + right_px, y + down_px)
 
     return find

@@ -208,9 +208,9 @@ class FrameReader:
             whole = self._aligner.whole(aligned)
             distance = self._steps.measure(FrameView(sums, aligned.offset_px, whole, soft))
         heard = sums[: self._pilot_chips]
-        points_px, sigma_px, flank_px = self._find_points(presence, placement, heard)
-        points_px = points_px + aligned.corner_px
-        centre_px = self._aligner.centre(aligned, points_px)
+        points_px, sigma_px, flank_px, centre_px = self._find_points(
+            presence, placement, heard, aligned.corner_px
+        )
         sight = BarSight()
         if self._is_column:
             sight = sight_of(self._camera, points_px, sigma_px, attitude)

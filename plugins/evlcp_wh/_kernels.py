@@ -103,8 +103,13 @@ def presence(
 
 
 @njit
-def pixel_maps(sums: Array, codes: Array, grid: int, selected: Array, out: Array) -> None:
-    """Pilot correlation of the pixels in each cluster's selected cells and their neighbours, 0 to 1."""
+def pixel_maps(
+    sums: Array, codes: Array, grid: int, probability: Array, least: float, selected: Array, out: Array
+) -> None:
+    """Pilot correlation of the pixels in each cluster's selected cells and their neighbours, 0 to 1.
+
+    `selected` (K, rows, columns) takes which cells are at `least` so likely.
+    """
     clusters, length = codes.shape
     _, rows, columns = selected.shape
     _, height, width = sums.shape
@@ -118,6 +123,7 @@ def pixel_maps(sums: Array, codes: Array, grid: int, selected: Array, out: Array
         for r in range(rows):
             some = False
             for c in range(columns):
+                selected[k, r, c] = probability[k, r, c] >= least
                 some |= selected[k, r, c]
             if some:
                 top, bottom = min(top, max(r - 1, 0)), min(r + 2, rows)

@@ -19,7 +19,7 @@ _VALUE_ERROR = 0.1
 _MIN_VALUES = 4
 """Values that must be seen in a cell for it to show a cluster: half of a pilot tells it from most others."""
 
-_MIN_PROBABILITY = np.float32(0.5)
+_MIN_PROBABILITY = 0.5
 """Presence probability that selects a cell: rather one cluster than any other, or none."""
 
 
@@ -61,9 +61,9 @@ class WhCorrelation(Separation):
         def separate(sums: NDArray[np.int16]) -> PresenceMap:
             sums = plain(sums)
             probability = posterior.probability(sums, self.grid_px)
-            selected = probability >= _MIN_PROBABILITY
+            selected, grid = np.empty(probability.shape, np.bool_), self.grid_px
             pixels = np.zeros((len(codes), *sums.shape[1:]), np.float32)
-            _kernels.pixel_maps(sums, codes, self.grid_px, selected, pixels)
-            return PresenceMap(probability, self.grid_px, selected, pixels)
+            _kernels.pixel_maps(sums, codes, grid, probability, _MIN_PROBABILITY, selected, pixels)
+            return PresenceMap(probability, grid, selected, pixels)
 
         return separate

@@ -78,9 +78,11 @@ def test_presence_is_bayes_rule(shape, grid, density):
 def test_pixel_maps(seed, grid):
     rng = np.random.default_rng(seed)
     sums = random_sums(rng, (16, 13, 10))
-    selected = rng.random((CLUSTERS, 13 // grid, 10 // grid)) < 0.1
+    probability = rng.random((CLUSTERS, 13 // grid, 10 // grid)).astype(np.float32)
+    selected, least = np.empty(probability.shape, np.bool_), float(np.sort(probability.ravel())[-30])
     codes, out = CODES.astype(np.int64), np.zeros((CLUSTERS, 13, 10), np.float32)
-    _kernels.pixel_maps(sums, codes, grid, selected, out)
+    _kernels.pixel_maps(sums, codes, grid, probability, least, selected, out)
+    assert_array_equal(selected, probability >= least)
     assert_array_equal(out, twins.pixel_maps(sums, codes, grid, selected).astype(np.float32))
     assert out.max() > 0
 

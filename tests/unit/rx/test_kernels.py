@@ -233,14 +233,11 @@ def test_connected_cells_of_each_cluster(seed, clusters, grid):
     rng = np.random.default_rng(seed)
     selected = rng.random((clusters, 11, 5)) < 0.3
     selected[rng.integers(clusters)] = False
-    most = int(selected.sum())
-    at, cluster, cells = np.empty(most, complex), np.empty(most, np.int64), np.empty(most, np.int64)
-    n = _kernels.blobs(selected, grid, at, cluster, cells)
+    at, cluster, cells = _kernels.blobs(selected, grid)
     want = sorted(twins.blobs(selected), key=lambda blob: -blob[2])
-    assert n == len(want)
-    assert_allclose(at[:n], [w[0] * grid + (grid - 1) / 2 * (1 + 1j) for w in want], rtol=1e-12)
-    assert cluster[:n].tolist() == [w[1] for w in want]
-    assert cells[:n].tolist() == [w[2] for w in want]
+    assert_allclose(at, [w[0] * grid + (grid - 1) / 2 * (1 + 1j) for w in want], rtol=1e-12)
+    assert cluster.tolist() == [w[1] for w in want]
+    assert cells.tolist() == [w[2] for w in want]
 
 
 @pytest.mark.parametrize("shape", [(90, 160), (7, 5), (1, 1), (1, 12)])
@@ -339,9 +336,10 @@ def test_light_in_step_with_the_pilot(seed, grid, every):
     sums = rng.integers(-2, 3, (16, 12, 9)).astype(np.int16)
     prior = np.where(rng.random((5, 12 // grid, 9 // grid)) < 0.3, rng.random(), 0).astype(np.float32)
     prior[2] = 0
-    out, seen = np.empty(5), rng.random(5) < 0.7
-    usual = _kernels.pilot_light(sums, codes, every, prior, grid, seen, out)
-    assert usual == pytest.approx(np.median(out[seen]) if seen.any() else 0.0)
+    out, seen, lit = np.empty(5), rng.random(5) < 0.7, np.empty(5, np.bool_)
+    assert not _kernels.pilot_light(sums, codes, every, prior, grid, seen, 0.75, out, lit)
+    usual = np.median(out[seen]) if seen.any() else 0.0
+    assert_array_equal(lit, out >= max(0.75 * usual, 1e-9))
     assert_allclose(out, twins.pilot_light(sums, codes, every, prior, grid), rtol=1e-6, atol=1e-9)
     assert out[2] == 0
 

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 from hypothesis import given, settings, strategies as st
+from numpy.testing import assert_allclose
 from numpy.typing import NDArray
 from rx_streams import LINK, frames_of, received
 
@@ -43,7 +44,7 @@ def points_of(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     layout = layout_of(centres_m)
     return points_finder(layout, *alone(len(centres_m)))(
-        presence, placements(presence, layout)[0], heard_of(presence.pixels)
+        presence, placements(presence, layout)[0], heard_of(presence.pixels), (0.0, 0.0)
     )[:2]
 
 
@@ -73,6 +74,7 @@ def test_points_of_an_ideal_bar(px_per_m: float, roll: float, dx: float, dy: flo
     # Drawn in eighths of a pixel.
     assert np.sqrt(np.mean((points - want) ** 2)) < 0.08
     assert (sigma[1:-1] < 0.12).all()
+    assert_allclose(sigma[[0, -1]], 1.5 * sigma[1])
     assert (sigma[[0, -1]] > sigma[1]).all()
 
 
@@ -112,10 +114,12 @@ def test_two_clusters_give_no_points() -> None:
     presence = drawn(CENTRES, 150, 24 + 100j, np.array([0.008, 0.03]), (48, 200))
     layout = layout_of(CENTRES)
     placement = replace(placements(presence, layout)[0], seen=np.arange(16) < 2)
-    points, sigma, _ = points_finder(layout, *alone(16))(presence, placement, heard_of(presence.pixels))
+    heard = heard_of(presence.pixels)
+    points, sigma, _, centre_px = points_finder(layout, *alone(16))(presence, placement, heard, (3.0, 5.0))
     assert np.isnan(points).all()
     assert np.isnan(sigma).all()
     assert points.shape == (16, 2)
+    assert centre_px == (placement.shift.real + 3, placement.shift.imag + 5)
 
 
 @settings(max_examples=25)
@@ -127,11 +131,12 @@ def test_cells_that_hold_more_of_one_side_do_not_shift_a_bar(dx: float) -> None:
     pixels = whole.pixels.copy()
     pixels[:, :, :first] = pixels[:, :, first + 4 :] = 0
     layout = layout_of(CENTRES)
-    points, _, _ = points_finder(layout, *alone(16))(
-        changed(whole, pixels=pixels), placements(whole, layout)[0], heard_of(whole.pixels)
+    points, _, _, centre_px = points_finder(layout, *alone(16))(
+        changed(whole, pixels=pixels), placements(whole, layout)[0], heard_of(whole.pixels), (8.0, 2.0)
     )
     # As drawn, an edge is right to half a part of a pixel.
-    assert np.abs(points[:, 0] - shift.real).max() <= 0.5 / FINE
+    assert np.abs(points[:, 0] - shift.real - 8).max() <= 0.5 / FINE
+    assert np.abs(np.subtract(centre_px, (shift.real + 8, shift.imag + 2))).max() <= 0.5 / FINE
 
 
 def lies(points: NDArray[np.float64]) -> bool:
