@@ -139,12 +139,11 @@ class RangeKeeper:
             sigma_m *= math.sqrt(_left_over(sums, height[0]))
             unsure_m = math.hypot(_WAVE_SHARE * math.sqrt(height[1]), _WAVE_REST_PX) * measured.bend.wave_m
         sigma_m = max(sigma_m, _LEAST_SIGMA * abs(distance_m))
-        n = len(state.past)
-        past = np.empty((n + 1, 3))
-        past[:n] = state.past
-        past[n] = t_s, distance_m, sigma_m**2
-        if past[0, 0] <= t_s - _MEMORY_S:
-            past = past[past[:, 0] > t_s - _MEMORY_S]
+        old = state.past
+        while len(old) and old[0, 0] <= t_s - _MEMORY_S:
+            old = old[1:]
+        past = np.empty((len(old) + 1, 3))
+        past[:-1], past[-1] = old, (t_s, distance_m, sigma_m**2)
         # They follow a parabola whose speed and acceleration are likely as above; the squares of what is
         # left, in those that the sigmas expect, scale the variances.
         speed_m_s, speed_variance, variance = _kernels.newest_on_parabola(

@@ -42,7 +42,7 @@ prints; on a Gaussian channel 1 to 1.3, as long as less than half of the frames 
 _LEAST_EVENTS = 0.5
 """Share of the events due, by the edges of the codeword with the fewest, that may be missing by chance."""
 
-_NO_RANGE = Range(math.nan, math.nan, 0)
+_NO_RANGE, _NO_SIGHT = Range(math.nan, math.nan, 0), BarSight()
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
 
@@ -169,7 +169,7 @@ class FrameReader:
         self._camera = link.camera
         self._is_column = float(np.ptp(centres_m[:, 0])) < 1e-9
         self._pilot_chips = link.packet.pilot_chips
-        self._least_activity = book.least_activity
+        self._least_lit = _LEAST_EVENTS * book.least_activity
         self._steps, self._aligner = steps, aligner
         self._layout = layout_of(centres_m)
         self._pairs = neighbours(self._layout)
@@ -196,12 +196,14 @@ class FrameReader:
         """
         sums, presence, placement = aligned.sums, aligned.pilot.presence, aligned.pilot.placement
         soft = self._steps.decode(presence, aligned.sums_and_next, before, self._behind[due.index])
-        lit = still_lit(sums, presence, placement.seen, self._pilot_chips, self._least_activity)
+        lit, images = np.empty_like(placement.seen), (sums, presence.probability, presence.grid_px)
+        # Where a stream has a gap, or a pole passes, silence is not what a cluster says.
+        _kernels.still_lit(*images, self._pilot_chips, self._least_lit, placement.seen, lit)
         given = calibrate_llr(soft, lit)
         if not due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             return Reading(
-                soft.symbols, given, _NO_RANGE, *_NO_POINTS, aligned.centre_px, BarSight(), spread=None
+                soft.symbols, given, _NO_RANGE, *_NO_POINTS, aligned.centre_px, _NO_SIGHT, spread=None
             )
         distance = _NO_RANGE
         if ranged:
@@ -211,7 +213,7 @@ class FrameReader:
         points_px, sigma_px, flank_px, centre_px = self._find_points(
             presence, placement, heard, aligned.corner_px
         )
-        sight = BarSight()
+        sight = _NO_SIGHT
         if self._is_column:
             sight = sight_of(self._camera, points_px, sigma_px, attitude)
         elif not self._camera.is_pinhole:
@@ -219,30 +221,6 @@ class FrameReader:
         # Only of two images at one time it is asked; the pilot alone is kept for that, not the whole frame.
         spread = LateSpread(heard.copy(), self._pilots, self._every, self._layout, self._pairs, placement)
         return Reading(soft.symbols, given, distance, points_px, sigma_px, flank_px, centre_px, sight, spread)
-
-
-def still_lit(
-    sums: NDArray[np.int16],
-    presence: PresenceMap,
-    seen: NDArray[np.bool_],
-    pilot_chips: int,
-    least_activity: float = 0.5,
-) -> NDArray[np.bool_]:
-    """Which clusters in sight have events in a frame's info segment as they have in its pilot, bool (K,).
-
-    Where a stream has a gap, or a pole passes, silence is not what a cluster says.
-
-    Args:
-        sums: Polarity sums of pilot and info segment, int16 (chips, height, width).
-        presence: Where the clusters are.
-        seen: Those in sight, bool (K,).
-        pilot_chips: Chips of the pilot.
-        least_activity: Edges a chip of the codeword with the fewest, over those of a pilot; half of them in
-            pair codes.
-    """
-    lit, least = np.empty_like(seen), _LEAST_EVENTS * least_activity
-    _kernels.still_lit(sums, presence.probability, presence.grid_px, pilot_chips, least, seen, lit)
-    return lit
 
 
 def calibrate_llr(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:

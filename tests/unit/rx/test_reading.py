@@ -5,8 +5,9 @@ import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import hadamard
-from evlcp_sdk.rx.reading import calibrate_llr, still_lit
-from evlcp_sdk.values import PresenceMap, SoftSymbols
+from evlcp_sdk.rx import _kernels
+from evlcp_sdk.rx.reading import calibrate_llr
+from evlcp_sdk.values import SoftSymbols
 
 ALL = np.ones(16, bool)
 ROWS = hadamard(8)
@@ -81,7 +82,8 @@ def test_silence_is_not_what_a_cluster_says() -> None:
     sums[16:20:2, :, 4:] = -1
     probability = np.zeros((3, 3, 4), np.float32)
     probability[0, :, :2] = probability[1, :, 2:] = 0.9
-    nothing = np.zeros((3, 6, 8), np.float32)
-    presence = PresenceMap(probability, 2, probability > 0.5, nothing)
-    assert still_lit(sums, presence, ALL[:3], 16).tolist() == [True, False, False]
-    assert not still_lit(sums, presence, ~ALL[:3], 16).any()
+    lit = np.empty(3, np.bool_)
+    _kernels.still_lit(sums, probability, 2, 16, 0.25, ALL[:3], lit)
+    assert lit.tolist() == [True, False, False]
+    _kernels.still_lit(sums, probability, 2, 16, 0.25, ~ALL[:3], lit)
+    assert not lit.any()
