@@ -762,18 +762,17 @@ def pilot_light(
     grid: int,
     seen: Array,
     least: float,
-    out: Array,
-    lit: Array,
+    light: tuple[Array, Array],
 ) -> bool:
-    """How far the pixels in each cluster's place follow its pilot, -1 to 1, `out` (K,); 0 without a place.
+    """How far the pixels in each cluster's place follow its pilot, -1 to 1, 0 without a place: `light` (K,).
 
-    Those are `lit` (K,) that do so at all, and `least` as far as the median of those `seen` (K,); it returns
-    whether all are.
+    Its second part (K,) says which do so at all, and `least` as far as the median of those `seen` (K,); it
+    returns whether all do.
 
     `codes` are edges, (K, n), `every` so many chips. A pixel's value is the sign of the sum of the chip
     behind one, or 0; where edges are in the middle of pairs, else the opposite of that of the chip before.
     """
-    clusters, _, columns = prior.shape
+    (clusters, _, columns), (out, lit) = prior.shape, light
     length = codes.shape[1]
     _, height, width = sums.shape
     flat = np.ascontiguousarray(sums).reshape(len(sums), height * width)
@@ -817,9 +816,8 @@ def pilot_light(
         out[k] = total / (edges * place) if place > 0 else 0.0
     among, many = np.empty(clusters), 0
     for k in range(clusters):
-        if seen[k]:
-            among[many] = out[k]
-            many += 1
+        among[many] = out[k]
+        many += int(seen[k])
     dim, every_one = max(least * median(among, many), 1e-9) if many else 1e-9, True
     for k in range(clusters):
         lit[k] = out[k] >= dim
@@ -1190,21 +1188,20 @@ def seek_clusters(
     heard: Array,
     edges: Array,
     line: tuple[complex, float],
-    points: Array,
-    wider: Array,
+    found: tuple[Array, Array],
 ) -> tuple[int, float]:
-    """Mean places of the clusters' pixels about where they should be, `points` (K, 2), NaN where unseen.
+    """Mean places of the clusters' pixels about where they should be, `found` (K, 2), NaN where unseen.
 
     `shown` (K,) says which clusters to seek about their `places`, half of `reach`, their spacing, and 1.5 px
     around. `heard` are the polarity sums of a pilot, `edges` the codes' (K, n), the first that into chip 1.
     Of a `line` (its direction in the image, how far across it light counts, px, 0 for none), the middles
-    across it are those of `middle_across`. `wider` (K,) becomes 1, NaN where unseen.
+    across it are those of `middle_across`. The second part of `found` (K,) is 1, NaN where unseen.
 
     Returns:
         How many are seen; how wide a line's flanks are, px, see `flank_px`, NaN of no line.
     """
     clusters, height, width = pixels.shape
-    unit, across = line
+    (unit, across), (points, wider) = line, found
     window = 0.5 * reach + 1.5
     profile, seen = np.zeros(max(height, width)), 0
     for k in range(clusters):

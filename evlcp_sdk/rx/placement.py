@@ -224,8 +224,8 @@ def lit(
     if presence.prior is None:
         return presence, placement
     light, seen = np.empty(len(edges)), np.empty(len(edges), np.bool_)
-    images, out = (presence.prior, presence.grid_px, placement.seen), (light, seen)
-    if not _kernels.pilot_light(sums, edges, every, *images, _LEAST_LIGHT, *out):
+    place, least = (presence.prior, presence.grid_px, placement.seen), _LEAST_LIGHT
+    if not _kernels.pilot_light(sums, edges, every, *place, least, (light, seen)):
         presence = without(presence, ~seen)
     return presence, changed(placement, seen=seen)
 

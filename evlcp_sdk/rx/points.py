@@ -75,7 +75,7 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
         mean, wider = np.empty((clusters, 2)), np.empty(clusters)
         line = unit * layout.way, across_px
         seen, flank_px = _kernels.seek_clusters(
-            presence.pixels, placement.seen, places, reach_px, heard, edges, line, mean, wider
+            presence.pixels, placement.seen, places, reach_px, heard, edges, line, (mean, wider)
         )
         x, y = placement.shift.real, placement.shift.imag
         if seen < 3:

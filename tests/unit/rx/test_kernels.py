@@ -337,7 +337,7 @@ def test_light_in_step_with_the_pilot(seed, grid, every):
     prior = np.where(rng.random((5, 12 // grid, 9 // grid)) < 0.3, rng.random(), 0).astype(np.float32)
     prior[2] = 0
     out, seen, lit = np.empty(5), rng.random(5) < 0.7, np.empty(5, np.bool_)
-    assert not _kernels.pilot_light(sums, codes, every, prior, grid, seen, 0.75, out, lit)
+    assert not _kernels.pilot_light(sums, codes, every, prior, grid, seen, 0.75, (out, lit))
     usual = np.median(out[seen]) if seen.any() else 0.0
     assert_array_equal(lit, out >= max(0.75 * usual, 1e-9))
     assert_allclose(out, twins.pilot_light(sums, codes, every, prior, grid), rtol=1e-6, atol=1e-9)
