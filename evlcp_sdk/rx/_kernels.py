@@ -333,9 +333,15 @@ _LOWEST = np.array([MOST_BOXES, *((n & -n).bit_length() - 1 for n in range(1, 1 
 
 @njit
 def select_boxes(
-    events: Columns, boxes: Array, pixels: Array, rhythmic: tuple[int, int, int], apart: int, out: Columns
-) -> Array:
-    """Copy the events inside each of some boxes (n, 4), `MOST_BOXES` at the most; how many, (n,).
+    events: Columns,
+    boxes: Array,
+    pixels: Array,
+    rhythmic: tuple[int, int, int],
+    apart: int,
+    out: Columns,
+    many: Array,
+) -> None:
+    """Copy the events inside each of some boxes (n, 4), `MOST_BOXES` at the most; how `many`, int64 (n,).
 
     Of each box, they begin `apart` events behind where those of the one before do; behind all is room for one
     more. `rhythmic` are (boxes of which only those in rhythm are meant, a bit each; the least score of
@@ -352,7 +358,9 @@ def select_boxes(
             columns[u] |= np.uint8(1 << k)
         for v in range(top, bottom):
             rows[v] |= np.uint8(1 << k)
-    ends = np.arange(MOST_BOXES + 1) * apart
+    ends = np.empty(MOST_BOXES + 1, np.int64)
+    for k in range(ends.size):
+        ends[k] = k * apart
     for i in range(t_us.size):
         inside = columns[x[i]] & rows[y[i]]
         if inside & filtered:
@@ -372,7 +380,8 @@ def select_boxes(
             inside &= np.uint8(inside - 1)
             if not inside:
                 break
-    return ends[: len(boxes)] - np.arange(len(boxes)) * apart
+    for k in range(len(boxes)):
+        many[k] = ends[k] - k * apart
 
 
 @njit

@@ -522,9 +522,11 @@ class Rhythm:
             ends = [_kernels.select_box(columns, boxes[0], self._columns)]
         else:
             filtered = sum(one << k for k, one in enumerate(rhythmic)), self._min_score, most_same
-            ends = _kernels.select_boxes(
-                columns, np.array(boxes), self._pixels, filtered, apart, self._columns
-            ).tolist()
+            numbers = np.empty(len(boxes), np.int64)
+            _kernels.select_boxes(
+                columns, np.array(boxes), self._pixels, filtered, apart, self._columns, numbers
+            )
+            ends = numbers.tolist()
         t_us, x, y, p = self._columns
         begin, found = 0, []
         for many in ends:

@@ -54,9 +54,11 @@ def presence(
     size, n = height * width, rows * columns
     flat, into = sums.reshape(-1, size), out.reshape(clusters, n)
     # Sums of the square of pixels that begins at each; where it leaves the image, there is no cell.
-    square = np.zeros((2, 2, size), np.int16)
+    square = np.empty((2, 2, size), np.int16)
     by_pixel, values = np.empty(size, np.int8), np.empty((length, n), np.int8)
-    seen = np.zeros(n, np.int16)
+    seen = np.empty(n, np.int16)
+    for j in range(n):
+        seen[j] = 0
     for i in range(length):
         for chip in range(2):
             part, most = flat[2 * i + chip], size
@@ -86,7 +88,9 @@ def presence(
         for j in range(m):
             some[i, j] = values[i, which[j]]
     # A literal 0 would compile the fit once more.
-    best, begin = np.full(m, -length, np.int16), n - n
+    best, begin = np.empty(m, np.int16), n - n
+    for j in range(m):
+        best[j] = -length
     for k in range(clusters):
         _fit(codes[k], some, begin, fits[k])
         for j in range(m):
