@@ -83,20 +83,18 @@ def cross_spectra(turned: Array, first: Array, second: Array, no_phase: float, o
     `turned` (2, 2, down, images, across) are images turned across by cosine and sine, of what was turned down
     by cosine and sine; `out` (2, down, pairs, 2, across) makes real and imaginary parts if it is turned back
     across by cosine and sine: it is of harmonics to both sides. What is less than `no_phase` of the largest
-    of a spectrum has no phase, and becomes 0.
+    of a spectrum has no phase, and becomes 0. `turned` is written over.
     """
     _, _, down, n, across = turned.shape
-    many, flat = n * across, turned.reshape(4, down, n * across)
-    # Real and imaginary parts of harmonics to the right, and of those to the left.
-    unit, power = np.empty((4, down, many), np.float32), np.empty((2, down, many), np.float32)
+    many, unit = n * across, turned.reshape(4, down, n * across)
     top = np.zeros(many, np.float32)
     for y in range(down):
         for j in range(many):
-            real, imaginary = flat[0, y, j] - flat[3, y, j], -flat[1, y, j] - flat[2, y, j]
-            unit[0, y, j], unit[1, y, j], power[0, y, j] = real, imaginary, real**2 + imaginary**2
-            real, imaginary = flat[0, y, j] + flat[3, y, j], flat[2, y, j] - flat[1, y, j]
-            unit[2, y, j], unit[3, y, j], power[1, y, j] = real, imaginary, real**2 + imaginary**2
-            top[j] = max(top[j], power[0, y, j], power[1, y, j])
+            # Real and imaginary part of a harmonic to the right, and of that to the left.
+            a, b = unit[0, y, j] - unit[3, y, j], -unit[1, y, j] - unit[2, y, j]
+            c, d = unit[0, y, j] + unit[3, y, j], unit[2, y, j] - unit[1, y, j]
+            unit[0, y, j], unit[1, y, j], unit[2, y, j], unit[3, y, j] = a, b, c, d
+            top[j] = max(top[j], a * a + b * b, c * c + d * d)
     for k in range(n):
         of_image, most = top[k * across : (k + 1) * across], np.float32(0)
         for x in range(across):
@@ -106,14 +104,14 @@ def cross_spectra(turned: Array, first: Array, second: Array, no_phase: float, o
     for y in range(down):
         for way in range(2):
             for j in range(many):
-                size = np.sqrt(max(power[way, y, j], np.float32(1e-37)))
-                by = np.float32(power[way, y, j] > top[j]) / size
-                unit[2 * way, y, j] *= by
-                unit[2 * way + 1, y, j] *= by
+                a, b = unit[2 * way, y, j], unit[2 * way + 1, y, j]
+                by = np.float32(a * a + b * b > top[j]) / np.sqrt(max(a * a + b * b, np.float32(1e-37)))
+                unit[2 * way, y, j], unit[2 * way + 1, y, j] = a * by, b * by
         for q in range(first.size):
-            for x in range(across):
-                # Unsigned, as indices below 0 would count from the end.
-                one, other = np.uint64(across * first[q] + x), np.uint64(across * second[q] + x)
+            # Unsigned, as indices below 0 would count from the end.
+            begin, start = np.uint64(across * first[q]), np.uint64(across * second[q])
+            for x in range(np.uint64(across)):
+                one, other = begin + x, start + x
                 a = unit[0, y, one] * unit[0, y, other] + unit[1, y, one] * unit[1, y, other]
                 b = unit[0, y, one] * unit[1, y, other] - unit[1, y, one] * unit[0, y, other]
                 c = unit[2, y, one] * unit[2, y, other] + unit[3, y, one] * unit[3, y, other]
