@@ -47,6 +47,8 @@ _BLOCK = 32
 """Events that are looked at together: of a bar alone in the dark, every other block has no stray in it."""
 
 _ROUND = np.uint32(CLOCK_ROUND - 1)
+_MOST_HITS = np.int16(2**15 - 1)
+"""What a cell's hits, two bytes, count no further than: of chips below 3 us there may be more in a step."""
 
 
 @njit
@@ -122,7 +124,8 @@ def score_rises(
         # One that comes after long is no blinking yet, however a pixel blinked when a bar was there.
         if (low & np.uint32(SCORES)) >= least and kind != np.uint32(0) and same < lamp:
             row = at // width
-            cells[(row >> shift) * columns + ((at - row * width) >> shift)] += 1
+            cell = (row >> shift) * columns + ((at - row * width) >> shift)
+            cells[cell] += np.int16(cells[cell] < _MOST_HITS)
             candidates += 1
     return candidates
 

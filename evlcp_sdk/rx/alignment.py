@@ -23,7 +23,7 @@ _EVEN = 0.01
 """Steps from cluster to cluster are a spacing where they are longer by rounding only."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
 class DueFrame:
     """The next frame of a grid of packets, and when its events are all there.
 

@@ -89,7 +89,7 @@ class Placement:
         # Asked for again and again in a frame.
         known: tuple[Layout, NDArray[np.complex128]] | None = vars(self).get("_places")
         if known is None or known[0] is not layout:
-            known = layout, self.scale * _turned(layout, self.mirrored) + self.shift
+            known = layout, self.scale * turned(layout, self.mirrored) + self.shift
             vars(self)["_places"] = known
         return known[1]
 
@@ -239,7 +239,8 @@ def without(presence: PresenceMap, clusters: NDArray[np.bool_]) -> PresenceMap:
     return changed(presence, **kept)
 
 
-def _turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:
+def turned(layout: Layout, mirrored: bool) -> NDArray[np.complex128]:
+    """Cluster centres of a layout, or of its mirror image; of a line both are one and the same."""
     return np.conj(layout.at_m) if mirrored and not layout.line else layout.at_m
 
 
@@ -250,7 +251,7 @@ def _voted(
     best_score, best = 0.0, None
     ways = (False,) if layout.line else (False, True)
     for mirrored in ways if before is None or layout.line else (before.mirrored,):
-        at_m = _turned(layout, mirrored)
+        at_m = turned(layout, mirrored)
         scale = 0j if before is None else before.scale
         place, proposers = (at_m, layout.spacing_m, slack_px), min(len(blobs[0]), _PROPOSERS)
         score, s, shift = _kernels.best_similarity(blobs, proposers, *place, _LEAST_SPACING_PX, scale)
@@ -275,7 +276,7 @@ def _judged(
 ) -> tuple[Placement, int]:
     """A similarity with what is in its place, and how likely that is by chance; the cells in no place."""
     clusters = len(layout.at_m)
-    places = scale * _turned(layout, mirrored) + shift
+    places = scale * turned(layout, mirrored) + shift
     spacing_px, reach = abs(scale) * layout.spacing_m, _reach(scale, layout, slack_px)
     seen = np.empty(clusters, np.bool_)
     shown, many, cells, left = _kernels.cells_by_place(*blobs, places, reach, spacing_px / 2, seen)

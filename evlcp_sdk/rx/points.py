@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.placement import Layout, Placement
+from evlcp_sdk.rx.placement import Layout, Placement, turned
 from evlcp_sdk.values import PresenceMap
 
 FindPoints = Callable[
@@ -70,7 +70,8 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
     ) -> tuple[NDArray[np.float64], NDArray[np.float64], float, tuple[float, float]]:
         # One cluster alone has no direction.
         unit = placement.scale / (abs(placement.scale) or 1.0)
-        reach_px, places = abs(placement.scale) * spacing_m, placement.scale * layout.at_m + placement.shift
+        reach_px, places = abs(placement.scale) * spacing_m, placement.places(layout)
+        at_m = turned(layout, placement.mirrored)
         across_px = max(_ACROSS_PX, reach_px / 2) if layout.line else 0.0
         mean, wider = np.empty((clusters, 2)), np.empty(clusters)
         line = unit * layout.way, across_px
@@ -83,10 +84,10 @@ def points_finder(layout: Layout, edges: NDArray[np.int64], every: int) -> FindP
             return np.full((clusters, 2), np.nan), np.full(clusters, np.nan), math.nan, centre_px
         points = mean.copy()
         for axis, way in ways:
-            along, pilot = (unit * way, reach_px), (heard, edges, every)
+            to_next = unit * (way if at_m is layout.at_m else way.conjugate())
+            along, pilot = (to_next, reach_px), (heard, edges, every)
             _kernels.meet_neighbours(mean, places, neighbours[axis], along, pilot, points, _OUTER, wider)
-        there = placement.places(layout)
-        squares, right_px, down_px = _kernels.settle_points(points, layout.at_m, there, corner_px)
+        squares, right_px, down_px = _kernels.settle_points(points, at_m, places, corner_px)
         freedom = max(2 * seen - 4, 0)
         variance = (_EXPECTED_WORTH * _SIGMA_PX**2 + squares) / (_EXPECTED_WORTH + freedom)
         return points, variance**0.5 * wider, flank_px, (x + right_px, y + down_px)

@@ -355,7 +355,7 @@ class Followed:
         """Drop events older than a time, and positions older than another: others ask where it was."""
         pieces = self.pieces
         while pieces and pieces[0][0] + step_us <= t_us:
-            self.held_bytes -= held_bytes(pieces.popleft()[1])
+            self.forget()
         self.positions.forget_before(places_us)
 
 
@@ -457,7 +457,9 @@ class Rhythm:
         self._seen: int | None = None
         self._open_us, self._taken, self._rises = -1, 0, 0
         self._shared = shared
+        # Where events are selected into, box by box, so many places apart.
         self._apart = -1
+        self._columns: _kernels.Columns = (np.empty(0),) * 4
         self._kept: tuple[tuple[int, int], int, NDArray[np.int16]] | None = None
 
     def step(self, start_us: int, events: Events, hits: NDArray[np.int16], cell_shift: int) -> int:
@@ -515,7 +517,7 @@ class Rhythm:
             self._apart = events.t_us.size + events.t_us.size // 4
             room = most * self._apart + 1
             into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
-            self._columns: _kernels.Columns = into
+            self._columns = into
         columns, apart = (events.t_us, events.x, events.y, events.p), self._apart
         if len(boxes) == 1 and not rhythmic[0]:
             # Of a bar alone, whole blocks of events.
@@ -599,7 +601,7 @@ class RegionFollower(RegionTracker):
         self._age_us = _AGE_CHIPS * chip_us
         shape = (camera.height, camera.width)
         self._rhythm = rhythm or Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
-        # Emptied once a step; no sensor's pixel rises a thousand times in one.
+        # Emptied once a step: two bytes each.
         self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in shape], np.int16)
         self._fresh: list[Box] = []
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)

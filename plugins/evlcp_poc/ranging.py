@@ -186,8 +186,9 @@ class PocRanging(Ranging):
 
 
 def cut_size(least: float) -> int:
-    """An even length that transforms fast, as in the paper: its half has no factors but 2, 3 and 5."""
+    """The next even length whose half has no factors but 2, 3 and 5, as of the paper's cuts."""
     half = math.ceil(least / 2)
+    # All such numbers of less than 17 factors divide this one, and no other does.
     while 30**16 % half:
         half += 1
     return 2 * half

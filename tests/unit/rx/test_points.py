@@ -3,6 +3,7 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
@@ -101,13 +102,15 @@ def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out() -> None:
     assert sigma[3] > sigma[2]
 
 
-def test_a_panel_has_neighbours_on_both_axes() -> None:
+@pytest.mark.parametrize("down", [1, -1], ids=["upright", "mirrored"])
+def test_a_panel_has_neighbours_on_both_axes(down: int) -> None:
     panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
     layout = panel.cluster_centres_m()
     turn, shift = 700 * np.exp(0.05j), 64.2 + 63.7j
-    presence = drawn(layout, turn, shift, np.array([0.02, 0.02]), (128, 128))
+    shown = layout * [1, down]
+    presence = drawn(shown, turn, shift, np.array([0.02, 0.02]), (128, 128))
     points, _ = points_of(presence, layout)
-    assert np.abs(points - truth_of(turn, shift, layout)).max() < 0.25
+    assert np.abs(points - truth_of(turn, shift, shown)).max() < 0.25
 
 
 def test_two_clusters_give_no_points() -> None:
