@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from evlcp_sdk.sim.scene import (
         BackgroundSpec as BackgroundSpec,
         BarSpec as BarSpec,
+        DropSpec as DropSpec,
         LampSpec as LampSpec,
         LensSpec as LensSpec,
         MotionSpec as MotionSpec,
@@ -34,8 +35,8 @@ if TYPE_CHECKING:
 _HOMES = {
     "record": "truth_of",
     "scene": (
-        "BackgroundSpec BarSpec LampSpec LensSpec MotionSpec ReflectionSpec Scene SensorSpec WiperSpec "
-        "WorldSpec load_scene preset_names preset_text resolve_scene"
+        "BackgroundSpec BarSpec DropSpec LampSpec LensSpec MotionSpec ReflectionSpec Scene SensorSpec "
+        "WiperSpec WorldSpec load_scene preset_names preset_text resolve_scene"
     ),
     "simulation": "Simulation",
     "truth": "SentBar Truth read_truth truth_from_table truth_path",

@@ -468,10 +468,11 @@ class TimeLine(NamedTuple):
 
     Attributes:
         t_us: When, the first where the block begins, float64 (entries,).
-        kind: What: the image moves (-2), the share of all light that passes changes (-1), or the source of
-            this number switches.
+        kind: What: the image moves (-2), the share of all light that passes or the background changes (-1),
+            or the source of this number switches.
         pose: The image's pose from then on.
         shade: Share of all light that passes from then on.
+        bright: How many times its mean the background's light is from then on.
         row: Row of the levels that each source shows from then on, (sources, entries).
     """
 
@@ -479,6 +480,7 @@ class TimeLine(NamedTuple):
     kind: Array
     pose: Array
     shade: Array
+    bright: Array
     row: Array
 
 
@@ -766,6 +768,10 @@ def _run_batch(
                 f[_AROUND + i] = scenery.light[1] + scenery.light[0] * (top + down * (low - top))
         for i in range(lanes):
             f[_TOTAL + i] = f[_AROUND + i]
+        bright = line.bright[e]
+        if bright != 1.0:
+            for i in range(lanes):
+                f[_TOTAL + i] = scenery.light[1] + bright * (f[_TOTAL + i] - scenery.light[1])
         for a in range(many):
             row = line.row[lit[a], e]
             if row != shining.clusters[a, 2]:
@@ -806,6 +812,7 @@ class ActivePixels(NamedTuple):
         batches: Where in `pixels` each batch begins, and the last ends; `LANES` at the most.
         masks: Bit i says that source i lights a batch.
         strides: A batch sees where the sources are anew in every so many poses only.
+        at_px: Column and row at which each pixel's light would be without what bends it, (2, pixels).
     """
 
     number: int
@@ -814,6 +821,7 @@ class ActivePixels(NamedTuple):
     batches: Array
     masks: Array
     strides: Array
+    at_px: Array
 
 
 @njit
@@ -851,12 +859,13 @@ def run_pixels(
     for j in range(first, last):
         if out.made[0] + LANES * most_events > out.t_us.size:
             return j
-        pixels = block.pixels[block.batches[j] : block.batches[j + 1]]
+        begin = block.batches[j]
+        pixels = block.pixels[begin : block.batches[j + 1]]
         for i, pixel in enumerate(pixels):
             s, c = states[pixel], counters[pixel]
             batch.code[i] = ((pixel // width) << COLUMN_BITS | (pixel % width)) << 1
             batch.key[i], batch.draw[i] = mix(model.seed + np.uint64(pixel) * np.uint64(PIXEL_STEP)), c[DRAW]
-            f[_X + i], f[_Y + i] = pixel % width, pixel // width
+            f[_X + i], f[_Y + i] = block.at_px[0, begin + i], block.at_px[1, begin + i]
             f[_ON + i], f[_OFF + i], f[_LAST_OUT + i] = s[ON_FACTOR], s[OFF_FACTOR], s[T_LAST_OUT]
             f[_U + i], f[_REFERENCE + i], f[_READY + i] = s[U_BASE], s[REFERENCE], s[T_READY]
             f[_NOW + i], f[_FOLLOWER + i], f[_ARMED + i] = s[LIGHT], s[FOLLOWER], float(c[ARMED])

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from evlcp_sdk.sim.motion import Strip
 from evlcp_sdk.sim.optics import led_light_w_m2
 from evlcp_sdk.sim.scene import (
     MOST_SOURCES,
+    BackgroundSpec,
     BarSpec,
     LampSpec,
     LensSpec,
@@ -37,6 +39,12 @@ _SINE_STEPS = 32
 
 _WIPER_STEP_LN = 0.05
 """Steps of the light while a wiper's edge passes: a quarter of a threshold, so that none is an event."""
+
+_BACKGROUND_STEP_LN = 0.01
+"""The same while the background changes: a twentieth of a threshold, so that as many events come."""
+
+_SLAT_STEP_UM = 1000.0
+"""How far a lattice moves along a bar until it hides other parts of it, um: a tenth of an LED's place."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +77,8 @@ class BarLight:
     """A transmitter's light: packets, one after another, or the chips of a file.
 
     Its `strips` are what shines, all switched by the same chips, its `light_w_m2` the irradiance of a pixel
-    that the brightest fills; its `images` are the same again for each reflection.
+    that the brightest fills; its `images` are the same again for each reflection. Of its `dark` clusters no
+    LED blinks.
 
     Args:
         bar: The bar.
@@ -99,17 +108,17 @@ class BarLight:
     ) -> None:
         self.bar = bar
         self.link = link
+        self.payload_seed = seed if bar.seed is None else bar.seed
         try:
-            strips = lit_strips(bar, link.bar)
+            strips = lit_strips(bar, link.bar, self.payload_seed)
         except ConfigError as refused:
-            raise ConfigError(f"{source}.link: {refused}") from refused
+            raise ConfigError(f"{source}.{refused}") from refused
         lights = [led_light_w_m2(bar, strip, lens) for strip in strips]
         self.light_w_m2 = max(lights)
         self.centre_m = (bar.x_m, bar.y_m, bar.z_m)
         self.rate_hz = link.air.chip_rate_hz * (1 + bar.ppm * 1e-6)
         # The codes rest for two chips at most, and by half their swing from their mean.
         self.longest_us = 1e6 / self.rate_hz
-        self.payload_seed = seed if bar.seed is None else bar.seed
         self._chips: NDArray[np.uint8] | None = None
         self._packets: dict[int, NDArray[np.uint8]] = {}
         self._transmitter_id = transmitter_id
@@ -135,6 +144,8 @@ class BarLight:
             )
         self.start_chip = start
         self._covers = self._checked_covers(source)
+        lit = {int(k) for strip in strips for k in strip.clusters[strip.swing > 0]}
+        self.dark = set(range(link.codebook.clusters)) - lit
         shares = [light / self.light_w_m2 if self.light_w_m2 else 1.0 for light in lights]
         self.strips = tuple(map(self._source, strips, shares))
         self.images = tuple(
@@ -159,11 +170,8 @@ class BarLight:
 
         def switches(begin_us: float, end_us: float) -> tuple[Floats, Floats]:
             when, levels = self.switches(begin_us, end_us)
-            if image is None:
-                when, levels = self.cover(when, levels, begin_us, end_us)
-            shown = levels[:, lit.clusters]
-            shown[:, lit.clusters < 0] = 0.0
-            return when, shown
+            shown = levels[:, lit.clusters] * lit.swing + lit.rest
+            return (when, shown) if image else self.cover(when, shown, begin_us, end_us, lit)
 
         strip = Strip(centre_m, along_m, lit.width_m, lit.cuts)
         return Source(strip, self.light_w_m2 * share, self.longest_us, switches, image)
@@ -186,27 +194,42 @@ class BarLight:
         poles = tuple((a, b, 0, last) for a, b in bar.pole_s)
         return tuple((a * 1e6, b * 1e6, first, end) for a, b, first, end in (*bar.cover_s, *poles))
 
-    def cover(self, when_us: Floats, levels: Floats, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+    def cover(
+        self, when_us: Floats, levels: Floats, begin_us: float, end_us: float, lit: LitStrip
+    ) -> tuple[Floats, Floats]:
         """Put out what is hidden.
 
         Args:
             when_us: Times of switching after `begin_us` and before `end_us`, float64 (n,).
-            levels: From each on, float64 (n + 1, clusters).
+            levels: From each on, float64 (n + 1, parts).
             begin_us: When the first levels hold.
             end_us: Until when the last hold.
+            lit: The parts.
 
         Returns:
             The same with the times at which something begins or ends to hide clusters.
         """
-        if not self._covers and not self.bar.covered:
+        slats = self.bar.lattice
+        if not self._covers and not self.bar.covered and slats is None:
             return when_us, levels
         edges = np.array([t for cover in self._covers for t in cover[:2] if begin_us < t < end_us])
+        pace = abs(slats.speed_mps) / _SLAT_STEP_UM if slats else 0.0
+        if pace:
+            steps = np.arange(math.floor(begin_us * pace) + 1, math.ceil(end_us * pace))
+            edges = np.append(edges, steps / pace)
         when = np.sort(np.concatenate([when_us, edges]))
         start = np.append(begin_us, when)
         seen: Floats = levels[np.searchsorted(when_us, start, side="right")]
-        seen[:, list(self.bar.covered)] = 0.0
+        seen[:, np.isin(lit.clusters, self.bar.covered)] = 0.0
         for from_us, to_us, first, last in self._covers:
-            seen[(start >= from_us) & (start < to_us), first : last + 1] = 0.0
+            behind = (lit.clusters >= first) & (lit.clusters <= last)
+            seen[np.ix_((start >= from_us) & (start < to_us), behind)] = 0.0
+        if slats is not None:
+            # Length that slats hide above each cut, of the cuts' places among the slats.
+            moved_m = np.floor(start * pace + 1e-6) * math.copysign(1e-6 * _SLAT_STEP_UM, slats.speed_mps)
+            at_m = (np.array(lit.cuts) + 0.5) * lit.length_m - slats.first_m - moved_m[:, None]
+            hidden = at_m // slats.every_m * slats.width_m + np.minimum(at_m % slats.every_m, slats.width_m)
+            seen *= 1 - np.diff(hidden, axis=1) / np.diff(at_m, axis=1)
         return when, seen
 
     def _check(self, bar: BarSpec, source: str) -> None:
@@ -351,6 +374,17 @@ def wiper_switches(wiper: WiperSpec, begin_us: float, end_us: float) -> tuple[Fl
         wipes = np.arange(first, last + 1, dtype=np.float64) * every_us
     when: Floats = (first_us + wipes[:, None] + once_us).ravel()
     return cut_changes(when, np.append(1.0, np.tile(once, len(wipes))), begin_us, end_us)
+
+
+def background_switches(background: BackgroundSpec, begin_us: float, end_us: float) -> tuple[Floats, Floats]:
+    """The same of the background's light: how many times `light_w_m2` it is, in even steps."""
+    when, held = [np.empty(0)], [np.array([share for _, share in background.change_s[:1]] or [1.0])]
+    for (from_s, first), (to_s, last) in pairwise(background.change_s):
+        steps = math.ceil(abs(math.log(last / first)) / _BACKGROUND_STEP_LN)
+        at = np.arange(steps)
+        when.append((from_s + (at + 0.5) / max(steps, 1) * (to_s - from_s)) * 1e6)
+        held.append(first * (last / first) ** ((at + 1) / max(steps, 1)))
+    return cut_changes(np.concatenate(when), np.concatenate(held), begin_us, end_us)
 
 
 def reflections_of(scene: Scene, bar: int) -> tuple[ReflectionSpec, ...]:

@@ -94,6 +94,7 @@ class CameraPath:
             t_s = t_us * 1e-6
             position = np.stack([m.lateral_mps * t_s, 0 * t_s, m.speed_mps * t_s - m.distance_m], 1)
             attitude = np.tile(np.radians([m.yaw_deg, m.pitch_deg, m.roll_deg]), (len(t_s), 1))
+            attitude[:, 0] += math.radians(m.yaw_rate_deg_s) * t_s
         else:
             values: Floats = self._spline(t_us * 1e-6)
             position, attitude = values[:, :3], np.radians(values[:, 3:])

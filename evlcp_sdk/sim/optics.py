@@ -5,14 +5,15 @@ one-dimensional steps for each of them.
 """
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.scene.optics import Blur, airy_blur, step
 from evlcp_sdk.sim.leds import LitStrip
-from evlcp_sdk.sim.scene import BarSpec, LensSpec
+from evlcp_sdk.sim.scene import BarSpec, DropSpec, LensSpec
 
 Floats = NDArray[np.float64]
 
@@ -65,6 +66,17 @@ def led_light_w_m2(bar: BarSpec, strip: LitStrip, lens: LensSpec) -> float:
     of_row = strip.leds * bar.led_mw_sr * 1e-3
     radiance = of_row / (strip.width_m * strip.pitch_m)
     return math.pi * radiance * lens.transmission / (4 * lens.f_number**2)
+
+
+def unbent(drops: Sequence[DropSpec], x_px: ArrayLike, y_px: ArrayLike, t_s: float) -> Floats:
+    """Where pixels (n,) would be seen at a time without the drops before them, px, float64 (2, n)."""
+    seen = np.array([x_px, y_px], np.float64)
+    found = seen.copy()
+    for drop in drops:
+        away = seen.T - (drop.x_px, drop.y_px) - np.multiply(drop.speed_px_s, t_s)
+        away = away.T / drop.radius_px
+        found -= drop.bend_px * away * np.exp(0.5 - 0.5 * (away**2).sum(0))
+    return found
 
 
 def strip_table(blur: Blur, strip_px: float, scale_px: float, nodes: int) -> Floats:

@@ -103,7 +103,7 @@ def _bar_of(light: BarLight, duration_s: float) -> dict[str, Any]:
         "chips_file": bar.chips_file,
         "payload": bar.payload,
         "symbols": light.sent_symbols(duration_s),
-        "covered": list(bar.covered),
+        "covered": sorted({*bar.covered, *light.dark}),
         "cover_s": [list(span) for span in bar.cover_s],
         "pole_s": [list(span) for span in bar.pole_s],
     }

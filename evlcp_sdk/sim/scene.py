@@ -1,4 +1,4 @@
-"""The scene: bars, reflections, lamps, lens, motion, background and sensor, from TOML to checked objects.
+"""The scene: bars, reflections, lamps, drops, lens, motion and sensor, from TOML to checked objects.
 
 Coordinates: x right, y down, z forward, m. The camera's path starts at the origin of x and y, looking along
 z; a bar with `z_m = 0` then stands `motion.distance_m` ahead. Defaults are those of the sensor model; where a
@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from importlib import resources
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,6 +34,16 @@ MOST_SOURCES = 64
 
 LinkTable = Mapping[str, Any]
 """A link, or what is different about it: tables as in `link.toml`."""
+
+
+@dataclass(frozen=True)
+class LatticeSpec:
+    """Slats before a bar that cross it, a slanted fence, by what they hide along it."""
+
+    every_m: Annotated[float, Field(ge=0.001, description="From one slat to the next.")] = 0.09
+    width_m: Annotated[float, Field(ge=0, description="What one hides; less than `every_m`.")] = 0.03
+    first_m: Annotated[float, Field(description="From the bar's top down to where one begins.")] = 0.0
+    speed_mps: Annotated[float, Field(ge=-10, le=10, description="How fast they go down the bar.")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -91,6 +102,13 @@ class BarSpec:
         Field(ge=0, description="Light of a fully lit pixel; none: from the LED's intensity and the lens."),
     ] = None
     led_mw_sr: Annotated[float, Field(gt=0, description="Intensity of one LED.")] = 20.0
+    dead_leds: Annotated[
+        tuple[int, ...], Field(description="LEDs that stay dark, counted from 0 as its layout does.")
+    ] = ()
+    stuck_leds: Annotated[tuple[int, ...], Field(description="LEDs that shine all the time.")] = ()
+    led_spread: Annotated[
+        float, Field(ge=0, le=1, description="Sigma of the logarithm of the light of one LED and another.")
+    ] = 0.0
     covered: Annotated[
         tuple[int, ...], Field(description="Clusters that are hidden all the time, counted from 0.")
     ] = ()
@@ -101,6 +119,7 @@ class BarSpec:
     pole_s: Annotated[
         tuple[tuple[float, float], ...], Field(description="[from s, to s] when all of it is hidden.")
     ] = ()
+    lattice: LatticeSpec | None = None
 
 
 @dataclass(frozen=True)
@@ -195,6 +214,9 @@ class MotionSpec:
     yaw_deg: Annotated[float, Field(ge=-60, le=60, description="The camera looks to the right.")] = 0.0
     pitch_deg: Annotated[float, Field(ge=-60, le=60, description="The camera looks up.")] = 0.0
     roll_deg: Annotated[float, Field(ge=-180, le=180, description="The camera's top leans right.")] = 0.0
+    yaw_rate_deg_s: Annotated[
+        float, Field(ge=-360, le=360, description="It turns to the right; 45: 5.7 px/ms.")
+    ] = 0.0
     vib_rate_rad_s: Annotated[
         float, Field(ge=0, le=2, description="Rms of the vibration's pitch and yaw rates; a guess.")
     ] = 0.06
@@ -255,6 +277,13 @@ class BackgroundSpec:
     light_w_m2: Annotated[
         float, Field(gt=0, le=100, description="On the sensor: night 1e-4, tunnel 0.1, sun 3 to 12.")
     ] = 0.05
+    change_s: Annotated[
+        tuple[tuple[float, Annotated[float, Field(gt=0, le=1e5)]], ...],
+        Field(
+            description="[at s, how many times that it is then]: sun through trees, a tunnel's end. Its"
+            " logarithm changes evenly in between; before and after it is as the nearest says."
+        ),
+    ] = ()
     texture: Annotated[
         float, Field(ge=0, le=2, description="Rms of its logarithm over the image; a guess.")
     ] = 0.3
@@ -273,6 +302,23 @@ class BackgroundSpec:
             " that these light; as many as the image is wide: everywhere.",
         ),
     ] = 0
+
+
+@dataclass(frozen=True)
+class DropSpec:
+    """A rain drop on the windscreen, a lens that bends what is seen through it away from its middle.
+
+    A point d px from the middle is seen `bend_px` (d / r) exp((1 - d^2 / r^2) / 2) farther out, r its
+    `radius_px`: by `bend_px`, the most, at its rim.
+    """
+
+    x_px: Annotated[float, Field(description="Its middle's column as the scene starts.")] = 640.0
+    y_px: Annotated[float, Field(description="Its row.")] = 360.0
+    radius_px: Annotated[float, Field(gt=0, le=1000, description="From its middle to its rim.")] = 25.0
+    bend_px: Annotated[float, Field(ge=-50, le=50, description="By how much; less than 0: inward.")] = 4.0
+    speed_px_s: Annotated[
+        tuple[float, float], Field(description="How it runs, to the right and down; in steps of 4 ms.")
+    ] = (0.0, 0.0)
 
 
 @dataclass(frozen=True)
@@ -367,6 +413,7 @@ class Scene:
     bars: tuple[BarSpec, ...] = (BarSpec(),)
     reflections: tuple[ReflectionSpec, ...] = ()
     lamps: tuple[LampSpec, ...] = ()
+    drops: tuple[DropSpec, ...] = ()
 
     def __post_init__(self) -> None:
         if len(self.bars) + len(self.lamps) + self.flicker_lamps > MOST_SOURCES:
@@ -386,6 +433,8 @@ class Scene:
             raise ConfigError(f"wiper.edge_s = {wiper.edge_s}: expected at most half of lasts_s")
         if 0 < wiper.every_s < wiper.lasts_s:
             raise ConfigError(f"wiper.every_s = {wiper.every_s}: expected at least lasts_s")
+        if any(b < a for (a, _), (b, _) in pairwise(self.background.change_s)):
+            raise ConfigError("background.change_s: expected times that rise")
         if max(self.camera.width, self.camera.height) > MOST_PIXELS:
             raise ConfigError(f"camera: expected at most {MOST_PIXELS} columns and rows")
         if self.lens.focus_m * 1e3 <= self.camera.focal_mm:
@@ -402,7 +451,7 @@ NEAREST_M = 0.5
 """Depth from which a source is rendered."""
 
 _TABLES = ("camera", "lens", "motion", "background", "sensor", "wiper", "world")
-_LISTS = ("bars", "reflections", "lamps")
+_LISTS = ("bars", "reflections", "lamps", "drops")
 
 
 def preset_names() -> list[str]:

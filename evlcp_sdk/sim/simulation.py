@@ -16,9 +16,9 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.optics import Blur, step
 from evlcp_sdk.sim import _kernels
-from evlcp_sdk.sim.light import Source, cut_changes, sources_of, wiper_switches
+from evlcp_sdk.sim.light import Source, background_switches, cut_changes, sources_of, wiper_switches
 from evlcp_sdk.sim.motion import CameraPath, project
-from evlcp_sdk.sim.optics import blur_of, strip_table
+from evlcp_sdk.sim.optics import blur_of, strip_table, unbent
 from evlcp_sdk.sim.scene import NEAREST_M, Scene, SensorSpec
 from evlcp_sdk.values import Events
 
@@ -160,8 +160,8 @@ class _Halo:
 
 def _time_line(
     starts_us: Floats,
-    wiped_us: Floats,
-    shade: Floats,
+    wiped: tuple[Floats, Floats],
+    changed: tuple[Floats, Floats],
     switches: list[Floats],
     levels_of: list[Floats],
     halos_of: list[list[Floats]],
@@ -171,8 +171,9 @@ def _time_line(
 
     Args:
         starts_us: When each pose begins, the block's begin first, float64 (poses,).
-        wiped_us: When the share of all light that passes changes, float64 (n,).
-        shade: That share, from the block's begin on, float64 (n + 1,).
+        wiped: When the share of all light that passes changes, float64 (n,), and that share, from the block's
+            begin on, float64 (n + 1,).
+        changed: The same of the background's light.
         switches: When each source switches, float64 (m,).
         levels_of: Levels of its clusters, from the block's begin on, float64 (m + 1, clusters).
         halos_of: Its light in each halo on a grid, float64 (m + 1, places), halo by halo.
@@ -182,9 +183,10 @@ def _time_line(
         The time line, the levels of `Strips`, and the light of `Halos`.
     """
     sources = len(switches)
-    when = np.concatenate([starts_us[:1], starts_us[1:], wiped_us, *switches])
-    # What an entry is: a pose, a wiper's step, or a switch of the source of this number.
-    kind = np.repeat(np.arange(-2, sources), [len(starts_us), len(wiped_us), *map(len, switches)])
+    parts = [starts_us, wiped[0], changed[0], *switches]
+    when = np.concatenate(parts)
+    # What an entry is: a pose, a wiper's step, one of the background, or a switch of the source of a number.
+    kind = np.repeat([-2, -1, -3, *range(sources)], [len(part) for part in parts])
     order = np.argsort(when, kind="stable")
     when, kind = when[order], kind[order]
     counts = [len(levels) for levels in levels_of]
@@ -199,8 +201,10 @@ def _time_line(
         for q, of in enumerate(halos_of):
             halo[q, begin : begin + count, : of[i].shape[1]] = of[i]
         begin += count
-    pose, wipes = np.cumsum(kind == -2) - 1, np.cumsum(kind == -1)
-    return _kernels.TimeLine(when, kind, pose, shade[wipes], row), levels, halo
+    pose, wipes, steps = (np.cumsum(kind == of) for of in (-2, -1, -3))
+    kind[kind == -3] = -1
+    line = _kernels.TimeLine(when, kind, pose - 1, wiped[1][wipes], changed[1][steps], row)
+    return line, levels, halo
 
 
 def _batches(
@@ -271,6 +275,7 @@ class _Stretch:
         seen: Of each source, places and depths by pose; see `project`.
         sent: Of each source, when it switches and its levels; see `Source.switches`.
         wiped: The same of the wiper; see `wiper_switches`.
+        changed: The same of the background; see `background_switches`.
     """
 
     begin_us: float
@@ -280,6 +285,7 @@ class _Stretch:
     seen: list[tuple[Floats, Floats]]
     sent: list[tuple[Floats, Floats]]
     wiped: tuple[Floats, Floats]
+    changed: tuple[Floats, Floats]
 
 
 def _between(slope: float, low: Floats, high: Floats) -> tuple[Floats, Floats]:
@@ -476,7 +482,8 @@ class Simulation:
             length = np.hypot(step[..., 0], step[..., 1]).max(1)
             seen = np.where(counts[np.arange(len(t)) // _CELLS], length, 0.0)
             moved = np.maximum(moved, seen.max(1))
-        most = _MOST_MOVES_STRUCK if self.scene.motion.pothole_s else _MOST_MOVES
+        motion = self.scene.motion
+        most = _MOST_MOVES_STRUCK if motion.pothole_s or motion.yaw_rate_deg_s else _MOST_MOVES
         moves = np.clip(np.ceil(2 * moved / MOTION_STEP_PX), 1, most).astype(int)
         starts = np.concatenate(
             [a + np.arange(n) / n * (b - a) for a, b, n in zip(cells, cells[1:], moves, strict=False)]
@@ -522,6 +529,7 @@ class Simulation:
                 [self.seen(source, position, attitude) for source in self._sources],
                 [source.switches(begin_us, end_us) for source in self._sources],
                 wiped,
+                background_switches(self.scene.background, begin_us, end_us),
             )
         return self._stretch
 
@@ -533,9 +541,11 @@ class Simulation:
         of_block = slice(*np.searchsorted(stretch.starts_us, (begin_us, end_us)))
         starts, attitude = stretch.starts_us[of_block], stretch.attitude[of_block]
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
-        wiped_us, shade = cut_changes(*stretch.wiped, begin_us, end_us)
-        lightest = float(shade.max())
-        darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * float(self._darkest_texture * shade.min())
+        wiped = cut_changes(*stretch.wiped, begin_us, end_us)
+        changed = cut_changes(*stretch.changed, begin_us, end_us)
+        lightest = float(wiped[1].max())
+        dimmest = float(self._darkest_texture * wiped[1].min() * changed[1].min())
+        darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * dimmest
         shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Floats, Floats, _Look]] = []
         marked: list[NDArray[np.int64]] = []
         beyond: list[NDArray[np.uint8]] = []
@@ -594,7 +604,7 @@ class Simulation:
             levels_of.append(levels)
             for of, share in zip(halos_of, look.halos, strict=True):
                 of.append(levels @ share)
-        line, levels, halo = _time_line(starts, wiped_us, shade, switches, levels_of, halos_of, most)
+        line, levels, halo = _time_line(starts, wiped, changed, switches, levels_of, halos_of, most)
         background = np.array([scene.background.light_w_m2, sensor.dark_w_m2])
         world = (
             line,
@@ -603,8 +613,10 @@ class Simulation:
             _kernels.Near(self._near_share, tables, near_scale, near_reach),
             _kernels.Scenery(turn, self._texture_every, self._texture, background),
         )
-        batches = _batches(pixels, masks, far, self._texture_every)
-        return _kernels.ActivePixels(number, end_us, *batches), world
+        pixels, batches, masks, strides = _batches(pixels, masks, far, self._texture_every)
+        y, x = np.divmod(pixels, camera.width)
+        at_px = unbent(scene.drops, x, y, (begin_us + end_us) * 0.5e-6)
+        return _kernels.ActivePixels(number, end_us, pixels, batches, masks, strides, at_px), world
 
     def seen(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
         """Where a source's clusters start and end in the image, and their depths; see `project`."""
@@ -651,7 +663,8 @@ class Simulation:
         nothing = np.empty(0, np.int64), np.empty(0, np.uint8)
         if look.across[0] < least_w_m2:
             return nothing
-        reach_across, reach_along = (reach + 0.5 for reach in look.reach_px(least_w_m2))
+        bend_px = sum(abs(drop.bend_px) for drop in self.scene.drops)
+        reach_across, reach_along = (reach + 0.5 + bend_px for reach in look.reach_px(least_w_m2))
         middle = place[len(place) // 2]
         vector = middle[-1] - middle[0]
         length = float(np.hypot(*vector))
@@ -679,7 +692,7 @@ class Simulation:
         dx, dy = x - middle[0, 0], y - middle[0, 1]
         aside = np.abs(dx * axis[1] - dy * axis[0]) - half_px
         ahead = np.abs(dx * axis[0] + dy * axis[1] - 0.5 * length) - 0.5 * length
-        away_px = np.maximum(aside, ahead)
+        away_px = np.maximum(aside, ahead) - bend_px
         far = sum(((away_px >= px).view(np.uint8) for px in _FAR_PX), np.zeros(len(x), np.uint8))
         return y * width + x, far
 

@@ -72,12 +72,19 @@ def pixel_events(
     number = np.arange(pixels, dtype=np.int32)
     begins = np.append(np.arange(0, pixels, _kernels.LANES), pixels)
     batches = np.ones(len(begins) - 1, np.int64)
-    active = _kernels.ActivePixels(0, end_us, number, begins, batches.astype(np.uint64), batches)
+    active = _kernels.ActivePixels(
+        0, end_us, number, begins, batches.astype(np.uint64), batches, np.zeros((2, pixels))
+    )
     # The light of an even background, of which a share passes that changes like a source that switches.
     light = np.array(light_w_m2, np.float64)
     none = np.zeros(len(light), np.int64)
     line = _kernels.TimeLine(
-        np.array(edge_us, np.float64), none, none, light, np.zeros((0, len(light)), np.int64)
+        np.array(edge_us, np.float64),
+        none,
+        none,
+        light,
+        np.ones(len(light)),
+        np.zeros((0, len(light)), np.int64),
     )
     scenery = scenery._replace(field=np.ones_like(scenery.field), light=np.array([1.0, 0.0]))
     world = (line, strips, halos, near, scenery)

@@ -37,7 +37,12 @@ def scene_of_truth(truth: Mapping[str, Any]) -> Scene:
                 **_taken(given, (), ("texture_px",)),
                 # How far around the bar such recordings have events of a background that moves.
                 **({"around_px": 24, "texture_step_px": 0.4} if given.get("bg_moves") else {}),
+                **({"around_px": 60, "change_s": given["bg_steps"]} if given.get("bg_steps") else {}),
             },
+            "drops": [
+                {"x_px": x, "y_px": y, "speed_px_s": [right, down], "radius_px": radius, "bend_px": bend}
+                for x, y, right, down, radius, bend in given.get("drops", ())
+            ],
             "sensor": {
                 **_taken(given, OF_SENSOR),
                 "hot_share": given["hot_pixels"] / (camera["width"] * camera["height"]),
@@ -64,7 +69,7 @@ def _bar_spec_of(bar: Mapping[str, Any], sent: SentBar, given: Mapping[str, Any]
     found = _taken(
         bar,
         ("x_m", "y_m", "z_m", "width_m", "ppm", "led_w_m2", "start_chip"),
-        ("chips_file", "lean_deg", "tilt_deg", "covered", "cover_s", "pole_s"),
+        ("chips_file", "lean_deg", "tilt_deg", "covered", "cover_s", "pole_s", "dead_leds", "led_spread"),
     )
     found["link"] = {section: dict(keys) for section, keys in sent.link.table.items()}
     if given.get("led_w_m2_all"):
@@ -84,6 +89,10 @@ def _motion_of(given: Mapping[str, Any], focal_px: float) -> dict[str, Any]:
         "yaw_share": "vib_yaw_share",
     }
     found |= {ours: given[theirs] for theirs, ours in names.items() if theirs in given}
+    if given.get("yaw_rate_deg_s"):
+        # There it turns to the left, and looks along `cam_yaw_deg` half-way.
+        found["yaw_rate_deg_s"] = -given["yaw_rate_deg_s"]
+        found["yaw_deg"] += given["yaw_rate_deg_s"] * given["duration_s"] / 2
     if given.get("pothole_px_ms"):
         found["pothole_s"] = [given["pothole_s"]]
         found["pothole_rad_s"] = given["pothole_px_ms"] * 1000 / focal_px

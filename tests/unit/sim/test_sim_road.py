@@ -17,6 +17,7 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BackgroundSpec,
     BarSpec,
+    DropSpec,
     LampSpec,
     MotionSpec,
     ReflectionSpec,
@@ -27,10 +28,11 @@ from evlcp_sdk.sim import (
     resolve_scene,
     truth_of,
 )
+from evlcp_sdk.sim.leds import led_light
 from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
-from evlcp_sdk.sim.scene import LensSpec
+from evlcp_sdk.sim.scene import LatticeSpec, LensSpec
 from evlcp_sdk.values import Events
 from tests.models.pixels import pixel_events, served, words_of
 from tests.unit.sim.scenes import EXACT, STILL, alike, every, rows, still
@@ -110,6 +112,69 @@ def test_covers_put_out_clusters_and_only_those() -> None:
         hidden.strips[0].switches(a, b)[0] for a, b in ((1000.0, 1200.0), (1200.0, 2717.3), (2717.3, 5000.0))
     ]
     assert set(np.concatenate(cuts)) | {1200.0} == set(whole)
+
+
+def test_leds_are_dead_stuck_dim_or_behind_slats() -> None:
+    slats = LatticeSpec(every_m=0.09, width_m=0.033, first_m=0.02, speed_mps=2.0)
+    dead, stuck = (5, *range(12, 18), 40), (3, 41)
+    bar = BarSpec(start_chip=2.3, dead_leds=dead, stuck_leds=stuck, led_spread=0.3, lattice=slats)
+    light, plain = (BarLight(one, resolve({}), LensSpec(), 7) for one in (bar, BarSpec(start_chip=2.3)))
+    assert light.dark == {2}
+    assert truth_of(Scene(bars=(bar,))).bars[0].covered == (2,)
+    own = led_light(bar, 96, 7)
+    assert np.log(own.sum(0)[own.sum(0) > 0]).std() == pytest.approx(0.3, abs=0.06)
+    when, levels = light.strips[0].switches(1000.0, 5000.0)
+    chips_when, chips_of = plain.strips[0].switches(1000.0, 5000.0)
+    places_m = (np.arange(96)[:, None] + np.linspace(0, 1, 200, endpoint=False)) / 100
+    for t_us in (1000.0, 1333.3, 2718.2, 4999.0):
+        # They pass by 2 mm in a millisecond, and move in steps of 1 mm.
+        moved_m = math.floor(t_us * 2e-3) * 1e-3
+        free = ((places_m - 0.02 - moved_m) % 0.09 >= 0.033).mean(1)
+        on = np.repeat(chips_of[np.searchsorted(chips_when, t_us, side="right")], 6)
+        want = (own[0] * on + own[1]) * free
+        found = levels[np.searchsorted(when, t_us, side="right")]
+        np.testing.assert_allclose(found, want, atol=0.02)
+        assert not found[list(dead)].any()
+        # However time is cut, it is the same light.
+        np.testing.assert_allclose(light.strips[0].switches(t_us, t_us + 1.0)[1][0], found, atol=1e-9)
+
+
+def test_a_drop_bends_what_is_seen_through_it() -> None:
+    drop = DropSpec(660.0, 350.0, 20.0, 5.0, (500.0, 0.0))
+    for dx, dy in ((10.0, 0.0), (-12.0, 16.0), (0.0, 2.0)):
+        x, y = (660.0 - 640 + dx) * 50 / FOCAL_PX, (350.0 - 360 + dy) * 50 / FOCAL_PX
+        lamp = LampSpec(x, y, 0.0, 0.005, 0.005, flicker_hz=1000.0)
+        events = every(still(0.0039, background=EVEN, bars=(), lamps=(lamp,), drops=(drop,)))
+        # Where the formula puts it, by iteration: in the first 4 ms the drop is 1 px farther on.
+        seen = at = np.array([dx - 1.0, dy]) / 20
+        for _ in range(200):
+            seen = at + 0.25 * seen * np.exp(0.5 - 0.5 * (seen @ seen))
+        centre = np.array([661.0, 350.0]) + seen * 20
+        found = [np.average(axis, weights=None) for axis in (events.x, events.y)]
+        np.testing.assert_allclose(found, centre, atol=0.4)
+
+
+def test_background_that_changes_gives_the_events_of_its_contrast() -> None:
+    background = BackgroundSpec(
+        light_w_m2=0.1, texture=0.0, change_s=((0.004, 1.0), (0.014, 300.0), (0.016, 30.0)), around_px=40
+    )
+    camera = CameraModel(width=40, height=4)
+    events = every(still(0.03, camera=camera, background=background, bars=()))
+    rising, falling = events[events.p == 1], events[events.p == 0]
+    # A pixel forgets what the light rises by while it is blind, 10 us, and waits for the next step of 0.01.
+    rate_per_us = math.log(300) / 10_000
+    each = 0.223 + 10 * rate_per_us + 0.005
+    assert len(rising) == 160 * math.floor(math.log(300) / each)
+    assert len(falling) == pytest.approx(160 * math.log(10) / (0.223 + 10 * math.log(10) / 2000), abs=160)
+    # The logarithm rises evenly: so do the events come.
+    np.testing.assert_allclose(np.diff(np.unique(rising.t_us))[3:-1], each / rate_per_us, atol=19)
+
+
+def test_a_camera_turns() -> None:
+    motion = replace(STILL, yaw_deg=2.0, yaw_rate_deg_s=-45.0)
+    column = truth_of(Scene(duration_s=0.08, motion=motion)).bars[0].centre_px[:, 0]
+    yaw = np.radians(2.0 - 45e-3 * np.arange(80))
+    np.testing.assert_allclose(column, 640 + FOCAL_PX * np.tan(np.arctan2(-1.5, 50) - yaw), atol=1e-2)
 
 
 def test_a_wiper_dims_along_its_line() -> None:
@@ -287,8 +352,9 @@ def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
             "motion": {"pothole_s": [0.003]},
             "wiper": {"share": 0.9, "at_s": 0.002, "lasts_s": 0.01},
             "lens": {"bloom": 0.1, "bloom_px": 5.0},
-            "background": {"around_px": 20, "light_w_m2": 0.5},
-            "bars": [{"cover_s": [[0.002, 0.006, 0, 4]]}],
+            "background": {"around_px": 20, "light_w_m2": 0.5, "change_s": [[0.001, 1.0], [0.006, 5.0]]},
+            "bars": [{"cover_s": [[0.002, 0.006, 0, 4]], "lattice": {"speed_mps": 3.0}, "dead_leds": [7]}],
+            "drops": [{"x_px": 420.0, "speed_px_s": [200.0, 0.0]}],
             "reflections": [{}, {"kind": "rail"}, {"kind": "window", "shift_px": [5, 5]}],
         }
     )
