@@ -5,6 +5,7 @@ import re
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from inspect import cleandoc
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -19,14 +20,12 @@ if TYPE_CHECKING:
 
 HELP = """Read data and distance from blinking LEDs with an event camera.
 
-[bold]evlcp loop[/] sends a text from end to end on this machine, emulated board and simulated camera;
-[bold]evlcp demo[/] simulates a drive and compares with the paper;
-[bold]evlcp receive REC.raw -o out[/] decodes yours.
+[bold]evlcp loop[/] sends a text from end to end on this machine, board and camera emulated;
+[bold]evlcp demo[/] simulates a drive; [bold]evlcp receive REC.raw -o out[/] decodes yours.
 
-Exit codes: [bold]0[/] done (also when no transmitter was there), [bold]1[/] failed,
-[bold]2[/] usage, configuration or an algorithm that cannot be used, [bold]3[/] input that cannot be read,
-[bold]4[/] much of a recording dropped, [bold]5[/] a camera that went away,
-[bold]70[/] a fault of evlcp itself, [bold]130[/] interrupted. A broken plugin is left out with a warning.
+Exit codes: [bold]0[/] done, also without a transmitter; [bold]1[/] failed; [bold]2[/] usage, link or plugin;
+[bold]3[/] input that cannot be read; [bold]4[/] much dropped; [bold]5[/] a camera that went away;
+[bold]70[/] a fault of evlcp itself; [bold]130[/] interrupted.
 """
 
 
@@ -56,8 +55,8 @@ _OWN = (
 _SOON = frozenset({"receive", "live"})
 """Commands that say themselves when they are loaded."""
 
-_EXAMPLE = re.compile(r"\n+(?= *[A-Z][^\n:\[]+:\s+\[bold\])")
-"""Before an example in a command's help: Typer takes lines for one that no empty one parts."""
+_WRAPPED = re.compile(r"(?<!\n)\n(?!\n|[A-Z][^\n:\[]+:\s+\[bold\])")
+"""Where a help text goes on in the next line, which Typer keeps: no paragraph or example ends."""
 
 
 class _Commands(TyperGroup):
@@ -116,6 +115,15 @@ def _printable_faults() -> Iterator[None]:
         raise
 
 
+def _finish(command: Any) -> None:
+    """Have a command, and those of a group, wrap its help as the screen is wide, and start sooner."""
+    for nested in getattr(command, "commands", {}).values():
+        _finish(nested)
+    command.help = _WRAPPED.sub(" ", cleandoc(command.help or ""))
+    for parameter in command.params:
+        _leave_unset(parameter)
+
+
 def _leave_unset(parameter: Any) -> None:
     """Spare a parameter that is not given what Typer makes to check it, an adapter of pydantic."""
     if parameter.required or parameter.callback is not None:
@@ -142,7 +150,7 @@ def make_app(*modules: str) -> typer.Typer:
     app.callback()(_root)
     for module in modules or _OWN:
         command = getattr(importlib.import_module(f"evlcp_sdk.cli.{module}"), module)
-        app.command(module.replace("_", "-"), help=_EXAMPLE.sub("\n\n", command.__doc__))(command)
+        app.command(module.replace("_", "-"))(command)
     return app
 
 
@@ -243,7 +251,5 @@ def run() -> None:
             app = make_app()
             add_plugin_commands(app, Registry.load())
         group = typer.main.get_group(app)
-        for command in group.commands.values():
-            for parameter in command.params:
-                _leave_unset(parameter)
+        _finish(group)
         group()

@@ -1,14 +1,36 @@
-"""Functions as commands, whose parameters may be groups of options."""
+"""Functions as commands, whose parameters may be groups of options, and whose rare ones help leaves out."""
 
 import inspect
 from collections.abc import Callable
 from dataclasses import fields, is_dataclass
 from functools import wraps
-from typing import Any, get_type_hints
+from typing import Annotated, Any, get_type_hints
+
+import typer
+
+from evlcp_sdk.cli._common import echo
+
+
+def _show_all(ctx: typer.Context, asked: bool) -> None:
+    """Show a command's help with its hidden options, and end."""
+    if not asked:
+        return
+    for parameter in ctx.command.params:
+        parameter.hidden = False  # type: ignore[attr-defined]
+    echo(ctx.get_help())
+    raise typer.Exit
+
+
+_HelpAll = Annotated[
+    bool,
+    typer.Option("--help-all", callback=_show_all, is_eager=True, help="Show rarer options, too."),
+]
 
 
 def command(function: Callable[..., None]) -> Callable[..., None]:
     """A function as a command for Typer: of each parameter that is a dataclass, every field is an option.
+
+    Help shows those of a dataclass with a `PANEL` under that title, and hidden ones with `--help-all`.
 
     >>> from dataclasses import dataclass
     >>> @dataclass(frozen=True)
@@ -30,16 +52,23 @@ def command(function: Callable[..., None]) -> Callable[..., None]:
         assert isinstance(kind, type)
         groups[parameter.name] = kind
         of_field = get_type_hints(kind, include_extras=True)
-        options += [
-            inspect.Parameter(f.name, parameter.KEYWORD_ONLY, default=f.default, annotation=of_field[f.name])
-            for f in fields(kind)
-        ]
-
-    if not groups:
-        return function
+        for f in fields(kind):
+            for info in getattr(of_field[f.name], "__metadata__", ()):
+                info.rich_help_panel = getattr(kind, "PANEL", None)
+            options.append(
+                inspect.Parameter(
+                    f.name, parameter.KEYWORD_ONLY, default=f.default, annotation=of_field[f.name]
+                )
+            )
+    infos = [info for one in options for info in getattr(one.annotation, "__metadata__", ())]
+    if any(getattr(info, "hidden", False) for info in infos):
+        options.append(
+            inspect.Parameter("help_all", inspect.Parameter.KEYWORD_ONLY, default=False, annotation=_HelpAll)
+        )
 
     @wraps(function)
     def run(**values: Any) -> None:
+        values.pop("help_all", None)
         for name, kind in groups.items():
             values[name] = kind(**{f.name: values.pop(f.name) for f in fields(kind)})
         function(**values)

@@ -32,12 +32,12 @@ LinkFiles = Annotated[
         "-c",
         "--config",
         metavar="link.toml",
-        help="The link; all defaults without it. Give another for another kind of transmitter in view.",
+        help="The link, or several.",
     ),
 ]
 Overrides = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; may be repeated."),
+    typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; repeat it."),
 ]
 Json = Annotated[bool, typer.Option("--json", help="JSON on stdout, nothing else.")]
 
@@ -47,17 +47,12 @@ Workers = Annotated[
         "--workers",
         min=0,
         metavar="N",
-        help="Local processes, one per core without it; 0: this one.",
+        help="Processes, one per core without it; 0: this one.",
         show_default=False,
     ),
 ]
 Dask = Annotated[
-    str | None,
-    typer.Option(
-        "--dask",
-        metavar="ADDRESS",
-        help="Run on the workers of a Dask scheduler, e.g. tcp://host:8786; needs the extra cluster.",
-    ),
+    str | None, typer.Option("--dask", metavar="ADDRESS", help="Run on the workers of this Dask scheduler.")
 ]
 
 

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
@@ -58,6 +58,8 @@ class LinkOptions:
 class ResultOptions:
     """Where results go, and formats beside the usual ones."""
 
+    PANEL: ClassVar[str] = "Results"
+
     out: Annotated[
         Path | None,
         typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be."),
@@ -67,21 +69,23 @@ class ResultOptions:
         typer.Option(
             "--json-lines",
             metavar="-",
-            help="Frames, messages and fixes as lines of JSON on stdout as they come; OUT may be left out.",
+            help="Lines of JSON on stdout as they come.",
         ),
     ] = None
     as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False
     figures: Annotated[
-        bool, typer.Option("--figures", help="Draw regions.png, presence.png, distance.png, track.png.")
+        bool, typer.Option("--figures", help="Draw regions, presence, distance and track.")
     ] = False
-    report: Annotated[
-        bool, typer.Option("--report", help="Write report.html: the recording on one page, to look at.")
+    report: Annotated[bool, typer.Option("--report", help="Write report.html, a page to look at.")] = False
+    parquet: Annotated[bool, typer.Option("--parquet", hidden=True, help="Also write frames.parquet.")] = (
+        False
+    )
+    mcap: Annotated[
+        bool, typer.Option("--mcap", hidden=True, help="Also write fixes.mcap, for Foxglove.")
     ] = False
-    parquet: Annotated[bool, typer.Option("--parquet", help="Also write frames.parquet.")] = False
-    mcap: Annotated[bool, typer.Option("--mcap", help="Also write fixes.mcap, for Foxglove.")] = False
     sinks: Annotated[
         list[str] | None,
-        typer.Option("--sink", metavar="NAME", help="Also write this format; may be repeated."),
+        typer.Option("--sink", metavar="NAME", help="Also write this format, e.g. mcap; repeat it."),
     ] = None
 
     def lines(self, recordings: Sequence[str]) -> "LinePrinter | None":
@@ -118,6 +122,8 @@ class ResultOptions:
 class PlaceOptions:
     """What places the camera: bars, its attitude over time, satellites, and UTC of its clock's 0."""
 
+    PANEL: ClassVar[str] = "Positions"
+
     sites: Annotated[
         Path | None,
         typer.Option("--sites", metavar="site.toml", help="Where known bars stand: compute positions."),
@@ -130,6 +136,7 @@ class PlaceOptions:
         typer.Option(
             "--gnss",
             metavar="FILE",
+            hidden=True,
             help="Fixes of satellites, with sigmas, which enter the track: CSV, or .nmea with --clock-zero.",
         ),
     ] = None
@@ -139,6 +146,7 @@ class PlaceOptions:
             "--clock-zero",
             parser=parse_utc,
             metavar="UTC",
+            hidden=True,
             help="UTC of the camera clock's 0, for the age of signed beacons, NMEA and MCAP.",
         ),
     ] = None
@@ -166,27 +174,42 @@ class PlaceOptions:
 class CameraOptions:
     """How the camera is turned, and what tells its clock."""
 
+    PANEL: ClassVar[str] = "Positions"
+
     heading_deg: Annotated[
-        float | None, typer.Option("--heading-deg", help="Its heading, clockwise from north, if known.")
+        float | None,
+        typer.Option("--heading-deg", metavar="DEG", help="The camera's heading, clockwise from north."),
     ] = None
-    pitch_deg: Annotated[float | None, typer.Option("--pitch-deg", help="Its pitch, up.")] = None
-    roll_deg: Annotated[float | None, typer.Option("--roll-deg", help="Its roll, top to the right.")] = None
+    pitch_deg: Annotated[float | None, typer.Option("--pitch-deg", metavar="DEG", help="Its pitch, up.")] = (
+        None
+    )
+    roll_deg: Annotated[
+        float | None, typer.Option("--roll-deg", metavar="DEG", help="Its roll, top to the right.")
+    ] = None
     heading_sigma_deg: Annotated[
-        float, typer.Option("--heading-sigma-deg", min=0, help="Sigma of the heading, unless a file has it.")
+        float,
+        typer.Option(
+            "--heading-sigma-deg", min=0, hidden=True, help="Sigma of the heading, unless a file has it."
+        ),
     ] = 0.5
     gravity_sigma_deg: Annotated[
         float | None,
         typer.Option(
             "--gravity-sigma-deg",
             min=0,
+            hidden=True,
             help="The same of pitch and roll.  [default: 0.1 with a file, 0.5 with angles]",
         ),
     ] = None
     white_sigma_deg: Annotated[
-        float, typer.Option("--white-sigma-deg", min=0, help="Of what is new in each angle with each line.")
+        float,
+        typer.Option(
+            "--white-sigma-deg", min=0, hidden=True, help="Of what is new in each angle with each line."
+        ),
     ] = 0.0
     time_sigma_us: Annotated[
-        float, typer.Option("--time-sigma-us", min=0, help="Of the file's times from the camera's.")
+        float,
+        typer.Option("--time-sigma-us", min=0, hidden=True, help="Of the file's times from the camera's."),
     ] = 0.0
     pps: Annotated[
         int | None,
@@ -195,6 +218,7 @@ class CameraOptions:
             min=0,
             max=255,
             metavar="CHANNEL",
+            hidden=True,
             help="This trigger input gets a pulse each second of UTC (PPS), and outputs have that time.",
         ),
     ] = None

@@ -31,7 +31,9 @@ def calibrate(
     ] = 2.0,
     as_json: Json = False,
 ) -> None:
-    """Estimate focal length, principal point and distortion; print them, with covariance, as a link.toml.
+    """Estimate focal length, principal point and distortion.
+
+    They are printed with their covariance, as a link.toml.
 
     One recording:  [bold]evlcp calibrate REC.raw --sites site.toml --poses poses.csv[/]
     Keep the table: [bold]evlcp calibrate REC.raw --sites site.toml --poses poses.csv > camera.toml[/]

@@ -46,7 +46,7 @@ def check(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Hold an installed algorithm, yours or ours, against the laws of its role; or all algorithms of a link.
+    """Hold an algorithm, or all of a link, against the laws of roles.
 
     A built-in one:      [bold]evlcp check ranging poc[/]
     With a parameter:    [bold]evlcp check ranging poc --set min_pixels=6[/]

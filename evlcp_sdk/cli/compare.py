@@ -46,7 +46,7 @@ def compare(
     ] = 0,
     as_json: Json = False,
 ) -> None:
-    """Run variants of the receiver on the same recordings; one table each, and one over all.
+    """Run variants of the receiver on the same recordings, in tables.
 
     Two rangings:     [bold]evlcp compare REC.raw --variant paper: --variant joint:ranging.id=joint-scale[/]
     Several settings: [bold]--variant best:ranging.id=joint-scale,decoding.id=ml-soft,tracking.id=kalman[/]

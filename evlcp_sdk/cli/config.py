@@ -27,7 +27,7 @@ def config(
         typer.Option("--codebook", help="Only the codes that both ends share, as JSON or as a C header."),
     ] = None,
 ) -> None:
-    """Print the resolved link: every parameter with its meaning, unit, bounds and default.
+    """Print the resolved link, each value with its meaning and bounds.
 
     Start your own:            [bold]evlcp config > link.toml[/]
     See what a change does:    [bold]evlcp config -c link.toml --set modulation.id=wh8 --digest[/]

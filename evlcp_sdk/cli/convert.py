@@ -30,7 +30,7 @@ def convert(
     ] = None,
     as_json: Json = False,
 ) -> None:
-    """Write the events and triggers of any source into a recording of another format.
+    """Write events and triggers into a recording of another format.
 
     A bag of ROS 2:           [bold]evlcp convert REC.raw -o drive.mcap[/]
     From one:                 [bold]evlcp convert bag:drive -o drive.raw[/]

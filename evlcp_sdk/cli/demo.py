@@ -48,7 +48,7 @@ def demo(
     workers: Workers = None,
     as_json: Json = False,
 ) -> None:
-    """Drive towards a bar of LEDs, simulated; receive it, and compare with the paper.
+    """Simulate a drive, receive it, and compare with the paper.
 
     Four stretches at 30 km/h:            [bold]evlcp demo[/] or [bold]evlcp demo -o somewhere[/]
     A shipped recording, frame by frame:  [bold]evlcp demo --recording[/]

@@ -23,7 +23,7 @@ def diagnose(
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
-    """Say why a recording is read, or is not: what blinks, and each stage of the receiver.
+    """Say why a recording is read, or is not, stage by stage.
 
     In words:       [bold]evlcp diagnose REC.raw[/]
     With pictures:  [bold]evlcp diagnose REC.raw -o REC.html[/]

@@ -13,7 +13,7 @@ def info(
     recording: Annotated[str, typer.Argument(metavar="REC", help="A recording; - for standard input.")],
     as_json: Json = False,
 ) -> None:
-    """Say what a recording holds: header, duration, rate, triggers, anomalies.
+    """Say what a recording holds: header, rate, triggers, anomalies.
 
     Reads it once from front to back and decodes no light: [bold]evlcp info REC.raw[/]
     """

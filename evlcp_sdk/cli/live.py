@@ -31,23 +31,31 @@ _HERE = "127.0.0.1"
 class ServingOptions:
     """What is served beside the results."""
 
-    view: Annotated[
-        bool, typer.Option("--view", help="Serve a page to look on in a browser; its address is printed.")
-    ] = False
+    view: Annotated[bool, typer.Option("--view", help="Serve a page for browsers.")] = False
     view_host: Annotated[
         str,
         typer.Option(
             "--view-host",
             metavar="ADDRESS",
-            help="Where the page is served: 0.0.0.0 for other machines, too, such as a phone.",
+            show_default=False,
+            help="0.0.0.0: for other machines, too.",
         ),
     ] = _HERE
     view_port: Annotated[
         int,
-        typer.Option("--view-port", min=0, max=65535, metavar="PORT", help="Its port; 0: any that is free."),
+        typer.Option(
+            "--view-port",
+            hidden=True,
+            min=0,
+            max=65535,
+            metavar="PORT",
+            show_default=False,
+            help="Its port; without it, any that is free.",
+        ),
     ] = 0
     view_record: Annotated[
-        bool, typer.Option("--view-record", help="Who looks on may record, into OUT or this folder.")
+        bool,
+        typer.Option("--view-record", hidden=True, help="Who looks on may record, into OUT or this folder."),
     ] = False
     nmea_port: Annotated[
         int | None,
@@ -60,7 +68,7 @@ class ServingOptions:
             min=0,
             max=65535,
             metavar="PORT",
-            help="Serve positions as gpsd does, whose usual port is 2947.",
+            help="Serve positions as gpsd does.",
         ),
     ] = None
 
@@ -93,11 +101,7 @@ def live(
     *,
     url: Annotated[
         str,
-        typer.Argument(
-            metavar="URL",
-            help="camera:, replay:REC, tcp://HOST:PORT, udp://HOST:PORT, unix:PATH, - for standard input, or"
-            " what a plugin can open; a recording is replayed at its own pace.",
-        ),
+        typer.Argument(metavar="URL", help="Where events come from; - for RAW on stdin."),
     ],
     link: LinkOptions,
     result: ResultOptions,
@@ -105,34 +109,26 @@ def live(
     camera: CameraOptions,
     reconnect: Annotated[
         bool,
-        typer.Option("--reconnect", help="Go on when a camera that was unplugged, or a stream, is back."),
+        typer.Option("--reconnect", help="Go on when a camera is back."),
     ] = False,
     waiting_ms: Annotated[
         float,
-        typer.Option("--waiting-ms", min=1.0, help="How long events may wait before some are left out."),
+        typer.Option(
+            "--waiting-ms", hidden=True, min=1.0, help="How long events may wait before some are left out."
+        ),
     ] = 20.0,
     serving: ServingOptions,
 ) -> None:
     """Receive in real time: results as they come, delays measured.
 
-    A recording, at its own pace:   [bold]evlcp live replay:REC.raw[/]
-    Again and again, twice as fast: [bold]evlcp live 'replay:REC.raw?loop=1&speed=2'[/]
-    From another machine:           [bold]evlcp live tcp://192.168.1.7:5600[/]
-    A camera:                       [bold]evlcp live camera:[/]
-    Some rows of it, its biases:    [bold]evlcp live 'camera:?diff_on=20&area=0,200,1280,240'[/]
-    From another program:           [bold]CAMERA | evlcp live - --json-lines -[/]
-    Several kinds of transmitters:  [bold]evlcp live URL -c bar.toml -c beacon.toml[/]
-    With positions:                 [bold]evlcp live URL --sites site.toml --pitch-deg 0 --roll-deg 0[/]
-    For Foxglove, written as it comes: [bold]evlcp live URL -o out --sites site.toml --attitude imu.csv
-    --mcap[/]
-    In a browser:                   [bold]evlcp live URL --view[/]
-    On a phone in this network:     [bold]evlcp live URL --view --view-host 0.0.0.0 --view-port 8080[/]
-    With UTC by a pulse each second: [bold]evlcp live camera: --sites site.toml --pps 0 --nmea-port 10110[/]
-    For programs that read gpsd:    [bold]evlcp live URL --sites site.toml --gpsd-port 2947[/], then
-    [bold]cgps[/] or [bold]gpspipe -w[/]
+    A camera:             [bold]evlcp live camera:[/]
+    A recording again:    [bold]evlcp live 'replay:REC.raw?loop=1'[/]
+    From another machine: [bold]evlcp live tcp://192.168.1.7:5600[/]
+    In a browser:         [bold]evlcp live URL --view[/]
+    Positions:            [bold]evlcp live URL --sites site.toml --attitude imu.csv[/]
+    For gpsd's programs:  [bold]evlcp live URL --sites site.toml --gpsd-port 2947[/]
 
-    Where the receiver cannot keep up, it leaves out, in this order, and counts: rows outside of regions, the
-    distances of most frames, all outside of regions, the oldest events. Ctrl-C ends it, with its summary.
+    What comes too fast is left out, and counted. Ctrl-C ends it.
     """
     from evlcp_sdk.errors import InputError, InterruptedRunError, UnpluggedError
     from evlcp_sdk.io.open import open_source

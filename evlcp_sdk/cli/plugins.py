@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def plugins(as_json: Json = False) -> None:
-    """List the roles with what they do, the installed algorithms of each, and broken plugins.
+    """List the roles, the algorithms installed, and broken plugins.
 
     `*` marks the default of a role, `!` two algorithms of one id, of which none can be used. Select an
     algorithm by its id: [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]

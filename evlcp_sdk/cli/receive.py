@@ -52,16 +52,21 @@ def receive(
     *,
     recordings: Annotated[
         list[str],
-        typer.Argument(metavar="REC...", help="Recordings, or what a plugin opens; - for RAW on stdin."),
+        typer.Argument(metavar="REC...", help="Recordings; - for RAW on stdin."),
     ],
     link: LinkOptions,
     link_mode: Annotated[
-        LinkMode, typer.Option("--link", help="auto: try other rates, modulations, packets; take the best.")
+        LinkMode, typer.Option("--link", show_default=False, help="auto: the one that fits best.")
     ] = LinkMode.GIVEN,
-    strict: Annotated[bool, typer.Option("--strict", help="End with 1 where there are warnings.")] = False,
+    strict: Annotated[
+        bool, typer.Option("--strict", hidden=True, help="End with 1 where there are warnings.")
+    ] = False,
     result: ResultOptions,
     workers: Annotated[
-        int, typer.Option("--workers", min=0, metavar="N", help="Processes for many recordings; 0: this one.")
+        int,
+        typer.Option(
+            "--workers", min=0, metavar="N", show_default=False, help="Processes for many recordings."
+        ),
     ] = 0,
     dask: Dask = None,
     place: PlaceOptions,
@@ -69,27 +74,16 @@ def receive(
 ) -> None:
     """Decode recordings: symbols and distances into OUT.
 
-    One recording:       [bold]evlcp receive REC.raw -o out[/]
-    With figures:        [bold]evlcp receive REC.raw -o out --figures[/]
-    A page to look at:   [bold]evlcp receive REC.raw -o out --report[/] writes out/report.html
-    Another profile:     [bold]evlcp receive REC.raw -o out --set modulation.id=wh8[/]
-    Settings unknown:    [bold]evlcp receive REC.raw -o out --link auto[/]
-    Your own link:       [bold]evlcp receive REC.raw -o out -c link.toml[/]
-    Several at once:     [bold]evlcp receive REC.raw -o out -c bar.toml -c beacon.toml[/]
-    As it comes:         [bold]CAMERA | evlcp receive - --json-lines -[/]
-    Several recordings:  [bold]evlcp receive a.raw b.raw -o out[/] writes out/a and out/b
-    Two at a time:       [bold]evlcp receive *.raw -o out --workers 2[/]
-    Positions, with the camera level and looking north: [bold]evlcp receive REC.raw -o out --sites site.toml
-    --heading-deg 0 --pitch-deg 0 --roll-deg 0[/]
-    Distances, with the camera pitched up: [bold]evlcp receive REC.raw -o out --pitch-deg 4 --roll-deg 0[/]
-    Positions, with an IMU's log: [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv[/]
-    A track between bars, too:    [bold]evlcp receive REC.raw -o out --sites site.toml --attitude imu.csv
-    --gnss gnss.csv[/]
+    One recording:      [bold]evlcp receive REC.raw -o out[/]
+    A page to look at:  [bold]evlcp receive REC.raw -o out --report[/]
+    Settings unknown:   [bold]evlcp receive REC.raw -o out --link auto[/]
+    Your own link:      [bold]evlcp receive REC.raw -o out -c link.toml[/]
+    As it comes:        [bold]CAMERA | evlcp receive - --json-lines -[/]
+    Several recordings: [bold]evlcp receive *.raw -o out --workers 2[/]
+    Positions:          [bold]evlcp receive REC.raw -o out --sites site.toml[/]
 
-    OUT gets frames.csv (a row per frame), packets.jsonl (a line per packet or message) and summary.json.
-    With --sites it gets fixes.csv, track.csv, fixes.geojson and fixes.nmea, too. --figures, --report,
-    --parquet and --mcap are short for --sink figures, report, parquet and mcap; plugins bring other formats.
-    An earlier result there is replaced when the new one is complete.
+    OUT gets frames.csv (a row a frame), packets.jsonl (a line a packet or message) and summary.json; with
+    --sites fixes.csv, track.csv, fixes.geojson and fixes.nmea, too. An earlier result there is replaced.
     """
     from evlcp_sdk.plugin.registry import Registry
 

@@ -33,7 +33,7 @@ def report(
     markdown: Annotated[bool, typer.Option("--markdown", help="Tables as Markdown on stdout.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Show what a campaign found: tables here, one self-contained page and figures for others.
+    """Show what a campaign found: tables, one page, figures.
 
     Tables only:        [bold]evlcp report paper.sqlite[/]
     Page and figures:   [bold]evlcp report paper.sqlite -o report.html[/]

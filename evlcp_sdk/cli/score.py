@@ -17,7 +17,7 @@ def score(
     truth_file: Annotated[Path, typer.Argument(metavar="REC.truth.json", help="The recording's truth.")],
     as_json: Json = False,
 ) -> None:
-    """Hold a result against the truth: frames found, bit errors, distance errors.
+    """Hold a result against the truth: frames, bits, distances.
 
     [bold]evlcp score out REC.truth.json[/]
 

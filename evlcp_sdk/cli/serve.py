@@ -22,7 +22,7 @@ def serve(
         Path | None, typer.Option("--unix", metavar="PATH", help="Listen on a Unix socket, too.")
     ] = None,
 ) -> None:
-    """Send a recording or a camera to other programs, as EVT3 words over TCP or a Unix socket.
+    """Send a recording or a camera to other programs: EVT3 by socket.
 
     A recording, at its own pace:  [bold]evlcp serve REC.raw --tcp 5600[/]
     The other end:                 [bold]evlcp live tcp://localhost:5600[/]

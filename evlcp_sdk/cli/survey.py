@@ -34,7 +34,7 @@ def survey(
     overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
-    """Estimate where bars stand, from a calibrated camera at known places; write site.toml.
+    """Estimate where bars stand, by a camera at known places.
 
     One recording:            [bold]evlcp survey REC.raw --poses poses.csv -o site.toml[/]
     By a calibrated camera:   [bold]evlcp survey REC.raw --poses poses.csv -c camera.toml -o site.toml[/]

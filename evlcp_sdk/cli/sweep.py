@@ -36,7 +36,7 @@ def sweep(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Simulate, receive and score every point of a campaign; go on where an earlier run stopped.
+    """Simulate, receive and score every point of a campaign.
 
     A campaign:            [bold]evlcp sweep examples/campaigns/paper.toml -o paper.sqlite[/]
     A quick look at it:    [bold]evlcp sweep examples/campaigns/paper.toml --set campaign.seeds=1[/]
@@ -44,7 +44,6 @@ def sweep(
     What came out:         [bold]evlcp report paper.sqlite -o report.html[/]
 
     A result is kept as soon as it is there: stopped or killed at any moment, the same command goes on.
-    One process a core, or as many as you say.
     """
     from dataclasses import asdict
 

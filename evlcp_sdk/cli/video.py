@@ -39,7 +39,7 @@ def video(
     whole: Annotated[bool, typer.Option("--whole", help="Show the whole image, not the bars only.")] = False,
     as_json: Json = False,
 ) -> None:
-    """Film the events in slow motion, with regions, symbols and distances drawn in.
+    """Film the events in slow motion, and what was read from them.
 
     The first frames:     [bold]evlcp video REC.raw -o REC.webp[/]
     More, and faster:     [bold]evlcp video REC.raw -o REC.webp --for-ms 100 --slow 100[/]

@@ -6,7 +6,7 @@ from evlcp_sdk.cli._common import Json, console, print_json, progress_bar
 
 
 def warm_up(as_json: Json = False) -> None:
-    """Compile the kernels now, so that no later command waits for them.
+    """Compile the kernels now: no later command waits for them.
 
     They are kept beside the package, or in your home where that cannot be written. It takes a minute or two,
     or a few seconds where all have been compiled.

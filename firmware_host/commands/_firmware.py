@@ -32,7 +32,7 @@ def build_images(
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to.")] = Path(),
     as_json: AsJson = False,
 ) -> None:
-    """Build the firmware: TARGET.elf, .hex and .bin, and TARGET.update.json for a board in the field.
+    """Build the firmware: TARGET.elf, .hex, .bin, and .update.json.
 
     For example: [bold]evlcp board build --target stm32f405-8mhz -o build[/]
     """
@@ -79,7 +79,7 @@ def flash(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Put an image into a part by the boot loader in its ROM (AN3155), over the board's own line.
+    """Put an image into a part by the boot loader in its ROM (AN3155).
 
     Set BOOT0 high and press reset before; low again, and reset, after. What SAVE keeps stays.
 

@@ -7,7 +7,7 @@ from typer.core import TyperCommand
 
 from evlcp_sdk.cli._common import echo, print_json
 
-AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, also of what goes wrong.")]
+AsJson = Annotated[bool, typer.Option("--json", help="JSON on stdout, faults too.")]
 
 
 def say(text: str, table: dict[str, Any], as_json: bool) -> None:

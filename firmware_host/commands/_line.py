@@ -76,18 +76,34 @@ def line_options(
         str | None,
         typer.Option(
             envvar="EVLCP_PORT",
-            help="Device, pyserial URL, usb:VID:PID, unix:PATH, tcp:HOST:PORT, or native:;"
-            " by default those are asked whose USB id boards usually have.",
+            show_envvar=False,
+            metavar="PORT",
+            rich_help_panel="Line",
+            help="Device, URL, usb:VID:PID, unix:PATH, native:; or all are asked.",
         ),
     ] = None,
-    baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = _BAUD,
-    trace: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the wire.")] = None,
+    baud: Annotated[
+        int,
+        typer.Option(
+            help="Line rate, bit/s.", min=1200, metavar="RATE", rich_help_panel="Line", show_default=False
+        ),
+    ] = _BAUD,
+    trace: Annotated[
+        Path | None, typer.Option(metavar="FILE", rich_help_panel="Line", help="Record the wire.")
+    ] = None,
     replay: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Play a recorded wire back; no board.")
+        Path | None,
+        typer.Option(metavar="FILE", rich_help_panel="Line", help="Play a recorded wire back; no board."),
     ] = None,
     key: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", envvar="EVLCP_BOARD_KEY", help="The board's key, if it has one."),
+        typer.Option(
+            metavar="FILE",
+            envvar="EVLCP_BOARD_KEY",
+            show_envvar=False,
+            rich_help_panel="Line",
+            help="The board's key, or EVLCP_BOARD_KEY.",
+        ),
     ] = None,
 ) -> None:
     """The callback of a group whose commands work on a board."""
@@ -148,7 +164,7 @@ def say_watchdog(action: str, timeout_ms: int) -> None:
 
 KeepAlive = Annotated[
     bool,
-    typer.Option("--keep-alive", help="Stay, so that the board's watchdog does not act; end with Ctrl-C."),
+    typer.Option("--keep-alive", help="Stay, for the board's watchdog, until Ctrl-C."),
 ]
 
 

@@ -23,14 +23,12 @@ class SymbolOptions:
 
     symbols: Annotated[
         Path | None,
-        typer.Argument(
-            metavar="SYMBOLS.json", help="Symbols \\[packet]\\[frame]\\[cluster], with their link."
-        ),
+        typer.Argument(metavar="SYMBOLS.json", help="Symbols and their link."),
     ] = None
     random: Annotated[
         int | None, typer.Option("--random", metavar="N", help="N packets of random symbols.")
     ] = None
-    seed: Annotated[int, typer.Option(help="Seed of --random.", min=0)] = 0
+    seed: Annotated[int, typer.Option(help="Seed of --random.", min=0, metavar="N", show_default=False)] = 0
     link_file: LinkFile = None
     overrides: Overrides = None
 
@@ -77,7 +75,7 @@ class BankOptions(SymbolOptions):
 
     masks: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.npy", help="Chips instead: uint8, a column per LED or cluster."),
+        typer.Option(metavar="FILE.npy", help="Chips instead of symbols."),
     ] = None
 
     def bank(self) -> "Bank":

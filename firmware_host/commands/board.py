@@ -95,7 +95,7 @@ def ports(
     every: Annotated[bool, typer.Option("--all", help="Say HELLO on every port.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """List the serial ports with their USB ids, and which have a board.
+    """List the serial ports, their USB ids, and which have a board.
 
     Nothing is written to a port whose USB id is not that of a bridge that boards usually have,
     unless --usb or --all asks for it.
@@ -163,21 +163,26 @@ def program(
     context: typer.Context,
     payload: BankOptions,
     inventory: InventoryFile = None,
-    level: Annotated[int | None, typer.Option(help="LED current, mA.", min=0, max=65535)] = None,
+    level: Annotated[
+        int | None, typer.Option(help="LED current, mA.", min=0, max=65535, metavar="MA")
+    ] = None,
     level_limit: Annotated[
-        int | None, typer.Option(help="Largest LED current from now on, mA.", min=1, max=65535)
+        int | None, typer.Option(help="Largest LED current from now on, mA.", min=1, max=65535, hidden=True)
     ] = None,
     duty_limit: Annotated[
-        float | None, typer.Option(help="Largest share of time that a LED is on.", min=0.001, max=1.0)
+        float | None,
+        typer.Option(help="Largest share of time that a LED is on.", min=0.001, max=1.0, hidden=True),
     ] = None,
     watchdog: Annotated[Silence | None, typer.Option(help="What to do when the host is silent.")] = None,
-    watchdog_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
-    verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
-    start: Annotated[bool, typer.Option(help="Play when done.")] = True,
+    watchdog_ms: Annotated[
+        int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1, hidden=True)
+    ] = 5000,
+    verify: Annotated[bool, typer.Option(help="Compare it there.", show_default=False)] = True,
+    start: Annotated[bool, typer.Option(help="Play when done.", show_default=False)] = True,
     stay: KeepAlive = False,
     as_json: AsJson = False,
 ) -> None:
-    """Program a board, or all boards of an inventory: codebook, settings and payload.
+    """Program a board, or all boards of an inventory.
 
     What is there already is not sent again. A board that plays changes between two packets, without a dark
     chip.
@@ -259,7 +264,7 @@ def send(
     *,
     context: typer.Context,
     payload: BankOptions,
-    verify: Annotated[bool, typer.Option(help="Compare what the board holds.")] = True,
+    verify: Annotated[bool, typer.Option(help="Compare it there.", show_default=False)] = True,
     as_json: AsJson = False,
 ) -> None:
     """Replace the payload of a programmed board, and nothing else.
@@ -326,7 +331,7 @@ def start(
 
 @app.command(cls=LineCommand)
 def stop(context: typer.Context, inventory: InventoryFile = None, as_json: AsJson = False) -> None:
-    """Finish the packet, then dark; a stream ends, and what waits in it is dropped."""
+    """Finish the packet, then dark; what waits in a stream is dropped."""
 
     def work(board: Board) -> None:
         board.stop()
@@ -388,7 +393,7 @@ def level(
     level_ma: Annotated[int, typer.Argument(metavar="MA", help="LED current, mA.", min=0, max=65535)],
     as_json: AsJson = False,
 ) -> None:
-    """Set the LED current; above the board's maximum it is refused.
+    """Set the LED current, up to the board's maximum.
 
     For example: [bold]evlcp board --port /dev/ttyUSB0 level 20[/]
     """
@@ -404,7 +409,7 @@ def watchdog(
     after_ms: Annotated[int, typer.Option(help="After which silence, ms.", min=100, max=2**32 - 1)] = 5000,
     as_json: AsJson = False,
 ) -> None:
-    """Choose what the board does when the host falls silent: keep playing, idle pattern, or dark."""
+    """Choose what the board does when the host falls silent."""
     from firmware_host.protocol.generated.requests import Watchdog
 
     with open_board(context) as board:
@@ -446,9 +451,9 @@ def monitor(
     inventory: InventoryFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Show a line of status again and again, and keep the board's watchdog from acting; end with Ctrl-C.
+    """Show the status again and again, until Ctrl-C.
 
-    A board that is gone is looked for until it answers again.
+    That keeps the board's watchdog from acting. A board that is gone is looked for until it answers again.
     """
     from firmware_host.board.monitor import watch
 
@@ -549,7 +554,7 @@ def verify(
     inventory: InventoryFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Read the active bank back and compare it with a payload; ends with 7 if it differs.
+    """Compare the active bank with a payload; 7 if it differs.
 
     For example: [bold]evlcp board --port /dev/ttyUSB0 verify SYMBOLS.json[/]
     """
@@ -597,7 +602,7 @@ def save(
     inventory: InventoryFile = None,
     as_json: AsJson = False,
 ) -> None:
-    """Save payload and settings to the board's flash; stop it first.
+    """Save payload and settings to a stopped board's flash.
 
     For example: [bold]evlcp board --port /dev/ttyUSB0 save --autostart[/]
     """
@@ -707,7 +712,7 @@ def keygen(
     show: Annotated[bool, typer.Option("--show", help="Print the name of one that is there.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make a key for boards, for its owner's eyes only; print its name, by which a board tells which it has.
+    """Make a key for boards; print its name, by which boards know it.
 
     For example: [bold]evlcp board keygen bar.key[/]
     """
@@ -724,7 +729,10 @@ def lock(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="The key, as 'evlcp board keygen' makes it.")],
     as_json: AsJson = False,
 ) -> None:
-    """Give a board a key: without it, the board can only be looked at; another one is taken with --key OLD.
+    """Give a board a key, without which it can only be looked at.
+
+    Another one is taken with --key OLD.
+
 
     The key goes over the line as it is: do it where nobody listens. It is gone with a reset unless saved.
 
@@ -741,7 +749,7 @@ def lock(
 
 @app.command(cls=LineCommand)
 def unlock(context: typer.Context, as_json: AsJson = False) -> None:
-    """Take a board's key away, with --key; it is back with a reset unless the board is saved."""
+    """Take a board's key away, until a reset unless it is saved."""
     with open_board(context) as board:
         board.set_key(None)
     say("unlocked; 'evlcp board save' keeps it so over a reset", {"key": None}, as_json)
@@ -761,10 +769,10 @@ def leds(
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Turn an LED record into a chip table; the ticks go into OUT.ticks.npy.
+    """Turn an LED record into a chip table.
 
-    Rows that are not a chip (dark, single-LED test) are left out. So is a last record that is cut off, and
-    then the command ends with 3.
+    The ticks go into OUT.ticks.npy. Rows that are not a chip (dark, single-LED test) are left out. So is a
+    last record that is cut off, and then the command ends with 3.
 
     For example: [bold]evlcp board leds leds.bin --chips chips.npy[/]
     """

@@ -30,13 +30,12 @@ def loop(
     overrides: Overrides = None,
     as_json: Annotated[bool, typer.Option("--json", help="Each step as a line of JSON.")] = False,
 ) -> None:
-    """Send a text from end to end on this machine: board, LEDs, camera, recording, receiver, text.
+    """Send a text from end to end on this machine, and read it.
 
     The board runs the real firmware, compiled here (needs cc and make); the camera is simulated. Ends with 1
     if the text does not arrive.
 
     Your own text:       [bold]evlcp loop --text "Tempo 30" --distance 60[/]
-
     At slower chips:     [bold]evlcp loop --set air.chip_rate_hz=5000.0[/]
     """
     import json

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
@@ -30,29 +30,36 @@ _MOST_NUMBER = 2**32 - 1
 class ContentOptions:
     """What is sent."""
 
+    PANEL: ClassVar[str] = "What is sent"
+
     text: Annotated[str | None, typer.Option(metavar="TEXT", help="Send a text.")] = None
     file: Annotated[Path | None, typer.Option(metavar="FILE", help="Send a file's bytes.")] = None
     beacon: Annotated[
         Path | None, typer.Option(metavar="site.toml", help="Send where the transmitter is.")
     ] = None
-    user: Annotated[str, typer.Option(metavar="TEXT", help="The beacon's own bytes, as text.")] = ""
+    user: Annotated[
+        str, typer.Option(metavar="TEXT", hidden=True, help="The beacon's own bytes, as text.")
+    ] = ""
     time: Annotated[bool, typer.Option("--time", help="Send the time.")] = False
     countdown: Annotated[
         float | None, typer.Option(metavar="SECONDS", help="Send how long a signal still shows.", min=0.0)
     ] = None
-    signal: Annotated[str, typer.Option(help="What it shows: red, green and the like.")] = "red"
-    next_signal: Annotated[str, typer.Option("--next", help="What it shows then.")] = "green"
+    signal: Annotated[str, typer.Option(hidden=True, help="What it shows: red, green and the like.")] = "red"
+    next_signal: Annotated[str, typer.Option("--next", hidden=True, help="What it shows then.")] = "green"
     key: Annotated[
         Path | None, typer.Option(metavar="private.pem", help="Sign the beacon; needs the extra sign.")
     ] = None
     transmitter_id: Annotated[
         int | None,
-        typer.Option("--id", min=0, max=_MOST_NUMBER, help="Transmitter id; the site's, or 0, without it."),
+        typer.Option("--id", metavar="ID", min=0, max=_MOST_NUMBER, help="Transmitter id."),
     ] = None
     sequence: Annotated[
         int | None,
         typer.Option(
-            min=0, max=_MOST_NUMBER, help="Sequence number; seconds since 1970 without it, so that it rises."
+            hidden=True,
+            min=0,
+            max=_MOST_NUMBER,
+            help="Sequence number; seconds since 1970 without it, so that it rises.",
         ),
     ] = None
 
@@ -98,17 +105,23 @@ class ContentOptions:
 class LineOptions:
     """A board that plays it."""
 
+    PANEL: ClassVar[str] = "Board"
+
     port: Annotated[
         str | None,
         typer.Option(
-            help="Program a board and play: device, pyserial URL, native:, as for 'evlcp board';"
-            " EVLCP_PORT without it, unless -o or --chips is given."
+            metavar="PORT", help="Device, URL, native:; or EVLCP_PORT, unless -o or --chips is given."
         ),
     ] = None
-    baud: Annotated[int, typer.Option(help="Line rate, bit/s.", min=1200)] = 1_000_000
+    baud: Annotated[int, typer.Option(hidden=True, help="Line rate, bit/s.", min=1200)] = 1_000_000
     board_key: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", envvar="EVLCP_BOARD_KEY", help="The board's key, if it has one."),
+        typer.Option(
+            metavar="FILE",
+            envvar="EVLCP_BOARD_KEY",
+            show_envvar=False,
+            help="The board's key, or EVLCP_BOARD_KEY.",
+        ),
     ] = None
 
     def line(self, *, only_named: bool = False) -> BoardLine | None:
@@ -121,15 +134,15 @@ class LineOptions:
 def message(
     *,
     content: ContentOptions,
-    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Send each packet so often in a row.")] = 1,
+    repeat: Annotated[
+        int, typer.Option(hidden=True, min=1, max=1000, help="Send each packet so often in a row.")
+    ] = 1,
     out: Annotated[
         Path | None, typer.Option("-o", "--out", metavar="FILE.json", help="Write the symbols.")
     ] = None,
     chips: Annotated[
         Path | None,
-        typer.Option(
-            metavar="FILE.npy", help="Write the chips: uint8, a row per chip, a column per cluster."
-        ),
+        typer.Option(metavar="FILE.npy", help="Write the chips: a row per chip."),
     ] = None,
     board: LineOptions,
     every: Annotated[
@@ -137,27 +150,23 @@ def message(
         typer.Option(
             metavar="SECONDS",
             min=1.0,
-            help="Send it anew so often, to a board: with the time, with what is left, and in the text"
-            " {time}, {left} and {n}; end with Ctrl-C, or when nothing is left.",
+            help="Send it anew so often, with {time}, {left} and {n} in the text.",
         ),
     ] = None,
-    count: Annotated[int | None, typer.Option(min=1, help="With --every: end after so many.")] = None,
+    count: Annotated[
+        int | None, typer.Option(hidden=True, min=1, help="With --every: end after so many.")
+    ] = None,
     ahead: Ahead = 2,
     stay: KeepAlive = False,
     link_file: LinkFile = None,
     overrides: Overrides = None,
-    as_json: Annotated[
-        bool, typer.Option("--json", help="One JSON object on stdout, with the symbols.")
-    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON on stdout, with the symbols.")] = False,
 ) -> None:
-    """Put a text, a file or a beacon on packets: symbols, chips, or a board that plays them.
+    """Put a text, a file or a beacon on packets, or on a board.
 
     A text:          [bold]evlcp tx message --text "Tempo 30" --id 7 -o message.json[/]
-
     A beacon:        [bold]evlcp tx message --beacon site.toml --key private.pem --chips chips.npy[/]
-
     Onto a board:    [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
-
     A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
     import json
@@ -296,7 +305,9 @@ def keygen(
     show: Annotated[bool, typer.Option("--show", help="Print the public key of one that is there.")] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Make an Ed25519 key that signs beacons; print the public key, for messages.trusted_keys.
+    """Make an Ed25519 key that signs beacons.
+
+    Its public key is printed, for messages.trusted_keys.
 
     For example: [bold]evlcp tx keygen private.pem[/]
     """

@@ -28,9 +28,7 @@ _MOST_LINES = 64
 
 Ahead = Annotated[
     int,
-    typer.Option(
-        min=2, help="Packets on the board: few for a short delay, many for a host that may be held up."
-    ),
+    typer.Option(metavar="N", min=2, help="Packets on the board: few for a short delay."),
 ]
 
 
@@ -50,14 +48,14 @@ def stream(
     ] = Lines.TEXT,
     ahead: Ahead = 4,
     transmitter_id: Annotated[
-        int, typer.Option("--id", min=0, max=2**32 - 1, help="Transmitter id of texts.")
+        int, typer.Option("--id", metavar="ID", min=0, max=2**32 - 1, help="Transmitter id of texts.")
     ] = 0,
-    repeat: Annotated[int, typer.Option(min=1, max=1000, help="Send each packet so often in a row.")] = 1,
+    repeat: Annotated[int, typer.Option(metavar="N", min=1, max=1000, help="Send each packet so often.")] = 1,
     link_file: LinkFile = None,
     overrides: Overrides = None,
     as_json: AsJson = False,
 ) -> None:
-    """Send what comes line by line, each as soon as it comes; end with the input, or with Ctrl-C.
+    """Send what comes, line by line, until the input ends.
 
     The board queues the packets, and shows its idle pattern while it has none (an underrun). At the end
     it is dark.

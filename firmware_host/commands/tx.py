@@ -49,7 +49,9 @@ def frames(
         ),
     ] = None,
 ) -> None:
-    """Show the words that go on air for these symbols; with the file's own link unless one is given.
+    """Show the words that go on air for these symbols.
+
+    By the file's own link unless one is given.
 
     For example: [bold]evlcp tx frames --random 2 --seed 1 --chips chips.npy[/]
     """
@@ -144,7 +146,9 @@ def check(
     sent: SymbolOptions,
     as_json: AsJson = False,
 ) -> None:
-    """Check balance and flicker: on-share, longest run, lines below 3 kHz against IEEE Std 1789-2015.
+    """Check balance and flicker.
+
+    On-share, longest run, and lines below 3 kHz against IEEE Std 1789-2015.
 
     Ends with 1 if a cluster's light is beyond the low-risk bound.
 

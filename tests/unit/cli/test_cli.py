@@ -14,9 +14,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+import typer
 
+from evlcp_sdk.cli._app import add_plugin_commands, make_app
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource, write_events
 from evlcp_sdk.place.gnss import checksum
+from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, load_sites, to_toml
 from evlcp_sdk.values import Events, Triggers
 
@@ -73,6 +76,35 @@ def test_help_teaches_by_example(evlcp: Evlcp, command: str) -> None:
     assert done.out.count(f"evlcp {command}") >= 2 or command == "plugins"
     assert done.out.count("evlcp ") >= 2
     assert "\x1b" not in done.out
+
+
+def test_every_help_fits_a_screen_and_names_what_it_leaves_out(
+    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    app = make_app()
+    add_plugin_commands(app, Registry.load())
+    commands = list(commands_of(typer.main.get_group(app)))
+    assert {"receive", "board program", "tx message"} <= {" ".join(names) for names, _ in commands}
+    for names, command in commands:
+        lines = evlcp(*names, "--help").out.splitlines()
+        assert len(lines) <= 46, names
+        assert max(map(len, lines)) <= 80, names
+        hidden = {option for one in command.params if getattr(one, "hidden", False) for option in one.opts}
+        if hidden:
+            assert not hidden & words_in(lines), names
+            assert hidden <= words_in(evlcp(*names, "--help-all").out.splitlines()), names
+
+
+def commands_of(group: Any, *names: str) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """All commands, groups too, with the names that they are called by."""
+    for name, command in group.commands.items():
+        yield (*names, name), command
+        yield from commands_of(command, *names, name) if hasattr(command, "commands") else ()
+
+
+def words_in(lines: list[str]) -> set[str]:
+    return {word for line in lines for word in line.split()}
 
 
 def test_a_plain_receive_loads_what_it_needs_and_lets_the_collector_rest_until_then(tmp_path: Path) -> None:
