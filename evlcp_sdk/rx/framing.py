@@ -91,6 +91,7 @@ _COUNTS = (
     "events_in_regions",
     "regions_opened",
     "regions_released",
+    "restarts",
     "locks",
     "preambles",
     "frames",
@@ -169,14 +170,9 @@ class PacketGrid:
         return True
 
     def restart(self, lock: SyncLock, earliest_us: float) -> None:
-        """Take a lock that is off the grid; frames go on with the first whole one, under new numbers."""
-        old, done = self.lock, self.frame
-        if old is not None:
-            earliest_us = max(earliest_us, self.start_us(done))
+        """Take a lock whatever was before; frames are numbered from the first whole one's packet on."""
         back = math.ceil((lock.packet_t_us - earliest_us) / (self.format.packet_chips * lock.chip_us))
-        self.lock = lock
-        self.packet = back + (0 if old is None else -(-done // self.format.frames))
-        self.frame = (self.packet - back) * self.format.frames
+        self.lock, self.packet, self.frame = lock, back, 0
         self.skip_before(earliest_us)
 
     def skip_before(self, earliest_us: float) -> int:
@@ -290,6 +286,8 @@ class Transmitter:
         rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
         said: Number of the newest frame that was decoded, on the grid, and its symbols.
+        given: Number of the newest frame that was given, on the grid.
+        rejected: Frames that were rejected since.
         missed: Frames due that were not given, by the count that they belong to.
         behind: Frames that are due wait for the next step.
         tried: Number of the newest frame on the grid that was not given as soon as it was due.
@@ -306,6 +304,8 @@ class Transmitter:
     rows: RowDelay = field(default_factory=RowDelay)
     pilot: Pilot | None = None
     said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
+    given: int = -1
+    rejected: int = 0
     missed: Counter[str] = field(default_factory=Counter)
     behind: bool = False
     tried: int = -1
@@ -339,21 +339,28 @@ class Transmitters:
         self.alive[region.id] = transmitter
         return transmitter
 
-    def adopt(self, transmitter: Transmitter, lock: SyncLock) -> bool:
-        """Take a new lock; frames go on where they were, or start with the first whole one of the region.
-
-        Returns whether it is another packet grid than before.
-        """
-        if transmitter.grid.follow(lock):
-            return False
+    def adopt(self, transmitter: Transmitter, lock: SyncLock) -> None:
+        """Take a lock that is off the grid; frames start with the first whole one of the region's events."""
+        region, grid = transmitter.region, transmitter.grid
         transmitter.pilot = None
         # Half a chip before the first event, at 0, is still within the first edge's delay.
-        earliest_us = max(transmitter.region.first_us, -lock.chip_us / 2)
-        if transmitter.grid.lock is None and self._inherit(transmitter, lock):
+        earliest_us = max(region.first_us, -lock.chip_us / 2)
+        if grid.lock is None and self._inherit(transmitter, lock):
             transmitter.grid.skip_before(earliest_us)
-            return True
-        transmitter.grid.restart(lock, earliest_us)
-        return True
+            return
+        if grid.lock is not None:
+            earliest_us = max(earliest_us, grid.start_us(grid.frame))
+        grid.restart(lock, earliest_us)
+
+    def succeed(self, old: Transmitter) -> Transmitter:
+        """Another transmitter in a region, after the last frame that was given of the one before."""
+        region = old.region
+        oldest_us = region.pieces[0][0] if region.pieces else 0
+        region.first_us = max(region.first_us, oldest_us, int(old.grid.start_us(old.given + 1)))
+        # The same LEDs, as far as one knows: where the bar is does not begin anew.
+        new = self.open(region, old.sync, old.distance)
+        new.rows = old.rows
+        return new
 
     def number(self, transmitter: Transmitter) -> int:
         """Its number: the next one, if it has none."""
@@ -370,7 +377,8 @@ class Transmitters:
             if unseen_us < _UNSEEN_STEPS * self._step_us or not lost.grid.follow(lock):
                 continue
             transmitter.number, transmitter.first = lost.number, lost.first
-            transmitter.distance = lost.distance
+            transmitter.distance, transmitter.given = lost.distance, lost.given
+            lost.number, lost.first, lost.given = None, None, -1
             transmitter.packets, lost.packets = lost.packets, transmitter.packets
             transmitter.grid, lost.grid = lost.grid, self._grid()
             return True
@@ -412,6 +420,10 @@ class Transmitters:
             keep_us = due.start_us - due.lock.chip_us
             if due.index == 0:
                 keep_us -= self._packet.preamble_chips * due.lock.chip_us
+            if transmitter.number is not None and due.number > transmitter.given + 1:
+                # They may be another's that has begun here, which its second preamble tells when it is over.
+                oldest_us -= 2 * self._packet.preamble_chips * due.lock.chip_us
+                keep_us = min(keep_us, max(transmitter.grid.start_us(transmitter.given + 1), oldest_us))
         region.forget_before(keep_us, self._step_us, min(keep_us, oldest_us))
 
     def release(self, transmitter: Transmitter) -> None:
@@ -607,8 +619,22 @@ class PacketFraming(Framer):
                     self._announcer.lap("synchronization", heard)
                 self.counts["preambles"] += 1
                 lock = self._late_rows(transmitter, heard)
-                self.counts["locks"] += self._transmitters.adopt(transmitter, lock)
+                if transmitter.grid.follow(lock):
+                    continue
+                self.counts["locks"] += 1
+                if transmitter.number is not None:
+                    transmitter = self._succeed(transmitter)
+                self._transmitters.adopt(transmitter, lock)
         return transmitter
+
+    def _succeed(self, old: Transmitter) -> Transmitter:
+        """End a transmitter that another is in the place of; frames rejected since its last were not sent."""
+        self.counts["restarts"] += 1
+        self.counts[Skipped.REJECTED] -= old.rejected
+        old.missed[Skipped.REJECTED] -= old.rejected
+        self._queue.add(old.packets, None)
+        self._ended.append((old.number, old.region.positions.place_at(old.region.latest.t_us), old.missed))
+        return self._transmitters.succeed(old)
 
     def _late_rows(self, transmitter: Transmitter, lock: SyncLock) -> SyncLock:
         """A lock with what its preamble, and those before, say of the rows of its bar."""
@@ -656,6 +682,7 @@ class PacketFraming(Framer):
                 if found is not Skipped.DARK:
                     self._lit_in(transmitter, self._clock.camera_us(due.start_us))
                     transmitter.missed[found] += 1
+                    transmitter.rejected += found is Skipped.REJECTED
                 self.counts[found] += 1
                 self._announce_skipped(transmitter, due, found)
                 continue
@@ -671,6 +698,7 @@ class PacketFraming(Framer):
     def _take(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         """Hand a frame on."""
         transmitter.grid.go_to(due.number + 1)
+        transmitter.given, transmitter.rejected = due.number, 0
         self._lit_in(transmitter, found.frame.t_us)
         self.counts["frames"] += 1
         self._queue.add(transmitter.packets, found)

@@ -259,7 +259,7 @@ class BarkerSynchronizer:
     def _accept(
         self, clock: _Clock | None, stray: _Preamble | None, found: _Preamble
     ) -> tuple[_Clock | None, _Preamble | None]:
-        """Add a preamble to the lock it fits; a better one, or a second one as good, off it starts anew.
+        """Add a preamble to the lock it fits; off it, a better one than its only one, or a second, begins.
 
         One symbol on all clusters at once blinks in phase, too, but can agree with 16 chips of 26 only.
         """
@@ -268,7 +268,7 @@ class BarkerSynchronizer:
         packets = self._packets_between(clock, found)
         if packets is not None:
             return self._next(clock, found, packets), None
-        if found.quality > clock.quality + _CLEARLY:
+        if clock.preambles == 1 and found.quality > clock.quality + _CLEARLY:
             return self._first(found), None
         if found.quality < clock.quality - _CLEARLY:
             return clock, stray

@@ -94,7 +94,7 @@ def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat, after
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("late_us", [-90.0, 0.0, 90.0, -110.0, 110.0, 1500.0])
 def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form: PacketFormat, late_us: float) -> None:
-    """A lock off the grid begins another, under new numbers."""
+    """A lock off the grid begins another."""
     grid, lock = PacketGrid(form), lock_of(form, 3, late_us)
     assert not grid.follow(lock)
     grid.restart(lock_of(form, 0), ZERO_US)
@@ -104,7 +104,7 @@ def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form: PacketForma
     assert grid.follow(lock) == near
     if not near:
         assert grid.start_us(grid.frame) == before_us
-        grid.restart(lock, 0.0)
+        grid.restart(lock, before_us)
     after = due_until(grid, on_air(form, 6)[-1][3])
     sent_us = [f[2] + late_us for f in on_air(form, 7)]
     assert all(min(abs(due.start_us - us) for us in sent_us) < 1e-6 for due in after)
@@ -113,7 +113,7 @@ def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form: PacketForma
         assert after[0].start_us == pytest.approx(sent_us[form.frames])
     else:
         assert after[0].start_us >= before_us - 1e-6
-        assert after[0].packet > done[-1].packet
+        assert after[0].packet in (0, 1)
 
 
 # Rows that come late

@@ -1,6 +1,7 @@
 """The whole receiver on ideal recordings: what it must decode, and what it leaves alone."""
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -248,15 +249,41 @@ def test_a_bar_lost_from_sight_goes_on_as_the_same() -> None:
     assert right_frames(packets, bar) == 39
 
 
-def test_a_transmitter_that_starts_anew_is_followed() -> None:
-    before = IdealBar(random_symbols(LINK, 3, 1))
-    after = IdealBar(random_symbols(LINK, 5, 2), start_us=127_777)
-    _, packets = received(LINK, merged(ideal_events(LINK, before), ideal_events(LINK, after)))
-    # One preamble off the old grid may be chance; the second one is believed.
-    late = [p for p in packets if p.t_us > after.start_us + 30_000]
-    assert right_frames(late, after) == 40
-    numbers = [p.packet for p in packets]
-    assert numbers == sorted(set(numbers)), "no packet number twice"
+@pytest.mark.parametrize("at_us", [74_000, 88_500, 101_000])
+def test_a_transmitter_that_starts_anew_is_another(at_us: float) -> None:
+    """In the middle of a packet, with another clock, and again: read from its first whole frame on.
+
+    Or from the second, where one that was cut short is given until then.
+    """
+    bars = [
+        IdealBar(random_symbols(LINK, 6, seed), start_us=start_us, ppm=ppm)
+        for seed, start_us, ppm in ((1, 5000, -60), (2, at_us - 13_210, 80), (3, at_us + 90_000, 0))
+    ]
+    begins = 0, at_us, at_us + 100_000, 300_000
+    sent = [ideal_events(LINK, bar) for bar in bars]
+    lit = [(e.t_us >= begins[i]) & (e.t_us < begins[i + 1]) for i, e in enumerate(sent)]
+    receiver, packets = received(LINK, merged(*(e[on] for e, on in zip(sent, lit, strict=True))))
+    assert receiver.counts["restarts"] == 2
+    assert receiver.counts["frames_rejected"] == 0
+    for number, bar in enumerate(bars):
+        chip_us = 100 / (1 + bar.ppm * 1e-6)
+        starts = bar.start_us + chip_us * np.add.outer(346 * np.arange(6), 26 + 32 * np.arange(10)).ravel()
+        whole = (starts >= begins[number]) & (starts + 32 * chip_us < begins[number + 1])
+        mine = [p for p in packets if p.transmitter == number]
+        frames = [f for f in frames_of(mine) if f.t_us + 3200 < begins[number + 1]]
+        assert np.count_nonzero(whole) - 1 <= len(frames) <= np.count_nonzero(whole)
+        assert right_frames([replace(p, frames=tuple(f for f in p.frames if f in frames)) for p in mine], bar)
+        assert [p.packet for p in mine] == list(range(len(mine)))
+
+
+def test_one_preamble_off_the_grid_starts_nothing() -> None:
+    bar, other = (
+        IdealBar(random_symbols(LINK, 5, seed), start_us=us) for seed, us in ((1, 5000), (2, 66_600))
+    )
+    events, glitch = ideal_events(LINK, bar), ideal_events(LINK, other)
+    late = (events.t_us > 66_600) & (events.t_us < 69_250)
+    receiver, packets = received(LINK, merged(events[~late], glitch[glitch.t_us < 69_250]))
+    assert (receiver.counts["restarts"], {p.transmitter for p in packets}) == (0, {0})
 
 
 STREAM = merged(
