@@ -40,7 +40,14 @@ def scene_of_truth(truth: Mapping[str, Any]) -> Scene:
                 **({"around_px": 60, "change_s": given["bg_steps"]} if given.get("bg_steps") else {}),
             },
             "drops": [
-                {"x_px": x, "y_px": y, "speed_px_s": [right, down], "radius_px": radius, "bend_px": bend}
+                # Theirs is that of a slope at the middle, of which the rim bends this share.
+                {
+                    "x_px": x,
+                    "y_px": y,
+                    "speed_px_s": [right, down],
+                    "radius_px": radius,
+                    "bend_px": bend / math.sqrt(math.e),
+                }
                 for x, y, right, down, radius, bend in given.get("drops", ())
             ],
             "sensor": {
