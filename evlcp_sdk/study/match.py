@@ -56,13 +56,14 @@ def nearest_bar(
 ) -> tuple[int, float] | None:
     """Number of the bar that is nearest in the image at a time after the scene's start, and its distance, px.
 
-    None without bars.
+    None without bars. Of bars in one place, as after a restart, it is one that is not all hidden then.
     """
-    away = []
+    away, behind = [], []
     for bar in bars:
         x, y = (float(np.interp(t_us, truth.t_us, bar.centre_px[:, axis])) for axis in (0, 1))
         away.append(float(np.hypot(x_px - x, y_px - y)))
-    return min(enumerate(away), key=lambda one: one[1], default=None)
+        behind.append(any(a <= t_us * 1e-6 < b for a, b in bar.pole_s))
+    return min(enumerate(away), key=lambda one: one[1] + behind[one[0]], default=None)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.link.resolve import load_link, resolve
-from evlcp_sdk.sim import Scene, load_scene, truth_from_table, truth_of
+from evlcp_sdk.sim import BarSpec, Scene, load_scene, truth_from_table, truth_of
 from evlcp_sdk.study.frames import read_frames
-from evlcp_sdk.study.match import check_link
+from evlcp_sdk.study.match import check_link, nearest_bar
 from evlcp_sdk.study.measure import statistics_of
 from evlcp_sdk.study.score import score_frames
 from tests.conftest import ROOT
@@ -175,6 +175,14 @@ def test_other_links_are_scored_as_plain_loops_score_them(name: str, tmp_path: P
     # A scene without bars has only ghosts.
     none = statistics_of(frames, replace(known, bars=()))
     assert (none.unmatched, none.segments) == (none.rows - none.echoes, {})
+
+
+def test_of_two_bars_in_one_place_the_one_that_shows_is_meant() -> None:
+    old, new = BarSpec(pole_s=((0.1, 1.0),)), BarSpec(seed=3, pole_s=((0.0, 0.1),))
+    truth = truth_of(Scene(bars=(old, new)))
+    for t_us, number in ((50_000.0, 0), (150_000.0, 1)):
+        x, y = (float(np.interp(t_us, truth.t_us, axis)) for axis in truth.bars[0].centre_px.T)
+        assert nearest_bar(truth.bars, truth, t_us, x + 3.0, y) == (number, pytest.approx(3.0))
 
 
 GOOD = ",".join(COLUMNS[:6]) + "\n"
