@@ -52,17 +52,17 @@ def find_start(starts_us: Floats, t_us: float, packet: PacketFormat) -> int | No
 
 
 def nearest_bar(
-    bars: Sequence[SentBar], truth: Truth, t_us: float, x_px: float, y_px: float
+    bars: Sequence[SentBar], truth: Truth, t_us: float, x_px: float, y_px: float, *, road: bool = True
 ) -> tuple[int, float] | None:
     """Number of the bar that is nearest in the image at a time after the scene's start, and its distance, px.
 
-    None without bars. Of bars in one place, as after a restart, it is one that is not all hidden then.
+    None without bars. On a `road`, of bars in one place, as after a restart, it is one that is not hidden.
     """
     away, behind = [], []
     for bar in bars:
         x, y = (float(np.interp(t_us, truth.t_us, bar.centre_px[:, axis])) for axis in (0, 1))
         away.append(float(np.hypot(x_px - x, y_px - y)))
-        behind.append(any(a <= t_us * 1e-6 < b for a, b in bar.pole_s))
+        behind.append(road and any(a <= t_us * 1e-6 < b for a, b in bar.pole_s))
     return min(enumerate(away), key=lambda one: one[1] + behind[one[0]], default=None)
 
 
@@ -173,7 +173,8 @@ def match(
             continue
         t_us = frame.t_us - truth.t0_us
         among = senders.get(frame.link, range(len(bars)))
-        nearest = nearest_bar([bars[i].bar for i in among], truth, t_us, frame.x_px, frame.y_px)
+        sent = [bars[i].bar for i in among]
+        nearest = nearest_bar(sent, truth, t_us, frame.x_px, frame.y_px, road=road)
         if nearest is None:
             unmatched += 1
             continue
