@@ -77,7 +77,7 @@ def lit_strips(bar: BarSpec, layout: BarLayout, seed: int = 0) -> list[LitStrip]
     """
     shape = layout.shape
     light = led_light(bar, len(layout.led_clusters()), seed)
-    each = bool(bar.dead_leds or bar.stuck_leds or bar.led_spread or bar.lattice)
+    each = bool(bar.dead_leds or bar.stuck_leds or bar.led_spread or bar.lattice_m)
     if isinstance(shape, LedGrid):
         return _of_grid(bar, shape, layout, light, each)
     side_m = shape.led_m if isinstance(shape, LedRing | LedTable) else bar.width_m

@@ -185,6 +185,8 @@ class BarLight:
             for i, span in enumerate(spans):
                 if not 0 <= span[0] < span[1]:
                     raise ConfigError(f"{source}.{key}.{i} = {list(span)}: expected a time, and a later one")
+        if bar.lattice_m is not None and not 0 < bar.lattice_m[1] < bar.lattice_m[0]:
+            raise ConfigError(f"{source}.lattice_m = {list(bar.lattice_m)}: expected slats with gaps")
         for i, (_, _, a, b) in enumerate(bar.cover_s):
             if not 0 <= a <= b <= last:
                 raise ConfigError(
@@ -209,12 +211,12 @@ class BarLight:
         Returns:
             The same with the times at which something begins or ends to hide clusters.
         """
-        slats = self.bar.lattice
+        slats, speed_mps = self.bar.lattice_m, self.bar.lattice_mps
         if not self._covers and not self.bar.covered and slats is None:
             return when_us, levels
         edges = np.array([t for cover in self._covers for t in cover[:2] if begin_us < t < end_us])
-        pace = abs(slats.speed_mps) / _SLAT_STEP_UM if slats else 0.0
-        if pace:
+        pace = abs(speed_mps) / _SLAT_STEP_UM
+        if slats is not None and pace:
             steps = np.arange(math.floor(begin_us * pace) + 1, math.ceil(end_us * pace))
             edges = np.append(edges, steps / pace)
         when = np.sort(np.concatenate([when_us, edges]))
@@ -225,10 +227,11 @@ class BarLight:
             behind = (lit.clusters >= first) & (lit.clusters <= last)
             seen[np.ix_((start >= from_us) & (start < to_us), behind)] = 0.0
         if slats is not None:
+            every_m, width_m, first_m = slats
             # Length that slats hide above each cut, of the cuts' places among the slats.
-            moved_m = np.floor(start * pace + 1e-6) * math.copysign(1e-6 * _SLAT_STEP_UM, slats.speed_mps)
-            at_m = (np.array(lit.cuts) + 0.5) * lit.length_m - slats.first_m - moved_m[:, None]
-            hidden = at_m // slats.every_m * slats.width_m + np.minimum(at_m % slats.every_m, slats.width_m)
+            moved_m = np.floor(start * pace + 1e-6) * math.copysign(1e-6 * _SLAT_STEP_UM, speed_mps)
+            at_m = (np.array(lit.cuts) + 0.5) * lit.length_m - first_m - moved_m[:, None]
+            hidden = at_m // every_m * width_m + np.minimum(at_m % every_m, width_m)
             seen *= 1 - np.diff(hidden, axis=1) / np.diff(at_m, axis=1)
         return when, seen
 

@@ -37,16 +37,6 @@ LinkTable = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class LatticeSpec:
-    """Slats before a bar that cross it, a slanted fence, by what they hide along it."""
-
-    every_m: Annotated[float, Field(ge=0.001, description="From one slat to the next.")] = 0.09
-    width_m: Annotated[float, Field(ge=0, description="What one hides; less than `every_m`.")] = 0.03
-    first_m: Annotated[float, Field(description="From the bar's top down to where one begins.")] = 0.0
-    speed_mps: Annotated[float, Field(ge=-10, le=10, description="How fast they go down the bar.")] = 0.0
-
-
-@dataclass(frozen=True)
 class BarSpec:
     """A transmitter: the LEDs that its link describes, which send packets without end."""
 
@@ -119,7 +109,14 @@ class BarSpec:
     pole_s: Annotated[
         tuple[tuple[float, float], ...], Field(description="[from s, to s] when all of it is hidden.")
     ] = ()
-    lattice: LatticeSpec | None = None
+    lattice_m: Annotated[
+        tuple[float, float, float] | None,
+        Field(
+            description="Slats of a slanted fence that cross it: [from one to the next, what one hides, from"
+            " its top to where one begins] along it; none: no fence."
+        ),
+    ] = None
+    lattice_mps: Annotated[float, Field(ge=-10, le=10, description="How fast they pass down it.")] = 0.0
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from evlcp_sdk.sim.leds import led_light
 from evlcp_sdk.sim.light import BarLight, wiper_switches
 from evlcp_sdk.sim.motion import pothole_angle_rad
 from evlcp_sdk.sim.optics import blur_of
-from evlcp_sdk.sim.scene import LatticeSpec, LensSpec
+from evlcp_sdk.sim.scene import LensSpec
 from evlcp_sdk.values import Events
 from tests.models.pixels import pixel_events, served, words_of
 from tests.unit.sim.scenes import EXACT, STILL, alike, every, rows, still
@@ -115,9 +115,9 @@ def test_covers_put_out_clusters_and_only_those() -> None:
 
 
 def test_leds_are_dead_stuck_dim_or_behind_slats() -> None:
-    slats = LatticeSpec(every_m=0.09, width_m=0.033, first_m=0.02, speed_mps=2.0)
     dead, stuck = (5, *range(12, 18), 40), (3, 41)
-    bar = BarSpec(start_chip=2.3, dead_leds=dead, stuck_leds=stuck, led_spread=0.3, lattice=slats)
+    bar = BarSpec(start_chip=2.3, dead_leds=dead, stuck_leds=stuck, led_spread=0.3)
+    bar = replace(bar, lattice_m=(0.09, 0.033, 0.02), lattice_mps=2.0)
     light, plain = (BarLight(one, resolve({}), LensSpec(), 7) for one in (bar, BarSpec(start_chip=2.3)))
     assert light.dark == {2}
     assert truth_of(Scene(bars=(bar,))).bars[0].covered == (2,)
@@ -353,7 +353,7 @@ def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
             "wiper": {"share": 0.9, "at_s": 0.002, "lasts_s": 0.01},
             "lens": {"bloom": 0.1, "bloom_px": 5.0},
             "background": {"around_px": 20, "light_w_m2": 0.5, "change_s": [[0.001, 1.0], [0.006, 5.0]]},
-            "bars": [{"cover_s": [[0.002, 0.006, 0, 4]], "lattice": {"speed_mps": 3.0}, "dead_leds": [7]}],
+            "bars": [{"cover_s": [[0.002, 0.006, 0, 4]], "lattice_m": [0.1, 0.03, 0], "dead_leds": [7]}],
             "drops": [{"x_px": 420.0, "speed_px_s": [200.0, 0.0]}],
             "reflections": [{}, {"kind": "rail"}, {"kind": "window", "shift_px": [5, 5]}],
         }
