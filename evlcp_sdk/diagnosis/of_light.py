@@ -6,6 +6,7 @@ import math
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
+from evlcp_sdk.clock import TimeGrain
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, has_rate, in_ms
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.link.several import alike_links
@@ -105,12 +106,13 @@ def check_events(facts: Facts) -> Found:
 def check_times(facts: Facts) -> Found:
     """Times in steps of more than a quarter of a chip, of which little is left; or guessed ones."""
     chip_us = min(one.link.packet.chip_us for one in (facts, *facts.parts.values()))
-    if facts.step_us > chip_us / 4:
-        yield Diagnostic(
-            "coarse-times",
-            f"times are rounded to {facts.step_us / 1000:g} ms; a chip is {chip_us / 1000:g} ms",
-            "export them in whole microseconds, or with six decimals of a second",
-        )
+    grain = facts.readout.grain if facts.readout is not None else TimeGrain()
+    step_us = max(facts.step_us, grain.step_us if grain.known_us is not None else 0)
+    if step_us > chip_us / 4:
+        step = "export them in whole microseconds, or with six decimals of a second; of a sensor that reads"
+        step += f" images, four to a chip: air.chip_rate_hz = {1e6 / (4 * step_us):.0f}"
+        text = f"times come in steps of {step_us / 1000:g} ms; a chip is {chip_us / 1000:g} ms"
+        yield Diagnostic("coarse-times", text, step, verdict="fail" if step_us > chip_us else "doubt")
     if facts.guessed:
         step = "where it is wrong, list:PATH?columns=...&unit=... says it"
         yield Diagnostic("guessed", facts.guessed, step, verdict="note")

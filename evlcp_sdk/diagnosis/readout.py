@@ -7,6 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.clock import TimeGrain
 from evlcp_sdk.values import Events
 
 _CAPPED_SHARE = 0.2
@@ -31,9 +32,14 @@ _TOGETHER = 1000
 
 
 class ReadoutTally:
-    """Counts the milliseconds that had so many events."""
+    """Counts the milliseconds that had so many events.
+
+    Attributes:
+        grain: How coarse the times are.
+    """
 
     def __init__(self) -> None:
+        self.grain = TimeGrain()
         self._hist = np.zeros(1 + _bins([_MOST])[0], np.int64)
         self._new: list[int] = []
         self._ms = (0, 0)
@@ -43,6 +49,7 @@ class ReadoutTally:
         t_us = events.t_us
         if not len(t_us):
             return
+        self.grain = self.grain.after(t_us)
         first, last = int(t_us[0]) // 1000, int(t_us[-1]) // 1000
         if 0 <= last - first < len(t_us) // 8:
             found = np.searchsorted(t_us, np.arange(first, last + 1) * 1000).tolist()

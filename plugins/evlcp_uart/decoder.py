@@ -8,12 +8,12 @@ the stream has a log-likelihood of each context of a bit; a character is worth w
 sequence of characters and pauses is found as a whole.
 """
 
-import math
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from evlcp_sdk.clock import TimeGrain
 from evlcp_uart.acquire import acquire
 from evlcp_uart.light import EARLY, TICKS, Floats, Light, Ticks
 from evlcp_uart.reader import LEAST_CHARACTERS, NEAR, TAIL, CharacterReader, Stretch
@@ -49,9 +49,6 @@ _SELDOM = 8
 _BUNCH_EVENTS, _BUNCH_TICKS = 6.0, TICKS // 2
 """Events of a tick from which on those of ticks some way apart are bunches of a readout, and how far these
 are apart at the most: edges are further."""
-
-_GRAINS = 24
-"""Differences of times that show how coarse these are: those of finer ones are all even in 1e-7 of cases."""
 
 _LOST = 8
 """Stretches with events and without a character after which the light is learned anew."""
@@ -89,10 +86,7 @@ class CharacterState:
         seen: First tick of which is known whether it has events; one before that may be a character's.
         light: What is known of the light; None before that.
         dark: Stretches with events and without a character since the last one.
-        grain_us: Greatest common divisor of what the first times differ by, us: 1 but for coarse ones.
-        grains: Differences of which that is known.
-        grain_at: Tick of the last of them; None as long as there are too few.
-        last_us: Time of the last event; None before the first.
+        grain: How coarse times are.
         spread: Ticks over which the events of one are spread, as their times are no better known.
         tried: Stretches with events in which light was looked for, or might have been, in vain.
         blocks: Blocks of the next stretch.
@@ -105,10 +99,7 @@ class CharacterState:
     seen: int = 0
     light: Light | None = None
     dark: int = 0
-    grain_us: int = 0
-    grains: int = 0
-    grain_at: int | None = None
-    last_us: int | None = None
+    grain: TimeGrain = field(default_factory=TimeGrain)
     spread: int = 1
     tried: int = 0
     blocks: int = 1
@@ -196,17 +187,7 @@ class CharacterDecoder:
         # Times rise: none is before the grid.
         inside = ticks >= 0
         np.add.at(counts, (p[inside].astype(np.int64), ticks[inside]), 1)
-        state = replace(state, first=first, counts=counts)
-        return self._grained(state, t_us) if len(t_us) and state.grain_at is None else state
-
-    def _grained(self, state: CharacterState, t_us: Ticks) -> CharacterState:
-        """With how coarse times are."""
-        apart = np.diff(t_us, prepend=t_us[0] if state.last_us is None else state.last_us)
-        steps = np.flatnonzero(apart)[: _GRAINS - state.grains]
-        grain_us = math.gcd(state.grain_us, int(np.gcd.reduce(apart[steps])) if len(steps) else 0)
-        grains = state.grains + len(steps)
-        at = int(t_us[steps[-1]] * TICKS // self.bit_us) if grains == _GRAINS else None
-        return replace(state, grain_us=grain_us, grains=grains, grain_at=at, last_us=int(t_us[-1]))
+        return replace(state, first=first, counts=counts, grain=state.grain.after(t_us))
 
     def _decode(
         self, state: CharacterState, due: int, last: bool = False
@@ -252,8 +233,9 @@ class CharacterDecoder:
         if state.light is None:
             spread = _bunches(counts[:, :due])
             # What is known only later, is not known yet in whatever pieces events come.
-            if state.grain_at is not None and state.grain_at < state.first + due:
-                spread = max(spread, round(state.grain_us * TICKS / self.bit_us))
+            grain = state.grain
+            if grain.known_us is not None and grain.known_us * TICKS // self.bit_us < state.first + due:
+                spread = max(spread, round(grain.step_us * TICKS / self.bit_us))
         counts = _spread(counts, min(spread, TICKS))
         end = counts.shape[1] - (0 if last else TAIL)
         # A character may go on behind what is known.

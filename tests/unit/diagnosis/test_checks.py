@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from hypothesis import given, strategies as st
+from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.checks import run_checks
 from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
@@ -62,6 +63,12 @@ READ = {"frames": 60, "blocks_tried": 6, "blocks_decoded": 4, "blocks_failed": 2
 """Most packets are read, so that the link is right."""
 BLINKS = {"events_in_regions": 5_000_000, "regions_opened": 1}
 BLINKING = "something blinks, 5,000,000 events in 1 region, but no"
+
+
+def readout_of(t_us: NDArray[np.int64]) -> ReadoutTally:
+    tally = ReadoutTally()
+    tally.add(Events.of(t_us, np.zeros_like(t_us), np.zeros_like(t_us), np.zeros_like(t_us)))
+    return tally
 
 
 @pytest.mark.parametrize(
@@ -146,8 +153,15 @@ def test_what_counts_and_frames_say(tally: RunTally, counts: dict[str, int], sai
     ("given", "said"),
     [
         ({"losses": [Loss(200, 0, "byte", "odd")]}, ["200 events or words dropped (200 in the file)"]),
-        ({"step_us": 30}, ["times are rounded to 0.03 ms; a chip is 0.1 ms"]),
+        ({"step_us": 30}, ["times come in steps of 0.03 ms; a chip is 0.1 ms"]),
         ({"step_us": 25}, []),
+        (
+            {"readout": readout_of(np.arange(0, 10_000, 65))},
+            ["times come in steps of 0.065 ms; a chip is 0.1 ms"],
+        ),
+        ({"readout": readout_of(np.arange(0, 10_000, 25))}, []),
+        # Two events so far apart say nothing.
+        ({"readout": readout_of(np.array([0, 500]))}, []),
     ],
 )
 def test_what_a_recording_is_said_to_lack(given: dict[str, Any], said: list[str]) -> None:

@@ -276,7 +276,7 @@ def test_whole_milliseconds_of_many_pixels(suffix: str, tmp_path: Path) -> None:
 def test_times_coarser_than_a_chip_are_warned_of(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
     (tmp_path / "a.csv").write_text(text(T_S, X, Y, P, head="t_s,x,y,p", form="%.3f"))
     done = evlcp("receive", tmp_path / "a.csv", "-o", tmp_path / "out")
-    assert "times are rounded to 1 ms; a chip is 0.1 ms" in " ".join(done.out.split())
+    assert "times come in steps of 1 ms; a chip is 0.1 ms" in " ".join(done.out.split())
 
 
 @pytest.mark.parametrize("before_us", [200, 7000])
