@@ -145,7 +145,7 @@ def measure_box(
     seam: int,
     reach: float,
     rows: Array,
-) -> tuple[int, float, int, int, float, float]:
+) -> tuple[int, float, int, int, float, float, float]:
     """Where in a box pixels blink in the rhythm of the chips, and rose lately.
 
     `awake` are (now, how many ticks ago a rise may be, the least score).
@@ -154,10 +154,19 @@ def measure_box(
     within `reach` of it. An edge row that holds fewer pixels than a full one counts by its share.
 
     Returns:
-        (pixels, mean column, first column, last column, upper edge, lower edge).
+        (pixels, mean column, first column, last column, upper edge, lower edge, share of the seam's pixels
+        that rose lately, in rhythm or not, on its calmer side).
     """
     now, span, min_score = awake
     left, top, right, bottom = box
+    calm = 1.0
+    for first in (left, right - seam):
+        many, cells = 0, 0
+        for v in range(top, bottom):
+            for u in range(max(first, left), min(first + seam, right)):
+                many += _blinks(pixels[v, u], now, span, 0)
+                cells += 1
+        calm = min(calm, many / max(cells, 1))
     blinks, counts = np.empty((bottom - top, right - left), np.uint8), np.zeros(right - left, np.int32)
     for v in range(top, bottom):
         line, row = pixels[v, left:right], blinks[v - top]
@@ -173,7 +182,7 @@ def measure_box(
             first_column, last_column = min(first_column, u), u
     rows[:] = 0
     if last_column < first_column:
-        return 0, 0.0, 0, 0, 0.0, 0.0
+        return 0, 0.0, 0, 0, 0.0, 0.0, calm
     outside = min(columns[:seam].sum(), columns[-seam:].sum()) / seam if columns.size > 2 * seam else 0.0
     for i in range(columns.size):
         columns[i] = max(columns[i] - outside, 0.0)
@@ -203,9 +212,9 @@ def measure_box(
         total += n
         lit += n > 0
     if total == 0:
-        return 0, 0.0, 0, 0, 0.0, 0.0
+        return 0, 0.0, 0, 0, 0.0, 0.0, calm
     upper, lower = _edges_of(rows, top, bottom, total / lit)
-    return total, column, first_column, last_column, upper, lower
+    return total, column, first_column, last_column, upper, lower, calm
 
 
 @njit
@@ -217,7 +226,7 @@ def measure_strips(
     near: float,
     strips: Array,
     rows: Array,
-) -> tuple[int, float, int, int, float, float]:
+) -> tuple[int, float, int, int, float, float, float]:
     """Where in a box pixels blink, as `measure_box`, of a bar whose light stands in strips of columns.
 
     `strips` (n, 2) are the middle of each from the bar's centre, and half its width, px. A pixel says how far
@@ -248,7 +257,7 @@ def measure_strips(
         column += off / total
     rows[:] = 0
     if total == 0:
-        return 0, 0.0, 0, 0, 0.0, 0.0
+        return 0, 0.0, 0, 0, 0.0, 0.0, 0.0
     first_column, last_column = right, left
     for u in range(left, right):
         if number[u - left] >= 0 and columns[u - left] > 0:
@@ -262,7 +271,7 @@ def measure_strips(
         many += n
         lit += n > 0
     upper, lower = _edges_of(rows, top, bottom, many / lit)
-    return many, column, first_column, last_column, upper, lower
+    return many, column, first_column, last_column, upper, lower, 0.0
 
 
 @njit
@@ -1343,35 +1352,59 @@ def settle_points(
 @njit
 def still_lit(
     sums: Array, weight: Array, grid: int, pilot_chips: int, least: float, seen: Array, out: Array
-) -> None:
+) -> tuple[float, float, float]:
     """Whether those `seen` (K,) have events in more info chips than `least` of the pilot's: `out` (K,).
 
     Of a sum over pixels, by shares of the chips; `weight` (K, rows, columns) is that of cells.
+
+    Returns:
+        How many more of the info chips than of the pilot's have events in pixels where no cluster is, by the
+        share of the pilot's that have in pixels of clusters; and how many of all pixels have in a chip of
+        that half of the info with the fewest, and of the other, over those in a chip of the pilot.
     """
     chips, height, width = sums.shape
     clusters, rows, columns = weight.shape
     flat = np.ascontiguousarray(sums).reshape(chips, height * width)
-    events = np.zeros((2, height * width), np.int16)
+    events, totals = np.zeros((2, height * width), np.int16), np.zeros(3)
+    half = (chips - pilot_chips) // 2
     for c in range(chips):
-        line, some = flat[c], events[int(c >= pilot_chips)]
+        line, some, many = flat[c], events[int(c >= pilot_chips)], np.int32(0)
         for j in range(line.size):
-            some[j] = np.int16(some[j] + np.int16(line[j] != 0))
-    by_info, by_pilot = 1 / max(chips - pilot_chips, 1), least / pilot_chips
-    over = np.zeros((rows, columns))
+            one = np.int16(line[j] != 0)
+            some[j] = np.int16(some[j] + one)
+            many = np.int32(many + one)
+        of = int(c >= pilot_chips) + int(c >= pilot_chips + half)
+        totals[of] += many / (pilot_chips if of == 0 else half if of == 1 else chips - pilot_chips - half)
+    shares = np.zeros((2, rows, columns))
+    by = (1 / pilot_chips, 1 / max(chips - pilot_chips, 1))
     for r in range(rows):
         for v in range(r * grid, (r + 1) * grid):
             pilot, info = events[0, v * width :], events[1, v * width :]
             for c in range(columns):
                 for u in range(c * grid, (c + 1) * grid):
-                    over[r, c] += info[u] * by_info - pilot[u] * by_pilot
+                    shares[0, r, c] += pilot[u] * by[0]
+                    shares[1, r, c] += info[u] * by[1]
+    empty, shown, heavy = np.ones((rows, columns), np.bool_), 0.0, 0.0
     for k in range(clusters):
         total = 0.0
         top, bottom = rows_of(weight[k])
         for r in range(top, bottom):
             for c in range(columns):
                 if weight[k, r, c] != 0:
-                    total += weight[k, r, c] * over[r, c]
+                    total += weight[k, r, c] * (shares[1, r, c] - least * shares[0, r, c])
+                    shown += weight[k, r, c] * shares[0, r, c]
+                    heavy += weight[k, r, c]
+                    empty[r, c] = False
         out[k] = seen[k] and total > 0
+    more, cells = 0.0, 0
+    for r in range(rows):
+        for c in range(columns):
+            if empty[r, c]:
+                more += shares[1, r, c] - shares[0, r, c]
+                cells += 1
+    more *= heavy / (cells * shown) if cells and shown > 0 else 0.0
+    one, other = totals[1] / max(totals[0], 1e-9), totals[2] / max(totals[0], 1e-9)
+    return more, min(one, other), max(one, other)
 
 
 @njit

@@ -65,6 +65,11 @@ _SEAM_PX = 2
 _MIN_PIXELS = 4
 """Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
 
+_CALM, _FLOODED, _FLOOD_STEPS = 0.25, 0.5, 3
+"""Share of the pixels beside a bar that rose lately up to which they are calm; from which on, soon after
+that, the light of all changes: pixels that the bar has left show as it does, and would drag its region along.
+And steps that this may last; what goes on, a halo, is no change. Leaves make 0.45 at the most."""
+
 _CENTRE_SIGMA_PX = 0.25
 """Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
 
@@ -286,6 +291,7 @@ class Followed:
         opened_us: End of the step in which it was found, us.
         cut_us: Until when its events were forgotten for want of room, us; None where none were.
         held_bytes: What its pieces take.
+        calm_us: When the pixels beside its bar were seen to be calm, us.
     """
 
     id: int
@@ -303,6 +309,7 @@ class Followed:
     opened_us: int = 0
     cut_us: int | None = None
     held_bytes: int = 0
+    calm_us: int = 0
 
     def __post_init__(self) -> None:
         self.hold(self.pieces)
@@ -551,7 +558,7 @@ class Rhythm:
         reach_px: float,
         rows: NDArray[np.int64],
         strips: tuple[float, float, NDArray[np.float64]] | None,
-    ) -> tuple[int, float, int, int, float, float]:
+    ) -> tuple[int, float, int, int, float, float, float]:
         """Where in a box pixels blink that rose in the last `span_us`, see `_kernels.measure_box`.
 
         `strips` are (expected, near, strips) of `_kernels.measure_strips` for a bar whose light stands in
@@ -949,7 +956,8 @@ class RegionFollower(RegionTracker):
     ) -> Place | None:
         """Where something blinks in a box at the end of a step; `rows`: its pixels in each row.
 
-        Of a bar of known width, rows count no pixels beside it, and of strips none between them.
+        Of a bar of known width, rows count no pixels beside it, and of strips none between them; it is
+        nowhere as long as the light of all changes.
         """
         width_px, strips = math.inf, None
         if followed is not None and followed.size_px is not None:
@@ -959,9 +967,14 @@ class RegionFollower(RegionTracker):
                 strips = expected_px, float(MARGIN_PX), followed.strips_px
         if rows is None:
             rows = np.empty(box[3] - box[1], np.int64)
-        total, column, left, right, upper, lower = self._rhythm.measure(
+        total, column, left, right, upper, lower, seam = self._rhythm.measure(
             box, end_us, self._measure_us, width_px / 2 + 1, rows, strips
         )
+        if followed is not None and followed.size_px is not None:
+            if seam <= _CALM:
+                followed.calm_us = end_us
+            elif seam > _FLOODED and end_us - followed.calm_us <= _FLOOD_STEPS * self._spec.step_us:
+                return None
         if total < _MIN_PIXELS:
             return None
         return column, (upper + lower - 1) / 2, right - left + 1.0, lower - upper

@@ -50,13 +50,14 @@ def score_rises(events, shape, start, chip_us, min_score, cell_shift, most_same=
     return (rose, time, same, score), hits
 
 
-def measure_box(lit, box, seam, reach):
-    """What `measure_box` says of a mask of blinking pixels."""
+def measure_box(lit, rose, box, seam, reach):
+    """What `measure_box` says of a mask of blinking pixels, and of one of those that rose lately."""
     left, top, right, bottom = box
     inside = lit[top:bottom, left:right]
     counts = inside.sum(0)
+    calm = min(rose[top:bottom, left:right][:, side].mean() for side in (slice(seam), slice(-seam, None)))
     if not counts.any():
-        return (0, 0.0, 0, 0, 0.0, 0.0), np.zeros(bottom - top, int)
+        return (0, 0.0, 0, 0, 0.0, 0.0, calm), np.zeros(bottom - top, int)
     outside = min(counts[:seam].mean(), counts[-seam:].mean()) if len(counts) > 2 * seam else 0
     more = np.maximum(counts - outside, 0)
     columns = left + np.arange(len(counts))
@@ -67,11 +68,11 @@ def measure_box(lit, box, seam, reach):
     column = np.average(columns[core], weights=more[core]) if more.any() else (seen[0] + seen[-1]) / 2
     rows = inside[:, np.abs(columns - column) <= reach].sum(1)
     if not rows.any():
-        return (0, 0.0, 0, 0, 0.0, 0.0), rows
+        return (0, 0.0, 0, 0, 0.0, 0.0, calm), rows
     first, last = np.flatnonzero(rows)[[0, -1]]
     share = np.minimum(rows / rows[rows > 0].mean(), 1)
     upper, lower = top + first + 1 - share[first], top + last + share[last]
-    return (rows.sum(), column, seen[0], seen[-1], upper, lower), rows
+    return (rows.sum(), column, seen[0], seen[-1], upper, lower, calm), rows
 
 
 def measure_strips(lit, box, expected, near, strips):
@@ -85,7 +86,7 @@ def measure_strips(lit, box, expected, near, strips):
         mine &= np.cumsum(mine, 0) == 1
         counts = mine * inside.sum(0)
         if not counts.any():
-            return (0, 0.0, 0, 0, 0.0, 0.0), np.zeros(bottom - top, int)
+            return (0, 0.0, 0, 0, 0.0, 0.0, 0.0), np.zeros(bottom - top, int)
         column += (counts * off).sum() / counts.sum()
     kept = inside[:, mine.any(0)]
     rows = kept.sum(1)
@@ -93,7 +94,7 @@ def measure_strips(lit, box, expected, near, strips):
     first, last = np.flatnonzero(rows)[[0, -1]]
     share = np.minimum(rows / rows[rows > 0].mean(), 1)
     upper, lower = top + first + 1 - share[first], top + last + share[last]
-    return (rows.sum(), column, seen[0], seen[-1], upper, lower), rows
+    return (rows.sum(), column, seen[0], seen[-1], upper, lower, 0.0), rows
 
 
 def select_box(events, box):
@@ -246,7 +247,11 @@ def info_activity(sums, weight, grid, pilot_chips, least):
         part.mean(0).reshape(rows, grid, columns, grid).sum((1, 3))
         for part in (active[:pilot_chips], active[pilot_chips:])
     )
-    return (weight * (info - least * pilot)).sum((1, 2))
+    empty, halves = (weight == 0).all(0), np.array_split(sums[pilot_chips:] != 0, 2)
+    shown = (weight * pilot).sum() / weight.sum()
+    flood = (info - pilot)[empty].mean() / shown if empty.any() else 0.0
+    by_half = sorted(half.mean() / (sums[:pilot_chips] != 0).mean() for half in halves)
+    return (weight * (info - least * pilot)).sum((1, 2)), flood, *by_half
 
 
 def calibrate_llr(read, llr, seen, frame_worth, expected_worth, spread, least, together):

@@ -155,7 +155,8 @@ def test_what_blinks_in_a_box(box, share, reach):
     span_us = 100 if share < 1 else 200
     rows = np.empty(box[3] - box[1], np.int64)
     got = rhythm_of(pixels, min_score=10).measure(box, 1100, span_us, reach, rows, None)
-    want, want_rows = twins.measure_box((rose >= 1100 - span_us) & (score >= 5), box, 2, reach)
+    late = rose >= 1100 - span_us
+    want, want_rows = twins.measure_box(late & (score >= 5), late, box, 2, reach)
     assert_allclose(got, want, rtol=1e-12)
     assert_array_equal(rows, want_rows)
 
@@ -183,7 +184,7 @@ def test_strips_are_measured_whatever_each_has_awake():
     box, rows = (0, 0, WIDTH, HEIGHT), np.empty(HEIGHT, np.int64)
     strips = 12.5, 2.0, np.array([[-6, 1.5], [6, 1.5]])
     rhythm = rhythm_of(pixels, min_score=10)
-    many, column, first, last, upper, lower = rhythm.measure(box, 1100, 200, np.inf, rows, strips)
+    many, column, first, last, upper, lower, _ = rhythm.measure(box, 1100, 200, np.inf, rows, strips)
     assert (many, first, last) == (36, 4, 18)
     assert column == pytest.approx(11)
     assert rows[8] == 3
@@ -406,9 +407,12 @@ def test_events_in_pilot_and_info(seed, grid):
     sums = (rng.integers(-2, 3, (20, 11, 9)) * (rng.random((20, 11, 9)) < 0.4)).astype(np.int16)
     weight = rng.random((3, 11 // grid, 9 // grid)).astype(np.float32)
     seen, out = np.array([True, True, False]), np.empty(3, np.bool_)
+    weight[:, :, : grid // 2 + 1] = 0
     sums[12:] *= rng.random((8, 11, 9)) < 0.25
-    _kernels.still_lit(sums, weight, grid, 12, 0.25, seen, out)
-    assert_array_equal(out, seen & (twins.info_activity(sums, weight, grid, 12, 0.25) > 0))
+    got = _kernels.still_lit(sums, weight, grid, 12, 0.25, seen, out)
+    over, *want = twins.info_activity(sums, weight, grid, 12, 0.25)
+    assert_array_equal(out, seen & (over > 0))
+    assert_allclose(got, want, rtol=1e-6)
 
 
 @pytest.mark.parametrize("scale", [0.0, 0.3, 20.0])

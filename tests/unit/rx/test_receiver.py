@@ -124,6 +124,42 @@ def test_a_bar_in_the_dark(
     assert {name: receiver.counts[name] for name in count} == count
 
 
+def flashes(start_us: int, seed: int = 7) -> Events:
+    """Light that rises twentyfold in 2 ms about the bar: every pixel fires every 200 us."""
+    rng = np.random.default_rng(seed)
+    x, y = (v.ravel() for v in np.meshgrid(np.arange(350, 450), np.arange(270, 430)))
+    t = start_us + (200 * (np.arange(10) + rng.random((x.size, 10)))).astype(np.int64)
+    pixel = np.repeat(np.arange(x.size), 10)
+    order = np.argsort(t.ravel(), kind="stable")
+    return Events.of(t.ravel()[order], x[pixel][order], y[pixel][order], np.ones(t.size, int))
+
+
+def test_a_step_of_light_costs_the_frame_that_it_is_in() -> None:
+    """The bar has been where its trail lights up, too, and is not dragged back."""
+    bar = IdealBar(random_symbols(LINK, 4), shake_px=16, shake_hz=10)
+    first_us = int(bar.start_us) + 100 * (frame_chip(LINK, 1, 4) + LINK.packet.pilot_chips)
+    receiver, packets = received(LINK, merged(ideal_events(LINK, bar), flashes(first_us)))
+    frames = frames_of(packets)
+    assert len(frames) == 40
+    for f in frames:
+        flooded = (f.packet, f.frame) == (1, 4)
+        assert (f.soft.symbols == (-1 if flooded else bar.symbols[f.packet, f.frame])).all()
+        x, _ = bar.centre(np.array([f.t_us + 850]))
+        assert f.x_px == pytest.approx(x[0] - 0.5, abs=1.0)
+    assert receiver.counts["frames_flooded"] == 1
+
+
+@pytest.mark.parametrize("sooner_us", [30, 45, 60])
+def test_events_that_come_sooner_in_brighter_light(sooner_us: int) -> None:
+    """From a frame on, well before the next preamble, and half as many."""
+    bar = IdealBar(random_symbols(LINK, 3))
+    e = ideal_events(LINK, bar, delay_on_us=70.0, delay_off_us=70.0)
+    bright = e.t_us >= bar.start_us + 100 * frame_chip(LINK, 1, 3) + 60
+    moved = Events.of(e.t_us - sooner_us * bright, e.x, e.y, e.p)[~bright | (e.x % 2 == 0)]
+    order = np.argsort(moved.t_us, kind="stable")
+    assert right_frames(received(LINK, moved[order])[1], bar, late_us=(0, 90)) == 30
+
+
 def test_a_bar_that_says_nothing_is_no_transmitter() -> None:
     """Preambles and pilots show its clusters; the info segments are dark."""
     bar, packet = IdealBar(random_symbols(LINK, 2)), LINK.packet
