@@ -113,7 +113,8 @@ $(VENV)/.pip: | $(BIN)/python
 
 # Most modules are never imported: Python compiles a module when it is, and keeps that.
 $(VENV)/.installed: pyproject.toml $(VENV)/.pip
-	$(BIN)/python -m pip install -q --no-compile -e .
+	@echo "environment: $(VENV), by pip ..."
+	@$(BIN)/python -m pip install -q --no-compile -e .
 	@touch $@
 
 $(VENV)/.dev: pyproject.toml $(VENV)/.pip

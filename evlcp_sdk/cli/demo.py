@@ -100,18 +100,23 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
         print_json(summary.to_dict())
         return
     show_drive(summary)
-    console().print(f"written: {out}/report.html, ber.png, rmse.png and more, {results}", style="dim")
+    console().print(
+        f"written: {results}, {out}/report.html for a browser, and a picture: {out}/rmse.png", style="dim"
+    )
 
 
 def show_drive(summary: Summary) -> None:
-    """Print wrong bits, BER with 95 % confidence, and RMSE of each segment of distance beside the paper's."""
+    """Print bits, BER with 95 % confidence and RMSE of each segment of distance beside the paper's."""
     from evlcp_sdk.study.intervals import measure
     from evlcp_sdk.study.summary import beside_paper
     from evlcp_sdk.study.tally import SEGMENT_M, Tally
 
     (series,) = summary.series
     paper = {
-        (c.reference.measure, begin): f"{'≤ ' if c.reference.bound else ''}{c.reference.value:g}"
+        (c.reference.measure, begin): (
+            f"{'≤ ' if c.reference.bound else ''}{c.reference.value:g}",
+            "as good" if c.verdict == "agrees" else c.verdict,
+        )
         for c in beside_paper([series])
         for begin in range(c.reference.from_m, c.reference.to_m, SEGMENT_M)
     }
@@ -119,18 +124,20 @@ def show_drive(summary: Summary) -> None:
     for begin, recordings in reversed(series.segments):
         tally = Tally.together(recordings)
         ber, rmse = measure(recordings, "ber"), measure(recordings, "rmse_m")
+        bits, metres = (paper.get((kind, begin), ("-", "-")) for kind in ("ber", "rmse_m"))
         rows.append(
             (
                 f"{begin} to {begin + SEGMENT_M} m",
                 f"{tally.frames_found} of {tally.frames_sent}",
                 f"{tally.bit_errors} of {tally.bits}",
                 f"≤ {ber.high:.2g}" if ber.count else "-",
-                paper.get(("ber", begin), "-"),
+                bits[0],
                 f"{rmse.value:.3f}" if rmse.count else "-",
-                paper.get(("rmse_m", begin), "-"),
+                metres[0],
+                f"{bits[1]}, {metres[1]}",
             )
         )
-    head = ("distance", "frames", "wrong bits", "BER, 95 %", "paper", "RMSE, m", "paper")
+    head = ("distance", "frames", "wrong bits", "BER, 95 %", "paper", "RMSE, m", "paper", "bits, metres")
     print_table(console(), head, rows)
 
 

@@ -92,8 +92,7 @@ def _draw_shape(axis: Axes, shape: Shape, *, legend: bool = False) -> Any:
     if shape.kind == "band":
         return axis.fill(x, y, color=colour, alpha=0.25, lw=0)[0]
     width = WIDTHS_PX[shape.kind]
-    if shape.kind in ("dots", "hole"):
-        colour = "white" if shape.kind == "hole" else colour
+    if shape.kind == "dots":
         return axis.plot(x, y, "o", ms=width, mec="none", mfc=colour, zorder=4)[0]
     style = (0, tuple(shape.dash)) if shape.dash else "-"
     return axis.plot(x, y, ls=style, lw=0.75 * width, color=colour, zorder=3)[0]

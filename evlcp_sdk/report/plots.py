@@ -26,7 +26,7 @@ INK = "var(--ink)"
 DASHES = ((), (8, 4), (2, 3), (8, 3, 2, 3))
 """Patterns that lines differ in, in widths of a line."""
 
-WIDTHS_PX = {"line": 1.6, "stem": 1.2, "level": 3.0, "dots": 5.0, "hole": 2.6, "ring": 1.0}
+WIDTHS_PX = {"line": 1.6, "stem": 1.2, "level": 3.0, "dots": 5.0, "ring": 1.0}
 """How thick lines and dots are."""
 
 _SIDE = 2000
@@ -38,7 +38,6 @@ _STYLES = {
     "stem": "stroke:{colour};stroke-width:{width}px",
     "level": "stroke:{colour};stroke-width:{width}px;stroke-dasharray:{dash}",
     "dots": "stroke:{colour};stroke-width:{width}px;stroke-linecap:round",
-    "hole": "stroke:var(--paper);stroke-width:{width}px;stroke-linecap:round",
     "ring": "stroke:{colour};stroke-width:{width}px;stroke-opacity:0.7",
 }
 """How shapes are drawn, the lowest first."""
@@ -257,7 +256,7 @@ def _runs(known: NDArray[np.bool_]) -> Iterable[slice]:
 def _path(share: NDArray[np.float64], kind: str) -> str:
     # Far beyond the box, where it makes no difference.
     steps = np.clip(np.rint(share * _SIDE), -10 * _SIDE, 10 * _SIDE).astype(int).tolist()
-    if kind in ("dots", "hole"):
+    if kind == "dots":
         return "".join(f"M{x} {y}h0" for x, y in steps)
     return "M" + "L".join(f"{x} {y}" for x, y in steps) + ("Z" if kind in ("band", "ring") else "")
 

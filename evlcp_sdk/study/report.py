@@ -31,11 +31,14 @@ from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
 
 Dash = Sequence[int]
 
+_ARROW = 2.0
+"""How far down an upper limit's arrow points, as a factor; each wing is a sixteenth of a segment wide."""
+
 
 def charts_of(summary: Summary) -> list[Plot]:
     """The charts of a campaign: BER, RMSE, gross errors, frames found, histogram, and positions if any."""
     note = f"Segments of {SEGMENT_M} m. {INTERVALS}"
-    limit = f"{note} A hollow dot is an upper limit: not one error was seen."
+    limit = f"{note} An arrow is an upper limit: not one error was seen."
     nearest = f"{note} The distance is that of the nearest bar."
     plot = partial(Plot, x_name="distance, m")
     by_kind = {
@@ -86,7 +89,7 @@ def _part(series: Series, prefix: str) -> str:
 
 def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: str, dash: Dash) -> None:
     """Draw a figure of each segment with its interval; on a logarithmic axis, none is an upper limit."""
-    xs, ys, labels, holes, ends = [], [], [], [], []
+    xs, ys, labels, dots, stems = [], [], [], [], []
     for begin, recordings in series.segments:
         figure = measure(recordings, kind)
         if not figure.count:
@@ -100,13 +103,15 @@ def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: 
         )
         xs.append(x)
         ys.append(y)
-        ends.append((y, y) if none else (figure.low, figure.high))
-        holes.append(y if none else math.nan)
-    plot.line(xs, ys, colour, series.name, dash)
-    plot.dots(xs, ys, colour, series.name, labels)
-    plot.line(xs, holes, colour, series.name, kind="hole")
-    for x, (low, high) in zip(xs, ends, strict=True):
-        plot.line([x, x], [low, high], colour, series.name, kind="stem")
+        dots.append(math.nan if none else y)
+        left, right, tip, wing = x - SEGMENT_M / 16, x + SEGMENT_M / 16, y / _ARROW, y / _ARROW**0.8
+        arrow = [x, x, left, x, right], [y, tip, wing, tip, wing]
+        stems.append(arrow if none else ([x, x], [figure.low, figure.high]))
+    plot.line(xs, dots, colour, series.name, dash)
+    plot.dots(xs, dots, colour, series.name)
+    plot.label(xs, ys, labels, series.name)
+    for stem_x, stem_y in stems:
+        plot.line(stem_x, stem_y, colour, series.name, kind="stem")
 
 
 def _counts(tally: Tally, kind: str) -> str:
