@@ -144,6 +144,16 @@ def check_reflection(_facts: Facts, one: TransmitterTally) -> Found:
         yield Diagnostic("reflection", text, verdict="note")
 
 
+def check_alike(facts: Facts) -> Found:
+    """Bars that send the same at the same time: a warning where it matters which is which."""
+    alike = facts.counts.get("frames_alike", 0)
+    if alike:
+        text = f"{counted(alike, 'frame')} of bars that send the same symbols as another at the same time"
+        step = "give each bar messages of its own: neither positions nor what is read can say which is which"
+        matters = facts.positions_tried or facts.tally.messages()
+        yield Diagnostic("same-symbols", text, step, verdict="doubt" if matters else "note")
+
+
 def check_clock(facts: Facts, one: TransmitterTally) -> Found:
     """A clock that no crystal has."""
     packet, ppm = facts.link.packet, one.clock_ppm()

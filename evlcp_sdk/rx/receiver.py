@@ -268,7 +268,7 @@ class LinkReceiver:
         else:
             self.framing = PluginFraming(link, name, stream, self._queue, on_frame)
         self._messages = MessageAssembler.of(link, stream.clock_zero)
-        self._given = {"frames_reflected": 0, "packets": 0}
+        self._given = {"frames_reflected": 0, "frames_alike": 0, "packets": 0}
         self._of_others = self._rejected_of_others = 0
 
     @property
@@ -342,6 +342,8 @@ class LinkReceiver:
         read = []
         for packet in packets:
             self._given["packets"] += 1
+            alike = packet.echo_of is None and self._queue.reflections.alike(packet.transmitter)
+            self._given["frames_alike"] += len(packet.frames) * alike
             self._given["frames_reflected"] += len(packet.frames) * (packet.echo_of is not None)
             packet = changed(packet, t_us=self._clock.camera_us(packet.t_us))
             if self._announcer is not None:

@@ -3,7 +3,8 @@
 A wet road, a guard rail or a window shows a bar a second time: the same chips at the same time, weaker, maybe
 blurred, and in a mirror on the road in the opposite order. Whatever repeats the symbols of another
 transmitter on its packet grid is its reflection: two transmitters on one clock that send other data agree in
-one symbol of as many as there are codewords.
+one symbol of as many as there are codewords. But every mirror takes light, sharpness or order: images that
+are alike in all of them are two bars that one controller feeds.
 """
 
 import math
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.regions import SAME_PX
-from evlcp_sdk.rx.spread import Spread, sharper
+from evlcp_sdk.rx.spread import Spread, compare
 from evlcp_sdk.values import Frame, Packet, changed
 
 FOLLOWED_CHIPS = 2.5
@@ -53,12 +54,20 @@ _MOST_LIGHT = 3.0
 _MOST_SHARP = 4.0
 """Log odds that light and sharpness can give at the most: less than a mirror image's order does."""
 
+_TWO_BARS, _TWO_STAY = 1.5, 2.0
+"""Log odds of being alike from which on two that say the same are two bars, as one pair in five is, and by
+how much less they stay so. Two equal bars have 1.5 to 4.5, and wander by 1; images without blur, -2 and less
+from half of the light down, 0 at .7 of it."""
+
 _ANEW = 1.25
 """Share of frames by which those in common must have grown before their sharpness is compared again."""
 
 _WHOLE = 1.0
 """Log odds for each e-fold of clusters that the one shows more of: a rail is lower than the bar, so that its
 image is cut more often than the bar is covered."""
+
+_CUT = 5.0
+"""Log odds for each e-fold of them that the two are no two bars: hardly ever is half of one hidden."""
 
 _STAYS = 1.0
 """Log odds for what was said to be the bar before: what wavers by less changes nothing."""
@@ -162,8 +171,10 @@ class _Pair:
         seen: The same of the clusters that are seen.
         mirrored: Frames in which only the second is mirrored less those in which only the first is.
         spread: How light spreads in each, by the frames that tell it of both.
-        sharper: Log odds of the first being sharper and brighter, by the frames up to some; None if unknown.
-        compared: Frames by which that is.
+        compared: Log odds of the first being sharper and brighter, and of both being alike, by the frames up
+            to some; None if unknown.
+        frames_compared: Frames by which that is.
+        two: Whether they are two bars.
         last_us: Time of the newest frame in common, us.
     """
 
@@ -175,8 +186,9 @@ class _Pair:
     seen: float = 0.0
     mirrored: int = 0
     spread: tuple[Spread, Spread] | None = None
-    sharper: float | None = None
-    compared: int = 0
+    compared: tuple[float, float] | None = None
+    frames_compared: int = 0
+    two: bool = False
     last_us: float = -math.inf
 
     def add(self, one: FrameDetection, other: FrameDetection, codewords: int) -> None:
@@ -198,16 +210,16 @@ class _Pair:
         self.last_us = max(one.t_us, other.t_us, self.last_us)
 
     def odds(self) -> float:
-        """Log odds of the first being the bar and the second its reflection."""
-        turned = _MIRRORED * self.mirrored / max(self.frames, 1)
-        lit = max(self.lit, 1)
-        if self.spread is not None and self.spread[0].frames >= self.compared * _ANEW:
-            self.sharper, self.compared = sharper(*self.spread), self.spread[0].frames
-        if self.sharper is None:
-            light = brighter(self.light / lit)
-        else:
-            light = min(max(self.sharper, -_MOST_SHARP), _MOST_SHARP)
-        return turned + light + _WHOLE * self.seen / lit
+        """Log odds of the first being the bar and the second its reflection; says whether they are `two`."""
+        turned, lit = _MIRRORED * self.mirrored / max(self.frames, 1), max(self.lit, 1)
+        if self.spread is not None and self.spread[0].frames >= self.frames_compared * _ANEW:
+            self.compared, self.frames_compared = compare(*self.spread), self.spread[0].frames
+        seen = self.seen / lit
+        if self.compared is None:
+            return turned + brighter(self.light / lit) + _WHOLE * seen
+        sharper, alike = self.compared
+        self.two = alike - abs(turned) - _CUT * abs(seen) > _TWO_BARS - _TWO_STAY * self.two
+        return turned + min(max(sharper, -_MOST_SHARP), _MOST_SHARP) + _WHOLE * seen
 
 
 class Reflections:
@@ -220,11 +232,16 @@ class Reflections:
         self._seen: dict[int, deque[FrameDetection]] = {}
         self._pairs: dict[tuple[int, int], _Pair] = {}
         self._echo_of: dict[int, int] = {}
+        self._alike: set[int] = set()
         self._now_us = -math.inf
 
     def echo_of(self, transmitter: int) -> int | None:
         """Of which transmitter one is a reflection, by all frames so far; None if of none."""
         return self._echo_of.get(transmitter)
+
+    def alike(self, transmitter: int) -> bool:
+        """Whether a transmitter is a bar, and another bar says the same."""
+        return transmitter in self._alike
 
     def shown(self, t_us: float, centre_px: tuple[float, float]) -> bool:
         """Whether a transmitter has shown a frame that began at this time in this place."""
@@ -280,7 +297,7 @@ class Reflections:
 
     def _decide(self) -> None:
         before = set(self._echo_of.values())
-        self._echo_of = {}
+        self._echo_of, self._alike = {}, set()
         if not self._pairs:
             return
         odds = {key: pair.odds() for key, pair in self._pairs.items() if pair.same}
@@ -290,7 +307,9 @@ class Reflections:
             groups = [group for group in groups if group not in joined] + [set(key).union(*joined)]
         for group in groups:
             bar = originals(sorted(group), odds, before)
-            self._echo_of |= dict.fromkeys(group - {bar}, bar)
+            bars = {n for n in group if (pair := self._pairs.get((min(n, bar), max(n, bar)))) and pair.two}
+            self._alike |= {bar, *bars} if bars else bars
+            self._echo_of |= dict.fromkeys(group - {bar} - bars, bar)
 
 
 class PacketAssembler:

@@ -11,7 +11,7 @@ pixel answers ratios of light:
 
 What they should be follows from the lens, for each blur and each background, as a share of the light. Of two
 images, both on one background, the one is the bar if it is sharper and brighter; how likely that is rather
-than the opposite is summed over all that they may be.
+than the opposite is summed over all that they may be. They are two bars if both are as sharp and as bright.
 """
 
 import math
@@ -65,6 +65,13 @@ _KEPT_PX = np.array([0.02, 0.05, 0.05])
 
 _COMMON_PX = np.array([0.08, 0.2, 0.4])
 """Errors that both images have: another lens, another strip, a camera in motion."""
+
+_BARS_PX = np.array([0.06, 0.06, 0.12])
+"""Differences of two bars of one make (sigma): light alike to a tenth, LEDs not quite in line."""
+
+_ANSWERS, _ANSWERS_KEPT, _ANSWERS_APART = 0.018, 0.008, 0.03
+"""Share of edges that the middle of a line answers: its error in a frame, how much two bars differ all the
+same, and a bar and its image (sigmas). Brighter light decays longer, so that more edges are lost."""
 
 _STEPS_PER_E = 4
 """Spacings that are told apart within a factor of e; what is expected changes little with them."""
@@ -140,6 +147,10 @@ class Spread:
         beyond = (part + (1 - _TO) - 0.5) * self.spacing_px / self.frames
         return np.array([*beyond, self._width_px()])
 
+    def answered(self) -> float:
+        """Share of the edges that are answered by the pixels that answer most, those of the line."""
+        return float((self.across[0] / np.maximum(self.across[1], 1)).max())
+
     def _width_px(self) -> float:
         """Columns that answer, those that answer half as often half; what lies beyond a gap is another's."""
         if not self.across[1].any():
@@ -184,26 +195,52 @@ def neighbours(layout: Layout) -> NDArray[np.int64]:
     return np.argwhere(beside).astype(np.int64)
 
 
-def sharper(one: Spread, other: Spread) -> float | None:
-    """Log odds of the first being sharper and brighter against the second being so; None if unknown."""
+def compare(one: Spread, other: Spread) -> tuple[float, float] | None:
+    """What two images of bars that say the same are, by how light spreads in them; None if unknown.
+
+    Log odds of the first being sharper and brighter against the second being so, and of both being alike, as
+    two bars are, against the one or the other.
+    """
     here, there = one.lengths(), other.lengths()
     if here is None or there is None:
         return None
-    spacing_px = (one.spacing_px + other.spacing_px) / (one.frames + other.frames)
-    expected = _expected_at(round(math.log(spacing_px) * _STEPS_PER_E))
+    sizes = one.spacing_px / one.frames, other.spacing_px / other.frames
+    expected = _expected_at(round(math.log(sum(sizes) / 2) * _STEPS_PER_E))
     error = np.hypot(_ERRORS_PX / math.sqrt(min(one.frames, other.frames)), _KEPT_PX)
     fits: Floats = np.zeros((len(expected), len(expected)))
-    for k in np.flatnonzero(~np.isnan(here + there)):
-        off_here, off_there = here[k] - expected[:, k], there[k] - expected[:, k]
-        # Of two errors with a common part, their difference has none of it, their mean all.
-        apart = (off_here[:, None] - off_there) ** 2 / (2 * error[k] ** 2)
-        mean = ((off_here[:, None] + off_there) / 2) ** 2 / (_COMMON_PX[k] ** 2 + error[k] ** 2 / 2)
-        fits -= (apart + mean) / 2
+    known = np.flatnonzero(~np.isnan(here + there)).tolist()
+    for k in known:
+        fits += _fit(here[k] - expected[:, k, None], there[k] - expected[:, k], k, error[k])
     # Of two of what is expected, whether the second is no sharper than the first and no brighter.
     blur, light = np.indices((len(_BLURS_PX), len(_BACKGROUNDS))).reshape(2, -1)
     first = (blur >= blur[:, None]) & (light >= light[:, None])
     # What is clear is beyond the smallest number that is not 0.
-    return float(np.logaddexp.reduce(fits[first]) - np.logaddexp.reduce(fits.T[first]))
+    sums = np.logaddexp.reduce(fits[first]), np.logaddexp.reduce(fits.T[first])
+    # A narrow strip's light in a pixel is as its width: of equal bars, the farther one's is less.
+    near, far = (_expected_at(round(math.log(size) * _STEPS_PER_E)) for size in sizes)
+    steps = np.log(_BACKGROUNDS / _BACKGROUNDS[0])
+    alike = np.zeros(len(expected))
+    for k in known:
+        rows = far[:, k].reshape(len(_BLURS_PX), -1)
+        there_k = np.array([np.interp(steps + math.log(sizes[0] / sizes[1]), steps, row) for row in rows])
+        spread = math.hypot(error[k], _BARS_PX[k] / math.sqrt(2))
+        alike += _fit(here[k] - near[:, k], there[k] - there_k.ravel(), k, spread) + math.log(
+            error[k] / spread
+        )
+    evidence = np.logaddexp.reduce(alike) - math.log(len(alike))
+    if 2 in known:
+        kept = math.hypot(_ANSWERS / math.sqrt(min(one.frames, other.frames)), _ANSWERS_KEPT)
+        apart = (one.answered() - other.answered()) ** 2
+        evidence += (apart / _ANSWERS_APART**2 - apart / kept**2) / 2 + math.log(_ANSWERS_APART / kept)
+    images = np.logaddexp(*sums) - math.log(2 * np.count_nonzero(first))
+    return float(sums[0] - sums[1]), float(evidence - images)
+
+
+def _fit(here: Floats, there: Floats, length: int, error_px: float) -> Floats:
+    """Log-likelihood of two errors of a length: their difference has no common part, their mean all of it."""
+    mean = ((here + there) / 2) ** 2 / (_COMMON_PX[length] ** 2 + error_px**2 / 2)
+    fit: Floats = -((here - there) ** 2 / (2 * error_px**2) + mean) / 2
+    return fit
 
 
 @lru_cache(maxsize=32)

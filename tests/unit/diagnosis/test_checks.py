@@ -87,6 +87,8 @@ def readout_of(t_us: NDArray[np.int64]) -> ReadoutTally:
         (FOUND, UNREAD | {"blocks_alike": 4}, "none of 6 packets with a block that can be read, though 4"),
         (FOUND, READ | {"blocks_other_codebook": 1}, "1 packet sent with another codebook"),
         (FOUND, {"frames": 60, "frames_askew": 40}, "40 of 60 frames show bars that do not stand plumb"),
+        # Of bars that one controller feeds: symbols are symbols, unless messages or positions are asked for.
+        (FOUND, {"frames": 60, "frames_alike": 60}, ""),
         # One bar of three that is mounted so.
         (FOUND, {"frames": 60, "frames_askew": 20}, ""),
         (FOUND, {"frames": 60, "frames_inverted": 50}, "50 of 60 frames fit only a light that is on where"),

@@ -10,7 +10,9 @@ import pytest
 from numpy.typing import NDArray
 from rx_streams import LINK, frames_of, received
 
+import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import PacketFormat
+from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.reflections import (
     FrameDetection,
     PacketAssembler,
@@ -308,3 +310,25 @@ def test_two_bars_on_one_clock_are_two() -> None:
     other = replace(BAR, symbols=random_symbols(LINK, 3, seed=9), x_px=500.0)
     sides = by_side(merged(OWN, ideal_events(LINK, other, seed=2)))
     assert [{p.echo_of for p in side} for side in sides] == [{None}, {None}]
+
+
+@pytest.mark.parametrize(("share", "farther_m"), [(None, 0.0), (None, 12.0), (0.25, 0.0)])
+def test_two_bars_that_one_controller_feeds(share: float | None, farther_m: float) -> None:
+    """Both are given, and the image that a rail shows of the one is that of either."""
+    fed = {"seed": 3, "start_chip": 120.0, "ppm": 20.0}
+    bars = [fed | {"x_m": -1.5}, fed | {"x_m": 2.5, "z_m": farther_m}]
+    rail = {"kind": "rail", "bar": 0, "share": share, "gap_m": 0.6}
+    scene = {
+        "duration_s": 0.08,
+        "motion": {"distance_m": 50.0},
+        "bars": bars,
+        "reflections": [rail] if share else [],
+    }
+    source = evlcp.simulate(scene, seed=4)
+    receiver = Receiver(LINK)
+    packets = [packet for chunk in source.chunks() for packet in receiver.feed(chunk)] + receiver.close()
+    sides = [[f for f in frames_of(packets) if (f.x_px > 640) == right] for right in (False, True)]
+    given = [[f for f in side if f.echo_of is None] for side in sides]
+    assert [len(side) for side in given] == [23, 23]
+    assert len(sides[0]) == len(given[0]) * (2 if share else 1)
+    assert receiver.counts["frames_alike"] == sum(map(len, given))

@@ -11,7 +11,7 @@ from scipy.ndimage import gaussian_filter
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.rx.placement import layout_of
-from evlcp_sdk.rx.spread import Spread, expected_lengths, neighbours, sharper
+from evlcp_sdk.rx.spread import Spread, compare, expected_lengths, neighbours
 
 
 def pixel_light(lit: NDArray[np.bool_], per_px: int, sigma_px: float) -> NDArray[np.float64]:
@@ -48,6 +48,17 @@ def test_expected_lengths_against_light_by_brute_force(blur_px: float) -> None:
     )
     (found,) = expected_lengths(spacing, np.array([blur_px]), [background])
     assert found == pytest.approx(want, abs=0.2)
+
+
+def sharper(one: Spread, other: Spread) -> float | None:
+    found = compare(one, other)
+    return None if found is None else found[0]
+
+
+def alike(one: Spread, other: Spread) -> float:
+    found = compare(one, other)
+    assert found is not None
+    return found[1]
 
 
 def answering(lengths: NDArray[np.float64], spacing_px: float = 9.0, frames: int = 1) -> Spread:
@@ -116,6 +127,19 @@ def test_the_sharper_and_brighter_one_is_the_bar(background: float, share: float
         assert odds[1] > odds[0] > 0
     else:
         assert odds == pytest.approx([0, 0])
+
+
+@pytest.mark.parametrize("background", [0.01, 0.03, 0.3])
+@pytest.mark.parametrize("farther", [1.0, 1.1, 1.5])
+def test_two_bars_are_alike_and_images_are_not(background: float, farther: float) -> None:
+    """Also where one is farther: its strip is narrower, and the light of a pixel less by as much."""
+    (bar,) = expected_lengths(9.0, np.zeros(1), [background])
+    (other,) = expected_lengths(9.0 / farther, np.zeros(1), [background * farther])
+    assert alike(answering(bar, frames=10), answering(other, 9.0 / farther, frames=10)) > 1.5
+    assert alike(answering(other, 9.0 / farther, 10), answering(bar, frames=10)) > 1.5
+    for share, blur_px in ((0.5, 0.0), (0.2, 0.0), (1.0, 1.0)):
+        (image,) = expected_lengths(9.0, np.array([blur_px]), [dimmed(background, share, blur_px)])
+        assert alike(answering(bar, frames=10), answering(image, frames=10)) < -0.5
 
 
 def test_neighbours_stand_side_by_side() -> None:
