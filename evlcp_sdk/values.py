@@ -307,12 +307,15 @@ class Bend:
     Attributes:
         place: Where the boundaries are on the bar, from its middle, in spacings of clusters, float64 (n,).
         off: How far each lies off, along the bar, in what a lean of sine 1 moves the boundary at place 1,
-            which is spacing_px * spacing_m / distance_m pixels; a lean moves others by place^2. float64 (n,).
+            which is spacing_px * spacing_m / distance_m pixels; a lean moves others by place^2. float64 (n,);
+            also of those of weight 0 that were left out as they are out of line, else 0 there.
         weight: Inverse variances of these, up to a factor that all share; 0 where unseen, float64 (n,).
         wave: How far each seems off, in the same, for every pixel by which a boundary a quarter of a pixel
             beyond the middle of one seems off: the sine of its place on the pixels. None where the ranging
             does not know. float64 (n,).
         wave_m: How far the distance is off for it, m.
+        spacing_px: From one cluster to the next in the image, px; NaN where the ranging does not say.
+        one_px: What `off` is in, px.
     """
 
     place: NDArray[np.float64]
@@ -320,6 +323,8 @@ class Bend:
     weight: NDArray[np.float64]
     wave: NDArray[np.float64] | None = None
     wave_m: float = 0.0
+    spacing_px: float = math.nan
+    one_px: float = math.nan
 
 
 @dataclass(frozen=True)
@@ -333,6 +338,9 @@ class Range:
         late_chips: Of a ranging: chips from the middle of the pilot, which a frame's distance is for, to when
             the distance holds.
         bend: Of a ranging: what it says of the bar's lean; None for nothing.
+        standing_m: The part of `sigma_m` that stays over frames, as what bends the bar's image does, m.
+        bent_px: Of an image of a bar that is bent, or has boundaries out of line: how far each lies off a
+            straight bar, along it, px, float64 (K - 1,), NaN where unseen. None of others.
     """
 
     distance_m: float
@@ -340,6 +348,8 @@ class Range:
     pairs: int
     late_chips: float = 0.0
     bend: Bend | None = field(default=None, compare=False)
+    standing_m: float = 0.0
+    bent_px: NDArray[np.float64] | None = field(default=None, compare=False)
 
     def __repr__(self) -> str:
         return f"Range({_distance(self)}, {self.pairs} pairs)"

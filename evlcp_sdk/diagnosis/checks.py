@@ -76,7 +76,7 @@ CHECKS: tuple[tuple[str, Callable[[Facts], _Of], tuple[Callable[..., Found], ...
             of_frames.check_characters,
         ),
     ),
-    ("distances", _of_many_frames, (of_frames.check_distances, of_frames.check_size)),
+    ("distances", _of_many_frames, (of_frames.check_distances, of_frames.check_bent, of_frames.check_size)),
     ("distances", _of_transmitters, (of_frames.check_length,)),
     ("messages", _of_links, (of_frames.check_messages,)),
     ("messages", _of_transmitters, (of_frames.check_packets,)),

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.diagnosis.facts import BRIGHTER, Diagnostic, Facts, Found, in_ms
 from evlcp_sdk.diagnosis.tallies import SURE, TransmitterTally, count_missing_codewords
+from evlcp_sdk.rx.straight import ALIKE, err_together
 from evlcp_sdk.spelling import counted
 
 FEW_FRAMES = 10
@@ -47,6 +48,13 @@ _LEAST_QUALITY = 0.4
 
 _RANGED_SHARE = 0.25
 """Frames with a distance of which fewer is said."""
+
+_BENT_SHARE = 0.1
+"""Share of frames whose image is bent of which more is said: drops run over the glass, poles pass."""
+
+_STANDING_OFF, _STANDING_PX = 4.0, 0.25
+"""Sigmas of a boundary's mean, 1 of 16000 by chance, and px, beyond which it stands off: where nothing moves,
+those between two pixels do by up to a fifth of one."""
 
 _SIZE_OFF = 0.1
 """Share by which distances and the bar's length in the picture may disagree: distances of far bars, and of
@@ -331,6 +339,32 @@ def check_distances(facts: Facts, one: TransmitterTally) -> Found:
         yield Diagnostic("few-distances", f"{text}: {why}", "another ranging.id may tolerate it")
     else:
         yield text
+
+
+def check_bent(facts: Facts, one: TransmitterTally) -> Found:
+    """Clusters that stand off a straight bar, in the mean over the frames whose image is bent."""
+    if one.bent < max(FEW_FRAMES, _BENT_SHARE * one.ranged):
+        return
+    seen = np.flatnonzero(one.bent_px[0] >= FEW_FRAMES)
+    count, total, squares = one.bent_px[:, seen]
+    mean_px = total / count
+    noise_px = np.sqrt(np.maximum(squares / count - mean_px**2, 0) * ALIKE / count)
+    off = np.abs(mean_px) > np.maximum(_STANDING_OFF * noise_px, _STANDING_PX)
+    if not off.any():
+        return
+    # A boundary moves towards the cluster that lacks light there.
+    clusters = ", ".join(map(str, sorted({*(seen + (mean_px > 0))[off].tolist()})))
+    most_px, together = float(np.abs(mean_px).max()), err_together(mean_px)
+    most_cm = most_px * 100 * one.median_m() / facts.link.camera.focal_px
+    yield Diagnostic(
+        "image-bent",
+        f"its image is bent in {one.bent} of {one.ranged} frames, which sigmas allow for: clusters"
+        f" {clusters} end up to {most_px:.2f} px ({most_cm:.1f} cm at the bar) off a straight one's,"
+        f" {'neighbours alike' if together else 'each by itself'}",
+        "clean what is before the camera: drops and uneven glass do this"
+        if together
+        else "look for LEDs of theirs that are dark, or hidden",
+    )
 
 
 def check_size(facts: Facts, one: TransmitterTally) -> Found:

@@ -9,6 +9,9 @@ from copy import copy
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.formatting import number_or_none, sigmas
 from evlcp_sdk.late import Late
@@ -63,6 +66,9 @@ class TransmitterTally:
         firsts: Its first symbols, where a frame has one; -1 for one that was not received.
         last_px: Where it is in the image in its newest frame, column and row.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
+        bent: Frames in which its image is bent.
+        bent_px: In how many of them each boundary is seen, sum of how far it lies off, px, and of the squares
+            of that, float64 (3, K - 1); empty before the first.
     """
 
     packet_frames: int
@@ -89,6 +95,8 @@ class TransmitterTally:
     sized: int = 0
     along_px: tuple[float, float] = (0.0, 0.0)
     beacon_m: float = math.nan
+    bent: int = 0
+    bent_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
     blocks: int = 0
     firsts: list[int] = field(default_factory=list)
     last_px: tuple[float, float] = (math.nan, math.nan)
@@ -133,6 +141,7 @@ class TransmitterTally:
                 if frame.echo_of is None:
                     # A mirror image stands on its head.
                     self._add_size(frame, distance_m)
+                    self._add_bent(frame.range.bent_px)
 
     def _add_size(self, frame: Frame, distance_m: float) -> None:
         """Add how long the bar looks times its distance, which is the same wherever it is."""
@@ -144,6 +153,14 @@ class TransmitterTally:
             self.reach_sum += math.log(reach)
             self.sized += 1
             self.along_px = (self.along_px[0] + x1 - x0, self.along_px[1] + y1 - y0)
+
+    def _add_bent(self, off_px: NDArray[np.float64] | None) -> None:
+        """Add how far the boundaries of a bent image lie off."""
+        if off_px is not None:
+            seen = np.isfinite(off_px)
+            px = np.where(seen, off_px, 0.0)
+            self.bent += 1
+            self.bent_px = np.stack([seen, px, px**2]) + (self.bent_px if self.bent_px.size else 0.0)
 
     def median_m(self) -> float:
         """Median distance to the centimetre, m; NaN without any."""

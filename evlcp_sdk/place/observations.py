@@ -104,6 +104,7 @@ class BarView:
             shaken_sigma_px`.
         early_px: What all points share in any direction besides, as a moving image is seen early or late, px.
         across: Errors of points across the bar, in those along it, which `sigma_px` are.
+        stretch: By how much it looks too long, or short, as its image is bent: a share (sigma).
     """
 
     transmitter: int
@@ -116,6 +117,7 @@ class BarView:
     between: float = 1.0
     early_px: float = 0.0
     across: float = 1.0
+    stretch: float = 0.0
 
 
 def project_bars(
@@ -425,7 +427,7 @@ def shared_errors(view: BarView, seen: NDArray[np.bool_], spec: ErrorModel, betw
     (x, y), (place, turn, length) = axis.tolist(), view.survey
     way = np.array([[x * x, x * y], [x * y, y * y]])
     return SharedErrors(
-        np.array([place, turn, math.hypot(length, spec.stretch_share)]),
+        np.array([place, turn, math.hypot(length, spec.stretch_share, view.stretch)]),
         across * _BOTH + (along - across) * way,
         sideways * _BOTH + ((1.0 if line else sideways) - sideways) * way,
     )

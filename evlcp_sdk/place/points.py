@@ -154,7 +154,14 @@ def points_at(
         between=between,
         early_px=early_px,
         across=across,
+        stretch=_stretch(near),
     )
+
+
+def _stretch(frames: Sequence[Frame]) -> float:
+    """By how much a bar whose image is bent looks too long, or short: a share (sigma), by the median."""
+    found = [one.range.standing_m / one.range.distance_m for one in frames if one.range.standing_m]
+    return float(np.median(found)) if 2 * len(found) > len(frames) else 0.0
 
 
 def _off(points: Floats, layout_m: Floats) -> tuple[float, int]:
@@ -286,8 +293,8 @@ def bar_point(
         # A bar of so many pixels is the farther, the longer the lens.
         standing[:, 0] += along * depth / camera.focal_px
         standing[:, :7] = standing[:, :7] @ sigma.root(camera)
-    standing[:, 7] = along * depth * spec.stretch_share
+    standing[:, 7] = along * math.hypot(depth * spec.stretch_share, frame.range.standing_m)
     new = np.zeros((3, 3))
-    new[:, 0] = along * frame.range.sigma_m
+    new[:, 0] = along * math.sqrt(max(frame.range.sigma_m**2 - frame.range.standing_m**2, 0.0))
     new[:2, 1:] = inverse * shift
     return BarPoint(along * depth, new @ new.T + standing @ standing.T, standing)

@@ -1573,29 +1573,53 @@ def bend_of(
 
 
 @njit
-def wave_of(place: Array, sums: Array, least: float, out: Array) -> None:
+def wave_of(
+    place: Array, sums: Array, least: float, out: Array, known: tuple[Array, Array], off: Array
+) -> tuple[float, float, float, float, float]:
     """What a frame's boundaries say of a wave in them that no parabola makes: added to `out` (4,).
 
     That is the sum of the squares of the wave, of its products with what lies off, of the squares of that,
     and degrees of freedom, all of what is left when the parabola is taken out that fits best; weighted.
     `place`, `sums` and `least` as of `bend_of`.
+
+    `off` (n,) takes what lies off, NaN of boundaries that are passed over; `known` are sums (3, n) of
+    these frames with those before, and what lay off in the one before, or none.
+
+    Returns:
+        Sum of the squares of what lies off, and of its mean and that of the wave over all frames; the median
+        of what it moved by since the frame before, NaN of none; and how many frames weigh as much as all.
     """
     right, inverse = np.empty((2, 3)), np.empty((3, 3))
-    weight = sums[0]
+    weight, moved = sums[0], np.empty(place.size)
+    # A literal 0 would make a median of its own.
+    many: Any = np.int64(0)
     n, lightest = _about_parabola(place, weight, sums[1:], least, right, inverse)
-    if n == 0:
-        return
+    squares, of_means, of_waves, light, all_light = 0.0, 0.0, 0.0, 0.0, 0.0
     for i in range(place.size):
+        off[i] = np.nan
         if weight[i] > lightest:
-            out[0] += sums[2, i] * sums[2, i] / weight[i]
-            out[1] += sums[2, i] * sums[1, i] / weight[i]
-            out[2] += sums[1, i] * sums[1, i] / weight[i]
-    for a in range(3):
-        for b in range(3):
-            out[0] -= right[1, a] * inverse[a, b] * right[1, b]
-            out[1] -= right[1, a] * inverse[a, b] * right[0, b]
-            out[2] -= right[0, a] * inverse[a, b] * right[0, b]
-    out[3] += n - 3
+            off[i] = sums[1, i] / weight[i]
+            squares += off[i] * off[i]
+            of_means += (known[0][1, i] / known[0][0, i]) ** 2
+            of_waves += (known[0][2, i] / known[0][0, i]) ** 2
+            light += weight[i]
+            all_light += known[0][0, i]
+            if known[1].size == place.size and known[1][i] == known[1][i]:
+                moved[many] = abs(off[i] - known[1][i])
+                many += 1
+            if n:
+                out[0] += sums[2, i] * sums[2, i] / weight[i]
+                out[1] += sums[2, i] * sums[1, i] / weight[i]
+                out[2] += sums[1, i] * sums[1, i] / weight[i]
+    if n:
+        for a in range(3):
+            for b in range(3):
+                out[0] -= right[1, a] * inverse[a, b] * right[1, b]
+                out[1] -= right[1, a] * inverse[a, b] * right[0, b]
+                out[2] -= right[0, a] * inverse[a, b] * right[0, b]
+        out[3] += n - 3
+    frames = all_light / max(light, 1e-300)
+    return squares, of_means, of_waves, median(moved, many) if many else np.nan, frames
 
 
 @njit

@@ -199,6 +199,9 @@ class Guard:
             if found.bend.wave is not None:
                 self.expect_array(found.bend.wave, "bend.wave", shape, "f")
             self.expect_number(found.bend.wave_m, "bend.wave_m", -_FARTHEST_M, _FARTHEST_M)
+            if not _unknown(found.bend.spacing_px):
+                self.expect_number(found.bend.spacing_px, "bend.spacing_px", 0.0, math.inf)
+                self.expect_number(found.bend.one_px, "bend.one_px", 0.0, math.inf)
             if len(shape) != 1:
                 self.refuse(f"bend.place of shape {shape}", "one number a boundary")
 

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
+from evlcp_sdk.rx.straight import ALIKE, WAVE_PX, Image, judge_image
 from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import Bend, Range
 
@@ -44,13 +45,6 @@ _SLANTED_SHARE = 6e-5
 then anything up to the steepest, more or less. As seldom as an outlier, so that it costs the others no sigma,
 and enough that a bend which contradicts is believed."""
 
-_WAVE_PX = 0.1
-"""By how much a boundary that falls between two pixels seems off before it is measured (sigma): 0 to .14 px
-in recordings, more where pixels are blind for long or bars sharp."""
-
-_WAVE_WORTH = 4.0
-"""Frames that err alike, as they show the bar in about the same place on the pixels."""
-
 _WAVE_SHARE, _WAVE_REST_PX = 0.6, 0.03
 """Share of the wave that distances have, and by how much that is off (sigma): rows far off a fit hardly pull
 it. 0.35 were found in recordings of an independent generator, and 0.85 in rendered ones where the wave is
@@ -72,6 +66,7 @@ class Ranges(NamedTuple):
         bend_s: When that was, s.
         told: The attitude gave how the bar leans then.
         wave: Sums that say how high the pixels' wave is, of `_kernels.wave_of`, float64 (4,).
+        image: How straight the bar's image is.
     """
 
     past: Floats = np.empty((0, 3))
@@ -79,6 +74,7 @@ class Ranges(NamedTuple):
     bend_s: float = math.nan
     told: bool = False
     wave: Floats = np.zeros(4)
+    image: Image = Image()
 
 
 class RangeKeeper:
@@ -123,21 +119,23 @@ class RangeKeeper:
         if not (0 < distance_m < math.inf and 0 <= sigma_m < math.inf):
             return state, measured
         t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
-        bend, bend_s, told, wave = state.bend, state.bend_s, state.told, state.wave
-        height, unsure_m = (0.0, _WAVE_PX**2), 0.0
+        bend, bend_s, told, wave, image = state.bend, state.bend_s, state.told, state.wave, Image()
+        height, unsure_m = (0.0, WAVE_PX**2), 0.0
         if measured.bend is not None:
             faded = math.exp(-max(t_s - bend_s, 0.0) / _TILT_MEMORY_S) if bend.size else 0.0
             new = _weighed(measured.bend, (sight.sine or 0.0) + sight.bow)
-            wave = wave * faded
-            _kernels.wave_of(measured.bend.place, new, _LEAST_WEIGHT, wave)
-            sums = wave.tolist()
-            height = _height(sums)
             goes_on = bend.shape == new.shape and told == (sight.sine is not None)
             bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.sine is not None
+            wave, off, known = wave * faded, np.empty(new.shape[1]), (bend, state.image.off)
+            scatter = _kernels.wave_of(measured.bend.place, new, _LEAST_WEIGHT, wave, known, off)
+            sums = wave.tolist()
+            height = _height(sums)
             distance_m -= _WAVE_SHARE * height[0] * measured.bend.wave_m
             # The ranging's sigma is of boundaries with the wave.
             sigma_m *= math.sqrt(_left_over(sums, height[0]))
             unsure_m = math.hypot(_WAVE_SHARE * math.sqrt(height[1]), _WAVE_REST_PX) * measured.bend.wave_m
+            image = judge_image(measured.bend, off, bend, scatter, state.image, t_s)
+            distance_m *= 1 - image.longer
         sigma_m = max(sigma_m, _LEAST_SIGMA * abs(distance_m))
         old = state.past
         while len(old) and old[0, 0] <= t_s - _MEMORY_S:
@@ -152,10 +150,21 @@ class RangeKeeper:
         distance_m -= speed_m_s * late_s
         # What is not known of the wave is alike in many frames: their scatter does not show it.
         variance += speed_variance * late_s**2 + unsure_m**2
-        length, length_variance = self._leaning(bend, height, measured.bend, sight)
+        # Nor does it show what bends the image.
+        standing_m = distance_m * image.sigma
+        variance += standing_m**2
+        # A bend that no lean makes says nothing of one.
+        newest = None if image.whole else measured.bend
+        length, length_variance = self._leaning(bend, height, newest, sight)
         variance = variance * length**2 + distance_m**2 * length_variance
-        found = Range(distance_m * length, math.sqrt(variance), measured.pairs)
-        return Ranges(past, bend, bend_s, told, wave), found
+        found = Range(
+            distance_m * length,
+            math.sqrt(variance),
+            measured.pairs,
+            standing_m=standing_m * length,
+            bent_px=image.bent_px,
+        )
+        return Ranges(past, bend, bend_s, told, wave, image), found
 
     def _leaning(
         self, sums: Floats, wave: tuple[float, float], newest: Bend | None, sight: BarSight
@@ -195,9 +204,9 @@ def _height(wave: list[float]) -> tuple[float, float]:
     """How high the pixels' wave is, px, and the variance of that, by what frames show and what is likely."""
     squares, products, left, freedom = wave
     if not (squares > 0 and freedom > 1):
-        return 0.0, _WAVE_PX**2
-    noise = _WAVE_WORTH * max(left - products**2 / squares, 1e-12 * squares) / (freedom - 1)
-    variance = 1 / (squares / noise + _WAVE_PX**-2)
+        return 0.0, WAVE_PX**2
+    noise = ALIKE * max(left - products**2 / squares, 1e-12 * squares) / (freedom - 1)
+    variance = 1 / (squares / noise + WAVE_PX**-2)
     return products / noise * variance, variance
 
 

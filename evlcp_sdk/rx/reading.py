@@ -135,9 +135,11 @@ class Steps:
         if not (math.isfinite(measured.distance_m) and math.isfinite(measured.sigma_m)):
             expected = self._distance.predict(state, t_us)
             return state, None if expected is None else Range(float(expected[0][0]), expected[1], 0)
-        value = np.array([measured.distance_m])
-        state, value, sigma = self._distance.step(state, t_us, value, measured.sigma_m)
-        return state, Range(float(value[0]), sigma, measured.pairs)
+        value, standing_m = np.array([measured.distance_m]), measured.standing_m
+        # What stays over frames is not filtered out.
+        new_m = math.sqrt(max(measured.sigma_m**2 - standing_m**2, 0.0))
+        state, value, sigma = self._distance.step(state, t_us, value, new_m)
+        return state, Range(float(value[0]), math.hypot(sigma, standing_m), measured.pairs)
 
 
 class Reading(NamedTuple):

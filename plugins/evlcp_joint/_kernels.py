@@ -671,7 +671,8 @@ def fit_bar(
         fit: What it begins with; changed.
 
     Returns:
-        As `assess_fit`, NaN without a fit; and `by_boundary` of `leftovers`.
+        As `assess_fit`, NaN without a fit; and `by_boundary` of `leftovers`, with the shifts of boundaries
+        that are left out, too, without information.
     """
     pilots, words, symbols, seen = said
     clusters, n = len(pilots), len(values)
@@ -692,6 +693,7 @@ def fit_bar(
     by_boundary, by_value = np.empty((3, clusters + 1)), np.empty((2, n))
     scores, normal = np.empty((values.shape[1], FITTED)), np.empty((FITTED, FITTED))
     moved, own, sizes = motion.copy(), np.zeros(n), np.empty(clusters + 1)
+    left_out = np.zeros(clusters + 1)
     spent, squares = 0.0, 0.0
     for left in range(_ROUNDS, -1, -1):
         reach = REACH * lens[0] * exp(fit[4])
@@ -712,11 +714,14 @@ def fit_bar(
             for b in range(clusters + 1):
                 if abs(by_boundary[0, b]) > most:
                     known[b] = False
+                    left_out[b] = by_boundary[0, b]
             for i in range(n):
                 own[i] += by_value[0, i]
                 by_value[1, i] /= max(noise, 1e-12)
             own_motion(own, by_value[1], motion[1], own)
             for i in range(n):
                 moved[0, i] = motion[0, i] + own[i]
+    for b in range(clusters + 1):
+        by_boundary[0, b] += left_out[b]
     explained = spent <= (1 - _LEAST_EXPLAINED) * squares
     return assess_fit(by_boundary, scores, normal) if explained else _NO_FIT, by_boundary

@@ -150,6 +150,8 @@ class JointScaleRanging(Ranging):
                     weight * one_px**2,
                     wave / one_px,
                     -distance * wider_px / spacing_px,
+                    spacing_px,
+                    one_px,
                 ),
             )
 

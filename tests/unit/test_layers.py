@@ -110,7 +110,7 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 
 
 RX = (
-    {"boxes", "limits", "rhythm"},
+    {"boxes", "limits", "rhythm", "straight"},
     {"guard", "regions", "trust"},
     {"detected", "framer"},
     {"inbox", "placement", "ranges"},

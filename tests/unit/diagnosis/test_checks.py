@@ -206,6 +206,31 @@ def test_what_the_figures_of_a_transmitter_say(figures: dict[str, Any], decoded:
     assert [(said in one.text, one.transmitter) for one in found] == [(True, 0)] * bool(said)
 
 
+@pytest.mark.parametrize(
+    ("off_px", "said"),
+    [
+        (
+            {2: -0.7, 9: 0.6},
+            "clusters 2, 10 end up to 0.70 px (0.5 cm at the bar) off a straight one's, each",
+        ),
+        (dict(enumerate(np.sin(np.arange(15) / 2))), "neighbours alike"),
+        ({2: 0.1, 9: 0.1}, ""),
+        ({}, ""),
+    ],
+)
+def test_a_bent_image(off_px: dict[int, float], said: str) -> None:
+    """Boundary 2, between clusters 2 and 3, is up the bar: cluster 2 lacks light."""
+    bent_px = np.zeros(15)
+    bent_px[list(off_px)] = list(off_px.values())
+    bent_px[5] = np.nan
+    tally = tally_of(RANDOM, range=Range(50.0, 0.1, 15, bent_px=bent_px))
+    found = find(Facts(LINK, tally, {}))
+    assert [(doubt.code, said in doubt.text) for doubt in found] == [("image-bent", True)] * bool(said)
+    # In a few of its frames.
+    tally.transmitters[0].bent = 9
+    assert not find(Facts(LINK, tally, {}))
+
+
 def test_the_modulation_that_was_sent() -> None:
     """Symbols that are all of wh8, read as those of wh4x2: of 64 words of 8 values 16 are words of wh8."""
     ours = LINK.codebook.codewords.tolist()

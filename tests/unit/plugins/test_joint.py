@@ -516,6 +516,19 @@ def test_boundaries_stay_where_one_sign_is_missed(dim: float) -> None:
     assert fit[0] == pytest.approx(spacing, rel=2e-5)
 
 
+def test_boundaries_out_of_line_are_left_out_and_shown() -> None:
+    """By up to half a pixel: of those farther off, a row's values say no more."""
+    codes, spacing = random_codes(np.random.default_rng(5)), 8.6
+    shift = np.zeros(K - 1)
+    shift[[3, 12]] = 0.5, -0.4
+    values = 0.6 * values_of(codes, 74.5 + spacing * (np.arange(1, K) - K / 2) + shift, 150)
+    fit, (off, weight, _) = fit_of(codes, 1.0, values, spacing)
+    assert fit[0] == pytest.approx(spacing, rel=1e-4)
+    assert np.flatnonzero(weight == 0).tolist() == [3, 12]
+    # As seen against a fit that they bent.
+    assert_allclose(off, shift, atol=0.16)
+
+
 def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
     """Steps up lie 0.08 px lower than steps down, and what repeats a value looks smaller by 0.05 px."""
     codes, spacing = random_codes(np.random.default_rng(7)), 8.6

@@ -312,6 +312,16 @@ def wave_of(place, off, weight, wave, least):
     return np.array([squares[0, 0], squares[0, 1], squares[1, 1], use.sum() - 3])
 
 
+def scatter_of(off, weight, least, sums, before):
+    use = weight > least * weight.max()
+    return (
+        (off[use] ** 2).sum(),
+        *((sums[1:] / sums[0])[:, use] ** 2).sum(1),
+        np.nanmedian(np.abs(off - before)[use]) if len(before) else np.nan,
+        sums[0, use].sum() / weight[use].sum(),
+    )
+
+
 def farthest_off(selected, grid, on, turn):
     _, row, column = np.nonzero(selected)
     cells = (column + 1j * row) * grid + (grid - 1) / 2 * (1 + 1j)

@@ -465,10 +465,16 @@ def test_a_wave_in_boundaries(seed, n):
     off, wave = rng.normal(0, 1, (2, n))
     out = np.array([1.0, 2.0, 3.0, 4.0])
     sums = np.stack([weight, weight * off, weight * wave])
-    _kernels.wave_of(place, sums, 0.1, out)
+    total, before, seen = sums + rng.uniform(1, 2, (3, n)), rng.normal(0, 1, n), np.empty(n)
+    before[0] = np.nan
+    got = _kernels.wave_of(place, sums, 0.1, out, (total, before), seen)
+    assert_allclose(got, twins.scatter_of(off, weight, 0.1, total, before), rtol=1e-9)
+    assert_allclose(seen, np.where(weight > 1, off, np.nan))
     assert_allclose(out - [1, 2, 3, 4], twins.wave_of(place, off, weight, wave, 0.1), rtol=1e-6)
-    _kernels.wave_of(place[:3], sums[:, :3], 0.1, before := out.copy())
-    assert_allclose(before, out)
+    few = sums[:, :3], total[:, :3]
+    got = _kernels.wave_of(place[:3], few[0], 0.1, kept := out.copy(), (few[1], np.empty(0)), seen)
+    assert_allclose(got, twins.scatter_of(off[:3], weight[:3], 0.1, few[1], ()), rtol=1e-9)
+    assert_allclose(kept, out)
 
 
 @pytest.mark.parametrize("grid", [1, 2, 3])

@@ -233,6 +233,62 @@ def test_what_is_not_known_of_the_wave_is_in_the_sigma() -> None:
     assert np.mean((raw / raw_sigma) ** 2) > 10
 
 
+def bent(frames: int, off_px: np.ndarray, rng: np.random.Generator) -> list[Range]:
+    """Frames of a bar 45 m away whose boundaries seem to lie off by so much, (15,): a scale through all."""
+    spacing_px = FOCAL_PX * SPACING_M / 45
+    one_px, found = spacing_px * SPACING_M / 45, []
+    for _ in range(frames):
+        slope, mean = np.polyfit(PLACES, seen := off_px + 0.04 * rng.standard_normal(15), 1)
+        rest, weight = (seen - slope * PLACES - mean) / one_px, np.full(15, one_px**2)
+        bend = Bend(PLACES, rest, weight, spacing_px=spacing_px, one_px=one_px)
+        found.append(Range(45 * spacing_px / (spacing_px + slope), 0.01, 15, 8.0, bend))
+    return found
+
+
+@pytest.mark.parametrize("height_px", [1.0, 0.2])
+def test_what_bends_an_image_does_not_average_away(height_px: float) -> None:
+    """A drop over the bar's lower half: all frames err alike, and each shows it, or some together."""
+    rng, at = np.random.default_rng(12), PLACES / 4 - 1
+    off_px = height_px * at * np.exp((1 - at**2) / 2)
+    measured = bent(60, off_px, rng)
+    raw = np.array([one.distance_m - 45 for one in measured])
+    _, found = kept(measured)
+    error = np.array([one.distance_m - 45 for one in found])
+    # No lean is seen in it.
+    assert np.abs(error - raw)[-20:].max() < 0.02
+    for one in found[-20:]:
+        assert one.standing_m > 0.4 * abs(raw.mean())
+        assert one.sigma_m > one.standing_m
+        assert one.bent_px is not None
+    straight = kept(bent(60, 0 * PLACES, rng))[1]
+    assert all(one.standing_m == 0 and one.bent_px is None for one in straight)
+    # Some time after it is gone, nothing is left of it.
+    _, again = kept(measured + bent(1500, 0 * PLACES, rng))
+    assert again[-1].sigma_m == pytest.approx(straight[-1].sigma_m, rel=0.3)
+
+
+def test_clusters_with_dark_leds_are_taken_out_and_shown() -> None:
+    off_px = np.zeros(15)
+    off_px[[1, 2, 8, 13]] = -0.7, -1.4, 0.7, 0.7
+    measured = bent(20, off_px, np.random.default_rng(13))
+    _, found = kept(measured)
+    assert min(abs(one.distance_m - 45) for one in measured) > 0.2
+    error = np.array([(one.distance_m - 45, one.sigma_m) for one in found])
+    assert np.abs(error[:, 0]).max() < 0.1
+    assert nees(error) < 1
+    for one in found:
+        assert one.bent_px is not None
+        assert np.flatnonzero(np.abs(one.bent_px) > 0.3).tolist() == [1, 2, 8, 13]
+    # What the ranging left out itself is shown, and changes nothing.
+    bend = measured[0].bend
+    assert bend is not None
+    alone = Bend(PLACES, np.eye(15)[3], np.where(PLACES[3] == PLACES, 0, bend.weight), None, 0.0, 9.6, 0.5)
+    _, (one,) = kept([Range(45.0, 0.01, 14, 8.0, alone)])
+    assert one.bent_px is not None
+    assert one.bent_px == pytest.approx(0.5 * np.eye(15)[3])
+    assert one.standing_m == 0
+
+
 def test_another_layout_s_bend_starts_anew() -> None:
     bend = bend_of(0.0, 45.0, 0.04, np.random.default_rng(6))
     few = Bend(bend.place[:4], bend.off[:4], bend.weight[:4])

@@ -1,0 +1,96 @@
+"""Boundaries that no straight bar explains: against drawn errors, and the formula of a drop."""
+
+import math
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from evlcp_sdk.rx.straight import Straight, straighten
+
+PLACES = np.arange(1.0, 16) - 8
+NOISE_PX = 0.06
+SPACING_PX = 9.0
+
+Floats = NDArray[np.float64]
+
+
+def drops(rng: np.random.Generator) -> Floats:
+    """How one to three drops on or beside a bar, a tenth to a third of it wide, bend it along itself, px."""
+    along_px, off = PLACES * SPACING_PX, np.zeros(15)
+    for _ in range(rng.integers(1, 4)):
+        radius = rng.uniform(15, 45)
+        at = (along_px - rng.uniform(-72 - radius, 72 + radius)) / radius
+        away = np.hypot(at, rng.uniform(-1, 1))
+        off += rng.choice([-1, 1]) * rng.uniform(0.5, 6) * at * np.exp((1 - away**2) / 2)
+    return off
+
+
+def dark(rng: np.random.Generator) -> Floats:
+    """A quarter of the boundaries off by up to a LED, as those beside them are dark."""
+    return np.asarray((rng.random(15) < 0.25) * rng.choice([-1, 1], 15) * rng.uniform(0.3, 1.5, 15))
+
+
+def seen(error_px: Floats, rng: np.random.Generator) -> tuple[float, Straight | None]:
+    """What a scale through boundaries with such errors is too short by, px, and what they say of it."""
+    off = error_px + NOISE_PX * rng.standard_normal(15)
+    slope, mean = np.polyfit(PLACES, off, 1)
+    # A lean's parabola, as large as it may be, is none of theirs.
+    return -slope, straighten(PLACES, off - slope * PLACES - mean + 0.01 * (PLACES**2 - 56 / 3), 0.1, 0.01)
+
+
+def judged(error_px: Floats, rng: np.random.Generator) -> tuple[float, float, float] | None:
+    """Error of the scale, that of the straight bar's spacing, px, and the square of that by its variance."""
+    short, found = seen(error_px, rng)
+    if found is None:
+        return None
+    return short, short - found.slope, (short - found.slope) ** 2 / found.variance
+
+
+def test_noise_and_a_lean_bend_nothing() -> None:
+    rng = np.random.default_rng(1)
+    assert [seen(np.zeros(15), rng)[1] for _ in range(1000)] == 1000 * [None]
+    # Of boundaries that scatter as much as is expected, 1 of 700.
+    off = np.array(
+        [0.1 * (px - np.polyval(np.polyfit(PLACES, px, 1), PLACES)) for px in rng.standard_normal((3000, 15))]
+    )
+    assert sum(straighten(PLACES, px, 0.1, 0.0) is not None for px in off) < 15
+    assert straighten(PLACES[:5], 9 * off[0, :5], 0.1, 0.0) is None
+
+
+def test_dark_leds_are_told_from_a_straight_bar() -> None:
+    """Most boundaries agree: the error is a third of that of a scale through all, and its sigma is true."""
+    rng = np.random.default_rng(2)
+    found = np.array([one for _ in range(400) if (one := judged(dark(rng), rng)) is not None])
+    assert len(found) > 300
+    before, after, squares = found.T
+    assert np.median(np.abs(after)) < 0.35 * np.median(np.abs(before))
+    assert np.sqrt(np.mean(after**2)) < 0.6 * np.sqrt(np.mean(before**2))
+    assert 0.2 < squares.mean() < 1.2
+    off = np.zeros(15)
+    off[[2, 9]] = 0.8, -1.0
+    told = seen(off, rng)[1]
+    assert told is not None
+    assert not told.together
+    assert np.flatnonzero(np.abs(told.rest_px) > 0.4).tolist() == [2, 9]
+
+
+def test_what_drops_add_to_a_scale_is_in_the_sigma() -> None:
+    """It cannot be seen: a drop over half of a bar makes it longer and hardly bends it."""
+    rng = np.random.default_rng(3)
+    found = np.array([one for _ in range(400) if (one := judged(drops(rng), rng)) is not None])
+    assert len(found) > 350
+    # A few hundred times as much where 1 in 200 looks like dark LEDs.
+    assert 0.3 < np.minimum(found[:, 2], 9).mean() < 1.5
+    assert np.mean(found[:, 2] > 3) < 0.1
+
+
+@pytest.mark.parametrize("clusters", [8, 64])
+def test_bars_of_other_lengths(clusters: int) -> None:
+    places = np.arange(1.0, clusters) - clusters / 2
+    off = 0.02 * np.sin(7 * places)
+    off[1], off[-2] = 0.9, 0.8
+    found = straighten(places, off + 0.01 * places, 0.05, 0.0)
+    assert found is not None
+    assert found.slope == pytest.approx(0.01, abs=4 * math.sqrt(found.variance))
+    assert abs(found.slope - 0.01) < 0.02
