@@ -472,7 +472,7 @@ class TimeLine(NamedTuple):
             or the source of this number switches.
         pose: The image's pose from then on.
         shade: Share of all light that passes from then on.
-        bright: How many times its mean the background's light is from then on.
+        step: How many times the background has changed until then.
         row: Row of the levels that each source shows from then on, (sources, entries).
     """
 
@@ -480,7 +480,7 @@ class TimeLine(NamedTuple):
     kind: Array
     pose: Array
     shade: Array
-    bright: Array
+    step: Array
     row: Array
 
 
@@ -551,7 +551,7 @@ class Scenery(NamedTuple):
         turn_px: How far the texture has moved, (poses, 2).
         every: After how many poses it is looked up.
         field: The texture, periodic, its size a power of two.
-        light: Irradiance on the sensor, and dark current as light, W/m2, (2,).
+        light: Dark current as light, and irradiance on the sensor after each number of changes, W/m2.
     """
 
     turn_px: Array
@@ -743,7 +743,7 @@ def _run_batch(
         lit[many], shining.clusters[many, 2] = g, -1
         many += int((mask >> np.uint64(g)) & np.uint64(1))
     # The entries that it sees: of its sources, and every so many poses.
-    own, pose = 0, -1
+    own, pose, looked, dark = 0, -1, -1, scenery.light[0]
     for e in range(line.t_us.size):
         what = line.kind[e]
         is_own = (mask >> np.uint64(max(what, 0))) & np.uint64(what >= 0)
@@ -755,7 +755,9 @@ def _run_batch(
         before, pose = pose, line.pose[e] // stride * stride
         # Where the sources are in the middle of these poses.
         here = min(pose + stride // 2, poses - 1)
-        if pose // scenery.every != before // scenery.every:
+        around = line.step[e] * poses + pose // scenery.every
+        if around != looked:
+            looked = around
             # The light of the background and the dark current: bilinear in the periodic texture.
             for i in range(lanes):
                 u, v = f[_X + i] + scenery.turn_px[pose, 0], f[_Y + i] + scenery.turn_px[pose, 1]
@@ -765,13 +767,9 @@ def _run_batch(
                 i1, j1 = (i0 + 1) & last, (j0 + 1) & last
                 top = field[i0, j0] + aside * (field[i0, j1] - field[i0, j0])
                 low = field[i1, j0] + aside * (field[i1, j1] - field[i1, j0])
-                f[_AROUND + i] = scenery.light[1] + scenery.light[0] * (top + down * (low - top))
+                f[_AROUND + i] = dark + scenery.light[1 + line.step[e]] * (top + down * (low - top))
         for i in range(lanes):
             f[_TOTAL + i] = f[_AROUND + i]
-        bright = line.bright[e]
-        if bright != 1.0:
-            for i in range(lanes):
-                f[_TOTAL + i] = scenery.light[1] + bright * (f[_TOTAL + i] - scenery.light[1])
         for a in range(many):
             row = line.row[lit[a], e]
             if row != shining.clusters[a, 2]:
@@ -782,7 +780,7 @@ def _run_batch(
         shade = line.shade[e]
         if shade != 1.0:
             for i in range(lanes):
-                f[_TOTAL + i] = scenery.light[1] + shade * (f[_TOTAL + i] - scenery.light[1])
+                f[_TOTAL + i] = dark + shade * (f[_TOTAL + i] - dark)
         if q == 0:
             # Pixels that were not active before are at rest in their light, and armed.
             for i in range(size[1]):

@@ -68,8 +68,8 @@ def led_light_w_m2(bar: BarSpec, strip: LitStrip, lens: LensSpec) -> float:
     return math.pi * radiance * lens.transmission / (4 * lens.f_number**2)
 
 
-def unbent(drops: Sequence[DropSpec], x_px: ArrayLike, y_px: ArrayLike, t_s: float) -> Floats:
-    """Where pixels (n,) would be seen at a time without the drops before them, px, float64 (2, n)."""
+def unbent(drops: Sequence[DropSpec], y_px: ArrayLike, x_px: ArrayLike, t_s: float) -> Floats:
+    """Column and row where pixels (n,) would see the same at a time without drops, px, float64 (2, n)."""
     seen = np.array([x_px, y_px], np.float64)
     found = seen.copy()
     for drop in drops:

@@ -161,7 +161,7 @@ class _Halo:
 def _time_line(
     starts_us: Floats,
     wiped: tuple[Floats, Floats],
-    changed: tuple[Floats, Floats],
+    changed_us: Floats,
     switches: list[Floats],
     levels_of: list[Floats],
     halos_of: list[list[Floats]],
@@ -173,7 +173,7 @@ def _time_line(
         starts_us: When each pose begins, the block's begin first, float64 (poses,).
         wiped: When the share of all light that passes changes, float64 (n,), and that share, from the block's
             begin on, float64 (n + 1,).
-        changed: The same of the background's light.
+        changed_us: When the background's light changes.
         switches: When each source switches, float64 (m,).
         levels_of: Levels of its clusters, from the block's begin on, float64 (m + 1, clusters).
         halos_of: Its light in each halo on a grid, float64 (m + 1, places), halo by halo.
@@ -183,7 +183,7 @@ def _time_line(
         The time line, the levels of `Strips`, and the light of `Halos`.
     """
     sources = len(switches)
-    parts = [starts_us, wiped[0], changed[0], *switches]
+    parts = [starts_us, wiped[0], changed_us, *switches]
     when = np.concatenate(parts)
     # What an entry is: a pose, a wiper's step, one of the background, or a switch of the source of a number.
     kind = np.repeat([-2, -1, -3, *range(sources)], [len(part) for part in parts])
@@ -203,7 +203,7 @@ def _time_line(
         begin += count
     pose, wipes, steps = (np.cumsum(kind == of) for of in (-2, -1, -3))
     kind[kind == -3] = -1
-    line = _kernels.TimeLine(when, kind, pose - 1, wiped[1][wipes], changed[1][steps], row)
+    line = _kernels.TimeLine(when, kind, pose - 1, wiped[1][wipes], steps, row)
     return line, levels, halo
 
 
@@ -536,16 +536,14 @@ class Simulation:
     def _prepare(self, number: int, begin_us: float, end_us: float) -> _Block | None:
         """Where the sources are in a block, how they switch, and which pixels they may excite."""
         scene = self.scene
-        camera, sensor = scene.camera, scene.sensor
-        stretch = self._stretch_at(begin_us)
+        camera, sensor, stretch = scene.camera, scene.sensor, self._stretch_at(begin_us)
         of_block = slice(*np.searchsorted(stretch.starts_us, (begin_us, end_us)))
         starts, attitude = stretch.starts_us[of_block], stretch.attitude[of_block]
         turn = np.stack([attitude[:, 0], -attitude[:, 1]], 1) * camera.focal_px
-        wiped = cut_changes(*stretch.wiped, begin_us, end_us)
-        changed = cut_changes(*stretch.changed, begin_us, end_us)
+        wiped, changed = (cut_changes(*of, begin_us, end_us) for of in (stretch.wiped, stretch.changed))
         lightest = float(wiped[1].max())
-        dimmest = float(self._darkest_texture * wiped[1].min() * changed[1].min())
-        darkest = sensor.dark_w_m2 + scene.background.light_w_m2 * dimmest
+        light = np.append(sensor.dark_w_m2, scene.background.light_w_m2 * changed[1])
+        darkest = float(light[0] + light[1:].min() * float(self._darkest_texture * wiped[1].min()))
         shown: list[tuple[Source, tuple[Floats, Floats], Floats, Floats, Floats, Floats, _Look]] = []
         marked: list[NDArray[np.int64]] = []
         beyond: list[NDArray[np.uint8]] = []
@@ -604,19 +602,17 @@ class Simulation:
             levels_of.append(levels)
             for of, share in zip(halos_of, look.halos, strict=True):
                 of.append(levels @ share)
-        line, levels, halo = _time_line(starts, wiped, changed, switches, levels_of, halos_of, most)
-        background = np.array([scene.background.light_w_m2, sensor.dark_w_m2])
+        line, levels, halo = _time_line(starts, wiped, changed[0], switches, levels_of, halos_of, most)
         world = (
             line,
             _kernels.Strips(levels, origin, axis, bounds, strips, clusters, gain),
             _kernels.Halos(halo, *self._halo_columns),
             _kernels.Near(self._near_share, tables, near_scale, near_reach),
-            _kernels.Scenery(turn, self._texture_every, self._texture, background),
+            _kernels.Scenery(turn, self._texture_every, self._texture, light),
         )
-        pixels, batches, masks, strides = _batches(pixels, masks, far, self._texture_every)
-        y, x = np.divmod(pixels, camera.width)
-        at_px = unbent(scene.drops, x, y, (begin_us + end_us) * 0.5e-6)
-        return _kernels.ActivePixels(number, end_us, pixels, batches, masks, strides, at_px), world
+        batches = _batches(pixels, masks, far, self._texture_every)
+        at_px = unbent(scene.drops, *np.divmod(batches[0], camera.width), (begin_us + end_us) * 0.5e-6)
+        return _kernels.ActivePixels(number, end_us, *batches, at_px), world
 
     def seen(self, source: Source, position: Floats, attitude: Floats) -> tuple[Floats, Floats]:
         """Where a source's clusters start and end in the image, and their depths; see `project`."""

@@ -83,10 +83,10 @@ def pixel_events(
         none,
         none,
         light,
-        np.ones(len(light)),
+        none,
         np.zeros((0, len(light)), np.int64),
     )
-    scenery = scenery._replace(field=np.ones_like(scenery.field), light=np.array([1.0, 0.0]))
+    scenery = scenery._replace(field=np.ones_like(scenery.field), light=np.array([0.0, 1.0]))
     world = (line, strips, halos, near, scenery)
     parts = [part for job in simulation._jobs((active, world), begin_us, end_us) for part in job()]
     request, code = (np.concatenate(column) for column in zip(*parts, strict=True))
