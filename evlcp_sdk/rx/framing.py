@@ -315,8 +315,9 @@ class Transmitter:
         rows: How late the rows of its bar are read.
         pilot: The newest pilot, None where it showed no bar.
         said: Number of the newest frame that was decoded, on the grid, and its symbols.
-        given: Number of the newest frame that was given, on the grid.
-        rejected: Frames that were rejected since.
+        given: Number of the newest frame on the grid that was given before any was rejected since the
+            newest preamble on it.
+        rejected: Frames that were rejected since then: maybe another transmitter sends.
         missed: Frames due that were not given, by the count that they belong to.
         behind: Frames that are due wait for the next step.
         tried: Number of the newest frame on the grid that was not given as soon as it was due.
@@ -341,6 +342,11 @@ class Transmitter:
     tried: int = -1
     lit_us: float | None = None
     step_events: int = 0
+
+    def settle(self) -> None:
+        """Take a preamble on the grid: the frames before it are its own."""
+        self.given, self.rejected = max(self.given, self.grid.frame - 1), 0
+        self.packets.in_doubt = False
 
 
 class Transmitters:
@@ -384,7 +390,7 @@ class Transmitters:
         grid.restart(lock, earliest_us)
 
     def succeed(self, old: Transmitter) -> Transmitter:
-        """Another transmitter in a region, after the last frame that was given of the one before."""
+        """Another transmitter in a region, after the last frame that is surely of the one before."""
         region = old.region
         oldest_us = region.pieces[0][0] if region.pieces else 0
         region.first_us = max(region.first_us, oldest_us, int(old.grid.start_us(old.given + 1)))
@@ -412,6 +418,7 @@ class Transmitters:
             lost.number, lost.first, lost.given = None, None, -1
             transmitter.packets, lost.packets = lost.packets, transmitter.packets
             transmitter.grid, lost.grid = lost.grid, self._grid()
+            transmitter.settle()
             return True
         return False
 
@@ -652,6 +659,7 @@ class PacketFraming(Framer):
                 lock = self._late_rows(transmitter, heard)
                 transmitter.step_events = events.t_us.size
                 if transmitter.grid.follow(lock):
+                    transmitter.settle()
                     continue
                 self.counts["locks"] += 1
                 if transmitter.number is not None:
@@ -660,11 +668,12 @@ class PacketFraming(Framer):
         return transmitter
 
     def _succeed(self, old: Transmitter) -> Transmitter:
-        """End a transmitter that another is in the place of; frames rejected since its last were not sent."""
+        """End a transmitter that another is in the place of; what was read since, or rejected, is not its."""
         self.counts["restarts"] += 1
         self.counts[Skipped.REJECTED] -= old.rejected
         old.missed[Skipped.REJECTED] -= old.rejected
-        self._queue.add(old.packets, None)
+        packet, frame = divmod(old.given, self._packet.frames)
+        self.counts["frames"] -= self._queue.end_after(old.packets, (packet - (old.first or 0), frame))
         self._ended.append((old.number, old.region.positions.place_at(old.region.latest.t_us), old.missed))
         return self._transmitters.succeed(old)
 
@@ -714,7 +723,9 @@ class PacketFraming(Framer):
                 if found is not Skipped.DARK:
                     self._lit_in(transmitter, self._clock.camera_us(due.start_us))
                     transmitter.missed[found] += 1
-                    transmitter.rejected += found is Skipped.REJECTED
+                    if found is Skipped.REJECTED and transmitter.number is not None:
+                        transmitter.rejected += 1
+                        transmitter.packets.in_doubt = True
                 self.counts[found] += 1
                 self._announce_skipped(transmitter, due, found)
                 continue
@@ -730,7 +741,8 @@ class PacketFraming(Framer):
     def _take(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         """Hand a frame on."""
         transmitter.grid.go_to(due.number + 1)
-        transmitter.given, transmitter.rejected = due.number, 0
+        if not transmitter.rejected:
+            transmitter.given = due.number
         self._lit_in(transmitter, found.frame.t_us)
         self.counts["frames"] += 1
         self._queue.add(transmitter.packets, found)

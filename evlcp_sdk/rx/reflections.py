@@ -312,27 +312,56 @@ class Reflections:
             self._echo_of |= dict.fromkeys(group - {bar} - bars, bar)
 
 
+_MOST_WAITING = 2
+"""Packets that wait while it is in doubt whose they are: the second preamble off a grid settles it."""
+
+
 class PacketAssembler:
     """Collects a transmitter's frames until their packet, of so many frames, is over.
 
     A packet is a reflection as a whole, as its last frame, which knows most, says.
+
+    Attributes:
+        in_doubt: The frames that come now may be of another transmitter: packets wait, so many at most.
     """
 
     def __init__(self, sent: int) -> None:
         self._sent = sent
         self._frames: list[Frame] = []
         self._start: tuple[float, float] = (0.0, 0.0)
+        self._done: list[Packet] = []
+        self.in_doubt = False
 
     def add(self, frame: Frame, packet_t_us: float, chip_us: float) -> list[Packet]:
-        """Take a frame; return the packet before it, if this frame starts another."""
-        done = self.flush() if self._frames and self._frames[-1].packet != frame.packet else []
+        """Take a frame; return the packets that are over, by the last of their frames or by this one."""
+        if self._frames and self._frames[-1].packet != frame.packet:
+            self._done += self._over()
         if not self._frames:
             self._start = (packet_t_us, chip_us)
         self._frames.append(frame)
-        return done + (self.flush() if frame.frame == self._sent - 1 else [])
+        if frame.frame == self._sent - 1:
+            self._done += self._over()
+        many = len(self._done) - _MOST_WAITING * self.in_doubt
+        over, self._done = self._done[: max(many, 0)], self._done[max(many, 0) :]
+        return over
+
+    def end_after(self, last: tuple[int, int]) -> int:
+        """Let the frames go that are later than one, by packet and frame; how many."""
+        many = len(self._frames) + sum(len(packet.frames) for packet in self._done)
+        self._frames = [one for one in self._frames if (one.packet, one.frame) <= last]
+        kept = [
+            changed(packet, frames=tuple(f for f in packet.frames if (f.packet, f.frame) <= last))
+            for packet in self._done
+        ]
+        self._done = [packet for packet in kept if packet.frames]
+        return many - len(self._frames) - sum(len(packet.frames) for packet in self._done)
 
     def flush(self) -> list[Packet]:
-        """The packet of the frames held, if any."""
+        """The packets of the frames held, if any."""
+        over, self._done = self._done + self._over(), []
+        return over
+
+    def _over(self) -> list[Packet]:
         if not self._frames:
             return []
         first, echo_of = self._frames[0], self._frames[-1].echo_of
@@ -370,6 +399,20 @@ class ReflectionQueue:
     def add(self, packets: PacketAssembler, detection: FrameDetection | None) -> None:
         """Take a frame, and where it goes; None for the end of a transmitter's frames."""
         self._new.append((packets, detection))
+
+    def end_after(self, packets: PacketAssembler, last: tuple[int, int]) -> int:
+        """End a transmitter's frames with one, by packet and frame: let later ones go; how many."""
+        gone = packets.end_after(last)
+        for waiting in (self._old, self._new):
+            many = len(waiting)
+            waiting[:] = [
+                (its, found)
+                for its, found in waiting
+                if its is not packets or found is None or (found.frame.packet, found.frame.frame) <= last
+            ]
+            gone += many - len(waiting)
+        self.add(packets, None)
+        return gone
 
     def step(self) -> list[Packet]:
         """End a time step; give the packets that are complete with the frames of the step before it."""

@@ -285,9 +285,11 @@ def test_a_bar_lost_from_sight_goes_on_as_the_same() -> None:
     assert right_frames(packets, bar) == 39
 
 
-@pytest.mark.parametrize("at_us", [74_000, 88_500, 101_000])
+@pytest.mark.parametrize("at_us", [61_810, 74_000, 88_500, 101_000])
 def test_a_transmitter_that_starts_anew_is_another(at_us: float) -> None:
     """In the middle of a packet, with another clock, and again: read from its first whole frame on.
+
+    Also where its frames stand on the old grid for a part of each packet.
 
     Or from the second, where one that was cut short is given until then.
     """
