@@ -47,9 +47,10 @@ class Receiver:
         limits: How much it holds at the most.
         on_frame: Gets each frame as soon as it is decoded, within `feed` or `close`, in order of a
             transmitter's frames. Its packet has the same later, unless the stream ends before the frame's
-            late events can have come, or the transmitter turns out to have been reset before; only `echo_of` is by what is known then. Of several links, frames come
-            with their packet until their transmitter holds its place; where another link takes that from it,
-            the count `frames_withdrawn` has those told of packets that are not given. None for nobody.
+            late events can have come, or the transmitter turns out to have been reset before; only `echo_of`
+            is by what is known then. Of several links, frames come with their packet until their transmitter
+            holds its place; where another link takes that from it, the count `frames_withdrawn` has those
+            told of packets that are not given. None for nobody.
 
     Attributes:
         left: Packets that were complete when an algorithm failed in the last `feed`, which did not give them.
