@@ -135,6 +135,7 @@ def diagnose(
         surveyed=True,
         sources=sources,
         restless=survey.restless(),
+        speed_px_ms=survey.speed_px_ms(),
     )
     checks = find_stages(facts)
     trials: tuple[Trial, ...] = ()

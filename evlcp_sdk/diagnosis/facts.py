@@ -128,6 +128,7 @@ class Facts:
         surveyed: Whether somebody looked for what blinks, as `diagnose` does; the rest is what that found.
         sources: What blinks, by events.
         restless: Box of where far more happens than elsewhere, px; None for nowhere.
+        speed_px_ms: How fast light sweeps over the image, px/ms; 0 where it does not.
         trials: Links that were tried, the one given first.
     """
 
@@ -149,6 +150,7 @@ class Facts:
     surveyed: bool = False
     sources: Sequence[LightSource] = ()
     restless: tuple[int, int, int, int] | None = None
+    speed_px_ms: float = 0.0
     trials: Sequence[Trial] = ()
 
     @property

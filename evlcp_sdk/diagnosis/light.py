@@ -18,6 +18,7 @@ from scipy import ndimage
 from evlcp_sdk.diagnosis import _kernels
 from evlcp_sdk.diagnosis._kernels import BINS, COARSE, COARSE_US, FINE, FINE_US, SHORT
 from evlcp_sdk.diagnosis.readout import ReadoutTally
+from evlcp_sdk.rx.sweeps import find_sweeps
 from evlcp_sdk.values import Events
 
 Floats = NDArray[np.float64]
@@ -176,6 +177,7 @@ class LightSurvey:
         self.signs = np.zeros((*cells, 2), np.int64)
         self._windows: list[tuple[int, list[NDArray[np.uint32]]]] = []
         self._every_us = _EVERY_US
+        self._speeds: list[float] = []
         self.readout = ReadoutTally()
         self.first_us = self.last_us = math.nan
 
@@ -216,6 +218,10 @@ class LightSurvey:
                 sources.append(source)
         frequency[~found] = np.nan
         return sorted(sources, key=lambda source: -source.events), frequency
+
+    def speed_px_ms(self) -> float:
+        """How fast light sweeps over the image in most of the windows, px/ms; 0 where it does not."""
+        return 1e3 * float(np.median(self._speeds)) if self._speeds else 0.0
 
     def restless(self) -> tuple[int, int, int, int] | None:
         """Where far more happens than elsewhere: (left, top, right, bottom), px; None for nowhere.
@@ -310,6 +316,9 @@ class LightSurvey:
         """Keep the positive events of a short window now and then; of too many windows every second one."""
         if not self._windows or events.t_us[0] >= self._windows[-1][0] + self._every_us:
             self._windows.append((int(events.t_us[0]), []))
+            part = events[: int(np.searchsorted(events.t_us, events.t_us[0] + _WINDOW_US))]
+            swept = find_sweeps(part, int(events.t_us[0]), _WINDOW_US, None, [], (self.width, self.height))
+            self._speeds.append(max((math.hypot(*one.speed) for one in swept), default=0.0))
             if len(self._windows) > _MOST_WINDOWS:
                 self._windows = self._windows[::2]
                 self._every_us *= 2

@@ -167,11 +167,17 @@ def check_light(facts: Facts) -> Found:
     """What blinks: a bar, lamps alone, or nothing that is worth a word; and a bar more that is not read."""
     if not facts.surveyed:
         return
+    sweeps = f"sweeps over the image at {facts.speed_px_ms:.1f} px/ms"
     if facts.reads:
-        yield _find_unread(facts) or _describe_sources(facts)
+        moves = f"; it {sweeps}" if facts.speed_px_ms else ""
+        yield _find_unread(facts) or f"{_describe_sources(facts)}{moves}"
         return
     if facts.bar is not None and not _is_lamp(facts.bar, facts):
         yield _describe_sources(facts)
+        return
+    if facts.speed_px_ms:
+        step = "turn more slowly, or a shorter lens: up to 8 px/ms a bar is followed"
+        yield Diagnostic("motion", f"what shines {sweeps}: hardly anything is read of it", step)
         return
     lamps = [one for one in facts.sources if one.kind == "lamp"]
     if lamps:

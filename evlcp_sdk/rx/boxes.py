@@ -108,13 +108,16 @@ def overlap(a: Box, b: Box) -> bool:
     return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
 
 
-def find_areas(hits: NDArray[np.int16], most: int, size_px: tuple[int, int]) -> tuple[list[Box], int]:
+def find_areas(
+    hits: NDArray[np.int16], most: int, size_px: tuple[int, int], shift: int = CELL_SHIFT
+) -> tuple[list[Box], int]:
     """Boxes around connected cells with hits, those with the most of too many; and how many are left out.
 
     Args:
-        hits: Of cells of 2^`CELL_SHIFT` px, int16 (rows, columns).
+        hits: Of cells of 2^shift px, int16 (rows, columns).
         most: How many boxes there may be.
         size_px: Columns and rows of the sensor.
+        shift: See there.
     """
     # Of 2 x 2 cells, one at the most begins an area.
     rows, columns = hits.shape
@@ -124,7 +127,7 @@ def find_areas(hits: NDArray[np.int16], most: int, size_px: tuple[int, int]) -> 
     boxes = boxes[:many]
     if many > most:
         boxes = boxes[np.sort(np.argsort(-total[:many], kind="stable")[:most])]
-    return [tuple(box) for box in np.minimum(boxes << CELL_SHIFT, size_px * 2).tolist()], max(many - most, 0)
+    return [tuple(box) for box in np.minimum(boxes << shift, size_px * 2).tolist()], max(many - most, 0)
 
 
 def likeliest_row(

@@ -32,6 +32,7 @@ from evlcp_sdk.rx.boxes import (
 )
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.rhythm import LAMP, SAME, RhythmTables
+from evlcp_sdk.rx.sweeps import FAST_PX_US, Sweep, find_sweeps, fit_sweep
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
 
@@ -69,6 +70,10 @@ _CALM, _FLOODED, _FLOOD_STEPS = 0.25, 0.5, 3
 """Share of the pixels beside a bar that rose lately up to which they are calm; from which on, soon after
 that, the light of all changes: pixels that the bar has left show as it does, and would drag its region along.
 And steps that this may last; what goes on, a halo, is no change. Leaves make 0.45 at the most."""
+
+_LEAST_SWEPT, _SWEPT_STEPS = 300, 4
+"""Events beside all regions from which on it is looked for a bar that sweeps; and steps whose events it has
+when it is found: it was seen in two of them, and was in the same motion before."""
 
 _CENTRE_SIGMA_PX = 0.25
 """Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
@@ -292,6 +297,7 @@ class Followed:
         cut_us: Until when its events were forgotten for want of room, us; None where none were.
         held_bytes: What its pieces take.
         calm_us: When the pixels beside its bar were seen to be calm, us.
+        speed: How fast it sweeps to the right and down, px/us; None of one whose pixels blink.
     """
 
     id: int
@@ -310,6 +316,7 @@ class Followed:
     cut_us: int | None = None
     held_bytes: int = 0
     calm_us: int = 0
+    speed: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         self.hold(self.pieces)
@@ -606,11 +613,13 @@ class RegionFollower(RegionTracker):
         self._sensor_px = camera.width, camera.height
         self._measure_us = round(_MEASURE_GAPS * gap_chips * chip_us)
         self._age_us = _AGE_CHIPS * chip_us
+        self._chip_us = chip_us
         shape = (camera.height, camera.width)
         self._rhythm = rhythm or Rhythm(camera.width, camera.height, chip_us, spec.min_score, gap_chips)
         # Emptied once a step: two bytes each.
         self._hits = np.zeros([(n - 1 >> CELL_SHIFT) + 1 for n in shape], np.int16)
         self._fresh: list[Box] = []
+        self._swept: list[Sweep] = []
         steps = math.ceil(min(keep_us, _LONGEST_US) / spec.step_us)
         self._recent: deque[Piece] = deque()
         self._most_recent = max(steps, BACKFILL_STEPS)
@@ -628,12 +637,12 @@ class RegionFollower(RegionTracker):
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
         # Before a frame shows where in its box a bar is, panels and moving textures around it would drown it:
         # only what blinks in rhythm counts.
-        unknown = [followed.size_px is None for followed in self.alive]
+        unknown = [one.size_px is None and one.speed is None for one in self.alive]
         selected = self._rhythm.select(events, boxes, unknown) if boxes else []
         for followed, inside, own in zip(self.alive, selected, self._own(boxes), strict=True):
             followed.add(start_us, inside)
-            if (found := self._locate(followed, own, end_us)) is not None:
-                followed.filter, place = found
+            if (found := self._locate(followed, own, end_us, (start_us + end_us) / 2)) is not None:
+                followed.filter, place, followed.speed = found
                 followed.positions.append(place)
             held += followed.held_bytes
         if len(self.alive) > 1:
@@ -641,6 +650,9 @@ class RegionFollower(RegionTracker):
         if held > self._limits.region_bytes:
             self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, spec.step_us)
         self._open(end_us, rises, taken)
+        beside = len(events) - sum(len(followed.pieces[-1][1]) for followed in self.alive)
+        if beside >= _LEAST_SWEPT and all(one.speed or one.size_px is None for one in self.alive):
+            self._open_swept(start_us, events, taken)
         seen = list(self.alive)
         gone = False
         for followed in seen:
@@ -656,7 +668,7 @@ class RegionFollower(RegionTracker):
         for followed in self.alive:
             last = followed.positions.latest
             x_px, y_px = self._expected(followed, t_us)
-            boxes.append(self._reach(x_px, y_px, last.width_px, last.height_px))
+            boxes.append(self._reach_of(followed, x_px, y_px))
             if followed.size_px is None:
                 unknown.append(len(boxes) - 1)
         if unknown:
@@ -727,11 +739,10 @@ class RegionFollower(RegionTracker):
             for piece in self._recent
             if oldest_us <= piece[0] < until_us and piece[0] + step_us > from_us
         ]
-        last = followed.latest
         gathered = {}
         x, y = followed.positions.at(np.array([start + step_us / 2 for start, _ in kept]))
         for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
-            box = self._reach(x_px, y_px, last.width_px, last.height_px)
+            box = self._reach_of(followed, x_px, y_px)
             gathered[start] = self._rhythm.select(events, [box], [False])[0]
         followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
         self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, step_us)
@@ -854,7 +865,9 @@ class RegionFollower(RegionTracker):
             for followed, own in zip(self.alive, self._own(boxes), strict=True):
                 if followed.id in meant:
                     heights = followed.heights.copy()
-                    if (found := self._locate(followed, own, until_us)) is not None:
+                    if (
+                        found := self._locate(followed, own, until_us, (start_us + until_us) / 2)
+                    ) is not None:
                         followed.positions.append(found[1])
                     followed.heights = heights
         self._recent.append((start_us, events))
@@ -867,7 +880,8 @@ class RegionFollower(RegionTracker):
                 _, part = followed.pieces.pop()
                 # What a frame's look gathered anew was counted; the whole image's events were not.
                 followed.held_bytes -= 0 if part is events else held_bytes(part)
-            if followed.positions.latest.t_us == until_us - self._age_us:
+            middle_us = (start_us + until_us) / 2 - self._chip_us
+            if followed.positions.latest.t_us in (until_us - self._age_us, middle_us):
                 followed.positions.take_back()
 
     def _expected(self, followed: Followed, t_us: float) -> tuple[float, float]:
@@ -877,6 +891,9 @@ class RegionFollower(RegionTracker):
             if predicted is not None:
                 return float(predicted[0][0]), float(predicted[0][1])
         last, before = followed.positions.latest, followed.positions.before
+        if followed.speed is not None:
+            after_us = t_us - last.t_us
+            return last.x_px + after_us * followed.speed[0], last.y_px + after_us * followed.speed[1]
         if before is last:
             return last.x_px, last.y_px
         # Further ahead than that, a shaking camera has turned back.
@@ -925,19 +942,47 @@ class RegionFollower(RegionTracker):
         size_px = known or (width_px, height_px + min(max(excess_px, 0.0), STRAY_PX))
         return region_of(followed.id, t_us, x_px, y_px - off_px, *size_px)
 
-    def _locate(self, followed: Followed, box: Box, now_us: int) -> tuple[Any, Region] | None:
-        """State of a region's filter after it was measured in a box, and its place by it; None if unseen."""
-        rows = np.empty(box[3] - box[1], np.int64)
-        seen = self._measure(followed, box, now_us, rows)
+    def _locate(
+        self, followed: Followed, box: Box, now_us: int, middle_us: float
+    ) -> tuple[Any, Region, tuple[float, float] | None] | None:
+        """State of a region's filter after it was measured in a box, its place and speed; None if unseen."""
+        sweep = self._sweep(followed, box, middle_us)
+        if sweep is not None:
+            t_us, rows, speed = middle_us - self._chip_us, sweep.rows, sweep.speed
+            seen: Place | None = sweep[:4]
+        else:
+            t_us, rows, speed = now_us - self._age_us, np.empty(box[3] - box[1], np.int64), None
+            seen = self._measure(followed, box, now_us, rows)
         if seen is None:
             return None
-        measured = self._whole(followed, now_us - self._age_us, seen, box[1], rows)
+        measured = self._whole(followed, t_us, seen, box[1], rows)
         if self._position is None:
-            return followed.filter, measured
+            return followed.filter, measured, speed
         centre = np.array([measured.x_px, measured.y_px])
         state, centre, _ = self._position.step(followed.filter, measured.t_us, centre, _CENTRE_SIGMA_PX)
         x_px, y_px = float(centre[0]), float(centre[1])
-        return state, Region(measured.id, measured.t_us, x_px, y_px, measured.width_px, measured.height_px)
+        place = Region(measured.id, measured.t_us, x_px, y_px, measured.width_px, measured.height_px)
+        return state, place, speed
+
+    def _sweep(self, followed: Followed, box: Box, middle_us: float) -> Sweep | None:
+        """What a region's newest events say of it where it is too fast for its pixels to blink, else None."""
+        last, before = followed.positions.latest, followed.positions.before
+        speed, apart_us = followed.speed, last.t_us - before.t_us
+        if apart_us > 0:
+            speed = (last.x_px - before.x_px) / apart_us, (last.y_px - before.y_px) / apart_us
+        if speed is None or max(abs(speed[0]), abs(speed[1])) < FAST_PX_US:
+            return None
+        along = speed[1 if last.height_px > last.width_px else 0]
+        sweep = fit_sweep(followed.pieces[-1][1], middle_us, box, along)
+        return sweep if sweep is not None and sweep.is_fast else None
+
+    def _reach_of(self, followed: Followed, x_px: float, y_px: float) -> Box:
+        """The box in which a region's events lie in a step in whose middle it is at a place."""
+        last, swept = followed.latest, followed.speed
+        if swept is None:
+            return self._reach(x_px, y_px, last.width_px, last.height_px)
+        right, down = abs(swept[0]) * self._spec.step_us, abs(swept[1]) * self._spec.step_us
+        return self._reach(x_px, y_px, last.width_px + right, last.height_px + down)
 
     def _reach(self, x_px: float, y_px: float, width_px: float, height_px: float) -> Box:
         """The box in which a region's events lie within the next step; an empty one off the sensor."""
@@ -1043,6 +1088,41 @@ class RegionFollower(RegionTracker):
             self.gather(followed)
         self.alive.append(followed)
 
+    def _open_swept(self, start_us: int, events: Events, taken: Sequence[Region]) -> None:
+        """Open a region where a bar sweeps over the image in two steps on end, where none does yet.
+
+        What was taken for a region there, as some pixels of it seemed to blink, goes.
+        """
+        step_us, merge_px = self._spec.step_us, self._spec.merge_px
+        known = [box_of(place) for place in taken]
+        known += [grown(box_of(one.latest), merge_px) for one in self.alive if one.speed is not None]
+        before, self._swept = (
+            self._swept,
+            find_sweeps(events, start_us, step_us, self._chip_us, known, self._sensor_px),
+        )
+        for sweep in self._swept:
+            one = next((one for one in before if _goes_on(one, sweep, step_us)), None)
+            if one is None:
+                continue
+            speed = (sweep.x_px - one.x_px) / step_us, (sweep.y_px - one.y_px) / step_us
+            same = next((other for other in self.alive if _is_swept(other.latest, sweep)), None)
+            if same is not None:
+                same.speed = speed
+                continue
+            if not self._place_for_one(start_us + step_us):
+                continue
+            t_us, id = start_us + step_us / 2 - self._chip_us, self._next_id
+            places = Places([region_of(id, t_us - step_us, *one[:4]), region_of(id, t_us, *sweep[:4])])
+            pieces = deque((start, Events.empty()) for start, _ in list(self._recent)[-_SWEPT_STEPS:])
+            followed = Followed(id, places, pieces[0][0], pieces, opened_us=start_us + step_us, speed=speed)
+            followed.filter = self._position.init() if self._position else None
+            self._next_id += 1
+            self.gather(followed)
+            swept = around([box_of(places.before), box_of(places.latest)])
+            for other in self.alive:
+                other.released |= other.speed is None and overlap(swept, box_of(other.latest))
+            self.alive.append(followed)
+
     def _place_for_one(self, now_us: int) -> bool:
         """Whether a new region may be followed, maybe in place of one that had its time and shows no bar."""
         followed = [one for one in self.alive if not one.released]
@@ -1074,6 +1154,20 @@ class RegionFollower(RegionTracker):
                 if shown == 0 or apart_px <= SAME_PX or (shown == 1 and same_place(one, other)):
                     younger.released = True
         # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
+
+
+def _goes_on(before: Sweep, sweep: Sweep, step_us: int) -> bool:
+    """Whether a sweep may be what was seen a step before."""
+    right = sweep.x_px - before.x_px - sweep.speed[0] * step_us
+    down = sweep.y_px - before.y_px - sweep.speed[1] * step_us
+    return max(abs(right), abs(down)) <= 2 * MARGIN_PX
+
+
+def _is_swept(place: Region, sweep: Sweep) -> bool:
+    """Whether a region shows most of a bar that sweeps."""
+    right, down = abs(place.x_px - sweep.x_px), abs(place.y_px - sweep.y_px)
+    long = max(place.width_px, place.height_px) > max(sweep.width_px, sweep.height_px) / 2
+    return long and max(right, down) <= 2 * MARGIN_PX
 
 
 def _outgrown(followed: Followed) -> Place:

@@ -111,6 +111,7 @@ def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
 
 RX = (
     {"boxes", "limits", "rhythm", "straight"},
+    {"sweeps"},
     {"guard", "regions", "trust"},
     {"detected", "framer"},
     {"inbox", "placement", "ranges"},

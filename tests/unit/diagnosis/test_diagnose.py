@@ -238,6 +238,22 @@ def survey_of(times_us: NDArray[np.float64]) -> LightSurvey:
     return survey
 
 
+@pytest.mark.parametrize(("speed_px_ms", "said"), [(12.0, "sweeps over the image at 12.0 px/ms"), (0.0, "")])
+def test_light_that_sweeps_is_not_said_to_be_weak(speed_px_ms: float, said: str) -> None:
+    rng = np.random.default_rng(2)
+    survey = LightSurvey(1280, 720)
+    for start_us in range(0, 100_000, 10_000):
+        t_us = start_us + np.sort(rng.integers(0, 10_000, 20_000))
+        x = 20 + speed_px_ms * 1e-3 * t_us + rng.normal(0, 1, t_us.size)
+        survey.feed(Events.of(t_us, np.rint(x).astype(int), rng.integers(300, 420, t_us.size), t_us % 2))
+    assert survey.speed_px_ms() == pytest.approx(speed_px_ms, abs=0.05)
+    link = load_link()
+    facts = Facts(link, RunTally(link.packet), {"events": 200_000}, surveyed=True, speed_px_ms=speed_px_ms)
+    light = next(one for one in find_stages(facts) if one.stage == "light")
+    assert (light.verdict, light.code) == ("fail", "motion" if said else "dark")
+    assert said in light.text
+
+
 @pytest.mark.parametrize("rate_hz", [100.0, 1000.0, 2375.0, 5000.0, 10_000.0])
 @pytest.mark.parametrize("late", [0.02, 0.1])
 def test_a_lamp_that_is_followed_is_one_at_any_rate(rate_hz: float, late: float) -> None:

@@ -208,6 +208,18 @@ def test_the_centre_is_followed() -> None:
         assert (f.x_px, f.y_px) == (pytest.approx(x[0] - 0.5, abs=1.0), pytest.approx(y[0] - 0.5, abs=1.5))
 
 
+@pytest.mark.parametrize(("shake_px", "shake_hz"), [(60, 15), (250, 5)])
+def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px: float, shake_hz: float) -> None:
+    """Round in a circle at 5.7 and 7.9 px/ms: in any direction, along the bar and across it."""
+    bar = IdealBar(random_symbols(LINK, 4), shake_px=shake_px, shake_hz=shake_hz)
+    receiver, packets = received(LINK, ideal_events(LINK, bar))
+    assert right_frames(packets, bar) == 40
+    assert receiver.counts["regions_opened"] == 1
+    for f in frames_of(packets):
+        x, y = bar.centre(np.array([f.t_us + 850]))
+        assert (f.x_px, f.y_px) == (pytest.approx(x[0] - 0.5, abs=1.0), pytest.approx(y[0] - 0.5, abs=1.5))
+
+
 def test_two_bars_and_lamps() -> None:
     bars = [
         IdealBar(random_symbols(LINK, 4, 1), ppm=40),
