@@ -3,6 +3,8 @@
 import itertools
 import json
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -15,6 +17,7 @@ from evlcp_uart.characters import Characters, Parity
 from evlcp_uart.decoder import Character
 from evlcp_uart.framing import Uart, read_characters
 from evlcp_uart.light import BEFORE, CONTEXTS, TICKS
+from scipy.io import savemat
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
@@ -23,6 +26,7 @@ from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events, Packet
+from tests.conftest import ROOT
 
 BAR = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
 CHARACTERS = Characters(7, "even", 2)
@@ -534,3 +538,26 @@ def test_a_bar_in_view_is_no_light_of_characters(framing: dict[str, Any], demo_r
     with evlcp.receive(demo_raw, [link]) as packets:
         assert list(packets) == []
         assert packets.counts["regions_opened"] == 0
+
+
+def test_the_beacons_bit_errors_are_those_against_the_text_that_is_repeated(tmp_path: Path) -> None:
+    """Of two repetitions and a third, with three bits that were sent otherwise; and of a part of one."""
+    rng = np.random.default_rng(1)
+    text = np.append(rng.integers(32, 127, 618), 127)
+    for name, bit_hz, first, many, errors in (
+        ("3125hz_30m", 3125, 400, 1450, 3),
+        ("504hz_30m", 504, 99, 90, 1),
+    ):
+        sent = np.resize(np.roll(text, -first), many)
+        sent[[20, 40, 60][:errors]] ^= 4
+        data = sent[:, None] >> np.arange(6, -1, -1) & 1
+        levels = np.pad(np.column_stack([data, data.sum(1) % 2]), ((0, 0), (1, 2)), constant_values=1)
+        levels[:, 0] = 0
+        events = seen(rng, levels.ravel().tolist(), 1e6 / bit_hz, events=(24.0, 20.0), noise_hz=50.0)
+        savemat(tmp_path / f"{name}.mat", {"event": 2.0 * events.p - 1, "event_t": events.t_us * 1e-6})
+    script = [sys.executable, str(ROOT / "benchmarks" / "beacons.py"), str(tmp_path)]
+    printed = subprocess.run(script, capture_output=True, text=True, check=True).stdout.splitlines()[2:]
+    assert [line.split(" | ")[3:5] for line in printed] == [
+        ["3 of 10150", "0.0003"],
+        ["1 of 630", "0.0016"],
+    ]
