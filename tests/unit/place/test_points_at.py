@@ -231,6 +231,22 @@ def test_the_point_is_the_one_that_is_seen() -> None:
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
 
 
+def test_what_bends_a_bar_stays_over_frames() -> None:
+    bent = replace(ranged(640.0, 360.0, 40.0, 0.5), range=Range(40.0, 0.5, 10, standing_m=0.4))
+    found = bar_point(bent, 0.96, BENT, None, replace(POINTS_ONLY, stretch_share=0.0))
+    straight = bar_point(ranged(640.0, 360.0, 40.0, 0.5), 0.96, BENT, None, POINTS_ONLY)
+    assert found is not None
+    assert straight is not None
+    np.testing.assert_allclose(found.covariance_m2, straight.covariance_m2, rtol=1e-3, atol=1e-6)
+    assert found.standing[2, 7] == pytest.approx(0.4)
+    frames = [replace(frame(BAR_PX, 0.1, t), range=bent.range) for t in T_US.tolist()]
+    for some, stretch in ((9, 0.01), (5, 0.01), (4, 0.0)):
+        near = frames[:some] + [replace(one, range=Range(40.0, 0.1, 10)) for one in frames[some:]]
+        view = points_at(7, near, 0.0, 40_000.0, LINE_M, SPEC)
+        assert view is not None
+        assert view.stretch == pytest.approx(stretch)
+
+
 def test_every_error_is_in_its_covariance() -> None:
     rng = np.random.default_rng(3)
     true, squares = np.array([3.0, -2.0, 25.0]), []
