@@ -62,6 +62,10 @@ _MIN_RISES, _LEAST_RATE, _SLENDER = 500, 0.25, 4.0
 many times longer than wide it is. Leaves and edges that pass look like a code of some hundred chips a second,
 a lamp whose periods are missed like one of some thousand."""
 
+_ROUND_CHIPS = 0.7
+"""Chips between two readings of a row from which on events of one edge, which come within 30 us, are read
+together with those of the next."""
+
 _GLOW_PX = 32
 """Gap up to which light beside a bar is its own."""
 
@@ -151,11 +155,21 @@ def check_readout(facts: Facts) -> Found:
     """A readout that is at its limit."""
     if facts.readout is None:
         return
-    share, peak = facts.readout.capped()
-    if facts.readout.at_limit:
+    events, (row_us, round_us) = facts.readout.events, facts.readout.round_us()
+    share, peak = events.capped()
+    chip_us = min(one.link.packet.chip_us for one in (facts, *facts.parts.values()))
+    if round_us > _ROUND_CHIPS * chip_us and not facts.sure:
+        yield Diagnostic(
+            "readout",
+            f"the sensor reads without rest, {row_us:.2g} us a row, and comes to each row every"
+            f" {round_us:.0f} us only, {round_us / chip_us:.2g} chips: changes in between are read together",
+            "fewer rows: from farther away, with a region of interest or masks beside the bar, or a bar that"
+            " lies; or a lower air.chip_rate_hz",
+        )
+    if events.at_limit:
         yield Diagnostic(
             "saturated",
-            f"{share:.0%} of all milliseconds, {facts.readout.capped_ms}, hold {peak / 1e3:.3g} Mev/s,"
+            f"{share:.0%} of all milliseconds, {events.capped_ms}, hold {peak / 1e3:.3g} Mev/s,"
             " no more and no less: the sensor's readout is at its limit, and what is beyond is lost",
             "mask rows and columns beside the bar, close the aperture, or raise the event-rate limit",
         )

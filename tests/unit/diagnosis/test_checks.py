@@ -282,6 +282,27 @@ def test_light_without_frames(start_us: float, lit_us: tuple[float, float] | Non
     assert find(replace(facts, tally=mirrored)) == []
 
 
+@pytest.mark.parametrize("rows", [40, 95])
+@pytest.mark.parametrize("quality", [0.5, 1.0])
+@pytest.mark.parametrize("rests", [True, False])
+def test_a_sensor_that_comes_to_each_row_too_late(rows: int, quality: float, rests: bool) -> None:
+    """A row a microsecond, without rest or for a part of each millisecond, 40 us or 95 from row to row."""
+    t_us = np.repeat(np.arange(100_000), 2)
+    y = 300 + t_us % rows
+    if rests:
+        used = t_us % 1000 < np.random.default_rng(5).integers(500, 1000, 100)[t_us // 1000]
+        t_us, y = t_us[used], y[used]
+    readout = ReadoutTally()
+    for part in np.array_split(np.arange(len(t_us)), 9):
+        readout.add(Events.of(t_us[part], part * 0, y[part], part * 0))
+    assert readout.round_us() == ((0.0, 0.0) if rests else pytest.approx((1, rows), rel=0.03))
+    soft = SoftSymbols(RANDOM[0, 0], np.zeros((16, 6), np.float32), quality)
+    found = find(Facts(LINK, tally_of(RANDOM, soft=soft), {"frames": 60}, 0.0, 1e5, readout=readout))
+    late = [doubt.text for doubt in found if doubt.code == "readout"]
+    assert len(late) == (rows == 95 and quality < 0.8 and not rests)
+    assert all("1 us a row" in text and "chips: changes" in text for text in late)
+
+
 def test_a_readout_at_its_limit() -> None:
     """3000 events in each millisecond, against 3000 on average, and a lamp that blinks evenly."""
     rng = np.random.default_rng(4)
@@ -308,7 +329,7 @@ def test_events_of_each_millisecond(steps: list[int], pieces: int) -> None:
     for piece in np.array_split(t_us, pieces):
         readout.add(Events.of(piece, piece * 0, piece * 0, piece * 0))
     many = np.unique(t_us // 1000, return_counts=True)[1][:-1]
-    share, most = readout.capped()
+    share, most = readout.events.capped()
     assert most == pytest.approx(many.max(initial=0), rel=0.004)
     assert share == pytest.approx(
         (many == many.max()).mean() if len(many) else 0.0, abs=0 if most < 100 else 1
