@@ -49,6 +49,10 @@ and nothing that the pilot showed holds. What moves, shines or blinks beside a b
 most in recordings, steps of light 0.28 and 0.38; a bar that leaves its place has no more events than before.
 In pair codes every symbol has half of the pilot's edges; in others some have none for long."""
 
+_SURE = 0.98
+"""Quality of a frame from which on its symbols hold, whatever the light of all does: where they are wrong, it
+is less. A halo and a jolt look like a step of light now and then."""
+
 _NO_RANGE, _NO_SIGHT = Range(math.nan, math.nan, 0), BarSight()
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
@@ -213,9 +217,10 @@ class FrameReader:
         beside, dim, most = _kernels.still_lit(
             *images, self._pilot_chips, self._least_lit, placement.seen, lit
         )
-        if flooded := (beside > _FLOODED and most > _MORE) or dim < self._least_half:
-            lit[:] = False
         given = calibrate_llr(soft, lit)
+        changed = (beside > _FLOODED and most > _MORE) or dim < self._least_half
+        if flooded := changed and given.quality < _SURE:
+            given = calibrate_llr(soft, np.zeros_like(lit))
         if not due.has_pilot:
             # Another distance of the same pilot, or other points, would say nothing new.
             return Reading(
