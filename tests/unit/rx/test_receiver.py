@@ -134,19 +134,22 @@ def flashes(start_us: int, seed: int = 7) -> Events:
     return Events.of(t.ravel()[order], x[pixel][order], y[pixel][order], np.ones(t.size, int))
 
 
-def test_a_step_of_light_costs_the_frame_that_it_is_in() -> None:
+@pytest.mark.parametrize("drowned", [True, False])
+def test_a_step_of_light_costs_the_frame_that_it_drowns(drowned: bool) -> None:
     """The bar has been where its trail lights up, too, and is not dragged back."""
     bar = IdealBar(random_symbols(LINK, 4), shake_px=16, shake_hz=10)
     first_us = int(bar.start_us) + 100 * (frame_chip(LINK, 1, 4) + LINK.packet.pilot_chips)
-    receiver, packets = received(LINK, merged(ideal_events(LINK, bar), flashes(first_us)))
+    events = ideal_events(LINK, bar)
+    lost = drowned & (events.t_us > first_us + 200) & (events.t_us < first_us + 1400)
+    receiver, packets = received(LINK, merged(events[~lost], flashes(first_us)))
     frames = frames_of(packets)
     assert len(frames) == 40
     for f in frames:
-        flooded = (f.packet, f.frame) == (1, 4)
+        flooded = drowned and (f.packet, f.frame) == (1, 4)
         assert (f.soft.symbols == (-1 if flooded else bar.symbols[f.packet, f.frame])).all()
         x, _ = bar.centre(np.array([f.t_us + 850]))
         assert f.x_px == pytest.approx(x[0] - 0.5, abs=1.0)
-    assert receiver.counts["frames_flooded"] == 1
+    assert receiver.counts["frames_flooded"] == int(drowned)
 
 
 @pytest.mark.parametrize("sooner_us", [30, 45, 60])
