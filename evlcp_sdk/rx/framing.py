@@ -816,9 +816,12 @@ class PacketFraming(Framer):
 
     def _retimed(self, transmitter: Transmitter, due: DueFrame) -> DueFrame:
         """A frame that is due, timed anew where light has changed since the preamble."""
-        grid, region, whole_us = transmitter.grid, transmitter.region, due.end_us - self._step_us
-        inside = [one for one in region.pieces if due.start_us - self._step_us < one[0] <= whole_us]
-        fewest = min((events.t_us.size for _, events in inside), default=transmitter.step_events)
+        grid, region, fewest = transmitter.grid, transmitter.region, transmitter.step_events
+        inside = []
+        for piece in region.pieces:
+            if due.start_us < piece[0] + self._step_us <= due.end_us:
+                inside.append(piece)
+                fewest = min(fewest, piece[1].t_us.size)
         if region.size_px is None or _DIMMED * fewest > transmitter.step_events:
             return due
         lock = retime(due.lock, due.start_us, inside)

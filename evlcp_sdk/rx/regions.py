@@ -75,6 +75,8 @@ _LEAST_SWEPT, _SWEPT_STEPS = 300, 4
 """Events beside all regions from which on it is looked for a bar that sweeps; and steps whose events it has
 when it is found: it was seen in two of them, and was in the same motion before."""
 
+_STILL = 0.0, 0.0
+
 _CENTRE_SIGMA_PX = 0.25
 """Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
 
@@ -297,7 +299,7 @@ class Followed:
         cut_us: Until when its events were forgotten for want of room, us; None where none were.
         held_bytes: What its pieces take.
         calm_us: When the pixels beside its bar were seen to be calm, us.
-        speed: How fast it sweeps to the right and down, px/us; None of one whose pixels blink.
+        speed: How fast it sweeps to the right and down, px/us; `_STILL` of one whose pixels blink.
     """
 
     id: int
@@ -316,7 +318,7 @@ class Followed:
     cut_us: int | None = None
     held_bytes: int = 0
     calm_us: int = 0
-    speed: tuple[float, float] | None = None
+    speed: tuple[float, float] = _STILL
 
     def __post_init__(self) -> None:
         self.hold(self.pieces)
@@ -637,10 +639,12 @@ class RegionFollower(RegionTracker):
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
         # Before a frame shows where in its box a bar is, panels and moving textures around it would drown it:
         # only what blinks in rhythm counts.
-        unknown = [one.size_px is None and one.speed is None for one in self.alive]
+        unknown = [one.size_px is None and one.speed == _STILL for one in self.alive]
         selected = self._rhythm.select(events, boxes, unknown) if boxes else []
+        beside = events.t_us.size
         for followed, inside, own in zip(self.alive, selected, self._own(boxes), strict=True):
             followed.add(start_us, inside)
+            beside -= inside.t_us.size
             if (found := self._locate(followed, own, end_us, (start_us + end_us) / 2)) is not None:
                 followed.filter, place, followed.speed = found
                 followed.positions.append(place)
@@ -650,8 +654,7 @@ class RegionFollower(RegionTracker):
         if held > self._limits.region_bytes:
             self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, spec.step_us)
         self._open(end_us, rises, taken)
-        beside = len(events) - sum(len(followed.pieces[-1][1]) for followed in self.alive)
-        if beside >= _LEAST_SWEPT and all(one.speed or one.size_px is None for one in self.alive):
+        if beside >= _LEAST_SWEPT and all(one.speed != _STILL or one.size_px is None for one in self.alive):
             self._open_swept(start_us, events, taken)
         seen = list(self.alive)
         gone = False
@@ -664,11 +667,12 @@ class RegionFollower(RegionTracker):
 
     def _boxes(self, t_us: float, taken: Sequence[Region]) -> list[Box]:
         """Where each region should be in the middle of a step; one of unknown size beside the others."""
-        boxes, unknown = [], []
+        boxes, unknown, step_us = [], [], self._spec.step_us
         for followed in self.alive:
             last = followed.positions.latest
             x_px, y_px = self._expected(followed, t_us)
-            boxes.append(self._reach_of(followed, x_px, y_px))
+            right_px = last.width_px + abs(followed.speed[0]) * step_us
+            boxes.append(self._reach(x_px, y_px, right_px, last.height_px + abs(followed.speed[1]) * step_us))
             if followed.size_px is None:
                 unknown.append(len(boxes) - 1)
         if unknown:
@@ -739,10 +743,12 @@ class RegionFollower(RegionTracker):
             for piece in self._recent
             if oldest_us <= piece[0] < until_us and piece[0] + step_us > from_us
         ]
+        last, (right, down) = followed.latest, followed.speed
+        width_px, height_px = last.width_px + abs(right) * step_us, last.height_px + abs(down) * step_us
         gathered = {}
         x, y = followed.positions.at(np.array([start + step_us / 2 for start, _ in kept]))
         for (start, events), x_px, y_px in zip(kept, x.tolist(), y.tolist(), strict=True):
-            box = self._reach_of(followed, x_px, y_px)
+            box = self._reach(x_px, y_px, width_px, height_px)
             gathered[start] = self._rhythm.select(events, [box], [False])[0]
         followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
         self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, step_us)
@@ -779,6 +785,8 @@ class RegionFollower(RegionTracker):
         off_px = math.inf
         if known is None:
             followed.heights.clear()
+            # Beside the bar itself there may be a halo.
+            followed.calm_us = 0
             last = followed.latest
             until_us = last.t_us + _LEFT_STEPS * self._spec.step_us
             followed.outgrown = -off[0], -off[1], last.width_px, last.height_px, until_us
@@ -891,7 +899,7 @@ class RegionFollower(RegionTracker):
             if predicted is not None:
                 return float(predicted[0][0]), float(predicted[0][1])
         last, before = followed.positions.latest, followed.positions.before
-        if followed.speed is not None:
+        if followed.speed != _STILL:
             after_us = t_us - last.t_us
             return last.x_px + after_us * followed.speed[0], last.y_px + after_us * followed.speed[1]
         if before is last:
@@ -944,14 +952,18 @@ class RegionFollower(RegionTracker):
 
     def _locate(
         self, followed: Followed, box: Box, now_us: int, middle_us: float
-    ) -> tuple[Any, Region, tuple[float, float] | None] | None:
+    ) -> tuple[Any, Region, tuple[float, float]] | None:
         """State of a region's filter after it was measured in a box, its place and speed; None if unseen."""
-        sweep = self._sweep(followed, box, middle_us)
+        last, before = followed.positions.latest, followed.positions.before
+        right, down, apart_us = last.x_px - before.x_px, last.y_px - before.y_px, last.t_us - before.t_us
+        sweep = None
+        if followed.speed != _STILL or max(abs(right), abs(down)) > FAST_PX_US * apart_us:
+            sweep = self._sweep(followed, box, middle_us)
         if sweep is not None:
             t_us, rows, speed = middle_us - self._chip_us, sweep.rows, sweep.speed
             seen: Place | None = sweep[:4]
         else:
-            t_us, rows, speed = now_us - self._age_us, np.empty(box[3] - box[1], np.int64), None
+            t_us, rows, speed = now_us - self._age_us, np.empty(box[3] - box[1], np.int64), _STILL
             seen = self._measure(followed, box, now_us, rows)
         if seen is None:
             return None
@@ -967,22 +979,12 @@ class RegionFollower(RegionTracker):
     def _sweep(self, followed: Followed, box: Box, middle_us: float) -> Sweep | None:
         """What a region's newest events say of it where it is too fast for its pixels to blink, else None."""
         last, before = followed.positions.latest, followed.positions.before
-        speed, apart_us = followed.speed, last.t_us - before.t_us
+        upright, apart_us = last.height_px > last.width_px, last.t_us - before.t_us
+        along = followed.speed[1 if upright else 0]
         if apart_us > 0:
-            speed = (last.x_px - before.x_px) / apart_us, (last.y_px - before.y_px) / apart_us
-        if speed is None or max(abs(speed[0]), abs(speed[1])) < FAST_PX_US:
-            return None
-        along = speed[1 if last.height_px > last.width_px else 0]
+            along = (last.y_px - before.y_px if upright else last.x_px - before.x_px) / apart_us
         sweep = fit_sweep(followed.pieces[-1][1], middle_us, box, along)
         return sweep if sweep is not None and sweep.is_fast else None
-
-    def _reach_of(self, followed: Followed, x_px: float, y_px: float) -> Box:
-        """The box in which a region's events lie in a step in whose middle it is at a place."""
-        last, swept = followed.latest, followed.speed
-        if swept is None:
-            return self._reach(x_px, y_px, last.width_px, last.height_px)
-        right, down = abs(swept[0]) * self._spec.step_us, abs(swept[1]) * self._spec.step_us
-        return self._reach(x_px, y_px, last.width_px + right, last.height_px + down)
 
     def _reach(self, x_px: float, y_px: float, width_px: float, height_px: float) -> Box:
         """The box in which a region's events lie within the next step; an empty one off the sensor."""
@@ -1015,7 +1017,7 @@ class RegionFollower(RegionTracker):
         total, column, left, right, upper, lower, seam = self._rhythm.measure(
             box, end_us, self._measure_us, width_px / 2 + 1, rows, strips
         )
-        if followed is not None and followed.size_px is not None:
+        if followed is not None:
             if seam <= _CALM:
                 followed.calm_us = end_us
             elif seam > _FLOODED and end_us - followed.calm_us <= _FLOOD_STEPS * self._spec.step_us:
@@ -1095,7 +1097,7 @@ class RegionFollower(RegionTracker):
         """
         step_us, merge_px = self._spec.step_us, self._spec.merge_px
         known = [box_of(place) for place in taken]
-        known += [grown(box_of(one.latest), merge_px) for one in self.alive if one.speed is not None]
+        known += [grown(box_of(one.latest), merge_px) for one in self.alive if one.speed != _STILL]
         before, self._swept = (
             self._swept,
             find_sweeps(events, start_us, step_us, self._chip_us, known, self._sensor_px),
@@ -1120,7 +1122,7 @@ class RegionFollower(RegionTracker):
             self.gather(followed)
             swept = around([box_of(places.before), box_of(places.latest)])
             for other in self.alive:
-                other.released |= other.speed is None and overlap(swept, box_of(other.latest))
+                other.released |= other.speed == _STILL and overlap(swept, box_of(other.latest))
             self.alive.append(followed)
 
     def _place_for_one(self, now_us: int) -> bool:

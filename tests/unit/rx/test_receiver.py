@@ -134,18 +134,23 @@ def flashes(start_us: int, seed: int = 7) -> Events:
     return Events.of(t.ravel()[order], x[pixel][order], y[pixel][order], np.ones(t.size, int))
 
 
-@pytest.mark.parametrize("drowned", [True, False])
-def test_a_step_of_light_costs_the_frame_that_it_drowns(drowned: bool) -> None:
-    """The bar has been where its trail lights up, too, and is not dragged back."""
-    bar = IdealBar(random_symbols(LINK, 4), shake_px=16, shake_hz=10)
-    first_us = int(bar.start_us) + 100 * (frame_chip(LINK, 1, 4) + LINK.packet.pilot_chips)
+@pytest.mark.parametrize(
+    ("drowned", "start_us", "which"),
+    [(True, 5000.0, (1, 4)), (False, 5000.0, (1, 4)), (True, -15_000.0, (0, 8))],
+)
+def test_a_step_of_light_costs_the_frame_that_it_drowns(
+    drowned: bool, start_us: float, which: tuple[int, int]
+) -> None:
+    """The bar has been where its trail lights up, too, and is not dragged back; nor before the first lock."""
+    bar = IdealBar(random_symbols(LINK, 4), shake_px=16, shake_hz=10, start_us=start_us)
+    first_us = int(bar.start_us) + 100 * (frame_chip(LINK, *which) + LINK.packet.pilot_chips)
     events = ideal_events(LINK, bar)
     lost = drowned & (events.t_us > first_us + 200) & (events.t_us < first_us + 1400)
     receiver, packets = received(LINK, merged(events[~lost], flashes(first_us)))
     frames = frames_of(packets)
-    assert len(frames) == 40
+    assert len(frames) == sum(start_us + 100 * frame_chip(LINK, *divmod(n, 10)) >= 0 for n in range(40))
     for f in frames:
-        flooded = drowned and (f.packet, f.frame) == (1, 4)
+        flooded = drowned and (f.packet, f.frame) == which
         assert (f.soft.symbols == (-1 if flooded else bar.symbols[f.packet, f.frame])).all()
         x, _ = bar.centre(np.array([f.t_us + 850]))
         assert f.x_px == pytest.approx(x[0] - 0.5, abs=1.0)
