@@ -141,7 +141,8 @@ class TransmitterTally:
                 if frame.echo_of is None:
                     # A mirror image stands on its head.
                     self._add_size(frame, distance_m)
-                    self._add_bent(frame.range.bent_px)
+                    if frame.range.bent_px is not None:
+                        self._add_bent(frame.range.bent_px)
 
     def _add_size(self, frame: Frame, distance_m: float) -> None:
         """Add how long the bar looks times its distance, which is the same wherever it is."""
@@ -154,13 +155,12 @@ class TransmitterTally:
             self.sized += 1
             self.along_px = (self.along_px[0] + x1 - x0, self.along_px[1] + y1 - y0)
 
-    def _add_bent(self, off_px: NDArray[np.float64] | None) -> None:
+    def _add_bent(self, off_px: NDArray[np.float64]) -> None:
         """Add how far the boundaries of a bent image lie off."""
-        if off_px is not None:
-            seen = np.isfinite(off_px)
-            px = np.where(seen, off_px, 0.0)
-            self.bent += 1
-            self.bent_px = np.stack([seen, px, px**2]) + (self.bent_px if self.bent_px.size else 0.0)
+        seen = np.isfinite(off_px)
+        px = np.where(seen, off_px, 0.0)
+        self.bent += 1
+        self.bent_px = np.stack([seen, px, px**2]) + (self.bent_px if self.bent_px.size else 0.0)
 
     def median_m(self) -> float:
         """Median distance to the centimetre, m; NaN without any."""

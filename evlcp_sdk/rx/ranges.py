@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.straight import ALIKE, WAVE_PX, Image, judge_image
+from evlcp_sdk.rx.straight import ALIKE, STRAIGHT, WAVE_PX, Image, judge_image
 from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import Bend, Range
 
@@ -67,6 +67,8 @@ class Ranges(NamedTuple):
         told: The attitude gave how the bar leans then.
         wave: Sums that say how high the pixels' wave is, of `_kernels.wave_of`, float64 (4,).
         image: How straight the bar's image is.
+        off: How far boundaries lie off, as in `Bend`, beyond the lean that is known, in the newest frame, NaN
+            where unseen, float64 (n,).
     """
 
     past: Floats = np.empty((0, 3))
@@ -74,7 +76,8 @@ class Ranges(NamedTuple):
     bend_s: float = math.nan
     told: bool = False
     wave: Floats = np.zeros(4)
-    image: Image = Image()
+    image: Image = STRAIGHT
+    off: Floats = np.empty(0)
 
 
 class RangeKeeper:
@@ -119,14 +122,14 @@ class RangeKeeper:
         if not (0 < distance_m < math.inf and 0 <= sigma_m < math.inf):
             return state, measured
         t_s, late_s = t_us * 1e-6, measured.late_chips * chip_us * 1e-6
-        bend, bend_s, told, wave, image = state.bend, state.bend_s, state.told, state.wave, Image()
-        height, unsure_m = (0.0, WAVE_PX**2), 0.0
+        bend, bend_s, told, wave, image = state.bend, state.bend_s, state.told, state.wave, STRAIGHT
+        height, unsure_m, off = (0.0, WAVE_PX**2), 0.0, state.off
         if measured.bend is not None:
             faded = math.exp(-max(t_s - bend_s, 0.0) / _TILT_MEMORY_S) if bend.size else 0.0
             new = _weighed(measured.bend, (sight.sine or 0.0) + sight.bow)
             goes_on = bend.shape == new.shape and told == (sight.sine is not None)
             bend, bend_s, told = new + faded * bend if goes_on else new, t_s, sight.sine is not None
-            wave, off, known = wave * faded, np.empty(new.shape[1]), (bend, state.image.off)
+            wave, off, known = wave * faded, np.empty(new.shape[1]), (bend, state.off)
             scatter = _kernels.wave_of(measured.bend.place, new, _LEAST_WEIGHT, wave, known, off)
             sums = wave.tolist()
             height = _height(sums)
@@ -164,7 +167,7 @@ class RangeKeeper:
             standing_m=standing_m * length,
             bent_px=image.bent_px,
         )
-        return Ranges(past, bend, bend_s, told, wave, image), found
+        return Ranges(past, bend, bend_s, told, wave, image, off), found
 
     def _leaning(
         self, sums: Floats, wave: tuple[float, float], newest: Bend | None, sight: BarSight

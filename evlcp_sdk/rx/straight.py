@@ -78,7 +78,6 @@ class Image(NamedTuple):
         sigma: Of that: it stays from frame to frame.
         bent_px: How far boundaries lie off a straight bar, px, float64 (n,), NaN where unseen; None where
             that is no more than those of a straight one do.
-        off: How far they lie off the scale, as in `Bend`, float64 (n,), NaN where unseen.
         whole: The sigma where what bends it bends it as a whole, else 0.
         bent: That of two frames in a row, the less the longer ago.
         t_s: When it was, s.
@@ -87,10 +86,12 @@ class Image(NamedTuple):
     longer: float = 0.0
     sigma: float = 0.0
     bent_px: Floats | None = None
-    off: Floats = np.empty(0)
     whole: float = 0.0
     bent: float = 0.0
     t_s: float = -math.inf
+
+
+STRAIGHT = Image()
 
 
 def judge_image(
@@ -113,38 +114,33 @@ def judge_image(
     """
     px, (squares, of_means, of_waves, moved, frames) = bend.one_px, scatter
     if not px > 0:
-        return Image()
+        return STRAIGHT
     # What two frames differ by has twice the variance, whose median this is.
     noise_px = _ROUGH_PX if math.isnan(moved) else 1.4826 / math.sqrt(2) * moved * px
     found, left_out = None, bend.off * (bend.weight == 0)
-    if squares * px**2 > _most(max(noise_px, _ROUGH_PX), len(off)):
+    # Most frames are well below what is asked of one.
+    if squares * px**2 > max(noise_px, _ROUGH_PX) ** 2 * len(off):
         found = _straight(bend, off, max(noise_px, _ROUGH_PX))
     # Where the image stands still, so does the pixels' wave.
     wave_px = WAVE_PX * px * math.sqrt(of_waves / len(off))
     noise_px = math.hypot(_STANDING_PX, noise_px * math.sqrt(ALIKE / frames), wave_px)
-    if found is None and of_means * px**2 > _most(noise_px, len(off)):
+    if found is None and of_means * px**2 > noise_px**2 * len(off):
         found = _straight(bend, np.where(off == off, sums[1] / np.maximum(sums[0], 1e-300), np.nan), noise_px)
-    bent = before.bent * math.exp((before.t_s - t_s) / _MEMORY_S)
-    if found is None and not left_out.any():
-        return Image(0.0, bent, None, off, 0.0, bent, t_s)
-    bent_px = np.where(left_out != 0, left_out, off) * px
+    bent = before.bent and before.bent * math.exp((before.t_s - t_s) / _MEMORY_S)
+    bent_px = np.where(left_out != 0, left_out, off) * px if found or left_out.any() else None
     if found is None:
-        return Image(0.0, bent, bent_px, off, 0.0, bent, t_s)
+        return Image(0.0, bent, bent_px, 0.0, bent, t_s) if bent or bent_px is not None else STRAIGHT
+    assert bent_px is not None
     bent_px[off == off] = found.rest_px
     sigma = math.sqrt(found.variance) / bend.spacing_px
     whole = sigma if found.together else 0.0
     bent = max(bent, min(whole, before.whole))
-    return Image(found.slope / bend.spacing_px, max(sigma, bent), bent_px, off, whole, bent, t_s)
+    return Image(found.slope / bend.spacing_px, max(sigma, bent), bent_px, whole, bent, t_s)
 
 
 def _straight(bend: Bend, off: Floats, noise_px: float) -> Straight | None:
     seen = off == off
     return straighten(bend.place[seen], off[seen] * bend.one_px, noise_px, _STEEPEST * bend.one_px)
-
-
-def _most(noise_px: float, n: int) -> float:
-    """Sum of squares of what boundaries of a straight bar lie off its scale, px2, at the most."""
-    return noise_px**2 * (n - 2 + _SIGMAS * math.sqrt(2 * max(n - 2, 0)))
 
 
 def straighten(place: Floats, off_px: Floats, noise_px: float, steepest_px: float) -> Straight | None:
@@ -170,7 +166,7 @@ def straighten(place: Floats, off_px: Floats, noise_px: float, steepest_px: floa
     line = np.linalg.lstsq(terms[:, 1:], off_px, rcond=None)[0]
     rest = off_px - terms[:, 1:] @ line
     squares = float(rest @ rest)
-    if squares <= _most(noise_px, n):
+    if squares <= noise_px**2 * (n - 2 + _SIGMAS * math.sqrt(2 * (n - 2))):
         return None
     if err_together(rest):
         return Straight(0.0, _SMOOTH * squares / float(at @ at), rest, together=True)
