@@ -3,9 +3,10 @@
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from evlcp_uart.light import CONTEXTS, OUTLIER, TICKS, Floats, Light, Ticks, guesses, log_sums
-from evlcp_uart.reader import LEAST_CHARACTERS, TAIL, CharacterReader, Stretch
+from evlcp_uart.reader import CLOCK_SHARE, LEAST_CHARACTERS, TAIL, CharacterReader, Stretch
 
 _LEAST_WORTH = 0.5
 """By how much each of half of a stretch's characters is to be likelier than without."""
@@ -44,7 +45,15 @@ _TRIED, _ROUNDS = 4, 5
 """Guesses of the light that are followed, and how often each is learned anew."""
 
 _CLOCKS = (-0.015, 0.015)
-"""Clocks by which those are tried, too: within a character, no bit is off by a quarter of itself then."""
+"""Clocks by which those are tried, too, where there is no line in the spectrum: within a character, no bit is
+off by a quarter of itself then."""
+
+_LINE = 8.5
+"""By how much the line of bits is above the median of the spectrum about it: of two polarities' noise, at a
+hundred frequencies, once in a thousand stretches."""
+
+_FINE = 4
+"""Frequencies that are looked at for one that a stretch distinguishes."""
 
 _SHIFTS, _AS_GOOD = range(-14, 15, 2), 0.01
 """Ticks by which bits are tried to begin elsewhere, as a burst should be within its bit's window: the latest
@@ -68,7 +77,9 @@ def acquire(reader: CharacterReader, mark_on: bool, stretch: Stretch) -> tuple[L
         return (None, True) if other else _find(reader, mark_on, stretch)
     # The rest, of which it has learned nothing, must be of these characters, too.
     rest = Stretch(stretch.counts, part.end, stretch.seen, stretch.end)
-    starts = reader.path(rest, light, False)[0]
+    # By themselves, a few of them might be read from another bit on.
+    starts = reader.path(stretch, light, False)[0]
+    starts = starts[starts >= part.end]
     if len(starts) >= LEAST_CHARACTERS:
         found, other = _best(reader, rest, [(light, starts)], _REST_FRAMED)
         if found is None:
@@ -151,10 +162,11 @@ def _candidates(
         tried.append((_explained(reader, stretch, light, starts), light))
         tried.sort(key=lambda one: -one[0])
 
+    line = _find_clock(stretch.counts)
     for light in guesses(stretch.counts, mark_on != inverted):
-        explain(replace(light, inverted=inverted))
+        explain(replace(light, inverted=inverted, rate=line or 1.0))
     for _, light in tried[:_TRIED]:
-        for off in _CLOCKS:
+        for off in () if line else _CLOCKS:
             explain(replace(light, rate=1 + off))
     learned = []
     for _, light in tried[:_TRIED]:
@@ -168,6 +180,16 @@ def _candidates(
         if worth > 0 and _cross_explained(reader, stretch, light) > 0:
             learned.append((light, starts))
     return learned
+
+
+def _find_clock(counts: NDArray[np.int32]) -> float | None:
+    """Length of a bit by the line in the spectrum of edges, which are whole bits apart; None without one."""
+    size = _FINE * counts.shape[1]
+    power = (np.abs(np.fft.rfft(counts, size)) ** 2).sum(0)
+    first, last = (int(size / (TICKS * (1 + off))) for off in (CLOCK_SHARE, -CLOCK_SHARE))
+    band = power[first : last + 1]
+    top = int(band.argmax())
+    return size / (TICKS * (first + top)) if band[top] > _LINE * np.median(band) else None
 
 
 def _begun(reader: CharacterReader, stretch: Stretch, light: Light, starts: Ticks, evidence: Floats) -> Light:

@@ -474,6 +474,23 @@ def test_fixed_bits_speak_as_all_words_say() -> None:
     np.testing.assert_allclose(CHARACTERS.framed(evidence), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("clock", [-0.025, 0.02])
+def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock: float) -> None:
+    """A few characters follow the part that is learned from, and fit from another bit on, too."""
+    text = b"rag thou wander'st in his shade, When in eternal lines to time thou grow'st: So long as men can "
+    sent = np.frombuffer(text + b"brea", np.uint8).astype(np.int64)
+    data = sent[:, None] >> np.arange(6, -1, -1) & 1
+    levels = np.pad(np.column_stack([data, data.sum(1) % 2]), ((0, 0), (1, 2)), constant_values=1)
+    levels[:, 0] = 0
+    rng = np.random.default_rng(1001)
+    rng.integers(0, 500)
+    bit_us, cut = 320 * (1 + clock), float(rng.uniform(0, 11))
+    light = seen(rng, levels.ravel().tolist(), bit_us, events=(14.0, 11.0), unseen=0.001, cut_bits=cut)
+    found = read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2, first_bit="highest"))
+    assert found[0].bit_us == pytest.approx(bit_us, rel=1e-3)
+    assert wrong_bits([one.value for one in found[-98:]], sent[-98:].tolist(), 7) < 0.01
+
+
 def test_text_that_fits_both_ways_is_read_as_the_link_says() -> None:
     """Eight bits of ASCII without a pause: the last one is ever 0, as a start bit the other way round."""
     sent = np.random.default_rng(5).integers(32, 127, 90)
