@@ -154,15 +154,15 @@ def measure_box(
     within `reach` of it. An edge row that holds fewer pixels than a full one counts by its share.
 
     Returns:
-        (pixels, mean column, first column, last column, upper edge, lower edge, share of the seam's pixels
-        that rose lately, in rhythm or not, on its calmer side).
+        (pixels, mean column, first column, last column, upper edge, lower edge, share of the pixels
+        in every second row of the seam that rose lately, in rhythm or not, on its calmer side).
     """
     now, span, min_score = awake
     left, top, right, bottom = box
     calm = 1.0
     for first in (left, right - seam):
         many, cells = 0, 0
-        for v in range(top, bottom):
+        for v in range(top, bottom, 2):
             for u in range(max(first, left), min(first + seam, right)):
                 many += _blinks(pixels[v, u], now, span, 0)
                 cells += 1
@@ -1365,25 +1365,28 @@ def still_lit(
     chips, height, width = sums.shape
     clusters, rows, columns = weight.shape
     flat = np.ascontiguousarray(sums).reshape(chips, height * width)
-    events, totals = np.zeros((2, height * width), np.int16), np.zeros(3)
+    # Of the pilot, and of the first and the second half of the info.
     half = (chips - pilot_chips) // 2
+    events, many = np.zeros((3, height * width), np.int16), np.zeros(3)
     for c in range(chips):
-        line, some, many = flat[c], events[int(c >= pilot_chips)], np.int32(0)
+        part = int(c >= pilot_chips) + int(c >= pilot_chips + half)
+        line, some = flat[c], events[part]
         for j in range(line.size):
-            one = np.int16(line[j] != 0)
-            some[j] = np.int16(some[j] + one)
-            many = np.int32(many + one)
-        of = int(c >= pilot_chips) + int(c >= pilot_chips + half)
-        totals[of] += many / (pilot_chips if of == 0 else half if of == 1 else chips - pilot_chips - half)
+            some[j] = np.int16(some[j] + np.int16(line[j] != 0))
+    for part in range(3):
+        total_of, some = np.int32(0), events[part]
+        for j in range(some.size):
+            total_of = np.int32(total_of + some[j])
+        many[part] = total_of
     shares = np.zeros((2, rows, columns))
     by = (1 / pilot_chips, 1 / max(chips - pilot_chips, 1))
     for r in range(rows):
         for v in range(r * grid, (r + 1) * grid):
-            pilot, info = events[0, v * width :], events[1, v * width :]
+            pilot, first, second = events[0, v * width :], events[1, v * width :], events[2, v * width :]
             for c in range(columns):
                 for u in range(c * grid, (c + 1) * grid):
                     shares[0, r, c] += pilot[u] * by[0]
-                    shares[1, r, c] += info[u] * by[1]
+                    shares[1, r, c] += (first[u] + second[u]) * by[1]
     empty, shown, heavy = np.ones((rows, columns), np.bool_), 0.0, 0.0
     for k in range(clusters):
         total = 0.0
@@ -1403,7 +1406,8 @@ def still_lit(
                 more += shares[1, r, c] - shares[0, r, c]
                 cells += 1
     more *= heavy / (cells * shown) if cells and shown > 0 else 0.0
-    one, other = totals[1] / max(totals[0], 1e-9), totals[2] / max(totals[0], 1e-9)
+    chip = max(many[0] * by[0], 1e-9)
+    one, other = many[1] / max(half, 1) / chip, many[2] / max(chips - pilot_chips - half, 1) / chip
     return more, min(one, other), max(one, other)
 
 

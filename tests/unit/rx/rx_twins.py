@@ -55,7 +55,7 @@ def measure_box(lit, rose, box, seam, reach):
     left, top, right, bottom = box
     inside = lit[top:bottom, left:right]
     counts = inside.sum(0)
-    calm = min(rose[top:bottom, left:right][:, side].mean() for side in (slice(seam), slice(-seam, None)))
+    calm = min(rose[top:bottom:2, left:right][:, side].mean() for side in (slice(seam), slice(-seam, None)))
     if not counts.any():
         return (0, 0.0, 0, 0, 0.0, 0.0, calm), np.zeros(bottom - top, int)
     outside = min(counts[:seam].mean(), counts[-seam:].mean()) if len(counts) > 2 * seam else 0
