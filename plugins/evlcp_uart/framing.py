@@ -91,7 +91,7 @@ def read_characters(
     Args:
         t_us: Event times, ascending, us, int64 (n,).
         p: Polarities, 1 for brighter, uint8 (n,).
-        bit_rate_hz: Bits a second on air; the clock may be off by two percent.
+        bit_rate_hz: Bits a second on air; the clock may be off by 2.5 percent.
         uart: Their format; None for eight data bits, no parity, one stop bit.
 
     >>> read_characters(np.array([5, 7]), np.array([1, 0], np.uint8), 3125.0)
