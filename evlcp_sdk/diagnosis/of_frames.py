@@ -182,7 +182,7 @@ def check_hidden(facts: Facts, one: TransmitterTally) -> Found:
         yield Diagnostic(
             "clusters-hidden",
             f"clusters never seen: {', '.join(map(str, hidden))}",
-            "is something before them? if not, compare the link's [bar] and [pilots] with the bar",
+            "is something before them? are LEDs dead? if not, compare the link's [bar] and [pilots] with it",
         )
 
 
