@@ -170,6 +170,13 @@ def test_what_a_recording_is_said_to_lack(given: dict[str, Any], said: list[str]
     assert [one.text for one in find(Facts(LINK, NOTHING, {"events": 50_000}, **given))] == said
 
 
+def test_bars_that_say_the_same_are_doubted_where_it_matters_which_is_which() -> None:
+    counts = {"events": 50_000, "frames_alike": 40}
+    for positions, verdict in ({}, "note"), (NO_POSITIONS | {"fixes": 5}, "doubt"):
+        found = find(Facts(LINK, NOTHING, counts, positions=positions), verdict)
+        assert [one.code for one in found].count("same-symbols") == 1
+
+
 @pytest.mark.parametrize(
     ("tally", "counts", "read", "said"),
     [
