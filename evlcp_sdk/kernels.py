@@ -20,11 +20,14 @@ _ROOM_BYTES = 50_000_000
 _LONG_S = 2.0
 """Time spent on compiling after which that is said."""
 
+_AGAIN_S = 10.0
+"""And how far it is, each time that this has passed."""
+
 
 class Compiling:
     """What compiling kernels, and loading those that are kept, has taken in this process.
 
-    Compiling is said once, to the log, when it has taken long; loading is not.
+    That it is compiled, and how far it is, is said to the log when it takes long; loading is not.
 
     Attributes:
         processor_s: Processor time, s.
@@ -35,7 +38,7 @@ class Compiling:
         self.processor_s = self.elapsed_s = 0.0
         self._compiled_s = 0.0
         self._depth = 0
-        self._is_said = False
+        self._said_at_s = _LONG_S
 
     def watched(self, kernel: Any) -> Callable[[Any], Any]:
         """A kernel's `compile`, its time added; a kernel may need others.
@@ -70,10 +73,10 @@ class Compiling:
                     self.elapsed_s += elapsed_s
                     if sum(kernel.stats.cache_misses.values()) > compiled:
                         self._compiled_s += elapsed_s
-                    if self._compiled_s > _LONG_S and not self._is_said:
-                        self._is_said = True
+                    if self._compiled_s > self._said_at_s:
+                        self._said_at_s = self._compiled_s + _AGAIN_S
                         logging.getLogger(__name__).info(
-                            "compiling kernels, once on a machine; up to a minute in all"
+                            f"compiling kernels, once on a machine: {count_compiled()} of {count_imported()}"
                         )
 
         return watched

@@ -2,7 +2,7 @@
 
     python docs/figures/live.py docs/images/live.png REC.raw --sites site.toml --attitude FILE.csv
 
-The recording is replayed 50 times slower before headless Chromium, which is driven as by the tests.
+The recording is replayed six times slower before headless Chromium, which is driven as by the tests.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from evlcp_sdk.run import live
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import load_sites
 
-SLOWER = 50
+SLOWER = 6
 HIGH = 1080
 
 
@@ -31,7 +31,7 @@ def main() -> None:
     parser.add_argument("recording", type=Path)
     parser.add_argument("--sites", type=Path, required=True)
     parser.add_argument("--attitude", type=Path, required=True)
-    parser.add_argument("--at-s", type=float, default=0.3, help="of the recording's time")
+    parser.add_argument("--at-s", type=float, default=0.9, help="of the recording's time")
     given = parser.parse_args()
     sys.path.insert(0, str(Path(__file__).parents[2]))
     from tests.unit.study.browser import Browser

@@ -48,8 +48,8 @@ def charts_of(summary: Summary) -> list[Plot]:
             "gross",
             y_name="share of distances",
             title="Distance errors of 0.5 m or more",
-            note=note,
-            from_zero=True,
+            note=limit,
+            log_y=True,
         ),
         "found_share": plot(
             "found", y_name="share of frames sent", title="Frames found", note=note, from_zero=True
@@ -90,17 +90,16 @@ def _part(series: Series, prefix: str) -> str:
 def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: str, dash: Dash) -> None:
     """Draw a figure of each segment with its interval; on a logarithmic axis, none is an upper limit."""
     xs, ys, labels, dots, stems = [], [], [], [], []
-    for begin, recordings in series.segments:
+    for begin, end in _spans(series, kind):
+        recordings = series.between(begin, end)
         figure = measure(recordings, kind)
         if not figure.count:
             continue
         none = plot.log_y and figure.none
-        x, y = begin + SEGMENT_M / 2 + shift, figure.high if none else figure.value
+        x, y = (begin + end) / 2 + shift, figure.high if none else figure.value
         shown = f"below {figure.high:.2g}" if none else f"{figure.value:.4g}"
         what = _counts(Tally.together(recordings), kind)
-        labels.append(
-            f"{series.name}\n{begin} to {begin + SEGMENT_M} m: {shown}\n{_interval(figure)}\n{what}"
-        )
+        labels.append(f"{series.name}\n{begin} to {end} m: {shown}\n{_interval(figure)}\n{what}")
         xs.append(x)
         ys.append(y)
         dots.append(math.nan if none else y)
@@ -112,6 +111,21 @@ def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: 
     plot.label(xs, ys, labels, series.name)
     for stem_x, stem_y in stems:
         plot.line(stem_x, stem_y, colour, series.name, kind="stem")
+
+
+def _spans(series: Series, kind: str) -> list[tuple[int, int]]:
+    """Where each figure begins and ends, m: segments, together where the paper has one figure for them.
+
+    That is where not one error was seen, and a segment alone is too little data to stay below the paper's.
+    """
+    spans = [(begin, begin + SEGMENT_M) for begin, _ in series.segments]
+    for paper in (one for one in PAPER if one.measure == kind):
+        whole = paper.from_m, paper.to_m
+        inside = [span for span in spans if whole[0] <= span[0] and span[1] <= whole[1]]
+        highest = max((measure(series.between(*span), kind).high for span in inside), default=0)
+        if highest > paper.value and measure(series.between(*whole), kind).none:
+            spans = [span for span in spans if span not in inside] + [whole]
+    return sorted(spans)
 
 
 def _counts(tally: Tally, kind: str) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -105,6 +106,20 @@ def test_json_has_every_figure(summary: Summary) -> None:
     first = table["series"][0]["segments"][0]
     assert first["ber"]["value"] == first["bit_errors"] / first["bits"]
     assert {"ours", "verdict", "value"} <= set(table["paper"][0])
+
+
+def test_a_limit_stands_above_the_paper_for_no_want_of_data(summary: Summary) -> None:
+    """3.7 / 400 distances are a limit above the paper's .004, 3.7 / 1200 are none."""
+    link = summary.series[0].link
+    for wrong, shown in ((0, ["30 to 60 m: below 0.0031"]), (1, ["30 to 40 m", "40 to 50 m", "50 to 60 m"])):
+        tallies = [Tally.distance(0.0)] * (400 - wrong) + [Tally.distance(0.6)] * wrong
+        at = Statistics.of([(m, tally) for m in (30, 40, 50) for tally in tallies], tasks=1)
+        series = Series({"scene.speed_kmh": 30}, {"speed_kmh": 30}, link, (at,))
+        charts = charts_of(replace(summary, series=(series,)))
+        (gross,) = (one for one in charts if one.id == "gross")
+        gross.markup()
+        seen = [text.splitlines()[1] for *_, text, _ in gross.labels if text.startswith(series.name)]
+        assert all(text.startswith(want) for text, want in zip(seen, shown, strict=True)), seen
 
 
 def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> None:
