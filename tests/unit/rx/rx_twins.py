@@ -126,13 +126,6 @@ def count_rows(t_us, y, p, start_us, step_us, top, block, shape):
     return counts
 
 
-def fit_rows(counts, chips, chip_steps, lags):
-    """Each block's counts correlated with the chips laid out in steps."""
-    laid = np.repeat(chips, chip_steps)
-    signed = counts * np.array([-1, 1])[:, None, None]
-    return np.array([[np.correlate(block, laid)[:lags] for block in part] for part in signed])
-
-
 def blobs(selected):
     """By SciPy: (mean column + row * 1j, cluster, cells), clusters in order, each blob by its first cell."""
     found = []
@@ -346,23 +339,6 @@ def core_profile(hits, cells, edge):
     return np.clip(profile[: peak + low[0] if len(low) else None], 0, 1)
 
 
-def slope_of_rows(rows, fit, seen, fewest, chance, least):
-    top = fit.max(1)
-    lit = top > np.maximum(np.median(top) / 4, chance * np.sqrt(seen))
-    if lit.sum() < fewest:
-        return np.nan, np.nan
-    rows, fit, top = rows[lit], fit[lit], top[lit]
-    weight = np.maximum(fit - 0.9 * top[:, None], 0)
-    places = (weight @ np.arange(fit.shape[1])) / weight.sum(1)
-    i, j = np.triu_indices(len(rows), 1)
-    far = rows[j] - rows[i] > (rows[-1] - rows[0]) / 3
-    i, j = i[far], j[far]
-    slope = np.median((places[j] - places[i]) / (rows[j] - rows[i]))
-    rest = places - slope * rows
-    spread = max(1.48 * np.median(np.abs(rest - np.median(rest))), least)
-    return slope, spread / np.sqrt(((rows - rows.mean()) ** 2).sum())
-
-
 def spread_between(sums, codes, places, seen, pairs, half, first, last):
     out = np.zeros((2, 2, 3), int)
     v, u = np.indices(sums.shape[1:])
@@ -408,48 +384,3 @@ def light_along(heard, code, every, at, unit, spacing, reach):
     sums *= np.clip(half + 2.5 - away, 0, 1)
     middle = sums[away <= max(0.6 * half, 0.5)].mean()
     return (sums / middle) ** 1.5 if middle > 0 else None
-
-
-def boundary_between(mine, its, start, end):
-    """`_kernels.boundary_between`."""
-    if abs(end - start) < 1:
-        return np.nan
-    sign = int(np.sign(end - start))
-    lines = np.arange(round(start), round(end) + sign, sign)
-    inside = (lines >= 0) & (lines < len(mine))
-    one, other = (np.where(inside, of[lines.clip(0, len(of) - 1)], 0) for of in (mine, its))
-    lit = one + other > 0
-    if 2 * (~lit).sum() > len(lines):
-        return np.nan
-    shares = np.divide(one, one + other, out=np.full(len(lines), 0.5), where=lit)
-    return (round(start) + sign * (shares.sum() - 0.5) - start) / (end - start)
-
-
-def middle_across(heard, edges, x, y, unit, along, across, profile):
-    """`_kernels.middle_across`, over the whole image."""
-    weight = edges / np.where(edges > 0, max((edges > 0).sum(), 1), max((edges < 0).sum(), 1))
-    light = np.tensordot(weight, heard[1 : 1 + len(edges)].astype(np.int64), 1)
-    rows, columns = np.mgrid[: light.shape[0], : light.shape[1]]
-    away = (columns - x + 1j * (rows - y)) * unit.conjugate()
-    near = abs(away.real) <= along
-
-    def window(off):
-        return near * np.clip(across + 0.5 - abs(away.imag - off), 0, 1) * light
-
-    off = 0.0
-    for _ in range(4):
-        held = window(off)
-        if held.sum() <= 0:
-            return 0.0
-        off += np.clip((held * (away.imag - off)).sum() / held.sum(), -1, 1)
-    held = window(off)
-    summed = held.sum(0) if abs(unit.imag) >= abs(unit.real) else held.sum(1)
-    profile[: len(summed)] += summed
-    return off
-
-
-def flank_px(profile):
-    """`_kernels.flank_px`."""
-    top = 0.7 * np.sort(profile.clip(0))[-2:].mean()
-    share = np.minimum(profile / top, 1)
-    return max(3 * (share * (1 - share)).sum(), 0.0)
