@@ -383,6 +383,27 @@ def test_motion_stands_out_of_the_noise_or_is_none(size: float) -> None:
     assert size < 1 or np.abs(out).max() > 0.5
 
 
+def test_the_variance_is_the_mean_of_the_rows_and_of_the_boundaries() -> None:
+    """The sandwich estimator of rows as observations, and the slope of a weighted line of boundaries."""
+    rng = np.random.default_rng(5)
+    (off, weight, wave), scores, root = (
+        rng.random((3, K + 1)),
+        rng.normal(size=(30, 7)),
+        rng.normal(size=(7, 7)),
+    )
+    weight[[0, 4]] = scores[5] = 0
+    variance, many, wider_px = _kernels.assess_fit(np.stack([off, weight, wave]), scores, root @ root.T)
+    place, used = np.arange(K + 1.0), weight > 0
+    by_rows = ((scores @ np.linalg.inv(root @ root.T)[0]) ** 2).sum() * 29 / (29 - 7)
+    spread = (weight * (place - np.average(place, weights=weight)) ** 2).sum()
+    by_boundaries = (weight * off**2).sum() / (many - 2) / spread
+    assert variance == pytest.approx((by_rows + by_boundaries) / 2)
+    assert (many, wider_px) == (
+        15,
+        pytest.approx(np.polyfit(place[used], wave[used], 1, w=weight[used] ** 0.5)[0]),
+    )
+
+
 @pytest.mark.parametrize("spacing", [5.3, -5.3])
 def test_how_dim_negative_values_are(spacing: float) -> None:
     rng = np.random.default_rng(4)
