@@ -14,7 +14,6 @@ from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Block, Kind, Message, joined
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.kinds import CountdownKind, TimeKind
-from evlcp_sdk.air.signing import TrustedKey, TrustedKeys
 from evlcp_sdk.link.resolve import Link
 from firmware_host.emulators.led_record import RECORD, LedRecord
 
@@ -112,19 +111,6 @@ def test_any_link(evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
     assert told["duration_s"] == pytest.approx(len(np.load(chips)) / 1e4)
     # Without a number it is the time, so that a later message has a higher one.
     assert abs(found.sequence - time.time()) < 60
-
-
-def test_a_signed_beacon(evlcp, site: Path, tmp_path: Path) -> None:
-    pytest.importorskip("cryptography", reason="the extra sign is not installed")
-    key, out = tmp_path / "private.pem", tmp_path / "m.json"
-    made = well(evlcp("tx", "keygen", key))
-    well(evlcp("tx", "message", "--beacon", site, "--key", key, "-o", out))
-    found = messages_of(np.array(json.loads(out.read_text())["symbols"]))
-    keys = TrustedKeys([TrustedKey(made.out.strip())])
-    assert keys.check(found[Kind.BEACON], LINK.block_coder().digest, found[Kind.SIGNATURE]) is True
-    again = evlcp("tx", "keygen", key)
-    check_fault(again, 1, f"evlcp: {key}: exists; a key is not overwritten; --show prints it again\n")
-    assert evlcp("tx", "keygen", key, "--show").out == made.out
 
 
 @pytest.mark.parametrize(

@@ -33,11 +33,13 @@ CHARACTERS = Characters(7, "even", 2)
 BIT_504_US = 1e6 / 504
 
 
-def levels_of(values: np.ndarray, data_bits: int, parity: Parity, stop_bits: int) -> list[int]:
-    """Bits on air of characters, by the textbook."""
+def levels_of(
+    values: np.ndarray, data_bits: int, parity: Parity, stop_bits: int, highest_first: bool = False
+) -> list[int]:
+    """Bits on air of characters, by the textbook, or the highest bit first as home-made transmitters send."""
     out = []
     for value in values.tolist():
-        data = [int(c) for c in reversed(f"{value:0{data_bits}b}")]
+        data = [int(c) for c in f"{value:0{data_bits}b}"[:: 1 if highest_first else -1]]
         ones = sum(data) % 2
         check = {"none": [], "even": [ones], "odd": [1 - ones]}[parity]
         out += [0, *data, *check, *[1] * stop_bits]
@@ -396,6 +398,31 @@ def test_a_text_comes_through_the_receiver_in_any_pieces() -> None:
     assert [repr(p) for p in again] == [repr(p) for p in packets]
 
 
+@pytest.mark.parametrize("idle", ["off", "on"])
+def test_a_pause_has_no_characters(idle: str, tmp_path: Path) -> None:
+    """Packets with long pauses between, rendered pixel by pixel: what is dark says nothing."""
+    framing = {"id": "uart", "idle": idle}
+    link = resolve({"bar": BAR, "air": {"frames_per_packet": 100}, "framing": framing})
+    packets = [compose(link, text=text, sequence=1)[0] for text in ("first", "second")]
+    pauses = [np.full((many, 1), idle == "on", np.uint8) for many in (1000, 2000)]
+    light = [part for k in (0, 1) for part in (pauses[k], packet_chips(packets[k], link.codebook))]
+    np.save(tmp_path / "chips.npy", np.concatenate(light))
+    scene = {
+        "duration_s": sum(map(len, light)) / link.air.chip_rate_hz,
+        "link": {table: dict(values) for table, values in link.table.items()},
+        "camera": dict(link.table["camera"]),
+        "lens": {"focus_m": 30.0},
+        "motion": {"distance_m": 30.0, "speed_mps": 0.0, "vib_rate_rad_s": 0.0},
+        "bars": [{"x_m": 0.0, "chips_file": str(tmp_path / "chips.npy")}],
+    }
+    receiver = Receiver(link)
+    with evlcp.simulate(scene, seed=1) as source:
+        found = [packet for events in source.chunks() for packet in receiver.feed(events)] + receiver.close()
+    assert {m.value for packet in found for m in packet.messages} == {"first", "second"}
+    # The chips come round and begin anywhere, so that one packet may be cut in two.
+    assert 198 <= sum(len(packet.frames) for packet in found) <= 200
+
+
 def test_a_bar_of_clusters_is_refused() -> None:
     with pytest.raises(ConfigError, match="framing 'uart': a bar of 16 clusters, expected one"):
         resolve({"framing": {"id": "uart"}})
@@ -419,12 +446,9 @@ SEVEN_EVEN = {"data_bits": 7, "parity": "even", "stop_bits": 2}
 
 
 def test_text_is_given_as_it_is_read(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
-    """The highest bit first, as a home-made transmitter may send; and what is said where it is not told."""
+    """The highest bit first; and what is said where it is not told."""
     text = "Rough winds do shake the darling buds of May, " * 3
-    codes = np.frombuffer(text.encode(), np.uint8).astype(int)
-    levels = np.concatenate(
-        [[0, *(b := [int(c) for c in f"{code:07b}"]), sum(b) % 2, 1, 1] for code in codes.tolist()]
-    ).tolist()
+    levels = levels_of(np.frombuffer(text.encode(), np.uint8), 7, "even", 2, True)
     events = seen(np.random.default_rng(2), levels, 320.0)
     printed, summary = received(evlcp, tmp_path, events, first_bit="highest", **SEVEN_EVEN)
     assert "text of 0: 'Rough winds do shake" in printed
@@ -479,13 +503,11 @@ def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock: floa
     """A few characters follow the part that is learned from, and fit from another bit on, too."""
     text = b"rag thou wander'st in his shade, When in eternal lines to time thou grow'st: So long as men can "
     sent = np.frombuffer(text + b"brea", np.uint8).astype(np.int64)
-    data = sent[:, None] >> np.arange(6, -1, -1) & 1
-    levels = np.pad(np.column_stack([data, data.sum(1) % 2]), ((0, 0), (1, 2)), constant_values=1)
-    levels[:, 0] = 0
+    levels = levels_of(sent, 7, "even", 2, True)
     rng = np.random.default_rng(1001)
     rng.integers(0, 500)
     bit_us, cut = 320 * (1 + clock), float(rng.uniform(0, 11))
-    light = seen(rng, levels.ravel().tolist(), bit_us, events=(14.0, 11.0), unseen=0.001, cut_bits=cut)
+    light = seen(rng, levels, bit_us, events=(14.0, 11.0), unseen=0.001, cut_bits=cut)
     found = read_characters(light.t_us, light.p, 3125.0, Uart(7, "even", 2, first_bit="highest"))
     assert found[0].bit_us == pytest.approx(bit_us, rel=1e-3)
     assert wrong_bits([one.value for one in found[-98:]], sent[-98:].tolist(), 7) < 0.01
@@ -567,10 +589,8 @@ def test_the_beacons_bit_errors_are_those_against_the_text_that_is_repeated(tmp_
     ):
         sent = np.resize(np.roll(text, -first), many)
         sent[[20, 40, 60][:errors]] ^= 4
-        data = sent[:, None] >> np.arange(6, -1, -1) & 1
-        levels = np.pad(np.column_stack([data, data.sum(1) % 2]), ((0, 0), (1, 2)), constant_values=1)
-        levels[:, 0] = 0
-        events = seen(rng, levels.ravel().tolist(), 1e6 / bit_hz, events=(24.0, 20.0), noise_hz=50.0)
+        levels = levels_of(sent, 7, "even", 2, True)
+        events = seen(rng, levels, 1e6 / bit_hz, events=(24.0, 20.0), noise_hz=50.0)
         savemat(tmp_path / f"{name}.mat", {"event": 2.0 * events.p - 1, "event_t": events.t_us * 1e-6})
     script = [sys.executable, str(ROOT / "benchmarks" / "beacons.py"), str(tmp_path)]
     printed = subprocess.run(script, capture_output=True, text=True, check=True).stdout.splitlines()[2:]

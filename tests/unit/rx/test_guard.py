@@ -294,18 +294,3 @@ def test_hooks_that_exit_end_nothing(demo_raw: Path) -> None:
         receiver.feed(EVENTS)
     with pytest.warns(PluginWarning, match="evlcp_open_events.* fails: SystemExit: 0"):
         open_source(demo_raw, registry).close()
-
-
-def test_the_command_line_tells_it_in_one_line(
-    evlcp: Callable[..., Any], demo_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    from evlcp_joint.ranging import JointScaleRanging
-
-    monkeypatch.setattr(JointScaleRanging, "compile", lambda *_: fails)
-    done = evlcp("receive", demo_raw, "-o", tmp_path / "out")
-    assert done.code == 2
-    assert done.err.startswith(
-        "evlcp: ranging algorithm 'joint-scale': KeyError: 'boom' (test_guard.py, line "
-    )
-    assert done.err.count("\n") == 1
-    assert not (tmp_path / "out").exists()
