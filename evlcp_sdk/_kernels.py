@@ -11,7 +11,7 @@ Array = NDArray[Any]
 
 
 @njit
-def take_in(heard: Array, prior: Array, out: Array) -> None:
+def take_in(observed: Array, prior: Array, out: Array) -> None:
     """Probability of each cluster in each cell by Bayes' rule, from its evidence and from the place alone.
 
     All are (K, rows, columns). Without a cluster, the evidence is as likely as each with equal priors, and
@@ -20,7 +20,7 @@ def take_in(heard: Array, prior: Array, out: Array) -> None:
     clusters, rows, columns = prior.shape
     # Flat, cells go side by side.
     cells = rows * columns
-    heard_of = np.ascontiguousarray(heard).reshape(clusters, cells)
+    observed_of = np.ascontiguousarray(observed).reshape(clusters, cells)
     prior_of = np.ascontiguousarray(prior).reshape(clusters, cells)
     out_of = out.reshape(clusters, cells)
     place, share = np.zeros(cells), np.zeros(cells)
@@ -28,19 +28,19 @@ def take_in(heard: Array, prior: Array, out: Array) -> None:
     for k in range(clusters):
         for j in range(cells):
             place[j] += prior_of[k, j]
-            share[j] += heard_of[k, j]
+            share[j] += observed_of[k, j]
     for j in range(cells):
         if place[j] == 0:
             continue
         odds = clusters / max(1 - share[j], 1e-6)
-        unheard = 0.0 if share[j] > 0 else 1.0
+        unobserved = 0.0 if share[j] > 0 else 1.0
         total = max(1 - place[j], 1e-6)
         for k in range(clusters):
             if prior_of[k, j] != 0:
-                total += prior_of[k, j] * (heard_of[k, j] * odds + unheard)
+                total += prior_of[k, j] * (observed_of[k, j] * odds + unobserved)
         for k in range(clusters):
             if prior_of[k, j] != 0:
-                out_of[k, j] = prior_of[k, j] * (heard_of[k, j] * odds + unheard) / total
+                out_of[k, j] = prior_of[k, j] * (observed_of[k, j] * odds + unobserved) / total
 
 
 @njit

@@ -547,8 +547,8 @@ def read_numbers(path: Path | str) -> "NDArray[Any]":
         array = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as fault:
         # NumPy evaluates the header as a piece of Python, which may fail in any way.
-        said = " ".join(str(fault).split())
-        raise InputError(f"{path}: not a .npy file of plain numbers: {said:.200}") from fault
+        reason = " ".join(str(fault).split())
+        raise InputError(f"{path}: not a .npy file of plain numbers: {reason:.200}") from fault
     if not isinstance(array, np.ndarray):
         raise InputError(f"{path}: not a .npy file of plain numbers, but an archive of several")
     if array.dtype.kind not in "biuf":

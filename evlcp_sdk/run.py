@@ -482,8 +482,8 @@ def _run(
             if (live is not None or source.size_bytes is None) and stopped():
                 status = "interrupted"
             writer.write(close())
-    if status == "complete" and (told := _much_dropped(source, receiver)):
-        status, error = "degraded", f"{url}: {told}"
+    if status == "complete" and (reason := _much_dropped(source, receiver)):
+        status, error = "degraded", f"{url}: {reason}"
     end = RunEnd(
         status,
         **_tables_of(source, url, watch, first_us, last_us),
@@ -730,7 +730,7 @@ def _seen_at(
         for packet in packets:
             if packet.link not in placing:
                 continue
-            who.hear(packet)
+            who.add_packet(packet)
             if packet.echo_of is not None:
                 frames.pop(packet.transmitter, None)
                 continue
@@ -802,11 +802,11 @@ def survey(
     axes = LocalAxes(first.latitude_deg, first.longitude_deg, first.height_m)
     views: list[CalibrationView] = []
     sends: dict[int, str] = {}
-    heard: list[BarRegistry] = []
+    registries: list[BarRegistry] = []
     for url in recordings:
         who = BarRegistry((), like.position)
         seen, link_of = _seen_at(url, poses, links, registry, who, name)
-        heard.append(who)
+        registries.append(who)
         ids = who.ids
         for pose, points in seen:
             bars = []
@@ -826,7 +826,7 @@ def survey(
         replace(bar, site=replace(bar.site, link=sends[bar.site.transmitter_id] or None)) for bar in surveyed
     ]
     sites = [bar.site for bar in named]
-    said = {id_: how for who in heard for id_, how in who.contradicted_by(sites).items()}
+    said = {id_: how for who in registries for id_, how in who.contradicted_by(sites).items()}
     return [replace(bar, contradicted=said.get(bar.site.transmitter_id, "")) for bar in named]
 
 
@@ -861,10 +861,10 @@ def survey_on_the_way(
     known = {site.transmitter_id: site for site in plan.sites}
     seen = []
     for url in recordings:
-        found, placed, told = _own_poses(url, plan, links, attitude, registry)
+        found, placed, reason = _own_poses(url, plan, links, attitude, registry)
         poses += found
         known = {site.transmitter_id: site for site in placed} | known
-        seen.append(f"{url}: {told}")
+        seen.append(f"{url}: {reason}")
     if not poses:
         raise ConfigError(
             f"no new bar was in view where the track is known: nothing to survey ({'; '.join(seen)})"

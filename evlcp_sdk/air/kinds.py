@@ -175,8 +175,8 @@ class CountdownKind(MessageKind):
         """Six bytes: both signals, and milliseconds."""
         for key in ("signal", "next_signal"):
             if getattr(value, key) not in SIGNALS:
-                said = getattr(value, key)
-                raise ConfigError(f"countdown: {key} = {said!r}, expected one of {', '.join(SIGNALS)}")
+                given = getattr(value, key)
+                raise ConfigError(f"countdown: {key} = {given!r}, expected one of {', '.join(SIGNALS)}")
         if not 0.0 <= value.left_s <= _LONGEST_COUNTDOWN_S:
             raise ConfigError(f"countdown: {value.left_s!r} s, expected 0 to {_LONGEST_COUNTDOWN_S:.0f}")
         numbers = SIGNALS.index(value.signal), SIGNALS.index(value.next_signal), round(value.left_s * 1e3)

@@ -314,12 +314,12 @@ def _explained(url: str) -> Iterator[None]:
         raise _fault(url, str(fault)) from fault
 
 
-def _fault(url: str, said: str, gone: bool = False) -> InputError:
-    if gone or any(word in said for word in _UNPLUGGED):
+def _fault(url: str, text: str, gone: bool = False) -> InputError:
+    if gone or any(word in text for word in _UNPLUGGED):
         return UnpluggedError(
-            f"{url}: the camera is gone ({said}): see its cable and port; --reconnect goes on when it is back"
+            f"{url}: the camera is gone ({text}): see its cable and port; --reconnect goes on when it is back"
         )
     for words, step in _NEXT_STEPS:
-        if any(word in said for word in words):
+        if any(word in text for word in words):
             return InputError(f"{url}: {step}")
-    return InputError(f"{url}: the driver says: {said}")
+    return InputError(f"{url}: the driver says: {text}")

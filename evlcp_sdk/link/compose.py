@@ -90,8 +90,8 @@ def messages_of(
     number = int(time.time()) if sequence is None else sequence
     found: list[Message] = []
     if beacon is not None:
-        said = beacon_of_site(beacon, user) if isinstance(beacon, BarSite) else beacon
-        found.append(Message(Kind.BEACON, transmitter_id, number, said.pack()))
+        sent = beacon_of_site(beacon, user) if isinstance(beacon, BarSite) else beacon
+        found.append(Message(Kind.BEACON, transmitter_id, number, sent.pack()))
         if key is not None:
             digest = link.block_coder().digest
             found.append(sign(found[0], digest, read_key(Path(key))))

@@ -23,7 +23,7 @@ _BELIEVED = {"none": (), "verified": ("verified",), "any": ("verified", "lapsed"
 
 
 @dataclass
-class _Said:
+class _Sent:
     """What a transmitter's beacons said.
 
     Attributes:
@@ -59,78 +59,78 @@ class BarRegistry:
         self._sites = tuple(sites)
         self._spec = spec
         self._alone = link
-        self._said: dict[int, _Said] = {}
+        self._sent: dict[int, _Sent] = {}
 
     @property
     def stands_at(self) -> dict[int, BarSite]:
         """Where the transmitters stand of which that is known."""
-        found = {number: self.site(number) for number in sorted(self._said)}
+        found = {number: self.site(number) for number in sorted(self._sent)}
         return {number: site for number, site in found.items() if site is not None}
 
     @property
     def ids(self) -> dict[int, int]:
         """Ids of the transmitters that said theirs and were not forged."""
-        said = self._said.items()
-        return {n: s.transmitter_id for n, s in said if s.transmitter_id is not None and s.trust != "forged"}
+        sent = self._sent.items()
+        return {n: s.transmitter_id for n, s in sent if s.transmitter_id is not None and s.trust != "forged"}
 
     @property
     def unseen(self) -> tuple[BarSite, ...]:
         """The sites that no transmitter was received of."""
-        seen = {id(self._listed(number)) for number in self._said}
+        seen = {id(self._listed(number)) for number in self._sent}
         return tuple(site for site in self._sites if id(site) not in seen)
 
     @property
     def contradicted(self) -> dict[int, str]:
         """Transmitters that are left out as their beacons contradict their sites, and how."""
-        found = {number: self.contradiction(number) for number in sorted(self._said)}
+        found = {number: self.contradiction(number) for number in sorted(self._sent)}
         return {number: how for number, how in found.items() if how}
 
     def contradicted_by(self, sites: Sequence[BarSite]) -> dict[int, str]:
         """How beacons contradict other sites than these here, by their ids."""
         others = BarRegistry(sites, self._spec, self._alone)
-        others._said = self._said
+        others._sent = self._sent
         return {self.ids[number]: how for number, how in others.contradicted.items() if number in self.ids}
 
-    def hear(self, packet: Packet) -> None:
+    def add_packet(self, packet: Packet) -> None:
         """Take what a packet's beacons say of its transmitter; a reflection is left out."""
         if packet.echo_of is not None:
-            self._said.pop(packet.transmitter, None)
+            self._sent.pop(packet.transmitter, None)
             return
-        said = self._said[packet.transmitter] = self._said.pop(packet.transmitter, _Said())
-        said.link = packet.link
-        if len(self._said) > _MOST_TRANSMITTERS:
-            del self._said[next(iter(self._said))]
-        for heard in packet.messages:
-            if heard.trust == "forged":
+        sent = self._sent[packet.transmitter] = self._sent.pop(packet.transmitter, _Sent())
+        sent.link = packet.link
+        if len(self._sent) > _MOST_TRANSMITTERS:
+            del self._sent[next(iter(self._sent))]
+        for news in packet.messages:
+            if news.trust == "forged":
                 self.forged += 1
-                said.trust, said.beacon = "forged", None
-            if heard.beacon is None or heard.trust == "forged":
+                sent.trust, sent.beacon = "forged", None
+            if news.beacon is None or news.trust == "forged":
                 continue
-            if said.trust == "verified" and heard.trust != "verified" and heard.message == said.verified:
-                said.trust = "lapsed"
-            if said.trust in ("forged", "verified", "lapsed") and heard.trust != "verified":
+            if sent.trust == "verified" and news.trust != "verified" and news.message == sent.verified:
+                sent.trust = "lapsed"
+            if sent.trust in ("forged", "verified", "lapsed") and news.trust != "verified":
                 # Once signed, or once forged, only a signature counts.
                 continue
-            said.verified = heard.message if heard.trust == "verified" else None
-            b = heard.beacon
-            said.transmitter_id, said.trust = heard.message.transmitter_id, heard.trust
-            said.beacon = BarSite(
-                heard.message.transmitter_id, b.latitude_deg, b.longitude_deg, b.height_m,
+            sent.verified = news.message if news.trust == "verified" else None
+            b = news.beacon
+            sent.transmitter_id, sent.trust = news.message.transmitter_id, news.trust
+            sent.beacon = BarSite(
+                news.message.transmitter_id, b.latitude_deg, b.longitude_deg, b.height_m,
                 b.heading_deg % 360, b.tilt_deg, b.length_m, position_sigma_m=self._spec.beacon_sigma_m,
             )  # fmt: skip
 
     def verified(self, number: int) -> bool:
         """Whether the newest beacon that counts was signed by a trusted key."""
-        return self._said[number].trust == "verified"
+        return self._sent[number].trust == "verified"
 
     def site(self, number: int) -> BarSite | None:
         """Where a transmitter that was received stands; None if that is not known, or not believed."""
-        said = self._said[number]
-        if said.trust == "forged" or self.contradiction(number):
+        sent = self._sent[number]
+        if sent.trust == "forged" or self.contradiction(number):
             return None
         site = self._listed(number)
-        if site is None and said.trust in _BELIEVED[self._spec.beacons]:
-            site = said.beacon
+        if site is None and sent.trust in _BELIEVED[self._spec.beacons]:
+            site = sent.beacon
         return site
 
     def contradiction(self, number: int) -> str:
@@ -139,7 +139,7 @@ class BarRegistry:
         A lamp that is not where its site is would move the camera by as much, and so would two bars that are
         mixed up. Beyond what the sigmas of both explain, with the chance of a false alarm, they disagree.
         """
-        site, beacon = self._listed(number), self._said[number].beacon
+        site, beacon = self._listed(number), self._sent[number].beacon
         if site is None or beacon is None or self._spec.beacons == "none":
             return ""
         place = (beacon.latitude_deg, beacon.longitude_deg, beacon.height_m)
@@ -154,23 +154,23 @@ class BarRegistry:
 
     def _listed(self, number: int) -> BarSite | None:
         """The site of the list that a transmitter stands at."""
-        said = self._said[number]
-        link = said.link or self._alone
+        sent = self._sent[number]
+        link = sent.link or self._alone
         sites = [site for site in self._sites if not link or site.link in (None, link)]
         # Of several links, one may be the only one of its own.
-        rivals = list(self._said.values())
+        rivals = list(self._sent.values())
         if all(site.link is not None for site in sites):
-            rivals = [other for other in rivals if other.link == said.link]
+            rivals = [other for other in rivals if other.link == sent.link]
         alone = len(rivals) == 1
-        return site_of_transmitter(sites, number, said.transmitter_id, alone=alone)
+        return site_of_transmitter(sites, number, sent.transmitter_id, alone=alone)
 
     def of_another_link(self, number: int) -> str:
         """Name of another link that has a site of a transmitter's id; empty where none has."""
-        said = self._said[number]
-        others = (s.link for s in self._sites if s.transmitter_id == said.transmitter_id and s.link)
-        return next((link for link in others if link != (said.link or self._alone)), "")
+        sent = self._sent[number]
+        others = (s.link for s in self._sites if s.transmitter_id == sent.transmitter_id and s.link)
+        return next((link for link in others if link != (sent.link or self._alone)), "")
 
     def link_of(self, number: int) -> str:
         """Name of the link that a transmitter's packets have; empty if none was received."""
-        said = self._said.get(number)
-        return "" if said is None else said.link
+        sent = self._sent.get(number)
+        return "" if sent is None else sent.link

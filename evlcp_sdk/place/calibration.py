@@ -195,7 +195,7 @@ def calibrate(
 ) -> Calibrated:
     """Fit the camera to all views.
 
-    All parameters are fitted together, within what lenses usually have. One is determined where the views say
+    All parameters are fitted together, within what lenses own have. One is determined where the views say
     more than that, and leave the image's corners uncertain by no more than a limit; the sigmas of these
     contain what is not known of the others. Errors that a bar's points share are those of positions;
     errors of a bar's site are the same in all views.
@@ -238,10 +238,10 @@ def calibrate(
             " a site or pose is not as was said"
         )
     for name in CAMERA_PARAMETERS[1:]:
-        value, said = getattr(found, name), getattr(start, name)
-        if abs(value - said) > _MOST_USUAL * usual[name]:
+        value, own = getattr(found, name), getattr(start, name)
+        if abs(value - own) > _MOST_USUAL * usual[name]:
             raise ConfigError(
-                f"{name} = {value:.4g} would fit the views, {said:.4g} is configured and {usual[name]:.2g} a"
+                f"{name} = {value:.4g} would fit the views, {own:.4g} is configured and {usual[name]:.2g} a"
                 " usual difference: angles of the poses, a place, or the configuration are not as was said"
             )
     kept = replace(start, **{name: getattr(found, name) for name in sure})

@@ -45,7 +45,7 @@ _LARGER = 4.0
 """By how much they are then."""
 
 _LITTLE = 0.01
-"""Share of a position's variance below which a doubt does not count."""
+"""Share of a position's variance below which an uncertain attitude does not count."""
 
 _FLAT = 1e-9
 """Share of what a part says in its best direction below which it says nothing in another."""
@@ -76,7 +76,7 @@ class Pose:
             `camera`, its seven parameters; of `attitude`, biases of pitch, roll and heading, and the offset
             in time; of `bar N`, its length, and its place and turn where these have a sigma; `doubt` whether
             the attitude errs more than its sigmas say.
-        doubt: Why it is not to be believed, in words; empty where all tests pass.
+        warning: Why it is not to be believed, in words; empty where all tests pass.
         tests: Of each part that could be tested: how much smaller the cost is without it.
     """
 
@@ -96,7 +96,7 @@ class Pose:
     standing_slope: Mapping[str, Floats] = field(default_factory=dict)
     hidden_m: Floats = field(default_factory=lambda: np.full(3, math.inf))
     failed: FailedBar | None = None
-    doubt: str = ""
+    warning: str = ""
     tests: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -123,7 +123,7 @@ def assess_fit(fit: Equations) -> Pose | Rejection:
     if bent > _MOST_BEND and not amiss:
         return Rejection("uncertain", f"by {wide:.2f} m along a curve: an ellipse would mislead")
     (horizontal_m, vertical_m, hidden_m), tests, worst = _test_parts(fit, spread)
-    doubt = f"the points miss the sites by {math.sqrt(fit.cost / freedom):.1f} sigmas (rms)" if amiss else ""
+    warning = f"the points miss the sites by {math.sqrt(fit.cost / freedom):.1f} sigmas (rms)"
     moves = _moves_by_errors(fit, spread)
     noise, slow = _rest(fit, spread, moves)
     doubted = _doubted(fit, spread)
@@ -145,7 +145,7 @@ def assess_fit(fit: Equations) -> Pose | Rejection:
         along=axes[:, -1],
         standing_slope=_named(problem, *slopes),
         hidden_m=hidden_m,
-        doubt=worst or doubt,
+        warning=worst or (warning if amiss else ""),
         tests=tests,
     )
 
@@ -226,9 +226,9 @@ def _test_parts(fit: Equations, spread: Floats) -> tuple[Levels, dict[str, float
     limits = {name: chi_square(chance, one.freedom) for name, one in tested if one.freedom}
     tests = {name: one.value for name, one in tested if one.freedom}
     worst = max(tests, key=lambda name: tests[name] / limits[name], default="")
-    doubt = ""
+    warning = ""
     if worst and tests[worst] > limits[worst]:
-        doubt = f"{worst} does not fit the rest: {math.sqrt(tests[worst]):.1f} sigmas"
+        warning = f"{worst} does not fit the rest: {math.sqrt(tests[worst]):.1f} sigmas"
     # Without a fault, and with one whose test just passes. A heading that is off is an attitude that is.
     nothing = np.zeros((3, 3))
     faults = [(name, one) for name, one in tested if name != "heading"]
@@ -240,7 +240,7 @@ def _test_parts(fit: Equations, spread: Floats) -> tuple[Levels, dict[str, float
     flat, high = (math.sqrt(chi_square(spec.risk, freedom)) for freedom in (2, 1))
     level_m = np.sqrt(limit) * _widest(unseen) + flat * _widest(whole)
     height_m = hidden_m[:, 2] + high * np.sqrt(np.maximum(whole[:, 2, 2], 0.0))
-    return (level_m.max(), height_m.max(), hidden_m.max(0)), tests, doubt
+    return (level_m.max(), height_m.max(), hidden_m.max(0)), tests, warning
 
 
 def _tested_parts(fit: Equations, spread: Floats) -> Iterator[tuple[str, _Tested]]:

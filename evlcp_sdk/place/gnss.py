@@ -131,9 +131,9 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
         if kind == "GGA":
             for field, letters in _LETTERS.items():
                 if fields[field] not in letters:
-                    said, expected = f"{fields[field]!r:.40}", " or ".join(filter(None, letters))
+                    shown, expected = f"{fields[field]!r:.40}", " or ".join(filter(None, letters))
                     raise ConfigError(
-                        f"{path}: line {line}: GGA's field {field} = {said}: expected {expected}"
+                        f"{path}: line {line}: GGA's field {field} = {shown}: expected {expected}"
                     )
             value(6, "quality", (0, 9))
         hours, minutes, seconds = (
@@ -281,8 +281,8 @@ def _check_covariance(where: str, spread: Floats) -> None:
             raise ConfigError(f"{where}: {name} = {spread[a, b]:g}: expected less than {most:g}, {both}")
     # Of the correlations, so that units do not count: below it the inverse has no digit that is right.
     if not np.linalg.eigvalsh(spread / sigma / sigma[:, None])[0] > 3 * np.finfo(float).eps:
-        said = ", ".join(f"{name} = {spread[at]:g}" for name, at in _CROSSED.items())
-        raise ConfigError(f"{where}: {said}: expected a covariance, which these are not together")
+        shown = ", ".join(f"{name} = {spread[at]:g}" for name, at in _CROSSED.items())
+        raise ConfigError(f"{where}: {shown}: expected a covariance, which these are not together")
 
 
 def gnss_fix(

@@ -231,9 +231,9 @@ def _scatter(t: Floats, shapes: Floats, sigma: Floats) -> tuple[float, float]:
     along = mean @ axis
     modes, _ = np.linalg.qr(np.stack([np.ones(count), along, along**2], 1))
     modes = modes[:, 1:]
-    said = sigma**2 @ modes**2
+    expected = sigma**2 @ modes**2
     turned = np.stack([rest @ axis, rest @ np.array([-axis[1], axis[0]])])
-    seen = (np.einsum("ank,km->anm", turned, modes) ** 2 / said).sum(1) / (n - 2)
+    seen = (np.einsum("ank,km->anm", turned, modes) ** 2 / expected).sum(1) / (n - 2)
     return math.sqrt(max(float(seen[0].max()), 1.0)), math.sqrt(max(float(seen[1, 0]), float(seen[1].mean())))
 
 

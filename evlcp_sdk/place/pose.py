@@ -83,13 +83,13 @@ def solve_pose(
     if isinstance(found, Rejection):
         if found.kind != "not-determined":
             return found
-    elif not found.doubt:
+    elif not found.warning:
         # Two bars on gravity do not show which is which.
         if problem.angles.known == 2 == len(found.transmitters) and math.isfinite(found.hpl_m + found.vpl_m):
             for _, behind in mixed_up():
                 found = covering(found, behind, spec)
         return found
-    doubt, tests = (found.detail, {}) if isinstance(found, Rejection) else (found.doubt, found.tests)
+    warning, tests = (found.detail, {}) if isinstance(found, Rejection) else (found.warning, found.tests)
     fits, unsure = _fits_without_one(problem, sigma, tests)
     names = [name for name, _ in fits]
     if "heading" in names:
@@ -111,7 +111,7 @@ def solve_pose(
     if isinstance(found, Rejection) and not names:
         return found
     could = f"; it may be {' or '.join(names)}" if names else ""
-    return Rejection("misfit", doubt + could, suspects=tuple(names))
+    return Rejection("misfit", warning + could, suspects=tuple(names))
 
 
 def _fits_without_one(
@@ -216,7 +216,7 @@ def fitting_focal_mm(
         return math.nan
     given = tried(around, _FREE_FOCAL / 5)
     found = given if isinstance(given, Rejection) else _plain(given)
-    return around if isinstance(found, Pose) and not found.doubt else math.nan
+    return around if isinstance(found, Pose) and not found.warning else math.nan
 
 
 def _mixed_up(
@@ -264,7 +264,7 @@ def _explained(problem: Problem) -> Pose | Rejection | None:
         return fits
     found = None if misfits(fits[0]) else _settled(fits)
     if isinstance(found, Pose):
-        return None if found.doubt else found
+        return None if found.warning else found
     return found
 
 

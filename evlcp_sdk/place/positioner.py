@@ -108,7 +108,7 @@ class Positioner:
         for packet in packets:
             if packet.link not in self._kinds:
                 continue
-            self.bars.hear(packet)
+            self.bars.add_packet(packet)
             if packet.echo_of is not None:
                 # What was not known to be a reflection before is no bar at a place, either.
                 self._frames.pop(packet.transmitter, None)
@@ -137,12 +137,12 @@ class Positioner:
         last = max((f.points_t_us for kept in self._frames.values() for f in kept), default=-math.inf)
         return self._until(last / self._packet_us + 0.5) if math.isfinite(last) else []
 
-    def _named(self, number: int, said: int | None) -> str:
+    def _named(self, number: int, declared: int | None) -> str:
         """A transmitter without a site, with what is known of it."""
-        if said is None:
+        if declared is None:
             return f"{number} (no id heard)"
         other = self.bars.of_another_link(number)
-        return f"{number} (id {said}" + (f", whose site is of link '{other}')" if other else ")")
+        return f"{number} (id {declared}" + (f", whose site is of link '{other}')" if other else ")")
 
     def _until(self, limit: float) -> list[Fix]:
         """The fixes of the grid times up to a limit, in packet times."""

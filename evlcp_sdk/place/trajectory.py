@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.place.error_model import ErrorModel, chi_square, symmetric_root
-from evlcp_sdk.scene.attitude import Swing
+from evlcp_sdk.scene.attitude import ImuMotion
 from evlcp_sdk.values import Fix
 
 Floats = NDArray[np.float64]
@@ -44,16 +44,16 @@ class Reckoned:
     turn_rad: float
 
 
-def imu_sigmas(swing: Swing, spec: ErrorModel) -> Floats:
+def imu_sigmas(motion: ImuMotion, spec: ErrorModel) -> Floats:
     """Sigmas of an IMU's biases: the gyroscope's, radians/s, the accelerometer's, m/s2: none, 1 or 4."""
-    sigmas = [np.radians(spec.rate_sigma_deg_s)] if swing.gyro else []
-    if swing.push_m_s2 is not None:
+    sigmas = [np.radians(spec.rate_sigma_deg_s)] if motion.gyro else []
+    if motion.push_m_s2 is not None:
         sigmas += 3 * [spec.push_sigma_m_s2]
     return np.array(sigmas)
 
 
 def reckon(
-    swing: Swing,
+    motion: ImuMotion,
     velocity_m_s: Floats,
     heading_rad: float,
     heading_sigma_rad: float,
@@ -68,23 +68,23 @@ def reckon(
     what is measured.
 
     Args:
-        swing: How the camera turned, and was pushed.
+        motion: How the camera turned, and was pushed.
         velocity_m_s: At its start, east, north, up, float64 (3,).
         heading_rad: The camera's at its start, clockwise from north; matters for a push only.
         heading_sigma_rad: Of it.
         imu: Estimated biases of the IMU in their sigmas, float64 (0, 1 or 4,).
         spec: Powers of what is not known.
     """
-    sigmas = imu_sigmas(swing, spec)
+    sigmas = imu_sigmas(motion, spec)
     bias = imu * sigmas
-    s, weight = _nodes(swing.t_s)
+    s, weight = _nodes(motion.t_s)
     span = float(s[-1])
-    angle = np.interp(s, swing.t_s, swing.turn_rad)
-    if swing.gyro:
+    angle = np.interp(s, motion.t_s, motion.turn_rad)
+    if motion.gyro:
         angle = angle - bias[0] * s
     turned, way = np.exp(-1j * angle), _integral_of_turn(s, angle)
     pushed = None
-    if swing.push_m_s2 is None:
+    if motion.push_m_s2 is None:
         ahead = complex(velocity_m_s[0], velocity_m_s[1])
         rest = way[-1] - way
         by_angle = -1j * ahead * np.stack([rest, np.full_like(rest, turned[-1])])
@@ -93,8 +93,8 @@ def reckon(
         move_to = complex(way[-1]), complex(turned[-1])
         added = np.zeros(6)
     else:
-        pushed = swing.push_m_s2 - bias[-3:]
-        level = np.interp(s, swing.t_s, pushed[:, 0]) + 1j * np.interp(s, swing.t_s, pushed[:, 1])
+        pushed = motion.push_m_s2 - bias[-3:]
+        level = np.interp(s, motion.t_s, pushed[:, 0]) + 1j * np.interp(s, motion.t_s, pushed[:, 1])
         facing = np.exp(-1j * heading_rad)
         speed = _running(s, facing * turned * level)
         place = _running(s, speed)
@@ -102,7 +102,7 @@ def reckon(
         kicked = np.stack([span - s, np.ones_like(s)]).astype(np.complex128)
         white = spec.push_white_m2_s3
         move_to = complex(span), complex(1.0)
-        up = np.interp(s, swing.t_s, pushed[:, 2])
+        up = np.interp(s, motion.t_s, pushed[:, 2])
         climb = _running(s, up)
         high = _running(s, climb)
         added = np.array(
@@ -116,7 +116,7 @@ def reckon(
     flat = np.stack([by_angle[0].real, by_angle[0].imag, by_angle[1].real, by_angle[1].imag])
     level_rows = [0, 1, 3, 4]
     by_imu = np.zeros((6, len(sigmas)))
-    if swing.gyro:
+    if motion.gyro:
         drift = np.radians(spec.rate_white_deg_rts) ** 2
         noise[np.ix_(level_rows, level_rows)] += drift * (flat * weight) @ flat.T
         by_imu[level_rows, 0] = -(flat @ weight) * sigmas[0]
@@ -172,7 +172,7 @@ def _matrix(c: complex) -> Floats:
     return np.array([[c.real, -c.imag], [c.imag, c.real]])
 
 
-SwingSource = Callable[[float, float], Swing | None]
+MotionSource = Callable[[float, float], ImuMotion | None]
 """How the camera turned from one time to a later one, us; None where that is not known."""
 
 GNSS, IMU = "gnss", "imu"
@@ -260,7 +260,7 @@ class TrajectoryPoint:
         heading_deg: Of the camera, as a fix or the IMU said last.
         heading_t_us: When that was.
         heading_sigma_deg: Of it.
-        swing: How the camera turned from the point before to this one.
+        motion: How the camera turned from the point before to this one.
         misses: Fixes in a row that were left out, this one included; 0 where it counts.
         starts: A trajectory starts here.
         taken: Fixes that count since then, this one included, as far as that matters.
@@ -276,7 +276,7 @@ class TrajectoryPoint:
     heading_deg: float = math.nan
     heading_t_us: float = -math.inf
     heading_sigma_deg: float = 0.0
-    swing: Swing | None = None
+    motion: ImuMotion | None = None
     misses: int = 0
     starts: bool = False
     taken: int = 1
@@ -309,7 +309,7 @@ def _columns(causes: Iterable[Cause]) -> list[tuple[Cause, slice]]:
 
 
 def trajectory_step(
-    state: TrajectoryPoint | None, fix: Fix, spec: ErrorModel, imu: SwingSource | None = None
+    state: TrajectoryPoint | None, fix: Fix, spec: ErrorModel, imu: MotionSource | None = None
 ) -> TrajectoryPoint:
     """Take a fix: velocity that turns as the camera does, driven by white acceleration (Bar-Shalom, chapter
     6), or that changes as an accelerometer says.
@@ -325,14 +325,14 @@ def trajectory_step(
     """
     if state is None:
         return _first(fix)
-    swing = imu(state.t_us, fix.t_us) if imu is not None and fix.t_us > state.t_us else None
-    if swing is None:
+    motion = imu(state.t_us, fix.t_us) if imu is not None and fix.t_us > state.t_us else None
+    if motion is None:
         # As the camera's headings do, if they are known.
         turn = math.remainder(fix.heading_deg - state.heading_deg, 360.0)
         recent = fix.t_us - state.heading_t_us <= _TURN_US
         turn_rad = math.radians(turn) if recent and math.isfinite(turn) else 0.0
-        swing = Swing.even((fix.t_us - state.t_us) * 1e-6, turn_rad)
-    ahead, seen = _expected(_joined(_ahead(state, fix.t_us, swing, spec), fix), fix)
+        motion = ImuMotion.even((fix.t_us - state.t_us) * 1e-6, turn_rad)
+    ahead, seen = _expected(_joined(_ahead(state, fix.t_us, motion, spec), fix), fix)
     innovation = fix.enu_m - seen @ ahead.mean
     spread = seen @ ahead.covariance @ seen.T + fix.noise_m2
     limit = chi_square(spec.false_alarm, 3) if fix.source == GNSS else spec.gate_sigmas**2
@@ -372,7 +372,7 @@ def _taken(ahead: TrajectoryPoint, fix: Fix, seen: Floats) -> TrajectoryPoint:
 
 
 def filter_fixes(
-    fixes: Iterable[Fix], spec: ErrorModel, imu: SwingSource | None = None
+    fixes: Iterable[Fix], spec: ErrorModel, imu: MotionSource | None = None
 ) -> list[TrajectoryPoint]:
     """Filter the fixes that are given, one point each; refused ones have none."""
     points: list[TrajectoryPoint] = []
@@ -410,8 +410,8 @@ def _again(
         if point.starts:
             again[i] = replace(_first(_moved(point.fix, away)), fix=point.fix)
         elif i:
-            assert point.swing is not None
-            ahead = _joined(_ahead(again[i - 1], point.t_us, point.swing, spec), point.fix)
+            assert point.motion is not None
+            ahead = _joined(_ahead(again[i - 1], point.t_us, point.motion, spec), point.fix)
             seen = _seen(ahead.causes, _moved(point.fix, away))
             taken = _faced(ahead, point.fix) if point.misses else _taken(ahead, point.fix, seen)
             again[i] = replace(taken, misses=point.misses, course=point.course, taken=point.taken)
@@ -424,10 +424,10 @@ def _smoothed(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[Traje
     for i in range(len(points) - 2, -1, -1):
         if points[i + 1].starts:
             continue
-        after, swing = smoothed[i + 1], points[i + 1].swing
-        assert swing is not None
-        here = _biased(points[i], after.t_us, swing, spec)
-        ahead, move, noise, causes, _ = _motion(here, after.t_us, swing, spec)
+        after, motion = smoothed[i + 1], points[i + 1].motion
+        assert motion is not None
+        here = _biased(points[i], after.t_us, motion, spec)
+        ahead, move, noise, causes, _ = _motion(here, after.t_us, motion, spec)
         # Causes that came later are independent of this point: what is common has passed on.
         at = {cause.name: columns for cause, columns in _columns(after.causes)}
         common = [*range(_FIXED), *(i for c in causes for i in range(at[c.name].start, at[c.name].stop))]
@@ -446,14 +446,14 @@ def _smoothed(points: Sequence[TrajectoryPoint], spec: ErrorModel) -> list[Traje
 
 
 def heading_at(
-    point: TrajectoryPoint, t_us: float, imu: SwingSource | None = None
+    point: TrajectoryPoint, t_us: float, imu: MotionSource | None = None
 ) -> tuple[float, float] | None:
     """The camera's heading at a time not before a point, and its sigma, degrees; None if not known."""
     if not math.isfinite(point.heading_deg):
         return None
-    swing = imu(point.heading_t_us, t_us) if imu is not None and t_us > point.heading_t_us else None
-    if swing is not None:
-        return point.heading_deg + math.degrees(float(swing.turn_rad[-1])), point.heading_sigma_deg
+    motion = imu(point.heading_t_us, t_us) if imu is not None and t_us > point.heading_t_us else None
+    if motion is not None:
+        return point.heading_deg + math.degrees(float(motion.turn_rad[-1])), point.heading_sigma_deg
     recent = t_us - point.heading_t_us <= _TURN_US
     return (point.heading_deg, point.heading_sigma_deg) if recent else None
 
@@ -493,10 +493,10 @@ def _expected(ahead: TrajectoryPoint, fix: Fix) -> tuple[TrajectoryPoint, Floats
     last = ahead.course
     if not fix.standing_slope:
         return ahead, _seen(ahead.causes, fix)
-    if last is None or last.transmitters != fix.transmitters or ahead.swing is None:
+    if last is None or last.transmitters != fix.transmitters or ahead.motion is None:
         return replace(ahead, course=_course(fix)), _seen(ahead.causes, fix)
-    dt = float(ahead.swing.t_s[-1])
-    turn = complex(*last.speed_m_s[:2]) * np.exp(-1j * float(ahead.swing.turn_rad[-1]))
+    dt = float(ahead.motion.t_s[-1])
+    turn = complex(*last.speed_m_s[:2]) * np.exp(-1j * float(ahead.motion.turn_rad[-1]))
     speed = np.array([turn.real, turn.imag, last.speed_m_s[2]])
     place = last.place_m + speed * dt
     away, count, fade = fix.enu_m - place, last.count, math.exp(-dt / _COURSE_S)
@@ -543,9 +543,9 @@ def _joined(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
     return _widened(replace(point, causes=tuple(causes)), new)
 
 
-def _biased(point: TrajectoryPoint, t_us: float, swing: Swing, spec: ErrorModel) -> TrajectoryPoint:
-    """A point with the biases of the IMU that its next swing is by, which nothing may have shown before."""
-    biases = len(imu_sigmas(swing, spec))
+def _biased(point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel) -> TrajectoryPoint:
+    """A point with the biases of the IMU that lead to the next one, which nothing may have shown before."""
+    biases = len(imu_sigmas(motion, spec))
     known = not biases or any(cause.name == IMU for cause in point.causes)
     return point if known else _widened(point, [Cause(IMU, biases, t_us)])
 
@@ -559,16 +559,16 @@ def _widened(point: TrajectoryPoint, new: Sequence[Cause]) -> TrajectoryPoint:
     return replace(point, mean=mean, covariance=covariance, causes=(*point.causes, *new))
 
 
-def _ahead(point: TrajectoryPoint, t_us: float, swing: Swing, spec: ErrorModel) -> TrajectoryPoint:
-    point = _biased(point, t_us, swing, spec)
-    mean, move, noise, causes, turn_rad = _motion(point, t_us, swing, spec)
+def _ahead(point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel) -> TrajectoryPoint:
+    point = _biased(point, t_us, motion, spec)
+    mean, move, noise, causes, turn_rad = _motion(point, t_us, motion, spec)
     covariance = move @ point.covariance @ move.T + noise
     ahead = replace(
-        point, t_us=t_us, mean=mean, covariance=covariance, causes=causes, swing=swing, starts=False
+        point, t_us=t_us, mean=mean, covariance=covariance, causes=causes, motion=motion, starts=False
     )
-    if not swing.gyro:
+    if not motion.gyro:
         return ahead
-    drift_deg = spec.rate_white_deg_rts * math.sqrt(float(swing.t_s[-1]))
+    drift_deg = spec.rate_white_deg_rts * math.sqrt(float(motion.t_s[-1]))
     return replace(
         ahead,
         heading_deg=point.heading_deg + math.degrees(turn_rad),
@@ -588,7 +588,7 @@ def _faced(point: TrajectoryPoint, fix: Fix) -> TrajectoryPoint:
 
 
 def _motion(
-    point: TrajectoryPoint, t_us: float, swing: Swing, spec: ErrorModel
+    point: TrajectoryPoint, t_us: float, motion: ImuMotion, spec: ErrorModel
 ) -> tuple[Floats, Floats, Floats, tuple[Cause, ...], float]:
     """A point at a later time, (m,), how it depends on it, (m, n), what is new, (m, m), causes, the turn."""
     dt = (t_us - point.t_us) * 1e-6
@@ -600,12 +600,12 @@ def _motion(
     move = np.eye(len(point.mean))[rows]
     noise = np.zeros((len(rows), len(rows)))
     own = next((at for c, at in _columns(point.causes) if c.name == IMU), slice(0, 0))
-    if swing.push_m_s2 is not None and not math.isfinite(point.heading_deg):
+    if motion.push_m_s2 is not None and not math.isfinite(point.heading_deg):
         # Where a push points to is not known without a heading.
-        swing = replace(swing, push_m_s2=None)
-    imu = point.mean[own][: len(imu_sigmas(swing, spec))]
+        motion = replace(motion, push_m_s2=None)
+    imu = point.mean[own][: len(imu_sigmas(motion, spec))]
     heading_rad, sigma_rad = math.radians(point.heading_deg), math.radians(point.heading_sigma_deg)
-    way = reckon(swing, point.mean[3:_MOTION], heading_rad, sigma_rad, imu, spec)
+    way = reckon(motion, point.mean[3:_MOTION], heading_rad, sigma_rad, imu, spec)
     move[:_MOTION, :_MOTION] = way.move
     noise[:_MOTION, :_MOTION] = way.noise
     fade = math.exp(-dt / spec.slow_s)

@@ -78,8 +78,8 @@ def answer(request: str, watch: dict[str, Any], newest: dict[str, dict[str, Any]
     if verb == "?DEVICE":
         return [device]
     if verb == "?POLL":
-        said = {name: [newest[name.upper()]] if name.upper() in newest else [] for name in ("tpv", "sky")}
-        return [{"class": "POLL", "active": 1, **said}]
+        reports = {name: [newest[name.upper()]] if name.upper() in newest else [] for name in ("tpv", "sky")}
+        return [{"class": "POLL", "active": 1, **reports}]
     if verb != "?WATCH":
         return [{"class": "ERROR", "message": f"Unrecognized request '{request.strip()[:60]}'"}]
     try:

@@ -36,8 +36,8 @@ def packet_line(packet: Packet, link: Link) -> dict[str, Any]:
     unknown, ones = "?" * each, (1 << each) - 1
     bits = [unknown * codebook.clusters] * packet.sent
     for frame in packet.frames:
-        said = symbols[frame.frame] = symbol_list(frame.soft.symbols)
-        bits[frame.frame] = "".join([unknown if s is None else f"{s & ones:0{each}b}" for s in said])
+        decoded = symbols[frame.frame] = symbol_list(frame.soft.symbols)
+        bits[frame.frame] = "".join([unknown if s is None else f"{s & ones:0{each}b}" for s in decoded])
     return {
         "kind": "packet",
         "transmitter": packet.transmitter,

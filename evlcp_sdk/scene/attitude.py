@@ -108,7 +108,7 @@ class Attitude:
 
 
 @dataclass(frozen=True, eq=False)
-class Swing:
+class ImuMotion:
     """Turn and push of a camera at times between two, straight lines between these.
 
     Attributes:
@@ -125,7 +125,7 @@ class Swing:
     push_m_s2: NDArray[np.float64] | None = None
 
     @classmethod
-    def even(cls, dt_s: float, turn_rad: float) -> "Swing":
+    def even(cls, dt_s: float, turn_rad: float) -> "ImuMotion":
         """A turn at one rate."""
         return cls(np.array([0.0, dt_s]), np.array([0.0, turn_rad]))
 
@@ -228,10 +228,10 @@ class AttitudeLog:
             return None
         ends = np.linspace(self.t_us[0], self.t_us[-1], _PIECES + 1)
         took_s = (ends[1] - ends[0]) * 1e-6
-        said = np.diff(np.interp(ends, self.t_us, self.heading_deg)) / took_s
+        logged = np.diff(np.interp(ends, self.t_us, self.heading_deg)) / took_s
         measured = np.degrees(np.diff(np.interp(ends, self.t_us, turned))) / took_s
-        both, own = float(said @ measured), float(said @ said)
-        if np.sqrt(((measured - said) ** 2).mean()) < _DRIFT_DEG_S:
+        both, own = float(logged @ measured), float(logged @ logged)
+        if np.sqrt(((measured - logged) ** 2).mean()) < _DRIFT_DEG_S:
             return None
         return both / own if both**2 > 0.5 * own * float(measured @ measured) else None
 
@@ -274,7 +274,7 @@ class AttitudeLog:
             self._rate_deg_s(t_us),
         )
 
-    def between(self, start_us: float, end_us: float) -> Swing | None:
+    def between(self, start_us: float, end_us: float) -> ImuMotion | None:
         """How the camera turned, and was pushed, from one time to a later one; None where that is not known.
 
         By the rates where there are any, else by the headings.
@@ -292,7 +292,7 @@ class AttitudeLog:
         push = self._push_m_s2
         if push is not None:
             push = np.stack([np.interp(t_us, self.t_us, column) for column in push.T], 1)
-        return Swing((t_us - start_us) * 1e-6, angle - angle[0], self.rates_deg_s is not None, push)
+        return ImuMotion((t_us - start_us) * 1e-6, angle - angle[0], self.rates_deg_s is not None, push)
 
     def _is_lost(self, first: int, last: int) -> bool:
         """Whether lines are lost anywhere from one line to another."""

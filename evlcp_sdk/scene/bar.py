@@ -218,8 +218,8 @@ class BarLayout:
         name = keys.pop("shape", "grid")
         if name not in SHAPES:
             near = nearest(name, list(SHAPES)) if isinstance(name, str) else ""
-            said = f" = {shown(name)}: expected one of {', '.join(SHAPES)}{near}"
-            raise SpecError([(("shape",), said)])
+            problem = f" = {shown(name)}: expected one of {', '.join(SHAPES)}{near}"
+            raise SpecError([(("shape",), problem)])
         return cls(build(SHAPES[name], keys)) if table else cls()
 
     @cached_property
@@ -389,10 +389,10 @@ def read_leds(path: Path | str) -> list[list[float | int]]:
     return [list(row) for row in zip(x.tolist(), y.tolist(), z.tolist(), cluster.tolist(), strict=True)]
 
 
-def _expect_number(leds: int, said: str) -> None:
+def _expect_number(leds: int, problem: str) -> None:
     if not 0 < leds <= _MOST_LEDS:
         least = "" if leds else ", and one at least"
-        raise ConfigError(f"{said}: expected at most {_MOST_LEDS} LEDs{least}")
+        raise ConfigError(f"{problem}: expected at most {_MOST_LEDS} LEDs{least}")
 
 
 def _expect_divisor(name: str, block: int, of: str, n: int) -> None:

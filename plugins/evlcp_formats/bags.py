@@ -250,15 +250,15 @@ def _messages(path: Path, topic: str | None, stack: ExitStack) -> Iterator[Event
 def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
     """The topic to read, of those with their types."""
     fitting = [name for name, kind in topics.items() if kind in TYPES]
-    told = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
+    listed = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none"
     if topic is not None:
         if topic not in fitting:
-            raise InputError(f"{path}: topic {topic!r}, expected one of type EventPacket (topics: {told})")
+            raise InputError(f"{path}: topic {topic!r}, expected one of type EventPacket (topics: {listed})")
         return topic
     if len(fitting) != 1:
         what = "no topic" if not fitting else f"{len(fitting)} topics"
         hint = "" if not fitting else "; choose one by ?topic=NAME"
-        raise InputError(f"{path}: {what} of type event_camera_msgs/EventPacket (topics: {told}){hint}")
+        raise InputError(f"{path}: {what} of type event_camera_msgs/EventPacket (topics: {listed}){hint}")
     return fitting[0]
 
 

@@ -648,7 +648,7 @@ _NO_FIT = (np.nan, 0, 0.0)
 
 @njit
 def fit_bar(
-    said: tuple[Array, Array, Array, Array],
+    decoded: tuple[Array, Array, Array, Array],
     offset_px: Array,
     values: Array,
     profile: Array,
@@ -659,7 +659,7 @@ def fit_bar(
     """Fit again and again, each time with the motion and without the boundaries that the last one showed.
 
     Args:
-        said: Pilots (K, values) and words (symbols, values), their values -1 and 1; the symbol of each
+        decoded: Pilots (K, values) and words (symbols, values), their values -1 and 1; the symbol of each
             cluster, int64 (K,), -1 of those not known, of which the pilot counts alone; which are seen (K,).
         offset_px: Of the centre in each chip, rows, (chips,), two of a value. Images are held still by whole
             pixels, so these jump by one.
@@ -674,7 +674,7 @@ def fit_bar(
         As `assess_fit`, NaN without a fit; and `by_boundary` of `leftovers`, with the shifts of boundaries
         that are left out, too, without information.
     """
-    pilots, words, symbols, seen = said
+    pilots, words, symbols, seen = decoded
     clusters, n = len(pilots), len(values)
     codes, known = np.empty((clusters, n)), np.zeros((clusters + 1, n), np.bool_)
     for k in range(clusters):

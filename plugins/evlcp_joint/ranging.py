@@ -123,11 +123,11 @@ class JointScaleRanging(Ranging):
                 # A bar upside down is mirrored.
                 spacing, first = -spacing, height - 1 - first
                 values, offset_px = plain(values[:, ::-1]), -offset_px
-            said = pilots, words, plain(view.soft.symbols), seen
+            decoded = pilots, words, plain(view.soft.symbols), seen
             centre = first + spacing * (clusters - 1) / 2 - (height - 1) / 2
             fit = np.array([spacing, centre, 0.0, _STARTING_GAIN, 0.0, 0.0, 0.0])
             (variance, seen_boundaries, wider_px), by_boundary = _kernels.fit_bar(
-                said, offset_px, values, profile(_CORE_SHARE), (self.blur_px, dim), least, fit
+                decoded, offset_px, values, profile(_CORE_SHARE), (self.blur_px, dim), least, fit
             )
             spacing_px, centre_px, *_ = fit.tolist()
             # From the start, which cells gave, an end moves by the size of a cell and a pixel of blur.

@@ -284,7 +284,7 @@ def test_which_beacons_are_believed(
     """After each message: `+` its place is known and verified, `?` known, `-` not."""
     registry = BarRegistry([], ErrorModel(beacons=beacons))
     for message, mark in zip(messages, known, strict=True):
-        registry.hear(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(*message),)))
+        registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(*message),)))
         found = registry.site(0)
         assert (found is None) == (mark == "-")
         if found is not None:
@@ -333,7 +333,7 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
 def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) -> None:
     """A lone bar of the wrong length or place fits the image as well as the right one."""
     registry = BarRegistry([dataclasses.replace(LEFT, **change)], ErrorModel())  # type: ignore[arg-type]
-    registry.hear(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(LEFT, "unverified", 0),)))
+    registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(LEFT, "unverified", 0),)))
     assert (registry.site(0) is None) == (told is not None)
     assert (told or "") in registry.contradiction(0)
     assert bool(told) == bool(registry.contradiction(0))

@@ -8,7 +8,7 @@ from scipy import stats
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.trajectory import IMU, filter_fixes, imu_sigmas, reckon, smooth_trajectory
-from evlcp_sdk.scene.attitude import AttitudeLog, Swing
+from evlcp_sdk.scene.attitude import AttitudeLog, ImuMotion
 from evlcp_sdk.values import Fix
 from tests.unit.place.place_scenes import Floats, by_chance, fix, square
 
@@ -266,15 +266,15 @@ STRONG = ErrorModel(acceleration_m2_s3=0.7, rate_white_deg_rts=2.0, push_white_m
 VELOCITY = np.array([8.0, 5.0, -1.0])
 
 
-def swing(*, gyro: bool = False, push: bool = False) -> Swing:
+def motion(*, gyro: bool = False, push: bool = False) -> ImuMotion:
     t = np.linspace(0, 3, 61)
     turn = 0.6 * t + 0.3 * np.sin(2 * t)
     pushed = np.stack([2 * np.sin(t), np.cos(3 * t), 0.5 * t], 1) if push else None
-    return Swing(t, turn, gyro, pushed)
+    return ImuMotion(t, turn, gyro, pushed)
 
 
 def stepped(
-    way: Swing, velocity: Floats, heading: float, imu: Floats, turned: Floats | float = 0.0
+    way: ImuMotion, velocity: Floats, heading: float, imu: Floats, turned: Floats | float = 0.0
 ) -> Floats:
     """Place and velocity in the end, by many short steps; `turned` is added to the heading at each."""
     steps = 6000
@@ -303,7 +303,7 @@ def stepped(
 
 @pytest.mark.parametrize("push", [False, True])
 def test_the_way_is_that_of_short_steps(push: bool) -> None:
-    way, imu = swing(gyro=True, push=push), np.array([3.0, 1.0, -2.0, 0.5])[: 4 if push else 1]
+    way, imu = motion(gyro=True, push=push), np.array([3.0, 1.0, -2.0, 0.5])[: 4 if push else 1]
     found = reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG)
     exact = stepped(way, VELOCITY, 0.4, imu)
     start = np.append(np.zeros(3), VELOCITY)
@@ -319,7 +319,7 @@ def test_the_way_is_that_of_short_steps(push: bool) -> None:
 
 
 def test_headings_error_pushes_aside() -> None:
-    way = swing(gyro=True, push=True)
+    way = motion(gyro=True, push=True)
     quiet = dataclasses.replace(STRONG, rate_white_deg_rts=0.0)
     without = reckon(way, VELOCITY, 0.4, 0.0, np.zeros(4), quiet).noise
     found = reckon(way, VELOCITY, 0.4, 0.01, np.zeros(4), quiet).noise - without
@@ -330,7 +330,7 @@ def test_headings_error_pushes_aside() -> None:
 @pytest.mark.parametrize("push", [False, True])
 def test_noise_is_that_of_kicks(push: bool) -> None:
     """White acceleration, and a gyroscope's random walk, kick by kick through what follows each."""
-    way = swing(gyro=True, push=push)
+    way = motion(gyro=True, push=push)
     found = reckon(way, VELOCITY, 0.4, 0.0, np.zeros(4 if push else 1), STRONG).noise
     t, kicks = way.t_s, 120
     noise, middles = np.zeros((6, 6)), (np.arange(kicks) + 0.5) * 3 / kicks
