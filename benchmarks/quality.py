@@ -21,11 +21,11 @@ from scipy.stats import binom
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import Scene, Simulation, truth_of
-from evlcp_sdk.study.frames import row_of_frame
+from evlcp_sdk.sim import Scene
+from evlcp_sdk.simulated import simulate
+from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.match import match
 from evlcp_sdk.study.task import plan_of
-from evlcp_sdk.values import Events
 
 CAMPAIGN = Path(__file__).parents[1] / "examples" / "campaigns" / "road.toml"
 DECODINGS = ("motion-feedback", "ml-soft", "wh-transform")
@@ -39,17 +39,17 @@ Judged = dict[str, list[tuple[float, int]]]
 
 def judged(scene: Scene, seed: int) -> Judged:
     """Quality of each frame of a simulated scene, and how many of its symbols are wrong, by decoding."""
-    simulation = Simulation(scene, seed)
-    events, truth = Events.concat(simulation.stream()), truth_of(simulation)
+    with simulate(scene, seed) as source:
+        events, _ = source.read()
     found: Judged = {}
     for decoding in DECODINGS:
         link = load_link(overrides=[f"decoding.id={decoding}"])
         receiver = Receiver(link)
         packets = receiver.feed(events) + receiver.close()
-        frames = [frame for packet in packets for frame in packet.frames]
-        rows = [row_of_frame(frame) for frame in frames]
+        rows = frames_of(packets)
+        frames = (frame for packet in packets for frame in packet.frames)
         quality = {id(row): frame.soft.quality for row, frame in zip(rows, frames, strict=True)}
-        matched, own = match(rows, truth), found.setdefault(decoding, [])
+        matched, own = match(rows, source.truth), found.setdefault(decoding, [])
         for sent, pairs in zip(matched.bars, matched.pairs, strict=True):
             for row, number in pairs:
                 said = np.array(row.symbols)

@@ -13,11 +13,10 @@ from pathlib import Path
 
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.sim import Simulation, resolve_scene, truth_of
-from evlcp_sdk.study.frames import row_of_frame
-from evlcp_sdk.study.match import match
-from evlcp_sdk.study.measure import bar_tallies
-from evlcp_sdk.study.tally import Statistics, Tally
+from evlcp_sdk.simulated import simulate
+from evlcp_sdk.study.frames import frames_of
+from evlcp_sdk.study.measure import statistics_of
+from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Events
 
 LINKS = Path(__file__).parents[2] / "examples" / "links"
@@ -58,24 +57,21 @@ def drive(name: str, seed: int) -> Tally:
     """What is read of a drive towards a bar by a sensor's link."""
     link, sensor = load_link(LINKS / f"{name}.toml"), SENSORS[name]
     camera, air = link.table["camera"], link.table["air"]
-    scene = resolve_scene(
-        {
-            "duration_s": 1.5 * link.packet.packet_chips * link.packet.chip_us * 1e-6,
-            "camera": camera,
-            "link": {"air": air},
-            "motion": {"distance_m": distance_m(link), "speed_mps": 8.333},
-            "background": {"light_w_m2": 0.3},
-            "bars": [{"x_m": -0.4}],
-            "sensor": {"charge_us_w_m2": 14.6 * sensor.latency, "cap_mev_s": sensor.cap_mev_s},
-        }
-    )
-    simulation = Simulation(scene, seed)
-    seen, truth = Events.concat(simulation.stream()), truth_of(simulation)
+    scene = {
+        "duration_s": 1.5 * link.packet.packet_chips * link.packet.chip_us * 1e-6,
+        "camera": camera,
+        "link": {"air": air},
+        "motion": {"distance_m": distance_m(link), "speed_mps": 8.333},
+        "background": {"light_w_m2": 0.3},
+        "bars": [{"x_m": -0.4}],
+        "sensor": {"charge_us_w_m2": 14.6 * sensor.latency, "cap_mev_s": sensor.cap_mev_s},
+    }
+    with simulate(scene, seed) as source:
+        seen, _ = source.read()
     seen = Events.of(seen.t_us // sensor.image_us * sensor.image_us, seen.x, seen.y, seen.p)
     receiver = Receiver(link)
     packets = receiver.feed(seen) + receiver.close()
-    found = match([row_of_frame(frame) for packet in packets for frame in packet.frames], truth)
-    return Statistics.of(bar_tallies(found.bars[0], found.pairs[0])).total()
+    return statistics_of(frames_of(packets), source.truth).total()
 
 
 def main() -> None:

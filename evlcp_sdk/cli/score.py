@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -48,35 +47,26 @@ def score(
         print_json(found)
         return
     screen = console()
-    screen.print(f"rows {found['rows']}, matching no true frame {found['unmatched']}")
-    for i, bar in enumerate(found["bars"]):
-        screen.print(
-            f"bar {i}{_sender(bar)}: frames {bar['frames_found']}/{bar['frames_sent']}  BER {bar['ber']}"
-            f"  RMSE {bar['rmse_m']} m over {bar['ranged']}  >=0.5 m: {bar['over_half_metre']}"
-        )
-        _show_segments(bar)
-    road = found["road"]
-    screen.print(
-        f"road: rows {road['rows']}, matching no true frame {road['unmatched']},"
-        f" said to be reflections {road['echoes']}"
-    )
-    for i, bar in enumerate(road["bars"]):
-        screen.print(
-            f"bar {i}{_sender(bar)}: frames {bar['frames_found']}/{bar['frames_sent']}  BER {bar['ber']}"
-            f"  erased {bar['erased']}  claimed {bar['claimed']}"
-            f"  RMSE {bar['rmse_m']} m over {bar['ranged']}  bias {bar['bias_m']}  worst {bar['worst_m']}"
-            f"  NEES {bar['nees']}  >=0.5 m: {bar['over_half_metre']}"
-        )
-        _show_segments(bar)
+    for kind, part in (("", found), ("road: ", found["road"])):
+        echoes = f", said to be reflections {part['echoes']}" if "echoes" in part else ""
+        screen.print(f"{kind}rows {part['rows']}, matching no true frame {part['unmatched']}{echoes}")
+        for i, bar in enumerate(part["bars"]):
+            sender = f" ({bar['link']})" if "link" in bar else ""
+            figures = "  ".join(form.format(**bar) for key, form in _FIGURES.items() if key in bar)
+            screen.print(f"bar {i}{sender}: frames {bar['frames_found']}/{bar['frames_sent']}  {figures}")
+            for name, segment in bar["segments"].items():
+                form = "   {}: RMSE {rmse_m} m, bias {bias_m} m, n {n}"
+                screen.print(form.format(name, **segment))
 
 
-def _sender(bar: Mapping[str, Any]) -> str:
-    """The link of a bar, where the result is of several."""
-    return f" ({bar['link']})" if "link" in bar else ""
-
-
-def _show_segments(bar: Mapping[str, Any]) -> None:
-    for name, segment in bar["segments"].items():
-        console().print(
-            f"   {name}: RMSE {segment['rmse_m']} m, bias {segment['bias_m']} m, n {segment['n']}"
-        )
+_FIGURES = {
+    "ber": "BER {ber}",
+    "erased": "erased {erased}",
+    "claimed": "claimed {claimed}",
+    "rmse_m": "RMSE {rmse_m} m over {ranged}",
+    "bias_m": "bias {bias_m}",
+    "worst_m": "worst {worst_m}",
+    "nees": "NEES {nees}",
+    "over_half_metre": ">=0.5 m: {over_half_metre}",
+}
+"""How figures of a bar are shown, as far as a score has them."""

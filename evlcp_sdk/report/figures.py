@@ -5,8 +5,7 @@ any length take constant memory.
 """
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from textwrap import fill
 from typing import Any
 
@@ -35,7 +34,7 @@ from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150
-_MOST_ZOOMS = 3
+_MOST_SHOWN = 3
 _MOST_PLACES = 4096
 _MOST_POINTS, _MOST_REGIONS = 1024, 64
 """Frames of a transmitter and places of a region, and regions, that are kept."""
@@ -81,7 +80,7 @@ class Figures(Sink):
             self._place(value)
         elif stage == "separation":
             self._presence = value
-        elif stage == "frame" and (value.transmitter in self.frames or len(self.frames) < _MOST_ZOOMS):
+        elif stage == "frame" and (value.transmitter in self.frames or len(self.frames) < _MOST_SHOWN):
             self.frames.setdefault(value.transmitter, Thinned(_MOST_POINTS)).add(value)
             # The newest frame knows most.
             self.echo_of[value.transmitter] = value.echo_of
@@ -122,34 +121,28 @@ class Figures(Sink):
 
 
 def draw_regions(kept: Figures, title: str) -> Figure:
-    """Accumulated events of the whole sensor with the followed regions, and a close view of some of them."""
-    shown = sorted(kept.regions.items(), key=lambda item: -len(item[1]))
-    zooms = sorted(dict(shown[:_MOST_ZOOMS]))
-    figure = Figure(figsize=(8 + 1.8 * len(zooms), 4.8), layout="constrained")
-    axes = figure.subplots(1, 1 + len(zooms), width_ratios=[8] + [1.6] * len(zooms), squeeze=False)[0]
+    """Accumulated events of the whole sensor with the followed regions."""
+    figure = Figure(figsize=(8, 4.8), layout="constrained")
+    axis = figure.subplots()
     height, width = kept.image.shape
     top = max(float(np.quantile(kept.image[kept.image > 0], 0.99)) if kept.image.any() else 1.0, 1.0)
     shades = np.log1p(kept.image, dtype=np.float32)
     # Coloured once, in bytes: Matplotlib would take 80 MB to do so while it draws.
     picture = colormaps["Greys"](np.clip(shades / np.float32(math.log1p(top)), 0, 1), bytes=True)
-    for axis in axes:
-        axis.imshow(picture, interpolation="nearest")
-        axis.set_xlabel("column, px")
-    whole = axes[0]
-    whole.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), ylabel="row, px")
-    many = f"{kept.many_regions} region{'s' * (kept.many_regions != 1)}"
+    axis.imshow(picture, interpolation="nearest")
+    axis.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5), xlabel="column, px", ylabel="row, px")
+    many = counted(kept.many_regions, "region")
     if kept.many_regions > len(kept.regions):
         many += f", {len(kept.regions)} shown"
-    if zooms:
-        many += " (beside: dotted at first, solid at last)"
-    titled(whole, f"{title}: {kept.image.sum():,} events, {many}")
+    titled(axis, f"{title}: {kept.image.sum():,} events, {many}")
     for n, (number, places) in enumerate(sorted(kept.regions.items())):
         colour = transmitter_colour(n)
-        path = list(places)
-        left, upper, right, lower = _bounds(path)
-        outline = partial(Rectangle, fill=False, ec=colour, lw=1.4)
-        whole.add_patch(outline((left - 6, upper - 6), right - left + 12, lower - upper + 12))
-        whole.annotate(
+        boxes = np.array([(one.x_px, one.y_px, one.width_px, one.height_px) for one in places])
+        corners = boxes[:, :2] - boxes[:, 2:] / 2
+        (left, upper), (right, lower) = corners.min(0), (corners + boxes[:, 2:]).max(0)
+        size = right - left + 12, lower - upper + 12
+        axis.add_patch(Rectangle((left - 6, upper - 6), *size, fill=False, ec=colour, lw=1.4))
+        axis.annotate(
             str(number),
             (right + 6, upper - 6),
             xytext=(3, 0),
@@ -159,20 +152,12 @@ def draw_regions(kept: Figures, title: str) -> Figure:
             # What sets it apart from what it is written on.
             path_effects=[withStroke(linewidth=2.5, foreground="white")],
         )
-        if number in zooms:
-            axis = axes[1 + zooms.index(number)]
-            pad = 0.15 * max(lower - upper, 20)
-            middle, half = (left + right) / 2, max(right - left, 0.36 * (lower - upper + 2 * pad)) / 2 + 4
-            axis.set(xlim=(middle - half, middle + half), ylim=(lower + pad, upper - pad))
-            for place, style in ((path[0], ":"), (path[-1], "-")):
-                axis.add_patch(outline(_corner(place), place.width_px, place.height_px, ls=style))
-            titled(axis, f"region {number}")
     return figure
 
 
 def draw_presence(kept: Figures, title: str) -> Figure:
     """Which pixels show which cluster, in one frame of each transmitter, and the profile of each cluster."""
-    shown = [kept.clearest[n] for n in sorted(kept.clearest)[:_MOST_ZOOMS]]
+    shown = [kept.clearest[n] for n in sorted(kept.clearest)[:_MOST_SHOWN]]
     figure = Figure(figsize=(6.4 * len(shown), 7.4), layout="constrained")
     text = fill(_PRESENCE.format(size=shown[0][1].grid_px), 92 * len(shown))
     figure.supxlabel(text, x=0.02, ha="left", fontsize=9, color=INK_COLOUR)
@@ -248,7 +233,7 @@ def draw_distance(kept: Figures, title: str) -> Figure:
             name_transmitter(number, kept.echo_of[number]),
             sorted(kept.frames[number], key=lambda frame: frame.t_us),
         )
-        for number in sorted(kept.frames)[:_MOST_ZOOMS]
+        for number in sorted(kept.frames)[:_MOST_SHOWN]
     }
     plots = [plot for number, one in frames.items() for plot in plot_distances(number, *one, axis)]
     return draw_plots([*plots, plot_quality(frames, axis)], f"{title}: distance along the optical axis")
@@ -261,13 +246,3 @@ def _coloured(
     alpha = np.asarray(strength, np.float64)[..., None]
     mixed: NDArray[np.float64] = colours[np.argmax(clusters, axis=0)] * alpha + (1 - alpha)
     return mixed
-
-
-def _corner(region: Region) -> tuple[float, float]:
-    return region.x_px - region.width_px / 2, region.y_px - region.height_px / 2
-
-
-def _bounds(path: Iterable[Region]) -> tuple[float, float, float, float]:
-    boxes = np.array([(*_corner(one), one.width_px, one.height_px) for one in path])
-    (left, upper), (right, lower) = boxes[:, :2].min(0), (boxes[:, :2] + boxes[:, 2:]).max(0)
-    return float(left), float(upper), float(right), float(lower)

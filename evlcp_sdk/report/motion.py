@@ -94,7 +94,7 @@ class Motion:
 
 
 class MotionProbe:
-    """Keeps the first frame that is read, and the largest one, of some transmitters; listens to the stages.
+    """Keeps the largest frame that is read of some transmitters; listens to the stages.
 
     Args:
         most: Transmitters of which frames are kept: the first ones.
@@ -103,8 +103,7 @@ class MotionProbe:
     def __init__(self, most: int = 3) -> None:
         self._most = most
         self._view: FrameView | None = None
-        self.first: dict[int, Motion] = {}
-        self.largest: dict[int, Motion] = {}
+        self._kept: dict[int, Motion] = {}
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
@@ -118,25 +117,20 @@ class MotionProbe:
                 self._keep(value, view)
 
     def _keep(self, frame: Frame, view: FrameView) -> None:
-        number = frame.transmitter
-        known = self.first.get(number)
-        if known is None and len(self.first) == self._most:
-            return
-        if known is None or known.frame.soft.quality < _CLEAR <= frame.soft.quality:
-            self.first[number] = self.largest[number] = Motion.of(frame, view)
-            return
-        last = self.largest[number]
-        shown = int(view.presence.selected.any(0).sum()) * view.presence.grid_px**2
-        if frame.soft.quality >= min(_CLEAR, last.frame.soft.quality) and shown > _LARGER * _pixels(last):
-            self.largest[number] = Motion.of(frame, view)
+        last, quality = self._kept.get(frame.transmitter), frame.soft.quality
+        if last is None:
+            better = len(self._kept) < self._most
+        else:
+            before = last.frame.soft.quality
+            shown = int(view.presence.selected.any(0).sum()) * view.presence.grid_px**2
+            larger = shown > _LARGER * int(np.count_nonzero(last.clusters >= 0))
+            better = before < _CLEAR <= quality or (quality >= min(_CLEAR, before) and larger)
+        if better:
+            self._kept[frame.transmitter] = Motion.of(frame, view)
 
     def motions(self) -> list[Motion]:
-        """What is kept, by transmitter; the largest frame after the first, if it is another."""
-        return [
-            motion
-            for number, first in sorted(self.first.items())
-            for motion in dict.fromkeys((first, self.largest[number]))
-        ]
+        """What is kept, by transmitter."""
+        return [self._kept[number] for number in sorted(self._kept)]
 
 
 _CLEAR = 0.5
@@ -167,7 +161,3 @@ def sent_chips(frame: Frame, codebook: Codebook) -> NDArray[np.int8]:
     info = codebook.codewords[np.maximum(symbols, 0)].astype(np.int8)
     info[symbols < 0] = -1
     return np.concatenate([codebook.pilots.astype(np.int8), info], axis=1)
-
-
-def _pixels(motion: Motion) -> int:
-    return int((motion.clusters >= 0).sum())

@@ -67,19 +67,6 @@ _SEAM_SIGMAS = 4.0
 """How far around its LEDs an image shows a layout, in blurs; and 2 px beside."""
 
 
-@dataclass(frozen=True)
-class BarBound:
-    """Smallest standard deviations of what one frame shows of a bar; infinite where no pixel shows it.
-
-    Attributes:
-        distance_m: Of its distance.
-        lean_deg: Of its lean, of a bar that hardly leans.
-    """
-
-    distance_m: float
-    lean_deg: float
-
-
 def bar_bound(
     link: Link,
     distance_m: float,
@@ -90,14 +77,14 @@ def bar_bound(
     columns: float = 5.0,
     gain: float = 0.8,
     shift_px: float = 0.0,
-) -> BarBound:
-    """Bounds of one frame of a bar, with spacing, position, drift and gain unknown.
+) -> float:
+    """Smallest standard deviation of a bar's distance by one frame, m; infinite where no pixel shows it.
+
+    Spacing, position, drift and gain are unknown.
 
     A row of pixels at a boundary sees light of both clusters, in shares that follow a normal distribution;
     each pixel's value is that mixture of their codes plus noise. Rows beyond the middles of the outermost
-    clusters, which have no neighbour, do not count. A lean of sine s moves the boundary at place b, in
-    spacings from the bar's middle, by b^2 s times spacing_px * spacing_m / distance_m pixels: a parabola,
-    which the other unknowns do not make. So its bound grows with the distance squared.
+    clusters, which have no neighbour, do not count.
 
     Args:
         link: For the camera, the bar and its codes; the bar is one even column of clusters.
@@ -113,9 +100,8 @@ def bar_bound(
         ConfigError: A quantity that must be positive is not, or the bar is another layout.
 
     >>> from evlcp_sdk.link.resolve import load_link
-    >>> bound = bar_bound(load_link(), 50.0, range(16), blur_px=0.45, noise=0.3)
-    >>> round(bound.distance_m, 4), round(bound.lean_deg, 2)
-    (0.0145, 3.52)
+    >>> round(bar_bound(load_link(), 50.0, range(16), blur_px=0.45, noise=0.3), 4)
+    0.0145
     """
     _check_positive(distance_m=distance_m, blur_px=blur_px, noise=noise)
     spacing_m = link.bar.column_pitch_m
@@ -131,14 +117,9 @@ def bar_bound(
     offset, when = np.zeros(values), _times(values)
     nearest = _nearest(fit, clusters, rows, offset, when)
     _, slopes = _model(fit, codes, nearest, rows, offset, when)
-    bend = (
-        slopes[1] * (np.clip(nearest, 1, clusters - 1) - clusters / 2) ** 2 * spacing * spacing_m / distance_m
-    )
-    seen = _counts(nearest, np.ones(clusters, np.bool_))
-    slopes = np.concatenate([slopes[:4], bend[None]])[:, seen]
-    information = columns / noise**2 * (slopes @ slopes.T)
-    sigma_px, lean = _sigmas(information[:4, :4])[0], _sigmas(information)[4]
-    return BarBound(float(distance_m * sigma_px / spacing), float(np.degrees(lean)))
+    slopes = slopes[:4, _counts(nearest, np.ones(clusters, np.bool_))]
+    sigma_px = _sigmas(columns / noise**2 * (slopes @ slopes.T))[0]
+    return float(distance_m * sigma_px / spacing)
 
 
 def _check_positive(**quantities: float) -> None:
@@ -227,7 +208,7 @@ def _bound_bar_frame(link: Link, full_events: float, view: FrameView) -> Range:
         return _NONE
     fit, noise = found
     distance_m = link.camera.distance_m(link.bar.column_pitch_m, float(fit[0]) * float(np.hypot(1.0, tilt)))
-    bound = bar_bound(
+    sigma_m = bar_bound(
         link,
         distance_m,
         view.soft.symbols,
@@ -237,9 +218,8 @@ def _bound_bar_frame(link: Link, full_events: float, view: FrameView) -> Range:
         gain=float(fit[3]),
         shift_px=float(fit[1]),
     )
-    if not math.isfinite(bound.distance_m):
-        return _NONE
-    return Range(distance_m, bound.distance_m, int((seen[1:] & seen[:-1]).sum()))
+    pairs = int((seen[1:] & seen[:-1]).sum())
+    return Range(distance_m, sigma_m, pairs) if math.isfinite(sigma_m) else _NONE
 
 
 def _row_values(

@@ -124,7 +124,7 @@ _WARM_PACKETS = 2
 
 
 class _Watch:
-    """Notes the processor time of the stages of each frame, us.
+    """Notes the processor time of the stages of each frame, us, and what it shows, until it is taken.
 
     A stage's time is what passed since the stage before finished, on the clock of the thread's processor, or
     on that of the wall where that is less: between two frames, work of other stages lies before the first.
@@ -133,11 +133,12 @@ class _Watch:
     def __init__(self) -> None:
         self.stage_us: dict[str, list[float]] = {stage: [] for stage in STAGES}
         self.frame_us: list[float] = []
+        self.views: list[FrameView] = []
         self._frame: dict[str, float] = {}
         self._finished_s = time.thread_time()
 
     @hookimpl
-    def evlcp_stage_finished(self, stage: str, elapsed_s: float) -> None:
+    def evlcp_stage_finished(self, stage: str, value: Any, elapsed_s: float) -> None:
         spent_s = min(elapsed_s, time.thread_time() - self._finished_s)
         if stage in STAGES:
             self._frame[stage] = spent_s * 1e6
@@ -146,41 +147,18 @@ class _Watch:
                 self.stage_us[name].append(us)
             self.frame_us.append(sum(self._frame.values()))
             self._frame = {}
+        elif stage == "view":
+            self.views.append(value)
         self._finished_s = time.thread_time()
-
-
-class _Bound:
-    """Gives the bound of every frame that a receiver decodes.
-
-    Args:
-        measure: From a frame's view to its bound.
-    """
-
-    def __init__(self, measure: Callable[[FrameView], Range]) -> None:
-        self.sigma_m: list[float] = []
-        self._measure = measure
-        self._views: list[FrameView] = []
-
-    @hookimpl
-    def evlcp_stage_finished(self, stage: str, value: object) -> None:
-        if stage == "view":
-            assert isinstance(value, FrameView)
-            self._views.append(value)
-
-    def settle(self) -> None:
-        """Compute what is due, while no receiver's time runs."""
-        self.sigma_m += [self._measure(view).sigma_m for view in self._views]
-        self._views = []
 
 
 class _Lane:
     """One variant's receiver, its frames and its time."""
 
-    def __init__(self, links: Mapping[str, Link], bound: _Bound | None = None) -> None:
+    def __init__(self, links: Mapping[str, Link]) -> None:
         self.watch = _Watch()
         self.links = links
-        others = [] if bound is None else [bound]
-        self.receiver = Receiver([*links.values()], Registry.load(self.watch, *others).hook)
+        self.receiver = Receiver([*links.values()], Registry.load(self.watch).hook)
         self.frames: list[FrameRow] = []
         self.packets = 0
         self.spent = Stopwatch()
@@ -237,9 +215,18 @@ def compare_recording(
             check_sensor(source, url, link.camera)
         _warm(source, variants)
     bound = _bound_of(variants[0].links)
-    lanes = [_Lane(variant.links, None if n else bound) for n, variant in enumerate(variants)]
+    lanes = [_Lane(variant.links) for variant in variants]
     first_us = last_us = 0
     reading = Stopwatch()
+    bounds_m: list[float] = []
+
+    def settle() -> None:
+        """Compute the bounds that are due, while no receiver's time runs."""
+        if bound is not None:
+            bounds_m.extend(bound(view).sigma_m for view in lanes[0].watch.views)
+        for lane in lanes:
+            lane.watch.views.clear()
+
     with open_source(url, registry) as source:
         for number, events in enumerate(_timed(source.chunks(), reading)):
             first_us = first_us if number else int(events.t_us[0])
@@ -248,20 +235,17 @@ def compare_recording(
             turn = number % len(lanes)
             for lane in lanes[turn:] + lanes[:turn]:
                 lane.feed(events)
-            if bound is not None:
-                bound.settle()
+            settle()
             advance(source.position_bytes, source.size_bytes)
     for lane in lanes:
         lane.feed(None)
-    if bound is not None:
-        bound.settle()
-    bounds_m = () if bound is None else tuple(m for m in bound.sigma_m if math.isfinite(m))
+    settle()
     recorded_s = (last_us - first_us) * 1e-6
     rows = {
         variant.name: lane.measured(url, truth, recorded_s, reading.processor_s)
         for variant, lane in zip(variants, lanes, strict=True)
     }
-    return Table(url, rows, bounds_m)
+    return Table(url, rows, tuple(filter(math.isfinite, bounds_m)))
 
 
 def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events]:
@@ -290,13 +274,13 @@ def _warm(source: EventSource, variants: Sequence[Variant]) -> None:
         lane.feed(None)
 
 
-def _bound_of(links: Mapping[str, Link]) -> _Bound | None:
+def _bound_of(links: Mapping[str, Link]) -> Callable[[FrameView], Range] | None:
     """What gives the bound of each frame; None where the bound's model does not hold, or not for all."""
     if len(links) > 1:
         return None
     (link,) = links.values()
     try:
-        return _Bound(frame_bound(link))
+        return frame_bound(link)
     except ConfigError:
         return None
 

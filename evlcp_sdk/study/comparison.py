@@ -166,14 +166,6 @@ def _gross(m: Measured) -> str:
     return f"{m.tally.gross_share:.1%} ({m.tally.gross})" if m.tally.ranged else "-"
 
 
-def _ends(m: Measured, key: str) -> tuple[float, float]:
-    """The interval over recordings, of what has one; else the figure itself."""
-    if key not in ("found_share", "ber", "rmse_m", "gross_share"):
-        return math.nan, math.nan
-    figure = m.figure(key)
-    return (figure.low, figure.high) if figure.recordings >= FEWEST_RECORDINGS else (math.nan, math.nan)
-
-
 COLUMNS = (
     # Who finds none is not the best of those.
     Column("found_share", "frames", _frames, lambda m: -m.tally.found_share or math.nan),
@@ -203,34 +195,6 @@ COLUMNS = (
     ),
 )
 """The columns, in order; BER's interval decides nothing."""
-
-
-@dataclass(frozen=True)
-class Bar:
-    """A figure as a bar.
-
-    Attributes:
-        name: What it is of.
-        value: Its length, at least 0.
-        text: The figure as it is written.
-        low: Lower end of its interval; NaN where there is none.
-        high: Upper end.
-        best: It is to stand out.
-        dim: It is a reference.
-    """
-
-    name: str
-    value: float
-    text: str
-    low: float = math.nan
-    high: float = math.nan
-    best: bool = False
-    dim: bool = False
-
-    @property
-    def end(self) -> float:
-        """Where it ends, with its interval."""
-        return max(v for v in (self.value, self.high) if math.isfinite(v))
 
 
 @dataclass(frozen=True)
@@ -269,28 +233,6 @@ class Table:
     def columns(self) -> list["Column"]:
         """Those that have a figure of any row."""
         return [c for c in COLUMNS if any(c.cell(measured) != "-" for measured in self.rows.values())]
-
-    def charts(self) -> list[tuple[str, list[Bar]]]:
-        """Of each column in which rows differ: its title, and a bar for each row that has a figure."""
-        found = []
-        best = self.best()
-        for column in self.columns():
-            if column.rank is None:
-                continue
-            ranks = [column.rank(measured) for measured in self.rows.values()]
-            if len({rank for rank in ranks if not math.isnan(rank)}) < 2:
-                continue
-            bars = []
-            for (name, measured), rank, keys in zip(self.rows.items(), ranks, best, strict=True):
-                if not math.isnan(rank):
-                    low, high = _ends(measured, column.key)
-                    text = column.cell(measured)
-                    bars.append(Bar(name, abs(rank), text, low, high, best=column.key in keys))
-            if column.key == "rmse_m" and self.bounds_m:
-                bound_m = rms(self.bounds_m)
-                bars.append(Bar(BOUND_NAME, bound_m, number_text(bound_m, ".4f"), bound_m, bound_m, dim=True))
-            found.append((column.title, bars))
-        return found
 
     def cells(self) -> tuple[list[str], list[list[tuple[str, bool]]]]:
         """Headings, and of each row the cells as (text, is best); columns without any figure are left out.
@@ -413,14 +355,14 @@ class Comparison:
         return f"{names} on {each[0] if len(each) == 1 else f'{len(each)} {self.each}s'}"
 
     def to_html(self) -> str:
-        """One self-contained page: first the table of all, with its figures as bars."""
+        """One self-contained page: first the table of all."""
         tables = []
         for one in sorted(self.tables, key=lambda one: not one.together):
             head, lines = one.cells()
             rows = [
                 [Markup("<b>{}</b>").format(text) if best else text for text, best in row] for row in lines
             ]
-            tables.append((one.name, head, rows, one.charts()))
+            tables.append((one.name, head, rows))
         title = f"Variants compared: {self.title}"
         return render_page("comparison.html", title, comparison=self, tables=tables)
 

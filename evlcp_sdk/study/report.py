@@ -6,7 +6,6 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import Any
 
 from markupsafe import Markup
@@ -40,22 +39,19 @@ def charts_of(summary: Summary) -> list[Plot]:
     note = f"Segments of {SEGMENT_M} m. {INTERVALS}"
     limit = f"{note} An arrow is an upper limit: not one error was seen."
     nearest = f"{note} The distance is that of the nearest bar."
-    plot = partial(Plot, x_name="distance, m")
+
+    def plot(id: str, y_name: str, title: str, note: str = note, **more: Any) -> Plot:
+        return Plot(id, "distance, m", y_name, title, note, **more)
+
     by_kind = {
-        "ber": plot("ber", y_name="bit error rate", title="Bit error rate", note=limit, log_y=True),
-        "rmse_m": plot("rmse", y_name="distance RMSE, m", title="Distance error", note=note, log_y=True),
+        "ber": plot("ber", "bit error rate", "Bit error rate", limit, log_y=True),
+        "rmse_m": plot("rmse", "distance RMSE, m", "Distance error", log_y=True),
         "gross_share": plot(
-            "gross",
-            y_name="share of distances",
-            title="Distance errors of 0.5 m or more",
-            note=limit,
-            log_y=True,
+            "gross", "share of distances", "Distance errors of 0.5 m or more", limit, log_y=True
         ),
-        "found_share": plot(
-            "found", y_name="share of frames sent", title="Frames found", note=note, from_zero=True
-        ),
+        "found_share": plot("found", "share of frames sent", "Frames found", from_zero=True),
         "position_rmse_m": plot(
-            "position", y_name="position RMSE in space, m", title="Position error", note=nearest, log_y=True
+            "position", "position RMSE in space, m", "Position error", nearest, log_y=True
         ),
     }
     histogram = Plot(

@@ -126,6 +126,12 @@ def compile_subject(subject: Subject) -> Any:
     return compile_or_skip(lambda: compile_given(subject, arguments))
 
 
+def pilot_sums(link: Link, missing: float = 0.0, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int16]]:
+    """Polarity sums of the pilot of an ideal frame, int16 (pilot chips, height, width)."""
+    sums = ideal_sums(link.codebook, symbols_of(link.codebook), missing=missing, seed=seed)
+    return sums[: link.packet.pilot_chips]
+
+
 def symbols_of(codebook: Codebook, seed: int = 0) -> np.ndarray[Any, np.dtype[np.int64]]:
     """Random symbols of one frame that carry bits, int64 (K,)."""
     return np.random.default_rng(seed).integers(0, 2**codebook.bits_per_symbol, codebook.clusters)
@@ -196,23 +202,6 @@ def _events(packets: int) -> Callable[[Subject], tuple[Any, ...]]:
     return lambda subject: (recording_of(link_of(subject), packets)[1],)
 
 
-def _detect(detector: Any, events: Events) -> Any:
-    return detector.step(detector.init(), 0, events)[1]
-
-
-def _frame(deframer: Any, events: Events) -> Any:
-    return feed_events(deframer, events, [int(events.t_us[-1]) + 1])
-
-
-def _synchronize(synchronizer: Any, t_us: Any, p: Any) -> Any:
-    return synchronizer.step(synchronizer.init(), t_us, p, int(t_us[-1]) + 1)[1]
-
-
-def _pilot_sums(subject: Subject) -> tuple[Any, ...]:
-    link = link_of(subject)
-    return (ideal_sums(link.codebook, symbols_of(link.codebook), missing=0.1)[: link.packet.pilot_chips],)
-
-
 def _frame_image(subject: Subject) -> tuple[Any, ...]:
     book = link_of(subject).codebook
     # Clusters of which it is not known what follows, that it is dark, that it is lit.
@@ -242,21 +231,20 @@ def _bits_and_llr(subject: Subject) -> tuple[Any, ...]:
     return bits, llr
 
 
-def _nothing(_: Subject) -> tuple[Any, ...]:
-    return ()
-
-
 def _call(function: Any, *inputs: Any) -> Any:
     return function(*inputs)
 
 
 _EXERCISES: dict[str, tuple[Callable[[Subject], tuple[Any, ...]], Callable[..., Any]]] = {
-    "detection": (_events(1), _detect),
-    "framing": (_events(2), _frame),
-    "pilots": (_nothing, lambda pilots: (pilots.preamble(), pilots.codes(4))),
-    "modulation": (_nothing, lambda modulation: modulation.codewords()),
-    "synchronization": (lambda s: (_events(2)(s)[0].t_us, _events(2)(s)[0].p), _synchronize),
-    "separation": (_pilot_sums, _call),
+    "detection": (_events(1), lambda detector, events: detector.step(detector.init(), 0, events)[1]),
+    "framing": (_events(2), lambda made, events: feed_events(made, events, [int(events.t_us[-1]) + 1])),
+    "pilots": (lambda _: (), lambda pilots: (pilots.preamble(), pilots.codes(4))),
+    "modulation": (lambda _: (), lambda modulation: modulation.codewords()),
+    "synchronization": (
+        lambda subject: (_events(2)(subject)[0].t_us, _events(2)(subject)[0].p),
+        lambda made, t_us, p: made.step(made.init(), t_us, p, int(t_us[-1]) + 1)[1],
+    ),
+    "separation": (lambda subject: (pilot_sums(link_of(subject), 0.1),), _call),
     "decoding": (_frame_image, _call),
     "ranging": (_view, _call),
     "tracking": (_measurements, _filter),

@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import Codebook
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Decode
-from evlcp_sdk.testing.exercises import compile_subject, expect_column, link_of, symbols_of
+from evlcp_sdk.testing.exercises import compile_subject, expect_column, link_of, pilot_sums, symbols_of
 from evlcp_sdk.testing.law import InapplicableLawError, Subject, compile_or_skip, expect, law
 from evlcp_sdk.testing.trees import map_arrays
-from evlcp_sdk.testing.views import GRID_PX, ideal_frame, ideal_presence, ideal_sums, ideal_view
+from evlcp_sdk.testing.views import GRID_PX, ideal_frame, ideal_presence, ideal_view
 from evlcp_sdk.values import PresenceMap, Range, SoftSymbols
 
 _SPACINGS_PX = (4, 6, 8, 10, 12, 14)
@@ -39,15 +38,10 @@ def _permuted(book: Codebook) -> tuple[NDArray[np.int64], Codebook]:
     return order, Codebook(book.profile, book.preamble, book.pilots[order], book.codewords)
 
 
-def _pilot_sums(link: Link, missing: float = 0.0, seed: int = 0) -> NDArray[np.int16]:
-    sums = ideal_sums(link.codebook, symbols_of(link.codebook), missing=missing, seed=seed)
-    return sums[: link.packet.pilot_chips]
-
-
 @law("shapes", "a PresenceMap of the documented shapes and types, probabilities in range")
 def _separation_shapes(subject: Subject) -> None:
     link, separate = link_of(subject), compile_subject(subject)
-    sums, k = _pilot_sums(link, missing=0.2), link.codebook.clusters
+    sums, k = pilot_sums(link, missing=0.2), link.codebook.clusters
     for given in (sums, sums[:, :-3, :-1]):
         found = separate(given)
         expect(isinstance(found, PresenceMap), f"a PresenceMap, got {type(found).__name__}")
@@ -68,7 +62,7 @@ def _finds_clusters(subject: Subject) -> None:
     link, separate = link_of(subject), compile_subject(subject)
     shown = ideal_presence(link.codebook.clusters).pixels > 0
     for seed in range(_SEEDS):
-        found = separate(_pilot_sums(link, 0.2 * (seed > 0), seed))
+        found = separate(pilot_sums(link, 0.2 * (seed > 0), seed))
         cells = found.selected.repeat(found.grid_px, 1).repeat(found.grid_px, 2)
         inside = cells & shown[:, : cells.shape[1], : cells.shape[2]]
         share = inside.sum((1, 2)) / shown.sum((1, 2))
@@ -90,7 +84,7 @@ def _separates_nothing(subject: Subject) -> None:
 def _separation_permutes(subject: Subject) -> None:
     link = link_of(subject)
     order, book = _permuted(link.codebook)
-    sums = _pilot_sums(link, missing=0.2)
+    sums = pilot_sums(link, missing=0.2)
     plain = compile_subject(subject)(sums)
     turned = compile_or_skip(lambda: subject.algorithm.compile(book))(sums)
     for name in ("probability", "selected", "pixels"):

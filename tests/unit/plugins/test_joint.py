@@ -520,7 +520,7 @@ def test_the_fit_reaches_the_cramer_rao_bound() -> None:
     for seed in range(80):
         distance_m, symbols = noisy_fit(55.0, noise, seed)
         errors.append(distance_m - 55)
-        bounds.append(bar_bound(LINK, 55.0, symbols, blur_px=0.45, noise=noise).distance_m)
+        bounds.append(bar_bound(LINK, 55.0, symbols, blur_px=0.45, noise=noise))
     ratio = np.sqrt(np.mean(np.square(errors)) / np.mean(np.square(bounds)))
     # The error of 80 draws is known to 8 %: three of these.
     assert 0.76 < ratio < 1.24

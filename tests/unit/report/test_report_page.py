@@ -102,8 +102,9 @@ def test_numbers_are_those_of_the_files(result: Path) -> None:
 
 
 def test_the_slow_motion_is_what_was_sent(result: Path) -> None:
-    (first,) = [m for m in held((result / "report.html").read_text())["motions"] if "frame 0" in m["name"]]
-    row = rows(result / "frames.csv")[0]
+    (first,) = held((result / "report.html").read_text())["motions"]
+    named = "transmitter {transmitter}, packet {packet}, frame {frame}"
+    (row,) = [one for one in rows(result / "frames.csv") if named.format(**one) == first["name"]]
     symbols = [int(s) for s in row["symbols"].split()]
     assert first["symbols"] == symbols
     sent = packet_chips(np.array([symbols]), LINK.codebook)[LINK.packet.preamble_chips :]

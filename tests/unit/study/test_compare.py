@@ -181,39 +181,6 @@ def test_json_csv_and_html_parse_back() -> None:
             assert (Markup("<b>{}</b>").format(text) if best else escape(text)) in page
 
 
-def test_figures_in_which_rows_differ_are_drawn() -> None:
-    one = table(measured(), measured(bit_errors=0))
-    charts = dict(one.charts())
-    assert "frames" not in charts
-    assert "RMSE, m" not in charts
-    assert [(bar.name, bar.value, bar.text, bar.best) for bar in charts["BER"]] == [
-        ("v0", 3 / 8448, "3.6e-04", False),
-        ("v1", 0, "0", True),
-    ]
-    far = table(measured(errors(0.4)), measured(errors(-0.2)), measured(Tally()))
-    (near, half, bound) = dict(far.charts())["RMSE, m"]
-    assert [bar.value for bar in (near, half)] == pytest.approx([0.4, 0.2])
-    assert (bound.name, bound.dim, bound.value) == (BOUND_NAME, True, pytest.approx(0.05))
-    page = comparison(far).to_html()
-    assert page.count('<i style="width:50.00%">') >= 2
-    assert page.count('<i style="width:12.50%">') == 1
-
-
-def test_of_five_recordings_a_bar_has_its_interval() -> None:
-    parts = []
-    for n in range(5):
-        rows = [measured(errors(error_m + 0.01 * n)) for error_m in (0.1, 0.2)]
-        parts.append(table(*(replace(m, recordings={f"{n}": m.statistics}) for m in rows)))
-    first, *_ = dict(total_of(parts).charts())["RMSE, m"]
-    assert 0.1 < first.low < first.value < first.high < 0.2
-    whole = comparison(*parts, total_of(parts))
-    page = whole.to_html()
-    assert page.count("<u style=") == 2
-    # All first, with its bars in sight; those of one recording on demand.
-    assert page.index("<h2>all</h2>") < page.index(f"<h2>{parts[0].name}</h2>")
-    assert page.count("as bars") == 5
-
-
 @pytest.mark.parametrize(
     ("text", "told"),
     [
@@ -249,7 +216,7 @@ def test_variants_share_what_is_set_for_all() -> None:
 def test_time_counts_of_frames_only() -> None:
     watch = _Watch()
     for stage in ("separation", "separation", "decoding", "ranging", "frame", "regions"):
-        watch.evlcp_stage_finished(stage, 1e-9)
+        watch.evlcp_stage_finished(stage, None, 1e-9)
     assert {stage: len(us) for stage, us in watch.stage_us.items()} == dict.fromkeys(STAGES, 1)
     # The wall's clock is the upper limit: a nanosecond each.
     assert watch.frame_us == [pytest.approx(3e-3)]
