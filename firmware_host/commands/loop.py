@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFile, Overrides, console, echo
+from evlcp_sdk.cli._common import LinkFile, Overrides, console, echo, progress_bar
 
 
 def loop(
@@ -54,7 +53,11 @@ def loop(
     done: Mapping[str, Any] = {}
     files: list[str] = []
     sinks = ["report"] if report else []
-    with _progress() as advance:
+    with progress_bar("rendering") as bar:
+
+        def advance(share: float) -> None:
+            bar(share, 1.0)
+
         for step in steps(text, link, out, distance_m=distance_m, seed=seed, sinks=sinks, advance=advance):
             done = step.figures
             files += step.files
@@ -126,14 +129,3 @@ _WORDS: dict[str, Callable[[Mapping[str, Any]], str]] = {
     "receiver": _receiver,
     "text": _text,
 }
-
-
-@contextmanager
-def _progress() -> Iterator[Callable[[float], None]]:
-    """A bar while the scene is rendered, on a terminal only."""
-    from rich.progress import Progress
-
-    err = console(stderr=True)
-    with Progress(console=err, transient=True, disable=not err.is_terminal) as bar:
-        task = bar.add_task("rendering", total=1.0, visible=False)
-        yield lambda share: bar.update(task, completed=share, visible=share < 1)
