@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from evlcp_sdk.cli._common import Json, LinkFile, Overrides, echo, print_json
-
-
-class CodebookForm(StrEnum):
-    """How `--codebook` prints the codes."""
-
-    JSON = "json"
-    C = "c"
 
 
 def config(
@@ -23,7 +15,7 @@ def config(
     digest: Annotated[bool, typer.Option("--digest", help="Only the SHA-256 of the link.")] = False,
     as_json: Json = False,
     codebook: Annotated[
-        CodebookForm | None,
+        Literal["json", "c"] | None,
         typer.Option("--codebook", help="Only the codes that both ends share, as JSON or as a C header."),
     ] = None,
 ) -> None:
@@ -43,7 +35,7 @@ def config(
     registry = Registry.load()
     link = load_link(link_file, overrides or [], registry)
     if codebook is not None:
-        echo(link.codebook.to_json() if codebook is CodebookForm.JSON else link.codebook.to_c())
+        echo(link.codebook.to_json() if codebook == "json" else link.codebook.to_c())
         return
     # A receiver compiles its algorithms: what they refuse is said here, not at the first recording.
     Receiver(link)

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, nullcontext
 from dataclasses import dataclass, replace
-from enum import StrEnum
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -31,13 +30,6 @@ if TYPE_CHECKING:
     from evlcp_sdk.utc import PulseClock
 
 
-class LinkMode(StrEnum):
-    """Where the link comes from."""
-
-    GIVEN = "given"
-    AUTO = "auto"
-
-
 @dataclass(frozen=True)
 class ReceiveJob:
     """One recording, the folder that its result goes to, and its link if it is not the one of all."""
@@ -56,8 +48,9 @@ def receive(
     ],
     link: LinkOptions,
     link_mode: Annotated[
-        LinkMode, typer.Option("--link", show_default=False, help="auto: the one that fits best.")
-    ] = LinkMode.GIVEN,
+        Literal["given", "auto"],
+        typer.Option("--link", show_default=False, help="auto: the one that fits best."),
+    ] = "given",
     strict: Annotated[
         bool, typer.Option("--strict", hidden=True, help="End with 1 where there are warnings.")
     ] = False,
@@ -91,7 +84,7 @@ def receive(
     jobs = _jobs(recordings, result.out, lines)
     registry = Registry.load()
     links = link.load(registry)
-    if link_mode is LinkMode.AUTO:
+    if link_mode == "auto":
         if len(links) > 1:
             raise typer.BadParameter("varies one link: give one -c, or none", param_hint="--link")
         jobs = [_fitted(job, links[0], registry) for job in jobs]

@@ -1,8 +1,7 @@
 """`evlcp board build`, `flash` and `update`: the firmware as files, into a part, and over a board's line."""
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -10,12 +9,8 @@ from evlcp_sdk.cli._common import progress_bar
 from firmware_host.commands._json import AsJson, say
 from firmware_host.commands._line import BoardLine, LineCommand, from_command_line, open_board
 
-
-class Target(StrEnum):
-    """Boards that an image is built for."""
-
-    STM32F405_8MHZ = "stm32f405-8mhz"
-    STM32F405_12MHZ = "stm32f405-12mhz"
+Target = Literal["stm32f405-8mhz", "stm32f405-12mhz"]
+"""Boards that an image is built for."""
 
 
 class FlashCommand(LineCommand):
@@ -24,11 +19,8 @@ class FlashCommand(LineCommand):
     line = ("port", "baud")
 
 
-TargetOption = Annotated[Target, typer.Option(help="Part and crystal.")]
-
-
 def build_images(
-    target: TargetOption,
+    target: Annotated[Target, typer.Option(help="Part and crystal.")],
     output: Annotated[Path, typer.Option("--output", "-o", metavar="FOLDER", help="Where to.")] = Path(),
     as_json: AsJson = False,
 ) -> None:
@@ -58,7 +50,7 @@ def build_images(
             outputs.open_binary(path).write(content)
         outputs.commit()
     table = {
-        "target": str(target),
+        "target": target,
         "address": image.address,
         "bytes": len(image.data),
         "files": [str(path) for path in paths],

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from dataclasses import replace
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -59,20 +58,8 @@ InventoryFile = Annotated[
 ]
 
 
-class Silence(StrEnum):
-    """What a board does when the host falls silent."""
-
-    KEEP = "keep"
-    IDLE = "idle"
-    DARK = "dark"
-
-
-class Emulator(StrEnum):
-    """Emulated boards."""
-
-    NATIVE = "native"
-    STM32 = "stm32"
-    ROM = "rom"
+Silence = Literal["keep", "idle", "dark"]
+"""What a board does when the host falls silent."""
 
 
 def _show(table: dict[str, Any], as_json: bool) -> None:
@@ -201,7 +188,7 @@ def program(
     from firmware_host.board.board import Settings, provision
     from firmware_host.protocol.generated.requests import Watchdog
 
-    action = None if watchdog is None else Watchdog[watchdog.name]
+    action = None if watchdog is None else Watchdog[watchdog.upper()]
     bank = payload.bank()
     settings = Settings(level, action, watchdog_ms, start, level_limit, duty_limit)
     with open_board(context) as board:
@@ -413,7 +400,7 @@ def watchdog(
     from firmware_host.protocol.generated.requests import Watchdog
 
     with open_board(context) as board:
-        board.watchdog(Watchdog[action.name], after_ms)
+        board.watchdog(Watchdog[action.upper()], after_ms)
     if as_json:
         print_json({"watchdog": action, "watchdog_ms": after_ms})
     else:
@@ -627,7 +614,7 @@ def recall(context: typer.Context, as_json: AsJson = False) -> None:
 @app.command()
 def emulate(
     emulator: Annotated[
-        Emulator,
+        Literal["native", "stm32", "rom"],
         typer.Argument(
             help="native: the firmware in this process; stm32: the image as flashed; rom: a part to flash."
         ),
@@ -654,7 +641,7 @@ def emulate(
     from firmware_host.emulators.native import NativeBoard, serve
     from firmware_host.ports.transport import socket_address
 
-    known = ("unix", "tcp", "pty") if emulator is Emulator.NATIVE else ("unix", "tcp")
+    known = ("unix", "tcp", "pty") if emulator == "native" else ("unix", "tcp")
     if listen.partition(":")[0] not in known:
         raise ConfigError(f"--listen {listen}: expected {' or '.join(known)} for {emulator}")
     if listen != "pty":
@@ -665,7 +652,7 @@ def emulate(
     check_free(listen)
     if leds is not None:
         check_output(leds, regular=False)
-    if emulator is Emulator.NATIVE:
+    if emulator == "native":
         with contextlib.ExitStack() as stack:
             board = stack.enter_context(contextlib.closing(NativeBoard(leds, flash, unique_id)))
             line = stack.enter_context(contextlib.closing(HostLine(listen, link)))
@@ -673,14 +660,14 @@ def emulate(
             echo(f"listening on {line.place}")
             serve(board, line, stopped)
         return
-    if emulator is Emulator.ROM:
+    if emulator == "rom":
         command = processes.rom_command(listen, flash, leds)
     else:
         command = processes.stm32_command(listen, leds)
     _run_in_foreground(emulator, command, listen)
 
 
-def _run_in_foreground(emulator: Emulator, command: list[str], listen: str) -> None:
+def _run_in_foreground(emulator: str, command: list[str], listen: str) -> None:
     """Run an emulator that ends with this command, however that comes."""
     import signal
     import subprocess

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterable, Iterator
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -32,20 +31,14 @@ Ahead = Annotated[
 ]
 
 
-class Lines(StrEnum):
-    """What a line of the input is."""
-
-    TEXT = "text"
-    SYMBOLS = "symbols"
-
-
 @command
 def stream(
     context: typer.Context,
     file: Annotated[Path, typer.Argument(metavar="[FILE]", help="A line a message; - is stdin.")] = Path("-"),
     lines: Annotated[
-        Lines, typer.Option(help="text: a message; symbols: JSON, \\[frame]\\[cluster], or a list of these.")
-    ] = Lines.TEXT,
+        Literal["text", "symbols"],
+        typer.Option(help="text: a message; symbols: JSON, \\[frame]\\[cluster], or a list of these."),
+    ] = "text",
     ahead: Ahead = 4,
     transmitter_id: Annotated[
         int, typer.Option("--id", metavar="ID", min=0, max=2**32 - 1, help="Transmitter id of texts.")
@@ -70,7 +63,7 @@ def stream(
 
     link = load_link(link_file, overrides or [], Registry.load())
     # before the board waits for packets
-    coder = link.block_coder() if lines is Lines.TEXT else None
+    coder = link.block_coder() if lines == "text" else None
     if coder is not None:
         coder.symbols(bytes(coder.block_bytes))
     packets = _packets(file, link, coder, transmitter_id, repeat)
