@@ -149,17 +149,20 @@ def check_reflection(_facts: Facts, one: TransmitterTally) -> Found:
     """A transmitter that is a reflection of another one."""
     if one.echoes and one.echo_of is not None:
         text = f"a reflection of transmitter {one.echo_of}, {counted(one.echoes, 'frame')}"
-        yield Diagnostic("reflection", text, verdict="note")
+        step = "or a much weaker bar that says the same: it is left out"
+        yield Diagnostic("reflection", text, step, verdict="note")
 
 
 def check_alike(facts: Facts) -> Found:
     """Bars that send the same at the same time: a warning where it matters which is which."""
     alike = facts.counts.get("frames_alike", 0)
     if alike:
-        text = f"{counted(alike, 'frame')} of bars that send the same symbols as another at the same time"
-        step = "give each bar messages of its own: neither positions nor what is read can say which is which"
-        matters = facts.positions_tried or facts.tally.messages()
-        yield Diagnostic("same-symbols", text, step, verdict="doubt" if matters else "note")
+        text = (
+            f"{counted(alike, 'frame')} of bars, or of a bright mirror, that send the same at the same time"
+        )
+        what = ["positions"] * (facts.positions_tried > 0) + ["messages"] * bool(facts.tally.messages())
+        step = f"give each bar messages of its own: {' and '.join(what)} cannot say which is which"
+        yield Diagnostic("same-symbols", text, step if what else "", verdict="doubt" if what else "note")
 
 
 def check_clock(facts: Facts, one: TransmitterTally) -> Found:

@@ -54,10 +54,11 @@ _MOST_LIGHT = 3.0
 _MOST_SHARP = 4.0
 """Log odds that light and sharpness can give at the most: less than a mirror image's order does."""
 
-_TWO_BARS, _TWO_STAY = 1.5, 2.0
-"""Log odds of being alike from which on two that say the same are two bars, as one pair in five is, and by
-how much less they stay so. Two equal bars have 1.5 to 4.5, and wander by 1; images without blur, -2 and less
-from half of the light down, 0 at .7 of it."""
+_TWO_STAY = 1.0
+"""Log odds that it takes to change whether two that say the same are two bars. At first it is by what images
+fit better: mirrors are more common, but to leave a bar out costs its place and what it says, and a mirror
+taken for one is warned of. Equal bars have 2 to 4, those of .6 of the light 0 to 2; mirrors that keep a third
+of it, or blur it, mostly -2 and less."""
 
 _ANEW = 1.25
 """Share of frames by which those in common must have grown before their sharpness is compared again."""
@@ -174,7 +175,7 @@ class _Pair:
         compared: Log odds of the first being sharper and brighter, and of both being alike, by the frames up
             to some; None if unknown.
         frames_compared: Frames by which that is.
-        two: Whether they are two bars.
+        two: 1 if they are two bars, -1 if not, 0 as long as light has not told.
         last_us: Time of the newest frame in common, us.
     """
 
@@ -188,7 +189,7 @@ class _Pair:
     spread: tuple[Spread, Spread] | None = None
     compared: tuple[float, float] | None = None
     frames_compared: int = 0
-    two: bool = False
+    two: int = 0
     last_us: float = -math.inf
 
     def add(self, one: FrameDetection, other: FrameDetection, codewords: int) -> None:
@@ -218,7 +219,8 @@ class _Pair:
         if self.compared is None:
             return turned + brighter(self.light / lit) + _WHOLE * seen
         sharper, alike = self.compared
-        self.two = alike - abs(turned) - _CUT * abs(seen) > _TWO_BARS - _TWO_STAY * self.two
+        bars = alike - abs(turned) - _CUT * abs(seen) + _TWO_STAY * self.two
+        self.two = 1 if bars > 0 else -1
         return turned + min(max(sharper, -_MOST_SHARP), _MOST_SHARP) + _WHOLE * seen
 
 
@@ -307,7 +309,7 @@ class Reflections:
             groups = [group for group in groups if group not in joined] + [set(key).union(*joined)]
         for group in groups:
             bar = originals(sorted(group), odds, before)
-            bars = {n for n in group if (pair := self._pairs.get((min(n, bar), max(n, bar)))) and pair.two}
+            bars = {n for n in group if self._pairs.get((min(n, bar), max(n, bar)), _Pair()).two > 0}
             self._alike |= {bar, *bars} if bars else bars
             self._echo_of |= dict.fromkeys(group - {bar} - bars, bar)
 

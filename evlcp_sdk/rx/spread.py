@@ -66,12 +66,14 @@ _KEPT_PX = np.array([0.02, 0.05, 0.05])
 _COMMON_PX = np.array([0.08, 0.2, 0.4])
 """Errors that both images have: another lens, another strip, a camera in motion."""
 
-_BARS_PX = np.array([0.06, 0.06, 0.12])
-"""Differences of two bars of one make (sigma): light alike to a tenth, LEDs not quite in line."""
+_BARS_PX, _BARS_LIGHT = 0.06, 0.15
+"""Differences of two bars of one make (sigmas): LEDs not quite in line; and the logarithm of the one's light
+over the other's: LEDs age, gather dirt and look elsewhere."""
 
-_ANSWERS, _ANSWERS_KEPT, _ANSWERS_APART = 0.018, 0.008, 0.03
+_ANSWERS, _ANSWERS_KEPT, _ANSWERS_APART = 0.018, 0.02, 0.04
 """Share of edges that the middle of a line answers: its error in a frame, how much two bars differ all the
-same, and a bar and its image (sigmas). Brighter light decays longer, so that more edges are lost."""
+same, as they lie on their pixels, and a bar and its image (sigmas). Brighter light decays longer, so that
+more edges are lost."""
 
 _STEPS_PER_E = 4
 """Spacings that are told apart within a factor of e; what is expected changes little with them."""
@@ -216,18 +218,19 @@ def compare(one: Spread, other: Spread) -> tuple[float, float] | None:
     first = (blur >= blur[:, None]) & (light >= light[:, None])
     # What is clear is beyond the smallest number that is not 0.
     sums = np.logaddexp.reduce(fits[first]), np.logaddexp.reduce(fits.T[first])
-    # A narrow strip's light in a pixel is as its width: of equal bars, the farther one's is less.
+    # A narrow strip's light in a pixel is as its width: of equal bars, the farther one's is less. The mean
+    # over what their light may differ by is that of three points of a normal distribution.
     near, far = (_expected_at(round(math.log(size) * _STEPS_PER_E)) for size in sizes)
     steps = np.log(_BACKGROUNDS / _BACKGROUNDS[0])
-    alike = np.zeros(len(expected))
+    ratios = math.log(sizes[0] / sizes[1]) + _BARS_LIGHT * math.sqrt(3) * np.array([-1, 0, 1])
+    alike = np.log([[1 / 6], [2 / 3], [1 / 6]]) - math.log(len(expected))
     for k in known:
         rows = far[:, k].reshape(len(_BLURS_PX), -1)
-        there_k = np.array([np.interp(steps + math.log(sizes[0] / sizes[1]), steps, row) for row in rows])
-        spread = math.hypot(error[k], _BARS_PX[k] / math.sqrt(2))
-        alike += _fit(here[k] - near[:, k], there[k] - there_k.ravel(), k, spread) + math.log(
-            error[k] / spread
-        )
-    evidence = np.logaddexp.reduce(alike) - math.log(len(alike))
+        there_k = [[np.interp(steps + ratio, steps, row) for row in rows] for ratio in ratios]
+        spread = math.hypot(error[k], _BARS_PX / math.sqrt(2))
+        off = there[k] - np.reshape(there_k, (len(ratios), -1))
+        alike = alike + _fit(here[k] - near[:, k], off, k, spread) + math.log(error[k] / spread)
+    evidence = np.logaddexp.reduce(alike, None)
     if 2 in known:
         kept = math.hypot(_ANSWERS / math.sqrt(min(one.frames, other.frames)), _ANSWERS_KEPT)
         apart = (one.answered() - other.answered()) ** 2

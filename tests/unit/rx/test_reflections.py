@@ -290,7 +290,7 @@ def test_a_rail_shows_the_bar_again() -> None:
 def test_a_reflection_that_comes_and_goes() -> None:
     """It locks now and then: each time it is a reflection from its first frame on."""
     own = ideal_events(LINK, IdealBar(random_symbols(LINK, 7)))
-    image = reflected(own, missing=0.4)
+    image = reflected(own[own.y < 370], missing=0.4)
     of_bar, beside = by_side(merged(own, image[(image.t_us // 60_000) % 2 == 1]))
     assert len(frames_of(beside)) > 20
     assert all(p.echo_of is not None for p in beside)
