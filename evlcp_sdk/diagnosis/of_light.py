@@ -181,17 +181,12 @@ def check_light(facts: Facts) -> Found:
     """What blinks: a bar, lamps alone, or nothing that is worth a word; and a bar more that is not read."""
     if not facts.surveyed:
         return
-    sweeps = f"sweeps over the image at {facts.speed_px_ms:.1f} px/ms"
-    if facts.reads:
-        moves = f"; it {sweeps}" if facts.speed_px_ms else ""
-        yield _find_unread(facts) or f"{_describe_sources(facts)}{moves}"
-        return
-    if facts.bar is not None and not _is_lamp(facts.bar, facts):
-        yield _describe_sources(facts)
+    if facts.reads or (facts.bar is not None and not _is_lamp(facts.bar, facts)):
+        yield (facts.reads and _find_unread(facts)) or _describe_sources(facts)
         return
     if facts.speed_px_ms:
         step = "turn more slowly, or a shorter lens: up to 8 px/ms a bar is followed"
-        yield Diagnostic("motion", f"what shines {sweeps}: hardly anything is read of it", step)
+        yield Diagnostic("motion", f"what shines {_sweeps(facts)}: hardly anything is read of it", step)
         return
     lamps = [one for one in facts.sources if one.kind == "lamp"]
     if lamps:
@@ -227,21 +222,17 @@ def _view(facts: Facts) -> str:
 
 def _find_unread(facts: Facts) -> Diagnostic | None:
     """Light of a code where no frame is read, beside one that is; None where there is none."""
-    link_hz, camera = facts.link.packet.chip_rate_hz, facts.link.camera
-    # The centre of a bar that has an end out of the picture may lie outside it, too.
-    places = [
-        (min(max(x, 0.0), camera.width - 1.0), min(max(y, 0.0), camera.height - 1.0))
-        for x, y in (one.last_px for one in facts.tally.transmitters.values())
-    ]
-    read = [one.box_px for one in facts.sources if any(_gap_px(one.box_px, (*at, *at)) <= 0 for at in places)]
+    link_hz = facts.link.packet.chip_rate_hz
+    places = [one.passed_px for one in facts.tally.transmitters.values()]
+    read = [one.box_px for one in facts.sources if any(_gap_px(one.box_px, at) <= 0 for at in places)]
     for source in facts.sources:
         same = has_rate(source, link_hz)
         long_px, wide_px = sorted((source.wide_px, source.high_px), reverse=True)
         likely = source.rate_hz >= _LEAST_RATE * link_hz and long_px >= _SLENDER * wide_px
         if source.kind != "code" or source.rises < _MIN_RISES or not (same or likely):
             continue
-        # A bar's own glow may stand a little apart.
-        if any(_gap_px(source.box_px, other) < _GLOW_PX for other in read):
+        # A bar's own glow may stand a little apart, and is left where it has been.
+        if any(_gap_px(source.box_px, other) < _GLOW_PX for other in (*read, *places)):
             continue
         left, top, right, bottom = source.box_px
         rate = f"{float(f'{source.rate_hz:.2g}'):g}"
@@ -454,7 +445,12 @@ def _describe_sources(facts: Facts) -> str:
         "lamp": counted(by["lamp"], "lamp"),
         "unclear": counted(by["unclear"], "unclear source"),
     }
-    return ", ".join(text for kind, text in words.items() if by[kind]) or "no source of its own"
+    text = ", ".join(text for kind, text in words.items() if by[kind]) or "no source of its own"
+    return f"{text}; what shines {_sweeps(facts)}" if facts.speed_px_ms else text
+
+
+def _sweeps(facts: Facts) -> str:
+    return f"sweeps over the image at {facts.speed_px_ms:.1f} px/ms"
 
 
 def _hz(rate_hz: float) -> str:

@@ -64,7 +64,7 @@ class TransmitterTally:
         along_px: Sum of the ways from the first to the last, right and down, px.
         blocks: Packets whose block is read.
         firsts: Its first symbols, where a frame has one; -1 for one that was not received.
-        last_px: Where it is in the image in its newest frame, column and row.
+        passed_px: Where it has been in the image: left, top, right, bottom.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
         bent: Frames in which its image is bent.
         bent_px: In how many of them each boundary is seen, sum of how far it lies off, px, and of the squares
@@ -99,7 +99,7 @@ class TransmitterTally:
     bent_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
     blocks: int = 0
     firsts: list[int] = field(default_factory=list)
-    last_px: tuple[float, float] = (math.nan, math.nan)
+    passed_px: tuple[float, float, float, float] = (math.inf, math.inf, -math.inf, -math.inf)
     link: str = ""
     number: int = 0
 
@@ -121,7 +121,11 @@ class TransmitterTally:
             number = frame.packet * self.packet_frames + frame.frame
             self.first_frame = number if self.first_frame < 0 else self.first_frame
             self.last_frame = number
-            self.last_px = frame.x_px, frame.y_px
+            left, top, right, bottom = self.passed_px
+            ends_px = frame.points_px[:: max(len(frame.points_px) - 1, 1)].tolist()
+            for x, y in ((frame.x_px, frame.y_px), *ends_px):
+                left, top, right, bottom = min(left, x), min(top, y), max(right, x), max(bottom, y)
+            self.passed_px = left, top, right, bottom
             self.first_us, self.last_us = min(self.first_us, frame.t_us), max(self.last_us, frame.t_us)
             self.quality_sum += frame.soft.quality
             self.echoes += frame.echo_of is not None

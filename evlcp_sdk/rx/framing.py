@@ -504,7 +504,7 @@ class PacketFraming(Framer):
     ) -> None:
         self._attitude_at = stream.attitude_at
         self._packet = link.packet
-        self._step_us = link.regions.step_us
+        self._step_us, self._fade_us = link.regions.step_us, link.regions.fade_us
         self._tail_us = _TAIL_CHIPS * link.packet.chip_us
         self._clock = stream.clock
         self._announcer, self._on_frame = stream.announcer, on_frame
@@ -930,7 +930,7 @@ class PacketFraming(Framer):
         """Look among the regions that ended for parts of a bar whose first frame is read."""
         for one in list(self._ended):
             number, place_px, missed = one
-            if number is None and _is_part(region, t_us, place_px):
+            if number is None and _is_part(region, t_us, place_px, self._fade_us):
                 self._ended.remove(one)
                 self._was_part(missed)
 
@@ -944,7 +944,7 @@ class PacketFraming(Framer):
         if missed:
             place_px = transmitter.region.positions.place_at(seen_us)
             bars = [one for one in self._regions.alive if one is not transmitter.region and one.size_px]
-            if number is None and any(_is_part(bar, seen_us, place_px) for bar in bars):
+            if number is None and any(_is_part(bar, seen_us, place_px, self._fade_us) for bar in bars):
                 self._was_part(missed)
             else:
                 self._ended.append((number, place_px, missed))
@@ -960,10 +960,11 @@ def _in_time(transmitter: Transmitter) -> bool:
     return known and not transmitter.behind and transmitter.tried != transmitter.grid.frame
 
 
-def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float]) -> bool:
-    """Whether what was seen somewhere may have been a part of a bar."""
-    (x, y), (width, height) = bar.positions.place_at(t_us), bar.positions.size_at(t_us)
-    right, down = abs(place_px[0] - x), abs(place_px[1] - y)
+def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float], fade_us: float) -> bool:
+    """Whether what was seen somewhere may have been a part of a bar, or what it has left to fade."""
+    (x, y), before = bar.positions.place_at(t_us), bar.positions.place_at(t_us - fade_us)
+    width, height = bar.positions.size_at(t_us)
+    right, down = abs(place_px[0] - x) - abs(before[0] - x), abs(place_px[1] - y) - abs(before[1] - y)
     return right <= width / 2 + _PART_PX and down <= height / 2 + _PART_PX
 
 

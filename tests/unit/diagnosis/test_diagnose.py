@@ -127,6 +127,20 @@ def test_parts_of_a_near_bar_are_no_frames_of_another() -> None:
     assert summary["warnings"] == []
 
 
+def test_what_a_bar_leaves_behind_that_sweeps_is_its_own() -> None:
+    """45 degrees a second, to the left: f of 7200 px times .785 rad/s are 5.65 px/ms, less vibration."""
+    motion = {"distance_m": 40.0, "yaw_deg": 2.7, "yaw_rate_deg_s": -45.0}
+    source = simulate({"duration_s": 0.12, "motion": motion}, seed=6)
+    summary = receive_to_folder(source, None)
+    counts = summary["counts"]
+    assert (counts["frames"], counts["frames_rejected"], summary["warnings"]) == (34, 0, [])
+    assert counts["frames_of_parts"] >= 10
+    found = diagnose(simulate({"duration_s": 0.12, "motion": motion}, seed=6))
+    assert code_of(found) == ""
+    (light,) = [one.text for one in found.checks if one.stage == "light"]
+    assert 4.7 < float(light.split(" at ")[1].removesuffix(" px/ms")) < 6.6
+
+
 def judged(
     *sources: LightSource,
     quality: float = 1.0,
@@ -141,7 +155,7 @@ def judged(
         one.frames, one.quality_sum, one.first_frame, one.last_frame = frames, quality * frames, 0, frames - 1
         one.values.update(range(64))
         one.ranged = frames
-        one.last_px = 410.0, 375.0
+        one.passed_px = 410.0, 375.0, 410.0, 375.0
     counts = dict.fromkeys(("preambles", "regions_opened"), 3)
     counts |= {"frames": frames, "frames_rejected": rejected}
     counts["events"], lost = 10**6, 2000
