@@ -52,17 +52,17 @@ def find_start(starts_us: Floats, t_us: float, packet: PacketFormat) -> int | No
 
 
 def nearest_bar(
-    bars: Sequence[SentBar], truth: Truth, t_us: float, x_px: float, y_px: float, *, road: bool = True
+    bars: Sequence[SentBar], truth: Truth, t_us: float, x_px: float, y_px: float
 ) -> tuple[int, float] | None:
     """Number of the bar that is nearest in the image at a time after the scene's start, and its distance, px.
 
-    None without bars. On a `road`, of bars in one place, as after a restart, it is one that is not hidden.
+    None without bars. Of bars in one place, as after a restart, it is one that is not hidden.
     """
     away, behind = [], []
     for bar in bars:
         x, y = (float(np.interp(t_us, truth.t_us, bar.centre_px[:, axis])) for axis in (0, 1))
         away.append(float(np.hypot(x_px - x, y_px - y)))
-        behind.append(road and any(a <= t_us * 1e-6 < b for a, b in bar.pole_s))
+        behind.append(any(a <= t_us * 1e-6 < b for a, b in bar.pole_s))
     return min(enumerate(away), key=lambda one: one[1] + behind[one[0]], default=None)
 
 
@@ -73,6 +73,7 @@ class BarFrames:
     Attributes:
         bar: The bar.
         start_us: Start of each after the scene's, us, float64 (n,).
+        cut_us: Start of those that something hides all of, or an end of the recording cuts, us.
         symbols: Symbols of each, int64 (n, clusters).
         distance_m: Distance in the middle of its pilot, or of its info segment without one, m, float64 (n,).
         hidden: Clusters that are hidden all the time, bool (n, clusters).
@@ -81,6 +82,7 @@ class BarFrames:
 
     bar: SentBar
     start_us: Floats
+    cut_us: Floats
     symbols: NDArray[np.int64]
     distance_m: Floats
     hidden: NDArray[np.bool_]
@@ -110,7 +112,7 @@ class BarFrames:
         )
         distance_m: Floats = np.interp(start_us[sent] + middle[sent], truth.t_us, bar.distance_m)
         symbols = np.asarray(bar.symbols, np.int64).reshape(-1, clusters)[: len(chip)]
-        return cls(bar, start_us[sent], symbols[sent], distance_m, hidden[sent], cut[sent])
+        return cls(bar, start_us[sent], start_us[~sent], symbols[sent], distance_m, hidden[sent], cut[sent])
 
 
 def _hide(
@@ -154,10 +156,9 @@ def match(
     """Put each decoded frame beside the sent one.
 
     A frame that names its link is put beside those of bars that send with it. A frame that is cut by an end
-    of the recording, or by something that hides all of the bar, is neither found nor unmatched, unless the
-    sent frame nearest to it was found before. Of two beside the same sent one, the first is it. On a `road`,
-    what is declared a reflection is left out, and what hides clusters is minded; `links` are the receiver's
-    by name, where it has several.
+    of the recording, or by something that hides all of the bar, is neither found nor unmatched. Of two
+    beside the same sent one, the first is it. On a `road`, what is declared a reflection is left out, and
+    what hides clusters is minded; `links` are the receiver's by name, where it has several.
     """
     bars = tuple(BarFrames.of(bar, truth, covers=road) for bar in truth.bars if bar.lit)
     pairs: tuple[list[tuple[FrameRow, int]], ...] = tuple([] for _ in bars)
@@ -174,7 +175,7 @@ def match(
         t_us = frame.t_us - truth.t0_us
         among = senders.get(frame.link, range(len(bars)))
         sent = [bars[i].bar for i in among]
-        nearest = nearest_bar(sent, truth, t_us, frame.x_px, frame.y_px, road=road)
+        nearest = nearest_bar(sent, truth, t_us, frame.x_px, frame.y_px)
         if nearest is None:
             unmatched += 1
             continue
@@ -189,7 +190,7 @@ def match(
 
 
 def _is_cut(sent: BarFrames, truth: Truth, t_us: float, found: set[int], *, road: bool) -> bool:
-    """Whether a frame of a bar at a time would be cut, and not one that was found before is nearest."""
+    """Whether a frame of a bar at a time is cut, or would be and the one nearest was not found before."""
     packet = sent.bar.link.packet
     tail_us = _tail_us(packet)
     # With its pilot, until its last events have come.
@@ -198,6 +199,8 @@ def _is_cut(sent: BarFrames, truth: Truth, t_us: float, found: set[int], *, road
     dark = road and any(t_us < b * 1e6 + long_us and t_us + long_us > a * 1e6 for a, b in sent.bar.pole_s)
     if not (at_end or dark):
         return False
+    if road and find_start(sent.cut_us, t_us, packet) is not None:
+        return True
     return not len(sent.start_us) or int(np.argmin(np.abs(sent.start_us - t_us))) not in found
 
 

@@ -75,7 +75,7 @@ def score(rows: list[Row], truth: dict[str, Any], lengths: Lengths, *, road: boo
         if bar.get("led_w_m2") is not None and bar["led_w_m2"] <= 1e-6:
             continue
         rate = lengths.rate_hz * (1 + bar["ppm"] * 1e-6)
-        sent = []
+        sent, cut = [], []
         for q, packet in enumerate(bar["symbols"]):
             for f, (first, chips) in enumerate(lengths.frames(len(packet))):
                 begin = (q * lengths.packet(len(packet)) + first - bar["start_chip"]) / rate * 1e6
@@ -85,9 +85,11 @@ def score(rows: list[Row], truth: dict[str, Any], lengths: Lengths, *, road: boo
                     middle = (lengths.pilot if chips > lengths.info else lengths.info) / 2 * chip
                     true_m = at(begin + middle, truth, truth["distance_m"][i])
                     sent.append((begin, packet[f], true_m, whole, part))
+                elif road:
+                    cut.append(begin)
         bars.append(
-            {"i": i, "bar": bar, "sent": sent, "hit": set(), "found": 0, "wrong": 0, "bits": 0, "visible": 0}
-            | {"erased": 0, "hidden": 0, "claimed": 0, "errors": [], "nees": [], "filtered": []}
+            {"i": i, "bar": bar, "sent": sent, "cut": cut, "hit": set(), "found": 0, "wrong": 0, "bits": 0}
+            | {"visible": 0, "erased": 0, "hidden": 0, "claimed": 0, "errors": [], "nees": [], "filtered": []}
         )
     unmatched = echoes = 0
     for row in rows:
@@ -113,7 +115,8 @@ def score(rows: list[Row], truth: dict[str, Any], lengths: Lengths, *, road: boo
                 t < b * 1e6 + long and t + long > a * 1e6 for a, b in best["bar"].get("pole_s", ())
             )
             ends = t < tail or t + long > duration
-            unmatched += not (away <= 60 and (ends or dark) and j not in best["hit"])
+            is_cut = any(abs(begin - t) <= near for begin in best["cut"])
+            unmatched += not (away <= 60 and (ends or dark) and (is_cut or j not in best["hit"]))
             continue
         best["hit"].add(j)
         best["found"] += 1
