@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -26,18 +27,27 @@ app.command(cls=JsonCommand)(message)
 app.command(cls=JsonCommand)(keygen)
 
 
-@app.command(cls=JsonCommand)
+class Form(StrEnum):
+    """How `tx frames` prints the words."""
+
+    TABLE = "table"
+    HEX = "hex"
+    C = "c"
+    JSON = "json"
+
+
+@app.command()
 @command
 def frames(
     *,
     sent: SymbolOptions,
+    form: Annotated[Form, typer.Option("--format", help="How the words are printed.")] = Form.TABLE,
     chips: Annotated[
         Path | None,
         typer.Option(
             metavar="FILE.npy", help="Write the chips: uint8, one row per chip, one column per cluster."
         ),
     ] = None,
-    as_json: AsJson = False,
 ) -> None:
     """Show the words that go on air for these symbols.
 
@@ -53,17 +63,7 @@ def frames(
         with Outputs() as outputs:
             outputs.write_array(symbol_chips(table, link.codebook, link.packet.pilot_every), chips)
             outputs.commit()
-    if not as_json:
-        echo(_table(table, link))
-        return
-    from firmware_host.board.symbols import symbols_table
-
-    info = _words(link.codebook.codewords)
-    words = {
-        "pilot_words": _words(link.codebook.pilots),
-        "info_words": [[[info[s] for s in frame] for frame in packet] for packet in table.tolist()],
-    }
-    print_json(symbols_table(table, link) | words)
+    echo(_FORMS[form](table, link))
 
 
 def _words(codes: NDArray[np.uint8]) -> list[str]:
@@ -86,6 +86,57 @@ def _table(symbols: NDArray[np.int64], link: Link) -> str:
                 pilot = (pilots[k] if link.packet.has_pilot(f) else "") or none
                 lines.append(f"{p:6} {f:5} {k:7} {symbol:6}  {pilot} {info[symbol]}")
     return "\n".join(lines)
+
+
+def _hex(symbols: NDArray[np.int64], link: Link) -> str:
+    pilots, info = _words(link.codebook.pilots), _words(link.codebook.codewords)
+    return "\n".join(
+        " ".join(
+            (pilots[k] if link.packet.has_pilot(f) else "") + info[symbol] for k, symbol in enumerate(frame)
+        )
+        for packet in symbols.tolist()
+        for f, frame in enumerate(packet)
+    )
+
+
+def _c(symbols: NDArray[np.int64], link: Link) -> str:
+    from evlcp_sdk.errors import ConfigError
+
+    book = link.codebook
+    bits = next((n for n in (16, 32, 64) if n >= link.packet.info_chips), None)
+    if bits is None:
+        raise ConfigError(f"--format c: info segments of {link.packet.info_chips} chips, at most 64")
+    info = _words(book.codewords)
+    packets, frames, clusters = symbols.shape
+    lines = [
+        "/* Info words of evlcp tx frames; pilots and preamble are in codebook.h. */",
+        "#include <stdint.h>",
+        f"/* Codebook {book.digest[:16]}, profile {book.profile}, pilot in every frame f with"
+        f" f % {link.packet.pilot_every} == 0. */",
+        f"static const uint{bits}_t evlcp_info[{packets}][{frames}][{clusters}] = {{",
+    ]
+    for packet in symbols.tolist():
+        rows = [", ".join(f"0x{info[symbol]}u" for symbol in frame) for frame in packet]
+        lines.append("    {" + ",\n     ".join(f"{{{row}}}" for row in rows) + "},")
+    return "\n".join([*lines, "};"])
+
+
+def _json(symbols: NDArray[np.int64], link: Link) -> str:
+    import json
+
+    from firmware_host.board.symbols import symbols_table
+
+    info = _words(link.codebook.codewords)
+    return json.dumps(
+        symbols_table(symbols, link)
+        | {
+            "pilot_words": _words(link.codebook.pilots),
+            "info_words": [[[info[s] for s in frame] for frame in packet] for packet in symbols.tolist()],
+        }
+    )
+
+
+_FORMS = {Form.TABLE: _table, Form.HEX: _hex, Form.C: _c, Form.JSON: _json}
 
 
 @app.command(cls=JsonCommand)

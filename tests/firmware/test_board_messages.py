@@ -157,7 +157,7 @@ def test_what_tx_wrote_tx_shows(evlcp, tmp_path: Path) -> None:
         again.unlink()
         well(evlcp("tx", "check", out, *named))
     # a word is the chips, most significant first: the first pilot stands behind the preamble
-    word = evlcp("tx", "frames", out, "--json").out
+    word = evlcp("tx", "frames", out, "--format", "json").out
     bits = "".join(str(chip) for chip in np.load(chips)[26:52, 0])
     assert int(json.loads(word)["pilot_words"][0], 16) == int(bits, 2)
 
@@ -237,7 +237,7 @@ def test_texts_go_out_as_they_come(native: str, tmp_path: Path) -> None:
 
 
 def test_symbols_from_a_file(evlcp, native: str, tmp_path: Path) -> None:
-    table = json.loads(evlcp("tx", "frames", "--random", 4, "--seed", 5, "--json").out)["symbols"]
+    table = json.loads(evlcp("tx", "frames", "--random", 4, "--seed", 5, "--format", "json").out)["symbols"]
     file = tmp_path / "lines.jsonl"
     # a packet a line, then two on one
     file.write_text("\n".join(map(json.dumps, (table[0], table[1], table[2:]))) + "\n\n")

@@ -37,14 +37,18 @@ def test_chips_are_the_air_vectors(evlcp, example: Path, tmp_path: Path) -> None
 
 
 def test_every_form_has_the_same_words(evlcp, example: Path) -> None:
-    table = json.loads(evlcp("tx", "frames", example, "--json", *TWO_FRAMES).out)
+    table = json.loads(evlcp("tx", "frames", example, "--format", "json", *TWO_FRAMES).out)
     assert table["pilot_words"] == AIR["pilot_words"]
     info = [w for frame in table["info_words"][0] for w in frame]
     expected = [AIR["info_words"]["wh4x2"][s] for frame in EXAMPLE["symbols"] for s in frame]
     assert info == expected
-    rows = [row.split() for row in evlcp("tx", "frames", example, *TWO_FRAMES).out.splitlines()[1:]]
-    assert [row[4] for row in rows] == 2 * AIR["pilot_words"]
-    assert [row[5] for row in rows] == expected
+    hexed = evlcp("tx", "frames", example, "--format", "hex", *TWO_FRAMES).out.split()
+    assert [h[4:] for h in hexed] == expected
+    assert [h[:4] for h in hexed] == 2 * AIR["pilot_words"]
+    c = evlcp("tx", "frames", example, "--format", "c", *TWO_FRAMES).out
+    assert [w for w in expected if f"0x{w}u" not in c] == []
+    rows = evlcp("tx", "frames", example, *TWO_FRAMES).out.splitlines()[1:]
+    assert [r.split()[5] for r in rows] == expected
 
 
 def test_payload_is_what_the_chips_say() -> None:
@@ -94,11 +98,11 @@ def test_wrong_symbols_are_one_line(evlcp, tmp_path: Path, text: str, expected: 
 
 @pytest.mark.parametrize("digest", ['"00"', "5", "null"])
 def test_symbols_of_another_codebook_are_refused(evlcp, tmp_path: Path, digest: str) -> None:
-    said, other = (evlcp("tx", "frames", "--random", 1, "--seed", n, "--json").out for n in (0, 1))
+    said, other = (evlcp("tx", "frames", "--random", 1, "--seed", n, "--format", "json").out for n in (0, 1))
     assert said != other
     path = tmp_path / "s.json"
     path.write_text(said)
-    assert evlcp("tx", "frames", path, "--json").out == said
+    assert evlcp("tx", "frames", path, "--format", "json").out == said
     own = json.loads(said)["codebook"]
     path.write_text(said.replace(f'"{own}"', digest))
     done = evlcp("tx", "frames", path)
@@ -174,8 +178,10 @@ def test_pilots_in_some_frames_only(evlcp, tmp_path: Path) -> None:
     assert np.load(file).tolist() == expected.tolist()
     masks = read_masks(file, link)
     assert (masks.packets, masks.packet.pilot_every, len(masks.content)) == (2, 4, len(expected) * 12)
-    rows = [line.split() for line in evlcp(*options).out.splitlines()[1:]]
+    rows = [line.split() for line in evlcp(*options, "--format", "table").out.splitlines()[1:]]
     assert {row[1] for row in rows if row[4] == "-"} == {"1", "2", "3", "5"}
-    assert json.loads(evlcp(*options, "--json").out)["link"]["air"]["pilot_every"] == 4
+    words = evlcp(*options, "--format", "hex").out.splitlines()
+    assert [len(line.split()[0]) for line in words] == [8, 4, 4, 4, 8, 4] * 2
+    assert json.loads(evlcp(*options, "--format", "json").out)["link"]["air"]["pilot_every"] == 4
     for profile in ("wh4x2", "wh8", "raw8"):
         well(evlcp("tx", "check", "--random", 20, *sparse, "--set", f"modulation.id={profile}"))
