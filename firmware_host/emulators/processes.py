@@ -23,12 +23,10 @@ _DIES_WITH_PARENT = (
 
 
 def bound(command: Sequence[str]) -> list[str]:
-    """A command line that ends with the process that starts it, however that ends; on Linux.
+    """A command line that ends with the process that starts it, however that ends.
 
     The command takes the place of the process that is started, so its number stays.
     """
-    if sys.platform != "linux":
-        return list(command)
     return [sys.executable, "-IS", "-c", _DIES_WITH_PARENT, str(os.getpid()), *command]
 
 

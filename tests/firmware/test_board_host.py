@@ -221,7 +221,6 @@ def is_there(pid: int) -> bool:
         return False
 
 
-@pytest.mark.skipif(sys.platform != "linux", reason="other systems do not tell children")
 def test_what_is_bound_ends_with_its_parent() -> None:
     code = (
         "import subprocess, sys, time\n"

@@ -4,13 +4,9 @@ import errno
 import json
 import os
 import pty
-import socket
-import subprocess
-import sys
 import termios
 import tty
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock, PropertyMock
 
@@ -20,8 +16,7 @@ from board_lines import check_fault
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board import survey
 from firmware_host.errors import LineError, NoBoardError
-from firmware_host.ports import serial_port
-from firmware_host.ports.serial_port import SerialTransport, holders
+from firmware_host.ports.serial_port import SerialTransport
 from firmware_host.ports.transport import open_transport
 from firmware_host.ports.usb import UsbFilter, device_of, serial_ports
 
@@ -138,79 +133,34 @@ def test_a_real_tty_gets_no_byte(monkeypatch: pytest.MonkeyPatch, evlcp, pty_nam
     assert os.read(ours, 100)
 
 
-def test_who_has_the_port_is_said(pty_name: tuple[int, str]) -> None:
-    device = pty_name[1]
-    code = (
-        "import serial, sys, time; p = serial.Serial(sys.argv[1], exclusive=True); print(1, flush=True);"
-        " time.sleep(60)"
-    )
-    with subprocess.Popen([sys.executable, "-c", code, device], stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        process.stdout.readline()
-        try:
-            says = rf"\(process {process.pid}\) has it open; end that first"
-            with pytest.raises(NoBoardError, match=says):
-                SerialTransport(device, 1_000_000)
-            assert any(str(process.pid) in who for who in holders(device))
-        finally:
-            process.kill()
-    assert holders("/dev/nowhere") == []
-
-
-def refusing(monkeypatch: pytest.MonkeyPatch, fault: Exception) -> None:
-    monkeypatch.setattr("serial.serial_for_url", Mock(side_effect=fault))
-
-
-WINDOWS = "could not open port 'COM3': "
-MAC = "/dev/cu.usbserial-1"
-
-
 @pytest.mark.parametrize(
-    ("system", "port", "fault", "says"),
+    ("port", "fault", "says"),
     [
-        # as pyserial words them on each system
-        ("win32", "COM3", Fault(WINDOWS + "FileNotFoundError(2, 'x', None, 2)"), "not there"),
-        ("win32", "COM3", Fault(WINDOWS + "PermissionError(13, 'x', None, 5)"), "another program has it"),
-        ("win32", "COM3", Fault(WINDOWS + "OSError(22, 'x', None, 121)"), "evlcp board ports"),
-        ("win32", "COM3", ValueError("Support for non-exclusive access not available"), "evlcp board ports"),
-        ("darwin", MAC, Fault(errno.EBUSY, "busy"), f"lsof {MAC}"),
-        ("darwin", MAC, Fault(errno.ENOENT, "gone"), "it is not there"),
-        ("darwin", MAC, ValueError("Failed to set custom baud rate (3)"), "take --baud 3"),
-        ("linux", "/dev/ttyUSB0", termios.error(5, "Input/output error"), "Input/output error"),
-        ("linux", "/dev/ttyUSB0", Fault(errno.ENXIO, "x"), "it is not there"),
-        ("linux", "/dev/ttyUSB0", Fault(errno.EAGAIN, "x"), "sudo fuser -v /dev/ttyUSB0"),
-        ("linux", "hwgrep://[", KeyError("x"), "evlcp board ports"),
+        ("/dev/ttyUSB0", ValueError("Failed to set custom baud rate (3)"), "take --baud 3"),
+        ("/dev/ttyUSB0", termios.error(5, "Input/output error"), "Input/output error"),
+        ("/dev/ttyUSB0", Fault(errno.ENXIO, "x"), "it is not there"),
+        (
+            "/dev/ttyUSB0",
+            Fault(errno.EACCES, "x"),
+            "no permission: join its group, which 'ls -l /dev/ttyUSB0'",
+        ),
+        ("/dev/ttyUSB0", Fault(errno.EAGAIN, "x"), "sudo fuser -v /dev/ttyUSB0"),
+        ("hwgrep://[", KeyError("x"), "evlcp board ports"),
     ],
 )
-def test_any_system_says_what_to_do(
-    evlcp, monkeypatch: pytest.MonkeyPatch, system: str, port: str, fault: Exception, says: str
+def test_what_cannot_be_opened_says_what_to_do(
+    evlcp, monkeypatch: pytest.MonkeyPatch, port: str, fault: Exception, says: str
 ) -> None:
-    refusing(monkeypatch, fault)
-    monkeypatch.setattr(serial_port.sys, "platform", system)
+    monkeypatch.setattr("serial.serial_for_url", Mock(side_effect=fault))
     done = evlcp("board", "hello", "--port", port, "--baud", "3000000")
     check_fault(done, 4, f"{port}: cannot be opened", says)
 
 
-def test_no_permission_names_group_and_rule(evlcp, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    grp = pytest.importorskip("grp")
-    device = tmp_path / "ttyUSB7"
-    device.write_text("")
-    device.chmod(0o660)
-    port = listed(str(device), 0x0403, 0x6015)
-    group = SimpleNamespace(gr_name="dialout", gr_gid=20, gr_mem=["bob"])
-    monkeypatch.setattr("serial.tools.list_ports.comports", lambda: [port])
-    monkeypatch.setattr(grp, "getgrgid", lambda _: group)
-    monkeypatch.setattr("getpass.getuser", lambda: "ann")
-    refusing(monkeypatch, Fault(errno.EACCES, "could not open port"))
-    check_fault(
-        evlcp("board", "hello", "--port", device),
-        4,
-        "it belongs to the group dialout: 'sudo usermod -aG dialout ann' and log in again",
-        'ATTRS{idVendor}=="0403", ATTRS{idProduct}=="6015", TAG+="uaccess"',
-        "/etc/udev/rules.d/70-evlcp.rules",
-    )
-    monkeypatch.setattr("getpass.getuser", lambda: "bob")
-    assert "log in again" in evlcp("board", "hello", "--port", device).err
+def test_a_port_has_one_host(pty_name: tuple[int, str]) -> None:
+    line = SerialTransport(pty_name[1], 9600)
+    with pytest.raises(NoBoardError, match="another program has it open"):
+        SerialTransport(pty_name[1], 9600)
+    line.close()
 
 
 @pytest.mark.parametrize(
@@ -237,8 +187,6 @@ def test_an_unplugged_port_is_a_broken_line(monkeypatch: pytest.MonkeyPatch, fau
     line.close()
 
 
-def test_no_port_and_no_unix_sockets(monkeypatch: pytest.MonkeyPatch, evlcp) -> None:
+def test_no_port(monkeypatch: pytest.MonkeyPatch, evlcp) -> None:
     monkeypatch.setattr("serial.tools.list_ports.comports", list)
     check_fault(evlcp("board", "status"), 4, "--port native: for an emulated one")
-    monkeypatch.delattr(socket, "AF_UNIX")
-    check_fault(evlcp("board", "hello", "--port", "unix:/tmp/board"), 4, "this system has no unix sockets")
