@@ -213,15 +213,3 @@ def serve(rom: RomEmulator, server: socket.socket) -> None:
     with server.accept()[0] as line:
         while data := line.recv(4096):
             line.sendall(rom.receive(data))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (("--port", "tcp:127.0.0.1:1"), 2, "give an image, or --target"),
-        (("--target", "stm32f405-8mhz"), 2, "--port: expected"),
-        (("no.bin", "--port", "tcp:127.0.0.1:1"), 3, "no.bin"),
-    ],
-)
-def test_options_of_flash_are_checked(evlcp, arguments: tuple[str, ...], code: int, words: str) -> None:
-    check_fault(evlcp("board", "flash", *arguments), code, words)

@@ -130,11 +130,7 @@ def test_any_link(evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
         (("--text", "a", "--count", "3"), 2, "--count belongs to --every"),
         (("--countdown", "3", "--signal", "blue", "--every", "1", "--port", "native:"), 2, "signal = 'blue'"),
         (("--countdown", "1e9", "--json"), 2, "expected 0 to 86400"),
-        (
-            ("--text", "a" * 8000, "--every", "1", "--port", "native:"),
-            2,
-            "201 packets of 34.6 ms; give --every 7",
-        ),
+        (("--text", "a" * 8000, "--every", "1", "--port", "native:"), 2, "201 packets of 34.6 ms; give"),
     ],
 )
 def test_faults_are_one_line(

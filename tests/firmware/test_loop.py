@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, board_link, check_fault, symbols_of, well
+from board_lines import LINK, board_link, symbols_of, well
 
 from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import symbol_chips
@@ -58,19 +58,6 @@ def test_a_text_that_does_not_arrive_ends_with_1(evlcp, tmp_path: Path) -> None:
     assert steps[-1]["texts"] == []
     for step in steps:
         assert all((tmp_path / name).is_file() for name in step["files"])
-
-
-@pytest.mark.parametrize(
-    ("arguments", "code", "says"),
-    [
-        (["--text", ""], 2, "text: expected at least one character"),
-        (["--distance", "5"], 2, "the bar, 0.96 m high, fits into the image from 9.6 m on"),
-        (["--set", "bar.rows=102", "--distance", "60"], 2, "a link of 102 LEDs, emulated has 96: HELLO says"),
-        (["--set", "air.chip_rate_hz=30000.0"], 5, "emulated: no chip rate of 30000 Hz"),
-    ],
-)
-def test_faults_are_one_line(evlcp, tmp_path: Path, arguments: list[str], code: int, says: str) -> None:
-    check_fault(evlcp("loop", "-o", tmp_path, *arguments), code, says)
 
 
 def test_without_a_compiler(evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -141,6 +141,7 @@ POSES = (
     b"a,0,48.1,11.5,520.0,90.0,1.0,0.0\nb,1000,48.2,11.6,521.0,,,\n"
 )
 ATTITUDE = b"t_us,heading_deg,pitch_deg,roll_deg,sigma_deg\n0,90.0,1.0,0.0,0.1\n5000,91.0,1.5,0.1,0.1\n"
+SUMMARY = b'{"status": "complete", "files": {}, "counts": {"a": 1}}'
 SITES = b"""[[bar]]
 transmitter_id = 17
 latitude_deg = 35.0
@@ -192,12 +193,7 @@ def kinds(folder: Path, store: bytes) -> list[Kind]:
         Kind("update", "a.json", _update(folder), Package.read),
         Kind("truth", "a.truth.json", json.dumps(truth).encode(), read_truth),
         Kind("frames.csv", "frames.csv", FRAMES, _frames),
-        Kind(
-            "summary.json",
-            "summary.json",
-            b'{"status": "complete", "files": {}, "counts": {"a": 1}}',
-            _summary,
-        ),
+        Kind("summary.json", "summary.json", SUMMARY, _summary),
         Kind("poses", "a.csv", POSES, read_poses),
         Kind("attitude", "a.csv", ATTITUDE, AttitudeLog.read),
         Kind("sites", "a.toml", SITES, load_sites),

@@ -64,10 +64,7 @@ HDF5: dict[str, tuple[Callable[[Any, Path], Any], str]] = {
     "one chunk of zeros": (lambda file, _: declare(file, 10**8, "u1", 10**8), "has chunks of 100 MB"),
     "many rows of nothing": (lambda file, _: declare(file, 10**12, "i8", 1 << 16), "bytes can hold"),
     "external storage": (lambda file, _: store_in(file, Path("/etc/passwd")), "is stored in another file"),
-    "external storage in a pipe": (
-        lambda file, folder: store_in(file, folder / "pipe"),
-        "is stored in another file, expected it in this one",
-    ),
+    "external storage in a pipe": (lambda file, folder: store_in(file, folder / "pipe"), "in another file"),
     "external link": (
         lambda file, folder: file.update(events=h5py.ExternalLink(str(folder / "other.h5"), "/events")),
         "/events is a link, expected it in the file itself",

@@ -96,18 +96,12 @@ BAD_NPZ = {
     "two dimensions": (npz(x=[[1, 2], [3, 4]]), r"array x: found int64 \(2, 2\), expected numbers"),
     "unequal lengths": (npz(y=[1]), "'y': 1.*expected one length"),
     "x too large": (npz(x=[1, 70_000]), "row 2: place 70000, expected whole numbers from 0 to 65535"),
-    "polarity": (
-        npz(p=[1, 7]),
-        "row 2: polarity 7 beside 1, expected 0 and 1, or -1 and 1",
-    ),
-    "a huge time": (
-        npz(t_us=np.array([1, 1 << 63], np.uint64)),
-        r"row 2: time 9\.22\d*e\+18 us, expected a number up to 1e\+18 us",
-    ),
+    "polarity": (npz(p=[1, 7]), "row 2: polarity 7 beside 1, expected 0 and 1, or -1 and 1"),
+    "a huge time": (npz(t_us=np.array([1, 1 << 63], np.uint64)), r"row 2: time 9\.22\d*e\+18 us, expected"),
     "bad width": (npz(width="wide"), "array width: found <U4"),
-    "triggers of unequal lengths": (
+    "unequal triggers": (
         npz(trigger_t_us=[1], trigger_channel=[1, 2], trigger_value=[0]),
-        "'trigger_channel': 2.*expected one length",
+        "'trigger_channel': 2",
     ),
     "no trigger channels": (
         npz(trigger_t_us=[1]),
@@ -142,16 +136,13 @@ BAD_CSV = {
     "polarity 5": (b"t,p\n1,1\n2,5\n", "line 3: polarity 5 beside 1, expected 0 and 1"),
     "polarity 0": (b"t,p\n1,1\n2,-1\n3,0\n4,0\n", "line 4: polarity 0 beside -1 and 1, expected 0 and 1"),
     "polarity in a word": (
-        b"t,p\n1,1\n2,up\n3,sideways\n4,1\n",
-        "line 4: polarity 'sideways', expected 0 or 1, or -1 or 1, or ON or OFF",
+        b"t,p\n1,1\n2,up\n3,aside\n4,1\n",
+        "line 4: polarity 'aside', expected 0 or 1, or",
     ),
     "a number without end": (HEAD + b"9" * 30 + b",2,3,1\n", r"line 2: time 1e\+30 us, expected a number"),
     "a time beyond": (b"t_s,p\n99999999999999999,1\n", "line 2: time 9{17} s, expected a number up to"),
     "a line without end": (HEAD + b"1" * 3_000_000 + b"\n", "line 2: found '1{60}\\.\\.\\.', expected"),
-    "nothing but such a line": (
-        b"1" * 9_000_000,
-        "line 1: found '1{60}\\.\\.\\.', expected the columns t and p",
-    ),
+    "nothing but such a line": (b"1" * 9_000_000, "line 1: found '1{60}\\.\\.\\.', expected the columns"),
     "bytes": (HEAD + b"\xff\xfe\n", "line 2: found '.*', expected"),
     "damaged gzip": (b"\x1f\x8bnothing", "damaged or closed file"),
     "cut gzip": (gzip.compress(HEAD + TEN_THOUSAND)[:10_000], r"bad\.csv: damaged or closed file"),

@@ -54,15 +54,9 @@ def test_examples_can_be_rendered(path: Path) -> None:
         ({"link": {"air": 3}}, "link: air = 3: expected a table"),
         ({"link": {"air": {"chip_rate": 1.0}}}, "link: air.chip_rate = 1.0: unknown key; did you"),
         ({"bars": [{"link": "no.toml"}]}, "bars.0.link: no.toml: cannot be read"),
-        (
-            {"bars": [{}, {"link": {"modulation": {"id": "wh9"}}}]},
-            "bars.1.link: no modulation algorithm named 'wh9'",
-        ),
+        ({"bars": [{}, {"link": {"modulation": {"id": "wh9"}}}]}, "bars.1.link: no modulation algorithm"),
         ({"bars": [{"link": {"bar": {"rows": 7}}}]}, "bars.0.link: bar.cluster_rows = 6: expected"),
-        (
-            {"bars": [{"profile": "wh8"}]},
-            'bars.0.profile = "wh8": unknown key; its link says it: bars.link.m',
-        ),
+        ({"bars": [{"profile": "wh8"}]}, 'bars.0.profile = "wh8": unknown key; its link says it: bars.link'),
     ],
 )
 def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> None:
