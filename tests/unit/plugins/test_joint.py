@@ -429,13 +429,11 @@ def random_codes(rng):
     return np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1)
 
 
-def fit_of(codes, dim, values, spacing):
+def fit_of(codes, dim, values, spacing, offset_px=np.zeros(32)):
     """The fit of a frame's values, of boundaries .45 px wide without tails, and where they lie off it."""
     said = codes, codes[:, :0].copy(), np.zeros(K, np.int64), np.ones(K, np.bool_)
     fit = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
-    (variance, *_), by_boundary = _kernels.fit_bar(
-        said, np.zeros(32), values, profile(1.0), (0.45, dim), 6, fit
-    )
+    (variance, *_), by_boundary = _kernels.fit_bar(said, offset_px, values, profile(1.0), (0.45, dim), 6, fit)
     assert variance > 0
     return fit, by_boundary[:, 1:-1]
 
@@ -484,6 +482,19 @@ def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
     assert_allclose(fit[5:], [0.04, 0.05], rtol=0.12)
     assert (weight > 0).all()
     assert np.abs(off).max() < 0.005
+
+
+def test_a_value_is_read_half_a_chip_before_its_second_chips_middle() -> None:
+    """Also where the image, held still by whole pixels, jumps between its chips."""
+    codes, spacing = random_codes(np.random.default_rng(7)), 8.6
+    place, values = 0.34 * (np.arange(32) + 0.5), np.empty((16, 150))
+    for i in range(16):
+        seen = 0.34 * (2 * i + 1) - np.rint(place[2 * i + 1])
+        boundaries = 74.5 + seen + spacing * (np.arange(1, K) - K / 2)
+        values[i] = 0.6 * values_of(codes[:, i : i + 1], boundaries, 150)[0]
+    fit, _ = fit_of(codes, 1.0, values, spacing, place - np.rint(place))
+    # Spacing, place and drift.
+    assert_allclose(fit[:3], [spacing, 0, 0], atol=1e-5)
 
 
 def test_a_wave_of_the_pixels_shows_in_the_boundaries() -> None:
