@@ -429,7 +429,10 @@ def random_codes(rng):
     return np.concatenate([PILOTS, WORDS[rng.integers(0, 64, K)]], axis=1)
 
 
-def fit_of(codes, dim, values, spacing, offset_px=np.zeros(32)):
+STILL = np.zeros(32)
+
+
+def fit_of(codes, dim, values, spacing, offset_px=STILL):
     """The fit of a frame's values, of boundaries .45 px wide without tails, and where they lie off it."""
     said = codes, codes[:, :0].copy(), np.zeros(K, np.int64), np.ones(K, np.bool_)
     fit = np.array([1.005 * spacing, 0.1, 0.0, 0.8, 0.0, 0.0, 0.0])
