@@ -200,19 +200,6 @@ def test_from_words_to_chips_and_back_without_a_dark_chip(device: SimulatedBoard
     assert names.startswith("wcwcwcw")
 
 
-def test_it_is_kept_over_a_reset(device: SimulatedBoard, board: Board) -> None:
-    bank = a_bank(chip_rate_hz=5000)
-    provision(board, bank, Settings(level_ma=7, start=False))
-    board.save(autostart=True)
-    device.reset()
-    device.records()
-    device.run(200_000)
-    check_round(shown(device), EXPECTED, 900)
-    again = board_on(device, nonce=9)
-    assert again.holds(bank, again.status())
-    assert not again.program(bank).written
-
-
 @pytest.mark.parametrize(("limit", "every"), [(0.5, 2), (0.3, 4), (0.001, 1000)])
 def test_idle_keeps_to_the_limits(device: SimulatedBoard, board: Board, limit: float, every: int) -> None:
     """LEDs are on for no more of it than they may be, whatever the length of a packet."""

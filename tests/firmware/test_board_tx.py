@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 from board_lines import LINK, board_link, check_fault, options_of, symbols_of, well
 
-from evlcp_sdk.air.frames import PacketFormat, packet_chips
+from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
 from firmware_host import flicker
-from firmware_host.board.bank import Bank, read_masks, symbol_chips
-from firmware_host.protocol.rows import chips_of_rows, rows_of_chips
+from firmware_host.board.bank import read_masks
+from firmware_host.protocol.rows import chips_of_rows
 
 AIR = json.loads((Path(__file__).parents[1] / "vectors" / "air-vectors.json").read_text())
 EXAMPLE = AIR["example_packet"]
@@ -49,17 +49,6 @@ def test_every_form_has_the_same_words(evlcp, example: Path) -> None:
     assert [w for w in expected if f"0x{w}u" not in c] == []
     rows = evlcp("tx", "frames", example, *TWO_FRAMES).out.splitlines()[1:]
     assert [r.split()[5] for r in rows] == expected
-
-
-def test_payload_is_what_the_chips_say() -> None:
-    link = board_link("air.frames_per_packet=2")
-    symbols = symbols_of(3, 0, link)
-    chips = symbol_chips(symbols, link.codebook)
-    masks = Bank.of_chips(chips, link.codebook, PacketFormat.of(link.codebook, 2))
-    assert len(Bank.of_symbols(symbols, link.codebook).content) == 3 * 2 * 16 * 2
-    rows = np.frombuffer(masks.content, np.uint8).reshape(3 * 90, 12)
-    assert (chips_of_rows(rows) == chips).all()
-    assert (rows_of_chips(np.unpackbits(rows, axis=1)) == rows).all()
 
 
 def test_torn_cluster_is_told() -> None:

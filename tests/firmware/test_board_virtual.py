@@ -233,7 +233,11 @@ def test_a_chip_rate_that_cannot_be_is_told_with_the_nearest(board: Board, rate:
 
 
 def test_save_survives_reset_and_damage(device: SimulatedBoard, board: Board) -> None:
-    first, second = some_bank(1, 1), some_bank(2, 2)
+    other = board_link(
+        "modulation.id=ppm", "separation.id=edges", "decoding.id=edges", "air.chip_rate_hz=5000.0"
+    )
+    first, second = some_bank(1, 1), some_bank(2, 2, other)
+    assert (first.format, second.format) == (protocol.Format.WORDS, protocol.Format.CLUSTERS)
     for bank in (first, second):
         provision(board, bank, Settings(level_ma=33, watchdog=Watchdog.IDLE, watchdog_ms=700, start=False))
         board.save()
@@ -242,6 +246,7 @@ def test_save_survives_reset_and_damage(device: SimulatedBoard, board: Board) ->
     assert board.recall().slot == 1
     status = board.status()
     assert board.holds(second, status)
+    assert not board.program(second).written
     assert (status.level_ma, status.watchdog, status.watchdog_ms) == (33, Watchdog.IDLE, 700)
     held = bytearray(device.flash())
     held[len(held) // 2 + 200] ^= 0x10
