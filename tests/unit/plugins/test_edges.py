@@ -1,7 +1,6 @@
 """Codes of any chips: their words, and separation and decoding by edges against plain twins and in scenes."""
 
 import itertools
-import math
 
 import numpy as np
 import pytest
@@ -96,7 +95,8 @@ def test_presence_is_bayes_rule_over_edges(seed: int) -> None:
     assert (found.selected == (found.probability >= 0.5)).all()
 
 
-Histogram = list[float]
+KEYS = ["".join(key) for many in (2, 3) for key in itertools.product("01", repeat=many)]
+"""What was sent in a chip and in the one or two before."""
 
 
 def spelled(word: list[int], chip: int, before: int, after: int) -> str:
@@ -106,24 +106,14 @@ def spelled(word: list[int], chip: int, before: int, after: int) -> str:
     return "" if "?" in last[1:] else last.lstrip("?")
 
 
-def logs_of(histograms: dict[str, Histogram], counted: float) -> dict[str, Histogram]:
+def logs_of(counts: dict[str, np.ndarray], counted: float) -> dict[str, np.ndarray]:
     """Log-likelihood of each sum behind each two and three chips, of histograms of these."""
-    pairs = [one for key, one in histograms.items() if len(key) == 2]
-    everything = [sum(column) for column in zip(*pairs, strict=True)]
-    prior = 9 / sum(everything)
-
-    def share(counts: Histogram, without: Histogram) -> Histogram:
-        return [c / sum(counts) for c in counts] if sum(counts) else without
-
-    alike = share(everything, everything)
-    found = {}
-    for pair in ("00", "01", "10", "11"):
-        found[pair] = share(histograms[pair], alike)
-        for oldest in "01":
-            counts = [c + counted * s for c, s in zip(histograms[oldest + pair], found[pair], strict=True)]
-            found[oldest + pair] = share(counts, alike)
-    many = len(alike)
-    return {key: [math.log((s + prior) / (1 + many * prior)) for s in one] for key, one in found.items()}
+    everything = sum(counts[key] for key in KEYS if len(key) == 2)
+    prior, alike, found = 9 / everything.sum(), everything / everything.sum(), {}
+    for key in KEYS:
+        more = counts[key] + (counted * found[key[1:]] if len(key) == 3 else 0)
+        found[key] = more / more.sum() if more.sum() else alike
+    return {key: np.log((share + prior) / (1 + 5 * prior)) for key, share in found.items()}
 
 
 @pytest.mark.parametrize("seed", range(2))
@@ -141,49 +131,38 @@ def test_decoding_is_the_likeliest_word_as_pilots_and_the_others_teach(seed: int
     decode = EdgeDecoding(max_events=2, pair_count=40, independent_pixels=0.07).compile(book)
     soft = decode(presence, sums, np.array(before, np.int8), np.array(after, np.int8))
 
-    clip = np.clip(sums, -2, 2).astype(int)
-    pixels = [np.argwhere(p.repeat(2, 0).repeat(2, 1) > 0.5) for p in presence.probability]
+    mine = presence.probability.repeat(2, 1).repeat(2, 2) > 0.5
+    seen = [np.clip(sums[:, : one.shape[0], : one.shape[1]], -2, 2)[:, one] + 2 for one in mine]
 
-    def taught(cluster: int, said: list[tuple[str, int]]) -> dict[str, Histogram]:
-        """Histograms by what was sent in a cluster's chips: (spelled, number)."""
-        found = {"".join(key): [0.0] * 5 for n in (2, 3) for key in itertools.product("01", repeat=n)}
-        for key, chip in said:
-            for v, u in pixels[cluster] if key else ():
-                for one in {key, key[-2:]}:
-                    found[one][clip[chip, v, u] + 2] += 0.9
+    def sent(k: int, word: int) -> list[str]:
+        return [spelled(words[word].tolist(), chip, before[k], after[k]) for chip in range(5)]
+
+    def taught(k: int, keys: list[str]) -> dict[str, np.ndarray]:
+        """Histograms of a cluster's pixels by what was sent in its chips."""
+        found = {key: np.zeros(5) for key in KEYS}
+        for key, numbers in zip(keys, seen[k], strict=False):
+            for one in {key, key[-2:]} - {""}:
+                found[one] += 0.9 * np.bincount(numbers, minlength=5)
         return found
 
-    def added(*many: dict[str, Histogram]) -> dict[str, Histogram]:
-        return {key: [sum(c) for c in zip(*(one[key] for one in many), strict=True)] for key in many[0]}
-
-    def fits(k: int, counts: dict[str, Histogram]) -> list[float]:
-        logs = logs_of(counts, 40)
-        found = []
-        for word in words.tolist():
-            keys = [spelled(word, chip, before[k], after[k]) for chip in range(5)]
-            terms = [
-                0.9 * logs[key][clip[7 + chip, v, u] + 2]
-                for chip, key in enumerate(keys)
-                for v, u in (pixels[k] if key else ())
-            ]
-            found.append(0.07 * sum(terms))
-        return found
+    def fits(k: int, *parts: dict[str, np.ndarray]) -> np.ndarray:
+        logs = logs_of({key: sum(part[key] for part in parts) for key in KEYS}, 40)
+        terms = [
+            [logs[key][seen[k][7 + chip]].sum() if key else 0 for chip, key in enumerate(sent(k, word))]
+            for word in range(4)
+        ]
+        return 0.07 * 0.9 * np.sum(terms, 1)
 
     pilots = [
-        taught(k, [(spelled(code, c, -1, -1), c) for c in range(7)]) for k, code in enumerate(PILOTS.tolist())
+        taught(k, [spelled(code, c, -1, -1) for c in range(7)]) for k, code in enumerate(PILOTS.tolist())
     ]
-    own, sure = [], []
+    first = np.array([fits(k, *pilots) for k in range(3)])
+    sure = np.ptp(np.sort(first)[:, -2:], axis=1) >= 5
+    assert 0 < sure.sum() < 3
+    own = [taught(k, [""] * 7 + sent(k, int(first[k].argmax())) if sure[k] else []) for k in range(3)]
     for k in range(3):
-        first = fits(k, added(*pilots))
-        best, second = sorted(first)[:-3:-1]
-        sure.append(best - second >= 5)
-        word = words.tolist()[int(np.argmax(first))]
-        said = [(spelled(word, c, before[k], after[k]), 7 + c) for c in range(5)] if sure[-1] else []
-        own.append(taught(k, said))
-    assert 0 < sum(sure) < 3
-    for k in range(3):
-        fit = fits(k, added(*pilots, *(one for other, one in enumerate(own) if other != k)))
-        assert soft.symbols[k] == int(np.argmax(fit))
+        fit = fits(k, *pilots, *(one for other, one in enumerate(own) if other != k))
+        assert soft.symbols[k] == fit.argmax()
         best = [max(fit[:2]) - max(fit[2:]), max(fit[0], fit[2]) - max(fit[1], fit[3])]
         np.testing.assert_allclose(soft.llr[k], best, rtol=1e-4, atol=1e-3)
 
