@@ -267,23 +267,6 @@ def test_a_reserve_is_kept() -> None:
                 assert code.decode(llr).ok
 
 
-def test_random_words_are_taken_no_more_often_than_stated() -> None:
-    """The bound at work: (48, 8) words, 256 codewords, one in 100 random words may come near."""
-    code = Polar(rate=0.7, undetected=0.01, list_size=128, max_list_size=128).compile(48)
-    assert code.message_bits == 8
-    codewords = np.array([code.encode(message) for message in every_word(8)])
-    rng = np.random.default_rng(0)
-    near, trials = 0, 6000
-    for _ in range(trials):
-        llr = rng.normal(size=48).astype(np.float32)
-        limit = discrepancy_limit(np.abs(llr).astype(float), np.log(0.01 / 256))
-        near += bool((discrepancy(llr, codewords) <= limit).any())
-    low, high = stats.binomtest(near, trials).proportion_ci()
-    assert high > 0.0005
-    assert low < 0.01
-    assert near / trials < 0.01
-
-
 def test_a_scale_of_the_llrs_changes_nothing() -> None:
     code = Polar().compile(256)
     rng = np.random.default_rng(0)

@@ -183,20 +183,6 @@ def test_the_smooth_path_is_the_best_of_all(seed, step_cost, place_cost):
 # Separation
 
 
-@pytest.mark.parametrize("silent", ["second", "first", "some"])
-def test_a_value_is_read_from_the_chip_that_is_seen(silent):
-    sums = image_of(CODES, range(CLUSTERS))
-    whole = WhCorrelation().compile(book_of())(sums)
-    halves = sums.reshape(8, 2, *sums.shape[1:])
-    if silent == "some":
-        halves[[1, 4, 6], 1] = halves[[0, 2, 5], 0] = 0
-    else:
-        halves[:, int(silent == "second")] = 0
-    found = WhCorrelation().compile(book_of())(sums)
-    assert_array_equal(found.probability, whole.probability)
-    assert_array_equal(found.pixels, whole.pixels)
-
-
 # Decoding
 
 

@@ -50,53 +50,6 @@ def score_rises(events, shape, start, chip_us, min_score, cell_shift, most_same=
     return (rose, time, same, score), hits
 
 
-def measure_box(lit, rose, box, seam, reach):
-    """What `measure_box` says of a mask of blinking pixels, and of one of those that rose lately."""
-    left, top, right, bottom = box
-    inside = lit[top:bottom, left:right]
-    counts = inside.sum(0)
-    calm = min(rose[top:bottom:2, left:right][:, side].mean() for side in (slice(seam), slice(-seam, None)))
-    if not counts.any():
-        return (0, 0.0, 0, 0, 0.0, 0.0, calm), np.zeros(bottom - top, int)
-    outside = min(counts[:seam].mean(), counts[-seam:].mean()) if len(counts) > 2 * seam else 0
-    more = np.maximum(counts - outside, 0)
-    columns = left + np.arange(len(counts))
-    seen = columns[counts > 0]
-    wide = int(min(2 * reach, len(counts)))
-    sums = np.array([more[i : i + wide].sum() for i in range(len(more) - wide + 1)])
-    core = slice(int(sums.argmax()), int(sums.argmax()) + wide)
-    column = np.average(columns[core], weights=more[core]) if more.any() else (seen[0] + seen[-1]) / 2
-    rows = inside[:, np.abs(columns - column) <= reach].sum(1)
-    if not rows.any():
-        return (0, 0.0, 0, 0, 0.0, 0.0, calm), rows
-    first, last = np.flatnonzero(rows)[[0, -1]]
-    share = np.minimum(rows / rows[rows > 0].mean(), 1)
-    upper, lower = top + first + 1 - share[first], top + last + share[last]
-    return (rows.sum(), column, seen[0], seen[-1], upper, lower, calm), rows
-
-
-def measure_strips(lit, box, expected, near, strips):
-    """What `measure_strips` says of a mask of blinking pixels."""
-    left, top, right, bottom = box
-    inside = lit[top:bottom, left:right]
-    columns, column = np.arange(left, right), expected
-    for more in (near, 1, 1):
-        off = columns - column - strips[:, :1]
-        mine = np.abs(off) <= strips[:, 1:] + more
-        mine &= np.cumsum(mine, 0) == 1
-        counts = mine * inside.sum(0)
-        if not counts.any():
-            return (0, 0.0, 0, 0, 0.0, 0.0, 0.0), np.zeros(bottom - top, int)
-        column += (counts * off).sum() / counts.sum()
-    kept = inside[:, mine.any(0)]
-    rows = kept.sum(1)
-    seen = columns[mine.any(0)][kept.any(0)]
-    first, last = np.flatnonzero(rows)[[0, -1]]
-    share = np.minimum(rows / rows[rows > 0].mean(), 1)
-    upper, lower = top + first + 1 - share[first], top + last + share[last]
-    return (rows.sum(), column, seen[0], seen[-1], upper, lower, 0.0), rows
-
-
 def select_box(events, box):
     left, top, right, bottom = box
     return events[(events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)]

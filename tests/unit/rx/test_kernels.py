@@ -144,35 +144,23 @@ def test_old_rises(seed):
     assert_array_equal(rhythmic.x, expected.x)
 
 
-@pytest.mark.parametrize("reach", [2.0, np.inf])
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 1.0])
-@pytest.mark.parametrize("box", [(0, 0, WIDTH, HEIGHT), (5, 3, 20, 12), (7, 7, 8, 8), (0, 15, 24, 16)])
-def test_what_blinks_in_a_box(box, share, reach):
-    rng = np.random.default_rng(round(100 * share))
-    rose = rng.integers(900, 1100, (HEIGHT, WIDTH))
-    score = np.where(rng.random(rose.shape) < share, 5, 3)
-    pixels = states(rose, rng.integers(0, 14, rose.shape), score)
-    span_us = 100 if share < 1 else 200
-    rows = np.empty(box[3] - box[1], np.int64)
-    got = rhythm_of(pixels, min_score=10).measure(box, 1100, span_us, reach, rows, None)
-    late = rose >= 1100 - span_us
-    want, want_rows = twins.measure_box(late & (score >= 5), late, box, 2, reach)
-    assert_allclose(got, want, rtol=1e-12)
-    assert_array_equal(rows, want_rows)
-
-
-@pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 1.0])
-@pytest.mark.parametrize("strips", [[[0, 3.03]], [[-8, 1.03], [7, 2.07]], [[-5, 3.03], [0, 0.57], [5, 3.03]]])
-def test_what_blinks_in_strips(strips, share):
-    rng = np.random.default_rng(round(100 * share))
-    box, strips = (1, 2, WIDTH - 1, HEIGHT - 3), np.array(strips, float)
-    blinks = rng.random((HEIGHT, WIDTH)) < share
-    pixels = states(np.full(blinks.shape, 1000), 0, np.where(blinks, 5, 3))
-    rows = np.empty(box[3] - box[1], np.int64)
-    got = rhythm_of(pixels, min_score=10).measure(box, 1100, 200, np.inf, rows, (11.3, 2.0, strips))
-    want, want_rows = twins.measure_strips(blinks, box, 11.3, 2.0, strips)
-    assert_allclose(got, want, rtol=1e-12)
-    assert_array_equal(rows, want_rows)
+def test_a_bar_is_measured_beside_light_that_is_everywhere() -> None:
+    """A lit row across the image is a halo's; the bar's last row has half of its pixels awake."""
+    blinks, rose = np.zeros((HEIGHT, WIDTH), bool), np.full((HEIGHT, WIDTH), 1000)
+    blinks[4:12, 9:13] = blinks[12, 9:11] = blinks[1] = True
+    # Of the left seam's pixels in every second row, six of sixteen rose long ago.
+    rose[2:8, :2] = 500
+    rhythm, rows = rhythm_of(states(rose, 0, np.where(blinks, 5, 3)), min_score=10), np.empty(HEIGHT, int)
+    column = (9 * 9 + 9 * 10 + 8 * 11 + 8 * 12) / 34
+    found = rhythm.measure((0, 0, WIDTH, HEIGHT), 1100, 200, 3.0, rows, None)
+    assert found == pytest.approx((40, column, 0, 23, 1, 12.5, 10 / 16))
+    assert rows.tolist() == [0, 6, 0, 0, *[4] * 8, 2, 0, 0, 0]
+    # A full row holds the mean of all.
+    found = rhythm.measure((5, 3, 20, 14), 1100, 200, np.inf, rows[:11], None)
+    assert found == pytest.approx((34, column, 9, 12, 4, 12 + 2 / (34 / 9), 1))
+    assert rhythm.measure((10, 7, 11, 8), 1100, 200, 2.0, rows[:1], None) == (1, 10, 10, 10, 7, 8, 1)
+    for box, end_us in (((0, 13, 9, 16), 1100), ((0, 0, WIDTH, HEIGHT), 1300)):
+        assert rhythm.measure(box, end_us, 200, 2.0, rows[: box[3] - box[1]], None)[:6] == (0,) * 6
 
 
 def test_strips_are_measured_whatever_each_has_awake():
@@ -518,23 +506,6 @@ def test_cells_that_boxes_touch_are_cleared(box):
     had, want = int(hits[inside].sum()), np.where(inside, 0, hits)
     assert _kernels.clear_cells(hits, np.array([box, (20, 0, 21, 1)]), 2) == had
     assert_array_equal(hits, want)
-
-
-@pytest.mark.parametrize("period_us", [200, 222, 300, 400, 500])
-def test_a_lamp_of_whole_chips_is_no_candidate(period_us):
-    """Its rises are on the chips; but in a code the same time does not come again and again."""
-    rng = np.random.default_rng(0)
-    rhythm = Rhythm(WIDTH, HEIGHT, CHIP_US, 8)
-    lamp = np.arange(0, 20_000, period_us)
-    lamp = lamp[rng.random(len(lamp)) > 0.05]
-    code = 100 * np.cumsum(rng.choice([2, 3, 4], 80, p=[0.5, 0.37, 0.13]))
-    code = code[code < 20_000]
-    t = np.concatenate([lamp, code])
-    order = np.argsort(t, kind="stable")
-    x = np.repeat([3, 9], [len(lamp), len(code)])
-    events = Events.of(t[order], x[order], np.full(len(t), 5), np.ones(len(t)))
-    rhythm.step(0, events, np.zeros((4, 6), np.int16), 2)
-    assert set(rhythm.of(events).x.tolist()) == {9}
 
 
 @pytest.mark.parametrize("n", [1, 2, 5])
