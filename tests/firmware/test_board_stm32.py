@@ -356,19 +356,6 @@ def test_a_swap_leaves_no_chip_out(bar: Bar) -> None:
     assert len(rows) > (found[0] + 2) * len(bar.chips)
 
 
-def test_a_reset_is_dark_and_what_is_programmed_after_it_plays(bar: Bar) -> None:
-    bar.play(7_000, 20)
-    at = bar.chip.now
-    bar.chip.reset(RESET_BY_PIN)
-    assert bar.dark
-    bar.chip.run(BOOT_US)
-    assert all(s.dark for s in bar.log if s.time > at)
-    bar.board = connect(bar.chip)
-    provision(bar.board, bank_of(symbols_of(1, 1, FOUR), FOUR), Settings(start=False))
-    bar.play(15_000, 100)
-    assert bar.board.status().faults == 0
-
-
 def test_counters_pass_two_to_the_32(bar: Bar) -> None:
     """TIM2, the milliseconds, the chips and the packets sent all wrap while it plays."""
     chip = bar.chip

@@ -171,17 +171,7 @@ def test_latency_grows_with_the_lit_area(side: int) -> None:
     assert latency_with_readout_us(SENSOR, 0.277, side) == pytest.approx(MEASURED_AREA[side], rel=0.1)
 
 
-def test_rows_are_read_one_after_another() -> None:
-    y = np.repeat(np.arange(100), 5)
-    events, *_ = served(words_of(np.full(500, 10.0), y, np.tile(np.arange(5), 100)), 720, 1.0)
-    # The row of the first request begins; each row takes all its requests along, a row a us.
-    assert events.t_us.tolist() == (11 + y).tolist()
-    assert events.y.tolist() == y.tolist()
-    assert events.x.tolist() == np.tile(np.arange(5), 100).tolist()
-    # A row that has been served waits no longer: the third in turn is passed over, not served again.
-    events, *_ = served(words_of(np.array([0.0, 5.0, 5.0, 6.5]), [3, 4, 2, 4], [0] * 4), 720, 1.0)
-    assert (events.t_us.tolist(), events.y.tolist()) == ([1, 6, 7, 8], [3, 4, 2, 4])
-    # Columns of the widest sensor are told apart.
+def test_columns_of_the_widest_sensor_are_told_apart() -> None:
     words = words_of(np.full(4, 10.0), [719, 718, 718, 719], [8191, 0, 4096, 1])
     events, *_ = served(words, 720, 1.0)
     assert events.x.tolist() == [0, 4096, 1, 8191]
