@@ -1,6 +1,7 @@
 """Bags of real cameras, and files of HDF5, give the events that are in them."""
 
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -146,9 +147,8 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path: Path) -> None:
         ("empty", "a folder without .db3 or .mcap files"),
         ("gone", "No such file"),
     ):
-        with pytest.raises(InputError) as fault:
+        with pytest.raises(InputError, match=re.escape(told)):
             open_source(f"bag:{tmp_path / name}")
-        assert told in str(fault.value)
 
 
 def test_a_bag_that_is_written_is_read_back(
@@ -241,6 +241,5 @@ def test_what_is_wrong_with_hdf5_is_said(tmp_path: Path) -> None:
         ("table.h5?columns=txy", "columns = 'txy': expected the letters t, x, y and p"),
         ("ecf.h5", "compressed by ECF, Prophesee's own codec"),
     ):
-        with pytest.raises(InputError) as fault:
+        with pytest.raises(InputError, match=re.escape(told)):
             open_source(f"hdf5:{tmp_path / name}")
-        assert told in str(fault.value)

@@ -54,21 +54,6 @@ def test_round_trip_is_the_identity(name, tmp_path_factory):
     check()
 
 
-def test_npz_keeps_size_and_triggers(tmp_path):
-    events = Events.of([1, 5, 9], [1, 2, 3], [4, 5, 6], [1, 0, 1])
-    triggers = Triggers.of([0, 5, 7, 11], [1, 1, 6, 6], [1, 0, 1, 0])
-    write_events(tmp_path / "a.npz", events, 640, 480, triggers)
-    with np.load(tmp_path / "a.npz") as arrays:
-        assert int(arrays["width"]) == 640
-        assert arrays["t_us"].dtype == np.int64
-    with open_source(tmp_path / "a.npz") as source:
-        assert (source.width, source.height) == (640, 480)
-        pieces = list(source.stream(2))
-    assert [g.t_us.tolist() for _, g in pieces] == [[0, 5], [7], [11]]
-    assert np.concatenate([g.channel for _, g in pieces]).tolist() == [1, 1, 6, 6]
-    assert np.concatenate([g.value for _, g in pieces]).tolist() == [1, 0, 1, 0]
-
-
 def npz(**changes):
     """Two good events in an NPZ file, but for some arrays; those given as bytes are members as they are."""
     arrays = {"t_us": [1, 2], "x": [3, 4], "y": [5, 6], "p": [1, 0], **changes}

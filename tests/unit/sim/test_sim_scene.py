@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.air.frames import packet_chips
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
 from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.sim import (
     BarSpec,
@@ -100,10 +100,6 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     symbols = ((tuple(range(16)),) * 10,)
     light = BarLight(BarSpec(symbols=symbols, start_chip=0.0), LINK, LensSpec(), seed=0)
     assert light.sent_symbols(0.05) == [[list(range(16))] * 10] * 2
-    with pytest.raises(ConfigError, match=r"bars\.0\.symbols\.0: 1 frames, expected 10"):
-        BarLight(BarSpec(symbols=((tuple(range(16)),),)), LINK, LensSpec(), 0, "bars.0")
-    with pytest.raises(ConfigError, match=r"symbol 99 .*expected 0 to 63"):
-        BarLight(BarSpec(symbols=(((99,) * 16,) * 10,)), LINK, LensSpec(), 0, "bars.0")
     chips = np.random.default_rng(0).integers(0, 2, (50, 16))
     np.save(tmp_path / "chips.npy", chips)
     sent = BarLight(
@@ -114,18 +110,16 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     assert sent.longest_us == 100 * max(
         len(run) for row in np.tile(chips, (2, 1)).T for run in re.findall("0+|1+", "".join(map(str, row)))
     )
-    with pytest.raises(ConfigError, match="8 clusters"):
-        BarLight(
-            BarSpec(chips_file=str(tmp_path / "chips.npy")),
-            resolve({"bar": {"rows": 48}}),
-            LensSpec(),
-            seed=0,
-        )
-    with pytest.raises(InputError, match="cannot be read"):
-        BarLight(BarSpec(chips_file=str(tmp_path / "no.npy")), LINK, LensSpec(), seed=0)
     (tmp_path / "text.npy").write_text("chips")
-    with pytest.raises(InputError, match=r"not a \.npy file of plain numbers"):
-        BarLight(BarSpec(chips_file=str(tmp_path / "text.npy")), LINK, LensSpec(), seed=0)
+    for link, wrong, says in (
+        (LINK, {"symbols": ((tuple(range(16)),),)}, r"bars\.0\.symbols\.0: 1 frames, expected 10"),
+        (LINK, {"symbols": (((99,) * 16,) * 10,)}, r"symbol 99 .*expected 0 to 63"),
+        (resolve({"bar": {"rows": 48}}), {"chips_file": str(tmp_path / "chips.npy")}, "8 clusters"),
+        (LINK, {"chips_file": str(tmp_path / "no.npy")}, "cannot be read"),
+        (LINK, {"chips_file": str(tmp_path / "text.npy")}, r"not a \.npy file of plain numbers"),
+    ):
+        with pytest.raises(EvlcpError, match=says):
+            BarLight(BarSpec(**wrong), link, LensSpec(), 0, "bars.0")
 
 
 def test_lamps_keep_their_period_and_duty() -> None:
@@ -155,15 +149,17 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     assert truth_of(scene).to_table()["distance_m"][0][100] == pytest.approx(39, abs=0.05)
     with pytest.raises(ConfigError, match=r"lasts from 0\.0 to 0\.2 s"):
         Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.3"]))
-    (tmp_path / "path.csv").write_text("\n".join([line.replace("-", "") for line in lines]))
-    with pytest.raises(ConfigError, match=r"bars\.0: the bar is behind the camera .*depth -40\.00 m"):
-        Simulation(scene)
-    (tmp_path / "path.csv").write_text("\n".join([lines[0], "0,0,0,x,0,0,0"]))
-    with pytest.raises(ConfigError, match="line 2: z_m = 'x': expected a number"):
-        Simulation(scene)
-    (tmp_path / "path.csv").write_text("\n".join([lines[0], lines[2], lines[1]]))
-    with pytest.raises(ConfigError, match="rising t_s"):
-        Simulation(scene)
+    for wrong, says in (
+        (
+            [line.replace("-", "") for line in lines],
+            r"bars\.0: the bar is behind the camera .*depth -40\.00 m",
+        ),
+        ([lines[0], "0,0,0,x,0,0,0"], "line 2: z_m = 'x': expected a number"),
+        ([lines[0], lines[2], lines[1]], "rising t_s"),
+    ):
+        (tmp_path / "path.csv").write_text("\n".join(wrong))
+        with pytest.raises(ConfigError, match=says):
+            Simulation(scene)
     (tmp_path / "path.csv").unlink()
     with pytest.raises(InputError, match="cannot be read"):
         Simulation(scene)
