@@ -167,10 +167,11 @@ def test_strips_are_measured_whatever_each_has_awake():
     """Where one of two lamps has a fifth of its pixels awake, the mean column is five columns off."""
     blinks = np.zeros((HEIGHT, WIDTH), bool)
     blinks[3:13, 4:7], blinks[4:14:5, 16:19] = True, True
-    blinks[8, 11] = True  # of neither
+    blinks[8, 8] = True  # of neither, but near one
     pixels = states(np.full(blinks.shape, 1000), 0, np.where(blinks, 5, 3))
     box, rows = (0, 0, WIDTH, HEIGHT), np.empty(HEIGHT, np.int64)
-    strips = 12.5, 2.0, np.array([[-6, 1.5], [6, 1.5]])
+    # Expected so far off that no column is within a pixel of its strip.
+    strips = 15.3, 3.0, np.array([[-6, 1.5], [6, 1.5]])
     rhythm = rhythm_of(pixels, min_score=10)
     many, column, first, last, upper, lower, _ = rhythm.measure(box, 1100, 200, np.inf, rows, strips)
     assert (many, first, last) == (36, 4, 18)
@@ -178,6 +179,11 @@ def test_strips_are_measured_whatever_each_has_awake():
     assert rows[8] == 3
     assert (upper, lower) == pytest.approx((3 + 1 / 6, 13 - 1 / 6))  # 36 pixels in ten rows
     assert abs(rhythm.measure(box, 1100, 200, np.inf, rows, None)[1] - 11) > 3
+    # Of two strips that meet, what is near both is the first's: of six columns five, in the end.
+    pixels[:] = states(1000, 0, np.where(abs(np.arange(WIDTH) - 11.5) < 3, 5, 3))
+    strips = 11.5, 2.0, np.array([[-1.5, 1.5], [1.5, 1.5]])
+    many, column, *_ = rhythm.measure(box, 1100, 200, np.inf, rows, strips)
+    assert (many, column) == (6 * HEIGHT, pytest.approx(12.5))
 
 
 @pytest.mark.parametrize("n", [0, 1, 500])
