@@ -67,6 +67,10 @@ _HEAD_DOWN, _MIRRORED = -0.5, -0.25
 """Cosine between a bar and its image beyond which it stands on its head, as one that lies may point either
 way; and the part of it, of one axis alone, beyond which left and right are exchanged."""
 
+_ANEW_PACKETS, _ANEW_PX = 3, 30.0
+"""Packets between the last frame before a reset and the first after it, which two preambles tell, and how far
+the image moves in between."""
+
 _LIT_SHARE, _LIT_PACKETS = 0.2, 3
 """Share of a recording, and packets, for which a bar is in the picture without a frame before it is said."""
 
@@ -151,6 +155,19 @@ def check_reflection(_facts: Facts, one: TransmitterTally) -> Found:
         text = f"a reflection of transmitter {one.echo_of}, {counted(one.echoes, 'frame')}"
         step = "or a much weaker bar that says the same: it is left out"
         yield Diagnostic("reflection", text, step, verdict="note")
+
+
+def check_restart(facts: Facts, one: TransmitterTally) -> Found:
+    """A transmitter that has begun anew in the place of another one."""
+    left, top, right, bottom = one.passed_px
+    for old in facts.tally.transmitters.values() if facts.counts.get("restarts") else ():
+        between_us = one.first_us - old.last_us
+        x0, y0, x1, y1 = old.passed_px
+        moved_px = max(left - x1, x0 - right, top - y1, y0 - bottom)
+        if 0 < between_us < _ANEW_PACKETS * facts.link.packet.packet_us and moved_px < _ANEW_PX:
+            at = in_ms(one.first_us - facts.first_us)
+            text = f"it is transmitter {old.number}, begun anew {at} into the recording, as after a reset"
+            yield Diagnostic("restart", text, verdict="note")
 
 
 def check_alike(facts: Facts) -> Found:
@@ -361,8 +378,8 @@ def check_bent(facts: Facts, one: TransmitterTally) -> Found:
     most_cm = most_px * 100 * one.median_m() / facts.link.camera.focal_px
     yield Diagnostic(
         "image-bent",
-        f"its image is bent in {one.bent} of {one.ranged} frames, which sigmas allow for: clusters"
-        f" {clusters} end up to {most_px:.2f} px ({most_cm:.1f} cm at the bar) off a straight one's,"
+        f"its image is bent in {one.bent} of {one.ranged} frames (their sigma {one.bent_sigma_m:.2g} m):"
+        f" clusters {clusters} by up to {most_px:.2f} px, {most_cm:.1f} cm at the bar,"
         f" {'neighbours alike' if together else 'each by itself'}",
         "clean what is before the camera: drops and uneven glass do this"
         if together

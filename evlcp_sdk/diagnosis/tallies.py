@@ -66,7 +66,7 @@ class TransmitterTally:
         firsts: Its first symbols, where a frame has one; -1 for one that was not received.
         passed_px: Where it has been in the image: left, top, right, bottom.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
-        bent: Frames in which its image is bent.
+        bent: Frames in which its image is bent; mean sigma of their distances, m: `bent_sigma_m`.
         bent_px: In how many of them each boundary is seen, sum of how far it lies off, px, and of the squares
             of that, float64 (3, K - 1); empty before the first.
     """
@@ -96,6 +96,7 @@ class TransmitterTally:
     along_px: tuple[float, float] = (0.0, 0.0)
     beacon_m: float = math.nan
     bent: int = 0
+    bent_sigma_m: float = 0.0
     bent_px: NDArray[np.float64] = field(default_factory=lambda: np.zeros((3, 0)))
     blocks: int = 0
     firsts: list[int] = field(default_factory=list)
@@ -147,6 +148,7 @@ class TransmitterTally:
                     self._add_size(frame, distance_m)
                     if frame.range.bent_px is not None:
                         self._add_bent(frame.range.bent_px)
+                        self.bent_sigma_m += (frame.range.sigma_m - self.bent_sigma_m) / self.bent
 
     def _add_size(self, frame: Frame, distance_m: float) -> None:
         """Add how long the bar looks times its distance, which is the same wherever it is."""

@@ -218,7 +218,7 @@ def test_what_the_figures_of_a_transmitter_say(figures: dict[str, Any], decoded:
     [
         (
             {2: -0.7, 9: 0.6},
-            "clusters 2, 10 end up to 0.70 px (0.5 cm at the bar) off a straight one's, each",
+            "(their sigma 0.1 m): clusters 2, 10 by up to 0.70 px, 0.5 cm at the bar",
         ),
         (dict(enumerate(np.sin(np.arange(15) / 2))), "neighbours alike"),
         ({2: 0.1, 9: 0.1}, ""),

@@ -141,6 +141,19 @@ def test_what_a_bar_leaves_behind_that_sweeps_is_its_own() -> None:
     assert 4.7 < float(light.split(" at ")[1].removesuffix(" px/ms")) < 6.6
 
 
+def test_a_restart_is_told_in_words() -> None:
+    old, new = (
+        {"pole_s": [[0.07, 9.0]], "seed": 1},
+        {"pole_s": [[0.0, 0.0702]], "seed": 2, "start_chip": 343.7},
+    )
+    source = simulate({"duration_s": 0.16, "bars": [old | {"start_chip": 40.3, "ppm": 11.0}, new]}, seed=3)
+    summary = receive_to_folder(source, None)
+    (note,) = [one for one in summary["notes"] if one["code"] == "restart"]
+    text, _, rest = note["text"].partition(", begun anew ")
+    assert (note["transmitter"], text) == (1, "it is transmitter 0")
+    assert 70 <= float(rest.split()[0]) < 77
+
+
 def judged(
     *sources: LightSource,
     quality: float = 1.0,
