@@ -260,21 +260,24 @@ class CameraOptions:
 
 
 class LinePrinter:
-    """Prints lines as they come, until whoever reads them has left.
+    """Prints lines as they come, until whoever reads them has left, or standard output takes no more.
 
     Attributes:
-        gone: The reader has left.
+        gone: It is so.
+        failed: It took no more, which was said: the exit code is 1.
     """
 
     def __init__(self) -> None:
-        self.gone = False
+        self.gone = self.failed = False
 
     def __call__(self, line: str) -> None:
         if self.gone:
             return
         try:
             echo(line)
-        except BrokenPipeError:
-            self.gone = True
+        except OSError as fault:
+            self.gone, self.failed = True, not isinstance(fault, BrokenPipeError)
+            if self.failed:
+                complain(f"standard output: {fault.strerror}")
             # Or else the interpreter tries once more as it ends.
             os.dup2(os.open(os.devnull, os.O_WRONLY), 1)

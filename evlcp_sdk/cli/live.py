@@ -179,7 +179,8 @@ def live(
         if stopped() and out is not None:
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")
     fault = UnpluggedError if summary["live"]["unplugged"] else InputError
-    raise typer.Exit(fault.exit_code if summary["status"] == "failed" else 0)
+    failed = summary["status"] == "failed"
+    raise typer.Exit(fault.exit_code if failed else int(lines is not None and lines.failed))
 
 
 @contextmanager

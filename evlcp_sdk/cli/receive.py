@@ -96,7 +96,7 @@ def receive(
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
     executor = make_executor(0 if here else workers or None, dask)
     outcomes = _run_jobs(jobs, decode, executor, registry if here else None, result)
-    raise typer.Exit(_exit_code(outcomes, strict=strict))
+    raise typer.Exit(_exit_code(outcomes, strict=strict) or int(lines is not None and lines.failed))
 
 
 def _run_jobs(

@@ -40,11 +40,11 @@ def environment(request: pytest.FixtureRequest) -> dict[str, str]:
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-@pytest.mark.parametrize("argument", ["plugins", "--version"])
-def test_a_full_stdout_is_one_line(argument: str, environment: dict[str, str]) -> None:
+@pytest.mark.parametrize("arguments", ["plugins", "--version", "receive {demo} --json-lines -"])
+def test_a_full_stdout_is_one_line(arguments: str, demo_raw: Path, environment: dict[str, str]) -> None:
     with Path("/dev/full").open("w") as full:
         done = subprocess.run(
-            [sys.executable, "-c", MAIN, argument],
+            [sys.executable, "-c", MAIN, *arguments.format(demo=demo_raw).split()],
             env=environment,
             stdout=full,
             stderr=subprocess.PIPE,
