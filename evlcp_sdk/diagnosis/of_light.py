@@ -114,11 +114,12 @@ def check_times(facts: Facts) -> Found:
     step_us = max(facts.step_us, grain.step_us if grain.known_us is not None else 0)
     if step_us > chip_us / 4:
         step = "export them in whole microseconds, or with six decimals of a second; of a sensor that reads"
-        step += f" images, four to a chip: air.chip_rate_hz = {1e6 / (4 * step_us):.0f}"
+        step += f" images, four to a chip: air.chip_rate_hz = {1e6 / (4 * step_us):.4g}"
+        step = f"see first whether their unit is right; if so, {step}" if facts.guessed else step
         text = f"times come in steps of {step_us / 1000:g} ms; a chip is {chip_us / 1000:g} ms"
         yield Diagnostic("coarse-times", text, step, verdict="fail" if step_us > chip_us else "doubt")
     if facts.guessed:
-        step = "where it is wrong, list:PATH?columns=...&unit=... says it"
+        step = "where that is wrong, name the file with its unit and columns: list:PATH?unit=us&columns=t,p"
         yield Diagnostic("guessed", facts.guessed, step, verdict="note")
     silences, silent_us = facts.skipped
     if silences:

@@ -104,8 +104,8 @@ class TimeUnit:
 
     @property
     def guess(self) -> str:
-        """What was guessed, in words; empty where the unit is known."""
-        if not self.why.startswith("guessed"):
+        """What was guessed, or is doubtful, in words; empty where the unit is known."""
+        if self.why in ("as its column says", "as told"):
             return ""
         others = [unit for unit in self.others if unit != self.name]
         return f"times in {self.name}, {self.why}" + (f"; {' or '.join(others)} would do" if others else "")
@@ -301,6 +301,8 @@ def time_unit(
 ) -> TimeUnit:
     """The unit of times: the one that is named, or else that in which something blinks, or what cameras do.
 
+    That something blinks in another one than is named is said.
+
     Lights blink at 100 to 60 000 chips a second, which is less than a thousandfold: of units a thousandfold
     apart one alone shows it. Where nothing blinks, times since 1970 say their unit by themselves; and a
     camera counts microseconds, whole ones: nanoseconds of one are multiples of 1000, milliseconds have three
@@ -323,8 +325,6 @@ def time_unit(
     >>> time_unit(np.array([0.125, 0.126, 0.131] * 100), None).name
     's'
     """
-    if named is not None:
-        return TimeUnit(named, "as its column says")
     inside = np.sort(times[np.isfinite(times)])
     span, most_hz = float(np.ptp(inside)) if len(inside) else 0.0, MOST_PLACED_HZ if placed else MOST_RATE_HZ
     rates_hz = {
@@ -332,7 +332,12 @@ def time_unit(
         for unit, length_us in UNITS_US.items()
     }
     likely = tuple(unit for unit, rate in rates_hz.items() if span > 0 and LEAST_RATE_HZ <= rate <= most_hz)
-    if (blinks := _blinking_unit(inside)) is not None:
+    blinks = _blinking_unit(inside)
+    if named is not None:
+        unit, rate_hz = blinks or (named, 0.0)
+        why = f", but in {unit} a light would blink, a line at {rate_hz:.4g} Hz"
+        return TimeUnit(named, "as its column says" + (why if unit != named else ""))
+    if blinks is not None:
         unit, rate_hz = blinks
         return TimeUnit(unit, f"guessed: a light blinks, a line at {rate_hz:.4g} Hz", likely)
     for unit, length_us in UNITS_US.items():

@@ -24,6 +24,7 @@ from evlcp_sdk.study.summary import (
     Reference,
     Series,
     Summary,
+    Verdict,
     beside_paper,
 )
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
@@ -37,7 +38,8 @@ _ARROW = 2.0
 def charts_of(summary: Summary) -> list[Plot]:
     """The charts of a campaign: BER, RMSE, gross errors, frames found, histogram, and positions if any."""
     note = f"Segments of {SEGMENT_M} m. {INTERVALS}"
-    limit = f"{note} An arrow is an upper limit: not one error was seen."
+    limit = f"{note} An arrow is an upper limit: not one error was seen, in one segment or in all that the"
+    limit += " paper has one figure for."
     nearest = f"{note} The distance is that of the nearest bar."
 
     def plot(id: str, y_name: str, title: str, note: str = note, **more: Any) -> Plot:
@@ -106,7 +108,7 @@ def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: 
     plot.dots(xs, dots, colour, series.name)
     plot.label(xs, ys, labels, series.name)
     for stem_x, stem_y in stems:
-        plot.line(stem_x, stem_y, colour, series.name, kind="stem")
+        plot.line(stem_x, stem_y, colour, series.name, dash, kind="stem")
 
 
 def _spans(series: Series, kind: str) -> list[tuple[int, int]]:
@@ -278,16 +280,18 @@ def _headlines(summary: Summary, beside: Sequence[PaperComparison]) -> list[tupl
         wrong = f"{total.messages_wrong} read wrong"
         shown.append(("messages read", f"{total.messages_found:,} of {total.messages_sent:,}", wrong))
     if beside:
-        counts = {v: sum(one.verdict == v for one in beside) for v in ("better", "agrees", "worse")}
+        counts = {v: sum(one.verdict == v for one in beside) for v in _SAID}
         said = ", ".join(f"{n} {_SAID[verdict]}" for verdict, n in counts.items() if n)
         shown.append(("beside the paper", said, f"of {len(beside)} figures of {PAPER_NAME}"))
     return shown
 
 
-_SAID = {"better": "better", "agrees": "agree", "worse": "worse"}
+_SAID: dict[Verdict, str] = {
+    "better": "better", "agrees": "agree", "worse": "worse", "too few": "of too few frames",
+}  # fmt: skip
 
 
-_MARKED = {"better": "yes", "agrees": "", "worse": "no"}
+_MARKED = {"better": "yes", "agrees": "", "worse": "no", "too few": ""}
 _MEASURES = {"ber": "bit error rate", "rmse_m": "distance RMSE, m", "gross_share": "errors of 0.5 m or more"}
 
 

@@ -265,7 +265,7 @@ class PaperComparison:
     verdict: "Verdict"
 
 
-Verdict = Literal["better", "agrees", "worse"]
+Verdict = Literal["better", "agrees", "worse", "too few"]
 
 AGREEMENT = 0.3
 """Up to what share two figures that agree differ."""
@@ -299,5 +299,8 @@ def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAP
             if some := [pair for pair in measured if pair[0].count]:
                 ours, at = max(some, key=lambda pair: pair[0].value)
                 verdict = verdict_of(ours.value, reference)
+                if ours.none and ours.high > reference.value:
+                    # Not one error, in less data than would show that there are fewer than the paper's.
+                    verdict = "too few"
                 found.append(PaperComparison(reference, one.name, ours, *at, verdict))
     return found

@@ -117,6 +117,11 @@ def test_a_limit_stands_above_the_paper_for_no_want_of_data(summary: Summary) ->
         series = Series({"scene.speed_kmh": 30}, {"speed_kmh": 30}, link, (at,))
         charts = charts_of(replace(summary, series=(series,)))
         (gross,) = (one for one in charts if one.id == "gross")
+        assert [one.verdict for one in beside_paper([series]) if one.reference.measure == "gross_share"] == [
+            "better"
+        ]
+        few = Series({}, {"speed_kmh": 30}, link, (Statistics.of([(30, Tally.distance(0.0))], tasks=1),))
+        assert "too few" in {one.verdict for one in beside_paper([few])}
         gross.markup()
         seen = [text.splitlines()[1] for *_, text, _ in gross.labels if text.startswith(series.name)]
         assert all(text.startswith(want) for text, want in zip(seen, shown, strict=True)), seen

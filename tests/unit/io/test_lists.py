@@ -279,6 +279,16 @@ def test_times_coarser_than_a_chip_are_warned_of(tmp_path: Path, evlcp: Callable
     assert "times come in steps of 1 ms; a chip is 0.1 ms" in " ".join(done.out.split())
 
 
+def test_a_light_that_blinks_in_another_unit_than_named_is_said(tmp_path: Path) -> None:
+    t_us = np.arange(80_000) // 1000 * 100 + np.arange(80_000) % 1000 // 50
+    for unit, said in (("ns", "in us a light would blink"), ("us", "")):
+        lines = [f"{t},{t % 2}" for t in t_us.tolist()]
+        (tmp_path / "a.csv").write_text("\n".join([f"t_{unit},p", *lines]))
+        with open_source(tmp_path / "a.csv") as source:
+            assert said in source.guessed
+            assert bool(source.guessed) == bool(said)
+
+
 @pytest.mark.parametrize("before_us", [200, 7000])
 @pytest.mark.parametrize("end", [1 << 32, 1 << 31, 1 << 24], ids=["uint32", "int32", "24 bits"])
 def test_counters_go_round(end: int, before_us: int, tmp_path: Path) -> None:
