@@ -59,8 +59,10 @@ def simulate(
     if show:
         from evlcp_sdk.sim import preset_text
 
-        if preset is None or scene_file is not None:
-            raise typer.BadParameter("--show prints a --preset", param_hint="--show")
+        if preset is None or scene_file or overrides or link:
+            raise typer.BadParameter(
+                "prints a --preset as it is, nothing else beside it", param_hint="--show"
+            )
         echo(preset_text(preset), nl=False)
         return
     source = _source_of(scene_file, preset)

@@ -48,9 +48,13 @@ def led_light(bar: BarSpec, leds: int, seed: int) -> NDArray[np.float64]:
     Raises:
         ConfigError: A dead or a stuck LED is none of the bar's.
     """
+    known: set[int] = set()
     for key, numbers in (("dead_leds", bar.dead_leds), ("stuck_leds", bar.stuck_leds)):
         if not all(0 <= i < leds for i in numbers):
             raise ConfigError(f"{key} = {list(numbers)}: expected LEDs, 0 to {leds - 1}")
+        if len(set(numbers) - known) < len(numbers):
+            raise ConfigError(f"{key} = {list(numbers)}: expected each LED once, either dead or stuck")
+        known.update(numbers)
     light = np.zeros((2, leds))
     light[0] = np.exp(bar.led_spread * np.random.default_rng([seed, 0x1ED]).normal(size=leds))
     stuck = list(bar.stuck_leds)

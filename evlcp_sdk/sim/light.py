@@ -185,8 +185,14 @@ class BarLight:
             for i, span in enumerate(spans):
                 if not 0 <= span[0] < span[1]:
                     raise ConfigError(f"{source}.{key}.{i} = {list(span)}: expected a time, and a later one")
-        if bar.lattice_m is not None and not 0 < bar.lattice_m[1] < bar.lattice_m[0]:
-            raise ConfigError(f"{source}.lattice_m = {list(bar.lattice_m)}: expected slats with gaps")
+        every_m, wide_m, _ = bar.lattice_m or (math.inf, 1.0, 0.0)
+        if min(wide_m, every_m - wide_m) < _SLAT_STEP_UM * 1e-6:
+            raise ConfigError(
+                f"{source}.lattice_m = {list(bar.lattice_m or ())}: expected [every, width, first], with"
+                f" width and every - width {_SLAT_STEP_UM * 1e-6:g} or more"
+            )
+        if bar.lattice_mps and bar.lattice_m is None:
+            raise ConfigError(f"{source}.lattice_mps = {bar.lattice_mps}: expected lattice_m beside it")
         for i, (_, _, a, b) in enumerate(bar.cover_s):
             if not 0 <= a <= b <= last:
                 raise ConfigError(

@@ -24,7 +24,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import SpecError, build, parse_toml, parse_value, read_toml
-from evlcp_sdk.spelling import nearest
+from evlcp_sdk.spelling import counted, nearest
 
 MOST_PIXELS = 4096
 """Columns and rows of a sensor."""
@@ -309,8 +309,8 @@ class DropSpec:
     `radius_px`: by `bend_px`, the most, at its rim.
     """
 
-    x_px: Annotated[float, Field(description="Its middle's column as the scene starts.")] = 640.0
-    y_px: Annotated[float, Field(description="Its row.")] = 360.0
+    x_px: Annotated[float, Field(description="Its middle's column as the scene starts.")]
+    y_px: Annotated[float, Field(description="Its row.")]
     radius_px: Annotated[float, Field(gt=0, le=1000, description="From its middle to its rim.")] = 25.0
     bend_px: Annotated[float, Field(ge=-50, le=50, description="By how much; less than 0: inward.")] = 4.0
     speed_px_s: Annotated[
@@ -417,8 +417,9 @@ class Scene:
             raise ConfigError(f"bars and lamps: expected at most {MOST_SOURCES} together")
         for i, reflection in enumerate(self.reflections):
             if reflection.bar is not None and reflection.bar >= len(self.bars):
+                some = counted(len(self.bars), "bar")
                 raise ConfigError(
-                    f"reflections.{i}.bar = {reflection.bar}: there are {len(self.bars)} bars, counted from 0"
+                    f"reflections.{i}.bar = {reflection.bar}: expected one of {some}, from 0 on"
                 )
         if self.lens.halo + self.lens.bloom >= 1:
             raise ConfigError(
@@ -430,8 +431,9 @@ class Scene:
             raise ConfigError(f"wiper.edge_s = {wiper.edge_s}: expected at most half of lasts_s")
         if 0 < wiper.every_s < wiper.lasts_s:
             raise ConfigError(f"wiper.every_s = {wiper.every_s}: expected at least lasts_s")
-        if any(b < a for (a, _), (b, _) in pairwise(self.background.change_s)):
-            raise ConfigError("background.change_s: expected times that rise")
+        times_s = [at_s for at_s, _ in self.background.change_s]
+        if times_s and (times_s[0] < 0 or any(b <= a for a, b in pairwise(times_s))):
+            raise ConfigError(f"background.change_s = {times_s}: expected times from 0 on that rise")
         if max(self.camera.width, self.camera.height) > MOST_PIXELS:
             raise ConfigError(f"camera: expected at most {MOST_PIXELS} columns and rows")
         if self.lens.focus_m * 1e3 <= self.camera.focal_mm:
@@ -710,7 +712,7 @@ def _set(table: dict[str, Any], key: str, value: Any) -> None:
         if len(rest) > 1 and (head, rest[0]) != ("bars", "link"):
             number, *rest = rest
             if not number.isdigit() or int(number) >= len(rows):
-                raise ConfigError(f"--set {key}: there are {len(rows)} {head}, counted from 0")
+                raise ConfigError(f"--set {key}: expected one of {counted(len(rows), head[:-1])}, from 0 on")
             holders = [rows[int(number)]]
     for holder in holders:
         if rest[0] == "link" and len(rest) > 1 and head in ("link", "bars"):

@@ -18,6 +18,7 @@ from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim.motion import CameraPath
 from evlcp_sdk.sim.scene import BarSpec, Scene, WorldSpec, links_of
+from evlcp_sdk.spelling import counted
 
 Floats = NDArray[np.float64]
 
@@ -108,7 +109,9 @@ def sites_said(scene: Scene, seed: int, registry: Registry | None = None) -> tup
     said = []
     for i, (bar, site) in enumerate(zip(scene.bars, true, strict=True)):
         if bar.site_of is not None and bar.site_of >= len(true):
-            raise ConfigError(f"bars.{i}.site_of = {bar.site_of}: there are {len(true)} bars, counted from 0")
+            raise ConfigError(
+                f"bars.{i}.site_of = {bar.site_of}: expected one of {counted(len(true), 'bar')}, from 0 on"
+            )
         there = true[i if bar.site_of is None else bar.site_of]
         off = np.array(bar.site_off_m) + errors[i]
         place: dict[str, Any] = {}

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 from scipy.stats import norm
 
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
@@ -112,6 +113,30 @@ def test_covers_put_out_clusters_and_only_those() -> None:
         hidden.strips[0].switches(a, b)[0] for a, b in ((1000.0, 1200.0), (1200.0, 2717.3), (2717.3, 5000.0))
     ]
     assert set(np.concatenate(cuts)) | {1200.0} == set(whole)
+
+
+@pytest.mark.parametrize(
+    ("keys", "says"),
+    [
+        ({"covered": (16,)}, "covered = [16]: expected clusters, 0 to 15"),
+        ({"dead_leds": (96,)}, "dead_leds = [96]: expected LEDs, 0 to 95"),
+        ({"dead_leds": (1, 1)}, "dead_leds = [1, 1]: expected each LED once"),
+        (
+            {"dead_leds": (1,), "stuck_leds": (2, 1)},
+            "stuck_leds = [2, 1]: expected each LED once, either dead",
+        ),
+        (
+            {"lattice_m": (0.1, 1e-7, 0.0)},
+            "lattice_m = [0.1, 1e-07, 0.0]: expected [every, width, first], with",
+        ),
+        ({"lattice_m": (0.1, 0.1, 0.0)}, "lattice_m = [0.1, 0.1, 0.0]: expected [every, width, first], with"),
+        ({"lattice_mps": 0.3}, "lattice_mps = 0.3: expected lattice_m beside it"),
+    ],
+)
+def test_what_cannot_hide_a_bar_is_told(keys: dict[str, Any], says: str) -> None:
+    with pytest.raises(ConfigError) as fault:
+        BarLight(BarSpec(**keys), resolve({}), LensSpec(), 7)
+    assert says in str(fault.value)
 
 
 def test_leds_are_dead_stuck_dim_or_behind_slats() -> None:
@@ -354,7 +379,7 @@ def test_all_that_a_road_adds_does_not_depend_on_threads_or_length() -> None:
             "lens": {"bloom": 0.1, "bloom_px": 5.0},
             "background": {"around_px": 20, "light_w_m2": 0.5, "change_s": [[0.001, 1.0], [0.006, 5.0]]},
             "bars": [{"cover_s": [[0.002, 0.006, 0, 4]], "lattice_m": [0.1, 0.03, 0], "dead_leds": [7]}],
-            "drops": [{"x_px": 420.0, "speed_px_s": [200.0, 0.0]}],
+            "drops": [{"x_px": 420.0, "y_px": 360.0, "speed_px_s": [200.0, 0.0]}],
             "reflections": [{}, {"kind": "rail"}, {"kind": "window", "shift_px": [5, 5]}],
         }
     )
