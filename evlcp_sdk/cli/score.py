@@ -43,6 +43,8 @@ def score(
     for warning in truth.warnings:
         complain(warning)
     found = score_frames(frames, truth, links if len(links) > 1 else None)
+    if frames and found["unmatched"] == len(frames):
+        complain(f"warning: no row of {folder} matches {truth_file}: another recording's, by times or places")
     if as_json:
         print_json(found)
         return
@@ -52,7 +54,8 @@ def score(
         screen.print(f"{kind}rows {part['rows']}, matching no true frame {part['unmatched']}{echoes}")
         for i, bar in enumerate(part["bars"]):
             sender = f" ({bar['link']})" if "link" in bar else ""
-            figures = "  ".join(form.format(**bar) for key, form in _FIGURES.items() if key in bar)
+            shown = {key: "-" if value is None else value for key, value in bar.items()}
+            figures = "  ".join(form.format(**shown) for key, form in _FIGURES.items() if key in bar)
             screen.print(f"bar {i}{sender}: frames {bar['frames_found']}/{bar['frames_sent']}  {figures}")
             for name, segment in bar["segments"].items():
                 form = "   {}: RMSE {rmse_m} m, bias {bias_m} m, n {n}"

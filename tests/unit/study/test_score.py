@@ -249,6 +249,17 @@ def test_what_cannot_be_scored_is_reported_in_one_line(
     assert summary is None or done.err.startswith(f"evlcp: {tmp_path}/summary.json: ")
 
 
+def test_a_result_of_another_recording_is_reported(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    truth = scene_truths()["two"]
+    (tmp_path / "frames.csv").write_text(text_of(faulty_rows(truth, Lengths(), 5)))
+    (tmp_path / "own.json").write_text(json.dumps(truth))
+    (tmp_path / "other.json").write_text(SCENE)
+    assert "another recording's" not in evlcp("score", tmp_path, tmp_path / "own.json").err
+    done = evlcp("score", tmp_path, tmp_path / "other.json")
+    assert f"no row of {tmp_path} matches {tmp_path}/other.json: another recording's" in done.err
+    assert "None" not in done.out
+
+
 def test_a_dark_bar_and_one_of_chips_need_no_link(tmp_path: Path) -> None:
     truth = truth_with(*LINKS["5 kchip/s"])
     truth["bars"][0]["led_w_m2"] = 0.0
