@@ -43,7 +43,7 @@ def score(
     for warning in truth.warnings:
         complain(warning)
     found = score_frames(frames, truth, links if len(links) > 1 else None)
-    if frames and found["unmatched"] == len(frames):
+    if frames and not any(bar["frames_found"] for bar in found["bars"]):
         complain(f"warning: no row of {folder} matches {truth_file}: another recording's, by times or places")
     if as_json:
         print_json(found)
