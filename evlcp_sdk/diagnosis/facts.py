@@ -121,6 +121,7 @@ class Facts:
         guessed: What the recording does not say and was guessed; empty for nothing.
         step_us: What all its times are multiples of, us; 0 where nobody looked.
         skipped: Silences beside damage that a replay did not wait for, and their time, us.
+        late_events: Events of a live run that came too late to be read.
         reads_messages: Whether messages were looked for.
         others: Codewords of other modulations by id, uint8 (symbols, chips); asked where it matters.
         positions: Figures of the positions; empty where none were computed.
@@ -143,6 +144,7 @@ class Facts:
     guessed: str = ""
     step_us: int = 0
     skipped: tuple[int, int] = (0, 0)
+    late_events: int = 0
     reads_messages: bool = True
     others: Callable[[], Mapping[str, NDArray[np.uint8]]] = dict
     positions: Mapping[str, Any] = field(default_factory=dict)

@@ -441,12 +441,14 @@ def check_messages(facts: Facts) -> Found:
         yield text
 
 
-def check_packets(_facts: Facts, one: TransmitterTally) -> Found:
+def check_packets(facts: Facts, one: TransmitterTally) -> Found:
     """Packets without a block of a transmitter that sends some; another one may send none at all."""
     failed = one.packets - one.blocks
     if one.blocks and failed >= FEW_FRAMES and failed > _FAILED_SHARE * one.packets:
         yield Diagnostic(
             "blocks-failed",
             f"{failed} of {one.packets} packets cannot be read",
-            "more light, a nearer or a better focused bar, or an error correction of a lower rate",
+            "events came too late to be read: a quicker machine, or fewer events"
+            if facts.late_events
+            else "more light, a nearer or a better focused bar, or an error correction of a lower rate",
         )

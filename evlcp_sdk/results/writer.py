@@ -175,6 +175,7 @@ class ResultWriter:
             guessed=str(recording.get("guessed", "")),
             step_us=recording.get("step_us", 0),
             skipped=(read.get("silences_skipped", 0), read.get("silences_skipped_us", 0)),
+            late_events=(end.live or {}).get("shed", {}).get("too_late", 0),
             positions=positions,
         )
         parts = {

@@ -420,3 +420,12 @@ def test_what_positions_say(code: str, positions: dict[str, Any], said: str) -> 
     facts = Facts(link, RunTally(link.packet), {}, positions=NO_POSITIONS | positions)
     found = find(facts)
     assert [said in str(one) for one in found if one.code == code] == [True] * bool(said)
+
+
+def test_packets_of_a_live_run_that_came_too_late_want_no_more_light() -> None:
+    tally = tally_of(np.concatenate([RANDOM, RANDOM, RANDOM]))
+    tally.transmitters[0].blocks = 2
+    for late_events, step in ((0, "more light"), (1000, "events came too late")):
+        facts = Facts(LINK, tally, READ, late_events=late_events)
+        (found,) = (one for one in find(facts) if one.code == "blocks-failed")
+        assert found.next_step.startswith(step)
