@@ -60,12 +60,10 @@ class Emulator:
         self.programs: list[subprocess.Popen[str]] = []
 
     def _listen(self) -> None:
-        assert self.process.stdout is not None
         for line in self.process.stdout:
             self.lines.put(line.strip())
 
     def tell(self, what: str) -> None:
-        assert self.process.stdin is not None
         self.process.stdin.write(what + "\n")
         self.process.stdin.flush()
 
@@ -108,8 +106,6 @@ def emulator(recording: Path, folder: Path, *options: str) -> Iterator[Emulator]
                 program.communicate()
         with contextlib.suppress(OSError):
             one.tell("end")
-        assert one.process.stdin is not None
-        assert one.process.stdout is not None
         one.process.wait(10)
         one.process.stdin.close()
         one.process.stdout.close()

@@ -191,7 +191,6 @@ class Trial:
 
 def check_result(folder: Path) -> None:
     summary = read_summary(folder)
-    assert summary is not None
     for name in summary["files"]:
         check_result_file(folder, name, summary)
 

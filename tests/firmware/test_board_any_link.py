@@ -110,9 +110,7 @@ ONE_LED = ("bar.rows=1", "bar.cluster_rows=1", "ranging.id=none")
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else value.name,
 )
-def test_every_led_does_what_it_is_sent(
-    device: SimulatedBoard, board: Board, form: Format, overrides: tuple[str, ...]
-) -> None:
+def test_every_led_does_what_it_is_sent(device, board, form, overrides) -> None:
     link = board_link(*overrides)
     symbols = symbols_of(2, 1, link)
     chips = np.concatenate([packet_chips(one, link.codebook, link.packet.pilot_every) for one in symbols])

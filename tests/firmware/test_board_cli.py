@@ -38,13 +38,11 @@ class Emulated:
     def __init__(self, *options: object) -> None:
         command = bound([*EVLCP, "board", "emulate", *map(str, options)])
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
-        assert self.process.stdout is not None
         self.said = self.process.stdout.readline()
 
     def end(self) -> int:
         self.process.send_signal(signal.SIGTERM)
         code = self.process.wait(10)
-        assert self.process.stdout is not None
         self.process.stdout.close()
         return code
 
@@ -171,15 +169,7 @@ EMULATE = ("board", "emulate", "native")
         (("loop", "--set", "air.chip_rate_hz=30000.0"), 5, None, "emulated: no chip rate of 30000 Hz"),
     ],
 )
-def test_a_fault_is_one_line_and_json_too(
-    evlcp,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: tuple[str, ...],
-    code: int,
-    kind: str | None,
-    says: str,
-) -> None:
+def test_a_fault_is_one_line_and_json_too(evlcp, tmp_path, monkeypatch, arguments, code, kind, says) -> None:
     monkeypatch.chdir(tmp_path)
     done = evlcp(*arguments, *["--json"] * (kind is not None))
     check_fault(done, code, says)
@@ -262,9 +252,7 @@ def test_trace_and_replay(evlcp, tmp_path: Path) -> None:
         check_fault(evlcp(*arguments, "--replay", trace), 3, f"{trace}: {says}")
 
 
-def test_line_options_stand_anywhere(
-    evlcp, native: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_line_options_stand_anywhere(evlcp, native, tmp_path, monkeypatch) -> None:
     before = evlcp("board", "--port", native, "hello", "--json")
     behind = evlcp("board", "hello", "--json", "--port", native)
     assert json.loads(before.out)["unique_id"] == json.loads(behind.out)["unique_id"]

@@ -116,9 +116,7 @@ def test_a_board_that_waits_for_a_pulse_says_so_and_is_stopped_without_one(evlcp
 
 
 @pytest.mark.parametrize(("latency_s", "frame_s", "at_most"), [(0.0, 0.0, 1.15), (0.002, 0.001, 1.3)])
-def test_programming_takes_the_wire_time(
-    device: SimulatedBoard, latency_s: float, frame_s: float, at_most: float
-) -> None:
+def test_programming_takes_the_wire_time(device, latency_s, frame_s, at_most) -> None:
     """By the board's own clock, over a line alone and behind a USB bridge: few waits for answers."""
     baud = 1_000_000
     board = board_on(UsbLine(device, latency_s, baud, frame_s))
@@ -229,7 +227,6 @@ def test_what_is_bound_ends_with_its_parent() -> None:
         "time.sleep(600)\n"
     )
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert parent.stdout is not None
     child = int(parent.stdout.readline())
     try:
         assert within(60, lambda: "sleep" in Path(f"/proc/{child}/cmdline").read_text().split("\0")[0])

@@ -135,9 +135,7 @@ def streams(draw: st.DrawFn) -> tuple[NDArray[np.uint8], int, float]:
 
 @settings(max_examples=60, deadline=None)
 @given(streams(), st.lists(st.integers(1, 2000), max_size=4))
-def test_no_stretch_of_what_is_sent_is_beyond_the_limits(
-    stream: tuple[NDArray[np.uint8], int, float], stops: list[int]
-) -> None:
+def test_no_stretch_of_what_is_sent_is_beyond_the_limits(stream, stops) -> None:
     rows, level_ma, limit = stream
     device = SimulatedBoard()
     board = board_on(device)

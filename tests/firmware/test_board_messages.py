@@ -133,9 +133,7 @@ def test_any_link(evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
         (("--text", "a" * 8000, "--every", "1", "--port", "native:"), 2, "201 packets of 34.6 ms; give"),
     ],
 )
-def test_faults_are_one_line(
-    evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...], code: int, says: str
-) -> None:
+def test_faults_are_one_line(evlcp, tmp_path, monkeypatch, options, code, says) -> None:
     monkeypatch.chdir(tmp_path)
     Path("two.toml").write_text(TILTED + TILTED.replace("= 7", "= 8"))
     check_fault(evlcp("tx", "message", *options), code, says)
@@ -214,7 +212,6 @@ def test_texts_go_out_as_they_come(native: str, tmp_path: Path) -> None:
     command = [*EVLCP, "board", "stream", "--port", native, "--id", "7", "--json"]
     pipe = subprocess.PIPE
     with subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True) as process:
-        assert process.stdin is not None
         # each when the one before has long been played
         for n in (3, 2, 1):
             process.stdin.write(f"Green in {n} s\n")
@@ -254,9 +251,7 @@ def test_symbols_from_a_file(evlcp, native: str, tmp_path: Path) -> None:
         (b"\xff", (), "cannot be read"),
     ],
 )
-def test_a_wrong_line_is_told(
-    evlcp, tmp_path: Path, text: bytes, options: tuple[str, ...], says: str
-) -> None:
+def test_a_wrong_line_is_told(evlcp, tmp_path, text, options, says) -> None:
     file = tmp_path / "lines"
     file.write_bytes(text)
     check_fault(evlcp("board", "stream", file, "--port", "native:", *options), 3, says)

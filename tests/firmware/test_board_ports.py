@@ -148,9 +148,7 @@ def test_a_real_tty_gets_no_byte(monkeypatch: pytest.MonkeyPatch, evlcp, pty_nam
         ("hwgrep://[", KeyError("x"), "evlcp board ports"),
     ],
 )
-def test_what_cannot_be_opened_says_what_to_do(
-    evlcp, monkeypatch: pytest.MonkeyPatch, port: str, fault: Exception, says: str
-) -> None:
+def test_what_cannot_be_opened_says_what_to_do(evlcp, monkeypatch, port, fault, says) -> None:
     monkeypatch.setattr("serial.serial_for_url", Mock(side_effect=fault))
     done = evlcp("board", "hello", "--port", port, "--baud", "3000000")
     check_fault(done, 4, f"{port}: cannot be opened", says)

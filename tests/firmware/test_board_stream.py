@@ -47,9 +47,7 @@ def expected(packets: np.ndarray, link: Link = LINK) -> list[bytes]:
 
 @pytest.mark.parametrize("link", [LINK, LONG], ids=["one piece a packet", "three pieces a packet"])
 @pytest.mark.parametrize(("latency_s", "ahead"), [(0.0, 5), (0.016, 2)])
-def test_packets_follow_without_a_gap(
-    device: SimulatedBoard, link: Link, latency_s: float, ahead: int
-) -> None:
+def test_packets_follow_without_a_gap(device, link, latency_s, ahead) -> None:
     packets = symbols_of(30, 0, link)
     with board_on(UsbLine(device, latency_s), nonce=1).stream(link, ahead) as stream:
         for n, packet in enumerate(packets):

@@ -42,8 +42,7 @@ MESSAGES = [json.loads(line) for line in (VECTORS / "protocol-2.jsonl").read_tex
 
 def of(table: dict[str, Any]) -> type[WireMessage]:
     name = "".join(word.capitalize() for word in f"{table['name']}_{table['kind']}".split("_"))
-    found: type[WireMessage] = getattr(requests, name, requests.REPLIES[table["type"]])
-    return found
+    return getattr(requests, name, requests.REPLIES[table["type"]])
 
 
 @pytest.mark.parametrize("table", MESSAGES, ids=lambda t: f"2.{t['minor']}-{t['name']}-{t['kind']}")
@@ -154,9 +153,7 @@ def definition() -> dict[str, Any]:
     return table
 
 
-def test_todays_host_and_tomorrows_firmware(
-    definition: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_todays_host_and_tomorrows_firmware(definition, tmp_path, monkeypatch) -> None:
     tree = tmp_path / "firmware"
     shutil.copytree(build.FIRMWARE, tree)
     (tree / "generated" / "protocol.h").write_text(generate.render("protocol.h", definition))

@@ -186,9 +186,7 @@ def test_silence_is_told(device: SimulatedBoard) -> None:
 
 
 @pytest.mark.parametrize(("major", "older"), [(MAJOR - 1, "host"), (MAJOR + 1, "firmware")])
-def test_another_major_version_is_incompatible(
-    device: SimulatedBoard, monkeypatch: pytest.MonkeyPatch, major: int, older: str
-) -> None:
+def test_another_major_version_is_incompatible(device, monkeypatch, major, older) -> None:
     monkeypatch.setattr("firmware_host.board.session.MAJOR", major)
     words = rf"it speaks protocol {MAJOR}\.{MINOR}, this host .*; update the {older}"
     with pytest.raises(IncompatibleError, match=words):

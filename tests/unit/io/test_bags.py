@@ -68,9 +68,7 @@ def same_as_the_recording(path: Path) -> Any:
 
 
 @pytest.mark.parametrize("listed", [True, False])
-def test_files_of_a_folder_are_read_in_their_order(
-    listed: bool, packets: list[Packet], tmp_path: Path
-) -> None:
+def test_files_of_a_folder_are_read_in_their_order(listed, packets, tmp_path) -> None:
     """Twelve: by their names, 10 would come before 2."""
     for n in range(12):
         messages = list(map(packed, packets[n * 6 : n * 6 + 6]))
@@ -90,9 +88,7 @@ def test_files_of_a_folder_are_read_in_their_order(
     ("write", "pack"), [(write_sqlite, packed), (write_mcap, packed), (write_ros1, packed_ros1)]
 )
 @pytest.mark.parametrize("how", ["one is 0", "jitter", "go round"])
-def test_packets_are_in_order_whatever_their_log_times(
-    how: str, write: Callable[..., Any], pack: Any, packets: list[Packet], tmp_path: Path
-) -> None:
+def test_packets_are_in_order_whatever_their_log_times(how, write, pack, packets, tmp_path) -> None:
     times = 10**9 + 10**7 * np.arange(len(packets))
     if how == "one is 0":
         times[30] = 0
@@ -151,9 +147,7 @@ def test_what_is_wrong_with_a_bag_is_said(tmp_path: Path) -> None:
             open_source(f"bag:{tmp_path / name}")
 
 
-def test_a_bag_that_is_written_is_read_back(
-    demo_raw: Path, tmp_path: Path, evlcp: Callable[..., Any]
-) -> None:
+def test_a_bag_that_is_written_is_read_back(demo_raw, tmp_path, evlcp) -> None:
     """By our reader; by `rosbags`, which knows ROS 2's own packing; and by `mcap`, word for word."""
     pytest.importorskip("mcap"), pytest.importorskip("rosbags")
     path = tmp_path / "a.mcap"
@@ -178,7 +172,6 @@ def test_a_bag_that_is_written_is_read_back(
     words, seqs = b"", []
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():
-            assert schema is not None
             assert (schema.name, schema.encoding) == ("event_camera_msgs/msg/EventPacket", "ros2msg")
             assert (channel.topic, channel.message_encoding) == ("/event_camera/events", "cdr")
             if not seqs:

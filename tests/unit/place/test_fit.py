@@ -85,7 +85,6 @@ def misses(p: Problem, at: Fit, change: Floats) -> Floats:
         found.append(np.einsum("nij,nj->ni", white, rows[:, 6:8] - points).ravel())
         found.append(-own)
     found.append(-z)
-    assert p.attitude is not None
     seen = Attitude.of_rotation(rotation)
     off_deg = np.array(
         [
@@ -126,7 +125,6 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     p = dataclasses.replace(p, spec=dataclasses.replace(SPEC, huber_sigmas=100.0))
     at = Fit(position, rotation, rng.normal(0, 0.3, (2, 9)), rng.normal(0, 0.3, 7))
     found = linearize(p, at)
-    assert found is not None
     at_rest = misses(p, at, np.zeros(32))
     slope = -approx_fprime(np.zeros(32), lambda x: misses(p, at, x), 1e-6)
     _, matrix, side = whole(p, found)
@@ -159,8 +157,7 @@ def fitted(p: Problem, position: Floats, rotation: Floats) -> Equations:
 def sigmas_of(p: Problem, equations: Equations) -> Floats:
     """Of the position, by the whole matrix."""
     matrix = whole(p, equations)[1][np.ix_(free_of(p), free_of(p))]
-    sigma: Floats = np.sqrt(np.diag(np.linalg.inv(matrix))[:3])
-    return sigma
+    return np.sqrt(np.diag(np.linalg.inv(matrix))[:3])
 
 
 def test_the_fit_is_that_of_scipy() -> None:
@@ -205,7 +202,6 @@ def test_a_step_turns_about_the_bars() -> None:
     step = np.zeros(14)
     step[:3], step[3:6] = np.cross(turn, position - centre), turn
     equations = linearize(p, at)
-    assert equations is not None
     there = equations.moved(step)
     assert np.linalg.norm(there.position - centre) == pytest.approx(np.linalg.norm(position - centre))
     np.testing.assert_allclose(there.rotation, Rotation.from_rotvec(turn).as_matrix() @ rotation, atol=1e-12)
@@ -290,7 +286,6 @@ def test_a_pose_is_as_sure_as_its_equations_whole(bars: int) -> None:
     slow = by_points @ np.diag(equations.stands) @ by_points.T
     np.testing.assert_allclose(pose.slow, slow, rtol=1e-6, atol=1e-12)
     np.testing.assert_allclose(pose.standing["camera"], -spread[:3, 7:14], rtol=1e-6, atol=1e-9)
-    assert p.attitude is not None
     angles = spread[:3, :14] @ equations.angles.T @ p.angles.white @ p.attitude.standing()
     np.testing.assert_allclose(pose.standing["attitude"], angles, rtol=1e-6, atol=1e-9)
     for b in range(bars):
@@ -308,7 +303,6 @@ def test_protection_levels_hold_with_any_bar_at_fault() -> None:
     fit = fitted(p, position, rotation)
     found, spread = assess_fit(fit), fit.spread
     assert isinstance(found, Pose)
-    assert spread is not None
     risk = stats.chi2.isf(SPEC.risk, 1)
     for b in range(3):
         bars = fit.bars
@@ -358,7 +352,6 @@ def test_a_fit_that_stalls_far_off_ends() -> None:
     whole = fitted(p, position, rotation)
     short, settled = fit_pose(p, Fit.at(p, position, rotation), hopeless=1000.0)
     assert settled
-    assert short is not None
     assert short.cost > 1000
     assert whole.cost <= short.cost
 

@@ -95,7 +95,6 @@ def test_the_antenna_is_not_the_camera() -> None:
     # Heading east: right is south, forward is east.
     east = Attitude(0.0, 0.0, 90.0, 0.0, math.degrees(0.1))
     found = gnss_fix(log, 0, axes, east, spec)
-    assert found is not None
     np.testing.assert_allclose(found.enu_m, [202.0, 300.5, 3.0], atol=1e-3)
     # A heading that is wrong by 0.1 moves the antenna's place by 0.2 to the side, 0.05 along.
     expected = np.diag([0.04, 0.09, 0.25]) + np.outer([0.05, -0.2, 0], [0.05, -0.2, 0])
@@ -114,7 +113,6 @@ def test_headings_for_the_antenna() -> None:
     found = attitude_of(Attitude(1.0, 2.0, None, 0.3), (-10.0, 0.5))
     assert found == Attitude(1.0, 2.0, 350.0, 0.3, 0.5)
     found = attitude_of(None, (10.0, 0.5))
-    assert found is not None
     assert found.gravity_sigma_deg == pytest.approx(10)
 
 

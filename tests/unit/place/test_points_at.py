@@ -220,13 +220,11 @@ def test_the_point_is_the_one_that_is_seen() -> None:
     true = np.array([3.0, -2.0, 40.0])
     x, y = BENT.project(true)
     found = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT)
-    assert found is not None
     np.testing.assert_allclose(found.point_m, true, atol=1e-6)
     # The sigma of the distance is along the line of sight, not along the axis.
     along = true / 40.0
     spec = dataclasses.replace(POINTS_ONLY, stretch_share=0.001)
     exact = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT, None, spec)
-    assert exact is not None
     stretched = 0.1**2 + (40 * 0.001) ** 2
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
 
@@ -235,15 +233,12 @@ def test_what_bends_a_bar_stays_over_frames() -> None:
     bent = replace(ranged(640.0, 360.0, 40.0, 0.5), range=Range(40.0, 0.5, 10, standing_m=0.4))
     found = bar_point(bent, 0.96, BENT, None, replace(POINTS_ONLY, stretch_share=0.0))
     straight = bar_point(ranged(640.0, 360.0, 40.0, 0.5), 0.96, BENT, None, POINTS_ONLY)
-    assert found is not None
-    assert straight is not None
     np.testing.assert_allclose(found.covariance_m2, straight.covariance_m2, rtol=1e-3, atol=1e-6)
     assert found.standing[2, 7] == pytest.approx(0.4)
     frames = [replace(frame(BAR_PX, 0.1, t), range=bent.range) for t in T_US.tolist()]
     for some, stretch in ((9, 0.01), (5, 0.01), (4, 0.0)):
         near = frames[:some] + [replace(one, range=Range(40.0, 0.1, 10)) for one in frames[some:]]
         view = points_at(7, near, 0.0, 40_000.0, LINE_M, SPEC)
-        assert view is not None
         assert view.stretch == pytest.approx(stretch)
 
 
@@ -262,7 +257,6 @@ def test_every_error_is_in_its_covariance() -> None:
         # By its length in the image a bar is the farther, the longer the lens is said to be.
         distance = 25 * BENT.focal_px / lens.focal_px * (1 + 0.004 * rng.normal()) + 0.15 * rng.normal()
         found = bar_point(ranged(x, y, distance, 0.15), 0.96, BENT, LENS, STRETCHED)
-        assert found is not None
         squares.append(square(found.point_m - true, found.covariance_m2))
     assert by_chance(squares, 3, 0.999)
     assert np.linalg.eigvalsh(found.covariance_m2 - found.standing @ found.standing.T)[0] > 0

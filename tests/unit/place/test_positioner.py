@@ -278,9 +278,7 @@ def test_beacons_tell_who_and_where() -> None:
         ),
     ],
 )  # fmt: skip
-def test_which_beacons_are_believed(
-    beacons: Any, messages: list[tuple[BarSite, Trust, int]], known: str
-) -> None:
+def test_which_beacons_are_believed(beacons, messages, known) -> None:
     """After each message: `+` its place is known and verified, `?` known, `-` not."""
     registry = BarRegistry([], ErrorModel(beacons=beacons))
     for message, mark in zip(messages, known, strict=True):
@@ -347,7 +345,6 @@ def test_an_attitude_file(tmp_path: Path) -> None:
     # What the file has not are those that are said.
     track = AttitudeLog.read(path, Attitude(gravity_sigma_deg=0.7, heading_sigma_deg=3.0))
     found = track.at(500)
-    assert found is not None
     angles = (found.pitch_deg, found.roll_deg, found.heading_deg)
     assert angles == pytest.approx((2, -1, 0))
     assert (found.gravity_sigma_deg, found.heading_sigma_deg) == pytest.approx((0.7, 0.3))

@@ -177,7 +177,6 @@ def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:
         views = []
         # A few of them: the survey itself is slow.
         for pose in poses[::3]:
-            assert pose.attitude is not None
             here = AXES.to_enu(pose.latitude_deg, pose.longitude_deg, pose.height_m)
             off.append(np.linalg.norm(here - where(pose.t_us)) / pose.position_sigma_m)
             points, _ = project_bars(

@@ -135,7 +135,6 @@ def test_standing_and_slow_errors_are_those_of_the_dense_problem() -> None:
     np.testing.assert_allclose(points[-1].mean, np.append(mean[-1], standing), atol=1e-5)
     for i, name in enumerate(names):
         found = points[-1].standing(name)
-        assert found is not None
         np.testing.assert_allclose(found[0], standing[2 * i : 2 * i + 2], atol=1e-5)
     assert points[-1].standing("bar 9") is None
 
@@ -387,7 +386,6 @@ def test_a_turning_car_is_followed_through_a_gap(push: bool) -> None:
                 off = square(found[at].mean[:3] - truth[at], found[at].covariance_m2)
                 squares.setdefault((name, at), []).append(off)
         told = points[-1].standing(IMU)
-        assert told is not None
         estimates.append(square(told[0] - biases, told[1]))
         sigmas.append(np.sqrt(np.diag(told[1])))
     assert all(by_chance(values, 3, 0.9999) for values in squares.values())

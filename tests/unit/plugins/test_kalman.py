@@ -46,7 +46,6 @@ def test_it_is_the_textbook_filter() -> None:
 def position_errors(measured: np.ndarray, true: np.ndarray, **parameters: float) -> np.ndarray:
     """Of the values and of the predictions a step ahead, (n, 2); 1.5 ms a step, 0.25 px of noise."""
     filter_ = KalmanTracking(**parameters).compile().position
-    assert filter_ is not None
     state, out = filter_.init(), []
     for k, z in enumerate(measured):
         ahead = filter_.predict(state, 1500.0 * k)

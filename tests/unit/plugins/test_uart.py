@@ -96,9 +96,7 @@ def wrong_bits(found: list[int], sent: list[int], data_bits: int) -> float:
         (10_000.0, -0.01, True, (40.0, 60.0)),
     ],
 )
-def test_bright_light_is_read_without_an_error(
-    bit_hz: float, clock: float, mark_on: bool, late_us: tuple[float, float]
-) -> None:
+def test_bright_light_is_read_without_an_error(bit_hz, clock, mark_on, late_us) -> None:
     rng = np.random.default_rng(3)
     sent = rng.integers(0, 128, 60)
     bit_us = 1e6 / bit_hz * (1 + clock)
@@ -130,9 +128,7 @@ def test_bright_light_is_read_without_an_error(
         (12, 0, b"y? Thou art more lovely and more temperate: rough winds do shake the darling bud"),
     ],
 )
-def test_a_list_is_read_from_its_first_character_wherever_time_begins(
-    seed: int, first_us: int, text: bytes
-) -> None:
+def test_a_list_is_read_from_its_first_character_wherever_time_begins(seed, first_us, text) -> None:
     levels = levels_of(np.frombuffer(text, np.uint8), 7, "even", 2)
     # Edges are seen late, so the first character begins before the first event.
     events = seen(np.random.default_rng(seed), levels, BIT_504_US, late_us=(60.0, 400.0), noise_hz=0.0)
@@ -152,9 +148,7 @@ def test_a_list_is_read_from_its_first_character_wherever_time_begins(
         (10_000.0, (60.0, 50.0), (25.0, 30.0), 25),
     ],
 )
-def test_times_that_are_coarse_are_read_in_any_pieces(
-    rate_hz: float, events: tuple[float, float], late_us: tuple[float, float], grain_us: int
-) -> None:
+def test_times_that_are_coarse_are_read_in_any_pieces(rate_hz, events, late_us, grain_us) -> None:
     """As a list rounds them, or a camera reads its events out in bunches that shift against the bits."""
     sent = np.random.default_rng(1).integers(0, 128, 60)
     bit_us = 1e6 / rate_hz * 1.002
@@ -236,9 +230,7 @@ DIM = [((4.0, 3.0), 0.03, 160), ((8.0, 6.0), 0.01, 150)]
 
 
 @pytest.mark.parametrize(("events", "unseen", "many"), DIM)
-def test_errors_are_those_of_a_receiver_that_knows_the_light(
-    events: tuple[float, float], unseen: float, many: int
-) -> None:
+def test_errors_are_those_of_a_receiver_that_knows_the_light(events, unseen, many) -> None:
     """Beside one that is told when each character starts, how late events are, and how many come."""
     bit_us = DIM_BIT_US
     sent, light, found = dim(events, unseen, many)

@@ -86,7 +86,6 @@ def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat, after
     read_us = end_us + 35 + after * CHIP_US
     assert grid.due(read_us - 1) is None
     due = grid.due(read_us + 1)
-    assert due is not None
     assert due is grid.next
     assert (due.start_us, due.end_us, due.read_us) == pytest.approx((start_us, end_us + 35, read_us))
 

@@ -276,7 +276,6 @@ def test_tracking_does_not_filter_it_out() -> None:
     state = steps.distance_init()
     for i, one in enumerate(bent(60, at * np.exp((1 - at**2) / 2), np.random.default_rng(14))):
         state, found, filtered = steps.follow(state, i * FRAME_US, CHIP_US, one, AHEAD)
-    assert filtered is not None
     assert found.sigma_m >= filtered.sigma_m >= found.standing_m > 0.1
     assert abs(filtered.distance_m - 45) < 2 * filtered.sigma_m
 
@@ -295,7 +294,6 @@ def test_clusters_with_dark_leds_are_taken_out_and_shown() -> None:
         assert np.flatnonzero(np.abs(one.bent_px) > 0.3).tolist() == [1, 2, 8, 13]
     # What the ranging left out itself is shown, and changes nothing.
     bend = measured[0].bend
-    assert bend is not None
     alone = Bend(PLACES, np.eye(15)[3], np.where(PLACES[3] == PLACES, 0, bend.weight), None, 0.0, 9.6, 0.5)
     _, (one,) = kept([Range(45.0, 0.01, 14, 8.0, alone)])
     assert one.bent_px is not None

@@ -70,7 +70,6 @@ def test_dark_leds_are_told_from_a_straight_bar() -> None:
     off = np.zeros(15)
     off[[2, 9]] = 0.8, -1.0
     told = seen(off, rng)[1]
-    assert told is not None
     assert not told.together
     assert np.flatnonzero(np.abs(told.rest_px) > 0.4).tolist() == [2, 9]
 
@@ -91,6 +90,5 @@ def test_bars_of_other_lengths(clusters: int) -> None:
     off = 0.02 * np.sin(7 * places)
     off[1], off[-2] = 0.9, 0.8
     found = straighten(places, off + 0.01 * places, 0.05, 0.0)
-    assert found is not None
     assert found.slope == pytest.approx(0.01, abs=4 * math.sqrt(found.variance))
     assert abs(found.slope - 0.01) < 0.02

@@ -73,8 +73,7 @@ def turned(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
     back = np.array([[1, 0, 0], [0, math.cos(tilt), math.sin(tilt)], [0, -math.sin(tilt), math.cos(tilt)]])
     aside = np.array([[math.cos(lean), -math.sin(lean), 0], [math.sin(lean), math.cos(lean), 0], [0, 0, 1]])
     ahead = points_m * [1, 1, -1]
-    found: NDArray[np.float64] = ahead @ back.T @ aside.T + [bar.x_m, bar.y_m, bar.z_m]
-    return found
+    return ahead @ back.T @ aside.T + [bar.x_m, bar.y_m, bar.z_m]
 
 
 LAYOUTS: dict[str, dict[str, Any]] = {
@@ -99,9 +98,7 @@ LAYOUTS: dict[str, dict[str, Any]] = {
         (PANEL, 6),
     ],
 )
-def test_a_cluster_of_any_layout_blinks_where_a_pinhole_shows_it(
-    layout: dict[str, Any], cluster: int, tmp_path: Path
-) -> None:
+def test_a_cluster_of_any_layout_blinks_where_a_pinhole_shows_it(layout, cluster, tmp_path) -> None:
     link = resolve({"bar": layout})
     chips = np.zeros((2, link.bar.clusters), np.uint8)
     chips[1, cluster] = 1

@@ -25,8 +25,7 @@ IDEAL = LensSpec(blur_px=0.05)
 def beyond(radius_px: Floats | float, lens: LensSpec) -> Floats:
     """Share of the light that an ideal lens throws further than a radius."""
     v = math.pi * np.asarray(radius_px) * CAMERA.pitch_um / (lens.wavelength_nm * 1e-3 * lens.f_number)
-    found: Floats = j0(v) ** 2 + j1(v) ** 2
-    return found
+    return j0(v) ** 2 + j1(v) ** 2
 
 
 def image_of_rectangle(
@@ -59,8 +58,7 @@ def table_at(table: Floats, scale_px: float, across_px: Floats, along_px: Floats
     a, b = i - i0, j - j0_
     low = (1 - b) * table[i0, j0_] + b * table[i0, j0_ + 1]
     high = (1 - b) * table[i0 + 1, j0_] + b * table[i0 + 1, j0_ + 1]
-    found: Floats = (1 - a) * low + a * high
-    return found
+    return (1 - a) * low + a * high
 
 
 @pytest.mark.parametrize("f_number", [1.4, 2.0, 4.0])

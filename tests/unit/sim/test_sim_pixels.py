@@ -37,9 +37,7 @@ AT_ONCE = replace(
     st.lists(st.tuples(st.integers(500, 3000), st.floats(0.02, 60.0)), min_size=2, max_size=6),
     st.floats(3.0, 40.0),
 )
-def test_crossings_are_those_of_brute_force_at_10_ns(
-    pieces: list[tuple[int, float]], refractory: float
-) -> None:
+def test_crossings_are_those_of_brute_force_at_10_ns(pieces, refractory) -> None:
     sensor = replace(AT_ONCE, refr_us=refractory)
     lengths = np.array([length for length, _ in pieces])
     edges = np.concatenate([[0], np.cumsum(lengths)[:-1]])  # in 10 ns, so that no step has two lights

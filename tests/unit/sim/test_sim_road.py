@@ -95,8 +95,7 @@ def test_covers_put_out_clusters_and_only_those() -> None:
 
     def at(source: Any, t_us: float) -> Floats:
         when, levels = source.switches(1000.0, 5000.0)
-        found: Floats = levels[np.searchsorted(when, t_us, side="right")]
-        return found
+        return levels[np.searchsorted(when, t_us, side="right")]
 
     for t_us in (1000.0, 1199.9, 1200.0, 3299.9, 3300.1, 4050.0, 4100.1, 4999.0):
         want = at(plain.strips[0], t_us).copy()
@@ -226,8 +225,7 @@ def lit(z_px: Floats, sigma: float) -> Floats:
     """Share of a pixel beyond a blurred edge, by quadrature: independent of the simulator's closed form."""
     nodes, weights = np.polynomial.legendre.leggauss(40)
     shares = norm.cdf((z_px[..., None] + 0.5 * nodes) / sigma)
-    found: Floats = shares @ weights * 0.5
-    return found
+    return shares @ weights * 0.5
 
 
 def light_on(scene: Scene, column: int, row: int) -> tuple[Floats, Floats]:

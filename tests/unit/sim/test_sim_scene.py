@@ -2,7 +2,6 @@
 
 import json
 import re
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -186,9 +185,7 @@ def test_the_vibration_has_its_rate_and_its_spectrum() -> None:
     assert (Vibration.of(0.0, 1).angle_rad([0.0, 1.0]) == 0).all()
 
 
-def test_simulate_writes_a_recording_and_its_truth(
-    tmp_path: Path, evlcp: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_simulate_writes_a_recording_and_its_truth(tmp_path, evlcp, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     first = evlcp("simulate", "--preset", "night", "-o", "a.raw", "--set", "duration_s=0.02", "--json")
     assert first.code == 0, first.err
@@ -227,10 +224,7 @@ def test_simulate_writes_a_recording_and_its_truth(
         (("x.toml", "--show"), 2, ""),
     ],
 )
-def test_simulate_tells_what_is_wrong(
-    arguments: tuple[str, ...], code: int, says: str, tmp_path: Path, evlcp: Callable[..., Any],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:  # fmt: skip
+def test_simulate_tells_what_is_wrong(arguments, code, says, tmp_path, evlcp, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     done = evlcp("simulate", *arguments)
     assert done.code == code

@@ -26,8 +26,7 @@ def with_revision(role: str, target: str, revision: int) -> Registry:
 
 
 def plain(truth: Truth) -> dict[str, Any]:
-    found: dict[str, Any] = json.loads(json.dumps(truth.to_table()))
-    return found
+    return json.loads(json.dumps(truth.to_table()))
 
 
 def test_a_truth_comes_back_from_its_file(tmp_path: Path) -> None:

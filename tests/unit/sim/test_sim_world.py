@@ -102,9 +102,7 @@ def test_an_imu_tells_the_attitude_and_one_error() -> None:
     for seed in range(60):
         path = CameraPath(scene.motion, scene.duration_s, seed)
         log = attitude_log(replace(scene, seed=seed), seed, path)
-        assert log is not None
         found, true = log.at(20_300.0), path.at(20_300.0)[1][0]
-        assert found is not None
         assert found.heading_deg is not None
         heading = (found.heading_deg - 359.5 - np.degrees(true[0]) + 180) % 360 - 180
         errors.append([found.pitch_deg - np.degrees(true[1]), found.roll_deg - np.degrees(true[2]), heading])
@@ -116,8 +114,6 @@ def test_errors_are_a_recordings_own_and_faults_leave_them() -> None:
     def said(*settings: str) -> list[float]:
         scene = load_scene("drive-30kmh", ["world.survey_sigma_m=0.05", "world.heading_deg=0", *settings])
         log = attitude_log(scene, 3, CameraPath(scene.motion, scene.duration_s, 3))
-        assert log is not None
-        assert log.heading_deg is not None
         return [log.heading_deg[0], sites_said(scene, 3)[0].height_m]
 
     here, there = said(), said("motion.distance_m=61")
