@@ -54,7 +54,6 @@ def drive(distance_m: float, row_px: float, seed: int) -> list[np.ndarray]:
         truth_of(simulation),
         attitude_log(scene, seed, simulation.path),
     )
-    assert true is not None
     sigma_deg = np.full(len(true.t_us), SIGMA_DEG)
     log = replace(true, pitch_deg=true.pitch_deg - off_deg, gravity_sigma_deg=sigma_deg)
     found = []
@@ -91,9 +90,7 @@ def test_an_independent_generator_s_pitch_is_corrected(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("x_m", "y_m"), [(-3.6, -1.6), (3.6, 1.6)])
-def test_a_stated_distortion_reaches_distances_in_opposite_corners(
-    tmp_path: Path, x_m: float, y_m: float
-) -> None:
+def test_a_stated_distortion_reaches_distances_in_opposite_corners(tmp_path, x_m, y_m) -> None:
     lens = load_link(overrides=["camera.k1=-0.25"])
     scene = load_scene(
         "night", {"duration_s": 0.15, "motion.distance_m": 45.0, "camera.k1": -0.25}, link=lens

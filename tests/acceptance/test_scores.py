@@ -48,8 +48,7 @@ def scored(out: Path, name: str, tool: str = "score.py") -> dict[str, Any]:
         warnings.simplefilter("ignore", ResourceWarning)
         patch.setattr(sys, "argv", [tool, str(out), str(RECORDINGS / f"{name}.truth.json"), "--json"])
         runpy.run_path(str(SHARED / "tools" / tool), run_name="__main__")
-    result: dict[str, Any] = json.loads(told.getvalue())
-    return result
+    return json.loads(told.getvalue())
 
 
 Receive = Callable[..., Path]
@@ -73,8 +72,7 @@ def received(tmp_path_factory: pytest.TempPathFactory) -> Receive:
 
 
 def truth_of(name: str) -> dict[str, Any]:
-    table: dict[str, Any] = json.loads((RECORDINGS / f"{name}.truth.json").read_text())
-    return table
+    return json.loads((RECORDINGS / f"{name}.truth.json").read_text())
 
 
 def frames_beside(
@@ -93,7 +91,6 @@ def frames_beside(
 def test_figures_are_reached(name: str, received: Receive) -> None:
     out = received(name)
     summary, score = read_summary(out), scored(out, name)
-    assert summary is not None
     assert summary["warnings"] == []
     assert score["unmatched"] == 0, "a row that matches no true frame"
     assert len(score["bars"]) == len(FIGURES[name])

@@ -2,7 +2,6 @@
 
 import csv
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -109,9 +108,7 @@ def test_bars_of_two_links_give_one_position(two_links: tuple[Path, list[Path]],
         assert np.linalg.norm(off) < 1.5
 
 
-def test_bars_of_two_links_are_surveyed(
-    two_links: tuple[Path, list[Path]], tmp_path: Path, evlcp: Callable[..., Any]
-) -> None:
+def test_bars_of_two_links_are_surveyed(two_links, tmp_path, evlcp) -> None:
     """From sites to sites: what a survey of two links says, positions by it, and names that no link has."""
     recording, (bar, short) = two_links
     poses, out = tmp_path / "poses.csv", tmp_path / "new.toml"

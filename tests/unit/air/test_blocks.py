@@ -35,9 +35,7 @@ U32 = st.integers(0, 2**32 - 1)
 @given(
     U32, U32, st.binary(min_size=1, max_size=300), st.integers(HEADER_BYTES + 1, 90), st.sampled_from(Kind)
 )
-def test_a_message_is_the_sum_of_its_blocks(
-    transmitter_id: int, sequence: int, payload: bytes, size: int, kind: Kind
-) -> None:
+def test_a_message_is_the_sum_of_its_blocks(transmitter_id, sequence, payload, size, kind) -> None:
     message = Message(kind, transmitter_id, sequence, payload)
     blocks = list(split(message, DIGEST, size))
     # Independent of the module: a message of several blocks is followed by its CRC-32.
@@ -106,9 +104,7 @@ def test_a_message_of_more_parts_than_there_are_numbers_is_refused() -> None:
         (Kind.DATA, 0, 0, bytes(65536), "65536 bytes of data"),
     ],
 )
-def test_what_is_no_message_is_told(
-    kind: Kind, transmitter_id: int, sequence: int, payload: bytes, told: str
-) -> None:
+def test_what_is_no_message_is_told(kind, transmitter_id, sequence, payload, told) -> None:
     with pytest.raises(ConfigError, match=told):
         Message(kind, transmitter_id, sequence, payload)
 
@@ -128,9 +124,7 @@ def test_text_is_utf8() -> None:
     st.integers(1, 100_000),
     st.binary(max_size=40),
 )
-def test_beacons_keep_every_digit(
-    latitude: int, longitude: int, height: int, heading: int, tilt: int, length: int, user: bytes
-) -> None:
+def test_beacons_keep_every_digit(latitude, longitude, height, heading, tilt, length, user) -> None:
     payload = struct.pack("<qqiHHI", latitude, longitude, height, heading, tilt, length) + user
     beacon = Beacon.unpack(payload)
     assert beacon.pack() == payload

@@ -74,9 +74,7 @@ def test_a_sparse_packet_is_the_full_one_without_some_pilots(profile: str, frame
 @pytest.mark.parametrize(("frames", "every"), [(10, 1), (10, 4), (9, 4), (1, 1)])
 @pytest.mark.parametrize("preamble", [[0, 1, 1], [1, 1, 0]])
 @pytest.mark.parametrize("first", [[0, 1], [0, 0]])
-def test_what_follows_a_frame_is_what_is_on_air(
-    frames: int, every: int, preamble: list[int], first: list[int]
-) -> None:
+def test_what_follows_a_frame_is_what_is_on_air(frames, every, preamble, first) -> None:
     words = np.array([[first[0], 1, 0], [first[1], 0, 1]])
     book = Codebook("x", np.array(preamble), np.array([[1, 0, 1], [0, 1, 1]]), words)
     form = PacketFormat.of(book, frames, pilot_every=every)

@@ -214,9 +214,7 @@ OVERRIDES: list[list[str]] = [
 
 
 @pytest.mark.parametrize("overrides", OVERRIDES)
-def test_the_commented_text_gives_the_same_link(
-    registry: Registry, tmp_path: Path, overrides: list[str]
-) -> None:
+def test_the_commented_text_gives_the_same_link(registry, tmp_path, overrides) -> None:
     link = load_link(None, overrides, registry)
     path = tmp_path / "link.toml"
     path.write_text(to_toml(link, registry))

@@ -58,9 +58,7 @@ TOLD = '[air]\nchip_rate_hz = {rate}\n[framing]\nid = "uart"\n'
     ],
     ids=str,
 )
-def test_links_whose_characters_the_other_reads_are_named(
-    tmp_path: Path, rate: float, settings: str, alike: bool
-) -> None:
+def test_links_whose_characters_the_other_reads_are_named(tmp_path, rate, settings, alike) -> None:
     (tmp_path / "lamp.toml").write_text(ONE_LED + TOLD.format(rate=3125.0))
     (tmp_path / "other.toml").write_text(ONE_LED + TOLD.format(rate=rate) + settings)
     (tmp_path / "bar.toml").write_text("")
@@ -68,9 +66,7 @@ def test_links_whose_characters_the_other_reads_are_named(
     assert alike_links(links) == [("lamp", "other")] * alike
 
 
-def test_links_alike_are_said_on_stderr_before_anything_is_read(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_links_alike_are_said_on_stderr_before_anything_is_read(tmp_path, capsys) -> None:
     for name, idle in (("lamp", ""), ("off", "idle = 'off'")):
         (tmp_path / f"{name}.toml").write_text(ONE_LED + TOLD.format(rate=3125.0) + idle)
     files = [str(tmp_path / "lamp.toml"), str(tmp_path / "off.toml")]

@@ -220,9 +220,7 @@ def options(role: str, id: str) -> list[str]:
 
 
 @pytest.mark.parametrize(("role", "id"), CASES)
-def test_it_is_one_line(
-    role: str, id: str, evlcp: Evlcp, lamp_raw: Path, demo_raw: Path, tmp_path: Path
-) -> None:
+def test_it_is_one_line(role, id, evlcp, lamp_raw, demo_raw, tmp_path) -> None:
     raw = lamp_raw if role in ("framing", "detection") else demo_raw
     done = evlcp("receive", raw, "-o", tmp_path / "out", *options(role, id))
     assert done.code == 2, done.err

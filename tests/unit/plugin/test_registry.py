@@ -190,9 +190,7 @@ def odd(x: "Nothing") -> None: ...  # type: ignore[name-defined]  # noqa: F821
         (lambda: Commands(receive), "has the command 'receive', which is there already"),
     ],
 )
-def test_the_command_line_goes_on_without_a_broken_plugin(
-    stranger: Callable[[], object], reason: str, monkeypatch: pytest.MonkeyPatch, evlcp: Any
-) -> None:
+def test_the_command_line_goes_on_without_a_broken_plugin(stranger, reason, monkeypatch, evlcp) -> None:
     install(monkeypatch, ("stranger", "evlcp-stranger", stranger), beside=True)
     told = f"evlcp: warning: plugin stranger of evlcp-stranger 1.0 is broken and left out: {reason}"
     for command in ("--help", "plugins"):

@@ -16,9 +16,7 @@ ZERO = datetime(2026, 3, 1, 23, 59, 58, tzinfo=UTC)
     st.floats(-90, 90), st.floats(-180, 180), st.floats(-100, 5000), st.floats(0, 1e9),
     st.integers(1, 20), st.floats(0, 100), st.floats(0, 360),
 )  # fmt: skip
-def test_sentences_read_back(
-    lat: float, lon: float, height: float, t_us: float, bars: int, speed: float, course: float
-) -> None:
+def test_sentences_read_back(lat, lon, height, t_us, bars, speed, course) -> None:
     place = (lat, lon, height)
     seen = pynmea2.parse(gga(clock_of(t_us, ZERO), place, bars).strip(), check=True)
     assert seen.talker == "IN"

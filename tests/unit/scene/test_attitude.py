@@ -42,9 +42,7 @@ def test_turn_and_push_of_a_tilted_camera() -> None:
     log = moving_log()
     start, end = 0.5032, 3.2071
     found = log.between(start * 1e6, end * 1e6)
-    assert found is not None
     assert found.gyro
-    assert found.push_m_s2 is not None
     assert found.t_s[0] == 0
     assert found.t_s[-1] == pytest.approx(end - start)
     turned = np.radians(heading_deg(start + found.t_s) - heading_deg(start))
@@ -64,7 +62,6 @@ def test_without_rates_headings_tell_and_a_long_log_is_thinned() -> None:
     heading = np.linspace(0, 720, len(t_us))
     still = np.zeros(len(t_us))
     found = AttitudeLog(t_us, still, still, heading, still, still).between(0.0, t_us[-1])
-    assert found is not None
     assert not found.gyro
     assert found.turn_rad[-1] == pytest.approx(np.radians(720))
     assert 2048 < len(found.t_s) < 4100
@@ -122,7 +119,6 @@ def test_angles_are_not_drawn_across_lines_that_are_lost() -> None:
     log = AttitudeLog(t_us, angle, still, angle, still, still)
     for known_us in (0.0, 48.5e3, 49e3, 200e3, 249e3):
         at = log.at(known_us)
-        assert at is not None
         assert at.pitch_deg == pytest.approx(known_us * 1e-3)
     assert log.at(49.1e3) is None
     assert log.at(199e3) is None
@@ -130,7 +126,6 @@ def test_angles_are_not_drawn_across_lines_that_are_lost() -> None:
     assert log.between(10e3, 210e3) is None
     for start_us, end_us in ((10e3, 49e3), (200e3, 249e3)):
         swing = log.between(start_us, end_us)
-        assert swing is not None
         assert swing.turn_rad[-1] == pytest.approx(np.radians((end_us - start_us) * 1e-3))
     # Lines that come late, but not by much, and logs of few lines have no gaps.
     late = AttitudeLog(np.array([0.0, 1e3, 2e3, 9e3, 10e3]), *(np.zeros(5),) * 2, None, *(np.zeros(5),) * 2)
@@ -160,9 +155,7 @@ CURVES = 10 * np.sin(2 * TURN_S) + 0.5 * NOISE, 20 * np.cos(2 * TURN_S)
         (CURVES[0], CURVES[1] * 1e3, 1e3),
     ],
 )
-def test_rates_of_another_measure_or_sign_are_told(
-    tmp_path: Path, heading_deg: Floats, rate_deg_s: Floats, times: float | None
-) -> None:
+def test_rates_of_another_measure_or_sign_are_told(tmp_path, heading_deg, rate_deg_s, times) -> None:
     columns = zip(TURN_S * 1e6, heading_deg % 360, rate_deg_s, strict=True)
     lines = [f"{ANGLES},heading_deg,{RATES}", *(f"{t:.0f},0,0,{h:.6f},0,{r:.6f},0" for t, h, r in columns)]
     (tmp_path / "imu.csv").write_text("\n".join(lines))
@@ -172,5 +165,4 @@ def test_rates_of_another_measure_or_sign_are_told(
     with pytest.raises(ConfigError) as caught:
         AttitudeLog.read(tmp_path / "imu.csv")
     told = re.search(r"rates turn the camera (\S+) times as far as its headings do", str(caught.value))
-    assert told is not None
     assert float(told[1]) == pytest.approx(times, rel=0.1)

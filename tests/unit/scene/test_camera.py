@@ -161,9 +161,7 @@ PLUMB = (0.0, 0.0, -1.0)
 @pytest.mark.parametrize(("east", "up"), [(0.0, 0.0), (4.0, 2.0), (-4.0, -2.0), (0.0, -2.4)])
 @pytest.mark.parametrize(("pitch_deg", "roll_deg"), [(0.0, 0.0), (4.0, 0.0), (-3.0, 10.0), (2.0, -90.0)])
 @pytest.mark.parametrize("axis", [PLUMB, (0.0, 0.0, 1.0)], ids=["upright", "upside-down"])
-def test_a_plumb_bar(
-    pitch_deg: float, roll_deg: float, east: float, up: float, axis: tuple[float, float, float]
-) -> None:
+def test_a_plumb_bar(pitch_deg, roll_deg, east, up, axis) -> None:
     attitude = Attitude(pitch_deg, roll_deg, 0.0)
     points, depth_m, direction = seen(attitude, east, up, axis)
     sight = sight_of(CAMERA, points, SIGMA_PX, attitude)
@@ -214,9 +212,7 @@ CORNERS = [(-600.0, -320.0), (600.0, -320.0), (-600.0, 320.0), (600.0, 320.0)]
 @pytest.mark.parametrize("corner", CORNERS)
 @pytest.mark.parametrize("lens", [{"k1": -0.25}, {"k1": 0.3, "k2": -5.0}, {"p1": 0.01, "p2": -0.02}])
 @pytest.mark.parametrize("depth_m", [20.0, 45.0])
-def test_distances_and_bends_of_a_distorted_bar_are_those_of_a_pinhole(
-    corner: tuple[float, float], lens: dict[str, float], depth_m: float
-) -> None:
+def test_distances_and_bends_of_a_distorted_bar_are_those_of_a_pinhole(corner, lens, depth_m) -> None:
     """An even scale fitted to where boundaries are seen, as rangings do, by NumPy."""
     camera = CameraModel(**lens)
     middle = np.array([*(np.array(corner) / CAMERA.focal_px * depth_m), depth_m])

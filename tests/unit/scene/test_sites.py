@@ -44,9 +44,7 @@ def enu_axes(latitude_deg: float, longitude_deg: float) -> np.ndarray:
     st.floats(-89, 89), st.floats(-179, 179), st.floats(-100, 3000),
     st.floats(0, 359), st.floats(0, 180), st.floats(-0.01, 0.01), st.floats(-0.01, 0.01),
 )  # fmt: skip
-def test_clusters_stand_where_the_ellipsoid_says(
-    lat: float, lon: float, height: float, heading: float, tilt: float, dlat: float, dlon: float
-) -> None:
+def test_clusters_stand_where_the_ellipsoid_says(lat, lon, height, heading, tilt, dlat, dlon) -> None:
     site = BarSite(1, lat, lon, height, heading, tilt, 1.6)
     axes = LocalAxes(lat + dlat, lon + dlon, height - 3)
     h, t = math.radians(heading), math.radians(tilt)
