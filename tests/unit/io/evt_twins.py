@@ -52,6 +52,16 @@ def judged(words: list[int], k: int, bits: int, low_bits: int, before: int) -> s
     return "doubtful" if against > len(following) - against else "believed"
 
 
+def doubtful(out: Decoded, words: list[int], k: int, bits: int, low_bits: int, before: int, at: int) -> bool:
+    """Count what TIME_HIGH words[k] is after `before`; whether it is not believed."""
+    verdict, value = judged(words, k, bits, low_bits, before), words[k] % (1 << bits)
+    if verdict != "believed":
+        out.lose("time_glitches", at)
+    out.rollovers += verdict == "believed" and value < before
+    out.early += verdict == "early" and value > before
+    return verdict == "doubtful"
+
+
 def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded:
     out = Decoded()
     high = row = base = None
@@ -102,15 +112,8 @@ def decode_evt3(data: bytes, width: int, height: int, start: int = 0) -> Decoded
         elif kind == 0x6:
             low = value
         elif kind == 0x8:
-            verdict = judged(words, k, 12, 12, high)
-            doubt = verdict == "doubtful"
-            if verdict != "believed":
-                out.lose("time_glitches", at)
-            if doubt:
-                continue
-            out.rollovers += verdict == "believed" and value < high
-            out.early += verdict == "early" and value > high
-            if value != high:
+            doubt = doubtful(out, words, k, 12, 12, high, at)
+            if not doubt and value != high:
                 high, low = value, 0
         elif kind == 0xA and doubt:
             out.lose("time_doubtful", at)
@@ -132,17 +135,8 @@ def decode_evt2(data: bytes, width: int, height: int, start: int = 0) -> Decoded
         at = start + 4 * k
         kind = word >> 28
         if kind == 0x8:
-            value = word & 0xFFFFFFF
-            if high is not None:
-                verdict = judged(words, k, 28, 6, high)
-                doubt = verdict == "doubtful"
-                if verdict != "believed":
-                    out.lose("time_glitches", at)
-                if doubt:
-                    continue
-                out.rollovers += verdict == "believed" and value < high
-                out.early += verdict == "early" and value > high
-            high = value
+            doubt = high is not None and doubtful(out, words, k, 28, 6, high, at)
+            high = high if doubt else word & 0xFFFFFFF
             continue
         if high is None:
             out.lose("words_before_time", at)

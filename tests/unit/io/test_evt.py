@@ -56,6 +56,8 @@ def rows(table, names):
 
 @pytest.mark.parametrize(("name", "words"), [("EVT3", words3), ("EVT2", words2)])
 def test_kernel_equals_its_twin_for_any_words_and_splits(name, words):
+    @settings(max_examples=100)
+    @given(st.lists(words, max_size=120), st.lists(st.integers(0, 200), max_size=4), st.integers(12, 80))
     def check(values, splits, capacity):
         codec = CODECS[name]
         array = np.array(values, codec.word)

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, strategies as st
 from scipy import stats
+from scipy.optimize import approx_fprime
 from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.place.error_model import ErrorModel
@@ -114,6 +115,22 @@ def test_attitude_is_the_named_turns(heading: float, pitch: float, roll: float) 
     np.testing.assert_allclose(Attitude(pitch, roll, heading).rotation(), level @ turns, atol=1e-12)
     back = Attitude.of_rotation(level @ turns)
     np.testing.assert_allclose(back.rotation(), level @ turns, atol=1e-7)
+
+
+@given(st.integers(0, 2**32 - 1))
+def test_slopes_are_the_numerical_ones(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    rotation = Attitude(*rng.uniform(-30, 30, 2), rng.uniform(0, 360)).rotation()
+    position = rng.uniform(-100, 100, 3)
+    enu = position + rotation @ np.array([rng.uniform(-2, 2), rng.uniform(-1, 1), rng.uniform(20, 60)])
+
+    def image(unknown: Floats) -> Floats:
+        turned = Rotation.from_rotvec(unknown[3:]).as_matrix() @ rotation
+        return project_bars(enu[None], position + unknown[:3], turned, BENT)[0][0]
+
+    _, slope = project_bars(enu[None], position, rotation, BENT)
+    want = approx_fprime(np.zeros(6), image, 1e-6)
+    np.testing.assert_allclose(slope[0], want, rtol=1e-5, atol=2e-2)
 
 
 @given(st.integers(0, 2**32 - 1))
