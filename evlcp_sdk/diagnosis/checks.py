@@ -61,7 +61,16 @@ CHECKS: tuple[tuple[str, Callable[[Facts], _Of], tuple[Callable[..., Found], ...
     ("brightness", _of_bar, (of_light.check_brightness,)),
     ("chip rate", _of_bar, (of_light.check_rate,)),
     ("preamble", _of_recording, (of_light.check_preamble,)),
-    ("frames", _of_links, (of_frames.check_frames, of_frames.check_kinds_of_frames, of_frames.check_alike)),
+    (
+        "frames",
+        _of_links,
+        (
+            of_frames.check_frames,
+            of_frames.check_kinds_of_frames,
+            of_frames.check_flooded,
+            of_frames.check_alike,
+        ),
+    ),
     ("frames", _of_transmitters, (of_frames.check_reflection, of_frames.check_restart, of_frames.check_lit)),
     ("frames", _of_many_frames, (of_frames.check_clock, of_frames.check_hidden)),
     ("frames", _of_recording, (of_light.check_coverage,)),

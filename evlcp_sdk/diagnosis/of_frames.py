@@ -149,6 +149,13 @@ def check_kinds_of_frames(facts: Facts) -> Found:
             yield Diagnostic(code, f"{min(number, due)} of {due} frames {text}", step)
 
 
+def check_flooded(facts: Facts) -> Found:
+    """Frames that a step of light leaves without a symbol."""
+    if flooded := facts.counts.get("frames_flooded", 0):
+        text = f"no symbol in {flooded} of {facts.counts['frames']} frames, as all light changed in them"
+        yield Diagnostic("light-steps", text, verdict="note")
+
+
 def check_reflection(_facts: Facts, one: TransmitterTally) -> Found:
     """A transmitter that is a reflection of another one."""
     if one.echoes and one.echo_of is not None:

@@ -159,7 +159,7 @@ def check_readout(facts: Facts) -> Found:
     events, (row_us, round_us) = facts.readout.events, facts.readout.round_us()
     share, peak = events.capped()
     chip_us = min(one.link.packet.chip_us for one in (facts, *facts.parts.values()))
-    if round_us > _ROUND_CHIPS * chip_us and not facts.sure:
+    if round_us > _ROUND_CHIPS * chip_us:
         yield Diagnostic(
             "readout",
             f"the sensor reads without rest, {row_us:.2g} us a row, and comes to each row every"

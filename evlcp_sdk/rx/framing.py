@@ -317,7 +317,8 @@ class Transmitter:
         said: Number of the newest frame that was decoded, on the grid, and its symbols.
         given: Number of the newest frame on the grid that was given before any was rejected since the
             newest preamble on it.
-        rejected: Frames that were rejected since then: maybe another transmitter sends.
+        doubtful: Frames since the first that was rejected since then, by what they count as: maybe another
+            transmitter sends.
         missed: Frames due that were not given, by the count that they belong to.
         behind: Frames that are due wait for the next step.
         tried: Number of the newest frame on the grid that was not given as soon as it was due.
@@ -336,7 +337,7 @@ class Transmitter:
     pilot: Pilot | None = None
     said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
     given: int = -1
-    rejected: int = 0
+    doubtful: Counter[str] = field(default_factory=Counter)
     missed: Counter[str] = field(default_factory=Counter)
     behind: bool = False
     tried: int = -1
@@ -345,7 +346,7 @@ class Transmitter:
 
     def settle(self) -> None:
         """Take a preamble on the grid: the frames before it are its own."""
-        self.given, self.rejected = max(self.given, self.grid.frame - 1), 0
+        self.given, self.doubtful = max(self.given, self.grid.frame - 1), Counter()
         self.packets.in_doubt = False
 
 
@@ -670,8 +671,8 @@ class PacketFraming(Framer):
     def _succeed(self, old: Transmitter) -> Transmitter:
         """End a transmitter that another is in the place of; what was read since, or rejected, is not its."""
         self.counts["restarts"] += 1
-        self.counts[Skipped.REJECTED] -= old.rejected
-        old.missed[Skipped.REJECTED] -= old.rejected
+        self._discarded(old.doubtful)
+        old.missed[Skipped.REJECTED] -= old.doubtful[Skipped.REJECTED]
         packet, frame = divmod(old.given, self._packet.frames)
         self.counts["frames"] -= self._queue.end_after(old.packets, (packet - (old.first or 0), frame))
         self._ended.append((old.number, old.region.positions.place_at(old.region.latest.t_us), old.missed))
@@ -724,7 +725,7 @@ class PacketFraming(Framer):
                     self._lit_in(transmitter, self._clock.camera_us(due.start_us))
                     transmitter.missed[found] += 1
                     if found is Skipped.REJECTED and transmitter.number is not None:
-                        transmitter.rejected += 1
+                        transmitter.doubtful[found] += 1
                         transmitter.packets.in_doubt = True
                 self.counts[found] += 1
                 self._announce_skipped(transmitter, due, found)
@@ -741,7 +742,7 @@ class PacketFraming(Framer):
     def _take(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         """Hand a frame on."""
         transmitter.grid.go_to(due.number + 1)
-        if not transmitter.rejected:
+        if not transmitter.doubtful:
             transmitter.given = due.number
         self._lit_in(transmitter, found.frame.t_us)
         self.counts["frames"] += 1
@@ -774,13 +775,13 @@ class PacketFraming(Framer):
         reading = self._reader.read(aligned, due, before, attitude, ranged=ranged)
         transmitter.said = due.number, reading.symbols
         distance, soft = reading.distance, reading.soft
-        self.counts["frames_askew"] += reading.sight.askew
+        self._note(transmitter, "frames_askew", reading.sight.askew)
         if max(soft.symbols.tolist()) < 0 and (
             transmitter.number is None or not math.isfinite(distance.distance_m)
         ):
             # What says nothing is no transmitter, and of one that is known its distance may still be of use.
             return Skipped.UNREAD
-        self.counts["frames_flooded"] += reading.flooded
+        self._note(transmitter, "frames_flooded", reading.flooded)
         if transmitter.number is None:
             self._find_parts(transmitter.region, due.start_us)
         number = self._transmitters.number(transmitter)
@@ -831,6 +832,12 @@ class PacketFraming(Framer):
         grid.go_to(due.number)
         assert grid.next is not None
         return grid.next
+
+    def _note(self, transmitter: Transmitter, name: str, many: int) -> None:
+        """Count something of a frame, as doubtful as the frame is."""
+        self.counts[name] += many
+        if transmitter.doubtful:
+            transmitter.doubtful[name] += many
 
     def _is_ranged(self) -> bool:
         """Whether the turn of a frame with a pilot has come to be ranged."""

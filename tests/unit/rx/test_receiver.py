@@ -299,9 +299,12 @@ def test_a_transmitter_that_starts_anew_is_another(at_us: float) -> None:
     begins = 0, at_us, at_us + 100_000, 300_000
     sent = [ideal_events(LINK, bar) for bar in bars]
     lit = [(e.t_us >= begins[i]) & (e.t_us < begins[i + 1]) for i, e in enumerate(sent)]
-    receiver, packets = received(LINK, merged(*(e[on] for e, on in zip(sent, lit, strict=True))))
+    events = merged(*(e[on] for e, on in zip(sent, lit, strict=True)))
+    # The camera is said to lean, which every frame that is read contradicts.
+    receiver, packets = received(LINK, events, attitude=Attitude(6.0, 5.0))
     assert receiver.counts["restarts"] == 2
     assert receiver.counts["frames_rejected"] == 0
+    assert receiver.counts["frames_askew"] == receiver.counts["frames"] + receiver.counts["frames_unread"]
     for number, bar in enumerate(bars):
         chip_us = 100 / (1 + bar.ppm * 1e-6)
         starts = bar.start_us + chip_us * np.add.outer(346 * np.arange(6), 26 + 32 * np.arange(10)).ravel()
