@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -27,21 +26,14 @@ app.command(cls=JsonCommand)(message)
 app.command(cls=JsonCommand)(keygen)
 
 
-class Form(StrEnum):
-    """How `tx frames` prints the words."""
-
-    TABLE = "table"
-    HEX = "hex"
-    C = "c"
-    JSON = "json"
-
-
 @app.command()
 @command
 def frames(
     *,
     sent: SymbolOptions,
-    form: Annotated[Form, typer.Option("--format", help="How the words are printed.")] = Form.TABLE,
+    form: Annotated[
+        Literal["table", "hex", "c", "json"], typer.Option("--format", help="How the words are printed.")
+    ] = "table",
     chips: Annotated[
         Path | None,
         typer.Option(
@@ -136,7 +128,7 @@ def _json(symbols: NDArray[np.int64], link: Link) -> str:
     )
 
 
-_FORMS = {Form.TABLE: _table, Form.HEX: _hex, Form.C: _c, Form.JSON: _json}
+_FORMS = {"table": _table, "hex": _hex, "c": _c, "json": _json}
 
 
 @app.command(cls=JsonCommand)
