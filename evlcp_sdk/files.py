@@ -543,14 +543,14 @@ def read_numbers(path: Path | str) -> "NDArray[Any]":
     import numpy as np
 
     data = read_whole(path)
+    if not data.startswith(b"\x93NUMPY"):
+        raise InputError(f"{path}: not a .npy file of plain numbers")
     try:
-        array = np.load(io.BytesIO(data), allow_pickle=False)
+        array: NDArray[Any] = np.load(io.BytesIO(data), allow_pickle=False)
     except Exception as fault:
         # NumPy evaluates the header as a piece of Python, which may fail in any way.
         reason = " ".join(str(fault).split())
         raise InputError(f"{path}: not a .npy file of plain numbers: {reason:.200}") from fault
-    if not isinstance(array, np.ndarray):
-        raise InputError(f"{path}: not a .npy file of plain numbers, but an archive of several")
     if array.dtype.kind not in "biuf":
         raise InputError(f"{path}: not a .npy file of plain numbers, but of {array.dtype}")
     return array

@@ -95,12 +95,11 @@ def check_events(facts: Facts) -> Found:
     if number >= _DROPPED_LEAST and number > _DROPPED_SHARE * (events + lost):
         kinds = [f"{k} {n.removeprefix('dropped_').replace('_', ' ')}" for n, k in dropped.items()]
         kinds += [f"{lost} in the file"] * (lost > 0)
-        yield Diagnostic(
-            "dropped",
-            f"{number} events or words dropped ({', '.join(kinds)})",
-            "losses and counts in summary.json say where and why; `evlcp info` says what is in the recording",
-        )
-    if events or not facts.surveyed:
+        step = "losses and counts in summary.json say where and why; `evlcp info` says what is in the recording"
+        if 2 * dropped.get("dropped_off_sensor", 0) > number:
+            step = "compare camera.width and camera.height with the sensor's"
+        yield Diagnostic("dropped", f"{number} events or words dropped ({', '.join(kinds)})", step)
+    if events or "events" not in facts.counts:
         yield f"{events:,} events in {facts.duration_us * 1e-6:.3f} s{losses}"
     else:
         step = "record again: `evlcp info` says what is in the file"

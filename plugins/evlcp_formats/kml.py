@@ -44,9 +44,10 @@ class Kml(Sink):
         if zero is not None:
             at = zero.astimezone(UTC) + timedelta(microseconds=round(fix.t_us))
             when = f"<TimeStamp><when>{at:%Y-%m-%dT%H:%M:%S}.{at.microsecond // 1000:03d}Z</when></TimeStamp>"
-        label = f"{fix.t_us / 1e3:.1f} ms, &#177; {east:.3f} E {north:.3f} N {up:.3f} U m"
+        name = f"<name>{fix.t_us / 1e3:.1f} ms</name>"
+        label = f"&#177; {east:.3f} E {north:.3f} N {up:.3f} U m"
         where = _point(fix.longitude_deg, fix.latitude_deg, fix.height_m)
-        self._placemark(f"{when}<styleUrl>#fix</styleUrl><description>{label}</description>{where}")
+        self._placemark(f"{name}{when}<styleUrl>#fix</styleUrl><description>{label}</description>{where}")
 
     def settle(self, settled: Sequence[Settled]) -> None:
         """Write the smoothed places as a line, one per trajectory."""
