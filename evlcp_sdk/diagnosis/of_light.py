@@ -95,7 +95,7 @@ def check_events(facts: Facts) -> Found:
     if number >= _DROPPED_LEAST and number > _DROPPED_SHARE * (events + lost):
         kinds = [f"{k} {n.removeprefix('dropped_').replace('_', ' ')}" for n, k in dropped.items()]
         kinds += [f"{lost} in the file"] * (lost > 0)
-        step = "losses and counts in summary.json say where and why; `evlcp info` says what is in the recording"
+        step = "losses and counts in summary.json say where and why, `evlcp info` what is in the recording"
         if 2 * dropped.get("dropped_off_sensor", 0) > number:
             step = "compare camera.width and camera.height with the sensor's"
         yield Diagnostic("dropped", f"{number} events or words dropped ({', '.join(kinds)})", step)
