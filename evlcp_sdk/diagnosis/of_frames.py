@@ -101,11 +101,13 @@ def check_frames(facts: Facts) -> Found:
             "turn the camera so that the whole bar is in the picture",
         )
     elif not reads or (rejected >= FEW_FRAMES and rejected > share * (frames + rejected)):
+        step = "compare the link's [bar], [pilots] and [air] with the transmitter's, or try --link auto;"
+        step += " list:PATH?inverted=1 turns the polarities of a list"
         yield Diagnostic(
             "frames-rejected",
             f"{rejected} of {frames + rejected} frames rejected, as their clusters do not stand where the bar"
             " has them",
-            "compare the link's [bar], [pilots] and [air] with the transmitter's, or try --link auto",
+            step if facts.surveyed else f"{step}; `evlcp diagnose` looks further",
         )
     else:
         yield text
