@@ -174,7 +174,8 @@ def program(
     What is there already is not sent again. A board that plays changes between two packets, without a dark
     chip.
 
-    For example: [bold]evlcp board --port /dev/ttyUSB0 program SYMBOLS.json[/]
+    Symbols:  [bold]evlcp board --port /dev/ttyUSB0 program SYMBOLS.json[/]
+    A text:   [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
     """
     if inventory is not None:
         _beside_inventory(context, "verify", "stay")
