@@ -142,16 +142,13 @@ class Link:
             raise ConfigError(f"{role}{_unused(self.table['framing']['id'])}")
         return self.algorithms[role]
 
-    def with_algorithm(
-        self, role: str, algorithm: Any, *, id: str | None = None, revision: int = 0
-    ) -> "Link":
+    def with_algorithm(self, role: str, algorithm: Any, *, id: str | None = None) -> "Link":
         """The same link with another algorithm, installed or not.
 
         Args:
             role: The role that it fills.
             algorithm: The algorithm, with its parameters.
             id: What it is called in the table and in messages; None for the name of its class.
-            revision: Its revision.
 
         Raises:
             ConfigError: There is no such role, or the pilots have fewer codes than the bar has clusters.
@@ -169,7 +166,7 @@ class Link:
         described = is_dataclass(algorithm) and not isinstance(algorithm, type)
         parameters = asdict(algorithm) if described else {}
         keys = {"id": id or type(algorithm).__name__} | json.loads(json.dumps(parameters, default=str))
-        table, revisions = {**self.table, role: keys}, {**self.revisions, role: revision}
+        table, revisions = {**self.table, role: keys}, {**self.revisions, role: 0}
         if role == "framing":
             unused = STEPS - algorithm.roles
             if missing := sorted(STEPS - unused - set(parts)):

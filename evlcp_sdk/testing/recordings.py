@@ -1,4 +1,4 @@
-"""Ideal recordings: a bar whose every pixel sends a few events after each edge; lamps; noise."""
+"""Ideal recordings: a bar whose every pixel sends a few events after each edge."""
 
 from dataclasses import dataclass
 
@@ -109,44 +109,3 @@ def merged(*parts: Events) -> Events:
     """All events in order of time."""
     every = Events.concat(parts)
     return every[np.argsort(every.t_us, kind="stable")]
-
-
-def lamp_events(
-    x: int, y: int, size: int, flicker_hz: float, duration_us: int, *, duty: float = 0.5, seed: int = 0
-) -> Events:
-    """A square lamp that flickers: its pixels send three events at each change of its light.
-
-    Args:
-        x: Its first column.
-        y: Its first row.
-        size: Its side, px.
-        flicker_hz: Flashes a second.
-        duration_us: How long, us.
-        duty: Share of a period that it shines.
-        seed: Of the jitter.
-    """
-    rng = np.random.default_rng(seed)
-    period_us = 1e6 / flicker_hz
-    starts = np.arange(0, duration_us, period_us)
-    edges = np.concatenate([starts, starts + duty * period_us])
-    on = np.concatenate([np.ones(len(starts)), np.zeros(len(starts))])
-    v, u = np.mgrid[y : y + size, x : x + size]
-    n = v.size * 3
-    t = np.repeat(edges, n) + np.tile(np.repeat([0, 12, 24], v.size), len(edges))
-    t = np.floor(t + rng.normal(25, 5, len(t)))
-    order = np.argsort(t, kind="stable")
-    columns = (
-        t,
-        np.tile(u.ravel(), 3 * len(edges)),
-        np.tile(v.ravel(), 3 * len(edges)),
-        np.repeat(on, n),
-    )
-    return Events.of(*(c[order] for c in columns))
-
-
-def noise_events(rate_hz: float, duration_us: int, seed: int = 0) -> Events:
-    """Random events all over a 1280x720 sensor."""
-    rng = np.random.default_rng(seed)
-    n = rng.poisson(rate_hz * duration_us * 1e-6)
-    t = np.sort(rng.integers(0, duration_us, n))
-    return Events.of(t, rng.integers(0, 1280, n), rng.integers(0, 720, n), rng.integers(0, 2, n))

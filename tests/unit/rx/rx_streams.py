@@ -5,6 +5,8 @@ from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
+
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.testing.recordings import IdealBar
@@ -66,3 +68,34 @@ def right_frames(
             assert late_us[0] < after_us < late_us[1]
             assert frame.soft.symbols.tolist() == bar.symbols[number, frame.frame].tolist()
     return len(frames_of(packets))
+
+
+def lamp_events(
+    x: int, y: int, size: int, flicker_hz: float, duration_us: int, *, duty: float = 0.5
+) -> Events:
+    """A square lamp that flickers: its pixels send three events at each change of its light."""
+    rng = np.random.default_rng(0)
+    period_us = 1e6 / flicker_hz
+    starts = np.arange(0, duration_us, period_us)
+    edges = np.concatenate([starts, starts + duty * period_us])
+    on = np.concatenate([np.ones(len(starts)), np.zeros(len(starts))])
+    v, u = np.mgrid[y : y + size, x : x + size]
+    n = v.size * 3
+    t = np.repeat(edges, n) + np.tile(np.repeat([0, 12, 24], v.size), len(edges))
+    t = np.floor(t + rng.normal(25, 5, len(t)))
+    order = np.argsort(t, kind="stable")
+    columns = (
+        t,
+        np.tile(u.ravel(), 3 * len(edges)),
+        np.tile(v.ravel(), 3 * len(edges)),
+        np.repeat(on, n),
+    )
+    return Events.of(*(c[order] for c in columns))
+
+
+def noise_events(rate_hz: float, duration_us: int) -> Events:
+    """Random events all over a 1280x720 sensor."""
+    rng = np.random.default_rng(0)
+    n = rng.poisson(rate_hz * duration_us * 1e-6)
+    t = np.sort(rng.integers(0, duration_us, n))
+    return Events.of(t, rng.integers(0, 1280, n), rng.integers(0, 720, n), rng.integers(0, 2, n))

@@ -8,13 +8,13 @@ import pytest
 import rx_twins as twins
 from hypothesis import assume, given, strategies as st
 from numpy.testing import assert_array_equal
-from rx_streams import LINK, frames_of, received
+from rx_streams import LINK, frames_of, noise_events, received
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.framing import PacketGrid, RowDelay, measure_row_delay
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, SyncLock
 
 CHIP_US, ZERO_US = 100.5, 1234.5

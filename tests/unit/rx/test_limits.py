@@ -7,7 +7,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of
+from rx_streams import LINK, frames_of, noise_events
 
 from evlcp_sdk.clock import Timeline
 from evlcp_sdk.link.sections import RegionSpec
@@ -15,7 +15,7 @@ from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.regions import EVENT_BYTES, PIECE_BYTES, RegionFollower
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events
 
 SPEC = RegionSpec(step_us=1000)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from rx_streams import LINK, frames_of, received, right_frames
+from rx_streams import LINK, frames_of, lamp_events, noise_events, received, right_frames
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link, load_link
@@ -19,9 +19,7 @@ from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.testing.recordings import (
     IdealBar,
     ideal_events,
-    lamp_events,
     merged,
-    noise_events,
     random_symbols,
 )
 from evlcp_sdk.values import Events, Packet, PresenceMap

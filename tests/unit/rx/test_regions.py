@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rx_streams import LINK
+from rx_streams import LINK, lamp_events, noise_events
 
 from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
@@ -18,9 +18,7 @@ from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import (
     IdealBar,
     ideal_events,
-    lamp_events,
     merged,
-    noise_events,
     random_symbols,
 )
 from evlcp_sdk.values import Events, Region

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rx_streams import frames_of, received, right_frames, said
+from rx_streams import frames_of, noise_events, received, right_frames, said
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
@@ -17,7 +17,7 @@ from evlcp_sdk.rx.multi import explained_us
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.regions import RegionFollower
 from evlcp_sdk.simulated import simulate
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols, changed
 
 

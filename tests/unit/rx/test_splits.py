@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from rx_streams import LINK, frames_of, received, said
+from rx_streams import LINK, frames_of, noise_events, received, said
 
 from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
@@ -16,7 +16,7 @@ from evlcp_sdk.rx.multi import EarlyFrames
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.regions import RegionFollower
 from evlcp_sdk.scene.attitude import AttitudeLog
-from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, noise_events, random_symbols
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, changed
 
 FEW_PILOTS = load_link(overrides=["air.pilot_every=4"])
