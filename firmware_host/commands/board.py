@@ -171,8 +171,7 @@ def program(
 ) -> None:
     """Program a board, or all boards of an inventory.
 
-    What is there already is not sent again. A board that plays changes between two packets, without a dark
-    chip.
+    What is there already is not sent again. It changes between two packets.
 
     Symbols:  [bold]evlcp board --port /dev/ttyUSB0 program SYMBOLS.json[/]
     A text:   [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
