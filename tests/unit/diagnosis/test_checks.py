@@ -371,14 +371,14 @@ def known(strange: list[int], unseen: list[int]) -> dict[str, Any]:
         ("no-site", NO_SITE | {"heard": {}}, "received: no id: compare"),
         # A bar more beside those that are known is none.
         ("no-site", NO_SITE | {"fixes": 9}, ""),
-        ("unknown-id", known([107], [8]), "without id 107, received and in no site; id 8 of the sites was"),
+        ("unknown-id", known([107], [8]), "without id 107, received and in no site; id 8 of the sites"),
         ("unknown-id", known([9, 4], [1, 2]), "without ids 4, 9, received and in no site; ids 1, 2 of the"),
-        ("unknown-id", known([9], [*range(20, 40)]), "ids 20, 21, 22, 23, 24 and 15 more of the sites were"),
+        ("unknown-id", known([9], [*range(20, 40)]), "ids 20, 21, 22, 23, 24 and 15 more of the sites"),
         ("unknown-id", known([107], []), ""),
         ("unknown-id", known([], [8]), ""),
         ("misfit", misfit({"heading": 9, "bar 1": 2}), "another heading would explain it: compare"),
         ("misfit", misfit({"focal length": 10, "bar 0": 6}, 34.6), "another focal length or another bar 0"),
-        ("misfit", misfit({"bar 0": 4}), "contradict one another: compare sites, angles and [camera], its"),
+        ("misfit", misfit({"bar 0": 4}), "contradict one another: compare sites, angles and [camera]"),
         (
             "misfit",
             misfit({"bar 0": 10}, 51.2),
