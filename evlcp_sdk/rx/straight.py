@@ -11,8 +11,8 @@ from evlcp_sdk.values import Bend
 Floats = NDArray[np.float64]
 
 _ROUGH_PX = 0.125
-"""How much a frame's boundaries scatter by noise at the most (sigma): in recordings .03 to .06 px, and .12
-where pixels are blind for long or miss most events."""
+"""How much boundaries of a frame alone scatter at the most (sigma): in recordings by noise .03 to .06 px, and
+.12 where pixels are blind for long or miss most events."""
 
 _STANDING_PX = 0.04
 """How far boundaries of a straight bar lie off all the time (sigma): up to .04 px in recordings."""
@@ -32,20 +32,23 @@ _TOGETHER = 0.2
 """Correlation of neighbours from which on something bends the image as a whole: errors of 15 boundaries, each
 for itself, reach it in 7 % of cases, and drops two spacings wide and wider miss it in .5 %."""
 
-_SMOOTH = 3.0
-"""Square of what a bend adds to a scale, in that of what it leaves beside it. Of one to three drops on and
-beside a bar, a tenth to half of it wide, it is 0.7 to 2.4, by their width; the more of a bar one drop covers,
-the more."""
+_REACHES, _HEIGHTS = np.array([1.0, 2.0, 4.0]), np.array([1.0, 2.0, 4.0])
+"""Spacings over which errors of a bent image are alike, of drops a tenth of a bar wide to half of it; and
+their sigma, in that of what a line leaves."""
 
-_MEMORY_S = 0.3
-"""Time in which a drop runs on by its width: for a moment it may bend nothing, and add to the scale."""
+_SMOOTH = 1.5
+"""Square of what a bend may add to a scale beyond that, in that of what it leaves beside it: one drop may
+cover much of a bar, and one that runs on bends nothing for a moment but the scale."""
 
-_WIDE = 1.5
-"""Sigma of the errors of boundaries that are off, in that of what all leave about a line through all."""
+_LEARN_S = 1.0
+"""Time over which what boundaries lie off is learnt: in that, a car nears by a sixth at the most."""
 
-_DOUBT = 0.5
-"""Of the sigma of a line through all boundaries, which is added where most agree: those may be wrong. Without
-it, the mean of (error / sigma)^2 is 1.1 to 1.6 where half of them are off."""
+_WIDE, _NEAR = 2.0, 0.15
+"""Sigmas of the errors of boundaries that are off, and of those that are not, in that of what all leave about
+a line through all: a dark LED moves the boundary beside it by half of its place, and others hardly."""
+
+_DOUBT = 0.35
+"""Of the sigma of a line through all boundaries, which is added where most agree: those may be wrong."""
 
 _STEEPEST = math.sin(math.radians(5.0))
 """Of a lean beyond what is known."""
@@ -78,17 +81,18 @@ class Image(NamedTuple):
         sigma: Of that: it stays from frame to frame.
         bent_px: How far boundaries lie off a straight bar, px, float64 (n,), NaN where unseen; None where
             that is no more than those of a straight one do.
-        whole: The sigma where what bends it bends it as a whole, else 0.
-        bent: That of two frames in a row, the less the longer ago.
+        whole: What bends it bends it as a whole.
         t_s: When it was, s.
+        learnt: Where it is bent, how far boundaries lie off one line in the frames so far, in spacings, and
+            how many frames that is worth, float64 (2, n).
     """
 
     longer: float = 0.0
     sigma: float = 0.0
     bent_px: Floats | None = None
-    whole: float = 0.0
-    bent: float = 0.0
+    whole: bool = False
     t_s: float = -math.inf
+    learnt: Floats = np.empty((2, 0))
 
 
 STRAIGHT = Image()
@@ -102,7 +106,7 @@ def judge_image(
     before: Image,
     t_s: float,
 ) -> Image:
-    """Judge a frame by its boundaries, or, where these scatter no more than any, by the mean of many frames.
+    """Judge a frame by how its boundaries lie off, and did in those before as far as it looks like them.
 
     Args:
         bend: Of the frame.
@@ -113,41 +117,68 @@ def judge_image(
         t_s: When it is, s.
     """
     px, (squares, of_means, of_waves, moved, frames) = bend.one_px, scatter
-    if not px > 0:
+    if not px * bend.spacing_px > 0:
         return STRAIGHT
     # What two frames differ by has twice the variance, whose median this is.
     noise_px = _ROUGH_PX if math.isnan(moved) else 1.4826 / math.sqrt(2) * moved * px
-    found, left_out = None, bend.off * (bend.weight == 0)
-    # Most frames are well below what is asked of one.
-    if squares * px**2 > max(noise_px, _ROUGH_PX) ** 2 * len(off):
-        found = _straight(bend, off, max(noise_px, _ROUGH_PX))
+    alone_px = max(noise_px, _ROUGH_PX)
     # Where the image stands still, so does the pixels' wave.
-    wave_px = WAVE_PX * px * math.sqrt(of_waves / len(off))
-    noise_px = math.hypot(_STANDING_PX, noise_px * math.sqrt(ALIKE / frames), wave_px)
-    if found is None and of_means * px**2 > noise_px**2 * len(off):
-        found = _straight(bend, np.where(off == off, sums[1] / np.maximum(sums[0], 1e-300), np.nan), noise_px)
-    bent = before.bent and before.bent * math.exp((before.t_s - t_s) / _MEMORY_S)
-    bent_px = np.where(left_out != 0, left_out, off) * px if found or left_out.any() else None
+    standing_px = math.hypot(_STANDING_PX, WAVE_PX * px * math.sqrt(of_waves / len(off)))
+    mean_px = math.hypot(standing_px, noise_px * math.sqrt(ALIKE / frames))
+    left_out = bend.off * (bend.weight == 0)
+    shown_px = np.where(left_out != 0, left_out, off) * px if left_out.any() else None
+    # Most frames, and their means, are well below what is asked of them.
+    if squares * px**2 <= alone_px**2 * len(off) and of_means * px**2 <= mean_px**2 * len(off):
+        return Image(bent_px=shown_px)
+    if before.learnt.shape[1] != len(off):
+        mean = sums[1] / np.maximum(sums[0], 1e-300) * (px / bend.spacing_px)
+        before = Image(t_s=t_s, learnt=np.array([mean, frames * (sums[0] > 0)]))
+    turn, learnt = _learn(bend, off, alone_px, before, t_s)
+    noise_px = min(math.hypot(standing_px, noise_px * math.sqrt(ALIKE / learnt[1].max())), alone_px)
+    known, seen = learnt[1] > 0.5, off == off
+    found = straighten(bend.place[known], learnt[0, known] * bend.spacing_px, noise_px, _STEEPEST * px)
     if found is None:
-        return Image(0.0, bent, bent_px, 0.0, bent, t_s) if bent or bent_px is not None else STRAIGHT
-    assert bent_px is not None
-    bent_px[off == off] = found.rest_px
+        return Image(bent_px=shown_px, t_s=t_s, learnt=learnt)
+    bent_px = np.where(left_out != 0, left_out * px, np.nan)
+    bent_px[seen] = found.rest_px[seen[known]]
     sigma = math.sqrt(found.variance) / bend.spacing_px
-    whole = sigma if found.together else 0.0
-    bent = max(bent, min(whole, before.whole))
-    return Image(found.slope / bend.spacing_px, max(sigma, bent), bent_px, whole, bent, t_s)
+    return Image(turn + found.slope / bend.spacing_px, sigma, bent_px, found.together, t_s, learnt)
 
 
-def _straight(bend: Bend, off: Floats, noise_px: float) -> Straight | None:
+def _learn(bend: Bend, off: Floats, noise_px: float, before: Image, t_s: float) -> tuple[float, Floats]:
+    """Add a frame's boundaries to those before; by how much its line is steeper than theirs, in spacings.
+
+    LEDs that are dark move with the bar, and boundaries lie off alike in all frames. What stands in the image
+    does not, and what was learnt is worth the less, the more a frame differs.
+    """
     seen = off == off
-    return straighten(bend.place[seen], off[seen] * bend.one_px, noise_px, _STEEPEST * bend.one_px)
+    frame = np.where(seen, off, 0.0) * (bend.one_px / bend.spacing_px)
+    mean, worth = before.learnt
+    both = seen * (worth > 0)
+    n = float(both.sum())
+    if n < _FEWEST:
+        return 0.0, np.array([frame, seen])
+    # What a line leaves of the difference, where both are.
+    at = bend.place - both @ bend.place / n
+    differs, arms = (frame - mean) * both, float(both @ at**2)
+    level, turn = float(differs.sum()) / n, float(differs @ at) / arms
+    squares = float(differs @ differs) - n * level**2 - arms * turn**2
+    worth = worth * math.exp((before.t_s - t_s) / _LEARN_S)
+    worth /= 1 + worth * max(squares * bend.spacing_px**2 / _most(noise_px, n) - 1, 0.0)
+    share = seen / (worth + 1)
+    return turn, np.array([mean + share * (frame - level - turn * at - mean), worth + seen])
+
+
+def _most(noise_px: float, n: float) -> float:
+    """Squares of what lies off a line through n boundaries, beyond which noise is no reason, px2."""
+    return noise_px**2 * (n - 2 + _SIGMAS * math.sqrt(2 * (n - 2)))
 
 
 def straighten(place: Floats, off_px: Floats, noise_px: float, steepest_px: float) -> Straight | None:
-    """The straight bar that most boundaries agree on, None where noise explains what they lie off a scale.
+    """The straight bar that boundaries agree on, None where noise explains what they lie off a scale.
 
-    What bends an image smoothly, a drop, moves neighbours alike, and all of them: what it adds to the scale
-    cannot be seen, and is about as large as what it leaves. What moves single boundaries, LEDs that are dark
+    What bends an image smoothly, a drop, moves neighbours alike, and all of them: a line is fitted as errors
+    demand that are the more alike, the nearer to each other. What moves single boundaries, LEDs that are dark
     or hidden, leaves others alone: of the lines through any two, those that many agree with are likely.
 
     Args:
@@ -166,21 +197,47 @@ def straighten(place: Floats, off_px: Floats, noise_px: float, steepest_px: floa
     line = np.linalg.lstsq(terms[:, 1:], off_px, rcond=None)[0]
     rest = off_px - terms[:, 1:] @ line
     squares = float(rest @ rest)
-    if squares <= noise_px**2 * (n - 2 + _SIGMAS * math.sqrt(2 * (n - 2))):
+    if squares <= _most(noise_px, n):
         return None
+    sigma_px = math.sqrt(squares / (n - 2))
     if err_together(rest):
-        return Straight(0.0, _SMOOTH * squares / float(at @ at), rest, together=True)
+        slope, variance = _smooth(terms[:, 1:], rest, noise_px, sigma_px)
+        variance += _SMOOTH * squares / float(at @ at)
+        return Straight(float(line[0]) + slope, variance, rest, together=True)
     one, other = np.triu_indices(n, 1)
     slope = (rest[other] - rest[one]) / (at[other] - at[one])
     left = rest - (rest[one] - slope * at[one])[:, None] - slope[:, None] * at
-    wide_px = max(_WIDE * math.sqrt(squares / (n - 2)), 2 * noise_px)
-    likely = sum(np.exp(-0.5 * (left / px) ** 2) / px for px in (noise_px, wide_px))
+    near_px, wide_px = math.hypot(noise_px, _NEAR * sigma_px), max(_WIDE * sigma_px, 2 * noise_px)
+    likely = sum(np.exp(-0.5 * (left / px) ** 2) / px for px in (near_px, wide_px))
     chance = np.log(np.maximum(likely, 1e-300)).sum(1)
     chance = np.exp(chance - chance.max())
     chance /= chance.sum()
     mean = float(chance @ slope)
-    variance = float(chance @ (slope - mean) ** 2) + _DOUBT**2 * squares / (n - 2) / float(at @ at)
+    variance = float(chance @ (slope - mean) ** 2) + (_DOUBT * sigma_px) ** 2 / float(at @ at)
     return Straight(float(line[0]) + mean, variance, chance @ left, together=False)
+
+
+def _smooth(terms: Floats, off_px: Floats, noise_px: float, sigma_px: float) -> tuple[float, float]:
+    """Slope of a line beside errors that neighbours share, and its variance: by generalised least squares.
+
+    How far errors are alike and how high they are is not known: a mean over what is likely.
+    """
+    apart = terms[:, 0, None] - terms[:, 0]
+    alike = np.exp(-0.5 * (apart / _REACHES[:, None, None]) ** 2)
+    errors = np.concatenate([(height * sigma_px) ** 2 * alike for height in _HEIGHTS])
+    weights = np.linalg.inv(errors + noise_px**2 * np.eye(len(apart)))
+    spread = np.linalg.inv(terms.T @ weights @ terms)
+    line = spread @ (terms.T @ weights @ off_px)[:, :, None]
+    left = off_px[:, None] - terms @ line
+    chance = (
+        np.linalg.slogdet(weights)[1]
+        + np.linalg.slogdet(spread)[1]
+        - (left.swapaxes(1, 2) @ weights @ left)[:, 0, 0]
+    )
+    chance = np.exp(0.5 * (chance - chance.max()))
+    chance /= chance.sum()
+    mean = float(chance @ line[:, 0, 0])
+    return mean, float(chance @ (spread[:, 0, 0] + (line[:, 0, 0] - mean) ** 2))
 
 
 def err_together(off_px: Floats) -> bool:

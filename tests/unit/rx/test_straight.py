@@ -65,7 +65,7 @@ def test_dark_leds_are_told_from_a_straight_bar() -> None:
     assert len(found) > 300
     before, after, squares = found.T
     assert np.median(np.abs(after)) < 0.35 * np.median(np.abs(before))
-    assert np.sqrt(np.mean(after**2)) < 0.6 * np.sqrt(np.mean(before**2))
+    assert np.sqrt(np.mean(after**2)) < 0.65 * np.sqrt(np.mean(before**2))
     assert 0.2 < squares.mean() < 1.2
     off = np.zeros(15)
     off[[2, 9]] = 0.8, -1.0
@@ -75,10 +75,13 @@ def test_dark_leds_are_told_from_a_straight_bar() -> None:
 
 
 def test_what_drops_add_to_a_scale_is_in_the_sigma() -> None:
-    """It cannot be seen: a drop over half of a bar makes it longer and hardly bends it."""
+    """Most of it is seen by how neighbours err, but a drop over half of a bar hardly bends it."""
     rng = np.random.default_rng(3)
     found = np.array([one for _ in range(400) if (one := judged(drops(rng), rng)) is not None])
     assert len(found) > 350
+    before, after = np.abs(found[:, :2].T)
+    assert np.sqrt(np.mean(after**2)) < 0.8 * np.sqrt(np.mean(before**2))
+    assert np.median(after) < 0.7 * np.median(before)
     # A few hundred times as much where 1 in 200 looks like dark LEDs.
     assert 0.3 < np.minimum(found[:, 2], 9).mean() < 1.5
     assert np.mean(found[:, 2] > 3) < 0.1
