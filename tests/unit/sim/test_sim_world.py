@@ -144,7 +144,7 @@ def test_what_is_said_of_sites_is_wrong_as_told() -> None:
     here = true[0].latitude_deg, true[0].longitude_deg, true[0].height_m
     off = pymap3d.geodetic2enu(said[1].latitude_deg, said[1].longitude_deg, said[1].height_m, *here)
     np.testing.assert_allclose(off, [0.3, -0.4, 1.2], atol=1e-5)
-    with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: there are 3 bars"):
+    with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: expected one of 3 bars"):
         sites_said(replace(wrong, bars=(one, two, replace(three, site_of=3))), 5)
 
 
