@@ -170,7 +170,10 @@ def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
             "standard input is read once, and links are tried on it first", param_hint="--link"
         )
     with open_source(job.url, registry) as source:
-        best = infer_link(source, link, registry)[0]
+        trials = infer_link(source, link, registry)
+    best = trials[0]
+    for said in dict.fromkeys(one.said for one in trials if one.said):
+        complain(f"{Path(job.url).name}: {said}")
     name, due = Path(job.url).name, best.frames + best.rejected
     if not best.fits:
         complain(f"{name}: no link that was tried fits, so the one given is taken; see evlcp diagnose {name}")

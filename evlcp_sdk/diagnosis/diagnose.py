@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.diagnosis.checks import find_stages
 from evlcp_sdk.diagnosis.facts import Diagnostic, Facts, other_codewords
 from evlcp_sdk.diagnosis.light import LightSource, LightSurvey
-from evlcp_sdk.diagnosis.probe import MOST_EVENTS, Trial, better_links, try_link
+from evlcp_sdk.diagnosis.probe import MOST_EVENTS, Trial, better_links, infer_links, try_link
 from evlcp_sdk.diagnosis.tallies import RunTally
 from evlcp_sdk.io.describe import check_sensor
 from evlcp_sdk.io.open import open_source
@@ -25,8 +25,12 @@ from evlcp_sdk.values import Events, Packet
 _RATE_SHARE = 0.005
 """How far a measured rate may be off: half of that is seen where rows are read late."""
 
-_TRIAL_US = 400_000
-"""Time of the events that other links are tried on: some packets."""
+_TRIAL_US, _LIGHT_US = 400_000, 4_000_000
+"""Time of the events that other links are tried on, some packets, and of a light that is no bar, as it may be
+slow."""
+
+_LIGHTS = 3
+"""Lights that may be one LED, of what blinks."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,8 +144,8 @@ def diagnose(
     checks = find_stages(facts)
     trials: tuple[Trial, ...] = ()
     wrong = any(one.verdict == "fail" or one.code in ("codewords", "unsure") for one in checks)
-    if wrong and sources and not facts.at_edge and seen.has_preambles:
-        trials = tuple(better_links(link, seen.sample(), registry, _rates(sources, link)))
+    if wrong and not facts.at_edge:
+        trials = tuple(_trials(seen, sources, link, registry))
         checks = find_stages(replace(facts, trials=trials))
     return Diagnosis(
         name,
@@ -161,7 +165,8 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
     """Links that may have sent a recording, the best first: what `receive --link auto` takes.
 
     Tried are chip rates of what blinks, modulations, frames per packet and frames per pilot; all else is as
-    given. A link whose framing has no preamble is taken as it is. Reads until some packets have been seen.
+    given. Where none of these fits, or packets have no preamble, framings say what they take each light for.
+    Reads until some packets have been seen.
 
     Args:
         source: What is read; not closed.
@@ -177,10 +182,22 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
         if seen.sampled:
             break
     sources, _ = seen.survey.found()
-    if not seen.has_preambles:
-        return [try_link(link, seen.sample())]
-    trials = better_links(link, seen.sample(), registry, _rates(sources, link))
-    return sorted(trials, key=lambda one: one.rank, reverse=True)
+    return sorted(_trials(seen, sources, link, registry), key=lambda one: one.rank, reverse=True)
+
+
+def _trials(seen: "_Pass", sources: Sequence[LightSource], link: Link, registry: Registry) -> Iterator[Trial]:
+    """What links make of a recording, the one given first."""
+    sample, fits = seen.sample(), False
+    short = sample[: int(np.searchsorted(sample.t_us - sample.t_us[:1], _TRIAL_US))]
+    if seen.has_preambles and sources:
+        for trial in better_links(link, short, registry, _rates(sources, link)):
+            yield trial
+            fits |= trial.fits
+    else:
+        yield try_link(link, short)
+    if len(sample) and not fits:
+        lights = [_inside(sample, one.box_px) for one in sources[:_LIGHTS]]
+        yield from infer_links(link, lights or [sample], registry)
 
 
 class _Pass:
@@ -223,7 +240,8 @@ class _Pass:
     def _full(self) -> bool:
         pieces = self._pieces
         long_us = pieces[-1].t_us[-1] - pieces[0].t_us[0] if pieces else 0
-        return sum(map(len, pieces)) >= MOST_EVENTS or bool(long_us > _TRIAL_US)
+        long_enough_us = _TRIAL_US if self._begun else _LIGHT_US
+        return sum(map(len, pieces)) >= MOST_EVENTS or bool(long_us > long_enough_us)
 
     @property
     def sampled(self) -> bool:
@@ -238,6 +256,13 @@ class _Pass:
     def has_preambles(self) -> bool:
         """Whether packets begin with a preamble: what else a link may be is tried of those only."""
         return "preambles" in self.receiver.counts
+
+
+def _inside(events: Events, box_px: tuple[int, int, int, int]) -> Events:
+    """The events in a box, px."""
+    left, top, right, bottom = box_px
+    inside = (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
+    return events[inside]
 
 
 def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:

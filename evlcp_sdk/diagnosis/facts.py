@@ -187,7 +187,8 @@ class Facts:
     @property
     def at_edge(self) -> bool:
         """Whether the bar's source touches the edge of the picture."""
-        if self.bar is None:
+        # That of a list without places is one pixel.
+        if self.bar is None or self.bar.wide_px * self.bar.high_px <= 1:
             return False
         left, top, right, bottom = self.bar.box_px
         width, height = self.link.camera.width, self.link.camera.height

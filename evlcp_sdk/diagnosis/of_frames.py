@@ -260,8 +260,7 @@ def check_orientation(facts: Facts, one: TransmitterTally) -> Found:
 def check_codewords(facts: Facts, one: TransmitterTally) -> Found:
     """Codewords that never occur, and the modulation that they are all of."""
     link, codewords, name = facts.link, facts.link.codebook.carrying, facts.better_value("modulation.id")
-    # Of characters a text has few.
-    never = 0 if link.characters_on_air and not one.blocks else count_missing_codewords(one, link)
+    never = count_missing_codewords(one, link)
     if not never and name is None:
         yield f"all of {codewords} that should occur do"
         return

@@ -181,6 +181,10 @@ def check_light(facts: Facts) -> Found:
     """What blinks: a bar, lamps alone, or nothing that is worth a word; and a bar more that is not read."""
     if not facts.surveyed:
         return
+    if not facts.reads and facts.better is not None and facts.better.said:
+        yield Diagnostic("link", facts.better.said, facts.better.options())
+        return
+    yield from (Diagnostic("", one.said, verdict="note") for one in facts.trials if one.said)
     if facts.reads or (facts.bar is not None and not _is_lamp(facts.bar, facts)):
         yield (facts.reads and _find_unread(facts)) or _describe_sources(facts)
         return

@@ -1,13 +1,16 @@
 """Which link fits a recording: the same events received with other settings, ranked."""
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import product
 from typing import Any
 
 from evlcp_sdk.diagnosis.tallies import SURE, RunTally, count_missing_codewords
 from evlcp_sdk.errors import ConfigError, EvlcpError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.roles import STEPS
+from evlcp_sdk.rx.guard import Guard
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events
 
@@ -35,6 +38,10 @@ _GOOD_SHARE = 0.8
 some."""
 
 
+_RATE, _SAME_CLOCK = "air.chip_rate_hz", 0.003
+"""The key of a rate, and share by which a clock is off without a word."""
+
+
 @dataclass(frozen=True)
 class Trial:
     """What a link makes of some events.
@@ -46,6 +53,7 @@ class Trial:
         rejected: Frames rejected.
         quality: Mean quality of the frames; 0 without any.
         never: Codewords that never occur though they should have, by far.
+        said: What a framing says of the light by which it was inferred, or why it was not.
     """
 
     changes: tuple[tuple[str, Any], ...]
@@ -54,6 +62,7 @@ class Trial:
     rejected: int
     quality: float
     never: int
+    said: str = ""
 
     @property
     def share(self) -> float:
@@ -71,9 +80,15 @@ class Trial:
         return self.frames >= _FEW_FRAMES and self.share >= _GOOD_SHARE and not self.never
 
     @property
-    def rank(self) -> tuple[bool, float, float, int]:
+    def rank(self) -> tuple[bool, bool, float, float, int]:
         """What trials are sorted by, the best largest."""
-        return self.fits, round(self.share, 2), round(self.quality, 1), -self.link.codebook.carrying
+        return (
+            self.fits,
+            bool(self.said),
+            round(self.share, 2),
+            round(self.quality, 1),
+            -self.link.codebook.carrying,
+        )
 
     def options(self) -> str:
         """The changes as options of the command line; empty for the link as it was given."""
@@ -122,11 +137,11 @@ def better_links(
     yield best
     others = [one.algorithm.id for one in registry.installed("modulation")]
     # Modulations of the same length only differ in what is read from frames that are accepted.
-    alike = [one for one in others if _chips(_with(link, "modulation.id", one, registry)) == _chips(link)]
+    alike = [one for one in others if _chips(_with(link, {"modulation.id": one}, registry)) == _chips(link)]
     rest = [one for one in others if one not in alike]
 
     for name, values, by_frames in (
-        ("air.chip_rate_hz", rates_hz, True),
+        (_RATE, rates_hz, True),
         ("modulation.id", rest, True),
         ("air.pilot_every", PILOT_SPACINGS, True),
         ("air.frames_per_packet", FRAME_COUNTS, True),
@@ -149,12 +164,42 @@ def better_links(
                 break
 
 
+def infer_links(link: Link, lights: Iterable[Events], registry: Registry) -> Iterator[Trial]:
+    """Let each framing say what it takes one of some lights for, up to the first that it knows, and try that.
+
+    Args:
+        link: The link to start from.
+        lights: Events of what may be one LED.
+        registry: Where framings are found.
+    """
+    for light, installed in product(lights, registry.installed("framing")):
+        changes: dict[str, Any] = {"framing.id": installed.algorithm.id}
+        if link.codebook.clusters > 1:
+            changes |= {f"bar.{key}": 1 for key in ("rows", "columns", "cluster_rows", "cluster_columns")}
+        if not (light.x.any() or light.y.any()):
+            changes["detection.id"] = "whole"
+        framing = _with(link, changes, registry)
+        if framing is None:
+            continue
+        with Guard(framing, "framing"):
+            inferred, said = framing.algorithm("framing").infer(light)
+        changes |= inferred
+        if abs(changes.get(_RATE, 0.0) / link.air.chip_rate_hz - 1) < _SAME_CLOCK:
+            changes[_RATE] = link.air.chip_rate_hz
+        other = _with(link, changes, registry) if inferred else None
+        if other is not None:
+            yield replace(try_link(other, light, () if other == link else tuple(changes.items())), said=said)
+            return
+        if said:
+            yield Trial((), link, 0, 0, 0.0, 0, said)
+
+
 def _tried(
     start: Trial, name: str, values: Iterable[Any], events: Events, registry: Registry
 ) -> Iterator[Trial]:
     """What a link is with other values of one of its keys, where it can be read at all."""
     for value in values:
-        other = _with(start.link, name, value, registry)
+        other = _with(start.link, {name: value}, registry)
         if other is None or other.digest == start.link.digest:
             continue
         try:
@@ -177,12 +222,17 @@ def _beside(frames: int) -> list[int]:
     return [n for n in range(below + 1, above) if n != frames]
 
 
-def _with(link: Link, name: str, value: Any, registry: Registry) -> Link | None:
-    """The link with another value; None where that is no link."""
-    table, key = name.split(".")
-    # Parameters of one modulation are not those of another.
-    keys = {} if key == "id" else dict(link.table[table])
+def _with(link: Link, changes: Mapping[str, Any], registry: Registry) -> Link | None:
+    """The link with other values; None where that is no link."""
+    tables = dict(link.table)
+    for name, value in changes.items():
+        table, key = name.split(".")
+        if table == "framing" and key == "id":
+            tables = {other: keys for other, keys in tables.items() if other not in STEPS | {"detection"}}
+        # Parameters of one algorithm are not those of another.
+        keys = {} if key == "id" else tables.get(table, {})
+        tables[table] = {**keys, key: value}
     try:
-        return resolve({**link.table, table: {**keys, key: value}}, registry)
+        return resolve(tables, registry)
     except EvlcpError:
         return None

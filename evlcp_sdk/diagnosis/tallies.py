@@ -220,13 +220,13 @@ class TransmitterTally:
 
 
 def count_missing_codewords(one: TransmitterTally, link: Link) -> int:
-    """How many codewords never occur in what a transmitter sent, 0 where that may be chance.
+    """How many codewords never occur in what a transmitter sent, 0 where that may be chance or a text's.
 
     Packets may repeat one another, so that all of them say no more than one.
     """
     codewords = link.codebook.carrying
     never = codewords - sum(symbol < codewords for symbol in one.values)
-    if not one.given or not never:
+    if not one.given or not never or (link.characters_on_air and not one.blocks):
         return 0
     if never == codewords:
         return never

@@ -151,6 +151,14 @@ class Framing(ABC):
     def compile(self, codebook: Codebook, packet: PacketFormat) -> Deframer:
         """Precompute for codes and a packet format."""
 
+    def infer(self, events: Events) -> tuple[Mapping[str, Any], str]:
+        """What a link has to say to read a light of which nothing is known: `table.key` to value, and why.
+
+        Nothing where it is no light of this framing, with what it looks like at best; nothing and no words
+        where a framing does not look.
+        """
+        return {}, ""
+
     def rest(self) -> int | None:
         """What LEDs must do while nothing is sent, 1 on, 0 off; None where any pattern may stand there."""
         return None

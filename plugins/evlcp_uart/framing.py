@@ -4,7 +4,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,6 +67,12 @@ class Uart(Framing):
         profile = f"uart-{self.data_bits}{self.parity[0].upper()}{self.stop_bits}{order}"
         pause = np.full(self.pause_bits, mark, np.uint8)
         return Codebook(profile, pause, np.empty((1, 0), np.uint8), levels if mark else 1 - levels)
+
+    def infer(self, events: Events) -> tuple[Mapping[str, Any], str]:
+        """Rate and format by the events of one light, where random bits do not look like that."""
+        from evlcp_uart.inference import infer
+
+        return infer(events.t_us, events.p)
 
     def rest(self) -> int:
         """A mark, as in pauses: anything else would be characters."""

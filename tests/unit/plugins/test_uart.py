@@ -16,6 +16,7 @@ from evlcp_uart import _kernels
 from evlcp_uart.characters import Characters, Parity
 from evlcp_uart.decoder import Character
 from evlcp_uart.framing import Uart, read_characters
+from evlcp_uart.inference import infer
 from evlcp_uart.light import BEFORE, CONTEXTS, TICKS
 from scipy.io import savemat
 
@@ -547,6 +548,73 @@ def test_a_lamp_that_reads_as_one_character_is_said(tmp_path: Path, evlcp: Calla
     (lamp,) = (one for one in said["lamp"] if one["code"] == "one-character")
     assert "characters are 0xf0: a lamp that blinks once in a character's time" in lamp["text"]
     assert said["text"] == []
+
+
+@pytest.mark.parametrize(
+    ("data_bits", "parity", "stop_bits", "bit_hz", "mark_on", "clock", "light"),
+    [
+        (7, "even", 2, 3125.0, True, 0.01, {"late_us": (160.0, 260.0), "cut_bits": 13.7}),
+        (7, "even", 2, 3125.0, True, 0.0, {"events": (4.0, 3.0), "unseen": 0.03}),
+        (8, "odd", 1, 20_000.0, False, 0.0, {"late_us": (25.0, 30.0)}),
+        (7, "none", 1, 300.0, False, -0.02, {}),
+        (8, "none", 1, 9600.0, True, 0.0, {"late_us": (40.0, 60.0)}),
+    ],
+)
+def test_rate_and_format_of_a_light_are_found(
+    data_bits: int,
+    parity: Parity,
+    stop_bits: int,
+    bit_hz: float,
+    mark_on: bool,
+    clock: float,
+    light: dict[str, Any],
+) -> None:
+    rng = np.random.default_rng(2)
+    levels = levels_of(rng.integers(0, 1 << data_bits, 90), data_bits, parity, stop_bits)
+    events = seen(
+        rng, levels, 1e6 / bit_hz / (1 + clock), mark_on=mark_on, noise_hz=bit_hz / 10, start_us=2e6, **light
+    )
+    found, _ = infer(events.t_us, events.p)
+    assert found.pop("air.chip_rate_hz") == pytest.approx(bit_hz * (1 + clock), rel=1e-3)
+    assert found.pop("framing.first_bit") == "lowest"
+    expected = {"data_bits": data_bits, "parity": parity, "stop_bits": stop_bits}
+    expected |= {"idle": "on" if mark_on else "off"}
+    assert found == {f"framing.{key}": value for key, value in expected.items()}
+
+
+def light_of(kind: str) -> Events:
+    """What is no asynchronous light: bits without a frame, or that repeat themselves."""
+    rng = np.random.default_rng(4)
+    bits = rng.integers(0, 2, 800)
+    levels = {
+        "random bits": bits,
+        "pair codes": np.stack([bits, 1 - bits], 1).ravel(),
+        "a lamp": np.tile([0, 1], 800),
+        "PWM": np.tile([1] + [0] * 9, 160),
+        "a pattern": np.tile(bits[:37], 40),
+        "no light": np.ones(1600, np.int64),
+    }[kind]
+    return seen(rng, levels.tolist(), 250.0, late_us=(40.0, 60.0))
+
+
+@pytest.mark.parametrize("kind", ["random bits", "pair codes", "a lamp", "PWM", "a pattern", "no light"])
+def test_other_light_is_no_asynchronous_one(kind: str) -> None:
+    events = light_of(kind)
+    found, said = infer(events.t_us, events.p)
+    assert found == {}
+    assert said.startswith("no asynchronous light found: at best ")
+
+
+def test_a_list_is_received_without_a_link(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
+    text = "Rough winds do shake the darling buds of May, " * 3
+    codes = np.frombuffer(text.encode(), np.uint8).astype(int)
+    turned = np.array([int(f"{code:07b}"[::-1], 2) for code in codes.tolist()])
+    light = seen(np.random.default_rng(2), levels_of(turned, 7, "even", 2), 320.0)
+    np.savez(tmp_path / "light.npz", t_us=light.t_us, p=light.p)
+    run = evlcp("receive", tmp_path / "light.npz", "-o", tmp_path / "out", "--link", "auto")
+    assert "3125 baud, 7 data bits highest first, even parity, 2 stop bits: 7E2, idle on, 13" in run.err
+    assert "Rough winds do shake the darling buds" in run.out
+    assert "light: an asynchronous light, 3125 baud" in evlcp("diagnose", tmp_path / "light.npz").out
 
 
 @pytest.mark.parametrize("seed", [3, 7])
