@@ -30,7 +30,8 @@ def diagnose(
     Against a link: [bold]evlcp diagnose REC.raw -c link.toml[/]
 
     Sources of light are found without a link, too: what blinks at which rate, lamps and all. Where a stage
-    fails, other chip rates, modulations and lengths of a packet are tried. Ends with 0 whatever is wrong.
+    fails, other chip rates, modulations and lengths of a packet are tried, and characters of one LED of any
+    rate and format. Ends with 0 whatever is wrong.
     """
     from evlcp_sdk.diagnosis.diagnose import diagnose as run
     from evlcp_sdk.files import Outputs

@@ -49,7 +49,7 @@ def receive(
     link: LinkOptions,
     link_mode: Annotated[
         Literal["given", "auto"],
-        typer.Option("--link", show_default=False, help="auto: the one that fits best."),
+        typer.Option("--link", show_default=False, help="auto: what fits best, or one LED."),
     ] = "given",
     strict: Annotated[
         bool, typer.Option("--strict", hidden=True, help="End with 1 where there are warnings.")
