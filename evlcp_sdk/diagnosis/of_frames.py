@@ -162,7 +162,7 @@ def check_reflection(_facts: Facts, one: TransmitterTally) -> Found:
     """A transmitter that is a reflection of another one."""
     if one.echoes and one.echo_of is not None:
         text = f"a reflection of transmitter {one.echo_of}, {counted(one.echoes, 'frame')}"
-        step = "or a much weaker bar that says the same: it is left out"
+        step = "or a much weaker bar that says the same; in either case it is left out"
         yield Diagnostic("reflection", text, step, verdict="note")
 
 
