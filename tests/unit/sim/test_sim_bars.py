@@ -139,8 +139,8 @@ def test_two_columns_are_two_bars_side_by_side(tmp_path: Path) -> None:
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 50.0, "heading_deg": 20.0}
 
 
-def blocks_of(symbols: Any, **settings: Any) -> list[Block]:
-    link = load_link(overrides=[f"{k.replace('__', '.')}={v}" for k, v in settings.items()])
+def blocks_of(symbols: Any, table: dict[str, Any] | None = None) -> list[Block]:
+    link = resolve(table or {})
     coder, found = link.block_coder(), []
     for packet in symbols:
         llr = 4 - 8.0 * bits_of_symbols(packet, link.codebook.bits_per_symbol)
@@ -165,10 +165,7 @@ def test_random_data_is_a_message_a_packet() -> None:
         "error-correction": {"id": "none"},
     }
     light = sources_of(resolve_scene({"bars": [{"payload": "data", "link": other}]}))[0][0]
-    (block,) = blocks_of(
-        [light.symbols(5)],
-        **{"modulation__id": "raw8", "air__frames_per_packet": 20, "error-correction__id": "none"},
-    )
+    (block,) = blocks_of([light.symbols(5)], other)
     assert block.sequence == 5
 
 
