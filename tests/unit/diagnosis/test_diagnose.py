@@ -25,6 +25,7 @@ from evlcp_sdk.report.diagnosis_page import page
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.sim import load_scene
 from evlcp_sdk.simulated import SimulatedSource, simulate
+from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events
 from tests.unit.study.browser import CHROMIUM, Browser
 
@@ -257,11 +258,9 @@ def survey_of(times_us: NDArray[np.float64]) -> LightSurvey:
     rises_us = np.cumsum(np.round(np.maximum(times_us, 80.0)), 1).astype(np.int64)
     pixel = np.broadcast_to(np.arange(len(rises_us))[:, None], rises_us.shape)
     t_us = np.concatenate([rises_us.ravel(), rises_us.ravel() + 40])
-    order = np.argsort(t_us, kind="stable")
-    x, y = (np.tile(at.ravel(), 2)[order] for at in (pixel % 8, pixel // 8))
-    p = np.repeat([1, 0], rises_us.size)[order]
+    x, y = (np.tile(at.ravel(), 2) for at in (pixel % 8, pixel // 8))
     survey = LightSurvey(64, 64)
-    survey.feed(Events.of(t_us[order], x, y, p))
+    survey.feed(merged(Events.of(t_us, x, y, np.repeat([1, 0], rises_us.size))))
     return survey
 
 

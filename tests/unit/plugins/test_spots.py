@@ -5,6 +5,7 @@ import pytest
 from evlcp_regions.spots import Spots
 
 from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events, Region
 
 ONE = {"rows": 1, "columns": 1, "cluster_rows": 1, "cluster_columns": 1}
@@ -38,8 +39,7 @@ def events_of(
     x = np.concatenate([x, rng.uniform(0, 1279, n)])
     y = np.concatenate([y, rng.uniform(0, 719, n)])
     p = np.concatenate([p, rng.integers(0, 2, n)])
-    order = np.argsort(t)
-    return Events.of(np.floor(t[order]), np.rint(x[order]), np.rint(y[order]), p[order])
+    return merged(Events.of(np.floor(t), np.rint(x), np.rint(y), p))
 
 
 def regions_of(link: Link, events: Events, seconds: float) -> list[tuple[int, list[Region]]]:
@@ -92,15 +92,7 @@ def moved(events: Events, right: int, share: float, late_us: int, rng: np.random
     """Some of the events elsewhere and later, as a lens scatters light and dim pixels see it."""
     kept = rng.random(len(events)) < share
     t = events.t_us[kept] + late_us + rng.integers(0, 40, int(kept.sum()))
-    order = np.argsort(t)
-    x, y, p = events.x[kept].astype(np.int64) + right, events.y[kept], events.p[kept]
-    return Events.of(t[order], x[order], y[order], p[order])
-
-
-def together(*streams: Events) -> Events:
-    order = np.argsort(np.concatenate([one.t_us for one in streams]), kind="stable")
-    columns = (np.concatenate([getattr(one, name) for one in streams]) for name in ("t_us", "x", "y", "p"))
-    return Events.of(*(column[order] for column in columns))
+    return merged(Events.of(t, events.x[kept].astype(np.int64) + right, events.y[kept], events.p[kept]))
 
 
 def places_of(found: list[tuple[int, list[Region]]], from_us: int, x_px: float) -> float:
@@ -123,7 +115,7 @@ def test_what_the_lens_scatters_is_no_light_and_a_dim_one_beside_is(rate_hz: flo
     dim = events_of(rng, rate_hz, seconds, 28, 0.0)
     noise = events_of(rng, rate_hz, seconds, 1, 10_000.0)
     flare, dim = moved(bright, -70, 0.3, late_us, rng), moved(dim, 60, 1.0, late_us, rng)
-    found = regions_of(link_of(rate_hz), together(bright, flare, dim, noise), seconds)
+    found = regions_of(link_of(rate_hz), merged(bright, flare, dim, noise), seconds)
     half_us = int(seconds * 5e5)
     assert places_of(found, half_us, 0) == 1
     assert places_of(found, half_us, 60) > 0.97
@@ -144,7 +136,7 @@ def beside_one_another(rng: np.random.Generator, places: dict[int, tuple[float, 
         one = events_of(rng, 10_000.0, 0.3, 60, 0.0)
         part = one[(one.t_us >= from_s * 1e6) & (one.t_us < until_s * 1e6)]
         parts.append(Events.of(part.t_us, part.x, part.y + down, part.p))
-    return together(*parts)
+    return merged(*parts)
 
 
 def test_a_large_light_is_one_though_its_places_come_and_go() -> None:

@@ -26,6 +26,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events, Packet
 from tests.conftest import ROOT
 
@@ -77,11 +78,9 @@ def seen(
         times.append(rng.uniform(0, end_us, many))
         polarities.append(np.full(many, on))
     t, p = np.concatenate(times), np.concatenate(polarities)
-    order = np.argsort(t)
-    t, p = t[order], p[order]
     kept = t >= start_us + cut_bits * bit_us if cut_bits else np.ones(len(t), np.bool_)
     n = int(kept.sum())
-    return Events.of(np.floor(t[kept]), np.zeros(n), np.zeros(n), p[kept])
+    return merged(Events.of(np.floor(t[kept]), np.zeros(n), np.zeros(n), p[kept]))
 
 
 def wrong_bits(found: list[int], sent: list[int], data_bits: int) -> float:

@@ -13,6 +13,7 @@ from evlcp_sdk.air.codebook import chips_of_values
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.placement import _WIDEST_PX, Layout, Placement, masked
 from evlcp_sdk.rx.regions import Rhythm
+from evlcp_sdk.testing.recordings import merged
 from evlcp_sdk.values import Events, PresenceMap
 
 WIDTH, HEIGHT = 24, 16
@@ -64,8 +65,7 @@ def test_scores_of_pixels(seed, freeze):
     events = random_events(rng, 4000, step_us=[3, 8, 20][seed % 3], width=6, height=4)
     # Three in four of them in the rhythm of the chips.
     t_us = np.where(rng.random(len(events)) < 0.75, (events.t_us / 100).round() * 100, events.t_us)
-    order = np.argsort(t_us, kind="stable")
-    events = Events.of(t_us[order], events.x[order], events.y[order], events.p[order])
+    events = merged(Events.of(t_us, events.x, events.y, events.p))
     start_us = -(2**16)
     pixels = states(np.full((HEIGHT, WIDTH), start_us), 0, 0)
     start = (np.full(pixels.shape, start_us), *np.zeros((3, *pixels.shape), int))

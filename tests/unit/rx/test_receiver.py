@@ -116,9 +116,7 @@ def flashes(start_us: int, seed: int = 7) -> Events:
     rng = np.random.default_rng(seed)
     x, y = (v.ravel() for v in np.meshgrid(np.arange(350, 450), np.arange(270, 430)))
     t = start_us + (200 * (np.arange(10) + rng.random((x.size, 10)))).astype(np.int64)
-    pixel = np.repeat(np.arange(x.size), 10)
-    order = np.argsort(t.ravel(), kind="stable")
-    return Events.of(t.ravel()[order], x[pixel][order], y[pixel][order], np.ones(t.size, int))
+    return merged(Events.of(t.ravel(), np.repeat(x, 10), np.repeat(y, 10), np.ones(t.size)))
 
 
 @pytest.mark.parametrize(
@@ -150,9 +148,8 @@ def test_events_that_come_sooner_in_brighter_light(sooner_us: int) -> None:
     bar = IdealBar(random_symbols(LINK, 3))
     e = ideal_events(LINK, bar, delay_on_us=70.0, delay_off_us=70.0)
     bright = e.t_us >= bar.start_us + 100 * frame_chip(LINK, 1, 3) + 60
-    moved = Events.of(e.t_us - sooner_us * bright, e.x, e.y, e.p)[~bright | (e.x % 2 == 0)]
-    order = np.argsort(moved.t_us, kind="stable")
-    assert right_frames(received(LINK, moved[order])[1], bar, late_us=(0, 90)) == 30
+    moved = merged(Events.of(e.t_us - sooner_us * bright, e.x, e.y, e.p)[~bright | (e.x % 2 == 0)])
+    assert right_frames(received(LINK, moved)[1], bar, late_us=(0, 90)) == 30
 
 
 def test_a_bar_that_says_nothing_is_no_transmitter() -> None:
@@ -239,9 +236,8 @@ def test_random_blinking_at_the_chip_rate_is_no_transmitter() -> None:
     edges = np.diff(chips, axis=0, prepend=0)
     when, pixel = np.nonzero(edges)
     t = when * 100 + rng.integers(20, 60, len(when))
-    first = np.argsort(t, kind="stable")
-    columns = t, 300 + pixel % 4, 200 + pixel // 4, edges[when, pixel] > 0
-    assert received(LINK, Events.of(*(c[first] for c in columns)))[1] == []
+    events = merged(Events.of(t, 300 + pixel % 4, 200 + pixel // 4, edges[when, pixel] > 0))
+    assert received(LINK, events)[1] == []
 
 
 def test_a_dark_cluster_costs_only_itself() -> None:
