@@ -36,9 +36,12 @@ _REACHES, _HEIGHTS = np.array([1.0, 2.0, 4.0]), np.array([1.0, 2.0, 4.0])
 """Spacings over which errors of a bent image are alike, of drops a tenth of a bar wide to half of it; and
 their sigma, in that of what a line leaves."""
 
-_SMOOTH = 1.5
+_SMOOTH = 1.0
 """Square of what a bend may add to a scale beyond that, in that of what it leaves beside it: one drop may
-cover much of a bar, and one that runs on bends nothing for a moment but the scale."""
+cover much of a bar."""
+
+_MEMORY_S = 0.3
+"""Time in which a drop runs on by its width: for a moment it may bend nothing, and add to the scale."""
 
 _LEARN_S = 1.0
 """Time over which what boundaries lie off is learnt: in that, a car nears by a sixth at the most."""
@@ -85,6 +88,7 @@ class Image(NamedTuple):
         t_s: When it was, s.
         learnt: Where it is bent, how far boundaries lie off one line in the frames so far, in spacings, and
             how many frames that is worth, float64 (2, n).
+        fading: Sigma of two frames in a row whose images are bent as a whole, the less the longer ago.
     """
 
     longer: float = 0.0
@@ -93,6 +97,7 @@ class Image(NamedTuple):
     whole: bool = False
     t_s: float = -math.inf
     learnt: Floats = np.empty((2, 0))
+    fading: float = 0.0
 
 
 STRAIGHT = Image()
@@ -127,22 +132,26 @@ def judge_image(
     mean_px = math.hypot(standing_px, noise_px * math.sqrt(ALIKE / frames))
     left_out = bend.off * (bend.weight == 0)
     shown_px = np.where(left_out != 0, left_out, off) * px if left_out.any() else None
+    fading = before.fading and before.fading * math.exp((before.t_s - t_s) / _MEMORY_S)
     # Most frames, and their means, are well below what is asked of them.
     if squares * px**2 <= alone_px**2 * len(off) and of_means * px**2 <= mean_px**2 * len(off):
-        return Image(bent_px=shown_px)
+        return Image(0.0, fading, shown_px, t_s=t_s, fading=fading)
     if before.learnt.shape[1] != len(off):
         mean = sums[1] / np.maximum(sums[0], 1e-300) * (px / bend.spacing_px)
-        before = Image(t_s=t_s, learnt=np.array([mean, frames * (sums[0] > 0)]))
+        before = before._replace(t_s=t_s, learnt=np.array([mean, frames * (sums[0] > 0)]))
     turn, learnt = _learn(bend, off, alone_px, before, t_s)
     noise_px = min(math.hypot(standing_px, noise_px * math.sqrt(ALIKE / learnt[1].max())), alone_px)
     known, seen = learnt[1] > 0.5, off == off
     found = straighten(bend.place[known], learnt[0, known] * bend.spacing_px, noise_px, _STEEPEST * px)
     if found is None:
-        return Image(bent_px=shown_px, t_s=t_s, learnt=learnt)
+        return Image(0.0, fading, shown_px, False, t_s, learnt, fading)
     bent_px = np.where(left_out != 0, left_out * px, np.nan)
     bent_px[seen] = found.rest_px[seen[known]]
     sigma = math.sqrt(found.variance) / bend.spacing_px
-    return Image(turn + found.slope / bend.spacing_px, sigma, bent_px, found.together, t_s, learnt)
+    if found.together and before.whole:
+        fading = max(fading, min(sigma, before.sigma))
+    longer, sigma = turn + found.slope / bend.spacing_px, max(sigma, fading)
+    return Image(longer, sigma, bent_px, found.together, t_s, learnt, fading)
 
 
 def _learn(bend: Bend, off: Floats, noise_px: float, before: Image, t_s: float) -> tuple[float, Floats]:
