@@ -104,12 +104,7 @@ STRAIGHT = Image()
 
 
 def judge_image(
-    bend: Bend,
-    off: Floats,
-    sums: Floats,
-    scatter: tuple[float, float, float, float, float],
-    before: Image,
-    t_s: float,
+    bend: Bend, off: Floats, sums: Floats, scatter: tuple[float, ...], before: Image, t_s: float
 ) -> Image:
     """Judge a frame by how its boundaries lie off, and did in those before as far as it looks like them.
 
@@ -167,7 +162,6 @@ def _learn(bend: Bend, off: Floats, noise_px: float, before: Image, t_s: float) 
     n = float(both.sum())
     if n < _FEWEST:
         return 0.0, np.array([frame, seen])
-    # What a line leaves of the difference, where both are.
     at = bend.place - both @ bend.place / n
     differs, arms = (frame - mean) * both, float(both @ at**2)
     level, turn = float(differs.sum()) / n, float(differs @ at) / arms
