@@ -32,6 +32,10 @@ _MOST_TRANSMITTERS = 1024
 """Transmitters with figures of their own; of more, those not received for longest are only counted."""
 
 _MOST_CLOCK_ERROR = 0.01
+"""Of a step between packets from the one that is stated."""
+
+_CHIP_ERROR = 1e-4
+"""The same from that by the chips that the packet was read by: characters may come behind another pause."""
 
 SURE = 0.8
 """Mean quality of frames from which their symbols are the link's; below, light may be too weak, or the
@@ -65,6 +69,7 @@ class TransmitterTally:
         blocks: Packets whose block is read.
         firsts: Its first symbols, where a frame has one; -1 for one that was not received.
         passed_px: Where it has been in the image: left, top, right, bottom.
+        packet_chips: Chips of a packet; 0 where nobody says. Sum of their lengths by packets: `chips_us`.
         beacon_m: Length of the bar by its newest beacon, m; NaN without.
         bent: Frames in which its image is bent; mean sigma of their distances, m: `bent_sigma_m`.
         bent_px: In how many of them each boundary is seen, sum of how far it lies off, px, and of the squares
@@ -103,15 +108,23 @@ class TransmitterTally:
     passed_px: tuple[float, float, float, float] = (math.inf, math.inf, -math.inf, -math.inf)
     link: str = ""
     number: int = 0
+    packet_chips: int = 0
+    chips_us: float = 0.0
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
         self.packets += 1
+        self.chips_us += packet.chip_us
         self.blocks += packet.block is not None
         self.frames += len(packet.frames)
         number, t_us = self.last_packet
-        step_us, nominal_us = packet.t_us - t_us, (packet.packet - number) * self.nominal_packet_us
-        if abs(step_us - nominal_us) < _MOST_CLOCK_ERROR * nominal_us:
+        steps = packet.packet - number
+        step_us, nominal_us = packet.t_us - t_us, steps * self.nominal_packet_us
+        own_us = steps * self.packet_chips * packet.chip_us if self.firsts else step_us
+        if (
+            abs(step_us - nominal_us) < _MOST_CLOCK_ERROR * nominal_us
+            and abs(step_us - own_us) < 0.75 * packet.chip_us + _CHIP_ERROR * nominal_us
+        ):
             self.steps_us += step_us
             self.nominal_steps_us += nominal_us
         self.last_packet = (packet.packet, packet.t_us)
@@ -191,9 +204,14 @@ class TransmitterTally:
         """The transmitter's chip rate against the camera's clock, ppm; NaN before the second packet.
 
         Taken from the times of the packets, so it is the surer the longer the recording; a step from one
-        packet to the next that no clock explains, as after a loss of lock, is left out.
+        packet to the next that no clock explains, as after a loss of lock, is left out. Of characters behind
+        pauses that nobody stated it is that of their bits.
         """
-        return (self.nominal_steps_us / self.steps_us - 1) * 1e6 if self.steps_us else math.nan
+        if self.steps_us:
+            return (self.nominal_steps_us / self.steps_us - 1) * 1e6
+        if self.firsts and self.packets > 1 and self.packet_chips:
+            return (self.nominal_packet_us / self.packet_chips * self.packets / self.chips_us - 1) * 1e6
+        return math.nan
 
     def to_dict(self) -> dict[str, Any]:
         """The figures as JSON values; what was never measured is null.
@@ -256,15 +274,21 @@ class RunTally:
         self.covered_us = 0.0
         self._messages: OrderedDict[tuple[int, int, int], ReceivedMessage] = OrderedDict()
         forms = {"": form} if isinstance(form, PacketFormat) else form
-        self._packets_us = {name: one.packet_us for name, one in forms.items()}
+        self._forms = dict(forms)
         self._until_us = -math.inf
 
     def add(self, packet: Packet) -> None:
         """Count a packet and its frames."""
         tally = self.transmitters.get(packet.transmitter)
-        packet_us = self._packets_us[packet.link]
+        form = self._forms[packet.link]
+        packet_us = form.packet_us
         if tally is None:
-            tally = TransmitterTally(packet.sent, packet_us, link=packet.link, number=packet.transmitter)
+            tally = TransmitterTally(
+                *(packet.sent, packet_us),
+                link=packet.link,
+                number=packet.transmitter,
+                packet_chips=form.packet_chips,
+            )
             self.transmitters[packet.transmitter] = tally
         tally.add(packet)
         for message in packet.messages:

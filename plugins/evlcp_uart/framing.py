@@ -116,13 +116,16 @@ def read_characters(
 class _State:
     """State of the decoder, characters that wait for a packet to begin, and where packets stand.
 
-    That is the start of the first character of one, us, and its number; and packet and place of the last one.
+    That is the start of the first character of one, us, and its number; packet, place and end of the last
+    character; and whether the pause that is stated was seen.
     """
 
     decoder: CharacterState
     waiting: tuple[Character, ...] = ()
     grid: tuple[float, int] | None = None
     last: tuple[int, int] = (-1, -1)
+    end_us: float = math.nan
+    pauses: bool = False
 
 
 @dataclass(frozen=True)
@@ -149,8 +152,12 @@ class _Packets:
     def _number(
         self, state: _State, found: list[Character], is_last: bool = False
     ) -> tuple[_State, list[DecodedFrame]]:
-        """Characters by packet and place in it, once one begins; one off the grid begins the next."""
+        """Characters by packet and place in it, once one begins; one off the grid begins the next.
+
+        So does what follows a whole packet, while no pause was the one that is stated: it may be longer.
+        """
         waiting, grid, last = (*state.waiting, *found), state.grid, state.last
+        end_us, pauses = state.end_us, state.pauses
         if grid is None and waiting:
             start_us = self._find_start(waiting)
             if start_us is None and not is_last:
@@ -166,14 +173,16 @@ class _Packets:
             place = (rest - 1) / self.packet.info_chips
             frame, packet = round(place), grid[1] + int(packets)
             off = abs(place - frame) * self.packet.info_chips
-            if off > 0.75 or frame >= self.packet.frames or (packet, frame) <= last:
+            pauses |= abs((one.t_us - end_us) / one.bit_us - self.packet.preamble_chips) < 0.75
+            is_whole = last[1] == self.packet.frames - 1 and not pauses
+            if off > 0.75 or is_whole or frame >= self.packet.frames or (packet, frame) <= last:
                 packet, frame = last[0] + 1, 0
             grid = one.t_us - frame * self.packet.info_chips * one.bit_us, packet
-            last = packet, frame
+            last, end_us = (packet, frame), one.t_us + self.packet.info_chips * one.bit_us
             soft = SoftSymbols(np.array([one.value]), one.llr[None], one.quality)
             start_us = grid[0] - self.packet.preamble_chips * one.bit_us
             frames.append(DecodedFrame(packet, frame, start_us, one.t_us, one.bit_us, soft))
-        return replace(state, grid=grid, waiting=(), last=last), frames
+        return replace(state, grid=grid, waiting=(), last=last, end_us=end_us, pauses=pauses), frames
 
     def _find_start(self, waiting: tuple[Character, ...]) -> float | None:
         """Where a packet begins, us: behind the pause before it, or the first of more than it has."""
