@@ -22,6 +22,7 @@ from scipy.io import savemat
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import packet_chips
+from evlcp_sdk.diagnosis.tallies import RunTally
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.compose import compose
 from evlcp_sdk.link.resolve import Link, resolve
@@ -388,6 +389,24 @@ def test_a_text_comes_through_the_receiver_in_any_pieces() -> None:
         assert all(math.isnan(f.range.distance_m) for f in packet.frames)
     again, _ = _received(link, events, 777)
     assert [repr(p) for p in again] == [repr(p) for p in packets]
+
+
+@pytest.mark.parametrize("extra", [-8, 44])
+def test_packets_behind_another_pause_than_is_stated_are_whole(extra: int) -> None:
+    """44 bits more are four characters, by which a frame's place was off."""
+    link, rng = _link(), np.random.default_rng(3)
+    sent = rng.integers(0, 128, (6, 100, 1))
+    stated = len(link.codebook.preamble)
+    levels = [packet_chips(one, link.codebook)[stated:, 0].tolist() for one in sent]
+    events = seen(rng, [v for one in levels for v in [*[1] * (stated + extra), *one]], 320.0 * (1 + 1e-3))
+    packets, _ = _received(link, events, 4000)
+    assert [(p.packet, [int(f.soft.symbols[0]) for f in p.frames]) for p in packets] == [
+        (n, one[:, 0].tolist()) for n, one in enumerate(sent)
+    ]
+    tally = RunTally(link.packet)
+    for packet in packets:
+        tally.add(packet)
+    assert tally.transmitters[0].clock_ppm() == pytest.approx(-1000, abs=100)
 
 
 @pytest.mark.parametrize("idle", ["off", "on"])
