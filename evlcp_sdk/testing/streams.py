@@ -2,8 +2,7 @@
 
 import pickle
 from collections.abc import Callable
-from dataclasses import replace
-from types import SimpleNamespace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,16 +37,29 @@ _GIVEN = {"framing": "frames", "synchronization": "locks"}
 """What a role gives."""
 
 
+@dataclass(frozen=True)
+class _Synchronizer:
+    """A synchronizer in the shape of what a framing compiles to."""
+
+    inner: Any
+
+    def init(self) -> Any:
+        return self.inner.init()
+
+    def step(self, state: Any, events: Events, until_us: int) -> Any:
+        return self.inner.step(state, events.t_us, events.p, until_us)
+
+    def close(self, state: Any) -> Any:
+        return state, []
+
+    def counts(self, state: Any) -> dict[str, int]:
+        return {}
+
+
 def _machine(subject: Subject) -> tuple[Link, Any]:
     """The link, and what turns its events into frames or locks."""
     link, made = link_of(subject), compile_subject(subject)
-    if subject.role == "synchronization":
-        # In the shape of what a framing compiles to.
-        inner, made = made, SimpleNamespace(init=made.init)
-        made.step = lambda state, events, until_us: inner.step(state, events.t_us, events.p, until_us)
-        made.close = lambda state: (state, [])
-        made.counts = lambda _: {}
-    return link, made
+    return link, _Synchronizer(made) if subject.role == "synchronization" else made
 
 
 def _recording(subject: Subject, link: Link) -> Events:
