@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from functools import cache, partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -19,7 +18,7 @@ from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
-from evlcp_sdk.rx.spread import Spread, neighbours
+from evlcp_sdk.rx.spread import LateSpread, Spread, neighbours
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
 from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
@@ -248,8 +247,7 @@ class FrameReader:
         elif not self._camera.is_pinhole:
             sight = BarSight(magnification=magnification_of(self._camera, points_px))
         # Only of two images at one time it is asked; the pilot alone is kept for that, not the whole frame.
-        pilot = heard.copy(), self._pilots, self._every, self._layout, self._pairs, placement
-        spread = cache(partial(Spread.of, *pilot))
+        spread = LateSpread(heard.copy(), self._pilots, self._every, self._layout, self._pairs, placement)
         image = points_px, sigma_px, flank_px, centre_px
         return Reading(soft.symbols, given, distance, *image, sight, spread, flooded)
 

@@ -18,6 +18,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -168,6 +169,20 @@ class Spread:
                 width += value
                 last = value
         return (width + float(rate[peak])) / most
+
+
+class LateSpread:
+    """`Spread.of`, of what that takes, in the moment in which it is asked for first; then that is let go."""
+
+    def __init__(self, *pilot: Any) -> None:
+        self._pilot = pilot
+        self._spread: Spread | None = None
+
+    def __call__(self) -> Spread:
+        """The same each time."""
+        if self._spread is None:
+            self._spread, self._pilot = Spread.of(*self._pilot), ()
+        return self._spread
 
 
 def neighbours(layout: Layout) -> NDArray[np.int64]:

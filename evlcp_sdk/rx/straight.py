@@ -130,6 +130,8 @@ def judge_image(
     fading = before.fading and before.fading * math.exp((before.t_s - t_s) / _MEMORY_S)
     # Most frames, and their means, are well below what is asked of them.
     if squares * px**2 <= alone_px**2 * len(off) and of_means * px**2 <= mean_px**2 * len(off):
+        if not fading and shown_px is None:
+            return STRAIGHT
         return Image(0.0, fading, shown_px, t_s=t_s, fading=fading)
     if before.learnt.shape[1] != len(off):
         mean = sums[1] / np.maximum(sums[0], 1e-300) * (px / bend.spacing_px)
