@@ -983,7 +983,7 @@ class RegionFollower(RegionTracker):
         along = followed.speed[1 if upright else 0]
         if apart_us > 0:
             along = (last.y_px - before.y_px if upright else last.x_px - before.x_px) / apart_us
-        sweep = fit_sweep(followed.pieces[-1][1], middle_us, box, along)
+        sweep = fit_sweep(followed.pieces[-1][1], middle_us, box, along, FAST_PX_US)
         return sweep if sweep is not None and sweep.is_fast else None
 
     def _reach(self, x_px: float, y_px: float, width_px: float, height_px: float) -> Box:

@@ -74,10 +74,12 @@ class Sweep(NamedTuple):
         return abs(self.speed[0 if self.height_px > self.width_px else 1]) >= FAST_PX_US
 
 
-def fit_sweep(events: Events, middle_us: float, box: Box, along: float = 0.0) -> Sweep | None:
-    """The line on which the events in a box lie; None where they lie on none.
+def fit_sweep(
+    events: Events, middle_us: float, box: Box, along: float = 0.0, least: float = 0.0
+) -> Sweep | None:
+    """The line on which the events in a box lie; None where they lie on none, or it is clearly slower.
 
-    `along` is how fast it moves along itself, px/us, which its events do not say.
+    `along` is how fast it moves along itself, px/us, which its events do not say, `least` across itself.
     """
     left, top, right, bottom = box
     every = max(events.t_us.size // _MOST_EVENTS, 1)
@@ -94,6 +96,8 @@ def fit_sweep(events: Events, middle_us: float, box: Box, along: float = 0.0) ->
     for _ in range(_ROUNDS):
         weighed = terms * near
         plane = np.linalg.solve(weighed @ terms.T + 1e-9 * np.eye(3), weighed @ across)
+        if abs(plane[1]) * 1e-3 < least / 2:
+            return None
         off = np.abs(across - plane @ terms)
         sigma = max(1.48 * float(np.median(off)), 0.7)
         near = off <= _OUTLIER * sigma
@@ -153,7 +157,7 @@ def find_sweeps(
         box = grown(area, 1 << _CELL_SHIFT)
         if any(overlap(area, one) for one in known):
             continue
-        sweep = fit_sweep(events, start_us + step_us / 2, box)
+        sweep = fit_sweep(events, start_us + step_us / 2, box, least=FAST_PX_US)
         if sweep is None or not sweep.is_fast:
             continue
         if chip_us is None or with_chips(events, box, chip_us):
