@@ -2,7 +2,7 @@
 
     python docs/figures/live.py docs/images/live.png REC.raw --sites site.toml --attitude FILE.csv
 
-The recording is replayed six times slower before headless Chromium, which is driven as by the tests.
+The recording is replayed four times slower before headless Chromium, which is driven as by the tests.
 """
 
 import argparse
@@ -21,7 +21,7 @@ from evlcp_sdk.run import live
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.scene.sites import load_sites
 
-SLOWER = 6
+SLOWER = 4
 HIGH = 1080
 
 
