@@ -19,6 +19,7 @@ from evlcp_sdk.io.open import open_source
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
+from evlcp_sdk.rx.boxes import inside
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events, Packet
 
@@ -196,7 +197,7 @@ def _trials(seen: "_Pass", sources: Sequence[LightSource], link: Link, registry:
     else:
         yield try_link(link, short)
     if len(sample) and not fits:
-        lights = [_inside(sample, one.box_px) for one in sources[:_LIGHTS]]
+        lights = [sample[inside(sample, one.box_px)] for one in sources[:_LIGHTS]]
         yield from infer_links(link, lights or [sample], registry)
 
 
@@ -256,13 +257,6 @@ class _Pass:
     def has_preambles(self) -> bool:
         """Whether packets begin with a preamble: what else a link may be is tried of those only."""
         return "preambles" in self.receiver.counts
-
-
-def _inside(events: Events, box_px: tuple[int, int, int, int]) -> Events:
-    """The events in a box, px."""
-    left, top, right, bottom = box_px
-    inside = (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
-    return events[inside]
 
 
 def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:

@@ -186,7 +186,8 @@ def check_alike(facts: Facts) -> Found:
         text = (
             f"{counted(alike, 'frame')} of bars, or of a bright mirror, that send the same at the same time"
         )
-        what = ["positions"] * (facts.positions_tried > 0) + ["messages"] * bool(facts.tally.messages())
+        asked = {"positions": facts.positions_tried, "messages": facts.tally.messages()}
+        what = [name for name, found in asked.items() if found]
         step = f"give each bar messages of its own: {' and '.join(what)} cannot say which is which"
         yield Diagnostic("same-symbols", text, step if what else "", verdict="doubt" if what else "note")
 

@@ -137,7 +137,11 @@ class ColumnSource(EventSource):
             self._pieces = itertools.chain((first,), table.pieces)
         share = min(self._position / max(size_bytes, 1), 1.0)
         placed = first is not None and first.places is not None
-        self._unit = TimeUnit(unit, "as told") if unit else time_unit(times, table.unit, share, placed=placed)
+        self._unit = (
+            TimeUnit(unit, "as told", sure=True)
+            if unit
+            else time_unit(times, table.unit, share, placed=placed)
+        )
         self._polarities = Polarities()
         self._sieve = Sieve(table.where, *table.size)
         self._row = first.number(0) if first is not None and len(times) else 1

@@ -96,16 +96,18 @@ class TimeUnit:
         name: `s`, `ms`, `us` or `ns`.
         why: How that is known, for `evlcp info`.
         others: Units that would do, too, where it is guessed.
+        sure: Somebody says it, and nothing speaks against it.
     """
 
     name: str
     why: str
     others: tuple[str, ...] = ()
+    sure: bool = False
 
     @property
     def guess(self) -> str:
         """What was guessed, or is doubtful, in words; empty where the unit is known."""
-        if self.why in ("as its column says", "as told"):
+        if self.sure:
             return ""
         others = [unit for unit in self.others if unit != self.name]
         return f"times in {self.name}, {self.why}" + (f"; {' or '.join(others)} would do" if others else "")
@@ -336,7 +338,8 @@ def time_unit(
     if named is not None:
         unit, rate_hz = blinks or (named, 0.0)
         why = f", but in {unit} a light would blink, a line at {rate_hz:.4g} Hz"
-        return TimeUnit(named, "as its column says" + (why if unit != named else ""))
+        sure = unit == named
+        return TimeUnit(named, "as its column says" + ("" if sure else why), sure=sure)
     if blinks is not None:
         unit, rate_hz = blinks
         return TimeUnit(unit, f"guessed: a light blinks, a line at {rate_hz:.4g} Hz", likely)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
+from evlcp_sdk.rx.boxes import inside
 from evlcp_sdk.values import Events, Region
 
 LEVELS: Final = (
@@ -110,7 +111,7 @@ class Shedder:
         for region in regions:
             left, right = _reach(region.x_px, region.width_px, self._size[0])
             top, bottom = _reach(region.y_px, region.height_px, self._size[1])
-            kept |= (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
+            kept |= inside(events, (left, top, right, bottom))
         return kept
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.values import Region
+from evlcp_sdk.values import Events, Region
 
 Box = tuple[int, int, int, int]
 """(left, top, right, bottom), px, the last two just outside."""
@@ -101,6 +101,15 @@ def grown(box: Box, by: int) -> Box:
     """A box that reaches further to each side, as far as the sensor's first row and column."""
     left, top, right, bottom = box
     return max(left - by, 0), max(top - by, 0), right + by, bottom + by
+
+
+def inside(events: Events, box: Box) -> NDArray[np.bool_]:
+    """Which events are in a box, bool (n,)."""
+    left, top, right, bottom = box
+    found: NDArray[np.bool_] = (
+        (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
+    )
+    return found
 
 
 def overlap(a: Box, b: Box) -> bool:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.rx.boxes import Box, find_areas, grown, overlap
+from evlcp_sdk.rx.boxes import Box, find_areas, grown, inside, overlap
 from evlcp_sdk.values import Events
 
 FAST_PX_US = 2e-3
@@ -84,8 +84,8 @@ def fit_sweep(
     left, top, right, bottom = box
     every = max(events.t_us.size // _MOST_EVENTS, 1)
     t, x, y = (one[::every].astype(np.float64) for one in (events.t_us, events.x, events.y))
-    inside = (x >= left) & (x < right) & (y >= top) & (y < bottom)
-    t, x, y = t[inside] - middle_us, x[inside], y[inside]
+    here = (x >= left) & (x < right) & (y >= top) & (y < bottom)
+    t, x, y = t[here] - middle_us, x[here], y[here]
     if t.size < _FEWEST or t.size * every < _LEAST_EVENTS:
         return None
     upright = float(y.std()) >= float(x.std())
@@ -127,9 +127,7 @@ def _ends(places: NDArray[np.float64]) -> tuple[float, float]:
 
 def with_chips(events: Events, box: Box, chip_us: float) -> bool:
     """Whether rises in a box come with the chips."""
-    left, top, right, bottom = box
-    inside = (events.x >= left) & (events.x < right) & (events.y >= top) & (events.y < bottom)
-    t_us = events.t_us[inside & (events.p > 0)]
+    t_us = events.t_us[inside(events, box) & (events.p > 0)]
     t_us = t_us[:: max(t_us.size // _PHASES, 1)]
     if not t_us.size:
         return False
