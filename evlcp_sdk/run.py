@@ -9,10 +9,10 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
-from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 from evlcp_sdk.errors import ConfigError, InputError, InterruptedRunError, PluginError, UnpluggedError
@@ -28,10 +28,10 @@ from evlcp_sdk.results.columns import frames_table
 from evlcp_sdk.results.summary import RunEnd, Status
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.signals import Stopped
+from evlcp_sdk.signals import Stopped, never
 from evlcp_sdk.stopwatch import Stopwatch, times_real_time
 from evlcp_sdk.utc import ClockZero, PulseClock
-from evlcp_sdk.values import Events, Frame, Packet
+from evlcp_sdk.values import Events, Frame, Packet, span_us
 
 if TYPE_CHECKING:
     import pandas
@@ -87,24 +87,28 @@ def receive(
     """
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
-    opened = source if isinstance(source, EventSource) else open_source(source, registry)
-    try:
-        url = opened.path if isinstance(source, EventSource) else source
-        check_sensor(opened, url, links[0].camera)
-        pulses = _pulses_of(clock_zero, opened, url)
+    with ExitStack() as stack:
+        opened = stack.enter_context(open_until(source, registry, never))
+        pulses = _check_source(opened, _name_of(source, opened), links, clock_zero)
         receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
-        return Reception(opened, receiver, links[0], pulses)
-    except BaseException:
-        opened.close()
-        raise
+        stack.pop_all()
+    return Reception(opened, receiver, links[0], pulses)
 
 
-def _pulses_of(clock_zero: ClockZero, source: EventSource, url: str | Path) -> PulseClock | None:
+def _name_of(source: EventSource | str | Path, opened: EventSource) -> str:
+    """What messages and the summary call a source."""
+    return str(opened.path if isinstance(source, EventSource) or source == STDIN else source)
+
+
+def _check_source(
+    source: EventSource, url: str, links: Sequence[Link], clock_zero: ClockZero
+) -> PulseClock | None:
     """What is told of a source's triggers; None for nobody.
 
     Raises:
-        ConfigError: Nothing says which second of UTC the pulses of a recording begin.
+        ConfigError: Its sensor is not the links', or nothing says which second of UTC its pulses begin.
     """
+    check_sensor(source, url, links[0].camera)
     if not isinstance(clock_zero, PulseClock):
         return None
     if not (clock_zero.dated or source.live):
@@ -115,14 +119,11 @@ def _pulses_of(clock_zero: ClockZero, source: EventSource, url: str | Path) -> P
     return clock_zero
 
 
-def _events_of(
-    source: EventSource, pulses: PulseClock | None, stopped: Stopped = lambda: False
-) -> Iterator[Events]:
+def _events_of(source: EventSource, pulses: PulseClock | None, stopped: Stopped = never) -> Iterator[Events]:
     """The events of a source; its triggers go to the pulses before the events that came with them."""
     for events, triggers in pieces_until(source, stopped):
-        if pulses is not None and (len(events) or len(triggers)):
-            now_us = max(int(column[-1]) for column in (events.t_us, triggers.t_us) if len(column))
-            pulses.add(triggers, time.time(), now_us)
+        if pulses is not None:
+            pulses.add(triggers, time.time(), span_us(events, triggers)[1])
         if len(events):
             yield events
 
@@ -221,9 +222,7 @@ class Reception(Iterator[Packet]):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_fault: object) -> None:
         self.close()
 
 
@@ -238,26 +237,16 @@ def receive_to_folder(
     clock_zero: ClockZero = None,
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
-    advance: Advance = lambda _done, _of: None,
-    stopped: Stopped = lambda: False,
+    advance: Advance = _say_nothing,
+    stopped: Stopped = never,
 ) -> dict[str, Any]:
     """Receive a recording into a folder: source, receiver, positions, sinks; in constant memory.
 
-    Args:
-        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
-        folder: Where the result goes; made if need be. An earlier result is replaced when the new one is
-            complete. None: nothing is written.
-        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
-        registry: The plugins; None for all that are installed.
-        plan: What positions are computed from; None for none.
-        attitude: What is known of the camera's attitude, the same always or over time, for distances and
-            positions; None for nothing.
-        clock_zero: UTC of the camera clock's 0, or pulses on its trigger input that say it, for the age of
-            signed beacons, and for formats with UTC; None if it is not known.
-        sinks: Output formats beside the default ones, by name, e.g. `parquet`.
-        lines: Takes a line of JSON for each frame, message and fix as it comes; None for nobody.
-        advance: Says how far the reading is.
-        stopped: Ends the run early; what was decoded until then is written.
+    Arguments are as of `receive`, and more: `folder` is where the result goes, made if need be, where an
+    earlier result is replaced when the new one is complete; None: nothing is written. `plan` is what positions
+    are computed from; `sinks` are output formats beside the default ones, by name, e.g. `parquet`; `lines`
+    takes a line of JSON for each frame, message and fix as it comes; `advance` says how far the reading is;
+    `stopped` ends the run early, and what was decoded until then is written.
 
     Returns:
         The summary; its `status` is `failed` when the recording cannot be read on, `degraded` when more
@@ -271,11 +260,9 @@ def receive_to_folder(
     """
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
-    url = str(source.path if isinstance(source, EventSource) else source)
     with open_until(source, registry, stopped) as opened:
-        url = str(opened.path) if url == STDIN else url
-        check_sensor(opened, url, links[0].camera)
-        pulses = _pulses_of(clock_zero, opened, url)
+        url = _name_of(source, opened)
+        pulses = _check_source(opened, url, links, clock_zero)
         with ResultWriter(
             folder,
             links,
@@ -306,7 +293,7 @@ def live(
     publisher: Publisher | None = None,
     budget: Budget | None = None,
     warm: bool = True,
-    stopped: Stopped = lambda: False,
+    stopped: Stopped = never,
 ) -> dict[str, Any]:
     """Receive in real time: results to listeners as they come, delays measured, what is too much left out.
 
@@ -330,7 +317,6 @@ def live(
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     publisher = Publisher() if publisher is None else publisher
-    url = str(source.path if isinstance(source, EventSource) else source)
     try:
         # A recording waits for its reader, and what is wrong with its name is said at once.
         waits = not isinstance(source, EventSource) and is_recording(source)
@@ -340,7 +326,7 @@ def live(
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
         with opened:
-            url = str(opened.path) if url == STDIN else url
+            url = _name_of(source, opened)
             check_sensor(opened, url, links[0].camera)
             if warm and waits:
                 warm_up(links, positions=plan is not None)
@@ -382,7 +368,7 @@ def convert(
     size: tuple[int, int] | None = None,
     format: str | None = None,
     advance: Advance = _say_nothing,
-    stopped: Stopped = lambda: False,
+    stopped: Stopped = never,
 ) -> dict[str, Any]:
     """Write events and triggers of a source into a recording, in constant memory.
 
@@ -552,7 +538,7 @@ def film(
     slow: float = 400.0,
     longest_px: int = 640,
     whole: bool = False,
-    advance: Advance = lambda _done, _of: None,
+    advance: Advance = _say_nothing,
 ) -> dict[str, Any]:
     """Film a recording in slow motion, with regions, symbols and distances drawn in; in bounded memory.
 

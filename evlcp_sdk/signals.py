@@ -15,6 +15,11 @@ Stopped = Callable[[], bool]
 """Asked after each piece of work whether to end early."""
 
 
+def never() -> bool:
+    """Of a run that nobody ends early."""
+    return False
+
+
 @contextmanager
 def heard_by(handler: Handler, *numbers: signal.Signals) -> Iterator[Callable[[], None]]:
     """Have a handler hear some of them; gives a function that lets those hear them again that did before.

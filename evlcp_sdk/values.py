@@ -170,6 +170,12 @@ class Triggers:
         return f"Triggers({_counted(self.t_us, 'edge')})"
 
 
+def span_us(events: Events, triggers: Triggers) -> tuple[int, int]:
+    """First and last time of a piece of a stream, in which something is, camera clock, us."""
+    columns = [column for column in (events.t_us, triggers.t_us) if len(column)]
+    return min(int(column[0]) for column in columns), max(int(column[-1]) for column in columns)
+
+
 @dataclass(frozen=True)
 class Region:
     """A blinking region of the image at one time.

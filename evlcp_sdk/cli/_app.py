@@ -3,8 +3,9 @@
 import importlib
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from inspect import cleandoc
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -72,34 +73,22 @@ class _Commands(TyperGroup):
         with _printable_faults():
             return super().invoke(ctx)
 
-    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        found = super().resolve_command(ctx, args)
-        if found[1] is not None:
-            _expect_once(ctx, *found)
-        return found
 
-
-def _expect_once(ctx: Any, name: str | None, command: Any, args: list[str]) -> None:
+def _parse_once(command: Any, parse: Callable[..., Any], ctx: Any, args: list[str]) -> Any:
     """Refuse an option that takes one value and is given two, of which all but the last would be ignored."""
-    with command.context_class(command, info_name=name, parent=ctx) as inner:
-        try:
-            _, rest, order = command.make_parser(inner).parse_args(list(args))
-        except Exception:
-            # The command itself says what is wrong with them.
-            return
-        for option in order:
-            takes_one = option.param_type_name == "option" and not (
-                option.multiple or option.is_flag or option.count
-            )
-            if takes_one and order.count(option) > 1:
-                said = f"{option.opts[-1]} is given {order.count(option)} times, expected once"
-                if "--config" in option.opts:
-                    said += f": {name} goes by one link; run it once for each"
-                inner.fail(said)
-        if isinstance(command, TyperGroup) and rest:
-            nested = command.get_command(inner, rest[0])
-            if nested is not None:
-                _expect_once(inner, rest[0], nested, rest[1:])
+    try:
+        _, _, order = command.make_parser(ctx).parse_args(list(args))
+    except Exception:
+        # The command itself says what is wrong with them.
+        return parse(ctx, args)
+    for option in order:
+        many = option.param_type_name != "option" or option.multiple or option.is_flag or option.count
+        if not many and order.count(option) > 1:
+            said = f"{option.opts[-1]} is given {order.count(option)} times, expected once"
+            if "--config" in option.opts:
+                said += f": {ctx.info_name} goes by one link; run it once for each"
+            ctx.fail(said)
+    return parse(ctx, args)
 
 
 @contextmanager
@@ -116,21 +105,11 @@ def _printable_faults() -> Iterator[None]:
 
 
 def _finish(command: Any) -> None:
-    """Have a command, and those of a group, wrap its help as the screen is wide, and start sooner."""
+    """Have a command, and those of a group, wrap its help as the screen is wide, and take options once."""
     for nested in getattr(command, "commands", {}).values():
         _finish(nested)
     command.help = _WRAPPED.sub(" ", cleandoc(command.help or ""))
-    for parameter in command.params:
-        _leave_unset(parameter)
-
-
-def _leave_unset(parameter: Any) -> None:
-    """Spare a parameter that is not given what Typer makes to check it, an adapter of pydantic."""
-    if parameter.required or parameter.callback is not None:
-        return
-    process = parameter.process_value
-    unset = () if parameter.multiple or parameter.nargs == -1 else None
-    parameter.process_value = lambda ctx, value: unset if value is None else process(ctx, value)
+    command.parse_args = partial(_parse_once, command, command.parse_args)
 
 
 def make_app(*modules: str) -> typer.Typer:

@@ -17,7 +17,7 @@ from evlcp_sdk.io import _kernels
 from evlcp_sdk.io.evt import EVT2, EVT3, MAX_SIDE, Codec, Columns, Decoder
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.plugin.writer import EventWriter
-from evlcp_sdk.values import Events, Triggers
+from evlcp_sdk.values import Events, Triggers, plain, span_us
 
 CODECS: Final = {codec.name: codec for codec in (EVT2, EVT3)}
 """The encodings that can be read and written, by name."""
@@ -379,16 +379,12 @@ class RawEncoder:
 
     def encode(self, events: Events, triggers: Triggers) -> Iterator[bytes]:
         """Yield the words of the next events and triggers, none of which is before the last ones."""
-        if not len(events) and not len(triggers):
-            return
-        if not self._begun:
+        if not self._begun and (len(events) or len(triggers)):
             self._begun = True
-            first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
-            words, self._state[0] = self._codec.prelude(first)
+            words, self._state[0] = self._codec.prelude(span_us(events, triggers)[0])
             yield words.tobytes()
-        event_columns = tuple(np.ascontiguousarray(c) for c in (events.t_us, events.x, events.y, events.p))
-        columns = triggers.t_us, triggers.channel, triggers.value
-        trigger_columns = tuple(np.ascontiguousarray(c) for c in columns)
+        event_columns = tuple(plain(c) for c in (events.t_us, events.x, events.y, events.p))
+        trigger_columns = tuple(plain(c) for c in (triggers.t_us, triggers.channel, triggers.value))
         i = j = 0
         while i < len(events) or j < len(triggers):
             n, i, j = self._codec.encoder(

@@ -9,7 +9,7 @@ import numpy as np
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.plugin.source import EventSource, Loss
-from evlcp_sdk.values import Events, Triggers
+from evlcp_sdk.values import Events, Triggers, span_us
 
 SEAM_US = 500_000
 """Dark time between a recording's end and its next pass: what was seen is forgotten, no clock leaps."""
@@ -83,13 +83,12 @@ class LoopSource(WrappingSource):
             begins = True
             piece = next(self._source.stream(max_events), None)
         events, triggers = piece
-        columns = [column for column in (events.t_us, triggers.t_us) if len(column)]
-        first_us = min(int(column[0]) for column in columns)
+        first_us, last_us = span_us(events, triggers)
         if self._start_us is None:
             self._start_us = first_us
         elif begins:
             self._shift_us = self._last_us + self._seam_us - first_us
-        self._last_us = max(int(column[-1]) for column in columns) + self._shift_us
+        self._last_us = last_us + self._shift_us
         if not self._shift_us:
             return piece
         return (
@@ -153,7 +152,7 @@ class ReplaySource(WrappingSource):
             self._damaged, self._damages = lost > self._damages, lost
             damaged |= self._damaged
         events, triggers = self._piece
-        first = min(int(column[0]) for column in (events.t_us, triggers.t_us) if len(column))
+        first, _ = span_us(events, triggers)
         if self._last_us is None:
             self._origins.append((first, self._clock()))
         elif damaged and first - self._last_us > DAMAGE_US:
@@ -165,8 +164,7 @@ class ReplaySource(WrappingSource):
         end_us = first + self._slice_us - (first - start_us) % self._slice_us
         n, m = (int(np.searchsorted(column, end_us)) for column in (events.t_us, triggers.t_us))
         self._piece = events[n:], triggers[m:]
-        self._last_us = max(int(column[k - 1]) for column, k in ((events.t_us, n), (triggers.t_us, m)) if k)
-
+        _, self._last_us = span_us(events[:n], triggers[:m])
         early_s = start_s + (end_us - start_us) * self._s_per_us - self._clock()
         if early_s > 0:
             self._sleep(early_s)

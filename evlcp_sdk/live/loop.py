@@ -18,7 +18,7 @@ from evlcp_sdk.plugin.source import EventSource, Loss
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.signals import Stopped
 from evlcp_sdk.utc import PulseClock
-from evlcp_sdk.values import Events, Frame, Packet, ReceivedMessage, Region
+from evlcp_sdk.values import Events, Frame, Packet, ReceivedMessage, Region, span_us
 
 STAGES: Final = ("gather", "queue", "compute", "total")
 """Of a frame's delay: from its last chip until the slice with which it could be decoded was there; until that
@@ -236,10 +236,8 @@ class LiveLoop:
 
     def _publish_raw(self, piece: Slice) -> None:
         if self._pulses is not None:
-            columns = [column for column in (piece.events.t_us, piece.triggers.t_us) if len(column)]
-            if columns:
-                came_s = time.time() - (time.monotonic() - piece.arrived_s)
-                self._pulses.add(piece.triggers, came_s, max(float(column[-1]) for column in columns))
+            came_s = time.time() - time.monotonic() + piece.arrived_s
+            self._pulses.add(piece.triggers, came_s, span_us(piece.events, piece.triggers)[1])
         self._events += len(piece.events)
         if len(piece.triggers):
             self._publisher.publish("triggers", float(piece.triggers.t_us[0]), piece.triggers)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import EvlcpError, OutputError, StreamError
 from evlcp_sdk.files import Outputs, writing
-from evlcp_sdk.values import Events, Triggers
+from evlcp_sdk.values import Events, Triggers, span_us
 
 LAST_TIME_US = 10**18 - 1
 """Latest time, and with a minus earliest, that a table holds: 18 digits, us."""
@@ -75,9 +75,8 @@ class EventWriter(ABC):
         self._check("trigger", "value", triggers.value, 2)
         with writing(self.path):
             self._write(events, triggers)
-        lasts = [int(column[-1]) for column in (events.t_us, triggers.t_us) if len(column)]
-        if lasts:
-            self._last_us = max(lasts)
+        if len(events) or len(triggers):
+            self._last_us = span_us(events, triggers)[1]
 
     def _begin(self) -> None:  # noqa: B027
         """Write what belongs at the start to `_file`."""
