@@ -243,10 +243,10 @@ def receive_to_folder(
     """Receive a recording into a folder: source, receiver, positions, sinks; in constant memory.
 
     Arguments are as of `receive`, and more: `folder` is where the result goes, made if need be, where an
-    earlier result is replaced when the new one is complete; None: nothing is written. `plan` is what positions
-    are computed from; `sinks` are output formats beside the default ones, by name, e.g. `parquet`; `lines`
-    takes a line of JSON for each frame, message and fix as it comes; `advance` says how far the reading is;
-    `stopped` ends the run early, and what was decoded until then is written.
+    earlier result is replaced when the new one is complete; None: nothing is written. `plan` is what
+    positions are computed from; `sinks` are output formats beside the default ones, by name, e.g. `parquet`;
+    `lines` takes a line of JSON for each frame, message and fix as it comes; `advance` says how far the
+    reading is; `stopped` ends the run early, and what was decoded until then is written.
 
     Returns:
         The summary; its `status` is `failed` when the recording cannot be read on, `degraded` when more

@@ -31,12 +31,3 @@ def hinted(what: str, role: str, id: str) -> str:
     "pilots algorithm 'mine': gave 3 codes; try: evlcp check pilots mine"
     """
     return f"{what}; try: evlcp check {role} {id}"
-
-
-def unhinted(what: str, role: str, id: str) -> str:
-    """The fault alone, where that command is what was run.
-
-    >>> unhinted("gave 3 codes; try: evlcp check pilots mine", "pilots", "mine")
-    'gave 3 codes'
-    """
-    return what.replace(hinted("", role, id), "")

@@ -63,31 +63,40 @@ def check(
     if role is None:
         if excuses:
             raise ConfigError("--excuse: expected ROLE and ID, whose law it is")
-        _check_link(link_file, overrides or [], as_json)
+        found = _check_link(link_file, overrides or [], as_json=as_json)
     elif id is None:
         raise ConfigError(f"check {role}: expected ROLE and ID, or neither for a whole link")
     else:
-        _check_one(role, id, link_file, overrides or [], excuses or [], as_json)
+        found = _check_one(role, id, link_file, overrides or [], excuses or [], as_json=as_json)
+    name, table = found
+    statuses = [law["status"] for law in table["laws"]]
+    failed = statuses.count("failed")
+    if as_json:
+        print_json(table | {"failed": failed}, 2)
+    else:
+        counts = (f"{n} {status}" for status in _STYLES if (n := statuses.count(status)))
+        console().print(f"{name}: {', '.join(counts)}")
+    raise typer.Exit(1 if failed else 0)
 
 
-def _check_link(link_file: str | None, overrides: Sequence[str], as_json: bool) -> None:
+def _check_link(
+    link_file: str | None, overrides: Sequence[str], *, as_json: bool
+) -> tuple[str, dict[str, Any]]:
+    """Hold all of a link against its laws, each shown as it is judged; its name, and what JSON says."""
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.testing.suite import check_link
 
     link = load_link(link_file, overrides)
     ids = {role: link.table[role]["id"] for role in link.algorithms}
-    outcomes: list[Verdict] = []
     laws: list[dict[str, str | None]] = []
     for role, outcome in check_link(link):
         id = ids.get(role)
-        outcome = outcome if id is None else _alone(outcome, role, id)
-        if not as_json and (not laws or laws[-1]["role"] != role):
-            console().print("the link" if id is None else f"{role} '{id}'", style="bold")
-        outcomes.append(outcome)
-        laws.append({"role": role, "id": id, **_law(outcome)})
         if not as_json:
+            if not laws or laws[-1]["role"] != role:
+                console().print("the link" if id is None else f"{role} '{id}'", style="bold")
             _show([outcome], _WIDTH)
-    _end(outcomes, link_file or "the default link", {"link": link.digest}, laws, as_json)
+        laws.append({"role": role, "id": id, **_law(outcome)})
+    return link_file or "the default link", {"link": link.digest, "laws": laws}
 
 
 def _check_one(
@@ -96,11 +105,12 @@ def _check_one(
     link_file: str | None,
     overrides: Sequence[str],
     excuses: Sequence[str],
+    *,
     as_json: bool,
-) -> None:
-    from evlcp_sdk.errors import ConfigError, PluginError
+) -> tuple[str, dict[str, Any]]:
+    """Hold an algorithm against the laws of its role; its name, and what JSON says."""
+    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.spelling import unhinted
     from evlcp_sdk.testing import check as hold, laws_of
 
     laws_of(role)
@@ -112,12 +122,8 @@ def _check_one(
         if not equals:
             raise ConfigError(f"--excuse {text}: expected LAW=REASON")
         reasons[law.strip()] = reason.strip()
-    try:
-        link = _link(role, id, link_file, overrides, registry)
-        algorithm = link.algorithm(role)
-    except (ConfigError, PluginError) as fault:
-        raise type(fault)(unhinted(str(fault), role, id)) from fault
-    outcomes = [_alone(outcome, role, id) for outcome in hold(role, algorithm, reasons, link)]
+    link = _link(role, id, link_file, overrides, registry)
+    outcomes = hold(role, link.algorithm(role), reasons, link)
     if not as_json:
         _show(outcomes, max(len(o.law.name) for o in outcomes))
     table = {
@@ -127,22 +133,9 @@ def _check_one(
         "version": entry.version,
         "link": link.digest,
         "parameters": {k: v for k, v in link.table[role].items() if k != "id"},
+        "laws": [_law(outcome) for outcome in outcomes],
     }
-    name = f"{role} '{id}' of {entry.distribution} {entry.version}"
-    _end(outcomes, name, table, [_law(outcome) for outcome in outcomes], as_json)
-
-
-def _end(
-    outcomes: Sequence[Verdict], name: str, table: dict[str, Any], laws: Sequence[Any], as_json: bool
-) -> None:
-    """Say how many laws were kept, or everything as JSON; end with 1 where one is broken."""
-    failed = sum(outcome.status == "failed" for outcome in outcomes)
-    if as_json:
-        print_json(table | {"failed": failed, "laws": laws}, 2)
-    else:
-        counts = (f"{n} {s}" for s in _STYLES if (n := sum(o.status == s for o in outcomes)))
-        console().print(f"{name}: {', '.join(counts)}")
-    raise typer.Exit(1 if failed else 0)
+    return f"{role} '{id}' of {entry.distribution} {entry.version}", table
 
 
 def _law(outcome: Verdict) -> dict[str, str]:
@@ -184,15 +177,6 @@ def _link(role: str, id: str, link_file: str | None, overrides: Sequence[str], r
             except ConfigError:
                 changed["bar"] = dict(ONE_CLUSTER)
     return resolve(changed, registry, source=link_file or "", overridden=overridden)
-
-
-def _alone(outcome: Verdict, role: str, id: str) -> Verdict:
-    """Without the hint to run what has just been run."""
-    from dataclasses import replace
-
-    from evlcp_sdk.spelling import unhinted
-
-    return replace(outcome, detail=unhinted(outcome.detail, role, id))
 
 
 def _show(outcomes: Sequence[Verdict], width: int) -> None:

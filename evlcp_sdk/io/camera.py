@@ -12,7 +12,7 @@ import numpy as np
 
 from evlcp_sdk.errors import ConfigError, InputError, UnpluggedError
 from evlcp_sdk.io.evt import EVT3
-from evlcp_sdk.io.raw import RawSource, format_header
+from evlcp_sdk.io.raw import ChunkBytes, RawSource, format_header
 from evlcp_sdk.io.urls import flag, positive, split_options
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.spelling import nearest
@@ -142,8 +142,8 @@ class CameraSource(RawSource):
         return dict(self._bytes.health)
 
 
-class _CameraBytes:
-    """What the camera sends, as `RawSource` reads it, behind a header that says what it is.
+class _CameraBytes(ChunkBytes):
+    """What the camera sends, behind a header that says what it is.
 
     Attributes:
         dropped: USB packets that the driver dropped so far.
@@ -152,12 +152,11 @@ class _CameraBytes:
     """
 
     def __init__(self, url: str, device: Any, header: bytes) -> None:
+        super().__init__(header)
         self._url = url
         self._device = device
-        self._ready = memoryview(header)
         self._lock = threading.Lock()
         self._closed = False
-        self._bytes = 0
         self._asked_s = -_HEALTH_EVERY_S
         self.dropped = self.first_dropped = self.overflows = 0
         self._engaged = False
@@ -165,16 +164,17 @@ class _CameraBytes:
         self._faults: list[Exception] = []
         self.health: dict[str, float | int | str] = {}
 
-    def readinto(self, room: memoryview, /) -> int:
-        """Wait for bytes; 0 once it is closed.
+    def more(self) -> bytes:
+        """Wait for bytes; nothing once it is closed.
 
         Raises:
             UnpluggedError: The camera is gone.
         """
-        while not len(self._ready):
+        data: bytes | None = None
+        while not data:
             with self._lock:
                 if self._closed:
-                    return 0
+                    return b""
                 try:
                     status, data = next(self._device)
                 except (RuntimeError, StopIteration) as fault:
@@ -186,12 +186,7 @@ class _CameraBytes:
                 if data is None and self._faults:
                     raise _fault(self._url, str(self._faults[0]), gone=True) from self._faults[0]
                 self._look(status)
-            self._ready = memoryview(data or b"")
-        size = min(len(room), len(self._ready))
-        room[:size] = self._ready[:size]
-        self._ready = self._ready[size:]
-        self._bytes += size
-        return size
+        return data
 
     def _look(self, status: Any) -> None:
         """Take note of what the driver says of itself, and now and then of the camera."""
@@ -206,7 +201,7 @@ class _CameraBytes:
         total = int(status.ring.dropped_packets)
         if total != self._dropped_before:
             if not self.dropped:
-                self.first_dropped = self._bytes
+                self.first_dropped = self.given
             self.dropped += max(total - self._dropped_before, 0)
             self._dropped_before = total
         engaged = bool(status.ring.clutch_engaged)

@@ -4,6 +4,7 @@ import os
 import select
 import stat
 import time
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +48,39 @@ class RawBytes(Protocol):
 
     def close(self) -> None:
         """Read no more."""
+
+
+class ChunkBytes(ABC):
+    """Bytes that come in chunks, as a `RawSource` reads them.
+
+    Args:
+        ready: What comes before the first chunk.
+
+    Attributes:
+        given: Bytes that have been read.
+    """
+
+    def __init__(self, ready: bytes = b"") -> None:
+        self._ready = memoryview(ready)
+        self.given = 0
+
+    @abstractmethod
+    def more(self) -> bytes | memoryview:
+        """Wait for the next chunk; nothing at the end."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give no more."""
+
+    def readinto(self, room: memoryview, /) -> int:
+        """Wait for bytes, put them to the front; how many, 0 at the end."""
+        if not len(self._ready):
+            self._ready = memoryview(self.more())
+        size = min(len(room), len(self._ready))
+        room[:size] = self._ready[:size]
+        self._ready = self._ready[size:]
+        self.given += size
+        return size
 
 
 @dataclass(frozen=True)

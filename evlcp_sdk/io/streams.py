@@ -1,11 +1,11 @@
 """RAW words from the network and from other programs: TCP, UDP, Unix sockets."""
 
 import socket
-from typing import Any, Final
+from typing import Final
 from urllib.parse import urlsplit
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.raw import CODECS, RawSource, format_header
+from evlcp_sdk.io.raw import CODECS, ChunkBytes, RawSource, format_header
 from evlcp_sdk.io.urls import sides, split_options
 from evlcp_sdk.plugin.source import EventSource
 
@@ -28,8 +28,8 @@ def _encoding(text: str) -> str:
     return named[text.lower()]
 
 
-class SocketBytes:
-    """What a socket receives, as `RawSource` reads it; of a stream without a header one is put before.
+class SocketBytes(ChunkBytes):
+    """What a socket receives; of a stream without a header one is put before.
 
     Args:
         sock: The socket, connected, or bound where it is of datagrams.
@@ -37,10 +37,10 @@ class SocketBytes:
     """
 
     def __init__(self, sock: socket.socket, header: bytes = b"") -> None:
+        super().__init__()
         self._socket = sock
         self._header = header
         self._datagrams = sock.type == socket.SOCK_DGRAM
-        self._ready = b""
         self._first = True
         self._closed = False
         sock.settimeout(_LOOK_S)
@@ -49,34 +49,27 @@ class SocketBytes:
         """Of the socket."""
         return self._socket.fileno()
 
-    def readinto(self, room: Any) -> int:
-        """Wait for bytes; 0 at the end, or once it is closed.
+    def more(self) -> bytes:
+        """Wait for bytes; nothing at the end, or once it is closed.
 
         Raises:
             OSError: The connection has failed.
         """
-        while not self._ready:
+        while True:
             try:
-                data = self._socket.recv(
-                    _DATAGRAM_BYTES if self._datagrams else min(len(room), _DATAGRAM_BYTES)
-                )
+                data = self._socket.recv(_DATAGRAM_BYTES)
             except TimeoutError:
                 continue
             except OSError:
                 if self._closed:
-                    return 0
+                    return b""
                 raise
             # Of datagrams one is empty now and then, and a header comes again and again.
             if self._datagrams and (not data or (not self._first and data.startswith(b"% evt "))):
                 continue
-            if not data:
-                return 0
-            self._ready = self._header + data if self._first and not data.startswith(b"% ") else data
+            bare = self._first and data and not data.startswith(b"% ")
             self._first = False
-        size = min(len(room), len(self._ready))
-        room[:size] = self._ready[:size]
-        self._ready = self._ready[size:]
-        return size
+            return self._header + data if bare else data
 
     def close(self) -> None:
         """Let the connection go; a read in another thread ends soon."""

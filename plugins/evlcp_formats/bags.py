@@ -1,6 +1,7 @@
 """ROS bags with `event_camera_msgs/EventPacket`, EVT3 inside: ROS 1, and ROS 2 in SQLite or MCAP."""
 
 import importlib
+import itertools
 import re
 import sqlite3
 import struct
@@ -14,7 +15,7 @@ from typing import Any, Final
 
 from evlcp_sdk.errors import EvlcpError, InputError
 from evlcp_sdk.io.evt import EVT3
-from evlcp_sdk.io.raw import RawSource, format_header
+from evlcp_sdk.io.raw import ChunkBytes, RawSource, format_header
 from evlcp_sdk.io.urls import split_options
 from evlcp_sdk.plugin.source import Loss
 
@@ -156,41 +157,32 @@ class _Order:
         return packet
 
 
-class _BagBytes:
-    """The words of a bag's packets, as `RawSource` reads them, behind a header of their sensor."""
+class _BagBytes(ChunkBytes):
+    """The words of a bag's packets behind a header of their sensor."""
 
     def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
         self._path = path
-        self._iterator = packets
         self._next_seq: int | None = None
-        self._bytes = 0
         self.lost = self.first_lost = 0
         first = next(packets, None)
         if first is None:
             raise InputError(f"{path}: no packets on its topic")
         self._encoding_of(first)
-        self._ready = memoryview(format_header(EVT3, first.width, first.height))
-        self._waiting: EventPacket | None = first
+        super().__init__(format_header(EVT3, first.width, first.height))
+        self._iterator: Iterator[EventPacket] = itertools.chain((first,), packets)
 
-    def readinto(self, room: memoryview, /) -> int:
-        """Give bytes; 0 at the end."""
-        while not len(self._ready):
-            packet = self._waiting or next(self._iterator, None)
-            self._waiting = None
-            if packet is None:
-                return 0
+    def more(self) -> memoryview:
+        """The words of the next packet that has any; nothing at the end."""
+        for packet in self._iterator:
             self._encoding_of(packet)
             if self._next_seq is not None and packet.seq > self._next_seq:
                 if not self.lost:
-                    self.first_lost = self._bytes
+                    self.first_lost = self.given
                 self.lost += packet.seq - self._next_seq
             self._next_seq = packet.seq + 1
-            self._ready = packet.data
-        size = min(len(room), len(self._ready))
-        room[:size] = self._ready[:size]
-        self._ready = self._ready[size:]
-        self._bytes += size
-        return size
+            if len(packet.data):
+                return packet.data
+        return memoryview(b"")
 
     def _encoding_of(self, packet: EventPacket) -> None:
         if packet.encoding != "evt3":
@@ -201,8 +193,7 @@ class _BagBytes:
 
     def close(self) -> None:
         """Give no more."""
-        self._iterator, self._waiting = iter(()), None
-        self._ready = memoryview(b"")
+        self._iterator, self._ready = iter(()), memoryview(b"")
 
 
 def _files_of(path: Path) -> list[Path]:
