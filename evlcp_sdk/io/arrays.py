@@ -1,12 +1,12 @@
 """Columns of arrays: those of NPZ and NPY files here, and what other files of arrays share with them."""
 
-import math
+import tempfile
 import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import IO, Any, Final, Literal, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,8 +22,6 @@ _LOOKED_AT: Final = 1 << 14
 
 _TRIGGER_ROWS: Final = 1 << 12
 _MOST_COLUMNS: Final = 8
-_MOST_ITEM_BYTES: Final = 1 << 12
-"""Bytes of a value or a record: more are no event's."""
 
 
 class Array(Protocol):
@@ -173,90 +171,40 @@ def pieces_of(columns: list[ArrayColumn], size_bytes: int) -> Iterator[Piece]:
         yield Piece(times, polarities, np.stack(places, 1) if places else None, (first + 1).__add__, done)
 
 
-class Stored:
-    """An array in NumPy's format; a table whose columns lie one behind another is read at once.
-
-    Args:
-        name: What faults call it.
-        opened: Opens it from its start.
+def _mapped(name: str, file: Path) -> NDArray[Any]:
+    """An array in NumPy's format, upright; what is looked at takes memory, not all of it.
 
     Raises:
         InputError: It is none.
     """
-
-    def __init__(self, name: str, opened: Callable[[], IO[bytes]]) -> None:
-        self._name, self._opened = name, opened
-        shape, on_end, self.dtype = self._open()
-        self.shape = (shape[0] * shape[1],) if len(shape) == 2 and 1 in shape else shape
-        if self.dtype.hasobject or self.dtype.itemsize > _MOST_ITEM_BYTES or min(shape, default=0) < 0:
-            raise InputError(f"{name}: found {self.dtype} {shape}, expected numbers (n,)")
-        self._whole: NDArray[Any] | None = None
-        # No table has more columns.
-        if len(self.shape) == 2 and min(shape) <= _MOST_COLUMNS and (on_end or shape[0] < shape[1]):
-            order: Literal["F", "C"] = "F" if on_end else "C"
-            size = math.prod(shape) * self.dtype.itemsize
-            data = self._file.read(size + 1)
-            if len(data) > size:
-                raise InputError(f"{name}: found more than {size} bytes, expected {self.dtype} {shape}")
-            values = self._values(data, math.prod(shape))
-            self._whole = upright(values.reshape(shape, order=order))
-            self.shape = self._whole.shape
-        self._rows = self.shape[0] if self.shape else 1
-
-    def _open(self) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
-        """Open it, and read its shape, whether its columns lie on end, and its type."""
-        try:
-            self._file, self._row = self._opened(), 0
-            version = np.lib.format.read_magic(self._file)
-            read = np.lib.format.read_array_header_1_0
-            return (read if version == (1, 0) else np.lib.format.read_array_header_2_0)(self._file)
-        except Exception as error:
-            # NumPy evaluates the header as a piece of Python, which may fail in any way.
-            raise InputError(f"{self._name}: {one_line(error)}") from error
-
-    def _values(self, data: bytes, many: int) -> NDArray[Any]:
-        size = many * self.dtype.itemsize
-        if len(data) < size:
-            found = (self._row if len(self.shape) < 2 else 0) + len(data) // self.dtype.itemsize
-            raise InputError(f"{self._name}: found {found} values, expected {math.prod(self.shape)}")
-        return np.frombuffer(data[:size], self.dtype)
-
-    def __getitem__(self, rows: slice, /) -> NDArray[Any]:
-        """The values of some rows: the first ones, or those behind the last ones.
-
-        Raises:
-            InputError: The array ends too early.
-        """
-        first, last, _ = rows.indices(self._rows)
-        if self._whole is not None:
-            return self._whole[first:last]
-        if first != self._row:
-            self._file.close()
-            self._open()
-        width = self.shape[1] if len(self.shape) == 2 else 1
-        many = (last - first) * width
-        values = self._values(self._file.read(many * self.dtype.itemsize), many)
-        self._row = last
-        return values.reshape(-1, width) if len(self.shape) == 2 else values
+    try:
+        return upright(np.lib.format.open_memmap(file, mode="r"))
+    except Exception as error:
+        # NumPy evaluates the header as a piece of Python, which may fail in any way.
+        raise InputError(f"{name}: found no array of numbers ({one_line(error)})") from error
 
 
-def read_npy(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
+def read_npy(path: Path, _: ExitStack, fields: Fields | None) -> EventTable:
     """A table in an NPY file, of records, (n, k) or (k, n)."""
-    array = Stored(str(path), lambda: stack.enter_context(path.open("rb")))
+    array = _mapped(str(path), path)
     columns, found = choose_columns(path, [path.name], lambda _: array, fields)
     return EventTable("NPY", pieces_of(columns, path.stat().st_size), found.unit)
 
 
 def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
-    """Arrays of an NPZ file, or a table in one; in our own names with triggers and the sensor's size."""
+    """Arrays of an NPZ file, or a table in one; in our own names with triggers and the sensor's size.
+
+    They are unpacked into a temporary folder, so that none has to be in memory.
+    """
     try:
         archive = stack.enter_context(zipfile.ZipFile(path))
     except (zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError) as error:
         raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
-    names = [member.removesuffix(".npy") for member in archive.namelist()]
+    names = [member.removesuffix(".npy") for member in archive.namelist() if member.endswith(".npy")]
+    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="evlcp-"))
 
-    def array(name: str) -> Stored:
-        return Stored(f"{path}: array {name}", lambda: stack.enter_context(archive.open(f"{name}.npy")))
+    def array(name: str) -> NDArray[Any]:
+        return _mapped(f"{path}: array {name}", Path(archive.extract(f"{name}.npy", folder)))
 
     columns, found = choose_columns(path, names, array, fields)
     pieces = pieces_of(columns, path.stat().st_size)
@@ -302,8 +250,8 @@ def _bounded(path: Path, name: str, values: NDArray[Any], row: int) -> NDArray[A
     return values.astype(WIRE_TYPES.get(name, np.dtype(np.int64)))
 
 
-def _one(path: Path, name: str, array: Stored) -> int:
+def _one(path: Path, name: str, array: NDArray[Any]) -> int:
     """The only value of an array."""
     if array.shape not in ((), (1,)):
         raise InputError(f"{path}: array {name}: found {array.shape} values, expected one")
-    return int(_bounded(path, name, array[:1], 0)[0])
+    return int(_bounded(path, name, array.ravel(), 0)[0])

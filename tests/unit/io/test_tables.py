@@ -77,7 +77,7 @@ BAD_NPZ = {
     "cut": (npz()[:-300], "found no NPZ file, expected one"),
     "a column missing": (npz(p=None), "found the arrays t_us, x, y, expected t and p"),
     "floats": (npz(x=[1.5, 2.0]), "row 1: place 1.5, expected whole numbers from 0 to 65535"),
-    "objects": (npz(x=[None, 1]), r"array x: found object \(2,\), expected numbers"),
+    "objects": (npz(x=[None, 1]), r"array x: found no array of numbers \(.* objects"),
     "two dimensions": (npz(x=[[1, 2], [3, 4]]), r"array x: found int64 \(2, 2\), expected numbers"),
     "unequal lengths": (npz(y=[1]), "'y': 1.*expected one length"),
     "x too large": (npz(x=[1, 70_000]), "row 2: place 70000, expected whole numbers from 0 to 65535"),
@@ -90,16 +90,22 @@ BAD_NPZ = {
     ),
     "no trigger channels": (npz(trigger_t_us=[1]), "found the arrays p, t_us, trigger_t_us, x, y, expected"),
     "a flipped byte": (npz().replace(b"\x03\x00\x00\x00\x00", b"\x03\x00\x01\x00\x00", 1), "Bad CRC-32"),
-    "a header of code": (npz(t_us=npy(b"__import__('os')._exit(7)\n")), "array t_us: malformed"),
+    "a header of code": (
+        npz(t_us=npy(b"__import__('os')._exit(7)\n")),
+        r"array t_us: found no array of numbers \(malformed",
+    ),
     "rows beyond memory": (
         npz(t_us=npy(b"{'descr': '<i8', 'fortran_order': False, 'shape': (%s,)}\n" % (b"9" * 30))),
-        "'t_us': 9{30}, .*expected one length",
+        r"array t_us: found no array of numbers \(Python int too large",
     ),
     "a pickle": (
         npz(t_us=npy(b"{'descr': '|O', 'fortran_order': False, 'shape': (2,)}\n")),
-        "array t_us: found object",
+        r"array t_us: found no array of numbers \(.* objects",
     ),
-    "no NPY in it": (npz(t_us=b"1, 2", x=None, y=None, p=None), "array t_us: EOF"),
+    "no NPY in it": (
+        npz(t_us=b"1, 2", x=None, y=None, p=None),
+        r"array t_us: found no array of numbers \(EOF",
+    ),
 }
 
 
