@@ -1,10 +1,10 @@
 """Events and rows in each millisecond, and whether the readout was at its limit, in constant memory."""
 
 import math
-from collections.abc import Sequence
+from collections import Counter
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.clock import TimeGrain
 from evlcp_sdk.values import Events
@@ -29,59 +29,38 @@ _LEAST_ROWS = 100
 _BIN = 0.005
 """Width of the bins of what a millisecond has, as a share."""
 
-_MOST = 1e9
-"""What has a bin."""
-
-_TOGETHER = 1000
-"""Milliseconds that are put into bins together."""
-
 
 class Milliseconds:
     """How many milliseconds had so many of something."""
 
     def __init__(self, least: int) -> None:
         self._least = least
-        self._hist = np.zeros(1 + _bins([_MOST])[0], np.int64)
-        self._new: list[int] = []
+        self._bins = Counter[int]()
 
-    def add(self, many: Sequence[int]) -> None:
-        """Count milliseconds, by what each of them had."""
-        self._new += many
-        if len(self._new) >= _TOGETHER:
-            self._note()
+    def add(self, many: int) -> None:
+        """Count a millisecond, by what it had."""
+        self._bins[round(math.log(max(many, 1)) / math.log1p(_BIN))] += 1
 
     def capped(self) -> tuple[float, float]:
         """Share of those with any that are within half a percent of the fullest, and what that had.
 
         Light that sends data varies by more from millisecond to millisecond; a readout at its limit does not.
         """
-        self._note()
-        many = int(self._hist.sum())
-        if not many:
+        if not self._bins:
             return 0.0, 0.0
-        return self.capped_ms / many, float((1 + _BIN) ** self._top)
+        return self.capped_ms / self._bins.total(), (1 + _BIN) ** max(self._bins)
 
     @property
     def at_limit(self) -> bool:
         """Whether the readout was at its limit."""
         share, most = self.capped()
-        return int(self._hist.sum()) >= _LEAST_MS and most >= self._least and share >= _CAPPED_SHARE
+        return self._bins.total() >= _LEAST_MS and most >= self._least and share >= _CAPPED_SHARE
 
     @property
     def capped_ms(self) -> int:
         """How many milliseconds these are."""
-        self._note()
-        return int(self._hist[max(self._top - 1, 0) :].sum())
-
-    @property
-    def _top(self) -> int:
-        filled = np.flatnonzero(self._hist)
-        return int(filled[-1]) if len(filled) else 0
-
-    def _note(self) -> None:
-        """Put what is new into bins."""
-        np.add.at(self._hist, _bins(self._new), 1)
-        self._new = []
+        top = max(self._bins, default=0)
+        return self._bins[top] + self._bins[top - 1]
 
 
 class ReadoutTally:
@@ -96,45 +75,38 @@ class ReadoutTally:
     def __init__(self) -> None:
         self.grain = TimeGrain()
         self.events, self.rows = Milliseconds(_LEAST_EVENTS), Milliseconds(_LEAST_ROWS)
-        self._ms, self._row = (-1, 0, 0), 0
+        self._ms, self._events, self._rows, self._row = -1, 0, 0, 0
         self._read = self._passes = 0
 
     def add(self, events: Events) -> None:
         """Count events, in pieces of any size."""
-        t_us, y = events.t_us, events.y
-        if not len(t_us):
+        if not len(events):
             return
-        self.grain = self.grain.after(t_us)
+        self.grain = self.grain.after(events.t_us)
+        t_us = events.t_us
         first, last = int(t_us[0]) // 1000, int(t_us[-1]) // 1000
         if 0 <= last - first < len(t_us) // 8:
-            found = np.searchsorted(t_us, np.arange(first, last + 1) * 1000).tolist()
-            # Milliseconds without events, and what a restart of the clock leaves out of order.
-            edges = sorted({0, *found} - {len(t_us)})
+            edges = np.searchsorted(t_us, np.arange(first + 1, last + 1) * 1000)
         else:
-            ms = t_us // 1000
-            edges = np.flatnonzero(np.diff(ms, prepend=ms[0] - 1)).tolist()
-        ends = [*edges[1:], len(t_us)]
-        many = [after - begin for begin, after in zip(edges, ends, strict=True)]
-        now, before, rows = self._ms
-        if first == now:
-            many[0] += before
-        elif before:
-            self.events.add([before])
-        for begin, after in zip(edges, ends, strict=True):
-            here = int(t_us[begin]) // 1000
-            if here != now and not now % _LOOKED_AT:
-                self.rows.add([rows])
-            if not here % _LOOKED_AT:
+            # Few in a long time, or a restart of the clock.
+            edges = 1 + np.flatnonzero(np.diff(t_us // 1000))
+        for begin, end in pairwise(sorted({0, *edges.tolist(), len(t_us)})):
+            ms = int(t_us[begin]) // 1000
+            if ms != self._ms:
+                if self._events:
+                    self.events.add(self._events)
+                    if not self._ms % _LOOKED_AT:
+                        self.rows.add(self._rows)
+                self._ms, self._events, self._rows = ms, 0, 0
+            self._events += end - begin
+            if not self._ms % _LOOKED_AT:
                 # Rows are read one after another, and after the lowest one that waits the highest.
-                part = y[max(begin - 1, 0) : after]
-                other, higher = (int(y[0]) != self._row, int(y[0]) < self._row) if begin == 0 else (0, 0)
-                read = int(np.count_nonzero(part[1:] != part[:-1])) + other
-                self._passes += int(np.count_nonzero(part[1:] < part[:-1])) + higher
+                y = np.append(np.int64(self._row), events.y[begin:end])
+                read = int(np.count_nonzero(y[1:] != y[:-1]))
+                self._passes += int(np.count_nonzero(y[1:] < y[:-1]))
                 self._read += read
-                rows = (rows if here == now else 0) + read
-            now = here
-        self._ms, self._row = (now, many.pop(), rows), int(y[-1])
-        self.events.add(many)
+                self._rows += read
+            self._row = int(events.y[end - 1])
 
     def round_us(self) -> tuple[float, float]:
         """How long a row takes to read, and until the sensor comes to it again, us; 0 where it ever rests."""
@@ -142,8 +114,3 @@ class ReadoutTally:
             return 0.0, 0.0
         row_us = 1000 / self.rows.capped()[1]
         return row_us, row_us * self._read / self._passes
-
-
-def _bins(many: Sequence[float]) -> NDArray[np.int64]:
-    size = np.clip(np.asarray(many, np.float64), 1, _MOST)
-    return np.round(np.log(size) / math.log1p(_BIN)).astype(np.int64)
