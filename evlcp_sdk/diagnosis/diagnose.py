@@ -282,6 +282,5 @@ def _headline(checks: Sequence[Diagnostic], tally: RunTally) -> str:
     for one in checks:
         if one.verdict == "fail":
             return f"{one.stage}: {one.text}"
-    # What stands before the colon; all of it is in its stage.
-    but = next((f"; but {one.text.partition(':')[0]}" for one in checks if one.verdict == "doubt"), "")
+    but = next((f"; but {one.text}" for one in checks if one.verdict == "doubt"), "")
     return f"it is read: {tally.headline()}{but}"
