@@ -17,10 +17,10 @@ from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
-from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
+from evlcp_sdk.report.colours import cluster_hex, transmitter_colour
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.values import Events, Frame, Packet, Region
+from evlcp_sdk.values import Events, Frame, Region
 
 FilmKind = Literal["WEBP", "GIF", "MP4"]
 
@@ -40,7 +40,8 @@ _MOST_SCALE = 8.0
 _TEXT_PX = 13
 _HEAD_PX = 20
 _COLOURS = 128
-_MOST_REGIONS = 20_000
+_MOST_KEPT = 20_000
+"""Frames, and regions, the newest, that are kept while a recording is decoded."""
 
 _LATE_PACKETS = 3
 """Packets after which the frames of a time are given."""
@@ -52,7 +53,6 @@ class Film:
 
     Attributes:
         start_us: Camera clock where it starts, us.
-        picture_us: Time from a picture to the next, us.
         pictures: How many there are.
         left: First column of the sensor that is shown.
         top: First row.
@@ -63,7 +63,6 @@ class Film:
     """
 
     start_us: float
-    picture_us: float
     pictures: int
     left: int
     top: int
@@ -73,9 +72,9 @@ class Film:
     slow: float
 
     @property
-    def end_us(self) -> float:
-        """Camera clock where it ends, us."""
-        return self.start_us + self.pictures * self.picture_us
+    def picture_us(self) -> float:
+        """Time from a picture to the next, us."""
+        return 1e6 / PICTURES_PER_S / self.slow
 
     @property
     def size_px(self) -> tuple[int, int]:
@@ -83,16 +82,19 @@ class Film:
         width, height = (math.ceil(n * self.scale - 1e-9) for n in (self.columns, self.rows))
         return width, height + _HEAD_PX
 
+    def at(self, x_px: float, y_px: float) -> tuple[float, float]:
+        """Where a place on the sensor is in its pictures."""
+        return (x_px + 0.5 - self.left) * self.scale, (y_px + 0.5 - self.top) * self.scale + _HEAD_PX
+
 
 @dataclass(frozen=True, eq=False)
 class Footage:
-    """What is drawn over a film's events.
+    """What is drawn over a film's events: frames and regions of its time.
 
     Attributes:
         start_us: Camera clock where it starts, us.
         first_us: The recording's first event, us.
-        frames: Frames of its time.
-        regions: Regions of its time.
+        frames: In order of time, as the regions.
     """
 
     start_us: float
@@ -107,11 +109,7 @@ def pictures_of(for_ms: float, slow: float) -> int:
     >>> pictures_of(40, slow=100)
     100
     """
-    return max(1, math.ceil(for_ms * 1e3 / _picture_us(slow) - 1e-9))
-
-
-def _picture_us(slow: float) -> float:
-    return 1e6 / PICTURES_PER_S / slow
+    return max(1, math.ceil(for_ms * 1e-3 * PICTURES_PER_S * slow - 1e-9))
 
 
 def check_film(out: Path, for_ms: float, slow: float) -> FilmKind:
@@ -136,7 +134,7 @@ class _RegionProbe:
     """Keeps the newest regions that a receiver follows."""
 
     def __init__(self) -> None:
-        self.regions: deque[Region] = deque(maxlen=_MOST_REGIONS)
+        self.regions: deque[Region] = deque(maxlen=_MOST_KEPT)
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
@@ -169,44 +167,43 @@ def gather_footage(
     Raises:
         InputError: The recording has nothing there.
     """
-    probe, frames = _RegionProbe(), list[Frame]()
-    start_us = first_us = last_us = None
-    longest_us = max(one.packet.packet_chips * one.packet.chip_us for one in links.values())
+    probe, frames = _RegionProbe(), deque[Frame](maxlen=_MOST_KEPT)
+    first_us = last_us = start_us = math.nan
     # Of several links, what one has read waits for the others.
-    late_us = _LATE_PACKETS * min(len(links), 2) * longest_us
-
-    def keep(packets: Sequence[Packet], start_us: float | None) -> float | None:
-        """Keep frames of the film's time; where it starts, by the first one where nothing else says so."""
-        found = [frame for packet in packets for frame in packet.frames]
-        if start_us is None and found:
-            start_us = min(frame.t_us for frame in found)
-        if start_us is not None:
-            # The one before the first picture is still shown in it.
-            frames.extend(f for f in found if start_us - for_us <= f.t_us <= start_us + for_us)
-        return start_us
-
+    late_us = _LATE_PACKETS * min(len(links), 2) * max(one.packet.packet_us for one in links.values())
     with registry.joined(probe):
         receiver = Receiver([*links.values()], registry.hook)
         for events in source.chunks():
-            first_us = int(events.t_us[0]) if first_us is None else first_us
-            last_us = int(events.t_us[-1])
-            if from_ms is not None:
-                start_us = first_us + from_ms * 1e3
-            start_us = keep(receiver.feed(events), start_us)
+            last_us = float(events.t_us[-1])
+            if math.isnan(first_us):
+                first_us = float(events.t_us[0])
+                start_us = math.nan if from_ms is None else first_us + from_ms * 1e3
+            frames.extend(frame for packet in receiver.feed(events) for frame in packet.frames)
+            if from_ms is None:
+                start_us = min((frame.t_us for frame in frames), default=math.nan)
             advance(source.position_bytes, source.size_bytes)
-            if start_us is not None and last_us > start_us + for_us + late_us:
+            if last_us > start_us + for_us + late_us:
                 break
-        start_us = keep(receiver.close(), start_us)
-    if first_us is None or last_us is None:
+        frames.extend(frame for packet in receiver.close() for frame in packet.frames)
+    if math.isnan(first_us):
         raise InputError(f"{name}: no events")
-    start_us = first_us if start_us is None else start_us
+    if from_ms is None:
+        start_us = min((frame.t_us for frame in frames), default=first_us)
     if start_us > last_us:
         raise InputError(
             f"{name}: ends {(last_us - first_us) * 1e-3:.1f} ms after its first event, nothing to show"
             f" from {from_ms:g} ms on"
         )
+
+    # The frame before the first picture is still shown in it.
+    shown = [one for one in frames if abs(one.t_us - start_us) <= for_us]
     regions = [one for one in probe.regions if start_us - 1e4 <= one.t_us <= start_us + for_us]
-    return Footage(start_us, first_us, frames, regions)
+    return Footage(
+        start_us,
+        first_us,
+        sorted(shown, key=lambda one: one.t_us),
+        sorted(regions, key=lambda one: one.t_us),
+    )
 
 
 def plan_film(
@@ -232,24 +229,19 @@ def plan_film(
         ConfigError: It would have too many pixels.
     """
     left, top, right, bottom = 0, 0, camera.width, camera.height
-    boxes = []
-    if not whole:
-        boxes = [*map(_box_of_frame, footage.frames)] or [*map(_box_of_region, footage.regions)]
-    if boxes:
+    boxes = [*map(_box_of_frame, footage.frames)] or [*map(_box_of_region, footage.regions)]
+    if boxes and not whole:
         low, high = np.min([b[0] for b in boxes], axis=0), np.max([b[1] for b in boxes], axis=0)
         middle, size = (low + high) / 2, high - low
-        margin = max(8.0, 0.15 * float(size.max()))
         # Symbols stand beside a bar, its distance above.
-        columns, rows = size + 2 * margin
+        columns, rows = size + 2 * max(8.0, 0.15 * float(size.max()))
         columns = max(columns, 0.7 * rows, 60.0)
         rows = max(rows, 0.4 * columns)
         left, right = _within(float(middle[0]), float(columns), camera.width)
         top, bottom = _within(float(middle[1]), float(rows), camera.height)
-    longest = max(right - left, bottom - top)
-    scale = min(longest_px / longest, _MOST_SCALE)
-    pictures, picture_us = pictures_of(for_us * 1e-3, slow), _picture_us(slow)
-    shown = (left, top, right - left, bottom - top)
-    film = Film(footage.start_us, picture_us, pictures, *shown, scale, slow)
+    scale = min(longest_px / max(right - left, bottom - top), _MOST_SCALE)
+    pictures = pictures_of(for_us * 1e-3, slow)
+    film = Film(footage.start_us, pictures, left, top, right - left, bottom - top, scale, slow)
     width, height = film.size_px
     if (megapixels := pictures * width * height * 1e-6) > MOST_MEGAPIXELS:
         raise ConfigError(
@@ -277,20 +269,20 @@ def draw_film(
     open_from = 1 - min(chip_us / film.picture_us, 1.0)
     # In one of less than a chip, what the chip has shown before stays.
     stays = 0.0 if open_from else 0.5 ** (film.picture_us / chip_us)
-    number = 0
-    for piece in events:
-        if number == film.pictures:
-            break
-        at, through = np.divmod((piece.t_us - film.start_us) / film.picture_us, 1.0)
-        while number < film.pictures:
-            _add(lit, piece[(at == number) & (through >= open_from)], film)
-            if not len(at) or at.max() <= number:
+    pieces = iter(events)
+    piece = Events.empty()
+    for number in range(film.pictures):
+        end_us = film.start_us + (number + 1) * film.picture_us
+        while True:
+            through = (piece.t_us - film.start_us) / film.picture_us - number
+            _add(lit, piece[(through >= open_from) & (through < 1)], film)
+            if len(piece) and piece.t_us[-1] >= end_us:
                 break
-            yield overlay.draw(number, _picture(lit, film))
-            lit *= stays
-            number += 1
-    for rest in range(number, film.pictures):
-        yield overlay.draw(rest, _picture(lit, film))
+            following = next(pieces, None)
+            if following is None:
+                break
+            piece = following
+        yield overlay.draw(number, _picture(lit, film))
         lit *= stays
 
 
@@ -373,15 +365,11 @@ class _Overlay:
     """
 
     def __init__(self, film: Film, footage: Footage, links: Mapping[str, Link]) -> None:
-        self._film = film
-        self._frames = sorted(footage.frames, key=lambda frame: frame.t_us)
-        self._regions = sorted(footage.regions, key=lambda region: region.t_us)
+        self._film, self._footage = film, footage
         self._packets = {name: link.packet for name, link in links.items()}
         self._step_us = next(iter(links.values())).regions.step_us
         most = max(link.codebook.clusters for link in links.values())
-        colours = (255 * cluster_colours(most)).astype(int)
-        # On a dark ground, dark ones are lifted.
-        self._colours = [tuple(int(90 + v * 165 / 255) for v in colour) for colour in colours]
+        self._colours = [_light(colour) for colour in cluster_hex(most)]
         self._font = ImageFont.load_default(_TEXT_PX)
 
     def draw(self, number: int, light: Image.Image) -> Image.Image:
@@ -391,45 +379,26 @@ class _Overlay:
         picture.paste(light, (0, _HEAD_PX))
         pen = ImageDraw.Draw(picture)
         t_us = film.start_us + (number + 0.5) * film.picture_us
-        self._draw_regions(pen, t_us)
-        self._draw_frames(pen, t_us)
+        step_us, regions = self._step_us, self._footage.regions
+        now = {r.id: r for r in regions if -1.5 * step_us < r.t_us - t_us <= step_us / 2}
+        for region in now.values():
+            (x0, y0), (x1, y1) = _box_of_region(region)
+            pen.rectangle((*film.at(x0 - 1, y0 - 1), *film.at(x1 + 1, y1 + 1)), outline=(90, 90, 90))
+        frames, packets = self._footage.frames, self._packets
+        newest = {f.transmitter: f for f in frames if 0 <= t_us - f.t_us < packets[f.link].packet_us}
+        for frame in newest.values():
+            packet = packets[frame.link]
+            chips = packet.frame_chips if packet.has_pilot(frame.frame) else packet.info_chips
+            (left, top), (right, _) = _box_of_frame(frame)
+            self._name(pen, frame, film.at(left, top))
+            if t_us < frame.t_us + chips * packet.chip_us:
+                self._symbols(pen, frame, right)
         pen.rectangle((0, 0, width, _HEAD_PX - 3), fill=tuple(_DARK.tolist()))
         pen.text((4, 1), f"{t_us * 1e-3:.2f} ms", fill=_INK, font=self._font)
         pen.text((width - 4, 1), f"1/{film.slow:g}", fill=_DIM, font=self._font, anchor="ra")
         done = (number + 1) / film.pictures * width
         pen.line((0, _HEAD_PX - 3, done, _HEAD_PX - 3), fill=_DIM)
         return picture.quantize(_COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-
-    def _at(self, x_px: float, y_px: float) -> tuple[float, float]:
-        film = self._film
-        return (x_px + 0.5 - film.left) * film.scale, (y_px + 0.5 - film.top) * film.scale + _HEAD_PX
-
-    def _draw_regions(self, pen: ImageDraw.ImageDraw, t_us: float) -> None:
-        now: dict[int, Region] = {}
-        for region in self._regions:
-            if region.t_us > t_us + self._step_us / 2:
-                break
-            if region.t_us > t_us - 1.5 * self._step_us:
-                now[region.id] = region
-        for region in now.values():
-            (x0, y0), (x1, y1) = _box_of_region(region)
-            pen.rectangle((*self._at(x0 - 1, y0 - 1), *self._at(x1 + 1, y1 + 1)), outline=(90, 90, 90))
-
-    def _draw_frames(self, pen: ImageDraw.ImageDraw, t_us: float) -> None:
-        newest: dict[int, Frame] = {}
-        for frame in self._frames:
-            if frame.t_us > t_us:
-                break
-            packet = self._packets[frame.link]
-            if frame.t_us > t_us - packet.packet_chips * packet.chip_us:
-                newest[frame.transmitter] = frame
-        for frame in newest.values():
-            packet = self._packets[frame.link]
-            chips = packet.frame_chips if packet.has_pilot(frame.frame) else packet.info_chips
-            (left, top), (right, _) = _box_of_frame(frame)
-            self._name(pen, frame, self._at(left, top))
-            if t_us < frame.t_us + chips * packet.chip_us:
-                self._symbols(pen, frame, right)
 
     def _name(self, pen: ImageDraw.ImageDraw, frame: Frame, corner: tuple[float, float]) -> None:
         distance = frame.range
@@ -444,14 +413,12 @@ class _Overlay:
         pen.text((x, y), text, fill=_light(transmitter_colour(frame.transmitter)), font=self._font)
 
     def _symbols(self, pen: ImageDraw.ImageDraw, frame: Frame, right_px: float) -> None:
-        points = frame.points_px
-        known = [k for k, point in enumerate(points) if np.isfinite(point).all()]
-        rows = np.sort([points[k, 1] for k in known])
-        if len(rows) < 2 or np.ptp(rows) * self._film.scale < 0.8 * _TEXT_PX * (len(rows) - 1):
+        rows = {k: y for k, (x, y) in enumerate(frame.points_px.tolist()) if math.isfinite(x + y)}
+        if len(rows) < 2 or np.ptp([*rows.values()]) * self._film.scale < 0.8 * _TEXT_PX * (len(rows) - 1):
             # A panel's, or those of a bar too far away, would cover one another.
             return
-        for k in known:
-            x, y = self._at(right_px, points[k, 1])
+        for k, row in rows.items():
+            x, y = self._film.at(right_px, row)
             symbol = int(frame.soft.symbols[k])
             text = str(symbol) if symbol >= 0 else "-"
             pen.text((x + 8, y), text, fill=self._colours[k], font=self._font, anchor="lm")

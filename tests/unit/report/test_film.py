@@ -49,7 +49,7 @@ def kinds(picture: Image.Image) -> np.ndarray:
 def test_a_picture_shows_the_last_chip_before_it(pieces: int) -> None:
     """In films that are faster than the chips; by a loop over all events, whatever pieces they come in."""
     events = random_events(900)
-    shown = Film(1000.0, 400.0, 8, 5, 3, 30, 20, 2.0, 100.0)
+    shown = Film(1000.0, 8, 5, 3, 30, 20, 2.0, 100.0)
     cuts = np.array_split(np.arange(len(events)), pieces)
     pictures = list(draw_film(shown, (events[c] for c in cuts), Footage(0.0), LINKS))
     assert len(pictures) == 8
@@ -69,7 +69,7 @@ def test_a_film_reads_no_further_than_it_shows() -> None:
             assert n < 5, "read on"
             yield Events.of([100 * n], [7], [7], [1])
 
-    shown = Film(0.0, 100.0, 3, 0, 0, 9, 9, 1.0, 400.0)
+    shown = Film(0.0, 3, 0, 0, 9, 9, 1.0, 400.0)
     assert len(list(draw_film(shown, endless(), Footage(0.0), LINKS))) == 3
     # Pictures after the last event are dark.
     dark = list(draw_film(shown, [], Footage(0.0), LINKS))
@@ -130,7 +130,7 @@ def test_a_film_of_a_recording(evlcp: Callable[..., Any], demo_raw: Path, tmp_pa
 def test_a_film_for_programs_that_play_no_pictures(tmp_path: Path) -> None:
     """Read again, each of its pictures is near the one that was drawn; an odd side gets one more."""
     av = pytest.importorskip("av")
-    shown = Film(1000.0, 400.0, 8, 5, 3, 31, 21, 3.0, 100.0)
+    shown = Film(1000.0, 8, 5, 3, 31, 21, 3.0, 100.0)
     drawn = list(draw_film(shown, [random_events(900)], Footage(0.0), LINKS))
     save_film(drawn, tmp_path / "a.mp4", "MP4")
     with av.open(tmp_path / "a.mp4") as file:
