@@ -3,8 +3,8 @@
 They belong to the geometry of the problem and to no algorithm, so they stand here and not beside one: how
 sharply light shows in the image, how noisy its pixels are, and how far clusters lie apart bound whatever
 reads it. Pixels have Gaussian noise of one size (Kay, Estimation Theory, chapter 3). Of a bar, one even
-column of clusters, it is the boundaries between clusters that say where they lie; of any other layout the
-light of each cluster, in two dimensions.
+column of clusters, it is the boundaries between clusters that say where they lie; `layout_bound` takes any
+layout, by the light of each cluster, in two dimensions.
 """
 
 import math
@@ -152,17 +152,15 @@ def _codes(codebook: Codebook, symbols: NDArray[np.int64]) -> Array:
 def frame_bound(link: Link, *, full_events: float = 3.0) -> Callable[[FrameView], Range]:
     """A function that gives, as sigma, the bound of a frame.
 
-    Blur, gain and noise of the bound are those of the frame. The values of a bar, one even column of three
-    clusters or more, are fitted by the boundaries' model (least squares over spacing, position, drift, gain,
-    blur, an offset between positive and negative events, shifts by a step's sign and by values that are
-    repeated, and a motion of each value), and what is left over is the noise. It is that of the rows that say
-    where boundaries lie: each weighs with the square of its slope, and with the leverage that the fit has on
-    it. Values of any other layout are fitted by its image (place, scale, turn, gain, background and blur).
-    Neither truth nor any algorithm is needed. The noise is taken as Gaussian and independent; an error that
-    several frames share is not seen.
+    Blur, gain and noise of the bound are those of the frame. Its values are fitted by the boundaries' model
+    (least squares over spacing, position, drift, gain, blur, an offset between positive and negative events,
+    shifts by a step's sign and by values that repeat, and a motion of each value), and what is left over
+    is the noise. It is that of the rows that say where boundaries lie: each weighs with the square of its
+    slope, and with the leverage that the fit has on it. Neither truth nor any algorithm is needed. The noise
+    is taken as Gaussian and independent; an error that several frames share is not seen.
 
     Args:
-        link: For the camera, the layout and its codes.
+        link: For the camera, the bar and its codes.
         full_events: Events of a pixel in a chip that count as a full value; more are clipped, as hot pixels
             send them.
 
@@ -171,15 +169,14 @@ def frame_bound(link: Link, *, full_events: float = 3.0) -> Callable[[FrameView]
         frame shows too little.
 
     Raises:
-        ConfigError: The layout is one cluster.
+        ConfigError: The layout is not one even column of three clusters or more.
     """
-    if link.bar.clusters < 2:
-        raise ConfigError("the Cramer-Rao bound of a distance needs two clusters or more")
-    even = link.bar.column_pitch_m > 0 and link.bar.clusters > 2
-    return partial(_bound_bar_frame if even else _bound_layout_frame, link, full_events)
+    if not (link.bar.column_pitch_m > 0 and link.bar.clusters > 2):
+        raise ConfigError("the bound of a frame needs one even column of three clusters or more")
+    return partial(_bound_of_frame, link, full_events)
 
 
-def _bound_bar_frame(link: Link, full_events: float, view: FrameView) -> Range:
+def _bound_of_frame(link: Link, full_events: float, view: FrameView) -> Range:
     seen, middles = _middles(view.presence)
     if int((seen[1:] & seen[:-1]).sum()) < _LEAST_BOUNDARIES:
         return _NONE
@@ -457,8 +454,7 @@ class _Image:
         first: Of the LEDs in the order of their clusters, where each cluster starts, int64 (K + 1,).
         side_m: Width and height that one lights, m.
         codes: What each cluster sends, float64 (K, values).
-        columns: Of the pixels, from the middle of the image, px, float64 (width,).
-        rows: The same, float64 (height,).
+        grid: Columns of the pixels, and rows, from the middle of the image, px, float64 (n,).
         distance_m: For the perspective of what stands out or leans.
     """
 
@@ -466,16 +462,8 @@ class _Image:
     first: NDArray[np.int64]
     side_m: float
     codes: Array
-    columns: Array
-    rows: Array
+    grid: Array
     distance_m: float
-
-    @classmethod
-    def of(cls, bar: BarLayout, codes: Array, columns: Array, rows: Array, distance_m: float) -> "_Image":
-        which = bar.led_clusters()
-        order = np.argsort(which, kind="stable")
-        first = np.searchsorted(which[order], np.arange(bar.clusters + 1))
-        return cls(bar.led_positions_m()[order], first, bar.shape.led_m, codes, columns, rows, distance_m)
 
     @classmethod
     def around(
@@ -483,8 +471,11 @@ class _Image:
     ) -> "_Image":
         seam = _SEAM_SIGMAS * blur_px + 2 + bar.shape.led_m * scale
         half = math.ceil(scale * float(np.abs(bar.led_positions_m()[:, :2]).max()) + seam)
-        across = np.arange(-half, half + 1, dtype=np.float64)
-        return cls.of(bar, codes, across, across, distance_m)
+        grid = np.arange(-half, half + 1, dtype=np.float64)
+        which = bar.led_clusters()
+        order = np.argsort(which, kind="stable")
+        first = np.searchsorted(which[order], np.arange(bar.clusters + 1))
+        return cls(bar.led_positions_m()[order], first, bar.shape.led_m, codes, grid, distance_m)
 
     def values(self, fit: dict[str, float]) -> Array:
         """Expected values, float64 (values, pixels)."""
@@ -498,8 +489,9 @@ class _Image:
         u = fit["x_px"] + near * (c * x - s * y)
         v = fit["y_px"] + near * (s * x + c * y)
         across, down = (
-            ndtr((grid - at[:, None] + side / 2) / blur) - ndtr((grid - at[:, None] - side / 2) / blur)
-            for grid, at in ((self.columns, u), (self.rows, v))
+            ndtr((self.grid - at[:, None] + side / 2) / blur)
+            - ndtr((self.grid - at[:, None] - side / 2) / blur)
+            for at in (u, v)
         )
         light = np.stack(
             [(down[a:b].T @ across[a:b]).ravel() for a, b in zip(self.first, self.first[1:], strict=False)]
@@ -520,44 +512,3 @@ class _Image:
             step *= self.distance_m
         low, high = ({**fit, name: fit.get(name, 0.0) + by} for by in (-step, step))
         return ((self.values(high) - self.values(low)) / (2 * step)).ravel()
-
-
-def _bound_layout_frame(link: Link, full_events: float, view: FrameView) -> Range:
-    start = _start(view.presence, link.bar.cluster_centres_m() @ np.array([1, 1j]))
-    if start is None:
-        return _NONE
-    scale, shift, seen = start
-    values = np.clip(view.sums[link.codebook.edge_chips].astype(np.float64) / full_events, -1.0, 1.0)
-    height, width = values.shape[1:]
-    codes = _codes(link.codebook, np.where(view.soft.symbols < 0, 0, view.soft.symbols))
-    distance_m = link.camera.focal_px / abs(scale)
-    image = _Image.of(link.bar, codes, _from_middle(width), _from_middle(height), distance_m)
-    middle = shift - complex(width - 1, height - 1) / 2
-    names = (*_POSE, "gain", "dark", "blur")
-    first = [middle.real, middle.imag, math.log(abs(scale)), float(np.angle(scale))]
-    first += [0.6, math.log(0.1), math.log(0.45)]
-
-    def off(fit: Array) -> Array:
-        return image.values(dict(zip(names, fit.tolist(), strict=True))).ravel() - values.ravel()
-
-    found = least_squares(off, first, x_scale=[1, 1, 0.01, 0.01, 0.3, 1, 0.3], max_nfev=30)
-    fit = dict(zip(names, found.x.tolist(), strict=True))
-    noise = math.sqrt(2 * found.cost / max(found.fun.size - len(first), 1))
-    if fit["gain"] < _LEAST_GAIN or abs(fit["scale"] - first[2]) > _MOST_OFF or not noise > 0:
-        return _NONE
-    distance_m = link.camera.focal_px / math.exp(fit["scale"])
-    slopes = np.stack([image.slope(fit, name) for name in (*_POSE, *_LENS)])
-    sigma = float(_sigmas(slopes @ slopes.T / noise**2)[2])
-    return Range(distance_m, distance_m * sigma, seen) if math.isfinite(sigma) else _NONE
-
-
-def _start(presence: PresenceMap, centres_m: NDArray[np.complex128]) -> tuple[complex, complex, int] | None:
-    """Scale, px a metre with the turn, place, px, and how many clusters are seen, by the cells' medians."""
-    seen, middles = _middles(presence)
-    at, layout = middles[seen] @ np.array([1, 1j]), centres_m[seen]
-    spread = layout - layout.mean() if len(at) else layout
-    power = float((np.abs(spread) ** 2).sum())
-    if len(at) < 2 or power <= 0:
-        return None
-    scale = complex(np.conj(spread) @ at) / power
-    return (scale, complex(at.mean() - scale * layout.mean()), len(at)) if abs(scale) > 0 else None
