@@ -26,6 +26,7 @@ from evlcp_sdk.study.summary import (
     Summary,
     Verdict,
     beside_paper,
+    verdict_of,
 )
 from evlcp_sdk.study.tally import BIN_M, SEGMENT_M, Tally
 
@@ -120,8 +121,8 @@ def _spans(series: Series, kind: str) -> list[tuple[int, int]]:
     for paper in (one for one in PAPER if one.measure == kind):
         whole = paper.from_m, paper.to_m
         inside = [span for span in spans if whole[0] <= span[0] and span[1] <= whole[1]]
-        highest = max((measure(series.between(*span), kind).high for span in inside), default=0)
-        if highest > paper.value and measure(series.between(*whole), kind).none:
+        few = [verdict_of(measure(series.between(*span), kind), paper) == "too few" for span in inside]
+        if any(few) and measure(series.between(*whole), kind).none:
             spans = [span for span in spans if span not in inside] + [whole]
     return sorted(spans)
 

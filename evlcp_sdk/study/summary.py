@@ -254,7 +254,6 @@ class PaperComparison:
         ours: The measured one; where the paper gives a bound, that of the worst segment.
         from_m: Start of the distances that ours was measured at, m.
         to_m: Their end, m.
-        verdict: Ours beside the paper's, as `verdict_of` finds.
     """
 
     reference: Reference
@@ -262,7 +261,11 @@ class PaperComparison:
     ours: Figure
     from_m: int
     to_m: int
-    verdict: "Verdict"
+
+    @property
+    def verdict(self) -> "Verdict":
+        """Ours beside the paper's, as `verdict_of` finds."""
+        return verdict_of(self.ours, self.reference)
 
 
 Verdict = Literal["better", "agrees", "worse", "too few"]
@@ -271,12 +274,15 @@ AGREEMENT = 0.3
 """Up to what share two figures that agree differ."""
 
 
-def verdict_of(ours: float, reference: Reference) -> Verdict:
+def verdict_of(ours: Figure, reference: Reference) -> Verdict:
     """Hold a figure against the paper's; the smaller one is the better.
 
     A bound is kept, which agrees, or not, which is worse: how far the paper stays below it, it does not say.
+    Not one error is too few in less data than would show that there are fewer than the paper's.
     """
-    ratio = ours / reference.value
+    if ours.none and ours.high > reference.value:
+        return "too few"
+    ratio = ours.value / reference.value
     if ratio > 1 + (0 if reference.bound else AGREEMENT):
         return "worse"
     return "agrees" if reference.bound or ratio >= 1 - AGREEMENT else "better"
@@ -298,9 +304,5 @@ def beside_paper(series: Iterable[Series], references: Iterable[Reference] = PAP
             measured = [(measure(one.between(*part), reference.measure), part) for part in parts]
             if some := [pair for pair in measured if pair[0].count]:
                 ours, at = max(some, key=lambda pair: pair[0].value)
-                verdict = verdict_of(ours.value, reference)
-                if ours.none and ours.high > reference.value:
-                    # Not one error, in less data than would show that there are fewer than the paper's.
-                    verdict = "too few"
-                found.append(PaperComparison(reference, one.name, ours, *at, verdict))
+                found.append(PaperComparison(reference, one.name, ours, *at))
     return found
