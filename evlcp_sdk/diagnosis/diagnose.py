@@ -1,6 +1,6 @@
 """Diagnosis of a recording: one pass through the receiver and past it, then what may be wrong is tried."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -21,7 +21,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.source import EventSource
 from evlcp_sdk.rx.boxes import inside
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.values import Events, Packet
+from evlcp_sdk.values import Events
 
 _RATE_SHARE = 0.005
 """How far a measured rate may be off: half of that is seen where rows are read late."""
@@ -121,7 +121,6 @@ def diagnose(
         seen = _Pass(link)
         for _ in seen.over(source):
             advance(source.position_bytes, source.size_bytes)
-    seen.end()
     survey, receiver = seen.survey, seen.receiver
     sources, frequency_hz = survey.found()
     facts = Facts(
@@ -167,12 +166,7 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
 
     Tried are chip rates of what blinks, modulations, frames per packet and frames per pilot; all else is as
     given. Where none of these fits, or packets have no preamble, framings say what they take each light for.
-    Reads until some packets have been seen.
-
-    Args:
-        source: What is read; not closed.
-        link: What is given, one of those tried.
-        registry: Where other modulations are found; None for all that are installed.
+    Reads the source until some packets have been seen; does not close it.
 
     Raises:
         InputError: The source cannot be read on.
@@ -180,7 +174,7 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
     registry = Registry.load() if registry is None else registry
     seen = _Pass(link)
     for _ in seen.over(source):
-        if seen.sampled:
+        if seen.begun and seen.full:
             break
     sources, _ = seen.survey.found()
     return sorted(_trials(seen, sources, link, registry), key=lambda one: one.rank, reverse=True)
@@ -188,9 +182,10 @@ def infer_link(source: EventSource, link: Link, registry: Registry | None = None
 
 def _trials(seen: "_Pass", sources: Sequence[LightSource], link: Link, registry: Registry) -> Iterator[Trial]:
     """What links make of a recording, the one given first."""
-    sample, fits = seen.sample(), False
+    sample, fits = Events.concat(seen.pieces)[:MOST_EVENTS], False
     short = sample[: int(np.searchsorted(sample.t_us - sample.t_us[:1], _TRIAL_US))]
-    if seen.has_preambles and sources:
+    # What else a link may be is tried of packets that begin with a preamble only.
+    if "preambles" in seen.receiver.counts and sources:
         for trial in better_links(link, short, registry, _rates(sources, link)):
             yield trial
             fits |= trial.fits
@@ -202,71 +197,49 @@ def _trials(seen: "_Pass", sources: Sequence[LightSource], link: Link, registry:
 
 
 class _Pass:
-    """A recording on its way through a survey and a receiver; keeps its first events.
+    """A recording on its way through a survey and a receiver.
 
     Attributes:
         survey: What blinks.
         receiver: What the link reads.
         tally: Figures of its transmitters.
+        pieces: Its first events, or those from where the receiver first finds something.
+        begun: Whether that was so.
     """
 
     def __init__(self, link: Link) -> None:
         self.survey = LightSurvey(link.camera.width, link.camera.height)
         self.receiver = Receiver(link)
         self.tally = RunTally(link.packet)
-        self._pieces: list[Events] = []
-        self._begun = False
+        self.pieces: list[Events] = []
+        self.begun = False
 
     def over(self, source: EventSource) -> Iterator[None]:
         """Take a source's events piece by piece."""
         for events in source.chunks():
-            self._add(self.receiver.feed(events))
+            self.tally.add(*self.receiver.feed(events))
             self.survey.feed(events)
-            if self.receiver.counts["regions_opened"] and not self._begun:
+            if self.receiver.counts["regions_opened"] and not self.begun:
                 # What was found had begun to blink in the piece before.
-                self._begun, self._pieces = True, self._pieces[-1:]
-            if not self._full:
-                self._pieces.append(events)
+                self.begun, self.pieces = True, self.pieces[-1:]
+            if not self.full:
+                self.pieces.append(events)
             yield
-
-    def end(self) -> None:
-        """Nothing comes any more."""
-        self._add(self.receiver.close())
-
-    def _add(self, packets: Iterable[Packet]) -> None:
-        for packet in packets:
-            self.tally.add(packet)
+        self.tally.add(*self.receiver.close())
 
     @property
-    def _full(self) -> bool:
-        pieces = self._pieces
-        long_us = pieces[-1].t_us[-1] - pieces[0].t_us[0] if pieces else 0
-        long_enough_us = _TRIAL_US if self._begun else _LIGHT_US
-        return sum(map(len, pieces)) >= MOST_EVENTS or bool(long_us > long_enough_us)
-
-    @property
-    def sampled(self) -> bool:
-        """Whether there is enough to try other links on, from where something blinks."""
-        return self._begun and self._full
-
-    def sample(self) -> Events:
-        """The first events, or those from where the receiver first finds something."""
-        return Events.concat(self._pieces)[:MOST_EVENTS]
-
-    @property
-    def has_preambles(self) -> bool:
-        """Whether packets begin with a preamble: what else a link may be is tried of those only."""
-        return "preambles" in self.receiver.counts
+    def full(self) -> bool:
+        """Whether there are enough first events to try other links on."""
+        long_us = self.pieces[-1].t_us[-1] - self.pieces[0].t_us[0] if self.pieces else 0
+        long_enough_us = _TRIAL_US if self.begun else _LIGHT_US
+        return sum(map(len, self.pieces)) >= MOST_EVENTS or bool(long_us > long_enough_us)
 
 
 def _rates(sources: Sequence[LightSource], link: Link) -> list[float]:
     """Chip rates that what blinks may have, rounded, as people choose them, and not; not the link's own."""
     rates: list[float] = []
-    own = link.packet.chip_rate_hz
-    if any(
-        one.strength_at(own) > 0.9 * one.strength and abs(one.rate_hz / own - 1) < _RATE_SHARE
-        for one in sources[:1]
-    ):
+    own, first = link.packet.chip_rate_hz, sources[0]
+    if first.strength_at(own) > 0.9 * first.strength and abs(first.rate_hz / own - 1) < _RATE_SHARE:
         return rates
     for source in [one for one in sources if one.kind != "lamp"][:3]:
         rounded = [float(f"{source.rate_hz:.{digits}g}") for digits in (1, 2, 3)]

@@ -99,16 +99,9 @@ class Trial:
 
 
 def try_link(link: Link, events: Events, changes: Sequence[tuple[str, Any]] = ()) -> Trial:
-    """Receive events with a link and count.
-
-    Args:
-        link: The link.
-        events: All of them on its sensor.
-        changes: What it has other than another; kept.
-    """
+    """Receive events, all of them on its sensor, with a link, and count."""
     receiver, tally = Receiver(link), RunTally(link.packet)
-    for packet in [*receiver.feed(events), *receiver.close()]:
-        tally.add(packet)
+    tally.add(*receiver.feed(events), *receiver.close())
     return Trial(
         tuple(changes),
         link,
@@ -125,13 +118,8 @@ def better_links(
     """Try what may be wrong in a link, one thing at a time and then on top of the best; yield what was tried.
 
     First the link as it is, then the chip rates that light was seen to have, frames a pilot, frames a packet,
-    and the modulations that are installed. Of what fits already nothing else is tried.
-
-    Args:
-        link: The link to start from.
-        events: All of them on its sensor.
-        registry: Where other modulations are found.
-        rates_hz: Chip rates to try.
+    and the modulations that are installed. Of what fits already nothing else is tried. All events have to be
+    on the link's sensor.
     """
     best = try_link(link, events)
     yield best
@@ -167,10 +155,7 @@ def better_links(
 def infer_links(link: Link, lights: Iterable[Events], registry: Registry) -> Iterator[Trial]:
     """Let each framing say what it takes one of some lights for, up to the first that it knows, and try that.
 
-    Args:
-        link: The link to start from.
-        lights: Events of what may be one LED.
-        registry: Where framings are found.
+    A light is the events of what may be one LED.
     """
     for light, installed in product(lights, registry.installed("framing")):
         changes: dict[str, Any] = {"framing.id": installed.algorithm.id}

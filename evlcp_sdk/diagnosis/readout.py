@@ -101,7 +101,7 @@ class ReadoutTally:
             self._events += end - begin
             if not self._ms % _LOOKED_AT:
                 # Rows are read one after another, and after the lowest one that waits the highest.
-                y = np.append(np.int64(self._row), events.y[begin:end])
+                y = np.append(self._row, events.y[begin:end]).astype(np.int64)
                 read = int(np.count_nonzero(y[1:] != y[:-1]))
                 self._passes += int(np.count_nonzero(y[1:] < y[:-1]))
                 self._read += read

@@ -158,28 +158,22 @@ class TransmitterTally:
                 self.cells[round(min(distance_m, _FARTHEST_M) / _CELL_M)] += 1
                 if frame.echo_of is None:
                     # A mirror image stands on its head.
-                    self._add_size(frame, distance_m)
-                    if frame.range.bent_px is not None:
-                        self._add_bent(frame.range.bent_px)
-                        self.bent_sigma_m += (frame.range.sigma_m - self.bent_sigma_m) / self.bent
+                    self._add_shape(frame)
 
-    def _add_size(self, frame: Frame, distance_m: float) -> None:
-        """Add how long the bar looks times its distance, which is the same wherever it is."""
-        if len(frame.points_px) < 2:
-            return
-        (x0, y0), (x1, y1) = frame.points_px[0].tolist(), frame.points_px[-1].tolist()
-        reach = distance_m * math.hypot(x1 - x0, y1 - y0)
+    def _add_shape(self, frame: Frame) -> None:
+        """Add how long the bar looks times its distance, which is the same wherever it is, and how bent."""
+        x, y = (frame.points_px[-1:] - frame.points_px[:1]).sum(0).tolist()
+        reach = frame.range.distance_m * math.hypot(x, y)
         if math.isfinite(reach) and reach > 0:
             self.reach_sum += math.log(reach)
             self.sized += 1
-            self.along_px = (self.along_px[0] + x1 - x0, self.along_px[1] + y1 - y0)
-
-    def _add_bent(self, off_px: NDArray[np.float64]) -> None:
-        """Add how far the boundaries of a bent image lie off."""
-        seen = np.isfinite(off_px)
-        px = np.where(seen, off_px, 0.0)
-        self.bent += 1
-        self.bent_px = np.stack([seen, px, px**2]) + (self.bent_px if self.bent_px.size else 0.0)
+            self.along_px = (self.along_px[0] + x, self.along_px[1] + y)
+        if frame.range.bent_px is not None:
+            seen = np.isfinite(frame.range.bent_px)
+            px = np.where(seen, frame.range.bent_px, 0.0)
+            self.bent += 1
+            self.bent_px = np.stack([seen, px, px**2]) + (self.bent_px if self.bent_px.size else 0.0)
+            self.bent_sigma_m += (frame.range.sigma_m - self.bent_sigma_m) / self.bent
 
     def median_m(self) -> float:
         """Median distance to the centimetre, m; NaN without any."""
@@ -273,24 +267,25 @@ class RunTally:
         self.others = self.others_frames = 0
         self.covered_us = 0.0
         self._messages: OrderedDict[tuple[int, int, int], ReceivedMessage] = OrderedDict()
-        forms = {"": form} if isinstance(form, PacketFormat) else form
-        self._forms = dict(forms)
+        self._forms = {"": form} if isinstance(form, PacketFormat) else form
         self._until_us = -math.inf
 
-    def add(self, packet: Packet) -> None:
-        """Count a packet and its frames."""
-        tally = self.transmitters.get(packet.transmitter)
+    def add(self, *packets: Packet) -> None:
+        """Count packets and their frames."""
+        for packet in packets:
+            self._add(packet)
+
+    def _add(self, packet: Packet) -> None:
         form = self._forms[packet.link]
         packet_us = form.packet_us
-        if tally is None:
-            tally = TransmitterTally(
+        if packet.transmitter not in self.transmitters:
+            self.transmitters[packet.transmitter] = TransmitterTally(
                 *(packet.sent, packet_us),
                 link=packet.link,
                 number=packet.transmitter,
                 packet_chips=form.packet_chips,
             )
-            self.transmitters[packet.transmitter] = tally
-        tally.add(packet)
+        self.transmitters[packet.transmitter].add(packet)
         for message in packet.messages:
             said = message.message
             key = (said.transmitter_id, said.kind, said.sequence)
