@@ -5,7 +5,6 @@ import os
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Coroutine
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 from evlcp_sdk.errors import ConfigError
@@ -47,9 +46,7 @@ class LoopThread:
         self._thread.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_fault: object) -> None:
         self.loop.call_soon_threadsafe(self.loop.stop)
         self._thread.join(_LEAVE_S)
 

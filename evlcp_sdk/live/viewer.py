@@ -7,6 +7,7 @@ last one: one that stalls costs nothing.
 """
 
 import asyncio
+import itertools
 import json
 import secrets
 import struct
@@ -46,7 +47,7 @@ _MOST_BROWSERS: Final = 16
 _MOST_SAID: Final = 4096
 """Bytes of what a browser says."""
 _KEPT: Final = {"message": 50, "fix": 500}
-"""What a browser that comes later is shown of what was before."""
+"""What a browser that comes later is shown of what was before; of other kinds but frames the last one."""
 
 
 @dataclass(eq=False)
@@ -104,7 +105,6 @@ class Viewer(Server):
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
         self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
-        self._last: dict[str, str] = {}
         self._tasks: set[asyncio.Task[None]] = set()
         self._body = b""
         self._left = 0
@@ -215,8 +215,7 @@ class Viewer(Server):
         from websockets.exceptions import ConnectionClosed
 
         browser = _Browser(socket)
-        for texts in (self._kept["message"], self._kept["fix"], self._last.values()):
-            browser.waiting.extend(texts)
+        browser.waiting.extend(itertools.chain.from_iterable(self._kept.values()))
         self._browsers.add(browser)
         try:
             await socket.send(json.dumps(self._about()))
@@ -281,10 +280,8 @@ class Viewer(Server):
 
     def _tell(self, kind: str, line: str) -> None:
         """Send something to all browsers, and keep what later ones are sent."""
-        if kind in self._kept:
-            self._kept[kind].append(line)
-        elif kind != "frame":
-            self._last[kind] = line
+        if kind != "frame":
+            self._kept.setdefault(kind, deque(maxlen=1)).append(line)
         for browser in self._browsers:
             browser.put(line)
 
