@@ -135,30 +135,8 @@ def sort_out(
 
 @njit
 def median(values: Array, n: int) -> float:
-    """Median of the first n values, which it reorders (Hoare's selection)."""
-    middle = n // 2
-    low, high = 0, n - 1
-    while low < high:
-        pivot, i, j = values[middle], low, high
-        while i <= j:
-            while values[i] < pivot:
-                i += 1
-            while pivot < values[j]:
-                j -= 1
-            if i <= j:
-                values[i], values[j] = values[j], values[i]
-                i += 1
-                j -= 1
-        if j < middle:
-            low = i
-        if middle < i:
-            high = j
-    if n % 2:
-        return float(values[middle])
-    below = values[0]
-    for i in range(1, middle):
-        below = max(below, values[i])
-    return float((below + values[middle]) / 2)
+    """Median of the first n values."""
+    return float(np.median(values[:n]))
 
 
 @njit

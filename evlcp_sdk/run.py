@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, Self
 from evlcp_sdk.errors import ConfigError, InputError, InterruptedRunError, PluginError, UnpluggedError
 from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
-from evlcp_sdk.io.describe import check_sensor
+from evlcp_sdk.io.describe import check_sensor, recording_table
 from evlcp_sdk.io.open import STDIN, is_recording
 from evlcp_sdk.io.patience import open_until, pieces_until
 from evlcp_sdk.link.resolve import Link, load_link
@@ -372,15 +372,10 @@ def convert(
 ) -> dict[str, Any]:
     """Write events and triggers of a source into a recording, in constant memory.
 
-    Args:
-        source: What to open, plugins asked first; or a source that is open, which is read on and closed.
-        out: The recording; its suffix says the format, as for `open_writer`.
-        registry: The plugins; None for all that are installed.
-        size: Columns and rows of the sensor, where the source does not say them.
-        format: As for `open_writer`.
-        advance: Says how far the reading is.
-        stopped: Ends the run early; what was read of a camera or a stream until then is written, and nothing
-            of a recording.
+    `source` and `registry` are as of `receive`, the recording `out` and its `format` as of `open_writer`;
+    `size` is that of the sensor, (columns, rows), where the source does not say it. `advance` says how far
+    the reading is; `stopped` ends the run early: what was read of a camera or a stream until then is written,
+    and nothing of a recording.
 
     Returns:
         Counts of what was written, losses of the source, `error`: what ended the reading early, or None, and
@@ -490,28 +485,15 @@ def _tables_of(
     source: EventSource, url: str, watch: Stopwatch, first_us: int | None, last_us: int | None
 ) -> dict[str, dict[str, Any]]:
     """What the summary says of a recording, and of how it was worked off."""
-    read = source.counts["events"]
-    duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
-    recording = {
-        "path": url,
-        "format": source.format,
-        "bytes": source.size_bytes,
-        "width": source.width,
-        "height": source.height,
-        "first_us": first_us,
-        "last_us": last_us,
-        "duration_s": round(duration_s, 6),
-        "events_per_s": round(read / duration_s) if duration_s else None,
-        "counts": dict(source.counts),
-        "guessed": source.guessed,
-        "step_us": source.step_us,
-    }
+    recording = recording_table(source, url, first_us, last_us)
+    recording |= {"guessed": source.guessed, "step_us": source.step_us}
+    duration_s = recording["duration_s"]
     pace = round(times_real_time(duration_s, watch.processor_s), 3) if duration_s else None
     processing = {
         "processor_s": round(watch.processor_s, 6),
         "elapsed_s": round(watch.elapsed_s, 6),
         "kernels_s": round(watch.kernels_s, 6),
-        "events_per_s": round(read / watch.processor_s),
+        "events_per_s": round(source.counts["events"] / watch.processor_s),
         "times_real_time": pace,
     }
     return {"recording": recording, "processing": processing}
@@ -544,18 +526,10 @@ def film(
 
     The recording is read twice: to decode it until the end of what is shown, and for the events.
 
-    Args:
-        recording: What to open, plugins asked first.
-        out: An animated picture, `.webp` or `.gif`, or a film, `.mp4`.
-        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
-        registry: The plugins; None for all that are installed.
-        from_ms: Where it starts, ms after the first event; None for the first frame that is decoded, or the
-            start where there is none.
-        for_ms: How much of the recording it shows, ms.
-        slow: How many times slower than it was.
-        longest_px: Longest side of a picture, px.
-        whole: Show the whole image, not the bars only.
-        advance: Says how far the reading is.
+    The film, `out`, is an animated picture, `.webp` or `.gif`, or `.mp4`. It starts `from_ms` after the first
+    event, or with the first frame that is decoded, or at the start where there is none; shows `for_ms` of the
+    recording, `slow` times slower than it was, in pictures of `longest_px`, and the bars only, or the `whole`
+    image. `advance` says how far the reading is; other arguments are as of `receive`.
 
     Returns:
         What it shows: pictures, their size, time, transmitters, frames.
@@ -614,14 +588,9 @@ def calibrate(
 ) -> Calibrated:
     """Estimate focal length, principal point and distortion from bars at known places.
 
-    Args:
-        recordings: Recordings of the bars.
-        sites: Where the bars stand.
-        poses: Where the camera was, and when.
-        link: The configuration, or a `link.toml`; None for all defaults.
-        registry: The plugins; None for all that are installed.
-        limit_px: Uncertainty of the image's corners that is allowed.
-        name: What a message calls the poses: the file they come from, which has a heading and a line a pose.
+    `recordings` show bars that stand at `sites`; `poses` say where the camera was, and when, and `name` is
+    what messages call the file they come from, which has a heading and a line a pose. `limit_px` is the
+    uncertainty of the image's corners that is allowed; `link` and `registry` are as of `receive`.
 
     Raises:
         InputError: A recording cannot be read.
@@ -667,14 +636,11 @@ def _check_lines(links: Mapping[str, Link]) -> None:
 
 def _check_names(recordings: Sequence[str], poses: Sequence[KnownPose], source: str) -> None:
     names = [Path(url).name for url in recordings]
+    known = names if len(names) > 1 else ["", *names]
     for line, pose in enumerate(poses, 2):
-        if pose.recording not in ("", *names):
-            known = ", ".join(names)
-            raise ConfigError(
-                f"{source}: line {line}: recording = {pose.recording!r}: expected one of {known}"
-            )
-        if not pose.recording and len(names) > 1:
-            raise ConfigError(f"{source}: line {line}: recording: expected one, as there are {len(names)}")
+        if pose.recording not in known:
+            expected = f"expected one of {', '.join(names)}"
+            raise ConfigError(f"{source}: line {line}: recording = {pose.recording!r}: {expected}")
 
 
 def _view(pose: KnownPose, bars: Sequence[BarView], axes: LocalAxes) -> CalibrationView:
@@ -760,14 +726,8 @@ def survey(
 ) -> list[SurveyedBar]:
     """Estimate where bars stand that send their ids, from known poses; the camera is known as the link says.
 
-    Args:
-        recordings: Recordings of the bars.
-        poses: Where the camera was, how it was turned, and when.
-        link: The configuration, or a `link.toml`, or several, whose bars are told apart by their codes and
-            whose sites name them; None for all defaults.
-        registry: The plugins; None for all that are installed.
-        name: What a message calls the poses: the file they come from, which has a heading and a line a pose.
-        known: Bars that need no survey.
+    Arguments are as of `calibrate`, with poses that say how the camera was turned, too; `known` are bars that
+    need no survey. Bars of several links are told apart by their codes, and their sites name them.
 
     Raises:
         InputError: A recording cannot be read.
@@ -826,15 +786,9 @@ def survey_on_the_way(
 ) -> list[SurveyedBar]:
     """Estimate where new bars stand from the camera's own track past known ones.
 
-    A recording is read two times, and a third time where a new bar was alone in view before it sent its id.
-
-    Args:
-        recordings: Recordings in which known bars, or fixes of satellites, give positions, and new bars send
-            their ids.
-        plan: Where the known bars stand; fixes of satellites.
-        link: The configuration, or a `link.toml`, or several of these; None for all defaults.
-        attitude: What is known of the camera's attitude, the same always or over time; None for nothing.
-        registry: The plugins; None for all that are installed.
+    In the recordings known bars, or fixes of satellites, both in the plan, give positions, and new bars send
+    their ids; other arguments are as of `receive`. A recording is read two times, and a third time where a
+    new bar was alone in view before it sent its id.
 
     Raises:
         InputError: A recording cannot be read.

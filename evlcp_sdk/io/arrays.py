@@ -162,13 +162,13 @@ def pieces_of(columns: list[ArrayColumn], size_bytes: int) -> Iterator[Piece]:
     for first in range(0, rows, PIECE_ROWS):
         part = slice(first, min(first + PIECE_ROWS, rows))
         blocks = {key: array[part] for key, array in arrays.items()}
-        times, polarities, *places = (column.of(blocks[id(column.array)]) for column in columns)
+        times, *others = (column.of(blocks[id(column.array)]) for column in columns)
         if times.dtype.kind == "u" and times.max() > np.iinfo(np.int64).max:
             times = times.astype(np.float64)
         elif times.dtype.kind != "f":
             times = times.astype(np.int64)
         done = round(size_bytes * part.stop / rows)
-        yield Piece(times, polarities, np.stack(places, 1) if places else None, (first + 1).__add__, done)
+        yield Piece((times, *others), (first + 1).__add__, done)
 
 
 def _mapped(name: str, file: Path) -> NDArray[Any]:

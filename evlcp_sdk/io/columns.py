@@ -49,17 +49,14 @@ class Piece:
     """Some rows of a table.
 
     Attributes:
-        times: Their times, int64 or float64 (n,).
-        polarities: Numbers or words (n,).
-        places: x and y (n, 2); None where there are none.
+        columns: Their times, int64 or float64 (n,), polarities, numbers or words (n,), and x and y (n,),
+            where there are any.
         number: In which line or row of the file the k-th of them stands.
         done: How much of the file is read behind them, bytes.
         cut: Rows at the end that are left out, as they are not whole.
     """
 
-    times: NDArray[Any]
-    polarities: NDArray[Any]
-    places: NDArray[Any] | None
+    columns: tuple[NDArray[Any], ...]
     number: Callable[[int], int]
     done: int
     cut: int = 0
@@ -132,16 +129,14 @@ class ColumnSource(EventSource):
         self._where, self._inverted, self._window_us = table.where, inverted, table.window_us
         self._dropped = Loss(0, 0, table.where, "rows whose time, polarity or place is no number; dropped")
         first = self._next_piece()
-        times = np.empty(0, np.int64) if first is None else _unwrap(first.times, None, 0)[0]
+        times = np.empty(0, np.int64) if first is None else _unwrap(first.columns[0], None, 0)[0]
         if first is not None:
             self._pieces = itertools.chain((first,), table.pieces)
         share = min(self._position / max(size_bytes, 1), 1.0)
-        placed = first is not None and first.places is not None
-        self._unit = (
-            TimeUnit(unit, "as told", sure=True)
-            if unit
-            else time_unit(times, table.unit, share, placed=placed)
-        )
+        placed = first is not None and len(first.columns) > 2
+        self._unit = TimeUnit(unit or "", "as told", sure=True)
+        if not unit:
+            self._unit = time_unit(times, table.unit, share, placed=placed)
         self._polarities = Polarities()
         self._sieve = Sieve(table.where, *table.size)
         self._row = first.number(0) if first is not None and len(times) else 1
@@ -158,11 +153,7 @@ class ColumnSource(EventSource):
         self.guessed = "; ".join(filter(None, (self._unit.guess, header.get("step"))))
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """As `EventSource.take`.
-
-        Raises:
-            InputError: The file cannot be read on, or a row is none of a time and a polarity.
-        """
+        """As `EventSource.take`; where a row is none of a time and a polarity, an InputError."""
         if self._fault is not None:
             raise self._fault
         try:
@@ -208,17 +199,17 @@ class ColumnSource(EventSource):
         while (found := self._next_piece()) is not None:
             self._counts["rows_cut"] += found.cut
             piece = self._numbers_of(found)
-            last = float(piece.times[-1]) if len(piece.times) else math.nan
-            times, turns, gone_round = _unwrap(piece.times, before, gone_round)
-            before = int(piece.times[-1]) if math.isfinite(last) else before
+            counted, polarities, *places = piece.columns
+            times, turns, gone_round = _unwrap(counted, before, gone_round)
+            before = int(counted[-1]) if len(counted) and math.isfinite(counted[-1]) else before
             if turns > 0 and not self._counts["times_gone_round"]:
                 self.guessed = "; ".join(filter(None, (self.guessed, "the counter of times went round")))
             self._counts["times_gone_round"] += max(turns, 0)
             rows, wrong = len(times), None
             while True:
                 try:
-                    t_us, p = self._unit.us(times[:rows]), self._polarities.of(piece.polarities[:rows])
-                    x, y = _places(None if piece.places is None else piece.places[:rows], rows)
+                    t_us, p = self._unit.us(times[:rows]), self._polarities.of(polarities[:rows])
+                    x, y = (_whole(c[:rows]) for c in places or np.zeros((2, rows), np.uint16))
                     break
                 except RowError as error:
                     rows = error.row
@@ -234,23 +225,13 @@ class ColumnSource(EventSource):
 
     def _numbers_of(self, piece: Piece) -> Piece:
         """A piece without the rows in which something is no number; they are counted."""
-        good = np.ones(len(piece.times), bool)
-        for column in (piece.times, piece.polarities, *(() if piece.places is None else piece.places.T)):
-            if column.dtype.kind in "US":
-                good &= ~np.isin(np.char.lower(column), np.array(["nan", ""]).astype(column.dtype.kind))
-            else:
-                good &= np.isfinite(column)
+        good = np.logical_and.reduce([_is_given(column) for column in piece.columns])
         if good.all():
             return piece
         kept = np.flatnonzero(good)
         self._dropped = self._dropped.more(len(good) - len(kept), piece.number(int((~good).argmax())))
-        return replace(
-            piece,
-            times=piece.times[kept],
-            polarities=piece.polarities[kept],
-            places=None if piece.places is None else piece.places[kept],
-            number=lambda row: piece.number(int(kept[row])),
-        )
+        columns = tuple(column[kept] for column in piece.columns)
+        return replace(piece, columns=columns, number=lambda row: piece.number(int(kept[row])))
 
     @property
     def counts(self) -> dict[str, int]:
@@ -366,16 +347,19 @@ def _in_words(step_us: int) -> str:
     return f"{step_us / 1000:g} ms" if step_us < 1_000_000 else f"{step_us / 1e6:g} s"
 
 
-def _places(places: NDArray[Any] | None, n: int) -> tuple[NDArray[np.uint16], NDArray[np.uint16]]:
-    if places is None:
-        return np.zeros(n, np.uint16), np.zeros(n, np.uint16)
-    whole = np.rint(places.astype(np.float64))
-    wrong = ~((whole >= 0) & (whole < _PLACES) & (whole == places))
+def _is_given(column: NDArray[Any]) -> Any:
+    """Where a column has a number, or a word, bool (n,)."""
+    if column.dtype.kind in "US":
+        return ~np.isin(np.char.lower(column), np.array(["nan", ""]).astype(column.dtype.kind))
+    return np.isfinite(column)
+
+
+def _whole(places: NDArray[Any]) -> NDArray[np.uint16]:
+    wrong = ~((places >= 0) & (places < _PLACES) & (places == np.rint(places)))
     if wrong.any():
-        row = int(wrong.any(1).argmax())
-        raise RowError(row, f"place {places[wrong][0]}, expected whole numbers from 0 to {_PLACES - 1}")
-    found = whole.astype(np.uint16)
-    return np.ascontiguousarray(found[:, 0]), np.ascontiguousarray(found[:, 1])
+        row = int(wrong.argmax())
+        raise RowError(row, f"place {places[row]}, expected whole numbers from 0 to {_PLACES - 1}")
+    return places.astype(np.uint16)
 
 
 def one_line(error: Exception) -> str:

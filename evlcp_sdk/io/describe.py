@@ -13,15 +13,27 @@ RATE_WINDOW_US = 10_000
 """The peak rate is the most events in a window of this length on a fixed grid."""
 
 
+def recording_table(
+    source: EventSource, name: str, first_us: int | None, last_us: int | None
+) -> dict[str, Any]:
+    """What summaries say of a source that was read: file, sensor, time and rate, as JSON values."""
+    duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
+    return {
+        "path": name,
+        "format": source.format,
+        "bytes": source.size_bytes,
+        "width": source.width,
+        "height": source.height,
+        "first_us": first_us,
+        "last_us": last_us,
+        "duration_s": round(duration_s, 6),
+        "events_per_s": round(source.counts["events"] / duration_s) if duration_s else None,
+        "counts": dict(source.counts),
+    }
+
+
 def describe(source: EventSource, name: str) -> dict[str, Any]:
-    """What a source holds, read to its end in constant memory.
-
-    Args:
-        source: Read from where it stands; not closed.
-        name: What the result calls it.
-
-    Returns:
-        Format, size, header, time, rates, triggers and losses as JSON values.
+    """What a source, called `name`, holds as JSON values, read to its end in constant memory; not closed.
 
     Raises:
         InputError: It cannot be read on.
@@ -43,27 +55,12 @@ def describe(source: EventSource, name: str) -> dict[str, Any]:
             in_window = in_window + n if w == window else n
             window, peak = w, max(peak, in_window)
     total = source.counts["events"]
-    duration_s = (last_us - first_us) * 1e-6 if first_us is not None and last_us is not None else 0.0
-    return {
-        "path": name,
-        "format": source.format,
-        "bytes": source.size_bytes,
-        "width": source.width,
-        "height": source.height,
+    return recording_table(source, name, first_us, last_us) | {
         "header": dict(source.header),
-        "first_us": first_us,
-        "last_us": last_us,
-        "duration_s": round(duration_s, 6),
-        "events_per_s": round(total / duration_s) if duration_s else None,
         "peak_events_per_s": round(peak * 1e6 / RATE_WINDOW_US),
         "positive_share": round(positive / total, 4) if total else None,
-        "counts": dict(source.counts),
         "triggers": [
-            {
-                "channel": channel,
-                "edge": "rising" if value else "falling",
-                "count": int(edges[channel, value]),
-            }
+            {"channel": channel, "edge": ("falling", "rising")[value], "count": int(edges[channel, value])}
             for channel, value in np.argwhere(edges).tolist()
         ],
         "losses": {kind: asdict(loss) for kind, loss in source.losses.items()},
@@ -72,12 +69,9 @@ def describe(source: EventSource, name: str) -> dict[str, Any]:
 
 
 def check_sensor(source: EventSource, url: object, camera: CameraModel) -> None:
-    """Refuse a recording of another sensor than the camera has; one that does not say its size passes.
+    """Refuse a recording, called `url`, of another sensor than the link's camera has.
 
-    Args:
-        source: The recording, open.
-        url: What the message calls it.
-        camera: That of the link.
+    One that does not say its size passes.
 
     Raises:
         ConfigError: The sizes differ.

@@ -152,7 +152,7 @@ def _csv_pieces(
             good = next(k for k, row in enumerate(rows) if not table.is_row(row, fields))
             columns = table.columns(rows[:good], fields)
         if columns is not None and rows:
-            yield Piece(*columns, numbers.__getitem__, raw.tell(), cut)
+            yield Piece(columns, numbers.__getitem__, raw.tell(), cut)
         if good + cut < len(rows):
             what = "a time and a polarity" + (", x and y" if fields.places else "")
             raise InputError(f"{path}: line {numbers[good]}: found {_show(rows[good])}, expected {what}")
@@ -248,20 +248,18 @@ class _Text:
                 (cells,) = csv.reader([line], delimiter=mark, skipinitialspace=True)
         return [_DECIMAL_COMMA.sub(".", plain(cell)) if "," in cell else plain(cell) for cell in cells]
 
-    def columns(
-        self, rows: list[str], fields: Fields
-    ) -> tuple[NDArray[Any], NDArray[Any], NDArray[Any] | None] | None:
-        """Times, polarities and places of some lines, (n,), (n,) and (n, 2); None where one is no row."""
+    def columns(self, rows: list[str], fields: Fields) -> tuple[NDArray[Any], ...] | None:
+        """Times, polarities and perhaps x and y of some lines, (n,) each; None where one is no row."""
         which, mark = fields.which, None if self._separator == " " else self._separator
         if not rows:
-            return np.empty(0, np.int64), np.empty(0, np.int64), None
+            return tuple(np.empty((len(which), 0), np.int64))
         decimal = [_DECIMAL_COMMA.sub(".", row) for row in rows] if mark != "," and "," in rows[0] else rows
         for kind in (np.int64, np.float64):
             try:
                 found = np.loadtxt(decimal, kind, None, mark, usecols=which, ndmin=2)
             except (ValueError, OverflowError):
                 continue
-            return found[:, 0], found[:, 1], found[:, 2:] if fields.places else None
+            return tuple(found.T)
         try:
             cells = np.array([[cells[k] or "nan" for k in which] for cells in map(self.cells, rows)])
         except IndexError:
@@ -269,7 +267,7 @@ class _Text:
         times, *places = (_numbers(column) for k, column in enumerate(cells.T) if k != 1)
         if any(column.dtype.kind == "U" for column in (times, *places)):
             return None
-        return times, cells[:, 1], np.stack(places, 1) if places else None
+        return times, cells[:, 1], *places
 
     def is_row(self, line: str, fields: Fields) -> bool:
         """Whether a line has numbers and a polarity where the columns are."""

@@ -324,24 +324,14 @@ class RawSource(EventSource):
         return self._buffer[self._start : self._start + count * size].view(self._codec.word)
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """As `EventSource.take`.
-
-        Raises:
-            InputError: The file cannot be read on.
-            RawFormatError: No word gives a time.
-        """
+        """As `EventSource.take`; where no word gives a time, a RawFormatError."""
         out = Columns(max(max_events, self._codec.burst), max(max_events // 16, 1024))
         if self._decode_into(out) and not out.events and not out.triggers:
             return None
         return out.taken()
 
     def read(self) -> tuple[Events, Triggers]:
-        """As `EventSource.read`.
-
-        Raises:
-            InputError: The file cannot be read on.
-            RawFormatError: No word gives a time.
-        """
+        """As `EventSource.read`."""
         # Room for an event a word is seldom filled, and what is not filled takes no memory.
         words = ((self.size_bytes or 0) - self._position) // self._codec.word.itemsize
         return self._join(min(max(words, MIN_READ), MAX_READ) + self._codec.burst)

@@ -57,11 +57,7 @@ class FaerySource(EventSource):
         self._row = 1
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
-        """Return the next packet of the file, of whatever size it has, or None at the end.
-
-        Raises:
-            InputError: The file cannot be read on.
-        """
+        """The next packet of the file, of whatever size it has, or None at the end."""
         try:
             packet = next(self._packets, None)
         except Exception as error:
