@@ -126,11 +126,8 @@ class CameraSource(RawSource):
     @property
     def losses(self) -> dict[str, Loss]:
         """As `EventSource.losses`, with what the driver dropped."""
-        dropped, first = self._bytes.dropped, self._bytes.first_dropped
-        if not dropped:
-            return super().losses
-        what = "USB packets that the driver had no room for; the program was too slow"
-        return super().losses | {"camera_overflow": Loss(dropped, first, "byte", what)}
+        dropped = self._bytes.dropped
+        return super().losses | ({"camera_overflow": dropped} if dropped.count else {})
 
     @property
     def health(self) -> Mapping[str, float | int | str]:
@@ -147,7 +144,6 @@ class _CameraBytes(ChunkBytes):
 
     Attributes:
         dropped: USB packets that the driver dropped so far.
-        first_dropped: At which byte it dropped first.
         health: As of the source.
     """
 
@@ -158,9 +154,10 @@ class _CameraBytes(ChunkBytes):
         self._lock = threading.Lock()
         self._closed = False
         self._asked_s = -_HEALTH_EVERY_S
-        self.dropped = self.first_dropped = self.overflows = 0
+        what = "USB packets that the driver had no room for; the program was too slow"
+        self.dropped = Loss(0, 0, "byte", what)
+        self._overflows = self._dropped_before = 0
         self._engaged = False
-        self._dropped_before = 0
         self._faults: list[Exception] = []
         self.health: dict[str, float | int | str] = {}
 
@@ -199,18 +196,16 @@ class _CameraBytes(ChunkBytes):
         if status.ring is None:
             return
         total = int(status.ring.dropped_packets)
-        if total != self._dropped_before:
-            if not self.dropped:
-                self.first_dropped = self.given
-            self.dropped += max(total - self._dropped_before, 0)
-            self._dropped_before = total
+        if total > self._dropped_before:
+            self.dropped = self.dropped.more(total - self._dropped_before, self.given)
+        self._dropped_before = total
         engaged = bool(status.ring.clutch_engaged)
-        self.overflows += engaged and not self._engaged
+        self._overflows += engaged and not self._engaged
         self._engaged = engaged
         self.health |= {
             "backlog": int(status.ring.backlog),
-            "dropped": self.dropped,
-            "overflows": self.overflows,
+            "dropped": self.dropped.count,
+            "overflows": self._overflows,
         }
 
     def close(self) -> None:

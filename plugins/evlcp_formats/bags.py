@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from evlcp_sdk.errors import EvlcpError, InputError
+from evlcp_sdk.errors import InputError
 from evlcp_sdk.io.evt import EVT3
 from evlcp_sdk.io.raw import ChunkBytes, RawSource, format_header
 from evlcp_sdk.io.urls import split_options
@@ -28,8 +28,6 @@ _STEPS: Final = 1_000_000
 _STEPS_A_BYTE: Final = 4
 _STEPS_AT_ONCE: Final = 10_000
 """Steps that SQLite may take, and those between two looks; a row of a message takes twenty."""
-
-_MAGICS: Final = {b"#ROSBAG V2.0": "ROS 1", b"SQLite format 3": "SQLite", b"\x89MCAP0\r\n": "MCAP"}
 
 
 @dataclass(frozen=True)
@@ -58,14 +56,7 @@ def open_bag(url: str) -> "BagSource":
         InputError: It is no bag, has no such topic, or other words than EVT3; or the extra `ros` is needed.
     """
     named, options = split_options(url, {"topic": str}) if url.startswith("bag:") else (url, {})
-    path = named.removeprefix("bag:")
-    try:
-        return BagSource(path, options.get("topic"))
-    except EvlcpError:
-        raise
-    except Exception as fault:
-        # A damaged bag makes a reader fail in any way.
-        raise InputError(f"{path}: a damaged bag: {type(fault).__name__}: {fault}") from fault
+    return BagSource(named.removeprefix("bag:"), options.get("topic"))
 
 
 class BagSource(RawSource):
@@ -96,10 +87,8 @@ class BagSource(RawSource):
     @property
     def losses(self) -> dict[str, Loss]:
         """As `EventSource.losses`, with the packets that are missing."""
-        lost, first = self._packets.lost, self._packets.first_lost
-        if not lost:
-            return super().losses
-        return super().losses | {"packets_lost": Loss(lost, first, "byte", "packets missing in the bag")}
+        lost = self._packets.lost
+        return super().losses | ({"packets_lost": lost} if lost.count else {})
 
     @property
     def counts(self) -> dict[str, int]:
@@ -163,7 +152,7 @@ class _BagBytes(ChunkBytes):
     def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
         self._path = path
         self._next_seq: int | None = None
-        self.lost = self.first_lost = 0
+        self.lost = Loss(0, 0, "byte", "packets missing in the bag")
         first = next(packets, None)
         if first is None:
             raise InputError(f"{path}: no packets on its topic")
@@ -176,9 +165,7 @@ class _BagBytes(ChunkBytes):
         for packet in self._iterator:
             self._encoding_of(packet)
             if self._next_seq is not None and packet.seq > self._next_seq:
-                if not self.lost:
-                    self.first_lost = self.given
-                self.lost += packet.seq - self._next_seq
+                self.lost = self.lost.more(packet.seq - self._next_seq, self.given)
             self._next_seq = packet.seq + 1
             if len(packet.data):
                 return packet.data
@@ -200,10 +187,8 @@ def _files_of(path: Path) -> list[Path]:
     """The files of a bag: itself, or those of its folder as metadata.yaml or their numbers order them."""
     if not path.is_dir():
         return [path]
-    try:
-        text = (path / "metadata.yaml").read_text("utf-8", "replace")
-    except OSError:
-        text = ""
+    about = path / "metadata.yaml"
+    text = about.read_text("utf-8", "replace") if about.is_file() else ""
     listed = re.search(r"relative_file_paths:[ ]*\n((?:[ ]*-.*\n?)+)", text)
     if listed is not None:
         names = [line.strip()[1:].strip(" \"'") for line in listed[1].splitlines()]
@@ -211,7 +196,9 @@ def _files_of(path: Path) -> list[Path]:
         if missing is not None:
             raise InputError(f"{path}: metadata.yaml names {missing}, which is not there")
         return [path / name for name in names]
-    found = (one for one in path.iterdir() if one.suffix in (".db3", ".mcap"))
+    found = [one for one in path.iterdir() if one.suffix in (".db3", ".mcap")]
+    if not found:
+        raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
     return sorted(
         found,
         key=lambda one: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", one.name)],
@@ -220,22 +207,21 @@ def _files_of(path: Path) -> list[Path]:
 
 def _messages(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
     """The packets of a bag, file by file."""
-    if not path.exists():
-        raise InputError(f"{path}: No such file or directory")
-    files = _files_of(path)
-    if not files:
-        raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
-    parts = []
-    for file in files:
-        with file.open("rb") as opened:
-            start = opened.read(16)
-        kind = next((kind for magic, kind in _MAGICS.items() if start.startswith(magic)), None)
-        if kind is None:
-            raise InputError(
-                f"{file}: starts with {start[:8].hex(' ')}, expected a bag of ROS 1, SQLite or MCAP"
-            )
-        parts.append(_read(file, kind, topic, stack))
-    return (packet for part in parts for packet in part)
+    file = path
+    try:
+        for file in _files_of(path):
+            with file.open("rb") as opened:
+                start = opened.read(16)
+            read = next((read for magic, read in _READERS.items() if start.startswith(magic)), None)
+            if read is None:
+                found = start[:8].hex(" ")
+                raise InputError(f"{file}: starts with {found}, expected a bag of ROS 1, SQLite or MCAP")
+            yield from read(file, topic, stack)
+    except InputError:
+        raise
+    except Exception as fault:
+        # A damaged bag makes a reader fail in any way.
+        raise InputError(f"{file}: a damaged bag: {type(fault).__name__}: {fault}") from fault
 
 
 def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
@@ -251,17 +237,6 @@ def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
         hint = "" if not fitting else "; choose one by ?topic=NAME"
         raise InputError(f"{path}: {what} of type event_camera_msgs/EventPacket (topics: {listed}){hint}")
     return fitting[0]
-
-
-def _read(path: Path, kind: str, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
-    """The packets of a file."""
-    try:
-        yield from {"ROS 1": _ros1, "SQLite": _sqlite, "MCAP": _mcap}[kind](path, topic, stack)
-    except InputError:
-        raise
-    except Exception as fault:
-        # A damaged bag makes a reader fail in any way.
-        raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
 
 
 def _sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
@@ -318,6 +293,10 @@ def _ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPack
     chosen = _chosen(path, {one.topic: one.msgtype for one in made.connections}, topic)
     for _, _, data in made.messages([one for one in made.connections if one.topic == chosen]):
         yield _of_ros1(path, data)
+
+
+_READERS: Final = {b"#ROSBAG V2.0": _ros1, b"SQLite format 3": _sqlite, b"\x89MCAP0\r\n": _mcap}
+"""By how a file starts."""
 
 
 def _needed(path: Path, module: str) -> Any:
