@@ -26,23 +26,11 @@ def show_faults(progress: "Progress") -> None:
 @contextmanager
 def campaign_bar(name: str) -> "Iterator[Callable[[Progress], None]]":
     """A bar by tasks, with the errors so far, on a terminal only."""
-    from evlcp_sdk.kernels import count_compiled, count_imported
-
-    found = ""
-
-    def words(done: float, total: float | None, _elapsed_s: float) -> str:
-        compiled = count_compiled()
-        if compiled and not done:
-            return f"compiling for the first run, {compiled} of {count_imported()}"
-        return f"{done:.0f}/{total:.0f} {found}" if total else ""
-
-    with progress_bar(name, words) as advance:
+    with progress_bar(name) as advance:
 
         def show(progress: "Progress") -> None:
-            nonlocal found
             failed = f", {len(progress.faults)} failed" if progress.faults else ""
-            errors = f"{progress.bit_errors:,} errors in {progress.bits:,} bits" if progress.bits else ""
-            found = errors + failed
-            advance(progress.done, progress.tasks)
+            errors = f": {progress.bit_errors:,} errors in {progress.bits:,} bits" if progress.bits else ""
+            advance(progress.done, progress.tasks, f"{progress.done}/{progress.tasks}{errors}{failed}")
 
         yield show

@@ -149,46 +149,34 @@ def shows_bars() -> bool:
     return bool(told) or (sys.stderr is not None and sys.stderr.isatty())
 
 
-def share_done(done: float, total: float | None, _elapsed_s: float) -> str:
-    """What a bar says of bytes, seconds or recordings: the share that is done."""
-    return f"{done / total:.0%}" if total else ""
-
-
 @contextmanager
-def progress_bar(
-    name: str, words: "Callable[[float, float | None, float], str]" = share_done
-) -> "Iterator[Callable[[float, float | None], None]]":
-    """A bar on stderr, on a terminal only: a function of what is done, and of how much if that is known."""
+def progress_bar(name: str, *, by_bytes: bool = False) -> "Iterator[Callable[..., None]]":
+    """A bar on stderr, on a terminal only: a function of what is done, of how much, and words beside it."""
     if not shows_bars():
-        yield lambda _done, _total: None
+        yield lambda _done, _total, _words="": None
         return
-    from rich.progress import BarColumn, Progress, ProgressColumn, Task, TextColumn, TimeRemainingColumn
-    from rich.text import Text
-
-    class Words(ProgressColumn):
-        """What is done, as it is now."""
-
-        def render(self, task: Task) -> Text:
-            return Text(words(task.completed, task.total, task.elapsed or 0.0))
+    from rich.progress import (
+        BarColumn,
+        DownloadColumn,
+        Progress,
+        TaskProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
 
     err = console(stderr=True)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), Words(), TimeRemainingColumn())
-    with Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
+    shown = DownloadColumn() if by_bytes else TaskProgressColumn()
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), shown, TimeElapsedColumn())
+    with Progress(
+        *columns, TimeRemainingColumn(), console=err, transient=True, disable=not err.is_terminal
+    ) as bar:
         task = bar.add_task(name, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        yield lambda done, total, words="": bar.update(
+            task, completed=done, total=total, description=f"{name} {words}".rstrip()
+        )
 
 
 def bytes_bar(name: str) -> "AbstractContextManager[Advance]":
-    """A bar by bytes read; of what has no size it says how much, or how long it took."""
-    return progress_bar(name, read_so_far)
-
-
-def read_so_far(done: float, total: float | None, elapsed_s: float) -> str:
-    """What a bar says: of a file how much of it, of a pipe how much, of what counts no bytes how long.
-
-    >>> read_so_far(1_500_000, 2_000_000, 1.0), read_so_far(1_500_000, None, 1.0), read_so_far(0, None, 7.2)
-    ('1.5 of 2.0 MB', '1.5 MB', '7 s')
-    """
-    if total is not None:
-        return f"{done / 1e6:.1f} of {total / 1e6:.1f} MB"
-    return f"{done / 1e6:.1f} MB" if done else f"{elapsed_s:.0f} s"
+    """A bar by bytes read, or by time where there is no size."""
+    return progress_bar(name, by_bytes=True)

@@ -27,7 +27,6 @@ MAX_HEADER_BYTES = 1 << 16
 PIPE_BYTES, PIPE_WAIT_S = 1 << 17, 0.1
 """Bytes of a pipe that are waited for first, and for how long: words enough to tell their encoding."""
 WRITE_WORDS = 1 << 15
-MIN_READ, MAX_READ = 1 << 20, 1 << 27
 
 # Another encoding read as the declared one has a reserved type in a third of its words or more, and a camera
 # never sends one. An eighth is far from both; and fewer than 16 words are not enough to say.
@@ -117,7 +116,7 @@ def parse_header(data: bytes, path: Path | str) -> RawHeader:
     if not data:
         raise RawFormatError(path, 0, "an empty file", "a RAW header, '% evt 3.0' or '% evt 2.0'")
     if not data.startswith(b"% "):
-        raise RawFormatError(path, 0, _describe(data), "a RAW header, lines that start with '% '")
+        raise RawFormatError(path, 0, data[:8].hex(" "), "a RAW header, lines that start with '% '")
     fields: dict[str, str] = {}
     offsets: dict[str, int] = {}
     at = 0
@@ -199,19 +198,6 @@ def _interpret(
             found = f"'% {key} {fields[key]}' beside '% format {fields['format']}'"
             raise RawFormatError(path, offsets[key], found, f"one {side}")
     return codecs[0], sizes.get("width"), sizes.get("height")
-
-
-def _describe(data: bytes) -> str:
-    """Say what the first bytes of a file look like."""
-    magics = {
-        b"\x89PNG": "a PNG image",
-        b"\x89HDF": "an HDF5 file",
-        b"PK\x03\x04": "a ZIP archive",
-        b"\x1f\x8b": "a gzip file",
-        b"%PDF": "a PDF document",
-    }
-    name = next((f" ({name})" for magic, name in magics.items() if data.startswith(magic)), "")
-    return data[:8].hex(" ") + name
 
 
 class RawSource(EventSource):
@@ -329,12 +315,6 @@ class RawSource(EventSource):
         if self._decode_into(out) and not out.events and not out.triggers:
             return None
         return out.taken()
-
-    def read(self) -> tuple[Events, Triggers]:
-        """As `EventSource.read`."""
-        # Room for an event a word is seldom filled, and what is not filled takes no memory.
-        words = ((self.size_bytes or 0) - self._position) // self._codec.word.itemsize
-        return self._join(min(max(words, MIN_READ), MAX_READ) + self._codec.burst)
 
     def _decode_into(self, out: Columns) -> bool:
         """Decode until `out` is full, and return False, or to the end of the file, and return True.

@@ -67,14 +67,6 @@ def _name_and_version(owner: Distribution) -> tuple[str, str]:
     return owner.name, owner.version
 
 
-class _Manager(pluggy.PluginManager):
-    """Looks for hooks among a plugin's own names alone, not among those that every module has."""
-
-    def parse_hookimpl_opts(self, plugin: object, name: str) -> pluggy.HookimplOpts | None:
-        """What is said of a hook; None for what is none."""
-        return None if name.startswith("__") else super().parse_hookimpl_opts(plugin, name)
-
-
 class Registry:
     """The installed plugins; made by `Registry.load()`, passed to whoever needs it.
 
@@ -88,7 +80,7 @@ class Registry:
     """
 
     def __init__(self, *plugins: object) -> None:
-        self._manager = _Manager(ENTRY_POINT_GROUP)
+        self._manager = pluggy.PluginManager(ENTRY_POINT_GROUP)
         self._manager.add_hookspecs(hookspecs)
         self._owners: dict[str, Distribution | None] = {}
         self._broken: list[Broken] = []

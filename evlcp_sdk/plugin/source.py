@@ -227,12 +227,7 @@ class EventSource(ABC):
         Raises:
             InputError: The file cannot be read on.
         """
-        return self._join(1 << 20)
-
-    def _join(self, max_events: int) -> tuple[Events, Triggers]:
-        pieces = list(self.stream(max_events))
-        if len(pieces) == 1:
-            return pieces[0]
+        pieces = list(self.stream(1 << 20))
         return Events.concat(e for e, _ in pieces), Triggers.concat(g for _, g in pieces)
 
     def __enter__(self) -> Self:

@@ -5,9 +5,7 @@ import itertools
 import re
 import sqlite3
 import struct
-import zlib
-from collections import OrderedDict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,9 +18,6 @@ from evlcp_sdk.io.urls import split_options
 from evlcp_sdk.plugin.source import Loss
 
 TYPES: Final = ("event_camera_msgs/msg/EventPacket", "event_camera_msgs/EventPacket")
-
-_MOST_HELD: Final = 256
-"""Packets that wait for earlier ones: some seconds of a camera, 30 MB."""
 
 _STEPS: Final = 1_000_000
 _STEPS_A_BYTE: Final = 4
@@ -62,9 +57,7 @@ def open_bag(url: str) -> "BagSource":
 class BagSource(RawSource):
     """The events of a bag's topic, its packets decoded one after another as one stream of words.
 
-    Packets are taken by their numbers, as far as they are in disorder by no more than a few hundred; those
-    that are there twice are left out, and counted (`packets_twice`), and missing ones are the loss
-    `packets_lost`.
+    Packets whose numbers are missing are the loss `packets_lost`.
 
     Args:
         path: The bag.
@@ -75,8 +68,7 @@ class BagSource(RawSource):
         target = Path(path)
         self._stack = ExitStack()
         try:
-            self._order = _Order(_messages(target, topic, self._stack))
-            self._packets = _BagBytes(target, iter(self._order))
+            self._packets = _BagBytes(target, _messages(target, topic, self._stack))
             super().__init__(target, file=self._packets)
         except BaseException:
             self._stack.close()
@@ -90,60 +82,10 @@ class BagSource(RawSource):
         lost = self._packets.lost
         return super().losses | ({"packets_lost": lost} if lost.count else {})
 
-    @property
-    def counts(self) -> dict[str, int]:
-        """As `EventSource.counts`, with packets that were there twice, or not in their order."""
-        found = {"packets_twice": self._order.twice, "packets_out_of_order": self._order.out_of_order}
-        return super().counts | {name: count for name, count in found.items() if count}
-
     def close(self) -> None:
         """Close the bag."""
         super().close()
         self._stack.close()
-
-
-class _Order:
-    """Packets by their numbers, each once; a number far below begins anew, as a driver does.
-
-    Args:
-        packets: As the bag gives them.
-
-    Attributes:
-        twice: How many were left out.
-        out_of_order: How many came after a later one.
-    """
-
-    def __init__(self, packets: Iterable[EventPacket]) -> None:
-        self._packets = packets
-        self._held: dict[int, EventPacket] = {}
-        self._given: OrderedDict[int, int] = OrderedDict()
-        self.twice = self.out_of_order = 0
-
-    def __iter__(self) -> Iterator[EventPacket]:
-        latest = -1
-        for packet in self._packets:
-            digest, same = zlib.crc32(packet.data), self._held.get(packet.seq)
-            if self._given.get(packet.seq) == digest or (same is not None and same.data == packet.data):
-                self.twice += 1
-                continue
-            self.out_of_order += packet.seq < latest <= packet.seq + _MOST_HELD
-            latest = packet.seq
-            while packet.seq in self._held or len(self._held) >= _MOST_HELD:
-                yield self._pop()
-            self._held[packet.seq] = packet
-        while self._held:
-            yield self._pop()
-
-    def _pop(self) -> EventPacket:
-        """The one that goes on where the last one ended, or else the first."""
-        expected = next(reversed(self._given), -1) + 1
-        near = [seq for seq in self._held if expected <= seq <= expected + _MOST_HELD] if self._given else []
-        packet = self._held.pop(min(near or self._held))
-        self._given[packet.seq] = zlib.crc32(packet.data)
-        self._given.move_to_end(packet.seq)
-        if len(self._given) > _MOST_HELD:
-            self._given.popitem(last=False)
-        return packet
 
 
 class _BagBytes(ChunkBytes):

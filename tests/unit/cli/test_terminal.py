@@ -102,7 +102,7 @@ def test_a_bar_says_how_much_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(_common, "console", lambda stderr: screen)
     with bytes_bar("night.raw") as advance:
         advance(1_000_000, 4_000_000)
-    assert "1.0 of 4.0 MB" in said.getvalue()
+    assert "1.0/4.0 MB" in said.getvalue()
 
 
 HEAD = ["series", "distance", *(f"figure {i}" for i in range(9))]

@@ -37,7 +37,7 @@ def some_events(n=3000):
 
 BAD_HEADERS = {
     "empty file": (b"", 0, "an empty file", "a RAW header"),
-    "PNG": (b"\x89PNG\r\n\x1a\n" + bytes(50), 0, "a PNG image", "'% '"),
+    "PNG": (b"\x89PNG\r\n\x1a\n" + bytes(50), 0, "89 50 4e 47", "'% '"),
     "no header": (np.array(GOOD * 10, "<u2").tobytes(), 0, "01 80 02 60", "'% '"),
     "text": (b"hello\n", 0, "68 65 6c 6c 6f 0a", "'% '"),
     "no encoding": (b"% date today\n% end\n", 0, "a header without encoding", "'% evt 3.0'"),
