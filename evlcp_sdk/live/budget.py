@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.rx.boxes import inside
@@ -86,33 +85,23 @@ class Shedder:
         """The events that are left; all where there is no region, as one must be found first."""
         if not level or not regions or not len(events):
             return events
-        if level < 3:
-            if int(events.t_us[0]) % _SWEEP_US < _WHOLE_US:
-                return events
-            name, kept = "rows_outside_regions", self._rows(regions)[np.minimum(events.y, self._size[1] - 1)]
-        else:
-            name, kept = "empty_areas", self._inside(events, regions)
+        rows_only = level < 3
+        if rows_only and int(events.t_us[0]) % _SWEEP_US < _WHOLE_US:
+            return events
+        kept = np.zeros(len(events), np.bool_)
+        for region in regions:
+            left, right = _reach(region.x_px, region.width_px, self._size[0])
+            top, bottom = _reach(region.y_px, region.height_px, self._size[1])
+            kept |= inside(
+                events, (0, top, self._size[0], bottom) if rows_only else (left, top, right, bottom)
+            )
+        name = "rows_outside_regions" if rows_only else "empty_areas"
         self.counts[name] += len(events) - int(np.count_nonzero(kept))
         return events[kept]
 
     def drop(self, events: Events) -> None:
         """Count events that are dropped whole."""
         self.counts["too_late"] += len(events)
-
-    def _rows(self, regions: Sequence[Region]) -> NDArray[np.bool_]:
-        rows = np.zeros(self._size[1], np.bool_)
-        for region in regions:
-            top, bottom = _reach(region.y_px, region.height_px, self._size[1])
-            rows[top:bottom] = True
-        return rows
-
-    def _inside(self, events: Events, regions: Sequence[Region]) -> NDArray[np.bool_]:
-        kept = np.zeros(len(events), np.bool_)
-        for region in regions:
-            left, right = _reach(region.x_px, region.width_px, self._size[0])
-            top, bottom = _reach(region.y_px, region.height_px, self._size[1])
-            kept |= inside(events, (left, top, right, bottom))
-        return kept
 
 
 def _reach(centre_px: float, size_px: float, most: int) -> tuple[int, int]:

@@ -1,13 +1,12 @@
 """How long results take, as quantiles in constant memory."""
 
-import itertools
 import math
+from collections import Counter
 from typing import Final
 
-_FINEST_MS: Final = 1e-3
+_RANGE_MS: Final = (1e-3, 1e6)
 _CELLS_PER_E: Final = 50
 """Cells a factor of e: 2 % each."""
-_CELLS: Final = round(_CELLS_PER_E * math.log(1e9))
 
 
 class DelayTally:
@@ -27,23 +26,24 @@ class DelayTally:
     def __init__(self) -> None:
         self.count = 0
         self.max_ms = 0.0
-        self._cells = [0] * (_CELLS + 1)
+        self._cells = Counter[int]()
 
     def add(self, delay_ms: float) -> None:
         """Count a delay; one that is not positive counts as the shortest."""
         self.count += 1
         self.max_ms = max(self.max_ms, delay_ms)
-        cell = int(math.log(delay_ms / _FINEST_MS) * _CELLS_PER_E) + 1 if delay_ms > _FINEST_MS else 0
-        self._cells[min(cell, _CELLS)] += 1
+        self._cells[math.ceil(math.log(min(max(delay_ms, _RANGE_MS[0]), _RANGE_MS[1])) * _CELLS_PER_E)] += 1
 
     def quantile_ms(self, share: float) -> float:
         """The delay that this share of all does not exceed, ms, to 2 %; NaN where there are none."""
         if not self.count:
             return math.nan
-        due = math.ceil(share * self.count)
-        reached = itertools.accumulate(self._cells)
-        cell = next(cell for cell, many in enumerate(reached) if many >= due)
-        return min(_FINEST_MS * math.exp(cell / _CELLS_PER_E), self.max_ms)
+        left = math.ceil(share * self.count)
+        for cell in sorted(self._cells):
+            left -= self._cells[cell]
+            if left <= 0:
+                break
+        return min(math.exp(cell / _CELLS_PER_E), self.max_ms)
 
     def to_dict(self) -> dict[str, float | int | None]:
         """Count, p50, p99 and maximum, ms, as JSON values."""

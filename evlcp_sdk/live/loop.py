@@ -205,7 +205,7 @@ class LiveLoop:
         pieces = [piece]
         while self._level == len(LEVELS) - 1 and taken_s - piece.arrived_s > self._budget.waiting_ms * 1e-3:
             # All but the newest is too late.
-            newer = self._reader.take_nowait()
+            newer = self._reader.take(0.0)
             if newer is None:
                 break
             self._publish_raw(piece)
@@ -213,7 +213,7 @@ class LiveLoop:
             piece, pieces = newer, [newer]
         events = len(piece.events)
         while events < _TURN_EVENTS and taken_s - piece.arrived_s > 1e-3 * _TURN_US / 8:
-            more = self._reader.take_nowait()
+            more = self._reader.take(0.0)
             if more is None:
                 break
             pieces.append(more)

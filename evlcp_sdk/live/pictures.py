@@ -13,9 +13,6 @@ from evlcp_sdk.values import Events, Region
 WINDOW_US = 10_000
 """How much time a picture shows."""
 
-_FORGET_EVERY = 16
-"""Slices after which what is too old for a picture is forgotten: to look with each takes longer."""
-
 
 @dataclass(frozen=True, eq=False)
 class Picture:
@@ -53,7 +50,6 @@ class PictureSlot:
 
     def __init__(self) -> None:
         self._recent: deque[Events] = deque()
-        self._kept = 0
         self._asked = False
         self._picture: Picture | None = None
         self._drawn = threading.Condition()
@@ -82,10 +78,6 @@ class PictureSlot:
         if not len(events):
             return
         self._recent.append(events)
-        self._kept += 1
-        if not self._asked and self._kept < _FORGET_EVERY:
-            return
-        self._kept = 0
         end_us = int(events.t_us[-1])
         while int(self._recent[0].t_us[-1]) <= end_us - WINDOW_US:
             self._recent.popleft()

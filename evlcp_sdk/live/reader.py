@@ -107,19 +107,16 @@ class Reader:
     def take(self, timeout_s: float) -> Slice | None:
         """The next slice; None after the time-out, or at the end."""
         with self._changed:
-            if not self._waiting and not self._over:
-                self._changed.wait_for(lambda: self._waiting or self._over, timeout_s)
-            if not self._waiting:
+            if (
+                not self._changed.wait_for(lambda: self._waiting or self._over, timeout_s)
+                or not self._waiting
+            ):
                 return None
             piece = self._waiting.popleft()
             self._events -= len(piece.events)
             if not self._source.live:
                 self._changed.notify_all()
             return piece
-
-    def take_nowait(self) -> Slice | None:
-        """The next slice if one waits."""
-        return self.take(0.0) if self._waiting else None
 
     def stop(self) -> None:
         """Read no more; the thread of a source that waits for a camera may go on."""
