@@ -247,47 +247,34 @@ def fields_of_values(columns: Sequence[NDArray[Any]]) -> Fields | None:
     >>> fields_of_values([np.array(c) for c in ([0, 1], [1, 1], [1, 0], [70_000, 90_000])]).which
     (3, 2, 0, 1)
     """
+    numeric = [column.dtype.kind in "iuf" for column in columns]
+    kept = list(range(len(columns)))
     if len(columns) in (3, 5):
-        return _fields_without_one(columns)
-    signs = [k for k, column in enumerate(columns) if _are_signs(column)]
-    if len(columns) not in (2, 4) or not signs:
+        kept = [k for k in kept if not (numeric[k] and _counts(columns[k]))]
+        if len(kept) == len(columns):
+            kept = [k for k in kept if (columns[k] != columns[k][0]).any()]
+    signs = [k for k in kept if _are_signs(columns[k]) and all(numeric[j] for j in kept if j != k)]
+    if len(kept) not in (2, 4) or not signs:
         return None
-    if len(columns) == 2:
-        if len(signs) == 1:
-            return Fields(1 - signs[0], signs[0])
-        return Fields(0, 1) if columns[0].dtype.kind in "iuf" else Fields(1, 0)
-    return _fields_of_four(columns, signs)
-
-
-def _fields_without_one(columns: Sequence[NDArray[Any]]) -> Fields | None:
-    """The same where one column counts the rows, or is the same in all, and so says nothing."""
-    numbers = [column.astype(float) if column.dtype.kind in "iuf" else np.zeros(0) for column in columns]
-    kept = [k for k, steps in enumerate(map(np.diff, numbers)) if len(steps) < 2 or (steps != 1).any()]
-    if len(kept) == len(columns):
-        kept = [k for k, column in enumerate(columns) if (column != column[0]).any()]
-    found = fields_of_values([columns[k] for k in kept]) if len(kept) == len(columns) - 1 else None
-    return None if found is None else found.of(kept)
-
-
-def _fields_of_four(columns: Sequence[NDArray[Any]], signs: list[int]) -> Fields | None:
-    """The same of four columns, of which `signs` may be polarities."""
-    # The last one, or the last but one, where places are 0 and 1, too.
-    sign = ([k for k in signs if k >= 2] or signs)[-1]
-    rest = [k for k in range(4) if k != sign]
-    if any(columns[k].dtype.kind not in "iuf" for k in rest):
-        return None
-
-    def is_place(column: NDArray[Any]) -> bool:
-        return bool((column == np.floor(column)).all() and column.min() >= 0 and column.max() < 1 << 16)
-
-    times = [k for k in rest if not is_place(columns[k])]
-    if not times:
-        # Small whole numbers throughout: the one that rises.
-        times = [k for k in rest if (np.diff(columns[k].astype(np.float64)) >= 0).all()]
+    # Where places are 0 and 1, too, polarities are the last ones.
+    times = rest = [k for k in kept if k != signs[-1]]
+    if len(rest) > 1:
+        # Of small whole numbers throughout, times are those that rise.
+        rising = [k for k in rest if (np.diff(columns[k].astype(np.float64)) >= 0).all()]
+        times = [k for k in rest if not _are_places(columns[k])] or rising
     if len(times) != 1:
         return None
-    x, y = (k for k in rest if k != times[0])
-    return Fields(times[0], sign, (x, y))
+    places = [k for k in rest if k != times[0]]
+    return Fields(times[0], signs[-1], (places[0], places[1]) if places else None)
+
+
+def _counts(column: NDArray[Any]) -> bool:
+    """Whether numbers are those of the rows."""
+    return len(column) > 1 and bool((np.diff(column.astype(np.float64)) == 1).all())
+
+
+def _are_places(column: NDArray[Any]) -> bool:
+    return bool((column == np.floor(column)).all() and column.min() >= 0 and column.max() < 1 << 16)
 
 
 def _are_signs(values: NDArray[Any]) -> bool:
