@@ -192,18 +192,8 @@ def inverted(matrix: Array, least: float, out: Array) -> bool:
     scale, low = np.zeros(n), np.zeros((n, n))
     if not rooted(matrix, 0.0, least, scale, low):
         return False
-    # The root's inverse in place, then its product with itself.
-    for j in range(n):
-        low[j, j] = 1 / low[j, j]
-        for i in range(j + 1, n):
-            value = 0.0
-            for k in range(j, i):
-                value -= low[i, k] * low[k, j]
-            low[i, j] = value / low[i, i]
-    for i in range(n):
-        for j in range(i + 1):
-            value = 0.0
-            for k in range(i, n):
-                value += low[k, i] * low[k, j]
-            out[i, j] = out[j, i] = value * scale[i] * scale[j]
+    for k in range(n):
+        side = np.zeros(n)
+        side[k] = 1.0
+        substituted(low, scale, side, out[k])
     return True

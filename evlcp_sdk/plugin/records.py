@@ -1,15 +1,14 @@
 """What plugins bring besides algorithms: output formats by name, kinds of messages by number."""
 
-import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any, TypeVar
 
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
-from evlcp_sdk.errors import ConfigError, PluginError
+from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.hooks import SinkRecord
-from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.plugin.registry import Registry, load_target
 from evlcp_sdk.spelling import nearest
 
 SUMMARY = "summary.json"
@@ -41,14 +40,7 @@ class InstalledSink:
         if missing := [name for name in record.packages if find_spec(name) is None]:
             how = f"the extra: pip install '{record.extra}'" if record.extra else ", ".join(missing)
             raise ConfigError(f"{self} needs {how}, or leave --sink {record.name} out")
-        module, _, name = record.target.partition(":")
-        try:
-            found = getattr(importlib.import_module(module), name)
-        except (Exception, SystemExit) as fault:
-            raise PluginError(f"{self}: cannot import {record.target}: {fault}") from fault
-        if not isinstance(found, type):
-            raise PluginError(f"{self}: {record.target} is not a class")
-        return found
+        return load_target(str(self), record.target)
 
 
 def installed_sinks(registry: Registry) -> dict[str, InstalledSink]:

@@ -203,17 +203,8 @@ class Registry:
             PluginError: Its target cannot be imported, or does not fill the role; or as `find`.
         """
         entry = self.find(role, id)
-        target = entry.algorithm.target
         who = f"{role} algorithm '{id}' of {entry.distribution}"
-        module, _, name = target.partition(":")
-        try:
-            found: type[Any] = getattr(importlib.import_module(module), name)
-        except (Exception, SystemExit) as fault:
-            raise PluginError(f"{who}: cannot import {target}: {_line(fault)}") from fault
-        abstract = ROLES[role].abstract
-        if not (isinstance(found, type) and issubclass(found, abstract)):
-            raise PluginError(f"{who}: {target} is not a {abstract.__name__}")
-        return found
+        return load_target(who, entry.algorithm.target, ROLES[role].abstract)
 
     def versions(self) -> dict[str, str]:
         """Versions of Python, the SDK, what it computes with, and all distributions that bring algorithms."""
@@ -291,6 +282,22 @@ class Registry:
                     entry = Installed(record, *self.owner(plugin))
                     self._collected.setdefault((record.role, record.id), []).append(entry)
         return self._collected
+
+
+def load_target(who: str, target: str, kind: type[Any] = object) -> type[Any]:
+    """Import the class that a record names as `module:Class`, of a kind.
+
+    Raises:
+        PluginError: It cannot be imported, or is none; the message begins with who has it.
+    """
+    module, _, name = target.partition(":")
+    try:
+        found: type[Any] = getattr(importlib.import_module(module), name)
+    except (Exception, SystemExit) as fault:
+        raise PluginError(f"{who}: cannot import {target}: {_line(fault)}") from fault
+    if not (isinstance(found, type) and issubclass(found, kind)):
+        raise PluginError(f"{who}: {target} is not a {'class' if kind is object else kind.__name__}")
+    return found
 
 
 def _line(fault: BaseException) -> str:
