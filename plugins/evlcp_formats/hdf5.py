@@ -1,5 +1,6 @@
 """HDF5 files, those of MATLAB 7.3 among them: columns in a group, records, or a table without names."""
 
+import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
@@ -45,13 +46,13 @@ def open_hdf5(url: str) -> ColumnSource:
     return ColumnSource(name, opened, unit=options.get("unit"))
 
 
-def _order(text: str) -> str:
+def _order(text: str) -> Fields:
     if sorted(text) != sorted("txyp"):
         raise ValueError("the letters t, x, y and p in the order of the table's columns, such as txyp")
-    return text
+    return Fields(text.index("t"), text.index("p"), (text.index("x"), text.index("y")))
 
 
-def _read(path: Path, stack: ExitStack, order: str | None, swapped: bool) -> EventTable:
+def _read(path: Path, stack: ExitStack, order: Fields | None, swapped: bool) -> EventTable:
     """Records or a group of columns by `h5py`, under one of `_PLACES`, or the only ones.
 
     External storage, links to other files and virtual data sets are refused.
@@ -97,23 +98,19 @@ class _DataSet:
         return block.ravel() if len(self.shape) == 1 else block
 
 
-def _columns_of(path: Path, file: Any, order: str | None) -> tuple[list[ArrayColumn], Fields]:
+def _columns_of(path: Path, file: Any, order: Fields | None) -> tuple[list[ArrayColumn], Fields]:
     """Time, polarity and, if there are any, x and y."""
     at, node = _place_of(path, file)
     is_group = isinstance(node, h5py.Group)
     names = [name for name in node if _is_own(node, name)] if is_group else list(node.dtype.names or ())
+    listed = ", ".join(names) or "no fields"
     if order is not None and names:
-        raise InputError(
-            f"{path}: {at} has {', '.join(names)}: columns = {order!r} is for tables without names"
-        )
+        raise InputError(f"{path}: {at} has {listed}: columns= is for tables without names")
     if (names or is_group) and fields_of(names) is None:
-        raise InputError(f"{path}: {at} has {', '.join(names) or 'no fields'}, expected x, y, p and t")
+        raise InputError(f"{path}: {at} has {listed}, expected x, y, p and t")
     if is_group:
         return choose_columns(path, names, lambda name: _DataSet(path, node[name]), None)
-    fields = None
-    if order is not None:
-        fields = Fields(order.index("t"), order.index("p"), (order.index("x"), order.index("y")))
-    return choose_columns(path, [at], lambda _: _DataSet(path, node), fields, "hdf5:PATH?columns=txyp")
+    return choose_columns(path, [at], lambda _: _DataSet(path, node), order, "hdf5:PATH?columns=txyp")
 
 
 def _place_of(path: Path, file: Any) -> tuple[str, Any]:
@@ -150,10 +147,7 @@ def _check(path: Path, dataset: Any) -> None:
     Raises:
         InputError: Which it is.
     """
-    is_column = (
-        isinstance(dataset, h5py.Dataset) and dataset.shape is not None and 1 <= len(dataset.shape) <= 2
-    )
-    if not is_column:
+    if not isinstance(dataset, h5py.Dataset) or len(dataset.shape or ()) not in (1, 2):
         raise InputError(f"{path}: found {dataset.name}, expected a column of numbers")
     if dataset.is_virtual or dataset.external:
         raise InputError(f"{path}: {dataset.name} is stored in another file, expected it in this one")
@@ -164,14 +158,15 @@ def _check(path: Path, dataset: Any) -> None:
             f"{path}: {dataset.name} is compressed by ECF, Prophesee's own codec, which is not read here:"
             " convert it to RAW by metavision_file_to_raw, or write it without compression"
         )
-    width = dataset.dtype.itemsize
-    if dataset.chunks is not None and int(np.prod(dataset.chunks)) * width > _MOST_CHUNK_BYTES:
+    chunk_bytes = math.prod(dataset.chunks or (0,)) * dataset.dtype.itemsize
+    if chunk_bytes > _MOST_CHUNK_BYTES:
         raise InputError(
-            f"{path}: {dataset.name} has chunks of {int(np.prod(dataset.chunks)) * width / 1e6:.0f} MB,"
+            f"{path}: {dataset.name} has chunks of {chunk_bytes / 1e6:.0f} MB,"
             f" expected at most {_MOST_CHUNK_BYTES / 1e6:.0f}: h5repack makes them smaller"
         )
-    if int(np.prod(dataset.shape)) * width > _MOST_RATIO * path.stat().st_size:
+    size_bytes = path.stat().st_size
+    if dataset.size * dataset.dtype.itemsize > _MOST_RATIO * size_bytes:
         raise InputError(
-            f"{path}: {dataset.name} is said to have {int(np.prod(dataset.shape))} values,"
-            f" more than {path.stat().st_size} bytes can hold"
+            f"{path}: {dataset.name} is said to have {dataset.size} values, more than"
+            f" {size_bytes} bytes can hold"
         )
