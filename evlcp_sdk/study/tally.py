@@ -8,7 +8,6 @@ from typing import Annotated, Any, Self, overload
 
 from pydantic import Field
 
-from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.specs import build
 
 SEGMENT_M = 10
@@ -435,16 +434,4 @@ class Statistics:
             ConfigError: It is something else.
         """
         found = build(cls, table)
-        for start, tally in found.segments.items():
-            for part, whole in _PARTS:
-                if getattr(tally, part) > getattr(tally, whole):
-                    raise ConfigError(f"segments.{start}.{part}: more than {whole}")
         return replace(found, segments=dict(sorted(found.segments.items())))
-
-
-_PARTS = (
-    *(("bit_errors", "bits"), ("erased", "visible"), ("gross", "ranged")),
-    *(("fixes_contradicted", "fixes_refused"), ("fixes_protected", "fixes"), ("fixes_excluded", "fixes")),
-    *(("fixes_beyond", "fixes_protected"), ("fixes_silent", "fixes"), ("fixes_uncovered", "fixes_silent")),
-)
-"""Counts, and what each is a part of."""

@@ -158,9 +158,5 @@ def test_a_kept_plan_is_the_plan(tmp_path: Path) -> None:
     assert kept == replace(plan, scenes=cases[0], links=cases[1])
     for one, other in zip(kept.points, plan.points, strict=True):
         assert [type(v) for v in one.labels.values()] == [type(v) for v in other.labels.values()]
-    deep: Any = 1
-    for _ in range(40):
-        deep = [deep]
-    for change in ({"environment": {"a": deep}}, {"environment": {"a": float("inf")}}):
-        with pytest.raises(ConfigError, match=r"nested more than 32 deep|not finite"):
-            plan_from_dict(plan.to_dict() | change)
+    with pytest.raises(ValueError, match="not JSON compliant"):
+        plan_from_dict(plan.to_dict() | {"environment": {"a": float("inf")}})
