@@ -126,9 +126,6 @@ _STEPS = 60
 _FREE_SIGMA_RAD = 0.5
 """Sigma of an attitude that is not known, about its closed-form start."""
 
-_MOST_AWAY = 10.0
-"""How many times as far as a bar looks it may be: no lens is mistaken for one ten times as long."""
-
 _MOST_USUAL = 4.0
 """Sigmas of what is usual, 1 in 16 000, beyond which it is not the lens or its mount that is off."""
 
@@ -200,18 +197,13 @@ def calibrate(
     contain what is not known of the others. Errors that a bar's points share are those of positions;
     errors of a bar's site are the same in all views.
 
-    Args:
-        views: Bars seen from known places.
-        camera: Where the fit starts, and what is kept of what is not determined.
-        spec: Weights; None for the defaults.
-        limit_px: Uncertainty of the corners, by one parameter, above which it is not determined, px.
+    The fit starts at `camera`, of which is kept what is not determined: by one parameter the corners may be
+    uncertain by `limit_px`.
 
     Raises:
         ConfigError: Not even the focal length is determined, or the views do not fit their places.
     """
     spec = ErrorModel() if spec is None else spec
-    for view in views:
-        _check_near(view, camera, spec)
     seen = [one for view in views if (one := SeenView.of(view, camera, spec)) is not None]
     if not seen:
         raise ConfigError("no view shows a bar at a known site: nothing to calibrate from")
@@ -256,25 +248,6 @@ def calibrate(
         misfit,
         _camera_sigma(covariance + np.outer(off, off)),
     )
-
-
-def _check_near(view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> None:
-    """Raise where a bar looks far nearer than its site and the pose are to each other."""
-    for bar in view.bars:
-        seen = np.flatnonzero(np.isfinite(bar.points_px).all(1))
-        if len(seen) < spec.min_points:
-            continue
-        first, last = seen[0], seen[-1]
-        length_px = float(np.linalg.norm(bar.points_px[last] - bar.points_px[first]))
-        length_m = float(np.linalg.norm(bar.enu_m[last] - bar.enu_m[first]))
-        away_m = float(np.linalg.norm(bar.enu_m.mean(0) - view.enu_m))
-        # Seen at an angle it is nearer than it looks.
-        if away_m * length_px > _MOST_AWAY * camera.focal_px * length_m:
-            looks_m = camera.focal_px * length_m / length_px
-            raise ConfigError(
-                f"the site of bar {bar.transmitter} is {away_m:.0f} m from where the camera is said to be,"
-                f" and in the image it is {looks_m:.0f} m away at the most: one of the places is another's"
-            )
 
 
 def _camera_sigma(covariance: Floats) -> CameraSigma:
@@ -501,14 +474,7 @@ def solve_views(
     loose: Floats,
     common: tuple[float, float] | None = None,
 ) -> SolvedViews:
-    """Least squares over everything.
-
-    Args:
-        views: What is seen.
-        camera: Where the fit starts.
-        loose: What whitens the camera's errors as they are known beforehand, float64 (7, 7).
-        common: Sigmas of an error of place, m, and of a turn, radians, that all views share; None for none.
-    """
+    """Least squares over everything; `camera` is where the fit starts, the others as in `_Model`."""
     surveys = {
         number: sigma
         for view in views

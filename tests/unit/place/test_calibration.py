@@ -136,7 +136,7 @@ def test_a_site_that_is_not_right_is_told() -> None:
 def test_a_pose_in_another_town_is_told_and_not_the_lens() -> None:
     seen = views(np.random.default_rng(3), 4, True)
     away = [dataclasses.replace(v, enu_m=v.enu_m + np.array([0, 111e3, 0])) for v in seen]
-    with pytest.raises(ConfigError, match=r"bar \d is 11\d{4} m from .*in the image it is \d\d m away"):
+    with pytest.raises(ConfigError, match="not as was said"):
         calibrate(away, NOMINAL, POINTS_ONLY)
 
 
