@@ -474,13 +474,8 @@ def fit_pose(
 ) -> tuple[Equations | None, bool]:
     """Levenberg-Marquardt with Huber's weights.
 
-    The damping follows how much of what the equations promise a step wins (Nielsen 1999).
-
-    Args:
-        problem: What is seen and known.
-        start: Where to begin.
-        steps: At most so many.
-        hopeless: A cost above which it counts as settled where steps hardly lower it, nor promise to.
+    The damping follows how much of what the equations promise a step wins (Nielsen 1999). Above the cost
+    `hopeless` it counts as settled where steps hardly lower it, nor promise to.
 
     Returns:
         Where it ends, None where the start has a point behind the camera; and whether it settled there.

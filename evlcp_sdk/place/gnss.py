@@ -98,10 +98,8 @@ def checksum(body: str) -> str:
 def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[NmeaFix]:
     """The fixes of a file, of any talker; a GGA that says that it has no fix gives none.
 
-    Args:
-        path: The file.
-        near: The day of the first fix is that within half a day of this; later ones follow it.
-        usual_sigma_m: Of east and north where a GGA has no GST of its time, of up twice that; 0: none.
+    The day of the first fix is that within half a day of `near`; later ones follow it. `usual_sigma_m` is of
+    east and north where a GGA has no GST of its time, of up twice that; 0: none.
 
     Raises:
         InputError: The file cannot be read.
@@ -217,17 +215,11 @@ class GnssLog:
     def read(
         cls, path: Path | str, clock_zero: datetime | None = None, usual_sigma_m: float = 0.0
     ) -> "GnssLog":
-        """Read a CSV whose columns are named as those of `fixes.csv`, or NMEA with GGA and GST.
+        """Read a CSV whose columns are named as those of `fixes.csv`, or NMEA as `read_nmea` does.
 
-        NMEA is what is named `.nmea`, or starts with a dollar sign.
-
-        t_us, latitude_deg, longitude_deg, height_m, sigma_east_m, sigma_north_m, sigma_up_m; optional
+        NMEA is what is named `.nmea`, or starts with a dollar sign; it needs the UTC of the camera clock's 0.
+        CSV has t_us, latitude_deg, longitude_deg, height_m, sigma_east_m, sigma_north_m, sigma_up_m; optional
         cov_east_north_m2, cov_east_up_m2, cov_north_up_m2.
-
-        Args:
-            path: The file.
-            clock_zero: UTC of the camera clock's 0, which NMEA needs.
-            usual_sigma_m: Of east and north where NMEA has no GST, of up twice that; 0: none.
 
         Raises:
             InputError: The file cannot be read.
@@ -292,15 +284,7 @@ def gnss_fix(
     attitude: Attitude | None,
     spec: ErrorModel,
 ) -> Fix | None:
-    """A fix of satellites as one of the camera; None where no heading tells where the antenna is from it.
-
-    Args:
-        log: The fixes.
-        row: Which one.
-        axes: The local axes.
-        attitude: The camera's, with heading; None where that is not known.
-        spec: Where the antenna is, and how the error lasts.
-    """
+    """A fix of satellites as one of the camera; None where no heading tells where the antenna is from it."""
     here = LocalAxes(*log.place[row].tolist())
     arm, spread = np.zeros(3), log.covariance_m2[row]
     if any(spec.antenna_m):

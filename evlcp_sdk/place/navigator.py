@@ -67,14 +67,8 @@ def estimate_biases(
 ) -> list[EstimatedBias]:
     """Standing states in their units; an error that was stated as none is left out.
 
-    Args:
-        states: Of each part, means in its sigmas, (k,), and covariance, (k, k), as `TrajectoryPoint.standing`
-            has them.
-        camera: The camera as stated.
-        camera_sigma: How precisely.
-        attitude: One with the sigmas that were stated; None where there is none.
-        sites: Where the transmitters stand, by number.
-        spec: An IMU's sigmas.
+    The states are of each part, means in its sigmas, (k,), and covariance, (k, k), as
+    `TrajectoryPoint.standing` has them; the others are as stated.
     """
     found: list[EstimatedBias] = []
     for part, (mean, covariance) in states.items():

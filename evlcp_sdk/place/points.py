@@ -89,13 +89,8 @@ def points_at(
     wrong together do not scatter. What a thin bar's frames do not show of where in a pixel it is, is apart,
     as all points share it; so is by how much a moving image is seen early or late.
 
-    Args:
-        transmitter: Its number.
-        frames: With points, in order of time.
-        t_us: Camera clock, us.
-        period_us: Frames within half of it, before and after, count, us.
-        layout_m: Where its clusters are in it, m, float64 (K, 3).
-        spec: Least number of points, the error within pixels, and that in time.
+    Frames are in order of time; those within half of `period_us` before and after count. `layout_m` is where
+    the bar's clusters are in it, m, float64 (K, 3).
 
     Returns:
         The points, of a bar that stands nowhere yet; None where it is not seen before and after.
@@ -207,16 +202,9 @@ def _scatter(t: Floats, shapes: Floats, sigma: Floats) -> tuple[float, float]:
     """By how much a bar's shape scatters about a straight line in time, in what its points' sigmas say.
 
     By its linear and square terms; what errors of neighbouring points have in common is in these, and nearly
-    all that a pose hangs on. Along the bar at least 1; across it may be less, as a line is seen better than
-    where it is parted.
-
-    Args:
-        t: float64 (n,).
-        shapes: Points about their mean, px, float64 (n, k, 2).
-        sigma: Theirs, float64 (n, k).
-
-    Returns:
-        Along the bar, and across.
+    all that a pose hangs on. Along the bar at least 1; across it, which comes second, it may be less, as a
+    line is seen better than where it is parted. Of times (n,), points about their mean, px, (n, k, 2), and
+    their sigmas (n, k).
     """
     n, count = shapes.shape[:2]
     if n < 3 or count <= _MODES:
@@ -263,14 +251,7 @@ def bar_point(
     """Where the centre of a frame's bar is; None where the frame has no distance.
 
     The distance is that along the optical axis, with its sigma; the bearing is that of the bar's centre in
-    the image. They err together where the camera's focal length does.
-
-    Args:
-        frame: A frame.
-        length_m: Length of the bar.
-        camera: The camera.
-        sigma: How precisely it is known; None: exactly.
-        spec: Errors that a bar's points share; None for the defaults.
+    the image. They err together where the camera's focal length does; without a `sigma` the camera is exact.
     """
     spec = ErrorModel() if spec is None else spec
     depth = frame.range.distance_m

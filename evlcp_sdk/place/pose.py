@@ -63,12 +63,7 @@ def solve_pose(
     headings; else the three-point solutions (Grunert) of the widest triangle of bars. Where the tests fail,
     each part is left out in turn: if one alone explains it, the fix is the one without it.
 
-    Args:
-        views: The bars seen at one time.
-        camera: The camera.
-        attitude: What is known of its attitude; its heading may be None; None for nothing.
-        spec: Bounds and weights; None for the defaults.
-        sigma: How precisely the camera is known; None: exactly.
+    Of the attitude the heading may be unknown, or all; the camera is known exactly without a `sigma`.
 
     Returns:
         The pose, or why the geometry does not determine one, or the parts contradict one another.
@@ -151,14 +146,8 @@ def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: i
     """Where a bar stands by its image, seen from a pose that does without it.
 
     Weighted least squares over its points, which share the shift of its image, for its place; its attitude
-    and length are taken as its site says.
-
-    Args:
-        problem: All that is seen, this bar, too.
-        bar: Its place among `problem.transmitters`.
-        pose: The pose without it.
-        test: Its test value.
-        parts: How many parts are tested.
+    and length are taken as its site says. `bar` is its place among `problem.transmitters`, `test` its test
+    value among those of so many `parts`.
     """
     from scipy.special import chndtr
 

@@ -159,16 +159,10 @@ def survey(
     sigma: CameraSigma | None = None,
     spec: ErrorModel | None = None,
 ) -> list[SurveyedBar]:
-    """Estimate where bars stand.
+    """Estimate where bars stand, from views from known places with known attitudes in the same axes.
 
-    Args:
-        views: From known places with known attitudes; the bars' `transmitter` is the id, their `enu_m` does
-            not count.
-        axes: The local axes of the views.
-        length_m: Length of the bars; of each by its id where they differ.
-        camera: The camera.
-        sigma: How precisely it is known; None: exactly.
-        spec: Weights; None for the defaults.
+    The bars' `transmitter` is the id, their `enu_m` does not count; their length is of each by its id where
+    they differ. The camera is known exactly without a `sigma`.
 
     Raises:
         ConfigError: A view's attitude is not known, no bar is seen, or the views do not fit one another.

@@ -65,15 +65,8 @@ def reckon(
     East and north are one complex number, east + i north: a turn by an angle clockwise is a factor exp(-i
     angle).
     Without a push the velocity turns as the camera does, driven by white acceleration; with one it changes by
-    what is measured.
-
-    Args:
-        motion: How the camera turned, and was pushed.
-        velocity_m_s: At its start, east, north, up, float64 (3,).
-        heading_rad: The camera's at its start, clockwise from north; matters for a push only.
-        heading_sigma_rad: Of it.
-        imu: Estimated biases of the IMU in their sigmas, float64 (0, 1 or 4,).
-        spec: Powers of what is not known.
+    what is measured. Velocity, east, north, up, and the camera's heading, clockwise from north, which matters
+    for a push only, are those at the start; `imu` has its estimated biases in their sigmas (0, 1 or 4,).
     """
     sigmas = imu_sigmas(motion, spec)
     bias = imu * sigmas
@@ -315,13 +308,8 @@ def trajectory_step(
     6), or that changes as an accelerometer says.
 
     A fix beyond `spec.gate_sigmas`, one of GNSS that fails its test at `spec.false_alarm`, is left out, and
-    after many of those in a row the trajectory starts anew.
-
-    Args:
-        state: The last point, None at the start; not changed.
-        fix: One that is given, not before the last.
-        spec: Power of the acceleration, memory of the slow errors, and the gate.
-        imu: How the camera turns between fixes; None, or where it does not know: as the fixes' headings do.
+    after many of those in a row the trajectory starts anew. The fix is a given one, not before the last; the
+    state, None at the start, is not changed. Where no IMU says how the camera turns, the fixes' headings do.
     """
     if state is None:
         return _first(fix)
