@@ -8,7 +8,7 @@ counts.
 import math
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -70,11 +70,8 @@ def load_variants(
 ) -> tuple[Variant, ...]:
     """Resolve variants, each `NAME:TABLE.KEY=VALUE,TABLE.KEY=VALUE`; `NAME:` is the link as it is.
 
-    Args:
-        texts: What `--variant` takes.
-        path: The `link.toml` that they share, or several; None for all defaults.
-        overrides: What `--set` takes; holds for all, and yields to a variant's own settings.
-        registry: Where algorithms are found; None for all that are installed.
+    They share the `link.toml`, or several, None for all defaults; `overrides`, what `--set` takes, hold for
+    all, and yield to a variant's own settings.
 
     Raises:
         ConfigError: All faults, one line each.
@@ -103,20 +100,11 @@ def load_variants(
             links = load_links(path, [*overrides, *settings], registry)
             found.append(Variant(name, settings, named_links(links)))
         except ConfigError as fault:
-            for line in str(fault).splitlines():
-                here = line.removeprefix("--set: ")
-                faults.append(f"--variant {name}: {here}" if _is_about(here, settings) else line)
+            lines = str(fault).splitlines()
+            faults += [f"--variant {name}: {line.removeprefix('--set: ')}" for line in lines]
     if faults:
-        raise ConfigError("\n".join(dict.fromkeys(faults)))
+        raise ConfigError("\n".join(faults))
     return tuple(found)
-
-
-def _is_about(fault: str, settings: Iterable[str]) -> bool:
-    """Whether a fault is one of these settings: it starts with the key, or names the unknown id."""
-    pairs = [[part.strip() for part in setting.split("=", 1)] for setting in settings]
-    # What names a link first names it for that link alone.
-    pairs = [[".".join(key.split(".")[-2:]), value] for key, value in pairs]
-    return any(fault.startswith(key) or f"named '{value}'" in fault for key, value in pairs)
 
 
 _WARM_PACKETS = 2
@@ -193,12 +181,8 @@ def compare_recording(
     """Receive a recording with every variant, and score it where its truth lies beside it.
 
     Its first packets are read and received once before, so that no kernel is loaded or compiled while time
-    runs. The bound is of the frames as the first variant decodes them; several links have none.
-
-    Args:
-        url: The recording, plugins asked first.
-        variants: At least one.
-        advance: Called after every piece with the bytes that are done, and of how many if that is known.
+    runs. The bound is of the frames as the first variant decodes them; several links have none. `advance` is
+    called after every piece with the bytes that are done, and of how many if that is known.
 
     Raises:
         ConfigError: Its sensor, or the link it was sent with, is not that of a variant.
@@ -216,31 +200,24 @@ def compare_recording(
         _warm(source, variants)
     bound = _bound_of(variants[0].links)
     lanes = [_Lane(variant.links) for variant in variants]
-    first_us = last_us = 0
+    first_us, last_us = math.inf, -math.inf
     reading = Stopwatch()
     bounds_m: list[float] = []
-
-    def settle() -> None:
-        """Compute the bounds that are due, while no receiver's time runs."""
-        if bound is not None:
-            bounds_m.extend(bound(view).sigma_m for view in lanes[0].watch.views)
-        for lane in lanes:
-            lane.watch.views.clear()
-
     with open_source(url, registry) as source:
         for number, events in enumerate(_timed(source.chunks(), reading)):
-            first_us = first_us if number else int(events.t_us[0])
-            last_us = int(events.t_us[-1])
+            if events is not None:
+                first_us, last_us = min(first_us, events.t_us[0]), events.t_us[-1]
             # Who comes first brings the events into the cache: each in turn.
             turn = number % len(lanes)
             for lane in lanes[turn:] + lanes[:turn]:
                 lane.feed(events)
-            settle()
+            # Bounds are computed while no receiver's time runs.
+            if bound is not None:
+                bounds_m += [bound(view).sigma_m for view in lanes[0].watch.views]
+            for lane in lanes:
+                lane.watch.views.clear()
             advance(source.position_bytes, source.size_bytes)
-    for lane in lanes:
-        lane.feed(None)
-    settle()
-    recorded_s = (last_us - first_us) * 1e-6
+    recorded_s = max(float(last_us - first_us), 0.0) * 1e-6
     rows = {
         variant.name: lane.measured(url, truth, recorded_s, reading.processor_s)
         for variant, lane in zip(variants, lanes, strict=True)
@@ -248,13 +225,12 @@ def compare_recording(
     return Table(url, rows, tuple(filter(math.isfinite, bounds_m)))
 
 
-def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events]:
-    """The same pieces, the time that it takes to get them counted."""
-    while True:
+def _timed(pieces: Iterator[Events], watch: Stopwatch) -> Iterator[Events | None]:
+    """The same pieces, and None at the end; the time that it takes to get them counted."""
+    piece: Events | None = Events.empty()
+    while piece is not None:
         with watch.running():
             piece = next(pieces, None)
-        if piece is None:
-            return
         yield piece
 
 

@@ -77,14 +77,10 @@ class Measured:
         """The tally of all distances."""
         return self.statistics.total()
 
-    def figure(self, kind: str) -> Figure:
-        """A figure of `measure` with its interval over recordings."""
-        return measure([one.total() for one in self.recordings.values()], kind)
-
     @cached_property
     def ber(self) -> Figure:
         """The bit error rate with its interval over recordings."""
-        return self.figure("ber")
+        return measure([one.total() for one in self.recordings.values()], "ber")
 
     @property
     def us_per_frame(self) -> float:

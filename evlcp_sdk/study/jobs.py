@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
 from threading import Thread
-from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, explained
 
@@ -57,25 +57,14 @@ class Outcome(Generic[J, R]):
     fault: Fault | None = None
 
 
-class Executor(Protocol):
-    """Runs a function over jobs; function, jobs and values can be pickled."""
-
-    def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
-        """Run the function over the jobs; `jobs` is drawn from only when there is room for one.
-
-        Who leaves before the end closes it, which ends what runs.
-
-        Raises:
-            EvlcpError: The executor itself cannot go on.
-        """
-        ...
-
-
 class Inline:
     """Runs jobs one after the other in this process."""
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
-        """See `Executor.run`."""
+        """Run the function over the jobs; `jobs` is drawn from only when there is room for one.
+
+        Function, jobs and values can be pickled. Who leaves before the end closes it, which ends what runs.
+        """
         for job in jobs:
             yield _attempt(function, job)
 
@@ -94,7 +83,7 @@ class Processes:
         self._workers = workers
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
-        """See `Executor.run`."""
+        """See `Inline.run`."""
         import multiprocessing
         from concurrent.futures import ProcessPoolExecutor
         from concurrent.futures.process import BrokenProcessPool
@@ -161,7 +150,7 @@ class DaskCluster:
             raise ConfigError(f"--dask {address}: no Dask scheduler answers there") from fault
 
     def run(self, function: Callable[[J], R], jobs: Iterable[J]) -> Generator[Outcome[J, R], None, None]:
-        """See `Executor.run`."""
+        """See `Inline.run`."""
         from concurrent.futures import CancelledError
 
         client = self._client
@@ -185,6 +174,10 @@ class DaskCluster:
                 pool.shutdown(wait=False)
             with suppress(Exception):
                 client.close(timeout=2)
+
+
+Executor = Inline | Processes | DaskCluster
+"""Runs a function over jobs; its `run` raises `EvlcpError` where it cannot go on."""
 
 
 def stop_workers() -> None:

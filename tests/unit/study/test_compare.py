@@ -210,7 +210,7 @@ def test_variants_share_what_is_set_for_all() -> None:
     assert base.to_dict()["digest"] != other.to_dict()["digest"]
     with pytest.raises(ConfigError) as fault:
         load_variants(["a:", "b:ranging.id=poc"], overrides=["bar.rows=x"])
-    assert str(fault.value).startswith('--set: bar.rows = "x": expected')
+    assert str(fault.value).startswith('--variant a: bar.rows = "x": expected')
 
 
 def test_time_counts_of_frames_only() -> None:
