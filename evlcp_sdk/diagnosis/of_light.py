@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING
 
@@ -198,7 +199,7 @@ def check_light(facts: Facts) -> Found:
         yield Diagnostic(
             "lamp",
             f"{counted(len(lamps), 'lamp')} blinking ({rates}), nothing sends chips",
-            f"is a bar in the picture ({_view(facts)}), and on (`evlcp board status`)?",
+            "is a bar in the picture, and on (`evlcp board status`)?",
         )
         return
     first = facts.sources[0] if facts.sources else None
@@ -212,16 +213,6 @@ def check_light(facts: Facts) -> Found:
         yield Diagnostic("defocus", text, _SHARPER)
     else:
         yield Diagnostic("dim", text, BRIGHTER)
-
-
-def _view(facts: Facts) -> str:
-    """How much the camera sees."""
-    width, height, focal = facts.link.camera.width, facts.link.camera.height, facts.link.camera.focal_px
-    return (
-        f"the picture is {2 * math.degrees(math.atan(width / 2 / focal)):.1f} by"
-        f" {2 * math.degrees(math.atan(height / 2 / focal)):.1f} degrees, {50 * width / focal:.1f} by"
-        f" {50 * height / focal:.1f} m at 50 m"
-    )
 
 
 def _find_unread(facts: Facts) -> Diagnostic | None:
@@ -278,8 +269,8 @@ def _without_rhythm(facts: Facts) -> Diagnostic:
     return Diagnostic(
         "dark",
         "nothing blinks: no rhythm between 60 Hz and 25 kHz anywhere",
-        f"is a bar in the picture ({_view(facts)}), and on (`evlcp board status`)? One that is too weak, too"
-        " far or behind a strong blur shows no rhythm, either",
+        "is a bar in the picture, and on (`evlcp board status`)? One that is too weak, too far or behind a"
+        " strong blur shows no rhythm, either",
     )
 
 
@@ -443,13 +434,10 @@ def check_coverage(facts: Facts) -> Found:
 
 
 def _describe_sources(facts: Facts) -> str:
-    by = {kind: sum(one.kind == kind for one in facts.sources) for kind in ("code", "lamp", "unclear")}
-    words = {
-        "code": f"{counted(by['code'], 'source')} of chips",
-        "lamp": counted(by["lamp"], "lamp"),
-        "unclear": counted(by["unclear"], "unclear source"),
-    }
-    text = ", ".join(text for kind, text in words.items() if by[kind]) or "no source of its own"
+    many = Counter[str](one.kind for one in facts.sources)
+    names = {"code": "source", "lamp": "lamp", "unclear": "unclear source"}
+    words = [counted(many[k], name) + " of chips" * (k == "code") for k, name in names.items() if many[k]]
+    text = ", ".join(words) or "no source of its own"
     return f"{text}; what shines {_sweeps(facts)}" if facts.speed_px_ms else text
 
 

@@ -164,12 +164,6 @@ class BarRegistry:
         alone = len(rivals) == 1
         return site_of_transmitter(sites, number, sent.transmitter_id, alone=alone)
 
-    def of_another_link(self, number: int) -> str:
-        """Name of another link that has a site of a transmitter's id; empty where none has."""
-        sent = self._sent[number]
-        others = (s.link for s in self._sites if s.transmitter_id == sent.transmitter_id and s.link)
-        return next((link for link in others if link != (sent.link or self._alone)), "")
-
     def link_of(self, number: int) -> str:
         """Name of the link that a transmitter's packets have; empty if none was received."""
         sent = self._sent.get(number)

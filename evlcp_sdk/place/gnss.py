@@ -266,11 +266,6 @@ def _starts_with_dollar(path: Path) -> bool:
 def _check_covariance(where: str, spread: Floats) -> None:
     """Whether sigmas and covariances go together."""
     sigma = np.sqrt(np.diag(spread))
-    for name, (a, b) in _CROSSED.items():
-        most = float(sigma[a] * sigma[b])
-        if not abs(spread[a, b]) < most:
-            both = f"{_SIGMAS[a]} times {_SIGMAS[b]}"
-            raise ConfigError(f"{where}: {name} = {spread[a, b]:g}: expected less than {most:g}, {both}")
     # Of the correlations, so that units do not count: below it the inverse has no digit that is right.
     if not np.linalg.eigvalsh(spread / sigma / sigma[:, None])[0] > 3 * np.finfo(float).eps:
         shown = ", ".join(f"{name} = {spread[at]:g}" for name, at in _CROSSED.items())

@@ -137,13 +137,6 @@ class Positioner:
         last = max((f.points_t_us for kept in self._frames.values() for f in kept), default=-math.inf)
         return self._until(last / self._packet_us + 0.5) if math.isfinite(last) else []
 
-    def _named(self, number: int, declared: int | None) -> str:
-        """A transmitter without a site, with what is known of it."""
-        if declared is None:
-            return f"{number} (no id heard)"
-        other = self.bars.of_another_link(number)
-        return f"{number} (id {declared}" + (f", whose site is of link '{other}')" if other else ")")
-
     def _until(self, limit: float) -> list[Fix]:
         """The fixes of the grid times up to a limit, in packet times."""
         fixes = []
@@ -175,26 +168,23 @@ class Positioner:
             site = self.bars.site(number)
             if site is None:
                 continue
-            if self.axes is None:
-                self.axes = LocalAxes.of([site])
             # Gravity and north are those of here, which may be far from the origin of the trajectory.
+            here = here or LocalAxes.of([site])
+            self.axes = self.axes or here
             try:
-                enu = site.layout_positions_m(kind.bar, LocalAxes.of([site]) if here is None else here)
+                enu = site.layout_positions_m(kind.bar, here)
+                sited.append(replace(view, enu_m=enu, survey=site.survey))
             except ConfigError as fault:
                 unplaced.append(str(fault))
-                continue
-            here = LocalAxes.of([site]) if here is None else here
-            sited.append(replace(view, enu_m=enu, survey=site.survey))
         if not views:
             return None
-        if here is None and unplaced:
+        if unplaced and not sited:
             return Fix.refused(t_us, tuple(views), "no-facing", "; ".join(unplaced))
         if here is None or self.axes is None:
             how = [text for number in views if (text := self.bars.contradiction(number))]
             if how:
                 return Fix.refused(t_us, tuple(views), "site-contradicted", "; ".join(how))
-            ids = self.bars.ids
-            which = ", ".join(self._named(n, ids.get(n)) for n in views)
+            which = ", ".join(f"{n} (id {self.bars.ids.get(n, 'not received')})" for n in views)
             return Fix.refused(t_us, tuple(views), "no-site", f"no site is known of transmitter {which}")
         return self._solved(t_us, views, sited, here, self.axes)
 
