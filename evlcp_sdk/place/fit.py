@@ -318,9 +318,12 @@ class Equations:
 def linearize(problem: Problem, at: Fit) -> Equations | None:
     """The problem at a point; None where a point is behind the camera."""
     huber = problem.spec.huber_sigmas
-    points, known, own = problem.points, problem.known, at.local[problem.bar]
-    offset = points[:, :3] - at.position + known.place * own[:, 3:6] + own[:, 2:3] * known.stretched
-    offset += _by(known.turn * own[:, 6:9], known.arm)
+    points, own = problem.points, at.local[problem.bar]
+    survey, root, even = (one[problem.bar] for one in problem.errors)
+    place, turn, stretched = survey[:, :1], survey[:, 1:2], survey[:, 2:3] * points[:, 3:6]
+    arm = skewed(points[:, 3:6])
+    offset = points[:, :3] - at.position + place * own[:, 3:6] + own[:, 2:3] * stretched
+    offset += _by(turn * own[:, 6:9], arm)
     seen = offset @ at.rotation
     if not (seen[:, 2] > 0).all():
         return None
@@ -337,20 +340,20 @@ def linearize(problem: Problem, at: Fit) -> Equations | None:
         )
     direction = seen[:, :2] / seen[:, 2:]
     expected = camera.distort(direction)
-    miss = _by((points[:, 6:8] - expected - _by(own[:, :2], known.root)) * points[:, 8:9], known.even)
+    miss = _by((points[:, 6:8] - expected - _by(own[:, :2], root)) * points[:, 8:9], even)
     size = np.hypot(miss[:, 0], miss[:, 1])
     weight = huber / np.maximum(size, huber)
     cost = float((np.where(size > huber, huber * (2 * size - huber), size**2)).sum())
-    white = known.even * (np.sqrt(weight) * points[:, 8])[:, None, None]
+    white = even * (np.sqrt(weight) * points[:, 8])[:, None, None]
     by_sight = white @ camera.distort_slope(direction) / seen[:, 2][:, None, None]
     by_point = np.concatenate([by_sight, -by_sight @ direction[:, :, None]], -1) @ at.rotation.T
     rows = np.zeros((len(points), 2, LOCAL + SHARED + 1))
     own_errors, shared = rows[:, :, :LOCAL], rows[:, :, LOCAL:-1]
-    own_errors[:, :, :2] = white @ known.root
-    own_errors[:, :, 2:3] = by_point @ known.stretched[:, :, None]
+    own_errors[:, :, :2] = white @ root
+    own_errors[:, :, 2:3] = by_point @ stretched[:, :, None]
     if problem.surveyed:
-        own_errors[:, :, 3:6] = by_point * known.place[:, :, None]
-        own_errors[:, :, 6:] = by_point @ known.arm * -known.turn[:, :, None]
+        own_errors[:, :, 3:6] = by_point * place[:, :, None]
+        own_errors[:, :, 6:] = by_point @ arm * -turn[:, :, None]
     shared[:, :, :3] = -by_point
     shared[:, :, 3:6] = by_point @ skewed(offset)
     by_focal = (expected - camera.centre_px) * (FOCAL_UNIT * problem.camera.focal_px / camera.focal_px)

@@ -163,27 +163,6 @@ class SharedErrors(NamedTuple):
     even: Floats
 
 
-@dataclass(frozen=True, eq=False)
-class KnownSigmas:
-    """What is the same of a problem wherever it is made linear: of each point, with the sigmas of its bar.
-
-    Attributes:
-        place: Sigma of its bar's place, m, float64 (n, 1).
-        turn: Of the turn, radians.
-        stretched: Its arm from its bar's centre by one sigma of the bar's length, m, float64 (n, 3).
-        arm: What a turn does to it, float64 (n, 3, 3).
-        root: A root of the covariance of its bar's shift in the image, px, float64 (n, 2, 2).
-        even: What makes its errors even in all directions, float64 (n, 2, 2).
-    """
-
-    place: Floats
-    turn: Floats
-    stretched: Floats
-    arm: Floats
-    root: Floats
-    even: Floats
-
-
 class KnownAngles(NamedTuple):
     """What an attitude says, or nothing.
 
@@ -271,12 +250,6 @@ class Problem:
         """Where each bar's points are."""
         ends = np.cumsum(np.bincount(self.bar, minlength=len(self.transmitters))).tolist()
         return [slice(first, end) for first, end in zip([0, *ends], ends, strict=False)]
-
-    @cached_property
-    def known(self) -> KnownSigmas:
-        """What is the same wherever it is made linear."""
-        arm_m, (sigma, root, even) = self.points[:, 3:6], (one[self.bar] for one in self.errors)
-        return KnownSigmas(sigma[:, :1], sigma[:, 1:2], arm_m * sigma[:, 2:3], skewed(arm_m), root, even)
 
     @classmethod
     def of(

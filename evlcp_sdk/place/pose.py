@@ -152,9 +152,8 @@ def estimate_fault(problem: Problem, bar: int, pose: Pose, test: float, parts: i
     from scipy.special import chndtr
 
     rows = problem.points[problem.bar == bar]
-    first = problem.parts[bar].start
-    weight = rows[:, 8, None, None] * problem.known.even[first]
-    shift = (weight @ problem.known.root[first]).reshape(-1, 2)
+    weight = rows[:, 8, None, None] * problem.errors.even[bar]
+    shift = (weight @ problem.errors.root[bar]).reshape(-1, 2)
     whole = np.linalg.inv(np.eye(2 * len(rows)) + shift @ shift.T)
     off_m = np.zeros(3)
     for _ in range(_FAULT_STEPS):
