@@ -157,11 +157,21 @@ def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
     return found
 
 
-def feed_events(machine: Any, events: Events, until_us: Sequence[int]) -> list[Any]:
-    """What a framing's machine gives of a recording that is cut at times, and at its end."""
+def feed_events(
+    machine: Any,
+    events: Events,
+    until_us: Sequence[int],
+    keep: Callable[[Any, Events, int], Any] | None = None,
+) -> list[Any]:
+    """What a framing's machine gives of a recording that is cut at times, and at its end.
+
+    `keep` may change its state before each step, by what is to come.
+    """
     state, found, begin = machine.init(), [], 0
     for until in until_us:
         end = int(np.searchsorted(events.t_us, until))
+        if keep is not None:
+            state = keep(state, events[begin:end], until)
         state, new = machine.step(state, events[begin:end], until)
         found += new
         begin = end

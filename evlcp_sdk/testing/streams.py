@@ -20,7 +20,7 @@ from evlcp_sdk.testing.exercises import (
 )
 from evlcp_sdk.testing.law import Subject, expect, expect_same, law
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, random_symbols
-from evlcp_sdk.values import Events, Region, SyncLock
+from evlcp_sdk.values import Events, SyncLock
 
 _PACKETS = 4
 _STEP_US = 1500
@@ -33,21 +33,16 @@ _SAME = 1e-9
 _NEAR_CHIPS = 0.75
 _MOST_BYTES = 1 << 22
 """What a state may take, pickled, however long the stream is."""
-_GIVEN = {"framing": "frames", "synchronization": "locks"}
+_GIVEN = {"framing": "frames", "synchronization": "locks", "detection": "regions"}
 """What a role gives."""
 
 
 @dataclass(frozen=True)
-class _Synchronizer:
-    """A synchronizer in the shape of what a framing compiles to."""
+class _Machine:
+    """A synchronizer, or a detector, in the shape of what a framing compiles to."""
 
-    inner: Any
-
-    def init(self) -> Any:
-        return self.inner.init()
-
-    def step(self, state: Any, events: Events, until_us: int) -> Any:
-        return self.inner.step(state, events.t_us, events.p, until_us)
+    init: Callable[[], Any]
+    step: Callable[[Any, Events, int], Any]
 
     def close(self, state: Any) -> Any:
         return state, []
@@ -57,18 +52,28 @@ class _Synchronizer:
 
 
 def _machine(subject: Subject) -> tuple[Link, Any]:
-    """The link, and what turns its events into frames or locks."""
+    """The link, and what turns its events into frames or locks, or into the regions of each step."""
     link, made = link_of(subject), compile_subject(subject)
-    return link, _Synchronizer(made) if subject.role == "synchronization" else made
+    if subject.role == "synchronization":
+        return link, _Machine(made.init, lambda s, events, until: made.step(s, events.t_us, events.p, until))
+    if subject.role == "detection":
+
+        def detect(state: Any, events: Events, until_us: int) -> Any:
+            state, regions = made.step(state, until_us - _STEP_US, events)
+            return state, [regions]
+
+        return link, _Machine(made.init, detect)
+    return link, made
 
 
 def _recording(subject: Subject, link: Link) -> Events:
-    return recording_of(link, _PACKETS, missing=0.0 if subject.role == "framing" else 0.1)[1]
+    return recording_of(link, _PACKETS, missing=0.1 if subject.role == "synchronization" else 0.0)[1]
 
 
 def _steps(events: Events) -> list[int]:
     last = int(events.t_us[-1]) + 1
-    return [*range(_STEP_US, last + _STEP_US, _STEP_US), last + _FLUSH_US]
+    end = -(-(last + _FLUSH_US) // _STEP_US) * _STEP_US
+    return [*range(_STEP_US, last + _STEP_US, _STEP_US), end]
 
 
 def _any_split(subject: Subject) -> None:
@@ -87,24 +92,20 @@ def _any_split(subject: Subject) -> None:
         expect_same(got, wanted, f"the same {given} from events fed {how} as every 1500 us", _SAME, given)
 
 
+@law("state-kept", "a step leaves the state it is given, which can be pickled")
 def _state_kept(subject: Subject) -> None:
     link, machine = _machine(subject)
     given, events = _GIVEN[subject.role], _recording(subject, link)
-    half = len(events) // 2
-    middle, end = int(events.t_us[half]), int(events.t_us[-1]) + _FLUSH_US
-    state, _ = machine.step(machine.init(), events[:half], middle)
 
-    def rest() -> list[Any]:
-        then, found = machine.step(state, events[half:], end)
+    def branch(state: Any, piece: Events, until_us: int) -> Any:
+        # A branch that is given up, and a state that was away.
+        then, _ = machine.step(state, piece, until_us)
         counts = machine.counts(then)
         expect(all(isinstance(n, int) for n in counts.values()), f"counts of whole numbers, got {counts}")
-        return [*found, *machine.close(then)[1]]
+        return pickle.loads(pickle.dumps(state))
 
-    first = rest()
-    what = f"a step not to change the state it is given: the same {given} again"
-    expect_same(rest(), first, what, name=given)
-    state = pickle.loads(pickle.dumps(state))
-    expect_same(rest(), first, f"the same {given} from a pickled state", name=given)
+    got, wanted = (feed_events(machine, events, _steps(events), keep) for keep in (branch, None))
+    expect_same(got, wanted, f"branches and pickling not to change the state: the same {given}", name=given)
 
 
 @law("clean", "no error in the events of an ideal sensor, every frame in its place")
@@ -147,39 +148,21 @@ def _bounded(subject: Subject) -> None:
 FRAMING = (
     _reads_clean,
     law("any-split", "any split of the events gives the same frames")(_any_split),
-    law("state-kept", "a step leaves the state it is given, which can be pickled")(_state_kept),
+    _state_kept,
     _bounded,
 )
 """Laws of framing."""
 
 
-def _detect(detector: Any, events: Events, keep: Any = None) -> list[list[Region]]:
-    """The regions of each step of a recording."""
-    state = detector.init()
-    found = []
-    for start_us in range(0, int(events.t_us[-1]), _STEP_US):
-        a, b = np.searchsorted(events.t_us, (start_us, start_us + _STEP_US))
-        if keep is not None:
-            state = keep(state, start_us)
-        state, regions = detector.step(state, start_us, events[a:b])
-        found.append(regions)
-    return found
-
-
-def _detector_and_events(subject: Subject) -> tuple[Any, Events]:
-    """A detector, and a recording in which it finds something, if any: of a bar, or else of one light."""
-    detector = compile_subject(subject)
-    events = recording_of(link_of(subject), 2, missing=0.0)[1]
-    if subject.link is None and not any(_detect(detector, events)):
-        # One that looks for single lights sees none in a bar.
-        return _detector_and_events(replace(subject, link=link_of_one_cluster()))
-    return detector, events
-
-
 @law("shapes", "regions of finite places and sizes, each of another id; one where a bar is, or a light")
 def _regions_shapes(subject: Subject) -> None:
-    detector, events = _detector_and_events(subject)
-    found = _detect(detector, events)
+    link, detector = _machine(subject)
+    events = _recording(subject, link)
+    found = feed_events(detector, events, _steps(events))
+    if subject.link is None and not any(found):
+        # One that looks for single lights sees none in a bar.
+        _regions_shapes.test(replace(subject, link=link_of_one_cluster()))
+        return
     for regions in found:
         ids = [region.id for region in regions]
         expect(len(set(ids)) == len(ids), f"regions of different ids, got {ids}")
@@ -189,20 +172,7 @@ def _regions_shapes(subject: Subject) -> None:
     expect(any(found), "a region in a recording of a bar, or of one light; got none")
 
 
-@law("state-kept", "a step leaves the state it is given, which can be pickled")
-def _detection_state_kept(subject: Subject) -> None:
-    detector, events = _detector_and_events(subject)
-
-    def branch(state: Any, start_us: int) -> Any:
-        # A branch that is given up, and a state that was away.
-        detector.step(state, start_us, events[:50])
-        return pickle.loads(pickle.dumps(state))
-
-    got, wanted = _detect(detector, events, branch), _detect(detector, events)
-    expect_same(got, wanted, "branches and pickling not to change what follows", name="regions")
-
-
-DETECTION = (_regions_shapes, _detection_state_kept)
+DETECTION = (_regions_shapes, _state_kept)
 """Laws of detection."""
 
 
@@ -259,7 +229,7 @@ SYNCHRONIZATION = (
     _locks_shapes,
     _finds_time,
     law("any-split", "any split of the events gives the same locks")(_any_split),
-    law("state-kept", "a step leaves the state it is given, which can be pickled")(_state_kept),
+    _state_kept,
     _no_lock_in_noise,
 )
 """Laws of synchronization."""

@@ -451,7 +451,7 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
     "detection": [
         ("shapes", detection(giving(lambda regions: [*regions, *regions])), "regions of different ids"),
         ("shapes", detection(giving(lambda regions: [])), "a region in a recording"),
-        ("state-kept", detection(grown), "not to change what follows"),
+        ("state-kept", detection(grown), "not to change the state"),
     ],
     "framing": [
         ("clean", framing(giving(lambda frames: [])), "got 0"),
