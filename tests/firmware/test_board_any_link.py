@@ -1,6 +1,5 @@
 """Any link on a board, LED by LED: other bars, other codes, characters, chips as they are."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -434,16 +433,6 @@ def test_the_image_of_the_part_plays_them_too(kind: str, stm32) -> None:
     rows, _ = lit_rows(chip.drivers.log[begin:])
     check_round(rows, np.roll(told, -int(told.any(1).argmax()), axis=0), 100)
     assert chip.longest[16 + Dma.IRQ] < 12 * US
-
-
-def test_a_text_by_a_board_and_a_camera(evlcp, tmp_path: Path) -> None:
-    options = options_of(*SERIAL, "air.frames_per_packet=80")
-    done = well(evlcp("loop", "--text", "Tempo 30!", "--seed", 2, "--json", "-o", tmp_path, *options))
-    said = {step.pop("step"): step for step in map(json.loads, done.out.splitlines())}
-    assert said["text"]["texts"] == ["Tempo 30!"]
-    receiver = said["receiver"]
-    assert (receiver["bit_errors"], receiver["warnings"]) == (0, [])
-    assert receiver["frames_sent"] - 1 <= receiver["frames"] <= receiver["frames_sent"]
 
 
 @pytest.mark.parametrize("kind", ["7E2", "8O1, turned"])

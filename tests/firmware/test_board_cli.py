@@ -159,6 +159,7 @@ EMULATE = ("board", "emulate", "native")
         (("loop", "--distance", "5"), 2, None, "the bar, 0.96 m high, fits into the image from 9.6 m on"),
         (("loop", "--set", "bar.rows=102", "--distance", "60"), 2, None, "a link of 102 LEDs, emulated has"),
         (("loop", "--set", "air.chip_rate_hz=30000.0"), 5, None, "emulated: no chip rate of 30000 Hz"),
+        (("loop", "--set", "air.chip_rate_hz=12.5"), 2, None, "a board takes whole chips per second"),
     ],
 )
 def test_a_fault_is_one_line_and_json_too(evlcp, tmp_path, monkeypatch, arguments, code, kind, says) -> None:

@@ -39,12 +39,6 @@ def excess(rows: NDArray[np.uint8], duty: float) -> NDArray[np.float64]:
     return (sums - np.minimum.accumulate(sums, axis=0)).max(1)[1:]
 
 
-def test_the_oracle_counts_every_stretch() -> None:
-    rows = np.random.default_rng(1).integers(0, 2, (40, 96), dtype=np.uint8)
-    every = max(float((rows[a:b].sum(0) - 0.4 * (b - a)).max()) for a in range(40) for b in range(a, 41))
-    assert excess(rows, 0.4).max() == pytest.approx(every)
-
-
 def test_all_ones_at_full_current_are_refused(device: SimulatedBoard, board: Board) -> None:
     assert (board.about.level_max_ma, board.about.mean_max_ma, board.about.burst_chips) == (60, 30, BURST)
     provision(board, GOOD, Settings(level_ma=60))

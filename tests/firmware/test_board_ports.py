@@ -14,7 +14,6 @@ import pytest
 from board_lines import check_fault
 
 from evlcp_sdk.errors import ConfigError
-from firmware_host.board import survey
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.serial_port import SerialTransport
 from firmware_host.ports.transport import open_transport
@@ -92,18 +91,6 @@ def test_a_usb_id_must_be_one(ports: list[SimpleNamespace], opened: Callable[[],
     with pytest.raises(NoBoardError, match=r"2 ports have it: COM7 \(serial number D30A1\), COM8"):
         open_transport("usb:0403:6015")
     assert opened() == ["COM7"]
-
-
-def test_only_likely_ports_are_opened(ports: list[SimpleNamespace], opened: Callable[[], list[str]]) -> None:
-    found = survey.survey(1_000_000)
-    assert opened() == ["COM7"]
-    assert [(f.port.device, f.asked) for f in found] == [("COM3", False), ("COM7", True), ("COM9", False)]
-    survey.survey(1_000_000, usb=UsbFilter.parse("1546"))
-    assert opened() == ["COM9"]
-    survey.survey(1_000_000, every=True)
-    assert opened() == ["COM3", "COM7", "COM9"]
-    with pytest.raises(NoBoardError, match=r"\(COM7\); not asked: COM3, COM9"):
-        survey.find(1_000_000)
 
 
 def test_board_ports(evlcp, ports: list[SimpleNamespace], opened: Callable[[], list[str]]) -> None:

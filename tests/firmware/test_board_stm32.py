@@ -170,15 +170,6 @@ def test_stop_ends_in_the_dark_on_a_stream_that_dies_meanwhile(bar: Bar) -> None
     assert bar.board.status().state == State.PLAYING
 
 
-def test_dead_from_the_start_stays_dark(bar: Bar) -> None:
-    bar.chip.tim1.stop_for_good()
-    begin = len(bar.log)
-    bar.board.start()
-    bar.chip.run(2_000)
-    assert all(s.dark for s in bar.log[begin:])
-    assert bar.board.status().state == State.FAULT
-
-
 def test_no_crystal_then_no_chip(bar: Bar) -> None:
     bar.chip.stop_crystal()
     bar.chip.run(1_000)
@@ -324,17 +315,6 @@ def symbol(name: str) -> int:
         ["arm-none-eabi-nm", build.arm_image("stm32f405")], capture_output=True, text=True, check=True
     ).stdout
     return next(int(line.split()[0], 16) for line in table.splitlines() if line.split()[-1] == name)
-
-
-def test_blank_is_dark_at_once_and_the_next_start_plays_whole(bar: Bar) -> None:
-    for moment in (3_333, 5_050, 7_777):
-        _, times = bar.play(moment, 10)
-        bar.board.blank()
-        assert bar.dark
-        assert max(s.time for s in bar.log if s.dark) - times[-1] < 40 * CHIP  # the request itself took some
-        bar.chip.run(2_000)
-        assert bar.dark
-        assert bar.board.status().state == State.DARK
 
 
 def test_a_swap_leaves_no_chip_out(bar: Bar) -> None:

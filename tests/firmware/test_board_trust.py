@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from board_lines import LINK, Native, NoisyLine, board_on, check_fault, recording, some_bank, symbols_of
+from board_lines import LINK, Native, board_on, check_fault, recording, some_bank, symbols_of
 from hypothesis import given, settings, strategies as st
 
 from firmware_host.board.board import Board, Settings, provision
@@ -224,16 +224,6 @@ def test_a_key_is_kept_and_changed(device: SimulatedBoard) -> None:
     board.set_key(None)
     board_on(device).level(34)
     assert device.bench.level_ma == 34
-
-
-def test_a_noisy_line_with_a_key(device: SimulatedBoard) -> None:
-    board = board_on(NoisyLine(device, 5e-4, 0.02, 0.03, seed=1), nonce=1, latency_s=0.004, tries=12)
-    board.set_key(KEY)
-    for level in range(40):
-        board.level(level)
-        assert device.bench.level_ma == board.status().level_ma == level
-    board.blank()
-    assert board.session.client.retries
 
 
 # -- command line

@@ -5,13 +5,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, board_link, check_fault, options_of, symbols_of, well
+from board_lines import LINK, check_fault, options_of, well
 
-from evlcp_sdk.air.frames import packet_chips
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import InputError
 from firmware_host import flicker
 from firmware_host.board.bank import read_masks
-from firmware_host.protocol.rows import chips_of_rows
 
 AIR = json.loads((Path(__file__).parents[1] / "vectors" / "air-vectors.json").read_text())
 EXAMPLE = AIR["example_packet"]
@@ -49,14 +47,6 @@ def test_every_form_has_the_same_words(evlcp, example: Path) -> None:
     assert [w for w in expected if f"0x{w}u" not in c] == []
     rows = evlcp("tx", "frames", example, *TWO_FRAMES).out.splitlines()[1:]
     assert [r.split()[5] for r in rows] == expected
-
-
-def test_torn_cluster_is_told() -> None:
-    rows = np.zeros((3, 12), np.uint8)
-    rows[1, 0] = 0x80
-    with pytest.raises(ConfigError, match=r"chip 1: the LEDs of cluster 0 differ.*--per-led"):
-        chips_of_rows(rows)
-    assert chips_of_rows(rows, None)[1].tolist() == [1] + [0] * 95
 
 
 @pytest.mark.parametrize(
@@ -151,22 +141,3 @@ def test_a_flickering_payload_ends_with_one(evlcp) -> None:
     done = evlcp("tx", "check", "--random", 1, "--json", *one)
     rows = json.loads(done.out, parse_constant=pytest.fail)["clusters"]
     assert {row["limit_percent"] for row in rows} == {None}
-
-
-def test_pilots_in_some_frames_only(evlcp, tmp_path: Path) -> None:
-    file, settings = tmp_path / "chips.npy", ("air.frames_per_packet=6", "air.pilot_every=4")
-    sparse = options_of(*settings)
-    options = ("tx", "frames", "--random", 2, "--seed", 3, *sparse)
-    link = board_link(*settings)
-    well(evlcp(*options, "--chips", file))
-    expected = np.concatenate([packet_chips(packet, link.codebook, 4) for packet in symbols_of(2, 3, link)])
-    assert np.load(file).tolist() == expected.tolist()
-    masks = read_masks(file, link)
-    assert (masks.packets, masks.packet.pilot_every, len(masks.content)) == (2, 4, len(expected) * 12)
-    rows = [line.split() for line in evlcp(*options, "--format", "table").out.splitlines()[1:]]
-    assert {row[1] for row in rows if row[4] == "-"} == {"1", "2", "3", "5"}
-    words = evlcp(*options, "--format", "hex").out.splitlines()
-    assert [len(line.split()[0]) for line in words] == [8, 4, 4, 4, 8, 4] * 2
-    assert json.loads(evlcp(*options, "--format", "json").out)["link"]["air"]["pilot_every"] == 4
-    for profile in ("wh4x2", "wh8", "raw8"):
-        well(evlcp("tx", "check", "--random", 20, *sparse, "--set", f"modulation.id={profile}"))

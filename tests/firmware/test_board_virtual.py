@@ -19,8 +19,6 @@ from board_lines import (
     symbols_of,
 )
 
-from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import Bank, bank_of
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.emulators.simulated import SimulatedBoard, SimulatedLine
@@ -191,43 +189,6 @@ def test_another_major_version_is_incompatible(device, monkeypatch, major, older
     words = rf"it speaks protocol {MAJOR}\.{MINOR}, this host .*; update the {older}"
     with pytest.raises(IncompatibleError, match=words):
         board_on(device)
-
-
-def test_what_a_watchdog_did_is_told_to_who_comes_back(device: SimulatedBoard, board: Board) -> None:
-    provision(board, some_bank(2), Settings())
-    board.watchdog(Watchdog.DARK, 200)
-    device.run(1_000_000)
-    for _ in range(2):
-        again = board_on(device)
-        assert [state_of(again) for _ in range(2)] == [(State.DARK, BoardFault.WATCHDOG)] * 2
-    again.start()
-    assert again.status().faults == 0
-
-
-def test_too_much_is_told_before_anything_is_sent(board: Board) -> None:
-    with pytest.raises(ConfigError, match="send at most 128 packets"):
-        board.program(some_bank(129))
-    assert board.status().requests <= 3
-    # 2 bytes for each of 16 clusters a frame: 1280 frames fill the 40960 bytes
-    with pytest.raises(ConfigError, match=r"1281 frames takes 40992 bytes.*at most 1280 frames"):
-        board.program(some_bank(link=board_link("air.frames_per_packet=1281")))
-    # 12 bytes per chip: 3413 chips, 26 of the preamble and 32 a frame
-    packet = PacketFormat.of(LINK.codebook, 106)
-    masks = Bank.of_chips(np.zeros((packet.packet_chips, 96), np.uint8), LINK.codebook, packet)
-    with pytest.raises(ConfigError, match="at most 105 frames"):
-        board.program(masks)
-
-
-@pytest.mark.parametrize("rate", [7777, 20_001, 1_000_000])
-def test_a_chip_rate_that_cannot_be_is_told_with_the_nearest(board: Board, rate: int) -> None:
-    def payload(hz: int) -> Bank:
-        return Bank.of_symbols(symbols_of(1), LINK.codebook, chip_rate_hz=hz)
-
-    nearest = min((r for r in range(1, 20_001) if 10_000_000 % r == 0), key=lambda r: abs(r - rate))
-    with pytest.raises(RefusedError, match=f"no chip rate of {rate} Hz.* nearest .* is {nearest}$") as told:
-        board.program(payload(rate))
-    assert told.value.detail == nearest
-    assert board.program(payload(nearest)).swapped
 
 
 def test_save_survives_reset_and_damage(device: SimulatedBoard, board: Board) -> None:

@@ -5,14 +5,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, board_link, symbols_of, well
+from board_lines import LINK, well
 
-from evlcp_sdk.errors import ConfigError
 from firmware_host.board.bank import symbol_chips
 from firmware_host.commands.loop import _receiver
 from firmware_host.emulators import simulated
 from firmware_host.emulators.led_record import LedRecord
-from firmware_host.loop import light_of
 
 
 def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path) -> None:
@@ -75,21 +73,3 @@ def test_wrong_bits_are_said_of_a_light_without_a_distance_too() -> None:
     assert _receiver(step | {"distance_m": None}) == said
     assert _receiver(step | {"distance_m": 30.0}) == f"{said}; distance 30.00 m"
     assert _receiver(step | {"frames": 0, "distance_m": None}) == "1 transmitter; 10 frames were sent"
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ("air.chip_rate_hz=6250.0", "modulation.id=wh8", "air.frames_per_packet=2"),
-        ("bar.rows=90", "bar.cluster_rows=9", "pilots.id=barker13"),
-    ],
-)
-def test_light_is_what_the_symbols_say(settings: tuple[str, ...]) -> None:
-    link = board_link(*settings)
-    symbols = symbols_of(3, 1, link)
-    light = light_of(symbols, link, 500)
-    assert len(light.chips) >= 500
-    assert (light.chips == np.resize(symbol_chips(symbols, link.codebook), light.chips.shape)).all()
-    assert light.rate_hz == link.air.chip_rate_hz
-    with pytest.raises(ConfigError, match="cannot play this link"):
-        light_of(symbols, board_link(*settings, "air.chip_rate_hz=12.5"), 500)

@@ -138,19 +138,6 @@ def test_time_for_kernels_is_left_out() -> None:
     assert 0.02 <= watch.processor_s < 0.05
 
 
-def test_a_kernel_s_time_is_counted_once() -> None:
-    @njit
-    def summed(values: np.ndarray) -> float:  # type: ignore[type-arg]
-        return float((values**2).sum())
-
-    before = COMPILING.elapsed_s
-    assert summed(np.ones(3)) == 3
-    after = COMPILING.elapsed_s
-    assert after > before
-    assert summed(np.ones(3)) == 3
-    assert COMPILING.elapsed_s == after
-
-
 def test_a_warm_up_leaves_nothing_to_compile() -> None:
     """The first compiles what there is not; the second finds all of it."""
     steps: list[str] = []

@@ -58,13 +58,6 @@ def test_a_value_that_may_be_of_two_types_has_one_line() -> None:
     assert refused.value.lines() == ["either = 3: expected a valid string or a table"]
 
 
-def test_all_faults_are_told_at_once() -> None:
-    with pytest.raises(SpecError) as caught:
-        build(Outer, {"inner": {"width_m": 0, "name": 3}, "foo": 1})
-    paths = {path for path, _ in caught.value.faults}
-    assert paths == {("count",), ("inner", "width_m"), ("inner", "name"), ("foo",)}
-
-
 def test_what_the_dataclass_refuses_passes_and_a_hint_stands_for_the_nearest() -> None:
     with pytest.raises(ConfigError, match=r"^count = 13: expected another"):
         build(Outer, {"count": 13})

@@ -106,12 +106,6 @@ def test_gross_rate(profile: str, frames: int, every: int, bit_s: float) -> None
     assert form.gross_bit_s(book.bits_per_symbol, 16) == pytest.approx(bit_s, abs=0.5)
 
 
-def test_the_digest_is_that_of_the_codes() -> None:
-    assert book_of("wh8") == book_of("wh8")
-    assert len({book_of(p).digest for p in PROFILES}) == 3
-    assert json.loads(CHIPS.to_json()) == CHIPS.to_dict() | {"digest": CHIPS.digest}
-
-
 def test_codes_are_checked() -> None:
     with pytest.raises(ConfigError, match="pilots: rows 0 and 1 are equal"):
         Codebook.of_values("x", hadamard(2)[0], np.ones((2, 8), np.int8), hadamard(8))

@@ -1,7 +1,6 @@
 """Signatures, held against `cryptography` itself; faults are one line."""
 
 import hashlib
-import stat
 import struct
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,7 +9,7 @@ import pytest
 
 from evlcp_sdk.air import signing
 from evlcp_sdk.air.blocks import Kind, Message
-from evlcp_sdk.errors import ConfigError, InputError, OutputError
+from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.text import to_toml
 from evlcp_sdk.plugin.registry import Registry
@@ -42,18 +41,6 @@ def test_a_signature_is_that_of_the_documented_bytes(tmp_path: Path) -> None:
     assert signing.TrustedKeys(()).check(BEACON, DIGEST, signature) is None
     other = signing.make_key(tmp_path / "other.pem")
     assert signing.TrustedKeys([signing.TrustedKey(other)]).check(BEACON, DIGEST, signature) is None
-
-
-def test_a_key_is_its_owners_and_stays(tmp_path: Path) -> None:
-    path = tmp_path / "k.pem"
-    signing.make_key(path)
-    assert stat.S_IMODE(path.stat().st_mode) == 0o600
-    before = path.read_bytes()
-    with pytest.raises(OutputError, match="exists; a key is not overwritten"):
-        signing.make_key(path)
-    assert path.read_bytes() == before
-    with pytest.raises(OutputError, match="cannot be written"):
-        signing.make_key(tmp_path / "no" / "k.pem")
 
 
 @pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620, 0o601])

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from evlcp_sdk.air.blocks import HEADER_BYTES, Kind, Message, split
+from evlcp_sdk.air.blocks import Kind
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.air.signing import TrustedKey, TrustedKeys, make_key
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.blocks import BlockCoder, interleaver
+from evlcp_sdk.link.blocks import BlockCoder
 from evlcp_sdk.link.compose import compose, messages_of, packets_of
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.sites import BarSite
 
 LINKS = [
@@ -64,33 +64,6 @@ def test_a_packet_too_short_is_told() -> None:
         coder_of("air.frames_per_packet=1", "bar.rows=6")
 
 
-def test_the_interleaver_is_a_permutation_that_spreads() -> None:
-    for bits in (60, 640, 672, 960, 1280):
-        assert sorted(interleaver(bits)) == list(range(bits))
-    # Frames and clusters of the default packet: each takes its share of every eighth of the code, as a random
-    # draw would, to four standard deviations of the hypergeometric distribution.
-    place = np.empty(960, int)
-    place[interleaver(960)] = np.arange(960)
-    air = place.reshape(10, 16, 6)
-    for taken in [*air, *air.transpose(1, 0, 2)]:
-        counts = np.bincount(taken.ravel() // 120, minlength=8)
-        share = taken.size / 8
-        spread = np.sqrt(share * 7 / 8 * (960 - taken.size) / 959)
-        assert np.abs(counts - share).max() < 4 * spread
-
-
-@pytest.mark.parametrize("overrides", [(), ("error-correction.id=none",)])
-def test_constant_bytes_do_not_make_constant_symbols(overrides: tuple[str, ...]) -> None:
-    coder = coder_of(*overrides)
-    for byte in (0x00, 0xFF, 0x55):
-        payload = bytes([byte]) * (coder.block_bytes - HEADER_BYTES)
-        message = Message(Kind.DATA, 0, 0, payload)
-        symbols = coder.symbols(next(split(message, coder.digest, coder.block_bytes)).pack(coder.block_bytes))
-        # 160 symbols of 64: 2.5 each. No symbol stays on its cluster: a line at the frame rate in the light.
-        assert np.bincount(symbols.ravel(), minlength=64).max() < 16
-        assert (symbols[1:] == symbols[:-1]).mean() < 0.1
-
-
 LOST = [np.s_[:, cluster] for cluster in (0, 7, 15)] + [np.s_[first : first + 3] for first in (0, 3, 7)]
 
 
@@ -112,15 +85,6 @@ def test_silence_and_noise_are_no_block() -> None:
     assert coder.block(few) is None
     for _ in range(100):
         assert coder.block(rng.normal(0, 3, 960).astype(np.float32)) is None
-
-
-def test_another_link_reads_no_block_or_another_digest() -> None:
-    def digest(link: Link) -> bytes:
-        return link.block_coder().digest
-
-    assert digest(load_link()) != digest(load_link(overrides=["modulation.id=wh8"]))
-    assert digest(load_link()) == digest(load_link(overrides=["air.frames_per_packet=12"]))
-    assert digest(load_link()) == bytes.fromhex(load_link().codebook.digest)[:4]
 
 
 SITE = BarSite(7, 35.0, 137.0, 50.0)

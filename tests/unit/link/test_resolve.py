@@ -105,14 +105,6 @@ def test_defaults_are_all_written_out(registry: Registry) -> None:
     assert json.loads(json.dumps(link.table)) == link.table
 
 
-def test_values_reach_the_objects(registry: Registry) -> None:
-    table = {"bar": {"rows": 48}, "ranging": {"id": "centroid", "drop": [1], "window_px": 3}}
-    link = resolve(table, registry)
-    assert link.codebook.clusters == 8
-    assert link.algorithm("ranging") == FakeRanging(drop=(1,), window_px=3.0)
-    assert link.revisions["ranging"] == 3
-
-
 @pytest.mark.parametrize(
     ("override", "section", "key", "value"),
     [
@@ -186,14 +178,6 @@ def test_a_wrong_id_says_exactly_this(registry: Registry) -> None:
         load_link(None, ["ranging.id=joint-scael", "air.frames_per_packet=0"], registry)
     assert expected in str(both.value).splitlines()
     assert len(str(both.value).splitlines()) == 2
-
-
-def test_values_that_do_not_fit_each_other(registry: Registry, tmp_path: Path) -> None:
-    text = "[bar]\ncluster_rows = 7\n[camera]\nwidth = 0\n"
-    assert faults_of(registry, text, tmp_path) == [
-        "link.toml: camera.width = 0: expected greater than 0",
-        "link.toml: bar.cluster_rows = 7: expected a divisor of bar.rows = 96",
-    ]
 
 
 def test_the_digest_holds_table_codebook_and_revisions(registry: Registry) -> None:

@@ -5,16 +5,6 @@ import numpy as np
 CHIP_US = 100.0
 
 
-def count_bins(t_us, p, first_bin, bin_us, known, bins):
-    counts = np.zeros((2, bins))
-    counts[:, : known.shape[1]] = known[:, :bins]
-    b = np.floor(t_us / bin_us).astype(int) - first_bin
-    for polarity in (0, 1):
-        inside = b[(b >= 0) & (b < bins) & (p == polarity)]
-        counts[polarity] += np.bincount(inside, minlength=bins)
-    return counts
-
-
 def correlate(counts, chips, due, steps, min_events, lags):
     """The windows of each lag laid out as a table of chips."""
     rho = np.zeros(lags)
@@ -25,23 +15,6 @@ def correlate(counts, chips, due, steps, min_events, lags):
         if seen >= min_events and fit > 0:
             rho[lag] = min(fit / seen, fit / np.linalg.norm(signed) / np.sqrt(due.sum()))
     return rho
-
-
-def mean_squares(rho, memory):
-    """Mean square of the positive values up to each, as a moving average that starts as a plain one."""
-    out, power, known = [], 0.0, 0
-    for value in rho:
-        if value > 0:
-            known += 1
-            weight = max(1 / known, 1 / memory)
-            power = (1 - weight) * power + weight * value**2
-        out.append(power if known >= memory / 2 else np.inf)
-    return np.array(out)
-
-
-def raise_to_chance(counts, span, first, squares):
-    seen = np.array([counts[:, lag : lag + span].sum() for lag in range(first, first + len(squares))])
-    return np.maximum(squares, 1 / np.maximum(seen, 1))
 
 
 def events_of(

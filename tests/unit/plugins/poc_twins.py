@@ -48,16 +48,6 @@ def correlation(one, other, down, across):
     return np.fft.irfft2(np.divide(spectra, size, out=0 * spectra, where=size > 0), one.shape[1:])
 
 
-def middle(image, min_pixels):
-    """Weighted median (row, column): every lit pixel at its place, as often as it weighs."""
-    if (image > 0).sum() < min_pixels:
-        return [-1, -1]
-    return [
-        int(np.searchsorted(np.cumsum(image.sum(axis, dtype=float)), image.sum(dtype=float) / 2))
-        for axis in (1, 0)
-    ]
-
-
 def scale(middles, apart, seen):
     """The median, px a metre, of pairs that are half as far apart as the farthest, or more."""
     pairs = [(a, b) for a in seen for b in seen if a < b]
@@ -74,14 +64,6 @@ def jackknife(values, weights, first, second, kept):
         rest = kept[(first[kept] != k) & (second[kept] != k)]
         means.append(np.average(values[rest], weights=weights[rest]))
     return np.sqrt((len(means) - 1) * np.var(means))
-
-
-def cut(image, at, rows, columns):
-    if at[0] < 0:
-        return np.zeros((rows, columns), image.dtype)
-    padded = np.pad(image, ((rows, rows), (columns, columns)))
-    top, left = at[0] + rows - rows // 2, at[1] + columns - columns // 2
-    return padded[top : top + rows, left : left + columns]
 
 
 def gaussian(centre, sigma, size):

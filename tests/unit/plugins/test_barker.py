@@ -1,7 +1,5 @@
 """Barker codes and packet synchronization, on events whose timing is known."""
 
-from itertools import groupby
-
 import barker_twins as twins
 import numpy as np
 import pytest
@@ -11,7 +9,7 @@ from evlcp_barker.pilots import Barker13Pilots
 from evlcp_barker.synchronization import BarkerSync
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.pilots import WhPilots
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from evlcp_sdk.air.codebook import BARKER13, Codebook, chips_of_values
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
@@ -63,21 +61,6 @@ def test_more_clusters_than_codes_are_refused():
         Barker13Pilots().codes(27)
 
 
-@pytest.mark.parametrize("n", [0, 1, 400])
-@pytest.mark.parametrize("skipped", [0, 3])
-@pytest.mark.parametrize(("first", "known", "bins"), [(0, 0, 50), (90, 7, 40), (105, 40, 40), (-20, 3, 0)])
-def test_counts(n, first, known, bins, skipped):
-    rng = np.random.default_rng(n)
-    t = 1000 + rng.integers(0, 4, n).cumsum()
-    p = rng.integers(0, 2, n).astype(np.uint8)
-    before = rng.integers(0, 9, (2, skipped + known)).astype(float)
-    # Quarters of us are exact in binary: the twin may divide where the kernel compares.
-    want = twins.count_bins(t, p, first, 11.25, before[:, skipped:], bins)
-    counts = np.empty((2, bins))
-    _kernels.count_bins(t, p, (first, 11.25, skipped), before, counts)
-    assert_array_equal(counts, want)
-
-
 @pytest.mark.parametrize(("steps", "min_events", "share"), [(4, 0, 1), (10, 0, 1), (10, 520, 1), (4, 0, 0.7)])
 @pytest.mark.parametrize("seed", range(4))
 def test_correlation(seed, steps, min_events, share):
@@ -94,19 +77,6 @@ def test_correlation(seed, steps, min_events, share):
     assert_allclose(rho, want, rtol=1e-12, atol=1e-12)
     assert top == rho.max()
     assert abs(int(rho.argmax()) - at) <= 1
-
-
-@pytest.mark.parametrize("lag", [0, 30, 41])
-def test_mean_squares_are_no_less_than_chance(lag):
-    rng = np.random.default_rng(lag)
-    counts = rng.poisson(np.linspace(3, 0, 100) ** 2 / 3, (2, 100)).astype(float)
-    rho, past = rng.uniform(0, 0.36, 60), (0.03, 10, 10)
-    squares, plain = np.empty(60 - lag), np.empty(60 - lag)
-    end = _kernels.mean_squares(rho, counts, 40, lag, past, squares)
-    assert _kernels.mean_squares(rho, np.full((2, 100), 1e9), 40, lag, past, plain) == end == (plain[-1], 10)
-    want = twins.raise_to_chance(counts, 40, lag, plain)
-    assert 0 < np.count_nonzero(want > plain) < len(want)
-    assert_allclose(squares, want, rtol=1e-12)
 
 
 @pytest.mark.parametrize("rate_hz", [1e5, 5e5, 2e6])
@@ -128,19 +98,6 @@ def test_noise_that_ends_at_once_is_no_preamble(rate_hz):
             assert not locks
 
 
-def test_mean_square_of_the_positive():
-    rng = np.random.default_rng(0)
-    rho = np.maximum(rng.normal(0, 0.1, 300), 0)
-    out, parts, crowd = np.empty(300), np.empty(300), np.full((2, 340), 1e9)
-    power, known = _kernels.mean_squares(rho, crowd, 40, 0, (0.0, 0, 100), out)
-    want = twins.mean_squares(rho, 100)
-    assert_allclose(out, want, rtol=1e-12)
-    assert (power, known) == (out[-1], 100)
-    middle = _kernels.mean_squares(rho, crowd, 40, 0, (0.0, 0, 100), parts[:77])
-    assert _kernels.mean_squares(rho, crowd, 40, 77, (*middle, 100), parts[77:]) == (power, known)
-    assert_array_equal(parts, out)
-
-
 # From which correlation on it is a preamble
 
 
@@ -154,28 +111,6 @@ OWN = SLOW | {
     "pulses of three": np.array([*map(int, "001001010100001100100010010001100010001")], np.uint8),
     "without return": np.array([*map(int, "1111100110100100001010111011000")], np.uint8),
 }
-
-
-@pytest.mark.parametrize("modulation", PROFILES)
-@pytest.mark.parametrize("pilots", [WhPilots(), Barker13Pilots()])
-def test_pair_codes_of_four_clusters_and_more_need_half(pilots, modulation):
-    words = PROFILES[modulation].codewords()
-    for clusters in (4, 8, 16, 26):
-        book = Codebook("own", pilots.preamble(), pilots.codes(clusters), words)
-        assert least_correlation(book, FRAMES, 1) == 0.5
-    # What one cluster sends resembles the preamble: nothing cancels.
-    lone = Codebook("own", pilots.preamble(), pilots.codes(1), words)
-    assert least_correlation(lone, FRAMES, 1) == 0.7
-
-
-@pytest.mark.parametrize("name", OWN)
-def test_the_share_that_tells_is_that_of_answers_behind_edges(name):
-    """Chip by chip, by hand: an answer ln((k + 2) / (k + 1)) in the k-th chip of a run."""
-    told = lost = 0.0
-    for _, run in groupby(OWN[name].tolist()):
-        first, *late = [np.log((k + 2) / (k + 1)) for k, _ in enumerate(run)]
-        told, lost = told + first, lost + sum(late)
-    assert preamble_share(OWN[name]) == pytest.approx(told / (told + lost))
 
 
 @pytest.mark.parametrize("clusters", [1, 4, CLUSTERS])
@@ -308,16 +243,6 @@ def test_the_lock_is_kept_across_missing_preambles():
     assert locks[-1].chip_us == pytest.approx(twins.CHIP_US * (1 - 40e-6), rel=6e-6)
 
 
-def test_one_stray_preamble_does_not_move_the_lock():
-    rng = np.random.default_rng(6)
-    chips = packets_of(rng, 8)
-    at = 3 * FORMAT.packet_chips + 150
-    chips[at : at + 26] = chips[:26]
-    locks, state = locks_of(*twins.events_of(chips, rng, START_US))
-    assert_allclose(numbers(locks), np.arange(8), atol=2e-3)
-    assert state.clock.packet == 7
-
-
 @pytest.mark.parametrize("jump_us", [1_234, 17_300, -9_000])
 def test_the_second_preamble_after_a_jump_is_believed(jump_us):
     rng = np.random.default_rng(7)
@@ -375,23 +300,6 @@ def test_the_clock_tolerance_is_a_bound(ppm, tolerance_ppm):
     # The packets are heard where they are all the same.
     late = [lock.packet_t_us - START_US - k * PERIOD_US * (1 + ppm * 1e-6) for k, lock in enumerate(locks)]
     assert np.ptp(late) < 8
-
-
-@pytest.mark.parametrize("half", [0, 1])
-def test_a_preamble_half_in_the_dark_spoils_nothing(half):
-    rng = np.random.default_rng(12)
-    t, p = twins.events_of(packets_of(rng, 10), rng, START_US, ppm=30)
-    chip = (t - START_US) / twins.CHIP_US - 5 * FORMAT.packet_chips
-    dark = (chip > 13 * half) & (chip < 13 * (half + 1))
-    locks, state = locks_of(t[~dark], p[~dark])
-    steady, _ = locks_of(t, p)
-    usual = {round(n): lock for n, lock in zip(numbers(steady), steady, strict=True)}
-    assert len(locks) >= 9
-    assert state.clock.packet == 9
-    for n, lock in zip(numbers(locks), locks, strict=True):
-        assert n == pytest.approx(round(n), abs=2e-3)
-        assert lock.packet_t_us == pytest.approx(usual[round(n)].packet_t_us, abs=4)
-        assert abs(lock.chip_us / usual[round(n)].chip_us - 1) < 30e-6
 
 
 def starts_of(locks):

@@ -18,7 +18,6 @@ from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.frames import frames_of
 from evlcp_sdk.study.match import match
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums
-from evlcp_sdk.values import PresenceMap
 
 PREAMBLE = [0, 1, 0, 0, 1, 1]
 PILOTS = np.array([[0, 1, 1, 0, 0, 1, 0], [1, 1, 0, 0, 1, 0, 1], [0, 0, 1, 0, 1, 1, 0]])
@@ -93,78 +92,6 @@ def test_presence_is_bayes_rule_over_edges(seed: int) -> None:
             want = [0.0] * 3
         np.testing.assert_allclose(found.probability[:, r, c], want, rtol=1e-5)
     assert (found.selected == (found.probability >= 0.5)).all()
-
-
-KEYS = ["".join(key) for many in (2, 3) for key in itertools.product("01", repeat=many)]
-"""What was sent in a chip and in the one or two before."""
-
-
-def spelled(word: list[int], chip: int, before: int, after: int) -> str:
-    """The chip of a word and the two before it as far as they are known, "" where no edge is: "01", "101"."""
-    sent = ["?" if c < 0 else str(c) for c in (-1, before, *word, after)]
-    last = "".join(sent[chip : chip + 3])
-    return "" if "?" in last[1:] else last.lstrip("?")
-
-
-def logs_of(counts: dict[str, np.ndarray], counted: float) -> dict[str, np.ndarray]:
-    """Log-likelihood of each sum behind each two and three chips, of histograms of these."""
-    everything = sum(counts[key] for key in KEYS if len(key) == 2)
-    prior, alike, found = 9 / everything.sum(), everything / everything.sum(), {}
-    for key in KEYS:
-        more = counts[key] + (counted * found[key[1:]] if len(key) == 3 else 0)
-        found[key] = more / more.sum() if more.sum() else alike
-    return {key: np.log((share + prior) / (1 + 5 * prior)) for key, share in found.items()}
-
-
-@pytest.mark.parametrize("seed", range(2))
-def test_decoding_is_the_likeliest_word_as_pilots_and_the_others_teach(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    words = Ppm(4, 1).codewords()
-    book = Codebook("x", np.array(PREAMBLE), PILOTS, words)
-    symbols, before, after = rng.integers(0, 4, 3), [1, 0, -1], [0, -1, 1]
-    sums = ideal_sums(book, symbols, after=np.maximum(after, 0), missing=0.3, seed=seed)
-    sums += rng.integers(-1, 2, sums.shape).astype(np.int16)
-    # Of some too little is seen to teach others.
-    sums[7:, 17:] = rng.integers(-1, 2, sums[7:, 17:].shape)
-    shown = ideal_presence(3)
-    presence = PresenceMap(0.9 * shown.probability, shown.grid_px, shown.selected, shown.pixels)
-    decode = EdgeDecoding(max_events=2, pair_count=40, independent_pixels=0.07).compile(book)
-    soft = decode(presence, sums, np.array(before, np.int8), np.array(after, np.int8))
-
-    mine = presence.probability.repeat(2, 1).repeat(2, 2) > 0.5
-    seen = [np.clip(sums[:, : one.shape[0], : one.shape[1]], -2, 2)[:, one] + 2 for one in mine]
-
-    def sent(k: int, word: int) -> list[str]:
-        return [spelled(words[word].tolist(), chip, before[k], after[k]) for chip in range(5)]
-
-    def taught(k: int, keys: list[str]) -> dict[str, np.ndarray]:
-        """Histograms of a cluster's pixels by what was sent in its chips."""
-        found = {key: np.zeros(5) for key in KEYS}
-        for key, numbers in zip(keys, seen[k], strict=False):
-            for one in {key, key[-2:]} - {""}:
-                found[one] += 0.9 * np.bincount(numbers, minlength=5)
-        return found
-
-    def fits(k: int, *parts: dict[str, np.ndarray]) -> np.ndarray:
-        logs = logs_of({key: sum(part[key] for part in parts) for key in KEYS}, 40)
-        terms = [
-            [logs[key][seen[k][7 + chip]].sum() if key else 0 for chip, key in enumerate(sent(k, word))]
-            for word in range(4)
-        ]
-        return 0.07 * 0.9 * np.sum(terms, 1)
-
-    pilots = [
-        taught(k, [spelled(code, c, -1, -1) for c in range(7)]) for k, code in enumerate(PILOTS.tolist())
-    ]
-    first = np.array([fits(k, *pilots) for k in range(3)])
-    sure = np.ptp(np.sort(first)[:, -2:], axis=1) >= 5
-    assert 0 < sure.sum() < 3
-    own = [taught(k, [""] * 7 + sent(k, int(first[k].argmax())) if sure[k] else []) for k in range(3)]
-    for k in range(3):
-        fit = fits(k, *pilots, *(one for other, one in enumerate(own) if other != k))
-        assert soft.symbols[k] == fit.argmax()
-        best = [max(fit[:2]) - max(fit[2:]), max(fit[0], fit[2]) - max(fit[1], fit[3])]
-        np.testing.assert_allclose(soft.llr[k], best, rtol=1e-4, atol=1e-3)
 
 
 @pytest.mark.parametrize("last", [0, 1])

@@ -7,7 +7,7 @@ from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
 from evlcp_poc.correlation import blob_band, full_band, pair_shifts, phase_only_correlation
 from evlcp_poc.ranging import PocRanging
-from numpy.testing import assert_allclose, assert_array_equal
+from numpy.testing import assert_allclose
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
@@ -15,7 +15,6 @@ from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedTable
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
-SEEDS = range(3)
 CAMERA, BAR = CameraModel(), BarLayout()
 PANEL = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
 LINK = load_link()
@@ -60,29 +59,6 @@ def test_what_has_no_phase_counts_for_nothing():
     # Of an even image, the mean alone.
     assert_allclose(found[:, 0], 1 / 48, rtol=1e-6)
     assert not found[:, 1].any()
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_medians_and_cuts_of_maps(seed):
-    rng = np.random.default_rng(seed)
-    maps = (rng.integers(0, 9, (6, 11, 7)) / 8 * (rng.random((6, 11, 7)) < 0.2)).astype(np.float32)
-    maps[1] = 0
-    maps[2], maps[2, 0, :4] = 0, 1
-    maps[3], maps[3, -1, -3:] = 0, 1
-    middle, apart = np.empty((6, 2), np.int64), np.abs(np.subtract.outer(np.arange(6.0), np.arange(6)))
-    scale, *reach = _kernels.find_middles(maps, apart, 4, middle)
-    want = [twins.middle(image, 4) for image in maps]
-    assert middle.tolist() == want
-    assert want[1] == want[3] == [-1, -1]
-    seen = [k for k in range(6) if want[k][0] >= 0]
-    assert reach == np.max([np.abs(np.argwhere(maps[k]) - want[k]).max(0) for k in seen], axis=0).tolist()
-    assert scale == pytest.approx(twins.scale(middle, apart, seen))
-    # Larger and smaller than the maps, even and odd.
-    for rows, columns in [(4, 3), (14, 12), (5, 8), (30, 30)]:
-        out = np.empty((rows, 6, columns), np.float32)
-        _kernels.cut_maps(maps, middle, out)
-        for n, image in enumerate(maps):
-            assert_array_equal(out[:, n], twins.cut(image, middle[n], rows, columns))
 
 
 # Exact shifts

@@ -122,13 +122,6 @@ def test_what_the_lens_scatters_is_no_light_and_a_dim_one_beside_is(rate_hz: flo
     assert places_of(found, 20_000, -70) < 0.03
 
 
-def test_a_framing_names_what_finds_its_lights() -> None:
-    assert link_of(500.0).table["detection"]["id"] == "spots"
-    assert resolve({}).table["detection"] == {"id": "rhythm"}
-    both = resolve({"bar": ONE, "framing": {"id": "uart"}, "detection": {"id": "whole"}})
-    assert both.table["detection"]["id"] == "whole"
-
-
 def beside_one_another(rng: np.random.Generator, places: dict[int, tuple[float, float]]) -> Events:
     """Lights of their own edges so many rows below the shaking place, from a time to a time, s."""
     parts = []

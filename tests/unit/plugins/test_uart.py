@@ -13,11 +13,11 @@ from typing import Any
 import numpy as np
 import pytest
 from evlcp_uart import _kernels
-from evlcp_uart.characters import Characters, Parity
+from evlcp_uart.characters import Parity
 from evlcp_uart.decoder import Character
 from evlcp_uart.framing import Uart, read_characters
 from evlcp_uart.inference import infer
-from evlcp_uart.light import BEFORE, CONTEXTS, TICKS
+from evlcp_uart.light import TICKS
 from scipy.io import savemat
 
 import evlcp_sdk as evlcp
@@ -32,7 +32,6 @@ from evlcp_sdk.values import Events, Packet
 from tests.conftest import ROOT
 
 BAR = {"rows": 6, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
-CHARACTERS = Characters(7, "even", 2)
 BIT_504_US = 1e6 / 504
 
 
@@ -280,52 +279,6 @@ def test_llrs_tell_the_truth() -> None:
     assert right[wrong].mean() < right[~wrong].mean()
 
 
-@pytest.mark.parametrize("parity", ["none", "odd", "even"])
-def test_scores_of_characters_are_those_of_all_words(parity: Parity) -> None:
-    characters = Characters(5, parity, 1)
-    rng = np.random.default_rng(1)
-    evidence = rng.normal(0, 5, (60, CONTEXTS))
-    places = np.arange(characters.bits) * 4
-    for likeliest in (False, True):
-        out = np.empty(60 - places[-1])
-        code = ("none", "odd", "even").index(parity)
-        _kernels.character_scores(evidence, places, 5, code, likeliest, out)
-        at = np.arange(len(out))[:, None] + places
-        every = []
-        for value in range(32):
-            word = [1] * BEFORE + levels_of(np.array([value]), 5, parity, 1)
-            contexts = [int("".join(map(str, word[k : k + BEFORE + 1])), 2) for k in range(characters.bits)]
-            every.append(evidence[at, contexts].sum(1))
-        np.testing.assert_allclose(characters.likelihoods(evidence[at]), np.array(every).T)
-        wanted = np.max(every, 0) if likeliest else np.logaddexp.reduce(every, 0)
-        # Where a character is unlikely, its likeliest word stands for all.
-        bound = np.max(every, 0)
-        wanted = np.where(bound > 0, wanted, bound)
-        # A light that stands as for a space is no character, either.
-        wanted -= np.maximum(evidence[at, 0].sum(1), 0)
-        np.testing.assert_allclose(out, wanted - 5 * math.log(2), atol=1e-9)
-
-
-def test_evidence_of_a_bit_is_the_likelihood_of_its_counts() -> None:
-    rng = np.random.default_rng(2)
-    counts = rng.poisson(0.4, (2, 50)).astype(np.int32)
-    rates = rng.gamma(1.0, 0.3, (3, 2, 8))
-    gains, shares, doubt = np.array([0.5, 2.0]), np.array([0.3, 0.7]), 0.01
-    costs = rates.sum((1, 2))[:, None] * gains - np.log(shares)
-    out = np.empty((50 - 8 + 1, 3))
-    logs = np.log(rates).transpose(1, 2, 0).copy()
-    _kernels.bit_evidence(counts, logs, np.log(gains), costs, 1.0, doubt, out)
-    for s in range(len(out)):
-        window = counts[:, s : s + 8]
-        likely = np.zeros(3)
-        for context in range(3):
-            for gain, share in zip(gains, shares, strict=True):
-                mean = gain * rates[context]
-                likely[context] += share * np.prod(mean**window * np.exp(-mean))
-        said = np.log((1 - doubt) * likely / likely.max() + doubt)
-        np.testing.assert_allclose(out[s], said - said[-1], atol=1e-9)
-
-
 @pytest.mark.parametrize(
     ("seed", "pause", "after_pause"), [(4, 0, 5.0), (4, 3, 2.0), (6, 3, 2.0), (6, 2, 4.5)]
 )
@@ -495,18 +448,6 @@ def test_a_light_the_other_way_round_is_read_as_it_is(
     state, more = decoder.close(state)
     assert [c.value for c in found + more] == sent.tolist()
     assert state.given["frames_inverted"] == (len(sent) if (idle == "on") != mark_on else 0)
-
-
-def test_fixed_bits_speak_as_all_words_say() -> None:
-    """Against a sum over every row of eleven bits, of which some are characters."""
-    evidence = np.random.default_rng(1).normal(size=(3, 11, CONTEXTS))
-    rows = np.array(list(itertools.product((0, 1), repeat=11)))
-    known = np.pad(rows, ((0, 0), (BEFORE, 0)), constant_values=1)
-    contexts = sum(known[:, k : k + 11] << (BEFORE - k) for k in range(BEFORE + 1))
-    worth = np.exp(evidence[:, np.arange(11), contexts].sum(2))
-    fits = (rows[:, 0] == 0) & (rows[:, 1:9].sum(1) % 2 == 0) & rows[:, 9] & rows[:, 10]
-    expected = np.log(worth[:, fits.astype(bool)].mean(1) / worth.mean(1))
-    np.testing.assert_allclose(CHARACTERS.framed(evidence), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("clock", [-0.025, 0.02])

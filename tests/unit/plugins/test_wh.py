@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import wh_twins as twins
 from evlcp_wh import _kernels
-from evlcp_wh.decoding import INDEPENDENT_PIXELS, LearnedDecoder, MlSoft, WhTransform, match_words
+from evlcp_wh.decoding import LearnedDecoder, MlSoft, WhTransform, match_words
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts
 from evlcp_wh.pilots import WhPilots
@@ -112,72 +112,6 @@ def test_words_are_matched(clusters, bits, length, more):
         for got, want in zip(found, twins.match_words(values, words), strict=True):
             assert_allclose(got, want, rtol=1e-9, atol=1e-12)
         assert least == np.abs(found[2]).min()
-
-
-def signs_of(codes):
-    return (codes > 0).astype(np.uint64)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(("grid", "most"), [(2, 1), (3, 2)])
-@pytest.mark.parametrize("prior", [0.5, 1.0])
-def test_worth_is_learned_and_summed(seed, grid, most, prior):
-    rng = np.random.default_rng(seed)
-    sums = random_sums(rng, (28, 13, 10))
-    # One cluster or none shows in a cell, so that probabilities sum to one at the most.
-    probability = rng.dirichlet(np.full(CLUSTERS + 1, 0.1), (13 // grid, 10 // grid)).T[:-1].swapaxes(1, 2)
-    probability = np.ascontiguousarray(probability, np.float32)
-    assert ((probability > 0.5).sum((1, 2)) > 0).any()
-    pairs, signs, worth = np.empty((14, 130), np.uint8), signs_of(CODES), np.empty((2 * most + 1) ** 2)
-    _kernels.learn_worth(sums, most, signs, probability, grid, prior, pairs, worth)
-    counts = twins.count_pairs(sums[:16], CODES, probability, grid, most, 0.0)
-    worth = worth.reshape(counts.shape[1:])
-    assert_allclose(worth, twins.log_ratio(counts, prior), rtol=1e-6, atol=1e-9)
-    out = np.zeros((CLUSTERS, 6))
-    _kernels.sum_worth(pairs, 10, signs, probability, grid, worth.ravel(), (0.2, 4.0), out)
-    want = twins.sum_worth(sums, CODES, probability, grid, 0.2, worth, 0.2)
-    assert_allclose(out, want, rtol=1e-6, atol=1e-9)
-
-
-@pytest.mark.parametrize("value", [-1, 1])
-def test_a_pilot_of_one_value_says_of_the_other_the_same_with_signs_changed(value):
-    rng = np.random.default_rng(0)
-    sums, cells = random_sums(rng, (16, 12, 8)), np.ones((1, 6, 4), np.float32)
-    codes, worth = np.full((1, 8), value), np.empty(49)
-    counts = twins.count_pairs(sums, codes, cells, 2, 3, 0.0)
-    known = int(value > 0)
-    assert not counts[1 - known].any()
-    counts[1 - known] = counts[known, ::-1, ::-1]
-    pairs = np.empty((len(sums) // 2, sums[0].size), np.uint8)
-    _kernels.learn_worth(sums, 3, signs_of(codes), cells, 2, 1.0, pairs, worth)
-    assert_allclose(worth.reshape(7, 7), twins.log_ratio(counts, 1.0), rtol=1e-9, atol=1e-12)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("reach", [1, 3])
-def test_what_clusters_say_off_their_places(seed, reach):
-    rng = np.random.default_rng(seed)
-    sums, worth = random_sums(rng, (12, 11, 7)), rng.normal(size=(7, 7))
-    maps = (rng.random((4, 11, 7)) * (rng.random((4, 11, 7)) < 0.4)).astype(np.float32)
-    prior = (rng.random((4, 5, 3)) * (rng.random((4, 5, 3)) < 0.7)).astype(np.float32)
-    presence = PresenceMap(prior, 2, prior > 0.5, maps, prior)
-    out = match_shifts(presence, twins.pairs_of(sums, 3), worth.ravel(), reach)
-    own = np.zeros(maps.shape, bool)
-    own[:, :10, :6] = (prior > 0).repeat(2, 1).repeat(2, 2)
-    pixels = twins.worth_of(sums, worth) - worth[3, 3]
-    want = INDEPENDENT_PIXELS * twins.cluster_matches(pixels, maps * own, reach)
-    assert_allclose(out, want, rtol=1e-5, atol=1e-5)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize(("step_cost", "place_cost"), [(0.0, 0.0), (0.5, 0.1), (3.0, 0.0), (0.1, 2.0)])
-def test_the_smooth_path_is_the_best_of_all(seed, step_cost, place_cost):
-    rng, path = np.random.default_rng(seed), np.empty((4, 2), np.int64)
-    matches, known = rng.normal(size=(3, 3, 3, 4)).astype(np.float32), rng.choice([-1, 1], (3, 2))
-    _kernels.find_path(matches, known.astype(np.int8), step_cost, place_cost, path)
-    scores = np.abs(matches).sum(0)
-    scores[..., :2] = (known[:, None, None] * matches[..., :2]).sum(0)
-    assert_array_equal(path, twins.best_path(np.moveaxis(scores, -1, 0), step_cost, place_cost))
 
 
 # Separation

@@ -1,7 +1,5 @@
 """Separation and decoding once more, from the air interface and Bayes' rule, in NumPy or plain Python."""
 
-import itertools
-
 import numpy as np
 
 
@@ -75,76 +73,6 @@ def llr(values, words):
     return cost.argmin(1), out, kept / (kept + rest)
 
 
-def count_pairs(sums, codes, probability, grid, most, prior):
-    """Histograms over pixels by plain loops; a pixel counts for its likeliest cluster."""
-    counts = np.full((2, 2 * most + 1, 2 * most + 1), prior)
-    clipped = np.clip(sums.astype(int), -most, most) + most
-    for r, c in np.ndindex(probability.shape[1:]):
-        k = probability[:, r, c].argmax()
-        if probability[k, r, c] < 0.5:
-            continue
-        for v, u in np.ndindex(grid, grid):
-            for i, value in enumerate(codes[k]):
-                first, second = clipped[2 * i : 2 * i + 2, r * grid + v, c * grid + u]
-                counts[int(value > 0), first, second] += probability[k, r, c]
-    return counts
-
-
-def worth_of(sums, worth):
-    """What each pixel's pair of sums is worth, (values, height, width)."""
-    most = len(worth) // 2
-    clipped = np.clip(sums.astype(int), -most, most) + most
-    return worth[clipped[::2], clipped[1::2]]
-
-
-def pairs_of(sums, most):
-    """The pair of sums of each value in each pixel, as one number, uint8 (values, pixels)."""
-    clipped = np.clip(sums.astype(int), -most, most) + most
-    return (clipped[::2] * (2 * most + 1) + clipped[1::2]).reshape(len(sums) // 2, -1).astype(np.uint8)
-
-
-def sum_worth(sums, codes, probability, grid, least, worth, share):
-    """Pixel by pixel: how likely it shows the cluster, by Bayes' rule of its pilot, times its worth."""
-    pixels, known = worth_of(sums, worth), codes.shape[1]
-    # Of a value of +1 and -1, as the log of their ratio and a mean of 1 say.
-    likely = {1: 2 * np.exp(pixels) / (1 + np.exp(pixels)), -1: 2 / (1 + np.exp(pixels))}
-    out = np.zeros((len(codes), len(pixels) - known))
-    for k, r, c in np.ndindex(probability.shape):
-        if probability[k, r, c] < least:
-            continue
-        for v, u in itertools.product(range(r * grid, (r + 1) * grid), range(c * grid, (c + 1) * grid)):
-            shown = share * np.prod([likely[code][i, v, u] for i, code in enumerate(codes[k].tolist())])
-            out[k] += probability[k, r, c] * shown / (shown + 1 - share) * pixels[known:, v, u]
-    return out
-
-
-def cluster_matches(pixels, maps, reach):
-    """What each cluster's pixels say where the bar is shifted, shift by shift, (K, n, n, values)."""
-    _, height, width = pixels.shape
-    seam = np.pad(pixels, ((0, 0), (reach, reach), (reach, reach)))
-    side = 2 * reach + 1
-    out = np.zeros((len(maps), side, side, len(pixels)))
-    for a, b in np.ndindex(side, side):
-        out[:, a, b] = np.einsum("kvu,ivu->ki", maps, seam[:, a : a + height, b : b + width])
-    return out
-
-
-def best_path(scores, step_cost, place_cost):
-    """The best of all paths."""
-    values, side, _ = scores.shape
-    places = list(np.ndindex(side, side))
-
-    def total(path):
-        places = np.array(path)
-        return (
-            sum(scores[i, a, b] for i, (a, b) in enumerate(path))
-            - step_cost * (np.diff(places, axis=0) ** 2).sum()
-            - place_cost * ((places - side // 2) ** 2).sum()
-        )
-
-    return np.array(max(itertools.product(places, repeat=values), key=total)) - side // 2
-
-
 def take_back(sums, path):
     reach = np.abs(path).max()
     seam = np.pad(sums, ((0, 0), (reach, reach), (reach, reach)))
@@ -155,13 +83,6 @@ def take_back(sums, path):
             for c in range(len(sums))
         ]
     )
-
-
-def log_ratio(counts, prior):
-    seen = counts.sum((1, 2), keepdims=True)
-    more = counts + prior * (seen / seen.mean() if seen.min() > 0 else 1.0)
-    share = more / more.sum((1, 2), keepdims=True)
-    return np.log(share[1] / share[0])
 
 
 def match_words(values, words):

@@ -1,17 +1,13 @@
 """Packet grids against a walk through the chips on air; delays by row, on bars whose rows come late."""
 
-from dataclasses import replace
 from itertools import takewhile
 
 import numpy as np
 import pytest
-import rx_twins as twins
 from hypothesis import assume, given, strategies as st
-from numpy.testing import assert_array_equal
 from rx_streams import LINK, frames_of, noise_events, received
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.framing import PacketGrid, RowDelay, measure_row_delay
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
@@ -143,13 +139,6 @@ def test_rows_that_are_read_late(row_us):
     assert sigma < 0.01
 
 
-def test_one_polarity_is_enough():
-    events = read_late(EVENTS, 0.2)
-    assert measured(events[events.p == 1])[0] == pytest.approx(0.2, abs=0.01)
-    few = events[(events.p == 1) | (np.random.default_rng(0).random(len(events)) < 0.05)]
-    assert measured(few)[0] == pytest.approx(0.2, abs=0.01)
-
-
 def test_hidden_rows_and_noise_are_outliers():
     events = read_late(EVENTS, 0.2)
     hidden = (events.y > 300) & (events.y < 350)
@@ -166,12 +155,6 @@ def test_nothing_to_see_is_nothing_known(events):
     assert np.isnan(measured(EVENTS, 20.0)[0])
 
 
-@pytest.mark.parametrize("row_us", [-0.15, 0.15])
-def test_the_last_row_is_late_by_half_a_bar(row_us):
-    lock = RowDelay(row_us, 1e-4).delayed(LOCK, HEIGHT_PX)
-    assert lock == replace(LOCK, row_us=row_us, last_row_us=0.15 * HEIGHT_PX / 2)
-
-
 def test_packets_are_averaged_and_changes_followed():
     rng = np.random.default_rng(1)
     known = RowDelay()
@@ -182,18 +165,6 @@ def test_packets_are_averaged_and_changes_followed():
     for _ in range(30):
         known = known.measured(0.1 + rng.normal(0, 0.03), 0.03)
     assert known.row_us == pytest.approx(0.1, abs=0.04)
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_counts_of_blocks(seed):
-    rng = np.random.default_rng(seed)
-    n = 3000
-    t = np.sort(rng.integers(0, 3000, n))
-    y, p = rng.integers(80, 200, n).astype(np.uint16), rng.integers(0, 2, n).astype(np.uint8)
-    start, counts = np.array([310.3, 420.7]), np.zeros((2, 9, 130))
-    _kernels.count_rows(t, y, p, start, 10.1, 90.5, 8.3, counts)
-    assert_array_equal(counts, twins.count_rows(t, y, p, start, 10.1, 90.5, 8.3, counts.shape))
-    assert counts.sum() > 100
 
 
 @pytest.mark.parametrize("row_us", [-0.25, 0.25])

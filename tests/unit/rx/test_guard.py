@@ -93,17 +93,6 @@ class Changed(Filter):
 
 
 @pytest.mark.parametrize(
-    "overrides",
-    [["tracking.id=kalman"], ["decoding.id=wh-transform", "ranging.id=poc", "tracking.id=kalman"]],
-)
-def test_what_comes_with_the_sdk_gives_what_is_expected(overrides: list[str]) -> None:
-    link = load_link(overrides=overrides)
-    assert set(ROLES) < link.built_in
-    assert link.with_algorithm("ranging", link.algorithm("ranging")).built_in == link.built_in - {"ranging"}
-    received(replace(link, built_in=frozenset()))
-
-
-@pytest.mark.parametrize(
     ("role", "fault", "says"),
     [
         *((role, KeyError("boom"), "KeyError: 'boom'") for role in ROLES),

@@ -57,15 +57,6 @@ def test_a_long_message_in_any_order_with_duplicates() -> None:
     }
 
 
-def test_a_lost_part_is_counted() -> None:
-    blocks = blocks_of(Message(Kind.DATA, 7, 3, bytes(200)))
-    feed = Feed()
-    assert not feed(blocks[:2] + blocks[3:])
-    assert "parts_missing" not in feed.counts
-    feed.assembler.close()
-    assert feed.counts["parts_missing"] == 1
-
-
 def test_state_is_bounded() -> None:
     feed = Feed(combine_packets=4)
     for sequence in range(40):
@@ -77,15 +68,6 @@ def test_state_is_bounded() -> None:
     assert all(len(i.open) <= 8 and len(i.done) <= 8 and len(i.sums) <= 4 for i in inboxes.values())
     feed.assembler.close()
     assert feed.counts["parts_missing"] == 40
-
-
-def test_two_transmitters_do_not_mix() -> None:
-    one, two = (blocks_of(Message(Kind.DATA, 7, 3, bytes([v]) * 80)) for v in (1, 2))
-    feed = Feed()
-    assert not feed(one[:1], transmitter=0)
-    assert not feed(two[1:], transmitter=1)
-    assert feed(one[1:], transmitter=0)[0].message.payload == bytes([1]) * 80
-    assert feed(two[:1], transmitter=1)[0].message.payload == bytes([2]) * 80
 
 
 def test_another_message_under_the_same_number_replaces_it() -> None:

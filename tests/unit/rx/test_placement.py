@@ -81,16 +81,6 @@ def test_clutter_and_a_cover(seed: int) -> None:
     assert not set(np.flatnonzero(~found.seen)) - set(hidden)
 
 
-def test_a_mirror_image_is_another_and_runs_up_the_image() -> None:
-    bar, image = (100 + 0j, 24 + 52j), (-100 + 0j, 26.0 + 164j)
-    presence = covered(drawn(CENTRES, bar, image), [])
-    own, other = placements(presence, LINE)
-    assert (own.mirrored, other.mirrored) == (False, True)
-    for found, (scale, shift) in ((own, bar), (other, image)):
-        assert abs(found.scale - scale) < 2
-        assert abs(found.shift - shift) < 1
-
-
 def test_a_reflection_beside_stays_out_of_the_footprints() -> None:
     bar, image = (100 + 0j, 12.0 + 60j), (100 + 0j, 34.0 + 60j)
     presence = drawn(CENTRES, bar, image, size=(48, 120))

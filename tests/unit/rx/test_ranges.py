@@ -138,22 +138,6 @@ def test_sigmas_become_true(truth: float) -> None:
     assert 0.75 < nees(late) < 1.35
 
 
-def test_braking_is_no_scatter() -> None:
-    t_s = np.arange(150) * FRAME_US * 1e-6
-    true_m = 40 - 15 * t_s + 8 * t_s**2 / 2
-    noise_m = 0.01 * np.random.default_rng(3).standard_normal(150)
-    _, found = kept(Range(seen_m, 0.01, 15) for seen_m in (true_m + noise_m).tolist())
-    plain = drive(frames=150, sigma_m=0.01, start_m=40.0, late_chips=0.0, seed=3)
-    assert np.mean([one.sigma_m for one in found[60:]]) < 1.15 * np.mean(plain[60:, 1])
-
-
-def test_an_outlier_says_so_and_leaves_the_others() -> None:
-    errors = drive(frames=60, sigma_m=0.02, outliers=(40,), seed=4)
-    without = drive(frames=60, sigma_m=0.02, seed=4)
-    assert errors[40, 1] > 0.4
-    assert errors[41:, 1].max() < 2 * without[41:, 1].max()
-
-
 @pytest.mark.parametrize("lean_deg", [-5.0, -3.0, 0.0, 4.0])
 def test_a_lean_is_found_in_the_bend(lean_deg: float) -> None:
     errors = np.stack(
@@ -166,12 +150,6 @@ def test_a_lean_is_found_in_the_bend(lean_deg: float) -> None:
     assert 0.5 < nees(errors[:, 10:].reshape(-1, 2)) < 2
     # What is left of 1 - cos(lean), up to 0.16 m.
     assert abs(errors[:, -1, 0].mean()) < 0.02
-
-
-def test_a_level_bar_costs_nothing_to_speak_of() -> None:
-    """Sigmas of a level bar at 45 m, against those of a keeper that knows that it is level."""
-    errors = drive(frames=60, sigma_m=0.015, start_m=45.0, bend_px=0.04, seed=3)
-    assert errors[15:, 1].mean() < 1.3 * 0.015
 
 
 def test_a_distance_keeps_nothing_of_old_bends_and_distances() -> None:
@@ -299,26 +277,6 @@ def test_clusters_with_dark_leds_are_taken_out_and_shown() -> None:
     assert one.bent_px is not None
     assert one.bent_px == pytest.approx(0.5 * np.eye(15)[3])
     assert one.standing_m == 0
-
-
-def test_dark_leds_are_learnt_and_forgotten() -> None:
-    """Two thirds of the boundaries off: the mean over frames says more than each, of the same bar only."""
-    rng, off_px = np.random.default_rng(15), np.zeros(15)
-    off_px[[0, 2, 3, 6, 7, 9, 10, 12, 14]] = 0.6, -0.7, 0.6, 1.2, -0.6, 0.7, -0.6, 0.7, 0.6
-    measured = bent(60, off_px, rng) + bent(60, np.roll(off_px, 3), rng)
-    error = np.array([one.distance_m - 45 for one in kept(measured)[1]])
-    alone = np.array([kept([one])[1][0].distance_m - 45 for one in measured])
-    for later in (slice(20, 60), slice(80, 120)):
-        assert np.sqrt((error[later] ** 2).mean()) < 0.67 * np.sqrt((alone[later] ** 2).mean())
-
-
-def test_another_layout_s_bend_starts_anew() -> None:
-    bend = bend_of(0.0, 45.0, 0.04, np.random.default_rng(6))
-    few = Bend(bend.place[:4], bend.off[:4], bend.weight[:4])
-    state, found = kept([Range(45.0, 0.01, 15, 8.0, bend), Range(45.0, 0.01, 4, 8.0, few)])
-    assert state.bend.shape == (3, 4)
-    # The scatter of four boundaries about a parabola says nothing of its sigma.
-    assert math.isfinite(found[-1].sigma_m)
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 1e-12])

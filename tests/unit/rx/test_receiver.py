@@ -1,13 +1,12 @@
 """The whole receiver on ideal recordings: what it must decode, and what it leaves alone."""
 
-import tracemalloc
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import NDArray
-from rx_streams import LINK, frames_of, lamp_events, noise_events, received, right_frames
+from rx_streams import LINK, frames_of, noise_events, received, right_frames
 
 from evlcp_sdk.errors import StreamError
 from evlcp_sdk.link.resolve import Link, load_link
@@ -202,22 +201,6 @@ def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px: float, shake_hz: fl
         assert (f.x_px, f.y_px) == (pytest.approx(x[0] - 0.5, abs=1.0), pytest.approx(y[0] - 0.5, abs=1.5))
 
 
-def test_two_bars_and_lamps() -> None:
-    bars = [
-        IdealBar(random_symbols(LINK, 4, 1), ppm=40),
-        IdealBar(random_symbols(LINK, 4, 2), x_px=900, y_px=250, cluster_px=5, ppm=-25, start_us=11_234),
-    ]
-    lamps = [
-        lamp_events(600, 300, 12, hz, 150_000, duty=duty)
-        for hz, duty in ((100, 0.5), (1000, 0.2), (2000, 0.5))
-    ]
-    events = merged(*(ideal_events(LINK, bar) for bar in bars), *lamps, noise_events(50_000, 150_000))
-    _, packets = received(LINK, events)
-    assert len(packets) == 8
-    for number, bar in enumerate(bars):
-        assert right_frames([p for p in packets if p.transmitter == number], bar) == 40
-
-
 @pytest.mark.parametrize("apart_px", [10, 14])
 def test_two_bars_a_few_pixels_apart_are_two(apart_px: int) -> None:
     """Each with a clock and a payload of its own."""
@@ -310,16 +293,6 @@ def test_a_transmitter_that_starts_anew_is_another(at_us: float) -> None:
         assert [p.packet for p in mine] == list(range(len(mine)))
 
 
-def test_one_preamble_off_the_grid_starts_nothing() -> None:
-    bar, other = (
-        IdealBar(random_symbols(LINK, 5, seed), start_us=us) for seed, us in ((1, 5000), (2, 66_600))
-    )
-    events, glitch = ideal_events(LINK, bar), ideal_events(LINK, other)
-    late = (events.t_us > 66_600) & (events.t_us < 69_250)
-    receiver, packets = received(LINK, merged(events[~late], glitch[glitch.t_us < 69_250]))
-    assert (receiver.counts["restarts"], {p.transmitter for p in packets}) == (0, {0})
-
-
 STREAM = merged(
     ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 3), shake_px=5, ppm=35), seed=3),
     ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 4), x_px=800, start_us=9000, cluster_px=5), seed=4),
@@ -340,13 +313,6 @@ def test_an_attitude_makes_distances_shorter_by_what_the_bar_leans() -> None:
         length = np.cos(np.radians(6)) + below * np.sin(np.radians(6))
         assert a.range.distance_m / b.range.distance_m == pytest.approx(length, abs=1e-4)
         assert a.range.sigma_m > b.range.sigma_m
-
-
-def test_an_attitude_that_the_image_contradicts_counts_as_none() -> None:
-    receiver, rolled = received(LINK, STREAM, attitude=Attitude(6.0, 5.0))
-    assert receiver.counts["frames_askew"] == receiver.counts["frames"] == 60
-    plain = frames_of(received(LINK, STREAM)[1])
-    assert [f.range for f in frames_of(rolled)] == [f.range for f in plain]
 
 
 @pytest.mark.parametrize("t0_us", [-123_457, 16_777_001, 1_700_000_000_123_457])
@@ -377,19 +343,6 @@ def test_what_is_dropped_is_counted() -> None:
         receiver.feed(Events.empty())
 
 
-def test_a_leap_of_a_month_in_one_piece_costs_nothing() -> None:
-    bar, month_us = IdealBar(random_symbols(LINK, 2)), 30 * 86_400_000_000
-    whole = Events.concat([ideal_events(LINK, bar), ideal_events(LINK, bar, t0_us=month_us)])
-    tracemalloc.start()
-    receiver, packets = received(LINK, whole)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert [f.transmitter for f in frames_of(packets)] == [0] * 20 + [1] * 20
-    assert right_frames(packets[2:], bar, t0_us=month_us) == 20
-    assert receiver.counts["clock_leaps"] == 1
-    assert peak < 100e6
-
-
 @pytest.mark.parametrize("back_us", [100_000, 3_000_000, 10**15])
 def test_a_camera_that_restarts_its_clock_is_heard_again(back_us: int) -> None:
     bar, late_us = IdealBar(random_symbols(LINK, 2)), 10**12
@@ -400,17 +353,6 @@ def test_a_camera_that_restarts_its_clock_is_heard_again(back_us: int) -> None:
     assert [f.transmitter for f in frames_of(packets)] == [0] * 20 + [1] * 20
     assert right_frames(packets[:2], bar, t0_us=late_us) == 20
     assert right_frames(packets[2:], bar, t0_us=late_us - back_us) == 20
-
-
-def test_memory_does_not_grow() -> None:
-    receiver = Receiver(LINK)
-    bar = IdealBar(random_symbols(LINK, 2), cluster_px=4, width_px=2)
-    period = 2 * LINK.packet.packet_chips * 100
-    for n in range(12):
-        receiver.feed(ideal_events(LINK, bar, t0_us=n * period))
-    (region,) = receiver._receivers[0]._regions.alive
-    assert len(region.pieces) < 10
-    assert len(region.positions) < 50
 
 
 class Probe:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import pairwise, permutations
 
 import numpy as np
@@ -18,7 +17,6 @@ from evlcp_sdk.rx.reflections import (
     PacketAssembler,
     ReflectionQueue,
     Reflections,
-    originals,
     repeats,
 )
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
@@ -149,12 +147,6 @@ def test_two_bars_with_a_reflection_each() -> None:
     assert judged(seen) == {1: 0, 3: 2}
 
 
-def test_what_comes_late_is_judged_by_what_was_before() -> None:
-    """A reflection is heard two packets late: it starts with the frames before its lock."""
-    own = [[sighting(0, n, said(n))] for n in range(25)]
-    assert judged(*own, [sighting(1, n, said(n), light=70) for n in range(5, 25)]) == {1: 0}
-
-
 @pytest.mark.parametrize(("off_px", "found"), [(0.0, {}), (4.0, {}), (6.0, {1: 0})])
 def test_one_image_seen_by_two_regions_is_no_reflection(off_px: float, found: dict[int, int]) -> None:
     assert found == judged(
@@ -212,19 +204,6 @@ def test_memory_is_bounded() -> None:
         echoes.judge([sighting(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
         assert sum(map(len, echoes._seen.values())) <= 4 * (3 * FORMAT.frames + 1)
         assert len(echoes._pairs) <= 3 + 2 * 8
-
-
-def test_originals_against_every_choice() -> None:
-    """The one that the pairs favour most, by trying each; whoever was it before has a bonus."""
-    rng = np.random.default_rng(6)
-    for _ in range(200):
-        size = int(rng.integers(2, 5))
-        matrix = rng.normal(0, 4, (size, size))
-        matrix -= matrix.T
-        before = {int(rng.integers(0, size))} if rng.random() < 0.5 else set()
-        odds = {(i, j): float(matrix[i, j]) for i in range(size) for j in range(i + 1, size)}
-        score = [matrix[i].sum() / 2 + 1.0 * (i in before) for i in range(size)]
-        assert originals(range(size), odds, before) == int(np.argmax(score))
 
 
 def test_what_was_shown_then_and_there_is_known() -> None:
@@ -285,31 +264,6 @@ def test_a_rail_shows_the_bar_again() -> None:
     assert {p.echo_of for p in of_bar} == {None}
     assert {p.echo_of for p in of_rail} == {bar}
     assert {p.messages for p in of_rail} == {()}
-
-
-def test_a_reflection_that_comes_and_goes() -> None:
-    """It locks now and then: each time it is a reflection from its first frame on."""
-    own = ideal_events(LINK, IdealBar(random_symbols(LINK, 7)))
-    image = reflected(own[own.y < 370], missing=0.4)
-    of_bar, beside = by_side(merged(own, image[(image.t_us // 60_000) % 2 == 1]))
-    assert len(frames_of(beside)) > 20
-    assert all(p.echo_of is not None for p in beside)
-    assert all(p.echo_of is None for p in of_bar)
-
-
-def test_half_a_reflection() -> None:
-    """Eight of sixteen clusters are mirrored, weaker than the bar: it is a reflection, or nothing."""
-    image = ideal_events(LINK, replace(BAR, x_px=480.3), seed=2, missing=0.2)
-    of_bar, beside = by_side(merged(OWN, image[image.y > 350]))
-    assert {p.echo_of for p in of_bar} == {None}
-    assert len(frames_of(of_bar)) == 30
-    assert all(p.echo_of is not None for p in beside)
-
-
-def test_two_bars_on_one_clock_are_two() -> None:
-    other = replace(BAR, symbols=random_symbols(LINK, 3, seed=9), x_px=500.0)
-    sides = by_side(merged(OWN, ideal_events(LINK, other, seed=2)))
-    assert [{p.echo_of for p in side} for side in sides] == [{None}, {None}]
 
 
 @pytest.mark.parametrize(("share", "farther_m"), [(None, 0.0), (None, 12.0), (0.25, 0.0)])

@@ -21,7 +21,7 @@ from evlcp_sdk.testing.recordings import (
     merged,
     random_symbols,
 )
-from evlcp_sdk.values import Events, Region
+from evlcp_sdk.values import Events
 
 SPEC = RegionSpec(step_us=1000)
 STEP_US = SPEC.step_us
@@ -113,38 +113,6 @@ def test_an_end_that_is_dark_for_a_while_is_still_there(end: str) -> None:
             assert at.height_px == pytest.approx(128, abs=2)
 
 
-def test_pixels_awake_beyond_an_end_do_not_move_a_region() -> None:
-    copies = BAR_EVENTS[(BAR_EVENTS.y == 290) & (BAR_EVENTS.x == 400) & (BAR_EVENTS.t_us >= 30_000)]
-    stray = raised(copies[copies.t_us < 34_000], 8)
-    (region,) = followed(merged(BAR_EVENTS, stray), 60_000)[59_000]
-    assert all(abs(at.y_px - CENTRE[1]) < 1 for at in region.positions if at.t_us > 10_000)
-
-
-@pytest.mark.parametrize(
-    ("heights_px", "rows_px"),
-    [
-        # 158 to 160 are trusted; 161 may be half a pixel off, and 162 a whole one.
-        ((158, 159, 160, 161, 162), [401, 404, 407, 409.5, 412]),
-        # What is twice as high may be anywhere in it.
-        ((300,) * 5, [390] * 5),
-    ],
-)
-def test_where_a_little_too_much_was_seen_a_region_stays_on_its_way(
-    heights_px: tuple[int, ...], rows_px: list[float]
-) -> None:
-    """A height that is off by a little more than is allowed for says nearly as much of the place."""
-    seen = Places(Region(0, 1000.0 * n, 50, 400 + 3 * n, 4, high) for n, high in enumerate(heights_px))
-    found = [at.y_px for at in seen.moved(0, 0, 1, (4, 150), row_px=390, most_px=10)]
-    assert found == pytest.approx(rows_px)
-
-
-def test_a_region_that_strayed_did_so_since_the_frame_before() -> None:
-    places = Places([Region(0, 1000.0 * n, 10.0, 50.0, 4.0, 9.0) for n in range(6)])
-    found = list(places.moved(0, 2.0, -8.0, (4.0, 9.0), grown_us=(1000.0, 3000.0)))
-    assert [p.x_px for p in found] == [10, 10, 11, 12, 12, 12]
-    assert [p.y_px for p in found] == [50, 50, 46, 42, 42, 42]
-
-
 @pytest.mark.parametrize("shows_again", [False, True])
 def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_again: bool) -> None:
     """Its lower quarter is hidden, for a while or all the time; one pixel in four above it blinks, too."""
@@ -157,12 +125,6 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
             regions.shape(region, region.latest.t_us, CENTRE, SIZE, (-64.0, 32.0))
         elif start > 12_000:
             assert region.latest.y_px == pytest.approx(CENTRE[1], abs=1.5), start
-
-
-def test_a_bar_in_two_pieces_is_one_region() -> None:
-    middle = (BAR_EVENTS.y >= 345) & (BAR_EVENTS.y < 349)
-    (region,) = followed(BAR_EVENTS[~middle], 30_000)[29_000]
-    assert region.latest.height_px == pytest.approx(128, abs=1.5)
 
 
 @pytest.mark.parametrize("merge_px", [8, 15, 16, 32])

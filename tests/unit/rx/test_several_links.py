@@ -5,20 +5,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 from rx_streams import frames_of, noise_events, received, right_frames, said
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.run import receive_to_folder
-from evlcp_sdk.rx.detected import DetectedRegions
-from evlcp_sdk.rx.multi import explained_us
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.rx.regions import RegionFollower
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols, changed
+from evlcp_sdk.values import Events, Packet, changed
 
 
 def named(name: str, **sections: dict[str, object]) -> Link:
@@ -94,17 +90,6 @@ def test_a_place_that_is_left_is_free_for_another_link() -> None:
     assert right(late, WH8, two) == len(two.symbols) * 10
 
 
-def test_links_share_the_room_for_events() -> None:
-    receiver = Receiver([BAR, WH8, LAMP])
-    assert {listener._regions._limits.region_bytes for listener in receiver._receivers} == {16 << 20}
-    one, other, lamp = (listener._regions for listener in receiver._receivers)
-    assert isinstance(one, RegionFollower)
-    assert isinstance(other, RegionFollower)
-    assert one._rhythm is other._rhythm
-    # Its framing names a detection of its own.
-    assert isinstance(lamp, DetectedRegions)
-
-
 @pytest.mark.parametrize(
     ("links", "said"),
     [
@@ -118,31 +103,6 @@ def test_links_share_the_room_for_events() -> None:
 def test_links_that_cannot_be_received_together_are_refused(links: list[Link], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         Receiver(links)
-
-
-def test_a_link_is_named_after_its_file(tmp_path: Path) -> None:
-    path = tmp_path / "beacon.toml"
-    path.write_text("[air]\nframes_per_packet = 5\n")
-    link = load_link(path)
-    assert link.name == link.with_air(pilot_every=5).name == "beacon"
-    assert link.with_algorithm("ranging", link.algorithm("ranging")).name == "beacon"
-    assert load_link().name == ""
-    # The name is no part of what is on air.
-    assert link == resolve({"air": {"frames_per_packet": 5}})
-
-
-def test_what_a_packet_explains_is_the_time_of_symbols_that_are_right() -> None:
-    form = BAR.packet
-    llr = np.zeros((16, BAR.codebook.bits_per_symbol), np.float32)
-    llr[:, :] = [30.0, -30.0, *[30.0] * (llr.shape[1] - 2)]
-    # Of one cluster a bit is as likely wrong as right; another was not seen.
-    llr[3, 0] = llr[5] = 0.0
-    symbols = np.arange(16)
-    symbols[5] = -1
-    soft = SoftSymbols(symbols, llr, 0.5)
-    frame = Frame(0, 0, 0, 0.0, soft, Range(np.nan, np.nan, 0), None, 0.0, 0.0)
-    packet = Packet(0, 0, 0.0, 100.0, (frame,), 10)
-    assert explained_us(packet, form) == pytest.approx(14.5 * form.frame_chips * 100.0)
 
 
 LAMP_TABLE = "[bar]\nrows = 1\ncolumns = 1\ncluster_rows = 1\ncluster_columns = 1\n[ranging]\nid = 'none'\n"
@@ -174,15 +134,3 @@ def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed: int, tmp_path:
     assert of_lamp["frames_of_others"] > 80
     assert of_lamp["frames_rejected"] < 10
     assert not summary["warnings"]
-
-
-def test_parts_of_bars_on_two_sides_of_one_take_nothing_off_it(tmp_path: Path) -> None:
-    """A link of one cluster takes each part of two bars for a lamp, some of them between others."""
-    summary = lamps_received(
-        tmp_path,
-        "name='r'\nduration_s=0.12\nseed=575705\n[motion]\ndistance_m=40.1\nspeed_mps=12.4\n"
-        "[[bars]]\nx_m=-0.40\ny_m=0.89\nstart_chip=75\n"
-        "[[bars]]\nx_m=0.34\ny_m=-0.87\nstart_chip=61\ncovered=[0,1,2,3,8]\n"
-        "[[bars]]\nx_m=2.42\ny_m=-0.99\nlink='lamp.toml'\n",
-    )
-    assert summary["status"] == "complete"

@@ -14,7 +14,6 @@ from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.multi import EarlyFrames
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.rx.regions import RegionFollower
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, changed
@@ -183,31 +182,3 @@ def test_frames_that_another_link_takes_are_counted_where_they_were_told() -> No
     assert early.withdrawn == 0
     early.refused(packets[2])
     assert (len(found), early.withdrawn) == (4, 2)
-
-
-def test_a_look_ahead_leaves_no_trace_in_the_regions() -> None:
-    """Regions that are shown parts of each step go on as those that are not."""
-    one, two = (RegionFollower(LINK.regions, LINK.camera, LINK.packet.chip_us) for _ in range(2))
-    step_us, ahead = LINK.regions.step_us, 0
-    bounds = np.searchsorted(BOTH.t_us, np.arange(0, 60_000, step_us))
-    for step, (a, b) in enumerate(pairwise(bounds.tolist())):
-        start_us, events = step * step_us, BOTH[a:b]
-        for until_us in (start_us + 400, start_us + 1300):
-            part = events[: np.searchsorted(events.t_us, until_us)]
-            places = [len(region.positions) for region in two.alive]
-            two.begin_part(start_us, until_us, part, {region.id for region in two.alive})
-            for region, before in zip(two.alive, places, strict=True):
-                # Soon after the start of a step its beginning says nothing new of the place.
-                ahead += (moved := len(region.positions) - before)
-                assert moved <= (until_us == start_us + 1300)
-                assert region.pieces[-1][0] == start_us
-                assert region.pieces[-1][1].t_us.max(initial=0) < until_us
-            two.end_part(until_us)
-        for mine, other in zip(one.step(start_us, events), two.step(start_us, events), strict=True):
-            assert [vars(p) for p in mine.positions] == [vars(p) for p in other.positions]
-            assert (mine.latest, mine.heights) == (other.latest, other.heights)
-            assert [(t, e.t_us.tolist()) for t, e in mine.pieces] == [
-                (t, e.t_us.tolist()) for t, e in other.pieces
-            ]
-            assert mine.held_bytes == other.held_bytes
-    assert ahead > 40

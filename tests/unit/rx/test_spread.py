@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 import evlcp_sdk as evlcp
-from evlcp_sdk.rx.placement import layout_of
-from evlcp_sdk.rx.spread import Spread, compare, expected_lengths, neighbours
+from evlcp_sdk.rx.spread import Spread, compare, expected_lengths
 
 
 def pixel_light(lit: NDArray[np.bool_], per_px: int, sigma_px: float) -> NDArray[np.float64]:
@@ -141,14 +140,6 @@ def test_two_bars_are_alike_and_images_are_not(background: float, farther: float
     for share, blur_px in ((0.33, 0.0), (0.2, 0.0), (1.0, 1.0)):
         (image,) = expected_lengths(9.0, np.array([blur_px]), [dimmed(background, share, blur_px)])
         assert alike(answering(bar, frames=10), answering(image, frames=10)) < -0.5
-
-
-def test_neighbours_stand_side_by_side() -> None:
-    grid = np.stack(np.meshgrid(np.arange(3) * 0.1, np.arange(2) * 0.1), -1).reshape(-1, 2)
-    pairs = {tuple(pair) for pair in neighbours(layout_of(grid)).tolist()}
-    beside = {(0, 1), (1, 2), (3, 4), (4, 5), (0, 3), (1, 4), (2, 5)}
-    assert pairs == beside | {(b, a) for a, b in beside}
-    assert len(neighbours(layout_of(np.zeros((1, 2))))) == 0
 
 
 def test_a_blurred_image_in_a_window_is_not_the_bar() -> None:

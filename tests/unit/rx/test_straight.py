@@ -1,9 +1,6 @@
 """Boundaries that no straight bar explains: against drawn errors, and the formula of a drop."""
 
-import math
-
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx.straight import Straight, straighten
@@ -85,13 +82,3 @@ def test_what_drops_add_to_a_scale_is_in_the_sigma() -> None:
     # A few hundred times as much where 1 in 200 looks like dark LEDs.
     assert 0.3 < np.minimum(found[:, 2], 9).mean() < 1.5
     assert np.mean(found[:, 2] > 3) < 0.1
-
-
-@pytest.mark.parametrize("clusters", [8, 64])
-def test_bars_of_other_lengths(clusters: int) -> None:
-    places = np.arange(1.0, clusters) - clusters / 2
-    off = 0.02 * np.sin(7 * places)
-    off[1], off[-2] = 0.9, 0.8
-    found = straighten(places, off + 0.01 * places, 0.05, 0.0)
-    assert found.slope == pytest.approx(0.01, abs=4 * math.sqrt(found.variance))
-    assert abs(found.slope - 0.01) < 0.02

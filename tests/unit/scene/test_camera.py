@@ -59,17 +59,6 @@ def test_a_direction_is_that_of_undistort(camera: CameraModel) -> None:
     assert camera.direction(701.3, 88.8) == tuple(camera.undistort(np.array([701.3, 88.8])).tolist())
 
 
-@given(st.floats(-0.25, -0.01), st.floats(0, 0.55))
-def test_undistort_of_one_radial_term_is_the_root_of_a_cubic(k1: float, u: float) -> None:
-    camera = CameraModel(focal_mm=4.0, k1=k1)
-    seen = u + k1 * u**3
-    roots = np.roots([k1, 0, 1, -seen])
-    real = roots[np.abs(roots.imag) < 1e-9].real
-    nearest = real[np.argmin(np.abs(real - seen))]
-    pixel = np.array([640 + camera.focal_px * seen, 360.0])
-    np.testing.assert_allclose(camera.undistort(pixel), [nearest, 0], atol=1e-8)
-
-
 def test_a_pixel_that_no_direction_reaches_is_not_inverted() -> None:
     # u + k1 u^3 is largest at u = 1 / sqrt(3 |k1|).
     camera = CameraModel(focal_mm=2.0, k1=-1.0)
@@ -128,14 +117,6 @@ def test_sigmas_and_correlations_make_the_covariance() -> None:
 def test_correlations_that_are_none_are_refused(rows: tuple[tuple[float, ...], ...], says: str) -> None:
     with pytest.raises(ConfigError, match=f"camera_sigma.correlation: .*{says}"):
         CameraSigma(focal_mm=1.0, correlation=rows)
-
-
-def test_undistort_of_many_points_is_that_of_each_to_the_last_bit() -> None:
-    points = np.stack(np.meshgrid(np.linspace(-4000, 5000, 40), np.linspace(-3000, 3700, 40)), -1)
-    together = BENT.undistort(points)
-    assert 0 < np.isnan(together).sum() < together.size
-    alone = [BENT.undistort(point) for point in points.reshape(-1, 2)]
-    np.testing.assert_array_equal(together.reshape(-1, 2), alone)
 
 
 CAMERA = CameraModel()

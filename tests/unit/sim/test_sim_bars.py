@@ -20,7 +20,6 @@ from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
     BarSpec,
-    Scene,
     Truth,
     load_scene,
     resolve_scene,
@@ -32,7 +31,7 @@ from evlcp_sdk.sim.scene import LensSpec, links_of
 from evlcp_sdk.study.measure import message_tallies
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Packet
-from tests.unit.sim.scenes import STILL, every, rows, still
+from tests.unit.sim.scenes import every, still
 
 PANEL = {"rows": 16, "columns": 16, "led_pitch_m": 0.02, "cluster_rows": 4, "cluster_columns": 4}
 
@@ -118,22 +117,6 @@ def test_leds_that_no_scene_can_hold_are_refused() -> None:
     leds = [[0.01 * i, 0.013 * i * i, 0.0, 0] for i in range(65)]
     with pytest.raises(ConfigError, match=r"bars\.0\.link: bar: its LEDs stand in more than 64 columns"):
         BarLight(BarSpec(), resolve({"bar": {"shape": "table", "leds": leds}}), LensSpec(), 0, "bars.0")
-
-
-def test_two_columns_are_two_bars_side_by_side(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    chips = rng.integers(0, 2, (60, 16)).astype(np.uint8)
-    for name, part in (("both", chips), ("left", chips[:, ::2]), ("right", chips[:, 1::2])):
-        np.save(tmp_path / f"{name}.npy", part)
-    column = {"rows": 48, "led_pitch_m": 0.02}
-
-    def bar(name: str, aside_m: float, columns: int) -> BarSpec:
-        link, file = {"bar": column | {"columns": columns}}, str(tmp_path / f"{name}.npy")
-        return BarSpec(-1.5 + aside_m, link=link, chips_file=file, start_chip=3.0, ppm=20.0, led_w_m2=30.0)
-
-    scene = Scene(duration_s=0.02, motion=STILL, bars=(bar("both", 0.0, 2),))
-    apart = bar("left", -0.01, 1), bar("right", 0.01, 1)
-    assert rows(every(scene)) == rows(every(replace(scene, bars=apart)))
 
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 50.0, "heading_deg": 20.0}

@@ -76,18 +76,6 @@ def test_clusters_that_are_not_in_line_stand_where_their_light_is(layout: dict[s
                 np.testing.assert_allclose(found[k], scene_to_enu(middle, 30.0), atol=1e-5)
 
 
-def test_the_origin_is_the_worlds() -> None:
-    scene = resolve_scene({"world": WORLD, "bars": [{"x_m": 3.0, "y_m": -1.0, "z_m": 4.0}]})
-    (site,) = sites_of(scene)
-    east, north, up = pymap3d.geodetic2enu(
-        site.latitude_deg, site.longitude_deg, site.height_m, 35.1, 137.2, 40.0
-    )
-    c, s = np.cos(np.radians(30)), np.sin(np.radians(30))
-    np.testing.assert_allclose([east, north, up], [3 * c + 4 * s, 4 * c - 3 * s, 1.0], atol=1e-6)
-    assert site.tilt_deg == pytest.approx(0.0)
-    assert site.heading_deg == 0.0
-
-
 def test_without_a_world_there_are_no_sites() -> None:
     scene = load_scene("drive-30kmh", ["duration_s=0.01"])
     assert "sites" not in truth_of(Simulation(scene)).to_table()
