@@ -134,13 +134,11 @@ class Tally:
         fixes_beyond: Those of these whose error is beyond one of them.
         fixes_silent: Positions whose error is beyond the 99.73 % bound of their own covariance.
         fixes_uncovered: Those of them that have no protection level, or are beyond it.
-        position_squares_nm2: Sum of the squares of the positions' errors in space, nm^2.
-        position_nees_micro: Sum of these errors squared in their own sigmas, millionths; 3 each is ideal.
         track: Points of the track, one a position that was given.
-        track_squares_nm2: Sum of the squares of their errors in space, nm^2, as filtered.
-        track_nees_micro: Sum of these errors squared in their own sigmas, millionths.
-        smoothed_squares_nm2: The same as smoothed, nm^2.
-        smoothed_nees_micro: The same as smoothed, millionths.
+        position_squares_nm2, track_squares_nm2, smoothed_squares_nm2: Sums of the squares of errors in space,
+            nm^2: of positions, and of points of the track as filtered and as smoothed.
+        position_nees_micro, track_nees_micro, smoothed_nees_micro: Sums of these errors squared in their own
+            sigmas, millionths; 3 each is ideal.
         histogram: Bin to count, in order of the bin; bin b holds errors from `b * BIN_M` up to the next, the
             outermost ones also everything beyond.
         position_histogram: The same of the positions' errors, in bins of `POSITION_BIN_M` from 0.
@@ -268,55 +266,37 @@ class Tally:
     """Share of wrong bits among those given. A bit is wrong in a wrong frame: of these there are fewer."""
 
     erased_share = Ratio("erased", "visible")
-    """Share of the visible clusters' symbols that are not given."""
-
     claimed_share = Ratio("claimed", "hidden")
-    """Share of the hidden clusters' symbols that are given all the same."""
+    """Share of the visible clusters' symbols that are not given, and of the hidden ones' that are."""
 
     found_share = Ratio("frames_found", "frames_sent")
     """Share of the sent frames that were decoded."""
 
     rmse_m = Ratio("squares_nm2", "ranged", 1e-9, root=True)
-    """Root mean square of the distance errors, m."""
-
     bias_m = Ratio("sum_nm", "ranged", 1e-9)
-    """Mean of the distance errors, m."""
-
     nees = Ratio("nees_micro", "with_sigma", 1e-6)
-    """Mean of the distances' (error / sigma)^2, ideally 1."""
+    gross_share = Ratio("gross", "ranged")
+    """Of the distance errors: root mean square and mean, m; mean of (error / sigma)^2, ideally 1; share of
+    those of half a metre or more."""
 
     filtered_rmse_m = Ratio("filtered_squares_nm2", "filtered", 1e-9, root=True)
     """Root mean square of the filtered distances' errors, m."""
 
-    gross_share = Ratio("gross", "ranged")
-    """Share of distance errors of half a metre or more."""
-
     lost_share = Ratio("messages_lost", "messages_sent")
-    """Share of the messages that were sent and not read."""
-
     wrong_share = Ratio("messages_wrong", "messages_read")
-    """Share of the messages that were read wrong."""
-
-    position_rmse_m = Ratio("position_squares_nm2", "fixes", 1e-9, root=True)
-    """Root mean square of the positions' errors in space, m."""
-
-    position_nees = Ratio("position_nees_micro", "fixes", 1e-6)
-    """Mean of the positions' errors squared in their own sigmas, ideally 3."""
+    """Share of the messages that were sent and not read, and of those that were read and are wrong."""
 
     kept_share = Ratio("fixes", "fixes_determined")
     """Share of the positions that what is in view determines which are given."""
 
+    position_rmse_m = Ratio("position_squares_nm2", "fixes", 1e-9, root=True)
+    position_nees = Ratio("position_nees_micro", "fixes", 1e-6)
     track_rmse_m = Ratio("track_squares_nm2", "track", 1e-9, root=True)
-    """Root mean square of the filtered track's errors in space, m."""
-
     track_nees = Ratio("track_nees_micro", "track", 1e-6)
-    """Mean of the filtered track's errors squared in their own sigmas, ideally 3."""
-
     smoothed_rmse_m = Ratio("smoothed_squares_nm2", "track", 1e-9, root=True)
-    """Root mean square of the smoothed track's errors in space, m."""
-
     smoothed_nees = Ratio("smoothed_nees_micro", "track", 1e-6)
-    """Mean of the smoothed track's errors squared in their own sigmas, ideally 3."""
+    """Of positions, of the filtered track and of the smoothed one: root mean square of the errors in space,
+    m, and mean of these squared in their own sigmas, ideally 3."""
 
     @property
     def worst_m(self) -> float:
