@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import check_columns, csv_number, read_csv
-from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.error_model import USUAL, ErrorModel
 from evlcp_sdk.place.gnss import PLACE
 from evlcp_sdk.place.observations import BarView, between_of, project_bars, shared_errors
 from evlcp_sdk.scene.attitude import Attitude
@@ -186,7 +186,7 @@ class Calibrated:
 def calibrate(
     views: Sequence[CalibrationView],
     camera: CameraModel,
-    spec: ErrorModel | None = None,
+    spec: ErrorModel = USUAL,
     *,
     limit_px: float = 2.0,
 ) -> Calibrated:
@@ -203,7 +203,6 @@ def calibrate(
     Raises:
         ConfigError: Not even the focal length is determined, or the views do not fit their places.
     """
-    spec = ErrorModel() if spec is None else spec
     seen = [one for view in views if (one := SeenView.of(view, camera, spec)) is not None]
     if not seen:
         raise ConfigError("no view shows a bar at a known site: nothing to calibrate from")

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.link.sections import PositionSpec
+from evlcp_sdk.scene.camera import CameraSigma
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,10 @@ class ErrorModel(PositionSpec):
         1.0
         """
         return cls(**asdict(spec))
+
+
+USUAL, EXACT = ErrorModel(), CameraSigma()
+"""The defaults of what is fitted: usual errors, and a camera that is known exactly."""
 
 
 def symmetric_root(covariance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.error_model import EXACT, USUAL, ErrorModel
 from evlcp_sdk.place.observations import BarView
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 from evlcp_sdk.values import Frame
@@ -245,15 +245,14 @@ def bar_point(
     frame: Frame,
     length_m: float,
     camera: CameraModel,
-    sigma: CameraSigma | None = None,
-    spec: ErrorModel | None = None,
+    sigma: CameraSigma = EXACT,
+    spec: ErrorModel = USUAL,
 ) -> BarPoint | None:
     """Where the centre of a frame's bar is; None where the frame has no distance.
 
     The distance is that along the optical axis, with its sigma; the bearing is that of the bar's centre in
     the image. They err together where the camera's focal length does; without a `sigma` the camera is exact.
     """
-    spec = ErrorModel() if spec is None else spec
     depth = frame.range.distance_m
     sight = camera.undistort(np.array([frame.x_px, frame.y_px]))
     if not (math.isfinite(depth) and math.isfinite(frame.range.sigma_m) and np.isfinite(sight).all()):
@@ -269,7 +268,7 @@ def bar_point(
     )
     inverse = depth * np.linalg.inv(camera.distort_slope(sight))
     standing = np.zeros((3, 8))
-    if sigma is not None and sigma.known:
+    if sigma.known:
         standing[:2, :7] = -inverse @ camera.parameter_slope(sight)
         # A bar of so many pixels is the farther, the longer the lens.
         standing[:, 0] += along * depth / camera.focal_px

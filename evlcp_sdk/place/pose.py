@@ -15,7 +15,7 @@ from itertools import combinations
 
 import numpy as np
 
-from evlcp_sdk.place.error_model import ErrorModel, chi_square
+from evlcp_sdk.place.error_model import EXACT, USUAL, ErrorModel, chi_square
 from evlcp_sdk.place.fit import ODDS, Equations, fit_pose, likely_fits, misfits
 from evlcp_sdk.place.fit_assessment import FOCAL, Pose, assess_fit, covering
 from evlcp_sdk.place.observations import BarView, Candidate, Problem, Rejection, project_bars
@@ -53,8 +53,8 @@ def solve_pose(
     views: Sequence[BarView],
     camera: CameraModel,
     attitude: Attitude | None = None,
-    spec: ErrorModel | None = None,
-    sigma: CameraSigma | None = None,
+    spec: ErrorModel = USUAL,
+    sigma: CameraSigma = EXACT,
 ) -> Pose | Rejection:
     """Fit position and attitude to all image points.
 
@@ -68,8 +68,6 @@ def solve_pose(
     Returns:
         The pose, or why the geometry does not determine one, or the parts contradict one another.
     """
-    spec = ErrorModel() if spec is None else spec
-    sigma = CameraSigma() if sigma is None else sigma
     problem = Problem.of(views, camera, attitude, spec, sigma)
     if isinstance(problem, Rejection):
         return problem
@@ -176,16 +174,14 @@ def fitting_focal_mm(
     views: Sequence[BarView],
     camera: CameraModel,
     attitude: Attitude | None = None,
-    spec: ErrorModel | None = None,
-    sigma: CameraSigma | None = None,
+    spec: ErrorModel = USUAL,
+    sigma: CameraSigma = EXACT,
 ) -> float:
     """The focal length with which views that contradict one another fit best, mm; NaN where with none.
 
     For what `solve_pose` refuses: it believes a focal length that is some percent off at the most, and one
     that was mistyped is another lens altogether.
     """
-    spec = ErrorModel() if spec is None else spec
-    sigma = CameraSigma() if sigma is None else sigma
 
     def tried(focal_mm: float, free: float) -> Problem | Rejection:
         other = replace(camera, focal_mm=focal_mm)

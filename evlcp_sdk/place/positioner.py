@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.place.bar_registry import BarRegistry
-from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.error_model import EXACT, USUAL, ErrorModel
 from evlcp_sdk.place.observations import BarView, Rejection
 from evlcp_sdk.place.points import points_at
 from evlcp_sdk.place.pose import fitting_focal_mm, solve_pose
@@ -59,8 +59,8 @@ class Positioner:
             left out.
         sites: Where the bars stand; may be empty where beacons are believed.
         attitude_at: What is known of the camera's attitude at a time, us; None for nothing.
-        spec: Bounds and weights; None for the defaults.
-        camera_sigma: How precisely the camera is known; None: exactly.
+        spec: Bounds and weights.
+        camera_sigma: How precisely the camera is known.
 
     Attributes:
         axes: The local axes; None before anything is known of a place.
@@ -73,8 +73,8 @@ class Positioner:
         kinds: Mapping[str, BarKind],
         sites: Sequence[BarSite],
         attitude_at: Callable[[float], Attitude | None],
-        spec: ErrorModel | None = None,
-        camera_sigma: CameraSigma | None = None,
+        spec: ErrorModel = USUAL,
+        camera_sigma: CameraSigma = EXACT,
     ) -> None:
         self.axes: LocalAxes | None = LocalAxes.of(sites) if sites else None
         self._camera = camera
@@ -82,7 +82,7 @@ class Positioner:
         self._kinds = dict(kinds)
         self._packet_us = max(kind.packet_us for kind in self._kinds.values())
         self._attitude_at = attitude_at
-        self._spec = ErrorModel() if spec is None else spec
+        self._spec = spec
         only = next(iter(self._kinds.values())).link if len(self._kinds) == 1 else ""
         self.bars = BarRegistry(sites, self._spec, only)
         self._frames: dict[int, list[Frame]] = {}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.place.calibration import MOST_MISFIT, CalibrationView, KnownPose, SeenView, solve_views
-from evlcp_sdk.place.error_model import ErrorModel
+from evlcp_sdk.place.error_model import EXACT, USUAL, ErrorModel
 from evlcp_sdk.place.navigator import Navigator, Placed, Settled
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -156,8 +156,8 @@ def survey(
     axes: LocalAxes,
     length_m: float | Mapping[int, float],
     camera: CameraModel,
-    sigma: CameraSigma | None = None,
-    spec: ErrorModel | None = None,
+    sigma: CameraSigma = EXACT,
+    spec: ErrorModel = USUAL,
 ) -> list[SurveyedBar]:
     """Estimate where bars stand, from views from known places with known attitudes in the same axes.
 
@@ -167,7 +167,6 @@ def survey(
     Raises:
         ConfigError: A view's attitude is not known, no bar is seen, or the views do not fit one another.
     """
-    spec = ErrorModel() if spec is None else spec
     if any(view.rotation is None for view in views):
         raise ConfigError("a survey needs poses with heading_deg, pitch_deg and roll_deg")
     numbers = sorted({bar.transmitter for view in views for bar in view.bars})
@@ -257,8 +256,8 @@ def _placed(
     return replace(view, bars=tuple(bars))
 
 
-def _whitening(camera: CameraModel, sigma: CameraSigma | None) -> Floats:
+def _whitening(camera: CameraModel, sigma: CameraSigma) -> Floats:
     """What makes the camera's errors independent and of sigma 1, its focal length in mm: float64 (7, 7)."""
-    root = (CameraSigma() if sigma is None else sigma).root(camera)
+    root = sigma.root(camera)
     root[0] *= camera.focal_mm / camera.focal_px
     return np.asarray(np.linalg.inv(np.linalg.cholesky(root @ root.T + _EXACT**2 * np.eye(7))))

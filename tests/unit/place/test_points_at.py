@@ -224,15 +224,15 @@ def test_the_point_is_the_one_that_is_seen() -> None:
     # The sigma of the distance is along the line of sight, not along the axis.
     along = true / 40.0
     spec = dataclasses.replace(POINTS_ONLY, stretch_share=0.001)
-    exact = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT, None, spec)
+    exact = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT, spec=spec)
     stretched = 0.1**2 + (40 * 0.001) ** 2
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
 
 
 def test_what_bends_a_bar_stays_over_frames() -> None:
     bent = replace(ranged(640.0, 360.0, 40.0, 0.5), range=Range(40.0, 0.5, 10, standing_m=0.4))
-    found = bar_point(bent, 0.96, BENT, None, replace(POINTS_ONLY, stretch_share=0.0))
-    straight = bar_point(ranged(640.0, 360.0, 40.0, 0.5), 0.96, BENT, None, POINTS_ONLY)
+    found = bar_point(bent, 0.96, BENT, spec=replace(POINTS_ONLY, stretch_share=0.0))
+    straight = bar_point(ranged(640.0, 360.0, 40.0, 0.5), 0.96, BENT, spec=POINTS_ONLY)
     np.testing.assert_allclose(found.covariance_m2, straight.covariance_m2, rtol=1e-3, atol=1e-6)
     assert found.standing[2, 7] == pytest.approx(0.4)
     frames = [replace(frame(BAR_PX, 0.1, t), range=bent.range) for t in T_US.tolist()]

@@ -103,7 +103,7 @@ def test_a_bar_that_looks_bent_leans_within_its_sigma() -> None:
     for _ in range(8):
         seen = views(rng, 0.002, 0.002, bend_px=0.2, bars=bars)
         for spec, misses in sigmas.items():
-            (bar,) = survey(seen, AXES, 0.96, CAMERA, None, spec)
+            (bar,) = survey(seen, AXES, 0.96, CAMERA, spec=spec)
             off = math.degrees(math.acos(min(bar.site.axis_enu() @ bars[0].axis_enu(), 1)))
             misses.append(off / (bar.site.attitude_sigma_deg or 0))
     # Towards the camera a bar leans by far more than across.
@@ -119,7 +119,7 @@ def test_what_cannot_be_surveyed_is_told() -> None:
         survey([dataclasses.replace(view, bars=()) for view in seen], AXES, 0.96, CAMERA)
     wrong = dataclasses.replace(seen[3], enu_m=seen[3].enu_m + np.array([3.0, 0.0, 0.0]))
     with pytest.raises(ConfigError, match="miss one another"):
-        survey([*seen[:3], wrong, *seen[4:]], AXES, 0.96, CAMERA, None, SPEC)
+        survey([*seen[:3], wrong, *seen[4:]], AXES, 0.96, CAMERA, spec=SPEC)
 
 
 LINK = load_link()
@@ -186,7 +186,7 @@ def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:
             seen = (BarView(2, np.empty((0, 3)), points, np.full(16, 0.0707)),)
             sigmas = (pose.position_sigma_m, pose.attitude.rotation(), pose.attitude_sigma_deg)
             views.append(CalibrationView(seen, here, *sigmas))
-        (bar,) = survey(views, AXES, 0.96, LINK.camera, None, ErrorModel())
+        (bar,) = survey(views, AXES, 0.96, LINK.camera)
         place = AXES.to_enu(bar.site.latitude_deg, bar.site.longitude_deg, bar.site.height_m)
         squares.append(square(place - SPOTS[2], bar.covariance_m2))
         assert np.linalg.norm(place - SPOTS[2]) < 0.4
