@@ -5,7 +5,7 @@ any length take constant memory.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from textwrap import fill
 from typing import Any
 
@@ -16,11 +16,11 @@ from matplotlib.patches import Rectangle
 from matplotlib.patheffects import withStroke
 from numpy.typing import NDArray
 
-from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import cluster_colours, transmitter_colour
 from evlcp_sdk.report.drawing import INK_COLOUR, draw_plots, plain, titled
 from evlcp_sdk.report.recording import (
+    Kept,
     Thinned,
     name_transmitter,
     plot_distances,
@@ -29,18 +29,17 @@ from evlcp_sdk.report.recording import (
     seconds_since,
 )
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.sink import Run
 from evlcp_sdk.spelling import counted
 from evlcp_sdk.values import Events, Frame, PresenceMap, Region
 
 _DPI = 150
 _MOST_SHOWN = 3
-_MOST_PLACES = 4096
 _MOST_POINTS, _MOST_REGIONS = 1024, 64
 """Frames of a transmitter and places of a region, and regions, that are kept."""
 
 
-class Figures(Sink):
+class Figures(Kept):
     """Draws `regions.png`, `presence.png`, `distance.png`, and with positions `track.png`.
 
     A figure without anything to show is left out.
@@ -54,20 +53,15 @@ class Figures(Sink):
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self.image: NDArray[np.int64] = np.zeros((run.link.camera.height, run.link.camera.width), np.int64)
-        self.first_us: int | None = None
         self.regions: dict[int, Thinned[Region]] = {}
         self.many_regions = 0
-        self.frames: dict[int, Thinned[Frame]] = {}
         self.clearest: dict[int, tuple[Frame, PresenceMap]] = {}
-        self.echo_of: dict[int, int | None] = {}
         self._presence: PresenceMap | None = None
-        self._track = Thinned[Settled](_MOST_PLACES)
 
     def events(self, events: Events) -> None:
         """Add events to the accumulated image."""
+        super().events(events)
         if len(events):
-            if self.first_us is None:
-                self.first_us = int(events.t_us[0])
             height, width = self.image.shape
             inside = (events.x < width) & (events.y < height)
             flat = events.y[inside].astype(np.int64) * width + events.x[inside]
@@ -75,17 +69,18 @@ class Figures(Sink):
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
-        """Keep regions, presence maps and frames."""
+        """Keep regions, and the clearest frames with their presence maps."""
         if stage == "regions":
             self._place(value)
         elif stage == "separation":
             self._presence = value
-        elif stage == "frame" and (value.transmitter in self.frames or len(self.frames) < _MOST_SHOWN):
-            self.frames.setdefault(value.transmitter, Thinned(_MOST_POINTS)).add(value)
-            # The newest frame knows most.
-            self.echo_of[value.transmitter] = value.echo_of
+        elif stage == "frame" and self._presence is not None:
             best = self.clearest.get(value.transmitter)
-            if self._presence is not None and (best is None or value.soft.quality > best[0].soft.quality):
+            if (
+                len(self.clearest) < _MOST_SHOWN
+                if best is None
+                else value.soft.quality > best[0].soft.quality
+            ):
                 self.clearest[value.transmitter] = value, self._presence
 
     def _place(self, region: Region) -> None:
@@ -97,21 +92,16 @@ class Figures(Sink):
             self.regions[region.id] = Thinned(_MOST_POINTS)
         self.regions[region.id].add(region)
 
-    def settle(self, settled: Sequence[Settled]) -> None:
-        """Keep places."""
-        for one in settled:
-            self._track.add(one)
-
     def finish(self) -> Mapping[str, Any]:
         """Draw."""
         name = self.run.name
         self._save(draw_regions(self, name), "regions.png")
-        if self.clearest:
+        if self.clearest.keys() & self.seen:
             self._save(draw_presence(self, name), "presence.png")
-        if self.frames:
+        if self.seen:
             self._save(draw_distance(self, name), "distance.png")
         if self.run.navigator is not None:
-            points = [*self._track]
+            points = [*self.track]
             plots = plot_positions(points, self.run.navigator.bars_enu_m(), seconds_since(0.0))
             self._save(draw_plots(plots, f"{name}: {counted(len(points), 'position')} shown"), "track.png")
         return {}
@@ -157,14 +147,14 @@ def draw_regions(kept: Figures, title: str) -> Figure:
 
 def draw_presence(kept: Figures, title: str) -> Figure:
     """Which pixels show which cluster, in one frame of each transmitter, and the profile of each cluster."""
-    shown = [kept.clearest[n] for n in sorted(kept.clearest)[:_MOST_SHOWN]]
+    shown = [kept.clearest[n] for n in sorted(kept.clearest.keys() & kept.seen)]
     figure = Figure(figsize=(6.4 * len(shown), 7.4), layout="constrained")
     text = fill(_PRESENCE.format(size=shown[0][1].grid_px), 92 * len(shown))
     figure.supxlabel(text, x=0.02, ha="left", fontsize=9, color=INK_COLOUR)
     parts = figure.subfigures(1, len(shown), squeeze=False)[0]
     for part, (frame, presence) in zip(parts, shown, strict=True):
         number = frame.transmitter
-        _draw_one_presence(part, frame, presence, name_transmitter(number, kept.echo_of[number]))
+        _draw_one_presence(part, frame, presence, name_transmitter(number, kept.seen[number].echo_of))
     figure.suptitle(f"{title}: which pixels show which cluster", fontsize=11, color=INK_COLOUR)
     return figure
 
@@ -228,13 +218,7 @@ def _draw_one_presence(part: SubFigure, frame: Frame, presence: PresenceMap, who
 def draw_distance(kept: Figures, title: str) -> Figure:
     """Distance of each transmitter, what it is off its neighbours, and quality, over time."""
     axis = seconds_since(kept.first_us or 0)
-    frames = {
-        number: (
-            name_transmitter(number, kept.echo_of[number]),
-            sorted(kept.frames[number], key=lambda frame: frame.t_us),
-        )
-        for number in sorted(kept.frames)[:_MOST_SHOWN]
-    }
+    frames = dict([*kept.frames().items()][:_MOST_SHOWN])
     plots = [plot for number, one in frames.items() for plot in plot_distances(number, *one, axis)]
     return draw_plots([*plots, plot_quality(frames, axis)], f"{title}: distance along the optical axis")
 

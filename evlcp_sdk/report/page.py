@@ -7,21 +7,19 @@ memory; all frames are in `frames.csv`, all messages in `packets.jsonl`.
 import math
 from collections import deque
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
 from evlcp_sdk.diagnosis.facts import Diagnostic
-from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.report.colours import transmitter_colour
 from evlcp_sdk.report.motion import MotionProbe
 from evlcp_sdk.report.pages import render_page
 from evlcp_sdk.report.plots import SCRIPT, Plot
 from evlcp_sdk.report.recording import (
-    Thinned,
+    Kept,
     TimeAxis,
     label_frames,
     name_transmitter,
@@ -31,57 +29,26 @@ from evlcp_sdk.report.recording import (
     seconds_since,
 )
 from evlcp_sdk.results.folder import ResultFolder
-from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.results.sink import Run
 from evlcp_sdk.spelling import counted
-from evlcp_sdk.values import Events, Frame, Packet
+from evlcp_sdk.values import Frame, Packet, ReceivedMessage
 
-_MOST_TRANSMITTERS = 6
-_MOST_POINTS = 512
-_MOST_ROWS = 40
 _MOST_MESSAGES = 50
-_MOST_CHARACTERS = 2_000
+_MOST_SAID = 2_000
 
 _SECONDS = 5.0
 """Length of a recording whose charts count in seconds."""
 
 
-@dataclass(eq=False)
-class _Seen:
-    """What is kept of a transmitter.
-
-    Attributes:
-        frames: A share of its frames, for the charts.
-        first: The first ones, for the table.
-        count: How many there were.
-        echo_of: Of which transmitter it is a reflection, as the newest packet says.
-        link: Name of its link, where there are several.
-    """
-
-    frames: Thinned[Frame] = field(default_factory=lambda: Thinned(_MOST_POINTS))
-    first: list[Frame] = field(default_factory=list)
-    count: int = 0
-    echo_of: int | None = None
-    link: str = ""
-
-
-class Report(Sink):
+class Report(Kept):
     """Writes `report.html`."""
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         super().__init__(folder, run)
         self._motion = MotionProbe(3 * max(len(run.links), 1))
-        self._track = Thinned[Settled](1024)
-        self._seen: dict[int, _Seen] = {}
-        self._messages: list[tuple[str, ...]] = []
-        self._latest: deque[tuple[str, ...]] = deque(maxlen=_MOST_MESSAGES)
+        self._messages: list[ReceivedMessage] = []
+        self._latest: deque[ReceivedMessage] = deque(maxlen=_MOST_MESSAGES)
         self._many_messages = 0
-        self._axis = TimeAxis("ms since the first event", 0.0, 1.0)
-        self._begun = False
-
-    def events(self, events: Events) -> None:
-        """Note when the recording starts."""
-        if not self._begun and len(events):
-            self._begun, self._axis = True, replace(self._axis, zero_us=float(events.t_us[0]))
 
     @hookimpl
     def evlcp_stage_finished(self, stage: str, value: Any) -> None:
@@ -90,50 +57,31 @@ class Report(Sink):
 
     def packet(self, packet: Packet) -> None:
         """Keep frames and messages."""
-        number = packet.transmitter
-        if packet.frames and (number in self._seen or len(self._seen) < _MOST_TRANSMITTERS):
-            seen = self._seen.setdefault(number, _Seen(link=packet.link))
-            seen.echo_of = packet.echo_of
-            for frame in packet.frames:
-                seen.count += 1
-                seen.frames.add(frame)
-                if len(seen.first) < _MOST_ROWS:
-                    seen.first.append(frame)
+        super().packet(packet)
         for message in packet.messages:
             self._many_messages += 1
-            row = (
-                f"{self._axis.ms(message.t_us):.1f}",
-                message.kind.name,
-                str(message.message.transmitter_id),
-                message.trust,
-                message.said(_MOST_CHARACTERS),
-            )
-            (self._messages if len(self._messages) < _MOST_MESSAGES else self._latest).append(row)
-
-    def settle(self, settled: Sequence[Settled]) -> None:
-        """Keep places."""
-        for one in settled:
-            self._track.add(one)
+            (self._messages if len(self._messages) < _MOST_MESSAGES else self._latest).append(message)
 
     def conclude(self, summary: Mapping[str, Any]) -> None:
         """Write the page, which is the same for the same recording: how long it took is not in it."""
+        axis = TimeAxis("ms since the first event", self.first_us or 0, 1.0)
         if summary["recording"]["duration_s"] > _SECONDS:
-            self._axis = seconds_since(self._axis.zero_us)
+            axis = seconds_since(axis.zero_us)
         motions = [
-            motion.to_dict(link.codebook, link.packet.chip_us, self._axis.ms)
+            motion.to_dict(link.codebook, link.packet.chip_us, axis.ms)
             for motion in self._motion.motions()
             # What another link fitted better is not given.
-            if motion.frame.transmitter in self._seen or not self.run.links
+            if motion.frame.transmitter in self.seen or not self.run.links
             for link in [self.run.link_of(motion.frame.link)]
         ]
-        frames = self._frames()
-        distances = [p for number, one in frames.items() for p in plot_distances(number, *one, self._axis)]
+        frames = self.frames()
+        distances = [p for number, one in frames.items() for p in plot_distances(number, *one, axis)]
         navigator = self.run.navigator
         places = None
         if navigator is not None:
-            places = plot_positions([*self._track], navigator.bars_enu_m(), self._axis)
-        of_frames = [*distances, plot_quality(frames, self._axis), self._plot_places()]
-        plots = of_frames * bool(self._seen) + (places or [])
+            places = plot_positions([*self.track], navigator.bars_enu_m(), axis)
+        of_frames = [*distances, plot_quality(frames, axis), self._plot_places(frames, axis)]
+        plots = of_frames * bool(self.seen) + (places or [])
         messages = [*self._messages, *self._latest]
         # Its labels are known once a chart is drawn.
         held = {plot.id: plot.markup() for plot in plots}
@@ -151,14 +99,17 @@ class Report(Sink):
             motions=motions,
             held=held,
             distances=distances,
-            seen=self._seen,
-            received=sum(seen.count for seen in self._seen.values()),
-            shown=sum(len(seen.frames) for seen in self._seen.values()),
+            seen=self.seen,
+            received=sum(seen.count for seen in self.seen.values()),
+            shown=sum(len(seen.frames) for seen in self.seen.values()),
             places=places,
-            placed=len(self._track) > 0,
-            messages=messages,
+            placed=len(self.track) > 0,
+            messages=[
+                (f"{axis.ms(m.t_us):.1f}", m.kind.name, m.message.transmitter_id, m.trust, m.said(_MOST_SAID))
+                for m in messages
+            ],
             left_out=self._many_messages - len(messages),
-            symbols=self._symbols(),
+            symbols=self._symbols(axis),
         )
         self.folder.open("report.html").write(page)
 
@@ -196,7 +147,7 @@ class Report(Sink):
         ]
         return figures
 
-    def _plot_places(self) -> Plot:
+    def _plot_places(self, shown: Mapping[int, tuple[str, Sequence[Frame]]], axis: TimeAxis) -> Plot:
         """Where in the image transmitters are."""
         camera = self.run.link.camera
         image = Plot(
@@ -208,28 +159,18 @@ class Report(Sink):
             x_limits=(0, camera.width),
             y_limits=(0, camera.height),
         )
-        for number, (who, frames) in self._frames().items():
+        for number, (who, frames) in shown.items():
             places = np.array([(frame.x_px, frame.y_px) for frame in frames])
-            labels = label_frames(who, frames, self._axis)
+            labels = label_frames(who, frames, axis)
             image.dots(places[:, 0], places[:, 1], transmitter_colour(number), who, labels)
             if len(frames) and np.isfinite(places[-1]).all():
                 image.name(float(places[-1, 0]), float(places[-1, 1]), str(number))
         return image
 
-    def _frames(self) -> dict[int, tuple[str, list[Frame]]]:
-        """What each transmitter is called, and its frames that are shown, in order."""
-        return {
-            number: (
-                name_transmitter(number, seen.echo_of, seen.link),
-                sorted(seen.frames, key=lambda frame: frame.t_us),
-            )
-            for number, seen in sorted(self._seen.items())
-        }
-
-    def _symbols(self) -> list[tuple[str, int, int, list[Any]]]:
+    def _symbols(self, axis: TimeAxis) -> list[tuple[str, int, int, list[Any]]]:
         """The symbols of the first frames of each transmitter: title, clusters, codewords, and rows."""
         tables = []
-        for number, seen in sorted(self._seen.items()):
+        for number, seen in sorted(self.seen.items()):
             rows = []
             book = self.run.link_of(seen.link).codebook
             for frame in seen.first:
@@ -237,7 +178,7 @@ class Report(Sink):
                 found = f"{depth.distance_m:.2f} ± {depth.sigma_m:.2f}"
                 start = (
                     f"{frame.packet}/{frame.frame}",
-                    f"{self._axis.ms(frame.t_us):.1f}",
+                    f"{axis.ms(frame.t_us):.1f}",
                     found if math.isfinite(depth.distance_m) else "-",
                     f"{frame.soft.quality:.2f}",
                 )

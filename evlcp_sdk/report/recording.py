@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 from evlcp_sdk.place.navigator import Settled
 from evlcp_sdk.report.colours import transmitter_colour
 from evlcp_sdk.report.plots import DASHES, INK, Plot, ellipse, enlarge_ellipses
-from evlcp_sdk.values import Fix, Frame
+from evlcp_sdk.results.folder import ResultFolder
+from evlcp_sdk.results.sink import Run, Sink
+from evlcp_sdk.values import Events, Fix, Frame, Packet
 
+_MOST_TRANSMITTERS, _MOST_FRAMES, _MOST_POSITIONS = 6, 512, 1024
+_MOST_ROWS = 40
 _MOST_ELLIPSES = 40
 _FIX = "#56b4e9"
 
@@ -50,6 +54,72 @@ class Thinned(Generic[T]):
 
     def __len__(self) -> int:
         return len(self._values)
+
+
+@dataclass(eq=False)
+class Seen:
+    """What is kept of a transmitter.
+
+    Attributes:
+        link: Name of its link, where there are several.
+        echo_of: Of which transmitter it is a reflection, as the newest packet says, which knows most.
+        frames: A share of its frames, for the charts.
+        first: The first ones, for the table.
+        count: How many there were.
+    """
+
+    link: str
+    echo_of: int | None = None
+    frames: Thinned[Frame] = field(default_factory=lambda: Thinned(_MOST_FRAMES))
+    first: list[Frame] = field(default_factory=list)
+    count: int = 0
+
+
+class Kept(Sink):
+    """Keeps what charts show of a recording, a bounded share of it: first transmitters, positions.
+
+    Attributes:
+        first_us: The recording's first event, camera clock, us; None before.
+        seen: What there is of each transmitter, by its number.
+        track: The positions.
+    """
+
+    def __init__(self, folder: ResultFolder, run: Run) -> None:
+        super().__init__(folder, run)
+        self.first_us: int | None = None
+        self.seen: dict[int, Seen] = {}
+        self.track = Thinned[Settled](_MOST_POSITIONS)
+
+    def events(self, events: Events) -> None:
+        """Note when the recording starts."""
+        if self.first_us is None and len(events):
+            self.first_us = int(events.t_us[0])
+
+    def packet(self, packet: Packet) -> None:
+        """Keep frames."""
+        number = packet.transmitter
+        if packet.frames and (number in self.seen or len(self.seen) < _MOST_TRANSMITTERS):
+            seen = self.seen.setdefault(number, Seen(packet.link))
+            seen.echo_of = packet.echo_of
+            seen.first += packet.frames[: _MOST_ROWS - len(seen.first)]
+            seen.count += len(packet.frames)
+            for frame in packet.frames:
+                seen.frames.add(frame)
+
+    def settle(self, settled: Sequence[Settled]) -> None:
+        """Keep places."""
+        for one in settled:
+            self.track.add(one)
+
+    def frames(self) -> dict[int, tuple[str, list[Frame]]]:
+        """What each transmitter is called, and its frames that are shown, in order, by its number."""
+        return {
+            number: (
+                name_transmitter(number, seen.echo_of, seen.link),
+                sorted(seen.frames, key=lambda frame: frame.t_us),
+            )
+            for number, seen in sorted(self.seen.items())
+        }
 
 
 @dataclass(frozen=True)

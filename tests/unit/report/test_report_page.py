@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -162,8 +163,8 @@ def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) ->
                 for k in range(10)
             )
             sink.packet(Packet(n % 9, n, 34e3 * n, 100.0, frames, 10))
-        assert len(sink._seen) == 6
-        assert all(len(seen.frames) <= 512 and len(seen.first) == 40 for seen in sink._seen.values())
+        assert len(sink.seen) == 6
+        assert all(len(seen.frames) <= 512 and len(seen.first) == 40 for seen in sink.seen.values())
     page = (tmp_path / "report.html").read_text()
     assert len(page) < 1_500_000
     assert re.search(r"[\d,]+ of 26,6\d0 frames are shown", page)
@@ -172,7 +173,14 @@ def test_a_recording_of_any_length_has_a_page_of_bounded_size(tmp_path: Path) ->
 def test_what_others_wrote_stays_text(tmp_path: Path) -> None:
     with reported(tmp_path, HOSTILE) as sink:
         sink._many_messages = 101
-        sink._messages.append(("1.0", HOSTILE, "7", "unverified", HOSTILE))
+        said: Any = SimpleNamespace(
+            t_us=1e3,
+            kind=SimpleNamespace(name=HOSTILE),
+            message=SimpleNamespace(transmitter_id=7),
+            trust="unverified",
+            said=lambda _most: HOSTILE,
+        )
+        sink._messages.append(said)
     page = Elements((tmp_path / "report.html").read_text())
     assert not [tag for tag, _ in page.tags if tag in ("img", "iframe")]
     assert len(page.scripts) == 4
