@@ -5,7 +5,6 @@
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import replace
 from typing import Any
 
 from markupsafe import Markup
@@ -24,7 +23,6 @@ from evlcp_sdk.study.summary import (
     Reference,
     Series,
     Summary,
-    Verdict,
     beside_paper,
     verdict_of,
 )
@@ -198,12 +196,11 @@ def page(summary: Summary) -> str:
     rule = summary.plan.rule
     return render_page(
         "campaign.html",
-        title_of(summary),
+        summary.plan.name,
         [SCRIPT],
         {"plots": {chart.id: chart.labels for chart in charts}},
         summary=summary,
         about=_about(summary),
-        figures=_headlines(summary, beside),
         charts=drawn,
         beside=[[*row[:-1], marked(row[-1])] for row in comparison_rows(beside)],
         paper=PAPER_NAME,
@@ -219,77 +216,13 @@ def page(summary: Summary) -> str:
     )
 
 
-def title_of(summary: Summary) -> str:
-    """What was measured, at which distances, and the campaign's name."""
-    tallies = [tally for one in summary.series for tally in one.statistics.segments.values()]
-    begins = [begin for one in summary.series for begin in one.statistics.segments]
-    if not begins:
-        return f"{summary.plan.name}: nothing measured yet"
-    what = ["bit errors", "distance errors"]
-    what += ["messages"] * any(t.messages_sent for t in tallies)
-    what += ["positions"] * any(t.fixes or t.fixes_refused for t in tallies)
-    said = f"{', '.join(what[:-1])} and {what[-1]}"
-    return f"{summary.plan.name}: {said}, {min(begins)} to {max(begins) + SEGMENT_M} m"
-
-
-def _about(summary: Summary) -> list[str]:
-    """How much was done, and what the series differ in."""
+def _about(summary: Summary) -> str:
+    """How much was done."""
     few = summary.done < summary.tasks
     done = f"{summary.done} of {summary.tasks} tasks" if few else counted(summary.done, "task")
     statistics = [one.statistics for one in summary.series]
     events, seconds = sum(s.events for s in statistics), sum(s.duration_us for s in statistics) * 1e-6
-    told = [f"{done}, {seconds:,.1f} s received, {events / 1e6:,.1f} million events."]
-    if len(summary.series) > 1:
-        varied = []
-        for key in dict.fromkeys(key for one in summary.series for key in one.labels):
-            labelled = [one for one in summary.series if key in one.labels]
-            values = dict.fromkeys(replace(one, labels={key: one.labels[key]}).name for one in labelled)
-            if len(values) > 1:
-                *most, last = values
-                varied.append(f"{', '.join(most)} or {last}")
-        told.append(f"{len(summary.series)} series: {'; '.join(varied)}.")
-    return told
-
-
-def _headlines(summary: Summary, beside: Sequence[PaperComparison]) -> list[tuple[str, str, str]]:
-    """The figures that a reader looks for first: of all distances, from the best series to the worst."""
-    everything = [(one, one.statistics.total()) for one in summary.series]
-    total = Tally.together(tally for _, tally in everything)
-    several = f"all distances, {len(everything)} series" if len(everything) > 1 else "all distances"
-    shown = []
-
-    def figures(kind: str, form: str, unit: str = "") -> str:
-        found = [measure(tuple(r.total() for r in one.recordings), kind) for one, _ in everything]
-        known = sorted((f for f in found if f.count), key=lambda figure: figure.value)
-        if not known:
-            return ""
-        ends = [f"below {f.high:{form}}" if f.none else f"{f.value:{form}}" for f in (known[0], known[-1])]
-        return " to ".join(dict.fromkeys(ends)) + unit
-
-    if total.frames_sent:
-        share = f"{total.frames_found / total.frames_sent:.1%} of frames sent"
-        shown.append(("frames found", f"{total.frames_found:,} of {total.frames_sent:,}", share))
-    for what, kind, form, unit in (
-        ("bit error rate", "ber", ".2g", ""),
-        ("distance RMSE", "rmse_m", ".3f", " m"),
-        ("errors of 0.5 m or more", "gross_share", ".2%", ""),
-        ("position RMSE in space", "position_rmse_m", ".3f", " m"),
-    ):
-        if value := figures(kind, form, unit):
-            shown.append((what, value, several))
-    if total.messages_sent:
-        wrong = f"{total.messages_wrong} read wrong"
-        shown.append(("messages read", f"{total.messages_found:,} of {total.messages_sent:,}", wrong))
-    if beside:
-        counts = {v: sum(one.verdict == v for one in beside) for v in _SAID}
-        said = ", ".join(f"{n} {_SAID[verdict]}" for verdict, n in counts.items() if n)
-        shown.append(("beside the paper", said, f"of {len(beside)} figures of {PAPER_NAME}"))
-    return shown
-
-
-_SAID: dict[Verdict, str] = {
-    "better": "better", "agrees": "agree", "worse": "worse", "too few": "of too few frames",
-}  # fmt: skip
+    return f"{done}, {seconds:,.1f} s received, {events / 1e6:,.1f} million events."
 
 
 _MARKED = {"better": "yes", "agrees": "", "worse": "no", "too few": ""}

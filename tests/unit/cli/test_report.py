@@ -18,7 +18,6 @@ from evlcp_sdk.study.report import POSITION_HEAD, charts_of, page, position_rows
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import PAPER, Series, Summary, beside_paper, summarize
 from evlcp_sdk.study.tally import Statistics, Tally
-from tests.unit.report.test_pages import Elements
 from tests.unit.study.browser import CHROMIUM, Browser
 from tests.unit.study.fake import run_fake
 
@@ -139,15 +138,8 @@ def test_charts_are_saved_as_png_and_svg(summary: Summary, tmp_path: Path) -> No
 def test_the_page_tells_everything(summary: Summary) -> None:
     text = page(summary)
     assert summary.plan.digest in text
-    assert "<h1>two methods &lt;/script&gt;: bit errors and distance errors, 30 to 80 m</h1>" in text
-    assert "4 series: 20 km/h or 30 km/h; 16 clusters or two clusters &lt;!--&lt;script&gt;." in text
-    head = Elements(text.partition("<h2>")[0])
-    total = Tally.together(one.statistics.total() for one in summary.series)
-    assert f"{total.frames_found:,} of {total.frames_sent:,}" in head.text
-    by_series = sorted(one.statistics.total().rmse_m for one in summary.series)
-    assert f"{by_series[0]:.3f} to {by_series[-1]:.3f} m" in head.text
+    assert "<h1>two methods &lt;/script&gt;</h1>" in text
     verdicts = [one.verdict for one in beside_paper(summary.series)]
-    assert f"{verdicts.count('worse')} worse" in head.text
     assert text.count('<span class="no">worse</span>') == verdicts.count("worse")
     assert text.count('<span class="yes">better</span>') == verdicts.count("better")
     assert "arXiv 2510.17203" in text
