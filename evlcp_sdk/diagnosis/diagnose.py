@@ -39,14 +39,12 @@ class Diagnosis:
     """What is in a recording, and what becomes of it.
 
     Attributes:
-        recording: Its name.
         headline: What is wrong first of all, or that nothing is, in one line.
         checks: What each check found, by stage, in the order in which light passes them.
         sources: What blinks, most events first.
         trials: Links that were tried, the one given first.
         counts: The receiver's counts.
-        cell_px: Size of the cells of the maps, px.
-        frequency_hz: What each cell blinks with, NaN where it does not, float64 (rows, columns).
+        frequency_hz: What each cell of `cell_px` blinks with, NaN where it does not, float64 (rows, columns).
         events_map: Negative and positive events of each cell, int64 (rows, columns, 2).
         duration_s: From the first event to the last, s.
     """

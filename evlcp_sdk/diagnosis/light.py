@@ -147,11 +147,7 @@ class LightSource:
 
 
 class LightSurvey:
-    """Takes a stream of events; says what blinks in it. In constant memory.
-
-    Args:
-        width: Columns of the sensor.
-        height: Its rows.
+    """Takes a stream of events of a sensor; says what blinks in it. In constant memory.
 
     Attributes:
         cell_px: Size of the cells that light is looked for in, px.
@@ -331,16 +327,9 @@ class LightSurvey:
 
 
 def comb(times: NDArray[np.generic], frequencies_hz: Floats) -> Floats:
-    """Mean of cos(2 pi f tau) over the times tau between rises.
+    """Mean of cos(2 pi f tau) over the times tau between rises, counted (..., BINS), float64 (..., n).
 
     At high frequencies only over the short ones: those beyond are counted in bins too wide for it.
-
-    Args:
-        times: Counts, any number (..., BINS).
-        frequencies_hz: float64 (n,).
-
-    Returns:
-        float64 (..., n).
     """
     counts = np.asarray(times, np.float64)
     short = counts[..., :FINE]

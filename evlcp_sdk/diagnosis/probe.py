@@ -48,9 +48,7 @@ class Trial:
 
     Attributes:
         changes: What it has other than the link that was given: `table.key` to value.
-        link: The link.
-        frames: Frames accepted.
-        rejected: Frames rejected.
+        frames: Frames accepted; others: `rejected`.
         quality: Mean quality of the frames; 0 without any.
         never: Codewords that never occur though they should have, by far.
         said: What a framing says of the light by which it was inferred, or why it was not.

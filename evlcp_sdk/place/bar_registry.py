@@ -27,11 +27,9 @@ class _Sent:
     """What a transmitter's beacons said.
 
     Attributes:
-        transmitter_id: Its id, None before.
-        beacon: Its place by its own word.
-        trust: How far that is believed; `forged` shuts it out until a verified one comes; `lapsed`: it was
-            verified, and its key or its age has run out since.
-        verified: The beacon that was verified last, None before.
+        trust: How far `beacon`, its place by its own word, is believed; `forged` shuts it out until a
+            verified one comes; `lapsed`: it was verified, and its key or its age has run out since.
+        verified: The beacon that was verified last.
         link: Name of the link that its packets have.
     """
 
@@ -43,11 +41,9 @@ class _Sent:
 
 
 class BarRegistry:
-    """Where the transmitters of a receiver stand.
+    """Where the transmitters of a receiver stand, by sites, or by beacons as far as they are believed.
 
     Args:
-        sites: Where bars stand; may be empty where beacons are believed.
-        spec: Which beacons are believed.
         link: Name of the link of a receiver that has one only; empty for none.
 
     Attributes:

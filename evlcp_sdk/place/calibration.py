@@ -49,10 +49,7 @@ class KnownPose:
     Attributes:
         recording: Name of the recording's file; empty where there is only one.
         t_us: When, camera clock, us.
-        latitude_deg: WGS-84.
-        longitude_deg: The same.
-        height_m: Above the ellipsoid, m.
-        position_sigma_m: Standard deviation of each of these, m.
+        position_sigma_m: Standard deviation of its place, WGS-84 and above the ellipsoid, in each axis, m.
         attitude: With heading; None where it is not known.
         attitude_sigma_deg: Standard deviation of a turn about each axis, degrees.
     """

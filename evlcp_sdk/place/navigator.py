@@ -154,10 +154,7 @@ class Place:
 
     Attributes:
         t_us: Camera clock, us.
-        latitude_deg: WGS-84.
-        longitude_deg: The same.
-        height_m: Above the ellipsoid, m.
-        enu_m: The same place in the local axes, m, float64 (3,).
+        enu_m: The place, WGS-84 and above the ellipsoid, in the local axes, m, float64 (3,).
         covariance_m2: Of `enu_m`, float64 (3, 3).
         speed_m_s: Over ground.
         course_deg: Where it moves to, clockwise from north.

@@ -26,13 +26,7 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BarKind:
-    """One kind of bars that positions are computed from.
-
-    Attributes:
-        bar: Their layout.
-        packet_us: Length of their packets, us.
-        link: Name of the link that they send with; empty for none.
-    """
+    """One kind of bars that positions are computed from: of one link, whose name may be empty."""
 
     bar: BarLayout
     packet_us: float

@@ -35,10 +35,7 @@ _PAUSE_US = 200_000.0
 class OwnPoses:
     """Collects the poses of a recording's track at times when bars are in view that stand at no known site.
 
-    Args:
-        navigator: Computes the track; it knows the sites and the attitude.
-        attitude_at: What is known of the camera's attitude at a time, us, for fixes that have none.
-        recording: What the poses call the recording.
+    The navigator computes the track; `attitude_at` is for fixes that have no attitude.
     """
 
     def __init__(

@@ -99,13 +99,7 @@ def _draw_shape(axis: Axes, shape: Shape, *, legend: bool = False) -> Any:
 
 
 def save_plots(plots: Sequence[Plot], title: str, folder: Path, outputs: Outputs) -> list[Path]:
-    """Draw charts as PNG and SVG, named by their id.
-
-    Args:
-        plots: What is drawn.
-        title: Above each.
-        folder: Where they go; made if need be.
-        outputs: The files that they come into place with.
+    """Draw charts as PNG and SVG, named by their id, into a folder that is made if need be.
 
     Raises:
         OutputError: A file cannot be written.

@@ -54,10 +54,7 @@ class Film:
     Attributes:
         start_us: Camera clock where it starts, us.
         pictures: How many there are.
-        left: First column of the sensor that is shown.
-        top: First row.
-        columns: Columns that are shown.
-        rows: Rows that are shown.
+        left, top, columns, rows: What is shown of the sensor.
         scale: Pixels of a picture for one of the sensor, at most 8.
         slow: How many times slower than it was it is shown.
     """
@@ -154,15 +151,8 @@ def gather_footage(
 ) -> Footage:
     """Decode a recording until the end of what a film shows.
 
-    Args:
-        source: The recording.
-        name: What messages call it.
-        links: The configurations by name.
-        registry: Its hooks hear of the receiver's stages.
-        from_ms: Where the film starts, ms after the first event; None for the first frame that is decoded,
-            or the start where there is none.
-        for_us: How much of the recording it shows, us.
-        advance: Says how far the reading is.
+    The film starts `from_ms` after the first event, without that at the first frame that is decoded, or at
+    the start where there is none. Hooks of the registry hear of the receiver's stages.
 
     Raises:
         InputError: The recording has nothing there.
@@ -217,13 +207,7 @@ def plan_film(
 ) -> Film:
     """What to show: the bars that are read, with a margin, or else what blinks, or else all.
 
-    Args:
-        footage: What is there.
-        for_us: How much of the recording it shows, us.
-        slow: How many times slower than it was.
-        camera: Has the size of the image.
-        longest_px: Longest side of a picture, but for the line above.
-        whole: Show all of the image.
+    `longest_px` is the longest side of a picture, but for the line above.
 
     Raises:
         ConfigError: It would have too many pixels.
@@ -254,14 +238,7 @@ def plan_film(
 def draw_film(
     film: Film, events: Iterable[Events], footage: Footage, links: Mapping[str, Link]
 ) -> Iterator[Image.Image]:
-    """Draw the pictures one after another; reads no further than to the last one's events.
-
-    Args:
-        film: What is shown.
-        events: Those of the recording.
-        footage: What is drawn over them.
-        links: The receiver's, by name.
-    """
+    """Draw the pictures one after another; reads no further than to the last one's events."""
     overlay = _Overlay(film, footage, links)
     chip_us = min(link.packet.chip_us for link in links.values())
     lit = np.zeros((2, film.rows, film.columns), np.float32)
@@ -356,13 +333,7 @@ def _picture(lit: NDArray[np.float32], film: Film) -> Image.Image:
 
 
 class _Overlay:
-    """Draws what was found over the events.
-
-    Args:
-        film: What is shown.
-        footage: What was found.
-        links: Lengths of frames, number of clusters.
-    """
+    """Draws what was found over the events."""
 
     def __init__(self, film: Film, footage: Footage, links: Mapping[str, Link]) -> None:
         self._film, self._footage = film, footage

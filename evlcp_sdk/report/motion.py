@@ -57,19 +57,8 @@ class Motion:
         clipped = np.clip(sums, -_MOST_EVENTS, _MOST_EVENTS).astype(np.int8)
         return cls(frame, clipped, clusters.copy())
 
-    def to_dict(
-        self,
-        codebook: Codebook,
-        chip_us: float,
-        ms: Callable[[float], float],
-    ) -> dict[str, Any]:
-        """The frame as JSON values, for a page's script.
-
-        Args:
-            codebook: The codes that it was sent with.
-            chip_us: Length of a chip, us.
-            ms: The time that is shown, ms, of one of the camera's clock, us.
-        """
+    def to_dict(self, codebook: Codebook, chip_us: float, ms: Callable[[float], float]) -> dict[str, Any]:
+        """The frame as JSON values, for a page's script; `ms` gives the time that is shown of the clock's."""
         chips, height, width = self.sums.shape
         lit = sent_chips(self.frame, codebook)
         rows = [np.nonzero(self.clusters == k)[0] for k in range(len(lit))]

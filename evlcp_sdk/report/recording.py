@@ -124,13 +124,7 @@ class Kept(Sink):
 
 @dataclass(frozen=True)
 class TimeAxis:
-    """How charts count time.
-
-    Attributes:
-        name: What it is, with the unit.
-        zero_us: Where it begins, camera clock, us.
-        step_ms: Its unit, ms.
-    """
+    """How charts count time: from `zero_us` on the camera's clock on, in units of `step_ms`."""
 
     name: str
     zero_us: float
@@ -208,13 +202,7 @@ def label_frames(who: str, frames: Iterable[Frame], axis: TimeAxis) -> list[str]
 def plot_positions(
     points: Sequence[Settled], bars_enu_m: Mapping[int, NDArray[np.float64]], axis: TimeAxis
 ) -> list[Plot]:
-    """Fixes, track and bars in local metres; height, sigmas and protection levels over time.
-
-    Args:
-        points: The trajectory.
-        bars_enu_m: Centre of each bar in the local axes, m, float64 (3,), by transmitter.
-        axis: How time is counted.
-    """
+    """Fixes, track and bars, by transmitter, in local metres; height, sigmas, protection levels over time."""
     fixes = [point.fix for point in points]
     labels = []
     for fix in fixes:
@@ -289,15 +277,7 @@ def _plot_times(points: Sequence[Settled], labels: Sequence[str], axis: TimeAxis
 
 
 def off_neighbours(t_s: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What each value lies off a straight line through itself and its neighbours in time.
-
-    Args:
-        t_s: Times, s, float64 (n,), ascending.
-        values: Float64 (n,).
-
-    Returns:
-        Float64 (n,), of the values' unit.
-    """
+    """What each value lies off a straight line through itself and its neighbours in time, float64 (n,)."""
     n = len(values)
     wide = min(_NEIGHBOURS, n)
     if wide < 3:

@@ -20,10 +20,8 @@ class Progress:
     Attributes:
         tasks: Tasks that count or may still: all, less those that a stopping rule made needless.
         done: Those of them that are finished.
-        points: Points of the plan.
-        points_done: Points that need no more tasks.
-        bits: Bits that count so far.
-        bit_errors: Wrong ones among them.
+        points_done: Points of the plan that need no more tasks.
+        bits: Bits that count so far; wrong ones among them: `bit_errors`.
         faults: Jobs that failed, in order.
     """
 

@@ -38,13 +38,7 @@ _AT_SETTING = re.compile(rf",(?=\s*{_KEY})")
 
 @dataclass(frozen=True, eq=False)
 class Variant:
-    """A configuration with a name.
-
-    Attributes:
-        name: As the user calls it.
-        settings: What sets it apart, e.g. `ranging.id=centroid`.
-        links: The resolved configuration by name, which is empty for a single link.
-    """
+    """A configuration with a name, the settings that set it apart, and its resolved links by their names."""
 
     name: str
     settings: tuple[str, ...]

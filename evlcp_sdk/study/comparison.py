@@ -28,8 +28,7 @@ class Times:
     """What one variant's work took; adds over recordings.
 
     Attributes:
-        frame_us: Time of every frame in the stages `STAGES` together, us.
-        stage_us: The same of each stage.
+        frame_us: Time of every frame in the stages `STAGES` together, us; of each stage: `stage_us`.
         recorded_s: Duration of the recordings, s.
         cpu_s: Processor time for reading and receiving them, as `Stopwatch` counts it, s.
     """

@@ -37,12 +37,7 @@ _WAITING_PER_THREAD = 2
 
 @dataclass(frozen=True)
 class Fault:
-    """Why a job has no value.
-
-    Attributes:
-        message: A line a fault.
-        exit_code: What the command line would end with.
-    """
+    """Why a job has no value, a line a fault, and what the command line would end with."""
 
     message: str
     exit_code: int = 1

@@ -135,7 +135,7 @@ class Matched:
 
     Attributes:
         bars: What the bars that are lit sent, in the truth's order.
-        pairs: For each of these bars, (decoded frame, number of the sent one), in the order of decoding.
+        pairs: For each of these, (decoded frame, number of the sent one), in the order of decoding.
         unmatched: Decoded frames beside which there is no sent one, or one that was found before.
         echoes: Decoded frames that are declared reflections and were left out.
     """

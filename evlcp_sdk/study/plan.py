@@ -68,13 +68,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Task:
-    """One seed of one point.
-
-    Attributes:
-        id: SHA-256 of everything that determines its result, 64 hex digits.
-        scene: The scene's value, as `Case.value` has it.
-        link: The link's value, likewise.
-    """
+    """One seed of one point: its id and, as `Case.value` has them, its scene and link."""
 
     id: str
     scene: Any
@@ -83,14 +77,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Job:
-    """A scene with a seed, and the tasks that receive its rendering.
-
-    Attributes:
-        scene: The scene's value, as `Case.value` has it: the first one's of those that look the same.
-        seed: The seed of everything random in it.
-        tasks: One a link and scene that looks the same.
-        environment: What the tasks' ids say of the code and its versions.
-    """
+    """A scene, the first one of those that look the same, with a seed, and what receives its rendering."""
 
     scene: Any
     seed: int
@@ -103,13 +90,9 @@ _Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 @dataclass(frozen=True)
 class Point:
-    """One scene with one link.
+    """One scene with one link, by their numbers, and the ids of its tasks, by seed.
 
-    Attributes:
-        labels: What sets it apart: keys start with `scene.` or `link.`.
-        scene: Number of its scene.
-        link: Number of its link.
-        tasks: Ids of its tasks, by seed.
+    Keys of its labels start with `scene.` or `link.`.
     """
 
     labels: dict[str, Any]

@@ -25,8 +25,7 @@ class Series:
 
     Attributes:
         labels: What sets it apart from the other series.
-        scene: Identity of its first scene.
-        link: Identity of its link.
+        scene, link: Identities of its first scene, and of its link.
         recordings: What counts of its points, added up seed by seed.
     """
 
@@ -103,14 +102,7 @@ def _speed_kmh(scene: Any) -> float | None:
 
 @dataclass(frozen=True)
 class Summary:
-    """A campaign's outcome.
-
-    Attributes:
-        tasks: Tasks that count or would.
-        done: Those that are finished.
-        series: In the order of the campaign.
-        plan: The plan that the store keeps.
-    """
+    """A campaign's outcome: how many tasks count or would, and are done; its series in order; its plan."""
 
     tasks: int
     done: int
@@ -252,8 +244,7 @@ class PaperComparison:
         reference: The paper's.
         series: Name of the series that it is held against.
         ours: The measured one; where the paper gives a bound, that of the worst segment.
-        from_m: Start of the distances that ours was measured at, m.
-        to_m: Their end, m.
+        from_m, to_m: The distances that ours was measured at, m.
     """
 
     reference: Reference

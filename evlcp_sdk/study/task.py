@@ -34,10 +34,6 @@ _STUDY = ("frames.py", "match.py", "measure.py", "tally.py", "task.py")
 def plan_of(path: Path | str, overrides: Sequence[str] = ()) -> Plan:
     """Read a campaign file; scenes and links resolved, code and versions of this installation.
 
-    Args:
-        path: The file.
-        overrides: What `--set` takes, e.g. `"campaign.seeds=2"`.
-
     Raises:
         ConfigError: All faults of the file, one line each.
     """

@@ -48,8 +48,7 @@ def _default_link() -> Link:
 def link_of(subject: Subject, **air: Any) -> Link:
     """The link with the subject in its role; `air` overrides values of its table `[air]`.
 
-    Raises:
-        InapplicableLawError: The subject has no code for the link's bar.
+    Passes over a law where the subject has no code for the link's bar.
     """
     link = _default_link() if subject.link is None else subject.link
     if subject.role == "framing" and subject.link is None:
@@ -76,11 +75,7 @@ def _of_chips(link: Link, kept: str) -> Link:
 
 
 def expect_column(link: Link) -> None:
-    """Pass over a law whose ideal images show a bar: two clusters or more, one above the other.
-
-    Raises:
-        InapplicableLawError: The link's bar is another.
-    """
+    """Pass over a law whose ideal images show a bar, two clusters or more, one above the other, of others."""
     if link.bar.clusters < 2 or np.ptp(link.bar.cluster_centres_m()[:, 0]) > 1e-9:
         raise InapplicableLawError("the ideal images of this law show one column of two clusters or more")
 
@@ -103,11 +98,7 @@ def arguments_of(subject: Subject) -> tuple[Any, ...]:
 
 
 def compile_given(subject: Subject, arguments: tuple[Any, ...]) -> Any:
-    """What the subject's `compile` gives.
-
-    Raises:
-        InapplicableLawError: It is a detection or a framing that the receiver does by itself.
-    """
+    """What the subject's `compile` gives; passes over a law of what the receiver does by itself."""
     rhythmic = subject.role == "detection" and subject.algorithm.rhythmic
     if rhythmic or (subject.role == "framing" and subject.algorithm.roles >= STEPS):
         raise InapplicableLawError("the receiver does this by itself")
@@ -115,11 +106,7 @@ def compile_given(subject: Subject, arguments: tuple[Any, ...]) -> Any:
 
 
 def compile_subject(subject: Subject) -> Any:
-    """What the subject compiles to on its link; a role that compiles to nothing, itself.
-
-    Raises:
-        InapplicableLawError: It refuses the link.
-    """
+    """What the subject compiles to on its link, if it does not refuse that; a role that does not, itself."""
     if subject.role not in _ARGUMENTS:
         return subject.algorithm
     arguments = arguments_of(subject)
@@ -144,11 +131,7 @@ def recording_of(link: Link, packets: int, **how: Any) -> tuple[IdealBar, Events
 
 
 def filters_of(subject: Subject) -> list[tuple[str, Any, int]]:
-    """The filters of a tracking algorithm: (name, filter, values of a measurement).
-
-    Raises:
-        InapplicableLawError: It leaves everything as measured.
-    """
+    """The filters of a tracking algorithm, if it has any: (name, filter, values of a measurement)."""
     tracker = compile_subject(subject)
     pairs = [("position", tracker.position, 2), ("distance", tracker.distance, 1)]
     found = [entry for entry in pairs if entry[1] is not None]
@@ -191,12 +174,7 @@ def run_filter(follow: Any, values: Any, peek: Callable[[Any, float], Any] | Non
 
 @dataclass(frozen=True)
 class Exercise:
-    """A task.
-
-    Attributes:
-        inputs: Values that hold arrays; empty where a role takes none.
-        prepare: Compiles anew and gives a function from the inputs to the results.
-    """
+    """A task: values that hold arrays, and what compiles anew and gives a function from them to results."""
 
     inputs: tuple[Any, ...]
     prepare: Callable[[], Callable[..., Any]]

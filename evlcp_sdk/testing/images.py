@@ -97,11 +97,7 @@ SEPARATION = (_separation_shapes, _finds_clusters, _separates_nothing, _separati
 
 
 def _decoders(subject: Subject) -> Iterator[tuple[Codebook, Decode]]:
-    """The subject compiled for the SDK's modulations and the link's that it takes, with the link's pilots.
-
-    Raises:
-        InapplicableLawError: It takes none.
-    """
+    """The subject compiled for the SDK's modulations and the link's that it takes, with the link's pilots."""
     registry, link = Registry.load(), link_of(subject)
     books = []
     for entry in registry.installed("modulation"):
@@ -197,11 +193,7 @@ DECODING = (_decoding_shapes, _decoding_inverts, _llr_agrees, _decoding_permutes
 def _measure(
     subject: Subject, cluster_px: int = 8, seed: int = 0, right_down: tuple[int, int] = (0, 0)
 ) -> Range:
-    """What the subject measures of an ideal image.
-
-    Raises:
-        InapplicableLawError: The image shows another bar than the link's.
-    """
+    """What the subject measures of an ideal image."""
     link = link_of(subject)
     expect_column(link)
     symbols = symbols_of(link.codebook, seed)
@@ -212,11 +204,7 @@ def _measure(
 
 
 def _expect_measuring(subject: Subject) -> None:
-    """Pass over a law of distances.
-
-    Raises:
-        InapplicableLawError: The subject gives none.
-    """
+    """Pass over a law of distances where the subject gives none."""
     if not subject.algorithm.measures:
         raise InapplicableLawError("it measures nothing")
 
