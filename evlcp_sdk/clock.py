@@ -51,8 +51,11 @@ _LATER_US = 1 << 62
 _GRAINS = 24
 """Differences of times that show how coarse these are: those of finer ones are all even in 1e-7 of cases."""
 
-_BACKWARD, _OFF_SENSOR, _DOUBTFUL, _KEPT, _HELD = range(5)
-"""Verdicts on an event, as the kernel gives them."""
+_DROPPED = ("dropped_time_backward", "dropped_off_sensor", "dropped_time_doubtful")
+"""What events are counted as that are dropped, by the kernel's verdict on them."""
+
+_KEPT, _HELD = 3, 4
+"""Its verdicts on others."""
 
 
 class CameraClock:
@@ -87,17 +90,7 @@ class CameraClock:
         self._held: list[Events] = []
         self._held_at = 0
         self.firsts: dict[str, int] = {}
-        self._counts = dict.fromkeys(
-            (
-                "events",
-                "dropped_time_backward",
-                "dropped_off_sensor",
-                "dropped_time_doubtful",
-                "clock_leaps",
-                "clock_restarts",
-            ),
-            0,
-        )
+        self._counts = dict.fromkeys(("events", *_DROPPED, "clock_leaps", "clock_restarts"), 0)
 
     @property
     def counts(self) -> dict[str, int]:
@@ -168,11 +161,7 @@ class CameraClock:
             if lost:
                 self._lose_held()
             number = self._counts["events"] - len(events) - many
-            for name, verdict in (
-                ("dropped_time_backward", _BACKWARD),
-                ("dropped_off_sensor", _OFF_SENSOR),
-                ("dropped_time_doubtful", _DOUBTFUL),
-            ):
+            for verdict, name in enumerate(_DROPPED):
                 if (found := verdicts == verdict).any():
                     self._lose(name, number + int(found.argmax()), int(np.count_nonzero(found)))
             if (kept := verdicts == _KEPT).any():

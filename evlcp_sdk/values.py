@@ -469,7 +469,15 @@ class ReceivedMessage:
 
     def said(self, most: int = 60) -> str:
         """What it says, the first `most` characters at least, for people to read."""
-        return _said(self, most)
+        if self.beacon is not None:
+            latitude_deg, longitude_deg, height_m = self.beacon.place
+            return f"beacon at {latitude_deg:.7f}, {longitude_deg:.7f} deg, {height_m:.2f} m"
+        if (text := self.message.text) is not None:
+            return repr(text if len(text) <= most else f"{text[:most]}...")
+        if isinstance(self.value, bytes):
+            return f"{len(self.message.payload)} bytes of {self.kind.name}"
+        value = repr(self.value)
+        return f"{self.kind.name} {value if len(value) <= most else f'{value[:most]}...'}"
 
     def __repr__(self) -> str:
         who = f"{self.said()} from {self.message.transmitter_id}, {self.trust}"
@@ -746,20 +754,3 @@ def _distance(found: Range) -> str:
     if math.isnan(found.distance_m):
         return "no distance"
     return f"{found.distance_m:.2f} ± {found.sigma_m:.2f} m"
-
-
-def _said(received: ReceivedMessage, most: int) -> str:
-    """What a message says, its start at least."""
-    message = received.message
-    text = message.text
-    if received.beacon is not None:
-        latitude_deg, longitude_deg, height_m = received.beacon.place
-        what = f"beacon at {latitude_deg:.7f}, {longitude_deg:.7f} deg, {height_m:.2f} m"
-    elif text is not None:
-        what = repr(text if len(text) <= most else f"{text[:most]}...")
-    elif isinstance(received.value, bytes):
-        what = f"{len(message.payload)} bytes of {received.kind.name}"
-    else:
-        value = repr(received.value)
-        what = f"{received.kind.name} {value if len(value) <= most else f'{value[:most]}...'}"
-    return what

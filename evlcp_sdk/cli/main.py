@@ -44,12 +44,6 @@ def main() -> None:
 
         # Python itself handles Ctrl-C.
         with heard_by(interrupt, SIGTERM, SIGHUP):
-            if sys.argv[1:] == ["--version"]:
-                # What the command line says, without all that it is made of.
-                from importlib.metadata import version
-
-                sys.stdout.write(f"evlcp-sdk {version('evlcp-sdk')}\n")
-                raise SystemExit
             from evlcp_sdk.cli._app import run
 
             run()

@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Any, Final, Protocol
 
 import numpy as np
 
@@ -165,39 +165,34 @@ def _interpret(
     fields: Mapping[str, str], offsets: Mapping[str, int], path: Path | str
 ) -> tuple[Codec, int | None, int | None]:
     """Return the encoding and the size of the sensor that header lines give."""
-    name, *options = fields.get("format", "").split(";")
-    version, by_version = fields.get("evt", ""), {codec.version: codec for codec in CODECS.values()}
-    codecs = []
-    for key, value, known, what in (
-        ("format", name, CODECS, "encoding"),
-        ("evt", version, by_version, "EVT version"),
-    ):
-        if key in fields and value not in known:
-            raise RawFormatError(path, offsets[key], f"{what} {value!r}", " or ".join(known))
-        codecs += [known[value]] if key in fields else []
-    if not codecs:
-        raise RawFormatError(
-            path, 0, f"a header without encoding ({', '.join(fields)})", "a line '% evt 3.0'"
-        )
-    if codecs[0] is not codecs[-1]:
-        found = f"'% evt {version}' beside '% format {fields['format']}'"
-        raise RawFormatError(path, offsets["evt"], found, "one encoding")
+    found: dict[str, tuple[str, Any]] = {}
 
-    sides = [("format", side, text) for side, _, text in (option.partition("=") for option in options)]
+    def settle(what: str, key: str, value: Any, expected: str) -> None:
+        """Take what a line says, None where it says nothing that is known."""
+        line = f"'% {key} {fields[key]}'"
+        if value is None:
+            raise RawFormatError(path, offsets[key], line, expected)
+        before, known = found.setdefault(what, (line, value))
+        if value != known:
+            raise RawFormatError(path, offsets[key], f"{line} beside {before}", f"one {what}")
+
+    name, *options = fields.get("format", "").split(";")
+    sides = [("format", *option.partition("=")[::2]) for option in options]
     if "geometry" in fields:
         width, _, height = fields["geometry"].partition("x")
         sides += [("geometry", "width", width), ("geometry", "height", height)]
-    sizes: dict[str, int] = {}
+    versions = {codec.version: codec for codec in CODECS.values()}
+    for key, text, known in (("format", name, CODECS), ("evt", fields.get("evt", ""), versions)):
+        if key in fields:
+            settle("encoding", key, known.get(text), " or ".join(known))
     for key, side, text in sides:
-        if side not in ("width", "height"):
-            continue
-        if not (text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_SIDE):
-            expected = f"a width and a height from 1 to {MAX_SIDE}"
-            raise RawFormatError(path, offsets[key], repr(fields[key]), expected)
-        if sizes.setdefault(side, int(text)) != int(text):
-            found = f"'% {key} {fields[key]}' beside '% format {fields['format']}'"
-            raise RawFormatError(path, offsets[key], found, f"one {side}")
-    return codecs[0], sizes.get("width"), sizes.get("height")
+        if side in ("width", "height"):
+            value = int(text) if text.isascii() and text.isdigit() and 1 <= int(text) <= MAX_SIDE else None
+            settle(side, key, value, f"a width and a height from 1 to {MAX_SIDE}")
+    if "encoding" not in found:
+        listed = ", ".join(fields)
+        raise RawFormatError(path, 0, f"a header without encoding ({listed})", "a line '% evt 3.0'")
+    return found["encoding"][1], *(found.get(side, ("", None))[1] for side in ("width", "height"))
 
 
 class RawSource(EventSource):

@@ -1,22 +1,20 @@
 """What plugins bring besides algorithms: output formats by name, kinds of messages by number."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.util import find_spec
-from typing import Any, TypeVar
+from typing import Any
 
 from evlcp_sdk.air.kinds import BUILT_IN_KINDS, MessageKind
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.hooks import SinkRecord
-from evlcp_sdk.plugin.registry import Registry, load_target
+from evlcp_sdk.plugin.registry import Owner, Registry, load_target
 from evlcp_sdk.spelling import nearest
 
 SUMMARY = "summary.json"
 """What every result has: no sink writes it."""
 
 _MOST_KIND = 15
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -48,8 +46,8 @@ def installed_sinks(registry: Registry) -> dict[str, InstalledSink]:
 
     A plugin with a format that cannot be used, or of a name or a file that another one has, is left out.
     """
-    found = _collect(registry, "evlcp_sinks", SinkRecord, _sink_fault)
-    return {record.name: InstalledSink(record, owner) for record, owner in found}
+    found = registry.collect("evlcp_sinks", SinkRecord, _sink_fault)
+    return {record.name: InstalledSink(record, owner) for record, (owner, _) in found}
 
 
 def choose_sinks(registry: Registry, names: Sequence[str], *, positions: bool) -> list[InstalledSink]:
@@ -81,46 +79,12 @@ def message_kinds(registry: Registry) -> dict[int, MessageKind]:
 
     A plugin with a kind that cannot be used, or of a number or a name that another one has, is left out.
     """
-    own = [(kind, "evlcp-sdk") for kind in BUILT_IN_KINDS.values()]
-    found = _collect(registry, "evlcp_message_kinds", MessageKind, _kind_fault, own)
+    own = [(kind, ("evlcp-sdk", "")) for kind in BUILT_IN_KINDS.values()]
+    found = registry.collect("evlcp_message_kinds", MessageKind, _kind_fault, own)
     return {kind.number: kind for kind, _ in found}
 
 
-def _collect(
-    registry: Registry,
-    hook: str,
-    wanted: type[Any],
-    fault_of: Callable[[T, Sequence[tuple[T, str]]], str | None],
-    own: Sequence[tuple[T, str]] = (),
-) -> list[tuple[T, str]]:
-    """What plugins give at a hook, each with its distribution, behind what is there already.
-
-    The SDK's come first: where two clash, the other one's plugin is left out, with all that it gives.
-
-    Args:
-        registry: The plugins.
-        hook: The hook.
-        wanted: What they are to give.
-        fault_of: What is wrong with one beside those before it; None where nothing is.
-        own: What is there already.
-    """
-    found = list(own)
-    answers = [(*answer, registry.owner(answer[0])[0]) for answer in registry.ask(hook)]
-    for plugin, given, owner in sorted(answers, key=lambda answer: answer[2] != "evlcp-sdk"):
-        more, fault = list(found), None
-        if not (isinstance(given, list | tuple) and all(isinstance(one, wanted) for one in given)):
-            given, fault = (), f"{hook}() gave something else than {wanted.__name__}s"
-        for one in given:
-            fault = fault or fault_of(one, more)
-            more.append((one, owner))
-        if fault is None:
-            found = more
-        else:
-            registry.leave_out(plugin, fault)
-    return found
-
-
-def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, str]]) -> str | None:
+def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, Owner]]) -> str | None:
     """What is wrong with the record of a sink, or with which of the others it clashes."""
     for key in ("name", "target", "summary"):
         value = getattr(record, key)
@@ -134,7 +98,7 @@ def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, str]]) ->
         return f"sink '{record.name}': files = {files!r}, expected names of files in the result's folder"
     if SUMMARY in record.files:
         return f"sink '{record.name}': {SUMMARY} is the summary's file"
-    for other, owner in others:
+    for other, (owner, _) in others:
         if record.name == other.name:
             return f"sink '{record.name}': {owner} has one of this name"
         if shared := [name for name in record.files if name in other.files]:
@@ -142,7 +106,7 @@ def _sink_fault(record: SinkRecord, others: Sequence[tuple[SinkRecord, str]]) ->
     return None
 
 
-def _kind_fault(kind: MessageKind, others: Sequence[tuple[MessageKind, str]]) -> str | None:
+def _kind_fault(kind: MessageKind, others: Sequence[tuple[MessageKind, Owner]]) -> str | None:
     """What is wrong with a kind of messages, or with which of the others it clashes."""
     # A class that does not set them passes for a kind.
     number, name = getattr(kind, "number", None), getattr(kind, "name", None)
@@ -153,7 +117,7 @@ def _kind_fault(kind: MessageKind, others: Sequence[tuple[MessageKind, str]]) ->
         return f"{who}: number = {number!r}, expected 7 to {_MOST_KIND}"
     if name == "packet":
         return f"{who}: its name is that of a packet's line; choose another"
-    for other, owner in others:
+    for other, (owner, _) in others:
         if number == other.number or name == other.name:
             return (
                 f"{who}: number {number} or its name is that of '{other.name}' of {owner};"

@@ -8,12 +8,12 @@ import importlib
 import platform
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.metadata import Distribution, EntryPoint, entry_points, version
-from typing import Any
+from typing import Any, TypeVar
 
 import pluggy
 
@@ -22,6 +22,12 @@ from evlcp_sdk.plugin import hooks as hookspecs
 from evlcp_sdk.plugin.hooks import ENTRY_POINT_GROUP, Algorithm
 from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.spelling import nearest
+
+T = TypeVar("T")
+Owner = tuple[str, str]
+"""Name and version of a distribution."""
+FaultOf = Callable[[T, Sequence[tuple[T, Owner]]], str | None]
+"""What is wrong with something beside others, each with its distribution; None where nothing is."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +145,34 @@ class Registry:
                 continue
             answers.append((impl.plugin_name, answer))
         return answers
+
+    def collect(
+        self, hook: str, wanted: type[Any], fault_of: FaultOf[T], own: Sequence[tuple[T, Owner]] = ()
+    ) -> list[tuple[T, Owner]]:
+        """What plugins give at a hook, each with its distribution, behind what is there already.
+
+        The SDK's come first: where two clash, the other one's plugin is left out, with all that it gives.
+
+        Args:
+            hook: The hook.
+            wanted: What they are to give.
+            fault_of: What is wrong with one beside those before it; None where nothing is.
+            own: What is there already.
+        """
+        found = list(own)
+        answers = [(*answer, self.owner(answer[0])) for answer in self.ask(hook)]
+        for plugin, given, owner in sorted(answers, key=lambda answer: answer[2][0] != "evlcp-sdk"):
+            more, fault = list(found), None
+            if not (isinstance(given, list | tuple) and all(isinstance(one, wanted) for one in given)):
+                given, fault = (), f"{hook}() gave something else than {wanted.__name__}s"
+            for one in given:
+                fault = fault or fault_of(one, more)
+                more.append((one, owner))
+            if fault is None:
+                found = more
+            else:
+                self.leave_out(plugin, fault)
+        return found
 
     @contextmanager
     def joined(self, *plugins: object) -> Iterator[None]:
@@ -273,14 +307,8 @@ class Registry:
     def _algorithms(self) -> dict[tuple[str, str], list[Installed]]:
         if self._collected is None:
             self._collected = {}
-            for plugin, records in self.ask("evlcp_algorithms"):
-                fault = _records_fault(records)
-                if fault is not None:
-                    self.leave_out(plugin, fault)
-                    continue
-                for record in records:
-                    entry = Installed(record, *self.owner(plugin))
-                    self._collected.setdefault((record.role, record.id), []).append(entry)
+            for record, owner in self.collect("evlcp_algorithms", Algorithm, _algorithm_fault):
+                self._collected.setdefault((record.role, record.id), []).append(Installed(record, *owner))
         return self._collected
 
 
@@ -306,20 +334,11 @@ def _line(fault: BaseException) -> str:
     return f"{type(fault).__name__}: {text}" if text else type(fault).__name__
 
 
-def _records_fault(records: Any) -> str | None:
-    """What is wrong with what `evlcp_algorithms` gave."""
-    if not isinstance(records, list | tuple):
-        return f"evlcp_algorithms() gave {type(records).__name__}, expected records of Algorithm"
-    seen = set()
-    for record in records:
-        if not isinstance(record, Algorithm):
-            return f"evlcp_algorithms() gave {record!r}, expected an Algorithm"
-        if record.role not in ROLES:
-            return f"algorithm '{record.id}' has role '{record.role}', expected one of {', '.join(ROLES)}"
-        if (record.role, record.id) in seen:
-            return f"evlcp_algorithms() gave two {record.role} algorithms named '{record.id}'"
-        seen.add((record.role, record.id))
-    return None
+def _algorithm_fault(record: Algorithm, _others: object) -> str | None:
+    """What is wrong with an algorithm that a plugin brings."""
+    if record.role in ROLES:
+        return None
+    return f"algorithm '{record.id}' has role '{record.role}', expected one of {', '.join(ROLES)}"
 
 
 def _known(plugin: Any) -> frozenset[tuple[str, str]]:
