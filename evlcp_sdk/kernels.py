@@ -1,6 +1,5 @@
 """What every kernel is compiled with: Numba, and its cache where there is a folder for one."""
 
-import gc
 import logging
 import shutil
 import sys
@@ -51,9 +50,6 @@ class Compiling:
         def watched(sig: Any) -> Any:
             begin = time.process_time(), time.perf_counter()
             compiled = sum(kernel.stats.cache_misses.values())
-            # Numba's many small objects would be looked through again and again: a seventh of the time.
-            collects = gc.isenabled()
-            gc.disable()
             self._depth += 1
             try:
                 return compile_(sig)
@@ -65,8 +61,6 @@ class Compiling:
                 return compile_(sig)
             finally:
                 self._depth -= 1
-                if collects:
-                    gc.enable()
                 if not self._depth:
                     self.processor_s += time.process_time() - begin[0]
                     elapsed_s = time.perf_counter() - begin[1]

@@ -245,23 +245,20 @@ def _jobs(recordings: Sequence[str], out: Path | None, lines: LinePrinter | None
         return [ReceiveJob(recordings[0], None)]
     if len(recordings) == 1:
         return [ReceiveJob(recordings[0], out)]
-    for url in recordings:
-        if _stem(url) in ("", ".", ".."):
-            raise typer.BadParameter(
-                f"{url}: gives no name of a folder in {out}; receive it by itself", param_hint="REC..."
-            )
-    folders = [out / _stem(url) for url in recordings]
-    for folder in folders:
+    jobs = [ReceiveJob(url, out / _stem(url)) for url in recordings]
+    folders = [job.folder for job in jobs]
+    for job in jobs:
+        wrong = ""
+        if _stem(job.url) in ("", ".", ".."):
+            wrong = f"{job.url}: gives no name of a folder in {out}; receive it by itself"
+        elif folders.count(job.folder) > 1:
+            wrong = f"two recordings would both be written to {job.folder}; receive them one by one"
+        if wrong:
+            raise typer.BadParameter(wrong, param_hint="REC...")
         # The user named OUT, and nobody what is in it.
-        if folder.is_symlink():
-            raise OutputError(f"{folder}: cannot be written: it is a link, which may lead out of {out}")
-    for folder in folders:
-        if folders.count(folder) > 1:
-            raise typer.BadParameter(
-                f"two recordings would both be written to {folder}; receive them one by one",
-                param_hint="REC...",
-            )
-    return [ReceiveJob(url, folder) for url, folder in zip(recordings, folders, strict=True)]
+        if job.folder is not None and job.folder.is_symlink():
+            raise OutputError(f"{job.folder}: cannot be written: it is a link, which may lead out of {out}")
+    return jobs
 
 
 def _stem(url: str) -> str:

@@ -3,7 +3,7 @@
 import json
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from typing import Any, Final
 
 import numpy as np
@@ -23,22 +23,6 @@ _MOST_BARS: Final = 64
 """A bar is drawn as its newest frame shows it, for so long, and so many of them."""
 
 
-@dataclass(frozen=True)
-class Shot:
-    """A picture as a browser gets it.
-
-    Attributes:
-        number: Counted from 0.
-        told: Its time and its regions, and where the bars' clusters are in it, and what they said last:
-            members `picture` and `bars` of a JSON object.
-        png: The events.
-    """
-
-    number: int
-    told: str
-    png: bytes
-
-
 class Serializer:
     """Writes what a run finds for browsers, in the thread that asks.
 
@@ -56,7 +40,7 @@ class Serializer:
         self._sites = tuple(sites)
         self._sites_told = not sites
         self._bars: dict[int, Frame] = {}
-        self._shot: Shot | None = None
+        self._shot = (-1, "", b"")
         self.untold, self.fault = 0, ""
 
     def lines(self, news: News, *, frames: bool) -> list[tuple[str, str]]:
@@ -71,12 +55,15 @@ class Serializer:
         self._keep(news.value)
         return [("frame", self._frame(news))] * frames
 
-    def shot(self, picture: Picture) -> Shot:
-        """A picture with what is drawn on it; the same again for the same one."""
-        if self._shot is None or self._shot.number != picture.number:
+    def shot(self, picture: Picture) -> tuple[str, bytes]:
+        """A picture's time and regions, and the clusters of bars in it with what they said last; and as PNG.
+
+        The first are members `picture` and `bars` of a JSON object, the same again for the same picture.
+        """
+        if self._shot[0] != picture.number:
             latest = [one for one in self._bars.values() if one.t_us > picture.t_us - _LATEST_US]
-            self._shot = Shot(picture.number, _told(picture, latest), picture.image().png())
-        return self._shot
+            self._shot = picture.number, _told(picture, latest), picture.image().png()
+        return self._shot[1:]
 
     def _keep(self, frame: Frame) -> None:
         self._bars[frame.transmitter] = frame

@@ -293,17 +293,16 @@ class Viewer(Server):
         from websockets.asyncio.server import broadcast
 
         picture = self._publisher.pictures.newest
-        shot = None if picture is None else self._serializer.shot(picture)
         self._publisher.pictures.ask()
         record = None if self._recorder is None else self._recorder.state
         end = f'"record": {json.dumps(record)}}}'
         for browser in ready:
-            new = shot is not None and browser.picture != shot.number
-            if not (new or browser.waiting):
-                continue
             told, data = '"picture": null, "bars": null', b""
-            if shot is not None and new:
-                browser.picture, told, data = shot.number, shot.told, shot.png
+            if picture is not None and browser.picture != picture.number:
+                browser.picture = picture.number
+                told, data = self._serializer.shot(picture)
+            elif not browser.waiting:
+                continue
             dropped = browser.dropped + self._mine.dropped
             text = f'{{"news": [{", ".join(browser.waiting)}], "dropped": {dropped}, {told}, {end}'.encode()
             browser.waiting.clear()

@@ -112,16 +112,11 @@ class EventWriter(ABC):
     def _check_times(self, t_us: NDArray[np.int64], what: str) -> None:
         if not len(t_us):
             return
-        back = t_us[1:] < t_us[:-1]
-        if back.any():
+        before = np.append(t_us[0] if self._last_us is None else self._last_us, t_us[:-1])
+        if (back := t_us < before).any():
             k = int(back.argmax())
-            raise StreamError(
-                f"{self.path}: {what} at {t_us[k + 1]} us after one at {t_us[k]} us, expected sorted times"
-            )
-        if self._last_us is not None and t_us[0] < self._last_us:
-            raise StreamError(
-                f"{self.path}: {what} at {t_us[0]} us after {self._last_us} us, expected sorted times"
-            )
+            found = f"{what} at {t_us[k]} us after {before[k]} us"
+            raise StreamError(f"{self.path}: {found}, expected sorted times")
         first, last = self.times_us
         for t in (t_us[0], t_us[-1]):
             if not first <= t <= last:

@@ -126,18 +126,9 @@ class _BagBytes(ChunkBytes):
 
 
 def _files_of(path: Path) -> list[Path]:
-    """The files of a bag: itself, or those of its folder as metadata.yaml or their numbers order them."""
+    """The files of a bag: itself, or those of its folder in the order of the numbers in their names."""
     if not path.is_dir():
         return [path]
-    about = path / "metadata.yaml"
-    text = about.read_text("utf-8", "replace") if about.is_file() else ""
-    listed = re.search(r"relative_file_paths:[ ]*\n((?:[ ]*-.*\n?)+)", text)
-    if listed is not None:
-        names = [line.strip()[1:].strip(" \"'") for line in listed[1].splitlines()]
-        missing = next((name for name in names if not (path / name).is_file()), None)
-        if missing is not None:
-            raise InputError(f"{path}: metadata.yaml names {missing}, which is not there")
-        return [path / name for name in names]
     found = [one for one in path.iterdir() if one.suffix in (".db3", ".mcap")]
     if not found:
         raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
