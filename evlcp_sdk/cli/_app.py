@@ -13,7 +13,7 @@ import typer
 from typer.core import TyperGroup
 from typer.models import CommandInfo
 
-from evlcp_sdk.cli._common import echo, hush, loaded, log_on_stderr
+from evlcp_sdk.cli._common import echo, hush, log_on_stderr
 from evlcp_sdk.printable import printable
 
 if TYPE_CHECKING:
@@ -53,9 +53,6 @@ _OWN = (
 )
 """Modules of our own commands, each of which has the one that it is named after."""
 
-_SOON = frozenset({"receive", "live"})
-"""Commands that say themselves when they are loaded."""
-
 _WRAPPED = re.compile(r"(?<!\n)\n(?!\n|[A-Z][^\n:\[]+:\s+\[bold\])")
 """Where a help text goes on in the next line, which Typer keeps: no paragraph or example ends."""
 
@@ -68,8 +65,6 @@ class _Commands(TyperGroup):
             return super().make_context(*args, **more)
 
     def invoke(self, ctx: Any) -> Any:
-        if not self.commands.keys() <= _SOON:
-            loaded()
         with _printable_faults():
             return super().invoke(ctx)
 

@@ -1,6 +1,5 @@
 """What the commands share: their options, where jobs run, what goes to stderr."""
 
-import gc
 import json
 import logging
 import os
@@ -85,16 +84,6 @@ def log_on_stderr() -> "Iterator[None]":
     finally:
         log.removeHandler(handler)
         log.setLevel(before)
-
-
-_GARBAGE = 250_000
-"""New objects before the collector of garbage looks for cycles: to load Numba makes 170 000, a run few."""
-
-
-def loaded() -> None:
-    """Wake the collector of garbage, which rests while a command is loaded: what that is made of stays."""
-    gc.freeze()
-    gc.set_threshold(_GARBAGE, *gc.get_threshold()[1:])
 
 
 def hush() -> None:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 import typer
 
-from evlcp_sdk.cli._common import LinkFiles, Overrides, echo, loaded
+from evlcp_sdk.cli._common import LinkFiles, Overrides, echo
 from evlcp_sdk.cli._complain import complain
 
 if TYPE_CHECKING:
@@ -50,7 +50,6 @@ class LinkOptions:
 
             for warning in find_alike_links(named_links(links)):
                 complain(f"warning: {warning}")
-        loaded()
         return links
 
 

@@ -14,8 +14,8 @@ from evlcp_sdk.cli._complain import complain
 _FAILED = 1
 _INTERRUPTED = 130
 
-_RESTING = 1_000_000
-"""New objects before the collector of garbage looks for cycles: it rests until a command is `loaded`."""
+_GARBAGE = 250_000
+"""New objects before the collector of garbage looks for cycles: to load Numba makes 170 000, a run few."""
 
 
 def main() -> None:
@@ -25,7 +25,7 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     # To look for plugins of pydantic is to read what every package says of itself.
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")
-    gc.set_threshold(_RESTING, *gc.get_threshold()[1:])
+    gc.set_threshold(_GARBAGE, *gc.get_threshold()[1:])
     before = sys.unraisablehook
 
     def unraisable(fault: sys.UnraisableHookArgs) -> None:

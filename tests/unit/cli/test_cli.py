@@ -123,7 +123,7 @@ def test_a_plain_receive_loads_what_it_needs_and_lets_the_collector_rest_until_t
         "print(idle, gc.get_threshold()[0], len(frozen), max(looked, default=0) < 3e5)\n"
     )
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1] == "[] 250000 2 True"
+    assert done.stdout.splitlines()[-1] == "[] 250000 1 True"
 
 
 def test_version(evlcp: Evlcp) -> None:
