@@ -609,7 +609,6 @@ def decode_evt2(
 @njit
 def encode_evt3(
     words: Column,
-    width: Integer,
     state: Column,
     events: EventColumns,
     i: Integer,
@@ -619,8 +618,7 @@ def encode_evt3(
     """Encode the events from i and the triggers from j on, by time, until they or `words` run out.
 
     Args:
-        words: uint16 (k,) to fill; k >= 8.
-        width: Columns of the sensor.
+        words: uint16 (k,) to fill; k >= 4.
         state: int64 (3,), carried from call to call: the number of the last TIME_HIGH, the last TIME_LOW
             and the last ADDR_Y, each -1 if there was none.
         events: Their columns, sorted by time.
@@ -635,7 +633,7 @@ def encode_evt3(
     trigger_t, channel, value = triggers
     step, low, row = state[0], state[1], state[2]
     n = 0
-    while (i < len(t) or j < len(trigger_t)) and n <= len(words) - 8:
+    while (i < len(t) or j < len(trigger_t)) and n <= len(words) - 4:
         is_trigger = j < len(trigger_t) and (i == len(t) or trigger_t[j] <= t[i])
         clock = trigger_t[j] if is_trigger else t[i]
         stepped = step < clock >> 12
@@ -660,29 +658,8 @@ def encode_evt3(
             row = int64(y[i])
             words[n] = EVT3_ADDR_Y << 12 | row
             n += 1
-        base = min(int64(x[i]), width - 32)
-        stop = i + 1
-        while (
-            stop < len(t)
-            and t[stop] == clock
-            and y[stop] == row
-            and p[stop] == p[i]
-            and x[stop - 1] < x[stop] < base + 32
-        ):
-            stop += 1
-        if stop - i <= 4 or base < 0:  # a vector takes 4 words
-            words[n] = EVT3_ADDR_X << 12 | int64(p[i]) << 11 | x[i]
-            n += 1
-            i += 1
-            continue
-        mask = 0
-        while i < stop:
-            mask |= 1 << (x[i] - base)
-            i += 1
-        words[n] = EVT3_VECT_BASE_X << 12 | int64(p[i - 1]) << 11 | base
-        words[n + 1] = EVT3_VECT_12 << 12 | (mask & 0xFFF)
-        words[n + 2] = EVT3_VECT_12 << 12 | ((mask >> 12) & 0xFFF)
-        words[n + 3] = EVT3_VECT_8 << 12 | (mask >> 24)
-        n += 4
+        words[n] = EVT3_ADDR_X << 12 | int64(p[i]) << 11 | x[i]
+        n += 1
+        i += 1
     state[0], state[1], state[2] = step, low, row
     return n, i, j

@@ -105,7 +105,6 @@ class Codec:
 
 def encode_evt2(
     words: NDArray[np.uint32],
-    _width: int,
     state: NDArray[np.int64],
     events: _kernels.EventColumns,
     i: int,

@@ -362,15 +362,9 @@ class RawSource(EventSource):
 
 
 class RawEncoder:
-    """Events and triggers as RAW words, piece by piece.
+    """Events and triggers as RAW words of an encoding, piece by piece."""
 
-    Args:
-        codec: The encoding.
-        width: Columns of the sensor.
-    """
-
-    def __init__(self, codec: Codec, width: int) -> None:
-        self._columns = width
+    def __init__(self, codec: Codec) -> None:
         self._codec = codec
         self._state = np.full(3, -1, np.int64)
         self._words = np.empty(WRITE_WORDS, codec.word)
@@ -386,9 +380,7 @@ class RawEncoder:
         trigger_columns = tuple(plain(c) for c in (triggers.t_us, triggers.channel, triggers.value))
         i = j = 0
         while i < len(events) or j < len(triggers):
-            n, i, j = self._codec.encoder(
-                self._words, self._columns, self._state, event_columns, i, trigger_columns, j
-            )
+            n, i, j = self._codec.encoder(self._words, self._state, event_columns, i, trigger_columns, j)
             yield self._words[:n].tobytes()
 
 
@@ -414,7 +406,7 @@ class RawWriter(EventWriter):
             raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
         super().__init__(path, width, height, outputs)
         self.channels = codec.channels
-        self._encoder = RawEncoder(codec, width)
+        self._encoder = RawEncoder(codec)
         self._file.write(format_header(codec, width, height))
 
     def _write(self, events: Events, triggers: Triggers) -> None:

@@ -132,7 +132,7 @@ class Sender:
 
     def _send(self, connection: socket.socket, mine: Subscription) -> None:
         width, height = self._source.width or 1280, self._source.height or 720
-        encoder = RawEncoder(EVT3, width)
+        encoder = RawEncoder(EVT3)
         with connection:
             connection.settimeout(_STALLED_S)
             try:

@@ -88,7 +88,7 @@ class EventBagWriter(EventWriter):
         if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
             raise StreamError(f"{path}: sensor of {width}x{height}, expected 1 to {MAX_SIDE} each")
         super().__init__(path, width, height, outputs)
-        self._encoder = RawEncoder(EVT3, width)
+        self._encoder = RawEncoder(EVT3)
         self._seq = 0
 
     def _begin(self) -> None:

@@ -192,21 +192,12 @@ def evt3_words(path):
     return np.frombuffer(data[data.index(b"% end\n") + 6 :], "<u2").tolist()
 
 
-def test_evt3_writer_states_every_time_step_and_only_whole_vectors(tmp_path):
-    x = [10, 11, 12, 15, 41, 42, 1279, 1270, 1271, 1272, 1273, 1279]
-    t = [4090] * 6 + [12289] * 6
+def test_evt3_writer_states_every_time_step(tmp_path):
     path = tmp_path / "a.raw"
-    write_events(path, Events.of(t, x, [3] * 12, [1] * 12), 1280, 720)
+    write_events(path, Events.of([4090, 4090, 12289], [10, 42, 1279], [3, 3, 3], [1, 0, 1]), 1280, 720)
     assert evt3_words(path) == [
-        0x8000,
-        0x6000 | 4090,
-        0x0003,
-        *(0x3800 | 10, 0x4000 | 0b100111, 0x4000, 0x5000 | 1 << 7),
-        0x2800 | 42,
-        *(0x8001, 0x6000, 0x8002, 0x6000, 0x8003, 0x6001),
-        0x0003,
-        0x2800 | 1279,
-        *(0x3800 | 1248, 0x4000, 0x4000 | 0b11 << 10, 0x5000 | 0b10000011),
+        *(0x8000, 0x6000 | 4090, 0x0003, 0x2800 | 10, 0x2000 | 42),
+        *(0x8001, 0x6000, 0x8002, 0x6000, 0x8003, 0x6001, 0x0003, 0x2800 | 1279),
     ]
 
 
