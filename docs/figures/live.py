@@ -45,14 +45,13 @@ def main() -> None:
         serve(serving, publisher, named_links(links), name=given.recording.name, sites=sites) as services,
         Browser(Path(folder)) as browser,
     ):
-        assert services.view is not None
         # Or else it tells of every picture that the page gets.
         browser.say("Network.disable")
         browser.dress(1280, dark=False)
         browser.say(
             "Emulation.setDeviceMetricsOverride", width=1280, height=HIGH, deviceScaleFactor=1, mobile=False
         )
-        browser.open(services.view.url)
+        browser.open(services["view"].url)
         runner = threading.Thread(
             target=live,
             args=(f"replay:{given.recording}?speed={1 / SLOWER}", None, links),

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
     from evlcp_sdk.live.loop import LiveStatus
     from evlcp_sdk.live.publisher import Publisher
-    from evlcp_sdk.live.services import Services, Serving
+    from evlcp_sdk.live.services import Serving
 
 _HERE = "127.0.0.1"
+_SERVED = {"view": "look on", "nmea": "NMEA", "gpsd": "gpsd's JSON"}
 
 
 @dataclass(frozen=True)
@@ -157,7 +158,8 @@ def live(
         ) as services,
         _going_on(publisher, silent=lines is not None),
     ):
-        _say_where(services)
+        for name, server in services.items():
+            complain(f"{_SERVED[name]} at {server.url}")
         source = ReconnectingSource(partial(open_source, url, registry), stopped) if reconnect else url
         summary = run_live(
             source,
@@ -173,8 +175,6 @@ def live(
             budget=Budget(waiting_ms=waiting_ms, most_ms=10 * waiting_ms),
             stopped=stopped.or_when(lambda: out is None and lines is not None and lines.gone),
         )
-        if services.view is not None and services.view.fault:
-            complain(services.view.fault)
         print_end(summary, out, lines, as_json=result.as_json)
         if stopped() and out is not None:
             raise InterruptedRunError(f"interrupted; what was decoded until then is in {out}")
@@ -225,12 +225,3 @@ def going_text(status: LiveStatus) -> str:
     # Each level says what it adds to those before.
     shed = ", ".join(LEVELS[1 : status.level + 1])
     return f"{text}; {shed}" if shed else text
-
-
-def _say_where(services: Services) -> None:
-    """Say on stderr where to look, and what else is served."""
-    if services.view is not None:
-        complain(f"look on at {services.view.url}")
-    for name, server in (("NMEA", services.nmea), ("gpsd's JSON", services.gpsd)):
-        if server is not None:
-            complain(f"{name} at {_HERE}:{server.port}")

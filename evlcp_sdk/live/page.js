@@ -6,7 +6,7 @@ let about = null, run = null, socket = null, wait = 250;
 const shown = { pictures: 0, frames: 0, fixes: 0, connects: 0, dropped: 0, last: [] };
 window.shown = shown;
 let zero = null, bins = new Map(), rates = [], rows = [], messages = [], status = null, ended = null;
-let fixes = [], track = [], sites = [], refused = null, untold = null, record = null, dirty = false, counted = [];
+let fixes = [], track = [], sites = [], refused = null, record = null, dirty = false, counted = [];
 const distances = new Map();
 
 // No number is "-0.00".
@@ -22,7 +22,7 @@ const style = (name) => getComputedStyle(document.documentElement).getPropertyVa
 
 function clear() {
   zero = null; bins = new Map(); rates = []; rows = []; messages = []; status = null; ended = null;
-  fixes = []; track = []; sites = []; refused = null; untold = null; counted = []; distances.clear();
+  fixes = []; track = []; sites = []; refused = null; counted = []; distances.clear();
   shown.pictures = shown.frames = shown.fixes = 0; shown.last = [];
 }
 
@@ -67,8 +67,6 @@ function take(news) {
     const from = (news.t_us - zero) / 1e6 - KEEP_S;
     while (rates.length && rates[0][0] < from) rates.shift();
     for (const n of bins.keys()) { if (n * BIN_S < from) bins.delete(n); else break; }
-  } else if (news.line === "untold") {
-    untold = news;
   } else if (news.line === "end") {
     ended = news;
   }
@@ -341,7 +339,6 @@ function drawWords() {
     alarms.push(`The receiver cannot keep up: ${about.levels.slice(1, status.level + 1).join(", ")}.`);
   }
   if (record && record.fault) alarms.push(`The recording ended: ${record.fault}`);
-  if (untold) alarms.push(`Messages that cannot be shown: ${untold.count}. ${untold.fault}.`);
   if (ended) alarms.push(`The run has ended, ${ended.status}: ${ended.error || ended.result}.`);
   by("alarm").textContent = alarms.join(" ");
   by("alarm").hidden = !alarms.length;

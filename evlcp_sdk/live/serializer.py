@@ -29,10 +29,6 @@ class Serializer:
     Args:
         links: The configurations by name, as `named_links` gives them.
         sites: Where the bars stand, for the map.
-
-    Attributes:
-        untold: Messages of a kind that failed to show them, so far.
-        fault: How the last one failed.
     """
 
     def __init__(self, links: Mapping[str, Link], sites: Sequence[BarSite] = ()) -> None:
@@ -41,10 +37,9 @@ class Serializer:
         self._sites_told = not sites
         self._bars: dict[int, Frame] = {}
         self._shot = (-1, "", b"")
-        self.untold, self.fault = 0, ""
 
     def lines(self, news: News, *, frames: bool) -> list[tuple[str, str]]:
-        """What is said of some news, JSON, each with its kind: that of the news, or `bars` or `untold`.
+        """What is said of some news, JSON, each with its kind: that of the news, or `bars`.
 
         Args:
             news: Of a kind that is shown.
@@ -73,7 +68,7 @@ class Serializer:
     def _told(self, news: News) -> list[tuple[str, dict[str, Any]]]:
         kind, value = news.kind, news.value
         if kind == "message":
-            return [self._message(value)]
+            return [(kind, _shown(value))]
         if kind == "status":
             shown = asdict(value)
             return [(kind, {name: shown[name] for name in shown.keys() - {"regions", "health"}})]
@@ -95,17 +90,6 @@ class Serializer:
         late = "null" if news.late_ms is None else f"{news.late_ms:.3f}"
         return f'{format_frame(news.value, self._columns)[:-1]}, "late_ms": {late}}}'
 
-    def _message(self, message: ReceivedMessage) -> tuple[str, dict[str, Any]]:
-        """A message; where its kind, which may be a plugin's, fails to show it, how many did and why."""
-        try:
-            # A page reads no NaN.
-            shown = json.loads(message_line(message), parse_constant=_not_a_number)
-        except (PluginError, ValueError) as fault:
-            self.untold += 1
-            self.fault = str(fault)
-            return "untold", {"count": self.untold, "fault": self.fault}
-        return "message", shown
-
     def _bars_of(self, fix: Fix) -> list[tuple[str, dict[str, Any]]]:
         """The bars in local metres, with the first fix that is given."""
         if self._sites_told:
@@ -118,6 +102,18 @@ class Serializer:
             place = here.to_enu(one.latitude_deg, one.longitude_deg, one.height_m) + fix.enu_m
             bars.append([one.transmitter_id, *(round(v, 3) for v in place.tolist())])
         return [("bars", {"bars": bars})]
+
+
+def _shown(message: ReceivedMessage) -> dict[str, Any]:
+    """What a message says; where its kind, which may be a plugin's, fails to show it, why."""
+    try:
+        # A page reads no NaN.
+        shown: dict[str, Any] = json.loads(message_line(message), parse_constant=_not_a_number)
+    except (PluginError, ValueError) as fault:
+        about = {name: getattr(message, name) for name in ("transmitter", "t_us", "trust")}
+        ids = {"kind": message.kind.name, "transmitter_id": message.message.transmitter_id}
+        return {**about, **ids, "text": f"cannot be shown: {fault}"}
+    return shown
 
 
 def _not_a_number(name: str) -> None:

@@ -78,6 +78,16 @@ class Server(ABC):
         self._publisher, self._host, self.port = publisher, host, port
         self._mine = publisher.subscribe(kinds, most=most, wake=wake)
 
+    @property
+    @abstractmethod
+    def url(self) -> str:
+        """Where it is to be found, once started."""
+
+    @property
+    @abstractmethod
+    def dropped(self) -> int:
+        """Results that clients were not sent, so far."""
+
     @abstractmethod
     async def _listen(self) -> Any:
         """Begin to listen; the server of `asyncio` or `websockets`."""

@@ -8,7 +8,7 @@ from pathlib import Path
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.live.publisher import Publisher
 from evlcp_sdk.live.recorder import Recorder
-from evlcp_sdk.live.server import LoopThread
+from evlcp_sdk.live.server import LoopThread, Server
 from evlcp_sdk.live.tcp_output import TcpOutput
 from evlcp_sdk.live.viewer import Viewer
 from evlcp_sdk.scene.sites import BarSite
@@ -36,26 +36,6 @@ class Serving:
     gpsd_port: int | None = None
 
 
-@dataclass(frozen=True)
-class Services:
-    """The servers of a live run; None for those that nobody asked for.
-
-    Attributes:
-        view: The web view.
-        nmea: The server of NMEA.
-        gpsd: That of gpsd's JSON.
-    """
-
-    view: Viewer | None
-    nmea: TcpOutput | None
-    gpsd: TcpOutput | None
-
-    @property
-    def dropped(self) -> dict[str, int]:
-        """Results that clients were not sent as they did not take them, by server."""
-        return {name: server.dropped for name, server in vars(self).items() if server is not None}
-
-
 @contextmanager
 def serve(
     serving: Serving,
@@ -65,8 +45,10 @@ def serve(
     name: str,
     sites: Sequence[BarSite] = (),
     clock_zero: ClockZero = None,
-) -> Iterator[Services]:
+) -> Iterator[dict[str, Server]]:
     """Serve in a thread beside a live run; in the end what there is is told, and a recording completed.
+
+    Gives the servers that were asked for: `view`, `nmea` and `gpsd`.
 
     Args:
         serving: What.
@@ -79,24 +61,25 @@ def serve(
     Raises:
         ConfigError: A port cannot be had, or a package is not installed.
     """
-    recorder = view = None
+    recorder = None
+    servers: dict[str, Server] = {}
     if serving.view:
         if serving.record_to is not None:
             camera = next(iter(links.values())).camera
             recorder = Recorder(publisher, serving.record_to, camera.width, camera.height)
         host, port = serving.host, serving.port
-        view = Viewer(publisher, links, name=name, sites=sites, host=host, port=port, recorder=recorder)
-    nmea, gpsd = (
-        None if port is None else TcpOutput(publisher, gpsd=gpsd, port=port, clock_zero=clock_zero)
-        for gpsd, port in ((False, serving.nmea_port), (True, serving.gpsd_port))
-    )
-    servers = [one for one in (view, nmea, gpsd) if one is not None]
+        servers["view"] = Viewer(
+            publisher, links, name=name, sites=sites, host=host, port=port, recorder=recorder
+        )
+    for kind, chosen in (("nmea", serving.nmea_port), ("gpsd", serving.gpsd_port)):
+        if chosen is not None:
+            servers[kind] = TcpOutput(publisher, gpsd=kind == "gpsd", port=chosen, clock_zero=clock_zero)
     with ExitStack() as stack:
         if servers:
             loop_thread = stack.enter_context(LoopThread())
-            for server in servers:
+            for server in servers.values():
                 stack.callback(loop_thread.finish, loop_thread.call(server.start()))
         stack.callback(publisher.close)
         if recorder is not None:
             stack.callback(recorder.stop)
-        yield Services(view, nmea, gpsd)
+        yield servers

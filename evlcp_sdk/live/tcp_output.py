@@ -49,6 +49,11 @@ class TcpOutput(Server):
         self._unsent = 0
 
     @property
+    def url(self) -> str:
+        """Address and port."""
+        return f"{self._host}:{self.port}"
+
+    @property
     def dropped(self) -> int:
         """What clients were not sent as they did not take it, or as there was no time, so far."""
         return self._mine.dropped + self._unsent

@@ -33,7 +33,6 @@ from evlcp_sdk.live.server import Server
 from evlcp_sdk.report.colours import TRANSMITTER_COLOURS, cluster_hex
 from evlcp_sdk.report.pages import TEMPLATES, render_page
 from evlcp_sdk.scene.sites import BarSite
-from evlcp_sdk.spelling import counted
 
 if TYPE_CHECKING:
     from websockets.asyncio.server import ServerConnection
@@ -119,14 +118,6 @@ class Viewer(Server):
     def dropped(self) -> int:
         """Results that browsers were not sent as they did not take them, or as there was no time, so far."""
         return self._mine.dropped + self._left + sum(browser.dropped for browser in self._browsers)
-
-    @property
-    def fault(self) -> str:
-        """What the page could not show, and why; empty for nothing."""
-        if not self._serializer.untold:
-            return ""
-        many = counted(self._serializer.untold, "message")
-        return f"{many} could not be shown on the page: {self._serializer.fault}"
 
     async def _listen(self) -> Any:
         serve = import_extra("websockets.asyncio.server", "live").serve

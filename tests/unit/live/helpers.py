@@ -12,7 +12,6 @@ import numpy as np
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.several import named_links
 from evlcp_sdk.live import Budget, Publisher
-from evlcp_sdk.live.services import Services
 from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.values import Fix, Frame
 
@@ -54,13 +53,6 @@ def sender(
         thread.start()
         yield f"tcp://127.0.0.1:{listening.getsockname()[1]}"
         thread.join(10)
-
-
-def port_of(services: Services, kind: str) -> int:
-    """Where NMEA, or gpsd's JSON, is served."""
-    server = {"nmea": services.nmea, "gpsd": services.gpsd}[kind]
-    assert server is not None
-    return server.port
 
 
 def publish_fix(publisher: Publisher, t_us: float) -> None:

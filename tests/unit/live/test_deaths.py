@@ -17,7 +17,7 @@ from websockets.sync.client import connect
 from evlcp_sdk.live import Publisher
 from evlcp_sdk.live.services import Serving, serve
 from evlcp_sdk.run import live, receive
-from tests.unit.live.helpers import LINKS, PATIENT, key, port_of, publish_fix, sender
+from tests.unit.live.helpers import LINKS, PATIENT, key, publish_fix, sender
 
 NOW = struct.pack("ii", 1, 0)
 """A connection is not ended, but broken off (RST), as by a process that is killed."""
@@ -34,8 +34,7 @@ def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
     publisher, over, lives = Publisher(), threading.Event(), {"nmea": 0, "gpsd": 0, "view": 0}
     serving = Serving(view=True, nmea_port=0, gpsd_port=0)
     with serve(serving, publisher, LINKS, name="x") as services:
-        assert services.view is not None
-        url = services.view.url.replace("http", "ws") + "live"
+        url = services["view"].url.replace("http", "ws") + "live"
 
         rngs = {kind: random.Random(kind) for kind in lives}
 
@@ -49,7 +48,7 @@ def test_who_reads_results_may_die_at_any_moment(demo_raw: Path) -> None:
 
         def client(kind: str) -> None:
             rng = rngs[kind]
-            link = socket.create_connection(("127.0.0.1", port_of(services, kind)), 5)
+            link = socket.create_connection(("127.0.0.1", services[kind].port), 5)
             link.settimeout(rng.choice((0.001, 0.02, 0.05)))
             with suppress(OSError):
                 link.sendall(b'?WATCH={"enable":true,"json":true};\n' if kind == "gpsd" else b"\n")

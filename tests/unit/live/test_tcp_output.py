@@ -13,24 +13,27 @@ import pynmea2
 import pytest
 
 from evlcp_sdk.live import Publisher
-from evlcp_sdk.live.services import Services, Serving, serve
-from tests.unit.live.helpers import LINKS, port_of, publish_fix
+from evlcp_sdk.live.server import Server
+from evlcp_sdk.live.services import Serving, serve
+from tests.unit.live.helpers import LINKS, publish_fix
 
 GPSPIPE = shutil.which("gpspipe")
 
 
 @pytest.fixture
-def served() -> Iterator[tuple[Publisher, Services]]:
+def served() -> Iterator[tuple[Publisher, dict[str, Server]]]:
     publisher = Publisher()
     with serve(Serving(nmea_port=0, gpsd_port=0), publisher, LINKS, name="x") as services:
         yield publisher, services
         publisher.close()
 
 
-def test_nmea_has_the_time_of_day_where_no_other_is_known(served: tuple[Publisher, Services]) -> None:
+def test_nmea_has_the_time_of_day_where_no_other_is_known(
+    served: tuple[Publisher, dict[str, Server]],
+) -> None:
     publisher, services = served
     got, n = b"", 0
-    with socket.create_connection(("127.0.0.1", port_of(services, "nmea")), 10) as link:
+    with socket.create_connection(("127.0.0.1", services["nmea"].port), 10) as link:
         link.settimeout(0.1)
         # The first ones may come before it is served.
         while got.count(b"\n") < 15:
@@ -47,9 +50,9 @@ def test_nmea_has_the_time_of_day_where_no_other_is_known(served: tuple[Publishe
     assert [float(one.altitude) + float(one.geo_sep) for one in sentences[1::5]] == pytest.approx([60.0] * 3)
 
 
-def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Publisher, Services]) -> None:
+def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Publisher, dict[str, Server]]) -> None:
     publisher, services = served
-    address = "127.0.0.1", port_of(services, "nmea")
+    address = "127.0.0.1", services["nmea"].port
     stalled = socket.socket()
     stalled.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
     stalled.connect(address)
@@ -60,9 +63,9 @@ def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Publisher, S
         publish_fix(publisher, n * 1e5)
         if n % 200 == 0:
             time.sleep(0.01)
-        if services.dropped["nmea"] > 10:
+        if services["nmea"].dropped > 10:
             break
-    assert services.dropped["nmea"] > 10
+    assert services["nmea"].dropped > 10
     stalled.close()
     with socket.create_connection(address, 10) as link:
         link.settimeout(0.2)
@@ -74,9 +77,9 @@ def test_a_client_that_stalls_or_leaves_costs_nothing(served: tuple[Publisher, S
         assert got == b"$INTXT"
 
 
-def test_gpsd_talks_once_it_is_asked(served: tuple[Publisher, Services]) -> None:
+def test_gpsd_talks_once_it_is_asked(served: tuple[Publisher, dict[str, Server]]) -> None:
     publisher, services = served
-    with socket.create_connection(("127.0.0.1", port_of(services, "gpsd")), 10) as link:
+    with socket.create_connection(("127.0.0.1", services["gpsd"].port), 10) as link:
         link.settimeout(10)
         lines = link.makefile("rw", newline="\r\n")
         assert json.loads(next(lines))["class"] == "VERSION"
@@ -98,10 +101,10 @@ def test_gpsd_talks_once_it_is_asked(served: tuple[Publisher, Services]) -> None
 
 
 @pytest.mark.skipif(GPSPIPE is None, reason="gpspipe is not installed (Debian: package gpsd-clients)")
-def test_gpspipe_reads_it(served: tuple[Publisher, Services]) -> None:
+def test_gpspipe_reads_it(served: tuple[Publisher, dict[str, Server]]) -> None:
     publisher, services = served
     assert GPSPIPE is not None
-    address = f"127.0.0.1:{port_of(services, 'gpsd')}"
+    address = f"127.0.0.1:{services['gpsd'].port}"
     reader = subprocess.Popen([GPSPIPE, "-w", "-n", "6", address], stdout=subprocess.PIPE, text=True)
     for n in range(200):
         publish_fix(publisher, n * 1e5)
