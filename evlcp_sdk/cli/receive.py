@@ -22,9 +22,7 @@ if TYPE_CHECKING:
     from datetime import datetime
 
     from evlcp_sdk.link.resolve import Link
-    from evlcp_sdk.place.navigator import PositionPlan
     from evlcp_sdk.plugin.registry import Registry
-    from evlcp_sdk.scene.attitude import Attitude, AttitudeLog
     from evlcp_sdk.signals import EndRequest
     from evlcp_sdk.study.jobs import Executor, Outcome
     from evlcp_sdk.utc import PulseClock
@@ -90,21 +88,23 @@ def receive(
         jobs = [_fitted(job, links[0], registry) for job in jobs]
     plan = place.plan(links, mcap=result.mcap)
     sinks = result.names(registry, positions=plan is not None)
-    decode = DecodeJob(links, plan, camera.attitude(place), partial(camera.clock, place), sinks, lines)
+    given: dict[str, Any] = {"links": links, "plan": plan, "attitude": camera.attitude(place), "sinks": sinks}
+    decode = partial(_decode, clock=partial(camera.clock, place), lines=lines, **given)
     here = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not here:
         raise typer.BadParameter("are given by this process only", param_hint="--json-lines")
     executor = make_executor(0 if here else workers or None, dask)
-    outcomes = _run_jobs(jobs, decode, executor, registry if here else None, result)
+    outcomes = _run_jobs(jobs, decode, executor, registry if here else None, result, lines)
     raise typer.Exit(_exit_code(outcomes, strict=strict) or int(lines is not None and lines.failed))
 
 
 def _run_jobs(
     jobs: Sequence[ReceiveJob],
-    decode: DecodeJob,
+    decode: Callable[..., dict[str, Any]],
     executor: Executor,
     registry: Registry | None,
     result: ResultOptions,
+    lines: LinePrinter | None,
 ) -> list[Outcome[ReceiveJob, dict[str, Any]]]:
     """Decode all, here if a registry is given, else in workers; print how each ended.
 
@@ -133,7 +133,7 @@ def _run_jobs(
             if outcome.value is None:
                 _print_failure(outcome, as_json=result.as_json)
             else:
-                print_end(outcome.value, outcome.job.folder, decode.lines, as_json=result.as_json)
+                print_end(outcome.value, outcome.job.folder, lines, as_json=result.as_json)
         if stopped():
             ended = [one.job.folder for one in outcomes if one.value and one.value["status"] == "interrupted"]
             folder = ended[0] if len(ended) == 1 else result.out
@@ -183,42 +183,29 @@ def _fitted(job: ReceiveJob, link: Link, registry: Registry) -> ReceiveJob:
     return replace(job, link=best.link)
 
 
-@dataclass(frozen=True)
-class DecodeJob:
-    """Decodes a recording, here with a bar; or, without `here`, quietly in a worker."""
+def _decode(
+    job: ReceiveJob,
+    *,
+    here: tuple[Registry, EndRequest] | None,
+    links: tuple[Link, ...],
+    clock: Callable[[], datetime | PulseClock | None],
+    lines: LinePrinter | None,
+    **given: Any,
+) -> dict[str, Any]:
+    """The summary of a recording, decoded here with a bar; or, without `here`, quietly in a worker."""
+    from evlcp_sdk.run import receive_to_folder
+    from evlcp_sdk.signals import stop_on_request
 
-    links: tuple[Link, ...]
-    plan: PositionPlan | None
-    attitude: Attitude | AttitudeLog | None
-    clock: Callable[[], datetime | PulseClock | None]
-    sinks: tuple[str, ...]
-    lines: LinePrinter | None
-
-    def __call__(self, job: ReceiveJob, here: tuple[Registry, EndRequest] | None) -> dict[str, Any]:
-        """The summary."""
-        from evlcp_sdk.run import receive_to_folder
-        from evlcp_sdk.signals import stop_on_request
-
-        decode = partial(
-            receive_to_folder,
-            job.url,
-            job.folder,
-            job.link or self.links,
-            plan=self.plan,
-            attitude=self.attitude,
-            clock_zero=self.clock(),
-            sinks=self.sinks,
-        )
-        if here is not None:
-            registry, stopped = here
-            lines = self.lines
-            ended = stopped.or_when(lambda: job.folder is None and lines is not None and lines.gone)
-            with bytes_bar(_named(job.url)) as advance:
-                return decode(registry=registry, lines=lines, advance=advance, stopped=ended)
-        hush()
-        # A terminal sends Ctrl-C to workers, too.
-        with stop_on_request() as asked:
-            return decode(stopped=asked)
+    run = partial(receive_to_folder, job.url, job.folder, job.link or links, clock_zero=clock(), **given)
+    if here is not None:
+        registry, stopped = here
+        ended = stopped.or_when(lambda: job.folder is None and lines is not None and lines.gone)
+        with bytes_bar(_named(job.url)) as advance:
+            return run(registry=registry, lines=lines, advance=advance, stopped=ended)
+    hush()
+    # A terminal sends Ctrl-C to workers, too.
+    with stop_on_request() as asked:
+        return run(stopped=asked)
 
 
 def _until(stopped: Callable[[], bool], jobs: Sequence[ReceiveJob]) -> Iterator[ReceiveJob]:

@@ -2,9 +2,9 @@
 
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, Protocol
 
@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.columns import DAMAGE, PIECE_ROWS, WINDOW_US, EventTable, Piece, one_line
+from evlcp_sdk.io.columns import PIECE_ROWS, WINDOW_US, EventTable, Piece, one_line
 from evlcp_sdk.io.fields import Fields, fields_of, fields_of_values
 from evlcp_sdk.io.tables import COLUMNS, LAST_VALUES, TRIGGER_COLUMNS, WIRE_TYPES
 from evlcp_sdk.values import Triggers
@@ -25,7 +25,7 @@ _MOST_COLUMNS: Final = 8
 
 
 class Array(Protocol):
-    """Values (n,), or a table's (n, k), that are read from front to back, perhaps more than once."""
+    """Values (n,), records (n,) or a table (n, k), of which some rows are read at a time."""
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -35,37 +35,8 @@ class Array(Protocol):
     def dtype(self) -> np.dtype[Any]:
         """Type of its values."""
 
-    def __getitem__(self, rows: slice, /) -> NDArray[Any]:
-        """The values of some rows."""
-
-
-@dataclass(frozen=True)
-class ArrayColumn:
-    """An array, or a part of a table.
-
-    Attributes:
-        name: Of the array, for messages.
-        array: The array.
-        part: Name or number of the part; None for all of the array.
-    """
-
-    name: str
-    array: Array
-    part: str | int | None = None
-
-    @property
-    def kind(self) -> str:
-        """Of its type, as NumPy's; empty where it is no column."""
-        dtype, shape = self.array.dtype, self.array.shape
-        if len(shape) != (2 if isinstance(self.part, int) else 1):
-            return ""
-        return dtype[self.part].kind if isinstance(self.part, str) else dtype.kind
-
-    def of(self, block: NDArray[Any]) -> NDArray[Any]:
-        """Its values in a block of the array's rows."""
-        if self.part is None:
-            return block
-        return block[self.part] if isinstance(self.part, str) else block[:, self.part]
+    def __getitem__(self, key: Any, /) -> Any:
+        """The values of some rows, of a slice; or a column, of a name or of `(slice(None), number)`."""
 
 
 def upright(array: NDArray[Any]) -> NDArray[Any]:
@@ -81,7 +52,7 @@ def choose_columns(
     array: Callable[[str], Array],
     fields: Fields | None,
     hint: str = "list:PATH?columns=t,p",
-) -> tuple[list[ArrayColumn], Fields]:
+) -> tuple[list[Array], Fields]:
     """Time, polarity and, where there are any, x and y: of arrays by name, or of a table among them.
 
     Args:
@@ -97,25 +68,25 @@ def choose_columns(
     found = fields or fields_of(names)
     if found is None and len(names) == 2:
         with suppress(InputError):  # beside a table, something else
-            found = _fields_of([ArrayColumn(name, array(name)) for name in names])
+            found = _fields_of([array(name) for name in names])
     if found is None or max(found.which) >= len(names):
-        columns, found = _choose_table(path, names, array, fields, hint)
+        named, found = _choose_table(path, names, array, fields, hint)
     else:
-        columns = [ArrayColumn(names[k], array(names[k])) for k in found.which]
-    if any(column.array.shape == () for column in columns[2:]):
+        named = [(names[k], array(names[k])) for k in found.which]
+    if any(column.shape == () for _, column in named[2:]):
         # Where the pixels are, not a place of each event.
-        found, columns = replace(found, places=None), columns[:2]
-    for column, kinds in zip(columns, ("iuf", "iubfUS", "iuf", "iuf"), strict=False):
-        if column.kind not in kinds or not column.kind:
-            what = f"{column.array.dtype} {column.array.shape}"
-            raise InputError(f"{path}: array {column.name}: found {what}, expected numbers (n,)")
-    _check_lengths(path, columns)
-    return columns, found
+        found, named = replace(found, places=None), named[:2]
+    for (name, column), kinds in zip(named, ("iuf", "iubfUS", "iuf", "iuf"), strict=False):
+        if column.dtype.kind not in kinds or len(column.shape) != 1:
+            what = f"{column.dtype} {column.shape}"
+            raise InputError(f"{path}: array {name}: found {what}, expected numbers (n,)")
+    _check_lengths(path, dict(named))
+    return [column for _, column in named], found
 
 
 def _choose_table(
     path: Path, names: Sequence[str], array: Callable[[str], Array], fields: Fields | None, hint: str
-) -> tuple[list[ArrayColumn], Fields]:
+) -> tuple[list[tuple[str, Array]], Fields]:
     """The columns of the first table in which they are recognized, one of a short name before others."""
     for name in sorted(names, key=len):
         try:
@@ -124,45 +95,38 @@ def _choose_table(
             if len(names) == 1:
                 raise
             continue
-        parts: Sequence[str | int] = table.dtype.names or ()
+        parts: Sequence[Any] = table.dtype.names or ()
         if len(table.shape) == 2 and 1 < table.shape[1] <= _MOST_COLUMNS:
-            parts = range(table.shape[1])
-        columns = [ArrayColumn(name, table, part) for part in parts]
+            parts = [(slice(None), k) for k in range(table.shape[1])]
+        columns: list[Array] = [table[part] for part in parts]
         found = fields or (fields_of(table.dtype.names) if table.dtype.names else None) or _fields_of(columns)
         if found is not None and max(found.which) < len(columns):
-            return [columns[k] for k in found.which], found
+            return [(name, columns[k]) for k in found.which], found
     raise InputError(
         f"{path}: found the arrays {', '.join(sorted(names)) or 'none'}, expected t and p or a table"
         f" of them (or say which columns they are, as by {hint})"
     )
 
 
-def _fields_of(columns: list[ArrayColumn]) -> Fields | None:
+def _fields_of(columns: Sequence[Array]) -> Fields | None:
     """Which of some columns is what, by the first rows."""
-    if not columns or not all(column.kind and column.kind in "iubfUS" for column in columns):
+    if not columns or not all(one.dtype.kind in "iubfUS" and len(one.shape) == 1 for one in columns):
         return None
-    return fields_of_values([column.of(column.array[:_LOOKED_AT]) for column in columns])
+    return fields_of_values([column[:_LOOKED_AT] for column in columns])
 
 
-def _check_lengths(path: Path, columns: list[ArrayColumn]) -> None:
-    lengths = {column.name: column.array.shape[0] if column.array.shape else 1 for column in columns}
+def _check_lengths(path: Path, columns: Mapping[str, Array]) -> None:
+    lengths = {name: (*column.shape, 1)[0] for name, column in columns.items()}
     if len(set(lengths.values())) > 1:
         raise InputError(f"{path}: found arrays of the lengths {lengths}, expected one length")
 
 
-def pieces_of(columns: list[ArrayColumn], size_bytes: int) -> Iterator[Piece]:
-    """The rows of columns, an array that has several of them read once.
-
-    Args:
-        columns: Time, polarity and perhaps x and y.
-        size_bytes: Of the file.
-    """
-    rows = columns[0].array.shape[0]
-    arrays = {id(column.array): column.array for column in columns}
+def pieces_of(columns: Sequence[Array], size_bytes: int) -> Iterator[Piece]:
+    """The rows of columns: time, polarity and perhaps x and y; of a file of so many bytes."""
+    rows = columns[0].shape[0]
     for first in range(0, rows, PIECE_ROWS):
         part = slice(first, min(first + PIECE_ROWS, rows))
-        blocks = {key: array[part] for key, array in arrays.items()}
-        times, *others = (column.of(blocks[id(column.array)]) for column in columns)
+        times, *others = (column[part] for column in columns)
         if times.dtype.kind == "u" and times.max() > np.iinfo(np.int64).max:
             times = times.astype(np.float64)
         elif times.dtype.kind != "f":
@@ -211,24 +175,21 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
     if fields is not None or not set(COLUMNS) <= set(names):
         return EventTable("NPZ", pieces, found.unit)
     size = [_one(path, name, array(name)) if name in names else None for name in ("width", "height")]
-    triggers: list[ArrayColumn] = []
+    triggers: dict[str, Array] = {}
     if "trigger_t_us" in names:
         for name in TRIGGER_COLUMNS:
             if name not in names:
                 raise InputError(f"{path}: found the arrays {', '.join(sorted(names))}, expected {name} too")
-            triggers.append(ArrayColumn(name, array(name)))
+            triggers[name] = array(name)
     _check_lengths(path, triggers)
     given = _triggers(path, triggers) if triggers else None
     return EventTable("NPZ", pieces, found.unit, size=(size[0], size[1]), triggers=given, window_us=WINDOW_US)
 
 
-def _triggers(path: Path, columns: list[ArrayColumn]) -> Iterator[Triggers]:
-    for first in range(0, columns[0].array.shape[0], _TRIGGER_ROWS):
+def _triggers(path: Path, columns: Mapping[str, Array]) -> Iterator[Triggers]:
+    for first in range(0, columns["trigger_t_us"].shape[0], _TRIGGER_ROWS):
         part = slice(first, first + _TRIGGER_ROWS)
-        try:
-            yield Triggers(*(_bounded(path, c.name, c.array[part], first) for c in columns))
-        except DAMAGE as error:
-            raise InputError(f"{path}: damaged triggers: {one_line(error)}") from error
+        yield Triggers(*(_bounded(path, name, column[part], first) for name, column in columns.items()))
 
 
 def _bounded(path: Path, name: str, values: NDArray[Any], row: int) -> NDArray[Any]:

@@ -1,15 +1,15 @@
 """HDF5 files, those of MATLAB 7.3 among them: columns in a group, records, or a table without names."""
 
+import copy
 import math
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from numpy.typing import NDArray
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.io.arrays import ArrayColumn, choose_columns, pieces_of
+from evlcp_sdk.io.arrays import Array, choose_columns, pieces_of
 from evlcp_sdk.io.columns import WINDOW_US, ColumnSource, EventTable, one_line
 from evlcp_sdk.io.fields import Fields, fields_of, unit_named
 from evlcp_sdk.io.urls import flag, split_options
@@ -86,19 +86,28 @@ class _DataSet:
         self._on_its_side = len(shape) == 2 and shape[0] < shape[1]
         shape = shape[::-1] if self._on_its_side else shape
         self.shape = shape[:1] if shape[1:] == (1,) else shape
+        self._part: Any = (slice(None), 0) if len(shape) > len(self.shape) else ...
+        self._held: list[Any] = [None, None]
 
-    def __getitem__(self, rows: slice, /) -> NDArray[Any]:
-        """The values of some rows."""
-        try:
-            block = np.asarray(self._dataset[:, rows].T if self._on_its_side else self._dataset[rows])
-        except Exception as fault:
-            raise InputError(
-                f"{self._path}: row {(rows.start or 0) + 1}: damaged: {one_line(fault)}"
-            ) from fault
-        return block.ravel() if len(self.shape) == 1 else block
+    def __getitem__(self, key: Any, /) -> Any:
+        """The values of some rows, read once for all columns; or a column."""
+        if not isinstance(key, slice):
+            column = copy.copy(self)
+            column._part, column.shape = key, self.shape[:1]
+            column.dtype = self.dtype[key] if isinstance(key, str) else self.dtype
+            return column
+        if self._held[0] != key:
+            try:
+                block = np.asarray(self._dataset[:, key].T if self._on_its_side else self._dataset[key])
+            except Exception as fault:
+                raise InputError(
+                    f"{self._path}: row {(key.start or 0) + 1}: damaged: {one_line(fault)}"
+                ) from fault
+            self._held[:] = key, block
+        return self._held[1][self._part]
 
 
-def _columns_of(path: Path, file: Any, order: Fields | None) -> tuple[list[ArrayColumn], Fields]:
+def _columns_of(path: Path, file: Any, order: Fields | None) -> tuple[list[Array], Fields]:
     """Time, polarity and, if there are any, x and y."""
     at, node = _place_of(path, file)
     is_group = isinstance(node, h5py.Group)
