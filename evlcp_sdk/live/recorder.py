@@ -63,9 +63,14 @@ class Recorder:
         self._thread.start()
 
     def stop(self) -> None:
-        """End the file: all that has come is in it."""
-        if self._mine is not None and self._thread is not None:
+        """End the file, which is there once all that has come is in it."""
+        if self._mine is not None:
             self._publisher.leave(self._mine)
+
+    def close(self) -> None:
+        """End the file, and wait for it."""
+        self.stop()
+        if self._thread is not None:
             self._thread.join(30.0)
 
     def _write(self, path: Path, mine: Subscription) -> None:

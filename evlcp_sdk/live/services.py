@@ -81,5 +81,5 @@ def serve(
                 stack.callback(loop_thread.finish, loop_thread.call(server.start()))
         stack.callback(publisher.close)
         if recorder is not None:
-            stack.callback(recorder.stop)
+            stack.callback(recorder.close)
         yield servers

@@ -14,7 +14,6 @@ import struct
 from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from email.utils import formatdate
 from http import HTTPStatus
 from importlib.resources import files
 from ipaddress import ip_address
@@ -47,6 +46,16 @@ _MOST_SAID: Final = 4096
 """Bytes of what a browser says."""
 _KEPT: Final = {"message": 50, "fix": 500}
 """What a browser that comes later is shown of what was before; of other kinds but frames the last one."""
+
+_HEADERS: Final = {
+    "Content-Type": "text/html; charset=utf-8",
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+"""Of the page."""
 
 
 @dataclass(eq=False)
@@ -104,8 +113,7 @@ class Viewer(Server):
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
         self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
-        self._tasks: set[asyncio.Task[None]] = set()
-        self._body = b""
+        self._page = ""
         self._left = 0
 
     @property
@@ -121,7 +129,7 @@ class Viewer(Server):
 
     async def _listen(self) -> Any:
         serve = import_extra("websockets.asyncio.server", "live").serve
-        self._body = page(self._name).encode()
+        self._page = page(self._name)
         given = {"process_request": self._answer, "compression": None, "max_size": _MOST_SAID}
         return await serve(self._serve, self._host, self.port, server_header=None, **given)
 
@@ -164,7 +172,10 @@ class Viewer(Server):
             return None
         if rest:
             return connection.respond(HTTPStatus.NOT_FOUND, "nothing is here\n")
-        return self._page()
+        response = connection.respond(HTTPStatus.OK, self._page)
+        del response.headers["Content-Type"]
+        response.headers.update(_HEADERS)
+        return response
 
     def _is_ours(self, host: str) -> bool:
         """Whether a request was meant for this server: names of others may point to our address."""
@@ -181,25 +192,6 @@ class Viewer(Server):
             return ip_address(name).is_loopback or self._host in ("0.0.0.0", "::")
         except ValueError:
             return False
-
-    def _page(self) -> "Response":
-        from websockets.datastructures import Headers
-        from websockets.http11 import Response
-
-        headers = Headers(
-            {
-                "Date": formatdate(usegmt=True),
-                "Content-Type": "text/html; charset=utf-8",
-                "Content-Length": str(len(self._body)),
-                "Connection": "close",
-                "Cache-Control": "no-store",
-                "Content-Security-Policy": "frame-ancestors 'none'",
-                "Cross-Origin-Resource-Policy": "same-origin",
-                "Referrer-Policy": "no-referrer",
-                "X-Content-Type-Options": "nosniff",
-            }
-        )
-        return Response(200, "OK", headers, self._body)
 
     async def _serve(self, socket: "ServerConnection") -> None:
         """Serve one browser until it leaves."""
@@ -236,10 +228,7 @@ class Viewer(Server):
         if asked["record"] is True:
             self._recorder.start()
         elif asked["record"] is False:
-            # Its end waits for the disk.
-            task = asyncio.create_task(asyncio.to_thread(self._recorder.stop))
-            self._tasks.add(task)
-            task.add_done_callback(self._tasks.discard)
+            self._recorder.stop()
         else:
             return False
         return True
