@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from board_lines import (
-    LINK,
     board_link,
     board_on,
     check_fault,
@@ -174,27 +173,6 @@ def test_a_bank_is_full_to_the_last_byte(device: SimulatedBoard, board: Board) -
     link = board_link("bar.rows=90", "bar.cluster_rows=9", "air.frames_per_packet=700")
     with pytest.raises(ConfigError, match=r"a packet of 22426 chips takes 44852 bytes.*room for two.*10210"):
         board.stream(link)
-
-
-def test_from_words_to_chips_and_back_without_a_dark_chip(device: SimulatedBoard, board: Board) -> None:
-    symbols = symbols_of(2)
-    words = np.repeat(symbol_chips(symbols, LINK.codebook), 6, axis=1)
-    known = {
-        rows.tobytes(): name for name, both in (("w", words), ("c", EXPECTED)) for rows in np.split(both, 2)
-    }
-    provision(board, bank_of(symbols, LINK), Settings())
-    for bank in 3 * [a_bank(), bank_of(symbols, LINK)]:
-        board.program(bank)
-        device.run(60_000)
-    assert board.status().hold == 0
-    record = device.records().played()
-    assert (np.diff(record.ticks) == 1000).all()
-    rows, at, names = record.chips(None), 0, ""
-    while at + 346 <= len(rows):
-        name = next(known[part] for n in (200, 346) if (part := rows[at : at + n].tobytes()) in known)
-        names += name if not names.endswith(name) else ""
-        at += 346 if name == "w" else 200
-    assert names.startswith("wcwcwcw")
 
 
 @pytest.mark.parametrize(("limit", "every"), [(0.5, 2), (0.3, 4), (0.001, 1000)])

@@ -4,12 +4,53 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from clock_twins import clock as twin, ordered
 from hypothesis import given, settings, strategies as st
 
-from evlcp_sdk import _kernels
 from evlcp_sdk.clock import LEAP_US, CameraClock
 from evlcp_sdk.values import Events
+
+
+def twin_clock(rows, width, height):
+    """What `CameraClock` keeps of events (t, x, y, p): rows inside, its counts, and first drops."""
+    leap, setback, far = 1_000_000, 10_000, 2**62
+    kept, held, last, offset = [], [], None, 0
+    counts = dict.fromkeys(("backward", "off", "doubtful", "leaps", "restarts"), 0)
+    firsts = {}
+
+    def drop(name, *numbers):
+        counts[name] += len(numbers)
+        firsts[name] = min([*numbers, firsts.get(name, len(rows))])
+
+    for number, row in enumerate(rows):
+        t = row[0]
+        if row[1] >= width or row[2] >= height:
+            drop("off", number)
+            continue
+        if abs(t) > far:
+            drop("doubtful", number)
+            continue
+        if last is None:
+            last = offset = t
+        if last <= t <= last + leap:
+            drop("doubtful", *(k for k, _ in held))
+            held, last = [], t
+            kept.append((t - offset, *row[1:]))
+        elif last - setback <= t < last or (held and held[-1][1][0] - setback <= t < held[-1][1][0]):
+            drop("backward", number)
+        else:
+            if held and not held[-1][1][0] <= t <= held[-1][1][0] + leap:
+                drop("doubtful", *(k for k, _ in held))
+                held = []
+            held.append((number, row))
+            begin = held[0][1][0]
+            if len(held) >= 16 and t - begin >= 10_000:
+                counts["leaps" if begin > last else "restarts"] += 1
+                offset = begin - (kept[-1][0] + 4_000_000)
+                kept += [(h[0] - offset, *h[1:]) for _, h in held]
+                held, last = [], t
+    drop("doubtful", *(k for k, _ in held))
+    return kept, counts, {name: first for name, first in firsts.items() if counts[name]}
+
 
 WIDTH, HEIGHT = 8, 6
 NAMES = {
@@ -54,7 +95,7 @@ def taken(events: Events, cuts: list[int]) -> tuple[list[tuple[int, ...]], Camer
 @given(st.integers(0, 10_000), st.lists(st.integers(0, 300), max_size=30))
 def test_any_split_is_judged_event_by_event(seed: int, cuts: list[int]) -> None:
     events = stream(seed)
-    want, counts, firsts = twin(rows(events), WIDTH, HEIGHT)
+    want, counts, firsts = twin_clock(rows(events), WIDTH, HEIGHT)
     got, clock = taken(events, sorted(min(cut, len(events)) for cut in cuts))
     assert got == want
     assert {name: clock.counts[told] for name, told in NAMES.items()} == counts
@@ -97,17 +138,3 @@ def test_what_is_held_is_bounded() -> None:
     assert clock.take(still) == []
     assert sum(map(len, clock.take(still))) == 1 << 20
     assert clock.counts["clock_restarts"] == 1
-
-
-@pytest.mark.parametrize("n", [0, 1, 2, 3, 40])
-@pytest.mark.parametrize("seed", range(8))
-def test_order_is_checked_event_by_event(seed: int, n: int) -> None:
-    """Of events in order on the sensor, and of those of which some are not."""
-    rng = np.random.default_rng(seed)
-    for back, off in ((0, 0), (2, 0), (0, 2)):
-        t_us = np.arange(n) + rng.integers(-back, back + 1, n)
-        e = Events.of(t_us, rng.integers(0, WIDTH + off, n), rng.integers(0, HEIGHT + off, n), np.ones(n))
-        want = ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT)
-        since = np.empty(n, np.int64)
-        assert _kernels.all_ordered(e.t_us, e.x, e.y, WIDTH, HEIGHT, -7, since) == want
-        assert np.array_equal(since, e.t_us + 7)

@@ -11,8 +11,6 @@ import evlcp_sdk
 from evlcp_sdk.errors import InputError, InterruptedRunError
 from evlcp_sdk.io import DEFAULT_MAX_EVENTS, RawSource
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.plugin.hooks import hookimpl
-from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.run import convert, receive
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.values import Events, Triggers
@@ -62,16 +60,6 @@ def test_leaving_early_closes_the_source(demo_raw: Path) -> None:
     assert list(reception) == []
     with pytest.raises(InputError, match="closed file"):
         list(reception.source.chunks())
-
-
-def test_a_plugins_camera_is_opened(demo_raw: Path) -> None:
-    class Camera:
-        @hookimpl
-        def evlcp_open_events(self, url: str) -> RawSource | None:
-            return RawSource(demo_raw) if url == "camera:0" else None
-
-    frames = list(receive("camera:0", registry=Registry.load(Camera())).frames())
-    assert len(frames) == sum(len(numbers) for _, _, numbers in by_hand(demo_raw))
 
 
 def test_input_that_fails_gives_what_was_decoded_first(demo_raw: Path) -> None:

@@ -1,6 +1,5 @@
 """Barker codes and packet synchronization, on events whose timing is known."""
 
-import barker_twins as twins
 import numpy as np
 import pytest
 from evlcp_barker import _kernels
@@ -15,6 +14,51 @@ from evlcp_sdk.air.codebook import BARKER13, Codebook, chips_of_values
 from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError
 
+CHIP_US = 100.0
+
+
+def correlate(counts, chips, due, steps, min_events, lags):
+    """The windows of each lag laid out as a table of chips."""
+    rho = np.zeros(lags)
+    for lag in range(lags):
+        window = counts[:, lag : lag + steps * len(chips)].reshape(2, len(chips), steps).sum(2)
+        signed, seen = window[1] - window[0], window.sum()
+        fit = np.where(due, signed * chips, np.minimum(signed * chips, 0)).sum()
+        if seen >= min_events and fit > 0:
+            rho[lag] = min(fit / seen, fit / np.linalg.norm(signed) / np.sqrt(due.sum()))
+    return rho
+
+
+def events_of(
+    chips, rng, start_us=5000.0, ppm=0.0, delay_us=(20.0, 45.0), missing_off=0.0, per_edge=2, jitter_us=4.0
+):
+    """(times, polarities) of clusters that blink as `chips` (n, K): each edge sends a few late events."""
+    edges = np.diff(chips.astype(int), axis=0, prepend=0)
+    when, cluster = (np.repeat(v, per_edge) for v in np.nonzero(edges))
+    p = (edges[when, cluster] > 0).astype(np.uint8)
+    late = (
+        np.where(p, *delay_us) + 12 * (np.arange(len(when)) % per_edge) + rng.normal(0, jitter_us, len(when))
+    )
+    t = np.floor(start_us + when * CHIP_US * (1 + ppm * 1e-6) + late).astype(np.int64)
+    keep = (p > 0) | (rng.random(len(t)) >= missing_off)
+    order = np.argsort(t[keep], kind="stable")
+    return t[keep][order], p[keep][order]
+
+
+def answers_of(chips, slow):
+    """Negative and positive events by chip, (2, n), of clusters that blink as `chips` (n, K), by plain loops.
+
+    A pixel answers an edge by ln((k + 2) / (k + 1)) events in the k-th chip behind it, or at once.
+    """
+    counts = np.zeros((2, len(chips)))
+    for lit in chips.T:
+        k = 0
+        for n, on in enumerate(lit):
+            k = 0 if n == 0 or on != lit[n - 1] else k + 1
+            counts[on, n] += np.log((k + 2) / (k + 1)) if slow else float(k == 0)
+    return counts
+
+
 PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
 CLUSTERS, FRAMES, START_US = 16, 10, 5000.0
 BOOKS = {
@@ -22,7 +66,7 @@ BOOKS = {
     for name, modulation in PROFILES.items()
 }
 FORMAT = PacketFormat.of(BOOKS["wh4x2"], FRAMES)
-PERIOD_US = FORMAT.packet_chips * twins.CHIP_US
+PERIOD_US = FORMAT.packet_chips * CHIP_US
 
 
 def packets_of(rng, n, profile="wh4x2"):
@@ -73,7 +117,7 @@ def test_correlation(seed, steps, min_events, share):
     lags = counts.shape[1] - 26 * steps + 1
     rho = np.empty(lags)
     top = _kernels.correlate(counts, chips, due, steps, min_events, rho)
-    want = twins.correlate(counts, chips, due, steps, min_events, lags)
+    want = correlate(counts, chips, due, steps, min_events, lags)
     assert_allclose(rho, want, rtol=1e-12, atol=1e-12)
     assert top == rho.max()
     assert abs(int(rho.argmax()) - at) <= 1
@@ -130,8 +174,8 @@ def test_a_preamble_passes_and_other_codes_do_not(name, clusters):
     least = least_correlation(book, FRAMES, 1)
     reached = {}
     for answers in ("slow", "quick"):
-        counts = twins.answers_of(chips, answers == "slow")
-        rho = twins.correlate(counts, signs, due, 1, 0, counts.shape[1] - len(signs) + 1)
+        counts = answers_of(chips, answers == "slow")
+        rho = correlate(counts, signs, due, 1, 0, counts.shape[1] - len(signs) + 1)
         at = np.arange(len(rho)) % packet
         own = np.minimum(at, packet - at)
         reached[answers] = rho[own == 0].min(), (rho[own > 3] > least).mean()
@@ -147,12 +191,10 @@ def test_a_preamble_passes_and_other_codes_do_not(name, clusters):
 def test_shifts_of_a_preamble_are_within_its_guard(name):
     code = OWN[name]
     dark = np.zeros(len(code) - 1, np.uint8)
-    counts = twins.answers_of(np.concatenate([[0], code, dark, [0]])[:, None], slow=False)[
-        :, 1 : len(code) + 1
-    ]
+    counts = answers_of(np.concatenate([[0], code, dark, [0]])[:, None], slow=False)[:, 1 : len(code) + 1]
     counts = np.pad(counts, [(0, 0), (len(code), len(code))])
     lags = 2 * len(code) + 1
-    rho = twins.correlate(counts, 2.0 * code - 1, due_chips(code), 1, 0, lags)
+    rho = correlate(counts, 2.0 * code - 1, due_chips(code), 1, 0, lags)
     least = 0.5 * preamble_share(code)
     guard = guard_chips(code, least)
     away = np.abs(np.arange(lags) - len(code))
@@ -170,14 +212,14 @@ def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():
     packet = PacketFormat.of(book, 7)
     rng = np.random.default_rng(0)
     symbols = rng.integers(0, 16, (4, 7, 12))
-    t, p = twins.events_of(np.concatenate([packet_chips(one, book) for one in symbols]), rng, START_US)
+    t, p = events_of(np.concatenate([packet_chips(one, book) for one in symbols]), rng, START_US)
     sync = BarkerSync().compile(book, packet)
     state, locks = sync.init(), []
     for until in range(0, int(t[-1]) + 9000, 1000):
         inside = (t >= until - 1000) & (t < until)
         state, found = sync.step(state, t[inside], p[inside], until)
         locks += found
-    apart = packet.packet_chips * twins.CHIP_US
+    apart = packet.packet_chips * CHIP_US
     assert_allclose([lock.packet_t_us for lock in locks], START_US + apart * np.arange(4), atol=50)
 
 
@@ -187,7 +229,7 @@ def test_a_preamble_of_sparse_pulses_is_one_lock_a_packet():
 @pytest.mark.parametrize(("ppm", "delay_us"), [(-50, (20, 45)), (0, (45, 20)), (50, (60, 10))])
 def test_packet_start_clock_and_delays(ppm, delay_us):
     rng = np.random.default_rng(ppm + 50)
-    events = twins.events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, delay_us=delay_us, missing_off=0.2)
+    events = events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, delay_us=delay_us, missing_off=0.2)
     locks, _ = locks_of(*events)
     assert len(locks) == 12
     start = START_US + delay_us[0] + PERIOD_US * (1 + ppm * 1e-6) * np.arange(12)
@@ -195,7 +237,7 @@ def test_packet_start_clock_and_delays(ppm, delay_us):
     # The earliest events of an edge come 1 to 2 sigma (4 us each) before the mean of its first.
     assert 3 <= early.min() <= early.max() <= 9
     # Eight packets, each known to 1 us, give 4 ppm (sigma); the first lock has the nominal rate.
-    error_ppm = 1e6 * (np.array([lock.chip_us for lock in locks]) / twins.CHIP_US - 1) - ppm
+    error_ppm = 1e6 * (np.array([lock.chip_us for lock in locks]) / CHIP_US - 1) - ppm
     assert np.abs(error_ppm[7:]).max() < 10
     assert abs(error_ppm[0] + ppm) < 1e-6
     for lock in locks:
@@ -210,9 +252,9 @@ def test_packet_start_clock_and_delays(ppm, delay_us):
 
 def test_a_lock_does_not_wait_for_the_next_packet():
     rng, sync = np.random.default_rng(3), synchronizer()
-    t, p = twins.events_of(packets_of(rng, 4), rng, START_US, ppm=30, missing_off=0.2)
+    t, p = events_of(packets_of(rng, 4), rng, START_US, ppm=30, missing_off=0.2)
     # The preamble, the guard of the peak behind it, and one step.
-    until_us = int(START_US + (26 + 3 + 2) * twins.CHIP_US)
+    until_us = int(START_US + (26 + 3 + 2) * CHIP_US)
     _, locks = sync.step(sync.init(), t[t < until_us], p[t < until_us], until_us)
     assert len(locks) == 1
 
@@ -233,14 +275,14 @@ def test_a_flash_is_no_preamble(events):
 
 def test_the_lock_is_kept_across_missing_preambles():
     rng = np.random.default_rng(5)
-    t, p = twins.events_of(packets_of(rng, 14), rng, START_US, ppm=-40)
+    t, p = events_of(packets_of(rng, 14), rng, START_US, ppm=-40)
     number = (t - START_US) / PERIOD_US
     hidden = (number > 4.9) & (number < 9.5)
     locks, state = locks_of(t[~hidden], p[~hidden])
     assert_allclose(numbers(locks), [0, 1, 2, 3, 4, 10, 11, 12, 13], atol=2e-3)
     assert state.clock.packet == 13
     # Times known to 1 us, 0.3 s apart.
-    assert locks[-1].chip_us == pytest.approx(twins.CHIP_US * (1 - 40e-6), rel=6e-6)
+    assert locks[-1].chip_us == pytest.approx(CHIP_US * (1 - 40e-6), rel=6e-6)
 
 
 @pytest.mark.parametrize("jump_us", [1_234, 17_300, -9_000])
@@ -248,8 +290,8 @@ def test_the_second_preamble_after_a_jump_is_believed(jump_us):
     rng = np.random.default_rng(7)
     chips = packets_of(rng, 9)
     cut = 4 * FORMAT.packet_chips
-    before = twins.events_of(chips[:cut], rng, START_US)
-    after = twins.events_of(chips[cut:], rng, START_US + 5 * PERIOD_US + jump_us)
+    before = events_of(chips[:cut], rng, START_US)
+    after = events_of(chips[cut:], rng, START_US + 5 * PERIOD_US + jump_us)
     locks, state = locks_of(*(np.concatenate(c) for c in zip(before, after, strict=True)))
     want = np.r_[0:4, 6:10] + np.r_[np.zeros(4), np.full(4, jump_us / PERIOD_US)]
     assert_allclose(numbers(locks), want, atol=2e-3)
@@ -273,7 +315,7 @@ def late(events, from_packet, to_packet, by_us):
 @pytest.mark.parametrize("packets", [(1.9, 3.9), (3.9, 4.9), (4.9, 20)])
 def test_latency_is_no_clock(ppm, by_us, packets):
     rng = np.random.default_rng(9)
-    events = twins.events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, missing_off=0.2)
+    events = events_of(packets_of(rng, 12), rng, START_US, ppm=ppm, missing_off=0.2)
     locks, state = locks_of(*late(events, *packets, by_us))
     assert len(locks) == 12
     assert state.clock.packet == 11
@@ -292,10 +334,10 @@ def test_latency_is_no_clock(ppm, by_us, packets):
 @pytest.mark.parametrize("ppm", [-400, 400])
 def test_the_clock_tolerance_is_a_bound(ppm, tolerance_ppm):
     rng = np.random.default_rng(11)
-    t, p = twins.events_of(packets_of(rng, 10), rng, START_US, ppm=ppm)
+    t, p = events_of(packets_of(rng, 10), rng, START_US, ppm=ppm)
     sync = BarkerSync(clock_tolerance_ppm=tolerance_ppm).compile(BOOKS["wh4x2"], FORMAT)
     _, locks = sync.step(sync.init(), t, p, int(t[-1]) + 5000)
-    rates = 1e6 * (np.array([lock.chip_us for lock in locks]) / twins.CHIP_US - 1)
+    rates = 1e6 * (np.array([lock.chip_us for lock in locks]) / CHIP_US - 1)
     assert np.abs(rates).max() <= tolerance_ppm + 1e-6
     # The packets are heard where they are all the same.
     late = [lock.packet_t_us - START_US - k * PERIOD_US * (1 + ppm * 1e-6) for k, lock in enumerate(locks)]
@@ -319,7 +361,7 @@ def among(events, t_us, p):
 @pytest.mark.parametrize(("rate_hz", "seed"), [(1000, 0), (2000, 0), (2000, 1)])
 def test_a_panel_behind_is_no_latency(rate_hz, seed):
     rng = np.random.default_rng(seed)
-    bar = twins.events_of(packets_of(rng, 6), rng, START_US, per_edge=6)
+    bar = events_of(packets_of(rng, 6), rng, START_US, per_edge=6)
     apart_us = 5e5 / rate_hz
     switches = rng.uniform(0, 2 * apart_us) + apart_us * np.arange(bar[0][-1] / apart_us - 1)
     # As many at each switch as half of the bar's clusters have at an edge, or all of them.
@@ -328,4 +370,4 @@ def test_a_panel_behind_is_no_latency(rate_hz, seed):
     locks, _ = locks_of(*among(bar, t, when % 2))
     assert len(locks) >= 5
     assert np.ptp(starts_of(locks)[1:]) < 8
-    assert max(abs(lock.chip_us / twins.CHIP_US - 1) for lock in locks) < 30e-6
+    assert max(abs(lock.chip_us / CHIP_US - 1) for lock in locks) < 30e-6

@@ -75,16 +75,6 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str
     assert found.distance_m == pytest.approx(true_m, rel=1e-3)
 
 
-@pytest.mark.parametrize("layout", ["2 clusters", "3 clusters", "one row of two"])
-def test_poc_compares_no_clusters_whose_edges_differ(layout: str) -> None:
-    link = link_with(layout, "ranging.id=poc")
-    other = "joint-scale" if layout == "3 clusters" else "none"
-    with pytest.raises(ConfigError, match=f"here no two are: use '{other}' for this layout$"):
-        link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
-    told = link_with(layout, "ranging.id=poc", "ranging.skip_outer=0")
-    told.algorithm("ranging").compile(told.camera, told.bar, told.codebook)
-
-
 @pytest.mark.parametrize("modulation", ["nrz", "ppm"])
 def test_joint_scale_reads_pilots_where_codewords_are_no_pair_codes(modulation: str) -> None:
     link = link_with("16 clusters", f"modulation.id={modulation}")

@@ -128,21 +128,6 @@ def test_values_that_the_fit_does_not_explain_give_no_distance(shift: int) -> No
     assert found.pairs == 0
 
 
-def test_whole_pixels_between_a_value_s_chips_do_not_move_the_bar() -> None:
-    """A bar that moves on by whole pixels, held still chip by chip: its values know of none of it."""
-    still, moving = view_of(50.0, noise=0.5, seed=4), view_of(50.0, noise=0.5, seed=4)
-    speed = 0.17
-    place = speed * (np.arange(32) + 0.5)
-    # A value's events show the bar half a chip before its second chip's middle.
-    shown = np.rint(speed * np.arange(32) - np.rint(place)).astype(int)
-    sums = np.stack([np.roll(s, by, 0) for s, by in zip(moving.sums, shown, strict=True)])
-    offset = np.stack([np.zeros(32), place - np.rint(place)])
-    found = measured(FrameView(sums, offset, moving.presence, moving.soft))
-    want = measured(still)
-    # The image moves by whole pixels only, which leaves a uniform error of a pixel.
-    assert found.distance_m == pytest.approx(want.distance_m, abs=0.05)
-
-
 def test_sigma_is_the_spread() -> None:
     errors = []
     for seed in range(60):
@@ -188,16 +173,6 @@ def test_two_columns_give_the_distance_of_both_and_its_sigma() -> None:
     assert one.pairs == 7
     # What is hidden is left out, a column that shows too little whole.
     assert measure(side_by_side(view_of(50.0, dark=tuple(range(16))))).pairs == 0
-
-
-BLUR, SHARE = 0.2, 0.4
-
-
-def test_profile_is_a_mixture_of_normal_distributions() -> None:
-    table = profile(SHARE)
-    z = np.linspace(0, _kernels.REACH, table.shape[1])
-    assert_allclose(table[0], 2 * (SHARE * norm.cdf(z) + (1 - SHARE) * norm.cdf(z / 3)) - 1, atol=1e-12)
-    assert_allclose(table[1], 2 * (SHARE * norm.pdf(z) + (1 - SHARE) * norm.pdf(z / 3) / 3), atol=1e-12)
 
 
 def random_codes(rng):

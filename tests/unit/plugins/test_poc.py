@@ -1,19 +1,108 @@
 """Ranging by phase-only correlation: kernels against twins, exact shifts, ideal images."""
 
 import numpy as np
-import poc_twins as twins
 import pytest
 from evlcp_centroid.ranging import CentroidRanging
 from evlcp_poc import _kernels
 from evlcp_poc.correlation import blob_band, full_band, pair_shifts, phase_only_correlation
 from evlcp_poc.ranging import PocRanging
 from numpy.testing import assert_allclose
+from scipy.special import erf
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.bar import BarLayout, LedGrid, LedTable
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
+
+
+def dirichlet(shift, size, band):
+    """The kernel and its slope as the sums of cosines and sines that they are."""
+    k = np.arange(-(band // 2), band // 2 + 1)
+    angle = 2 * np.pi * np.outer(shift, k) / size
+    return np.cos(angle).sum(1) / size, -(2 * np.pi * k / size * np.sin(angle)).sum(1) / size
+
+
+def peak_shift(samples, size, band):
+    """Least squares over shift and gain by brute force: a fine grid, then a finer one."""
+    at = np.arange(len(samples)) - len(samples) // 2
+
+    def rest(shift):
+        m, _ = dirichlet(at - shift, size, band)
+        return ((samples - m * max(m @ samples / (m @ m), 0)) ** 2).sum()
+
+    best, width = 0.0, 1.0
+    for _ in range(5):
+        grid = best + np.linspace(-width, width, 81)
+        best, width = min(grid, key=rest), width / 20
+    return best
+
+
+def band_limited(rng, height, width):
+    """A random image without its Nyquist frequencies, which no shift keeps real, and its spectrum."""
+    spectrum = np.fft.rfft2(rng.normal(size=(height, width)))
+    spectrum[height // 2] *= height % 2
+    spectrum[:, -1] *= width % 2
+    return spectrum
+
+
+def shifted(spectrum, shape, down, right):
+    v = np.fft.fftfreq(shape[0])[:, None]
+    u = np.fft.rfftfreq(shape[1])
+    return np.fft.irfft2(spectrum * np.exp(-2j * np.pi * (down * v + right * u)), shape).astype(np.float32)
+
+
+def twin_correlation(one, other, down, across):
+    """Of the phases of whole spectra, in double precision."""
+    spectra = np.fft.rfft2(one.astype(float)).conj() * np.fft.rfft2(other.astype(float))
+    spectra[:, down + 1 : one.shape[1] - down] = spectra[:, :, across + 1 :] = 0
+    size = np.abs(spectra)
+    return np.fft.irfft2(np.divide(spectra, size, out=0 * spectra, where=size > 0), one.shape[1:])
+
+
+def twin_scale(middles, apart, seen):
+    """The median, px a metre, of pairs that are half as far apart as the farthest, or more."""
+    pairs = [(a, b) for a in seen for b in seen if a < b]
+    far = max((apart[pair] for pair in pairs), default=0) / 2
+    return np.median(
+        [np.hypot(*(middles[a] - middles[b])) / apart[a, b] for a, b in pairs if apart[a, b] >= far]
+    )
+
+
+def jackknife(values, weights, first, second, kept):
+    """Sigma of a weighted mean of pairs by leaving out one cluster after another."""
+    means = []
+    for k in np.union1d(first[kept], second[kept]):
+        rest = kept[(first[kept] != k) & (second[kept] != k)]
+        means.append(np.average(values[rest], weights=weights[rest]))
+    return np.sqrt((len(means) - 1) * np.var(means))
+
+
+def gaussian(centre, sigma, size):
+    """A Gaussian's integral over each pixel of a line; pixel n reaches from n - 1/2 to n + 1/2."""
+    return np.diff(erf((np.arange(size + 1) - 0.5 - centre) / (np.sqrt(2) * sigma))) / 2
+
+
+def box(centre, width, size):
+    """The part of each pixel of a line that a box covers."""
+    edges = np.clip(np.arange(size + 1) - 0.5, centre - width / 2, centre + width / 2)
+    return np.diff(edges)
+
+
+def soft_box(centre, width, blur, size):
+    """A box blurred by a Gaussian, the mean over each pixel of a line by 16 samples; and its slope."""
+    x = (np.arange(16 * size) + 0.5) / 16 - 0.5 - centre
+
+    def edge(at):
+        return erf((x - at) / (np.sqrt(2) * blur)) / 2
+
+    def bell(at):
+        return np.exp(-((x - at) ** 2) / (2 * blur**2)) / (np.sqrt(2 * np.pi) * blur)
+
+    value = edge(-width / 2) - edge(width / 2)
+    slope = bell(width / 2) - bell(-width / 2)
+    return value.reshape(size, 16).mean(1), slope.reshape(size, 16).mean(1)
+
 
 CAMERA, BAR = CameraModel(), BarLayout()
 PANEL = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
@@ -40,10 +129,10 @@ def test_a_noisy_peak_is_fitted_by_least_squares(seed):
     rng = np.random.default_rng(seed)
     size, samples = int(rng.integers(12, 50)), int(rng.integers(1, 5))
     band = size - 1 + size % 2
-    kernel, _ = twins.dirichlet(np.arange(-samples, samples + 1) - rng.uniform(-0.6, 0.6), size, band)
+    kernel, _ = dirichlet(np.arange(-samples, samples + 1) - rng.uniform(-0.6, 0.6), size, band)
     noisy = kernel + rng.normal(0, 0.05, len(kernel))
     # Steps end below 1e-3 px, the next would be quadratically smaller.
-    assert fit_peak(noisy, size, band) == pytest.approx(twins.peak_shift(noisy, size, band), abs=1e-4)
+    assert fit_peak(noisy, size, band) == pytest.approx(peak_shift(noisy, size, band), abs=1e-4)
 
 
 @pytest.mark.parametrize("samples", [[0, 0, 0], [-1, -2, -1], [0, 1, 0]])
@@ -69,9 +158,9 @@ def test_what_has_no_phase_counts_for_nothing():
 @pytest.mark.parametrize("samples", [1, 2, 4])
 def test_exact_shifts_are_recovered(samples, shape, most):
     rng = np.random.default_rng(samples)
-    spectrum = twins.band_limited(rng, *shape)
+    spectrum = band_limited(rng, *shape)
     by = np.array([[0, 0], *rng.uniform(-4, 4, (3, 2)), [1, -2], [0.5, -0.5]])
-    images = np.stack([twins.shifted(spectrum, shape, *d) for d in by], axis=1)
+    images = np.stack([shifted(spectrum, shape, *d) for d in by], axis=1)
     first, second = np.triu_indices(len(by), 1)
     near = np.abs(by[second] - by[first]).max(1) < 5
     first, second = first[near], second[near]
@@ -79,7 +168,7 @@ def test_exact_shifts_are_recovered(samples, shape, most):
     pairs = first, second
     shifts = pair_shifts(images, shape, pairs, most_of_all, 5, samples)
     correlation = phase_only_correlation(images, shape, pairs, most_of_all, range(-3, 5), range(-2, 2))
-    want = twins.correlation(*(images.swapaxes(0, 1)[some] for some in pairs), *most_of_all)
+    want = twin_correlation(*(images.swapaxes(0, 1)[some] for some in pairs), *most_of_all)
     want = want[:, np.arange(-3, 5)[:, None], np.arange(-2, 2)]
     assert_allclose(correlation, want.swapaxes(0, 1), atol=2e-6)
     # The images are float32: 3e-7 px were seen with the full band. The less band, the flatter the peak, and
@@ -95,8 +184,8 @@ def test_a_shift_in_noise_and_its_bound(spacing_px, noise):
     by = rng.uniform(-0.5, 0.5, (pairs, 2))
     at = np.repeat(rng.uniform(-0.5, 0.5, (pairs, 2)), 2, axis=0)
     at[1::2] += by
-    down = [twins.soft_box(rows // 2 + v, spacing_px, 0.6, rows) for v, _ in at]
-    across = [twins.soft_box(columns // 2 + u, 3.0, 0.6, columns) for _, u in at]
+    down = [soft_box(rows // 2 + v, spacing_px, 0.6, rows) for v, _ in at]
+    across = [soft_box(columns // 2 + u, 3.0, 0.6, columns) for _, u in at]
     images = np.array([np.outer(v, u) for (v, _), (u, _) in zip(down, across, strict=True)])
     slopes = np.array([np.outer(v, u) for (_, v), (u, _) in zip(down, across, strict=True)])
     # Two images in white noise, each of known shape: the variances of their places add up.
@@ -140,11 +229,10 @@ def image_of(bar, distance_m, *, tilt_deg=0.0, blob="gaussian", offset=(0.2, -0.
         centres[cluster] += by
     if blob == "gaussian":
         maps = [
-            np.outer(twins.gaussian(y, 0.3 * pitch, rows), twins.gaussian(x, 0.3 * pitch, columns))
-            for x, y in centres
+            np.outer(gaussian(y, 0.3 * pitch, rows), gaussian(x, 0.3 * pitch, columns)) for x, y in centres
         ]
     else:
-        maps = [np.outer(twins.box(y, pitch, rows), twins.box(x, 4.0, columns)) for x, y in centres]
+        maps = [np.outer(box(y, pitch, rows), box(x, 4.0, columns)) for x, y in centres]
     maps = np.array(maps)
     # A map is zero away from its cluster.
     return np.where(maps > 1e-4 * maps.max(), maps / maps.max(), 0)
@@ -258,6 +346,6 @@ def test_extremes_of_both_sides_and_outliers_are_left_out():
 
     rest = np.delete(np.arange(15), [0, 5, 9])
     want = np.average(values[rest], weights=apart[rest] ** 2)
-    assert mean(0.0, 15) == pytest.approx((want, twins.jackknife(values, apart**2, first, second, rest), 12))
+    assert mean(0.0, 15) == pytest.approx((want, jackknife(values, apart**2, first, second, rest), 12))
     # Two clusters farther apart than half a metre are out of place; too few are left, then.
     assert np.isnan(mean(1.0, 1)[0])

@@ -465,14 +465,6 @@ def test_a_text_is_read_from_its_first_stretch_on_whatever_the_clock(clock: floa
     assert wrong_bits([one.value for one in found[-98:]], sent[-98:].tolist(), 7) < 0.01
 
 
-def test_text_that_fits_both_ways_is_read_as_the_link_says() -> None:
-    """Eight bits of ASCII without a pause: the last one is ever 0, as a start bit the other way round."""
-    sent = np.random.default_rng(5).integers(32, 127, 90)
-    events = seen(np.random.default_rng(6), levels_of(sent, 8, "none", 1), 320.0)
-    found = read_characters(events.t_us, events.p, 3125.0, Uart(8))
-    assert [c.value for c in found] == sent.tolist()
-
-
 def test_what_a_list_has_wrong_is_said(tmp_path: Path, evlcp: Callable[..., Any]) -> None:
     """Polarities that are turned, or of one kind alone; and what the list did not say."""
     sent = np.random.default_rng(4).integers(0, 128, 60)

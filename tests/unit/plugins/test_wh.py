@@ -4,9 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import wh_twins as twins
-from evlcp_wh import _kernels
-from evlcp_wh.decoding import LearnedDecoder, MlSoft, WhTransform, match_words
+from evlcp_wh.decoding import LearnedDecoder, MlSoft, WhTransform
 from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.motion_feedback import MotionFeedback, find_path, match_shifts
 from evlcp_wh.pilots import WhPilots
@@ -16,6 +14,77 @@ from numpy.testing import assert_allclose, assert_array_equal
 from evlcp_sdk.air.codebook import Codebook, chips_of_values
 from evlcp_sdk.testing.views import ideal_presence, ideal_sums
 from evlcp_sdk.values import PresenceMap
+
+
+def twin_values_of(sums):
+    """b' = the second chip's sign; b'' = minus the first's, where the second is silent."""
+    first, second = np.sign(sums[::2].astype(int)), np.sign(sums[1::2].astype(int))
+    return np.where(second != 0, second, -first)
+
+
+def cells_of(sums, grid):
+    """Sums of whole grid cells, (chips, rows, columns)."""
+    chips, height, width = sums.shape
+    rows, columns = height // grid, width // grid
+    whole = sums[:, : rows * grid, : columns * grid].astype(int)
+    return whole.reshape(chips, rows, grid, columns, grid).sum((2, 4))
+
+
+def posterior(sums, codes, grid, error, min_values):
+    """Bayes' rule, a product of probabilities each cell and cluster; half the prior is on `no cluster`."""
+    values = twin_values_of(cells_of(sums, grid))
+    out = np.zeros((len(codes), *values.shape[1:]))
+    for r, c in np.ndindex(out.shape[1:]):
+        seen = [(i, v) for i, v in enumerate(values[:, r, c]) if v]
+        if len(seen) < min_values:
+            continue
+        nothing = 0.5 * 0.5 ** len(seen)
+        joint = [np.prod([1 - error if code[i] == v else error for i, v in seen]) for code in codes]
+        joint = 0.5 / len(codes) * np.array(joint)
+        out[:, r, c] = joint / (joint.sum() + nothing)
+    return out
+
+
+def weighted_values(sums, probability, grid, least):
+    values = cells_of(twin_values_of(sums), grid)
+    weight = np.where(probability >= least, probability, 0)
+    return np.einsum("krc,irc->ki", weight, values)
+
+
+def twin_llr(values, words):
+    """Symbols, ln P(bit 0) / P(bit 1), and share of energy explained: nearest words at the mean amplitude.
+
+    The amplitudes are those of the least-squares fit; all clusters have one noise.
+    """
+    amplitude = np.array([max(w @ v / len(w) for w in words) for v in values])
+    cost = np.array([[((v - amplitude.mean() * w) ** 2).sum() for w in words] for v in values])
+    kept = (amplitude**2).sum() * words.shape[1]
+    rest = sum(
+        ((v - a * words[cost[k].argmin()]) ** 2).sum()
+        for k, (v, a) in enumerate(zip(values, amplitude, strict=True))
+    )
+    variance = rest / values.size
+    bits = len(words).bit_length() - 1
+    out = np.empty((len(values), bits))
+    for k, b in np.ndindex(out.shape):
+        # Symbols beyond carry no bits.
+        zeros = np.array([f"{s:0{bits}b}"[b] == "0" for s in range(2**bits)])
+        carrying = cost[k, : 2**bits]
+        out[k, b] = (carrying[~zeros].min() - carrying[zeros].min()) / (2 * variance)
+    return cost.argmin(1), out, kept / (kept + rest)
+
+
+def take_back(sums, path):
+    reach = np.abs(path).max()
+    seam = np.pad(sums, ((0, 0), (reach, reach), (reach, reach)))
+    _, height, width = sums.shape
+    return np.array(
+        [
+            seam[c, reach + path[c // 2, 0] :, reach + path[c // 2, 1] :][:height, :width]
+            for c in range(len(sums))
+        ]
+    )
+
 
 PROFILES = {"wh4x2": Wh4x2(), "wh8": Wh8(), "raw8": Raw8()}
 SEEDS = range(2)
@@ -66,52 +135,11 @@ def test_presence_is_bayes_rule(shape, grid, density):
     rng = np.random.default_rng(grid)
     sums = random_sums(rng, (16, *shape), density)
     found = WhCorrelation(grid_px=grid).compile(book_of())(sums)
-    want = twins.posterior(sums, CODES, grid, 0.1, 4)
+    want = posterior(sums, CODES, grid, 0.1, 4)
     # Ratios below 1e-9 count as nothing, and the result is float32.
     assert_allclose(found.probability, want, rtol=1e-5, atol=2e-9)
     assert found.probability.shape == (CLUSTERS, shape[0] // grid, shape[1] // grid)
     assert_array_equal(found.selected, found.probability >= 0.5)
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("grid", [2, 3])
-def test_pixel_maps(seed, grid):
-    rng = np.random.default_rng(seed)
-    sums = random_sums(rng, (16, 13, 10))
-    probability = rng.random((CLUSTERS, 13 // grid, 10 // grid)).astype(np.float32)
-    selected, least = np.empty(probability.shape, np.bool_), float(np.sort(probability.ravel())[-30])
-    codes, out = CODES.astype(np.int64), np.zeros((CLUSTERS, 13, 10), np.float32)
-    _kernels.pixel_maps(sums, codes, grid, probability, least, selected, out)
-    assert_array_equal(selected, probability >= least)
-    assert_array_equal(out, twins.pixel_maps(sums, codes, grid, selected).astype(np.float32))
-    assert out.max() > 0
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-@pytest.mark.parametrize("grid", [2, 3])
-def test_weighted_values(seed, grid):
-    rng = np.random.default_rng(seed)
-    sums = random_sums(rng, (16, 13, 10))
-    presence = presence_of(rng, CLUSTERS, 13 // grid, 10 // grid, grid)
-    out = np.zeros((CLUSTERS, 8))
-    _kernels.weighted_values(sums, presence.probability, grid, 0.2, out)
-    assert_allclose(out, twins.weighted_values(sums, presence.probability, grid, 0.2), rtol=1e-6)
-    assert out.any()
-
-
-@pytest.mark.parametrize(
-    ("clusters", "bits", "length", "more"),
-    [(16, 6, 8, 0), (1, 1, 2, 0), (3, 8, 16, 0), (5, 2, 8, 2), (5, 2, 8, 3)],
-)
-def test_words_are_matched(clusters, bits, length, more):
-    """Words beyond the 2^bits first carry no bits."""
-    rng = np.random.default_rng(bits)
-    words = rng.choice([-1.0, 1.0], (2**bits + more, length))
-    for values in (rng.normal(size=(clusters, length)), np.zeros((clusters, length))):
-        *found, least = match_words(values, np.ascontiguousarray(words.T), bits)
-        for got, want in zip(found, twins.match_words(values, words), strict=True):
-            assert_allclose(got, want, rtol=1e-9, atol=1e-12)
-        assert least == np.abs(found[2]).min()
 
 
 # Separation
@@ -141,8 +169,8 @@ def test_llr_is_the_brute_force_max_log(profile, seed, symbols):
     presence = presence_of(rng, CLUSTERS, 6, 4, 2)
     presence.probability[:, 0, 0] = 0.7
     soft = WhTransform().compile(book)(presence, framed(sums))
-    values = twins.weighted_values(sums, presence.probability, 2, 0.01)
-    symbols, llr, quality = twins.llr(values, book.codeword_edges.astype(float))
+    values = weighted_values(sums, presence.probability, 2, 0.01)
+    symbols, llr, quality = twin_llr(values, book.codeword_edges.astype(float))
     assert_array_equal(soft.symbols, symbols)
     assert_allclose(soft.llr, llr, rtol=1e-4, atol=1e-4)
     assert soft.quality == pytest.approx(quality)
@@ -194,7 +222,7 @@ def drifting(book, symbols, right_down, missing=0.3, seed=0, **image):
     still = ideal_sums(book, symbols, missing=missing, seed=seed, **image)
     share = np.clip((np.arange(16) - 7.5) / 7.5, 0, 1)
     path = np.rint(share[:, None] * np.array(right_down)[::-1]).astype(int)
-    return twins.take_back(still, -path), path
+    return take_back(still, -path), path
 
 
 @pytest.mark.parametrize("profile", PROFILES)

@@ -14,8 +14,6 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.reflections import (
     FrameDetection,
-    PacketAssembler,
-    ReflectionQueue,
     Reflections,
     repeats,
 )
@@ -213,25 +211,6 @@ def test_what_was_shown_then_and_there_is_known() -> None:
     assert echoes.shown(one.t_us + 40, (304.0, 350.0))
     assert not echoes.shown(one.t_us + 60, (304.0, 350.0))
     assert not echoes.shown(one.t_us + 40, (306.0, 350.0))
-
-
-def test_the_queue_marks_what_the_next_step_tells() -> None:
-    """A bar locks a step after its reflection: the reflection's frames have waited."""
-    queue = ReflectionQueue(Reflections(FORMAT, CODEWORDS))
-    bar, image = PacketAssembler(FORMAT.frames), PacketAssembler(FORMAT.frames)
-    for n in range(10):
-        queue.add(image, sighting(0, n, said(n), light=70))
-    assert queue.step() == []
-    assert queue
-    for n in range(10):
-        queue.add(bar, sighting(1, n, said(n)))
-    (packet,) = queue.step()
-    assert (packet.transmitter, packet.echo_of) == (0, 1)
-    assert {f.echo_of for f in packet.frames} == {1}
-    queue.add(image, sighting(0, 10, said(10)))
-    queue.add(image, None)
-    assert [(p.transmitter, p.echo_of, len(p.frames)) for p in queue.close()] == [(1, None, 10), (0, 1, 1)]
-    assert not queue
 
 
 def reflected(events: Events, *, missing: float) -> Events:

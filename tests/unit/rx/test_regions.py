@@ -257,23 +257,6 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
     assert regions.shape(region, 24_000.0, (x + 1, y), (4.0, 131.0)) == pytest.approx(3)
 
 
-def test_another_image_moves_with_its_bar() -> None:
-    bar = IdealBar(random_symbols(LINK, 2), start_us=0, shake_px=4, shake_hz=20)
-    regions = follower(keep_us=50_000)
-    *_, (_, (region,)) = stepped(regions, ideal_events(LINK, bar), 25_000)
-    x, y = region.positions.place_at(24_000.0)
-    other = regions.beside(region, 24_000.0, (x + 60, y + 10), SIZE)
-    at = np.arange(5000.0, 24_000.0, 500.0)
-    apart = np.array(other.positions.at(at)) - np.array(region.positions.at(at))
-    assert np.ptp(apart, axis=1) == pytest.approx([0, 0], abs=1e-9)
-    assert other in regions.alive
-    assert other.covers(24_000.0, (x + 60, y + 10))
-    assert not other.covers(24_000.0, (x, y))
-    assert [region.holds(other, 24_000.0, px) for px in (3.0, 59.0, 61.0)] == [False, False, True]
-    regions.drop(other)
-    assert regions.alive == [region]
-
-
 def test_what_frames_have_shown_to_be_two_stays_two() -> None:
     """A bar over its image, found as one: a jolt brings one region over the other; a pole hides the bar."""
     below = CENTRE[0], CENTRE[1] + 138
@@ -365,20 +348,3 @@ def test_of_two_regions_that_follow_the_same_the_older_stays() -> None:
             regions.shape(first, first.latest.t_us, CENTRE, SIZE)
             regions.beside(first, first.latest.t_us, (CENTRE[0], CENTRE[1] + 3), SIZE)
     assert regions.alive == [first]
-
-
-def test_parts_of_a_bar_that_hear_the_same_become_one_region() -> None:
-    """The middle is dark for longer than parts are joined over."""
-    events = BAR_EVENTS[np.abs(BAR_EVENTS.y - BAR.y_px) > 12]
-    regions = follower(keep_us=50_000)
-    *_, (_, found) = stepped(regions, events, 25_000)
-    upper, lower = sorted(found, key=lambda r: r.latest.y_px)
-    regions.unite(lower, upper)
-    assert regions.alive == [lower]
-    assert upper.released
-    assert lower.positions.place_at(24_000.0) == pytest.approx(CENTRE, abs=1.5)
-    assert lower.latest.height_px == pytest.approx(128, abs=4)
-    since_us = lower.pieces[0][0] + 6000
-    kept = sum(int((e.t_us >= since_us).sum()) for _, e in lower.pieces)
-    # Pixels that blink like a lamp just now are left out of all steps: one cluster of sixteen or two.
-    assert kept > 0.85 * ((events.t_us >= since_us) & (events.t_us < 25_000)).sum()

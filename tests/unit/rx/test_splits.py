@@ -12,11 +12,10 @@ from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.rx.limits import Limits
-from evlcp_sdk.rx.multi import EarlyFrames
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, Frame, Packet, changed
+from evlcp_sdk.values import Events, Frame, Packet
 
 FEW_PILOTS = load_link(overrides=["air.pilot_every=4"])
 BAR, WH8 = (replace(resolve({"modulation": {"id": id}}), name=id) for id in ("wh4x2", "wh8"))
@@ -160,25 +159,3 @@ def test_of_several_links_a_frame_comes_at_once_where_its_transmitter_holds_its_
     # The first packets wait for their judgement, the last ones for nothing.
     assert late_us[0] > 60_000
     assert max(late_us[4:6]) < 100 + 250
-
-
-def test_frames_that_another_link_takes_are_counted_where_they_were_told() -> None:
-    one = frames_of(received(LINK, OWN)[1])[0]
-    packets = [
-        Packet(5, n, 0.0, 100.0, tuple(changed(one, transmitter=5, packet=n, frame=k) for k in range(2)), 2)
-        for n in range(3)
-    ]
-    found: list[tuple[int, int]] = []
-    early = EarlyFrames(lambda frame: found.append((frame.packet, frame.frame)))
-    for frame in (*packets[0].frames, *packets[1].frames):
-        early.decoded(frame, owns=False)
-    early.refused(packets[0])
-    early.decoded(packets[2].frames[0], owns=False)
-    assert found == []
-    early.given(packets[1], owns=True)
-    assert found == [(1, 0), (1, 1), (2, 0)]
-    early.decoded(packets[2].frames[1], owns=True)
-    assert found == [(1, 0), (1, 1), (2, 0), (2, 1)]
-    assert early.withdrawn == 0
-    early.refused(packets[2])
-    assert (len(found), early.withdrawn) == (4, 2)

@@ -160,10 +160,3 @@ def test_an_old_beacon_is_replayed() -> None:
     assert found == ("forged", "differs from the verified beacon of sequence 9")
     # Another transmitter's number is its own.
     assert shown(1, replace(PLACE, latitude_deg=35.4), 8).trust == "verified"
-
-
-def test_a_key_that_ends_while_the_receiver_runs() -> None:
-    judge = judge_of(TrustedKey(operator().public, valid_to="2026-03-02"))
-    message, signature = operator().beacon(SIGNED_S)
-    assert judge.judge(message, PLACE, signature, SIGNED_S + 10.0).trust == "verified"
-    assert judge.judge(message, PLACE, signature, SIGNED_S + 43_201.0).trust == "unverified"

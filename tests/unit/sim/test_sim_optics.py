@@ -13,7 +13,7 @@ from scipy.special import j0, j1
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import BackgroundSpec, BarSpec, MotionSpec, Scene, SensorSpec, Simulation, _kernels
 from evlcp_sdk.sim.motion import project
-from evlcp_sdk.sim.optics import blur_of, strip_table
+from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.scene import LensSpec
 
 Floats = NDArray[np.float64]
@@ -47,20 +47,6 @@ def image_of_rectangle(
     return np.fft.fftshift(np.fft.ifft2(transfer * rectangle).real) * per_px**2
 
 
-def table_at(table: Floats, scale_px: float, across_px: Floats, along_px: Floats) -> Floats:
-    """Bilinear values of a strip's table: the kernel's twin."""
-    nodes = len(table) - 1
-    n = np.abs(across_px)
-    i = nodes * n / (n + scale_px)
-    j = nodes + nodes * along_px / (np.abs(along_px) + scale_px)
-    i0 = np.minimum(i.astype(int), nodes - 1)
-    j0_ = np.minimum(j.astype(int), 2 * nodes - 1)
-    a, b = i - i0, j - j0_
-    low = (1 - b) * table[i0, j0_] + b * table[i0, j0_ + 1]
-    high = (1 - b) * table[i0 + 1, j0_] + b * table[i0 + 1, j0_ + 1]
-    return (1 - a) * low + a * high
-
-
 @pytest.mark.parametrize("f_number", [1.4, 2.0, 4.0])
 def test_the_gaussians_throw_as_much_light_aside_as_the_airy_pattern(f_number: float) -> None:
     lens = replace(IDEAL, f_number=f_number)
@@ -74,39 +60,6 @@ def test_the_gaussians_throw_as_much_light_aside_as_the_airy_pattern(f_number: f
     closed = beyond(radius[:, None] + ring, lens).mean(1)
     np.testing.assert_allclose(found, closed, rtol=0.07)
     np.testing.assert_allclose(found[radius < 4], closed[radius < 4], rtol=0.03)
-
-
-def test_the_kernel_looks_up_what_the_table_says() -> None:
-    table = strip_table(blur_of(50.0, LensSpec(), CAMERA), 0.7, 1.9, 64)
-    rng = np.random.default_rng(1)
-    pixels = 100
-    across, along = rng.normal(0, 5, pixels), rng.normal(0, 20, pixels)
-    along[0] = 1e20
-    expected = table_at(table, 1.9, across, along)
-    # One cluster that begins here and ends at infinity.
-    none, one = np.empty(0), np.ones((1, 1))
-    origin, down = np.zeros((2, 1, 1)), np.array([0.0, 1.0]).reshape(2, 1, 1)
-    bounds = np.array([0.0, 1e30]).reshape(1, 2, 1)
-    strips = _kernels.Strips(none, origin, down, bounds, 0.7 * one, np.ones(1, int), np.array([3.0]))
-    lanes = np.zeros(_kernels._ROOM)
-    lanes[_kernels._X : _kernels._X + pixels] = across
-    lanes[_kernels._Y : _kernels._Y + pixels] = along
-    weight, clusters = np.empty((1, _kernels.LANES)), np.empty((1, 3), int)
-    nodes = np.empty((2, pixels), np.int32)
-    room = _kernels._Shining(clusters, weight, none, none, none, nodes, np.empty(2 * _kernels.LANES))
-
-    def look_up(reach_px: float) -> None:
-        near = _kernels.Near(1.0, table[None], np.array([1.9]), np.array([reach_px]))
-        _kernels._take_clusters.py_func(0, 0, 0, (pixels, pixels), lanes, strips, near, room)
-
-    look_up(1e40)
-    np.testing.assert_allclose(weight[0, :pixels], 3.0 * expected, rtol=0, atol=1e-11)
-    # What is further away than it is followed is not there.
-    look_up(6.0)
-    near = (np.abs(across) < 6.35) & (along > -6.0)
-    assert near.any()
-    assert not near.all()
-    np.testing.assert_allclose(weight[0, :pixels], np.where(near, 3.0 * expected, 0.0), rtol=0, atol=1e-11)
 
 
 def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:
