@@ -125,7 +125,6 @@ def test_a_real_tty_gets_no_byte(monkeypatch: pytest.MonkeyPatch, evlcp, pty_nam
     [
         ("/dev/ttyUSB0", ValueError("Failed to set custom baud rate (3)"), "take --baud 3"),
         ("/dev/ttyUSB0", termios.error(5, "Input/output error"), "Input/output error"),
-        ("/dev/ttyUSB0", Fault(errno.ENXIO, "x"), "it is not there"),
         ("/dev/ttyUSB0", Fault(errno.EACCES, "x"), "no permission: join its group, which 'ls -l"),
         ("/dev/ttyUSB0", Fault(errno.EAGAIN, "x"), "sudo fuser -v /dev/ttyUSB0"),
         ("hwgrep://[", KeyError("x"), "evlcp board ports"),

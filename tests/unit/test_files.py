@@ -33,9 +33,7 @@ UNREADABLE = [
     (read_csv, "a.csv", b'a,b\n"' + 140_000 * b"x" + b'",1\n', r"a\.csv: not a CSV file: "),
     (read_csv, "a.csv", b"t_s,x_m,x_m\n1,2,3\n", r"a\.csv: line 1: 2 columns x_m: expected one"),
     (read_csv, "a.csv", b"t_s,name\n1,a\n\n2\n", r"a\.csv: line 4: 1 fields, expected 2, as line 1 has"),
-    (read_csv, "a.csv", b"t_s,name\n1,a\n\n2,b,c\n", r"a\.csv: line 4: 3 fields, expected 2, as line 1 has"),
     (read_json, "a.json", b"{", r"a\.json: not JSON: "),
-    (read_json, "a.json", b'"\xff"', r"a\.json: not JSON: "),
     (read_json, "a.json", 200_000 * b"[", r"a\.json: not JSON: "),
     *(
         (read, "gone", None, "gone: cannot be read: No such file")
@@ -227,9 +225,6 @@ NEEDED, OPTIONAL = (
     ("further", "meant"),
     [
         (("gravity_sigma",), "gravity_sigma_deg"),
-        (("Gravity_Sigma_Deg",), "gravity_sigma_deg"),
-        ((" gravity_sigma_deg",), "gravity_sigma_deg"),
-        (("gravity_sigma_rad",), "gravity_sigma_deg"),
         (("sigma_gravity_deg",), "gravity_sigma_deg"),
         (("gravty_sigma_deg",), "gravity_sigma_deg"),
         (("rate_x_deg_s",), "rate_right_deg_s"),

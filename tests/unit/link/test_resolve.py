@@ -227,13 +227,8 @@ def test_the_text_tells_meaning_unit_bounds_and_default(registry: Registry) -> N
     ("setting", "says"),
     [
         ("bar.led_pitch_m=1e-308", "expected greater than or equal to 0.000001"),
-        ("bar.rows=600000000", "expected less than or equal to 4096"),
         ("bar.columns=4096", "bar.rows = 96, bar.columns = 4096: expected at most 65536 LEDs"),
         ("air.chip_rate_hz=1e-300", "expected greater than or equal to 1"),
-        ("air.frames_per_packet=100000000", "expected less than or equal to 4096"),
-        ("camera.width=1000000000", "expected less than or equal to 8192"),
-        ("camera.focal_mm=1e-300", "expected greater than or equal to 0.01"),
-        ("camera.pitch_um=1e-300", "expected greater than or equal to 0.01"),
     ],
 )
 def test_sizes_that_no_memory_or_number_holds_are_refused(setting: str, says: str) -> None:

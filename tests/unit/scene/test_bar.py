@@ -159,12 +159,10 @@ def test_a_fault_of_a_csv_file_is_one_line(text: str, said: str, tmp_path: Path)
 @pytest.mark.parametrize(
     ("bar", "said"),
     [
-        ({"leds_file": "no.csv"}, "link.toml: bar.leds_file: no.csv: cannot be read: No such file"),
         ({"leds_file": 3}, "link.toml: bar.leds_file = 3: expected the name of a CSV file"),
         ({"leds_file": "a.csv", "leds": []}, 'link.toml: bar.leds_file = "a.csv": expected it'),
         ({"shape": "ring", "rows": 3}, "link.toml: bar.rows = 3: unknown key"),
         ({"shape": "ring", "cluster_leds": 5}, "bar.cluster_leds = 5: expected a divisor of bar.leds = 12"),
-        ({"shape": "columns", "cluster_rows": 5}, "bar.cluster_rows = 5: expected a divisor of bar.rows"),
         ({"shape": 3}, "link.toml: bar.shape = 3: expected one of grid, columns, ring, table"),
         ({"shape": "table", "leds": []}, "bar.leds: 0 LEDs: expected at most 65536 LEDs, and one at least"),
         ({"shape": "table", "leds": [[0, 0, 0, 1]]}, "bar.leds: no LED of cluster 0: expected clusters 0"),
@@ -172,8 +170,6 @@ def test_a_fault_of_a_csv_file_is_one_line(text: str, said: str, tmp_path: Path)
             {"shape": "table", "leds": [[0, 0, 0, 0], [0.1, 0, 0, 1], [0, 0, 0.3, 2]]},
             "bar.leds: cluster 2 is behind cluster 0, LED by LED: expected clusters that a camera in front",
         ),
-        ({"shape": "table", "leds": [[0, 0, 200, 0]]}, "bar.leds.0.2 = 200: expected less than"),
-        ({"shape": "table", "leds": [[0, 0, 0, -1]]}, "bar.leds.0.3 = -1: expected greater than"),
         ({"shape": "table", "leds": [[0, 0, 0, 0], [1e-8, 0, 0, 1]]}, "bar.leds.1: stands where bar.leds.0"),
     ],
 )
