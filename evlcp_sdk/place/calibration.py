@@ -7,7 +7,7 @@ far as these are not known. A parameter that the views do not determine keeps it
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -479,18 +479,14 @@ def solve_views(
     }
     model = _Model(views, camera, loose, common, surveys)
 
-    @lru_cache(maxsize=1)
-    def parts_at(x: bytes) -> tuple[Floats, Floats]:
-        return model.parts(np.frombuffer(x))
-
     def misses_of(x: Floats) -> Floats:
-        return parts_at(x.tobytes())[0]
+        return model.parts(x)[0]
 
     def slopes_of(x: Floats) -> Floats:
-        return parts_at(x.tobytes())[1]
+        return model.parts(x)[1]
 
     fit = least_squares(misses_of, model.start, slopes_of, x_scale="jac", max_nfev=_STEPS)
-    misses, rows = parts_at(fit.x.tobytes())
+    misses, rows = model.parts(fit.x)
     scale = 1 / np.sqrt((rows**2).sum(0))
     half = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
     covariance = (half @ half.T) * scale * scale[:, None]
