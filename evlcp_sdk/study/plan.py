@@ -85,94 +85,73 @@ class Job:
     environment: Mapping[str, Any]
 
 
-_Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
-
-
 @dataclass(frozen=True)
 class Point:
-    """One scene with one link, by their numbers, and the ids of its tasks, by seed.
+    """One scene with one link, and the ids of its tasks, by seed.
 
     Keys of its labels start with `scene.` or `link.`.
     """
 
     labels: dict[str, Any]
-    scene: Annotated[int, Field(ge=0)]
-    link: Annotated[int, Field(ge=0)]
-    tasks: tuple[_Sha256, ...]
+    scene: Case
+    link: Case
+    tasks: tuple[str, ...]
 
 
 @dataclass(frozen=True)
 class Plan:
-    """A whole campaign.
+    """A whole campaign: every scene with every link and every seed.
 
     Attributes:
-        name: Its name.
         rule: When a point has enough.
         merge: Labels over which a report adds points up.
-        seeds: The seeds of every point, in order.
-        scenes: The scenes.
-        links: The links.
-        points: Every scene with every link.
         environment: Code and versions that the results come from.
-        digest: SHA-256 of all its tasks.
-
-    Raises:
-        ConfigError: Its parts do not fit each other.
     """
 
     name: Annotated[str, Field(max_length=200)]
-    rule: StopRule
-    merge: tuple[str, ...]
-    seeds: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1)]
     scenes: tuple[Case, ...]
     links: tuple[Case, ...]
-    points: tuple[Point, ...]
-    environment: dict[str, Any]
-    digest: _Sha256
+    seeds: Annotated[tuple[Annotated[int, Field(ge=0, lt=2**63)], ...], Field(min_length=1)]
+    rule: StopRule = StopRule()
+    merge: tuple[str, ...] = ()
+    environment: dict[str, Any] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        for i, point in enumerate(self.points):
-            if point.scene >= len(self.scenes) or point.link >= len(self.links):
-                raise ConfigError(f"points.{i}: of a scene or a link that there is not")
-            if len(point.tasks) != len(self.seeds):
-                raise ConfigError(
-                    f"points.{i}.tasks: {len(point.tasks)} of them, expected one a seed, {len(self.seeds)}"
-                )
-        if self.digest != digest_of([point.tasks for point in self.points]):
-            raise ConfigError(f"digest = {self.digest}: not that of its tasks")
+    @cached_property
+    def points(self) -> tuple[Point, ...]:
+        """Every scene with every link."""
+        points = []
+        for scene, link in itertools.product(self.scenes, self.links):
+            labels = {f"scene.{key}": value for key, value in scene.labels.items()}
+            labels |= {f"link.{key}": value for key, value in link.labels.items()}
+            known = {"scene": scene.identity, "link": link.identity, "environment": self.environment}
+            tasks = tuple(digest_of(known | {"seed": seed}) for seed in self.seeds)
+            points.append(Point(labels, scene, link, tasks))
+        return tuple(points)
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of all its tasks, 64 hex digits."""
+        return digest_of([point.tasks for point in self.points])
 
     @cached_property
     def jobs(self) -> tuple[Job, ...]:
         """What there is to do: the first seed of every rendering, then the second, and so on."""
-        alike: dict[Any, list[int]] = {}
-        for s, scene in enumerate(self.scenes):
-            alike.setdefault(s if scene.group is None else scene.group, []).append(s)
-        together: dict[Any, list[int]] = {}
-        for k, link in enumerate(self.links):
-            together.setdefault(link.group, []).append(k)
-        points = {(point.scene, point.link): point for point in self.points}
+        alike: dict[Any, list[Point]] = {}
+        for number, point in enumerate(self.points):
+            alone = ("", number // len(self.links))
+            seen = alone if point.scene.group is None else point.scene.group
+            alike.setdefault((seen, point.link.group), []).append(point)
         jobs = []
-        for (n, seed), scenes, links in itertools.product(
-            enumerate(self.seeds), alike.values(), together.values()
-        ):
-            tasks = (
-                Task(points[s, k].tasks[n], self.scenes[s].value, self.links[k].value)
-                for s, k in itertools.product(scenes, links)
-            )
+        for (n, seed), points in itertools.product(enumerate(self.seeds), alike.values()):
             # Scenes or links that differ in name only are one task.
-            once = {task.id: task for task in tasks}
-            jobs.append(Job(self.scenes[scenes[0]].value, seed, tuple(once.values()), self.environment))
+            once = {p.tasks[n]: Task(p.tasks[n], p.scene.value, p.link.value) for p in points}
+            jobs.append(Job(points[0].scene.value, seed, tuple(once.values()), self.environment))
         return tuple(jobs)
 
     def to_dict(self) -> dict[str, Any]:
         """What is kept of it, as for JSON."""
-        parts = {
-            "rule": asdict(self.rule),
-            "scenes": [case.to_dict() for case in self.scenes],
-            "links": [case.to_dict() for case in self.links],
-            "points": [asdict(point) for point in self.points],
-        }
-        return {f.name: getattr(self, f.name) for f in fields(self)} | parts
+        cases = {key: [case.to_dict() for case in getattr(self, key)] for key in ("scenes", "links")}
+        return {f.name: getattr(self, f.name) for f in fields(self)} | {"rule": asdict(self.rule)} | cases
 
 
 def plan_from_dict(table: Any) -> Plan:
@@ -196,33 +175,6 @@ def digest_of(value: Any) -> str:
     """
     text = json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(text.encode()).hexdigest()
-
-
-def make_plan(
-    name: str,
-    scenes: Sequence[Case],
-    links: Sequence[Case],
-    seeds: Sequence[int],
-    *,
-    rule: StopRule = StopRule(),
-    merge: Sequence[str] = (),
-    environment: Mapping[str, Any] | None = None,
-) -> Plan:
-    """Every scene with every link and every seed."""
-    environment = dict(environment or {})
-
-    def id_of(scene: Case, link: Case, seed: int) -> str:
-        whole = {"scene": scene.identity, "link": link.identity, "seed": seed, "environment": environment}
-        return digest_of(whole)
-
-    points = []
-    for (s, scene), (k, link) in itertools.product(enumerate(scenes), enumerate(links)):
-        labels = {f"scene.{key}": value for key, value in scene.labels.items()}
-        labels |= {f"link.{key}": value for key, value in link.labels.items()}
-        points.append(Point(labels, s, k, tuple(id_of(scene, link, seed) for seed in seeds)))
-    digest = digest_of([point.tasks for point in points])
-    parts = tuple(merge), tuple(seeds), tuple(scenes), tuple(links), tuple(points)
-    return Plan(name, rule, *parts, environment, digest)
 
 
 @dataclass(frozen=True)
@@ -303,14 +255,14 @@ def load_plan(
             f"{path}: {len(scenes)} scenes x {len(links)} links x {head.seeds} seeds: {tasks} tasks,"
             f" expected at most {_MOST_TASKS}"
         )
-    return make_plan(
+    return Plan(
         head.name,
-        scenes,
-        links,
-        range(head.first_seed, head.first_seed + head.seeds),
-        rule=StopRule(head.max_bits, head.max_errors),
-        merge=merge,
-        environment=environment,
+        tuple(scenes),
+        tuple(links),
+        tuple(range(head.first_seed, head.first_seed + head.seeds)),
+        StopRule(head.max_bits, head.max_errors),
+        merge,
+        dict(environment),
     )
 
 

@@ -19,7 +19,7 @@ from evlcp_sdk.files import check_output
 from evlcp_sdk.study.plan import Plan, plan_from_dict
 from evlcp_sdk.study.tally import Statistics
 
-SCHEMA = 3
+SCHEMA = 4
 
 _TABLES = f"""
 BEGIN IMMEDIATE;

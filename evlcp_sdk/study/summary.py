@@ -186,8 +186,7 @@ def summarize(store: Store) -> Summary:
         key = json.dumps(labels)
         before = found.get(key)
         if before is None:
-            scene, link = plan.scenes[point.scene].identity, plan.links[point.link].identity
-            found[key] = Series(labels, scene, link, counted.recordings)
+            found[key] = Series(labels, point.scene.identity, point.link.identity, counted.recordings)
         else:
             pairs = zip_longest(before.recordings, counted.recordings, fillvalue=Statistics())
             found[key] = replace(before, recordings=tuple(a + b for a, b in pairs))

@@ -13,7 +13,7 @@ from evlcp_sdk.report.drawing import save_plots
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
-from evlcp_sdk.study.plan import Case, Job, Plan, make_plan
+from evlcp_sdk.study.plan import Case, Job, Plan
 from evlcp_sdk.study.report import POSITION_HEAD, charts_of, page, position_rows
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import PAPER, Series, Summary, beside_paper, summarize
@@ -31,19 +31,19 @@ def plan_of_two_methods() -> Plan:
     """Drives at two speeds through five segments, received with 16 clusters and with two."""
     bar = {"rows": 96, "columns": 1, "cluster_rows": 6, "cluster_columns": 1}
     methods = {"16 clusters": {}, TWO: {"clusters": [1, 14]}}
-    return make_plan(
+    return Plan(
         "two methods </script>",
-        [
+        tuple(
             Case({"speed_kmh": v, "distance_m": 30.0 + 10 * n}, {"n": n}, {"n": n, "speed_kmh": v})
             for v in (20, 30)
             for n in range(5)
-        ],
-        [
+        ),
+        tuple(
             Case({"variant": name}, i, {"table": {"bar": bar, "ranging": ranging}, "digest": "d" * 64})
             for i, (name, ranging) in enumerate(methods.items())
-        ],
-        range(2),
-        merge=["scene.distance_m"],
+        ),
+        (0, 1),
+        merge=("scene.distance_m",),
         environment={"evlcp-sdk": "0"},
     )  # fmt: skip
 
@@ -200,7 +200,8 @@ def test_a_browser_draws_it_and_hover_works(summary: Summary, tmp_path: Path) ->
 def test_what_became_of_positions_is_a_table_of_its_own(summary: Summary, tmp_path: Path) -> None:
     assert position_rows(summary) == []
     assert "<h2>Positions</h2>" not in page(summary)
-    plan = make_plan("p", [Case({"variant": v}, v, v) for v in ("right", "off")], [Case({}, 0, {})], [0])
+    scenes = tuple(Case({"variant": v}, v, v) for v in ("right", "off"))
+    plan = Plan("p", scenes, (Case({}, 0, {}),), (0,))
     fixes = [Tally.fix(0.1, 2.0, protected=True), Tally.fix(0.3, 20.0, excluded=True)]
     tallies = {
         "right": [*fixes, Tally.tracked(0.2, 3.0, 0.1, 6.0)],

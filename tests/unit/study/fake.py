@@ -11,7 +11,7 @@ from typing import Any
 from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.jobs import Processes
-from evlcp_sdk.study.plan import Case, Job, Plan, StopRule, make_plan
+from evlcp_sdk.study.plan import Case, Job, Plan, StopRule
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics, Tally
 
@@ -20,11 +20,11 @@ def fake_plan(
     scenes: int = 5, links: int = 2, seeds: int = 4, rule: StopRule | None = None, **scene: Any
 ) -> Plan:
     """Scenes of growing difficulty; `scene` says what else their tasks do."""
-    return make_plan(
+    return Plan(
         "fake",
-        [Case({"distance_m": 30.0 + 10 * n}, {"n": n, **scene}, {"n": n}) for n in range(scenes)],
-        [Case({"variant": f"link {n}"}, n, n) for n in range(links)],
-        range(seeds),
+        tuple(Case({"distance_m": 30.0 + 10 * n}, {"n": n, **scene}, {"n": n}) for n in range(scenes)),
+        tuple(Case({"variant": f"link {n}"}, n, n) for n in range(links)),
+        tuple(range(seeds)),
         rule=rule or StopRule(),
         environment={"code": "fake"},
     )

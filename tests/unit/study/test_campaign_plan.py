@@ -14,7 +14,6 @@ from evlcp_sdk.study.plan import (
     Plan,
     StopRule,
     load_plan,
-    make_plan,
     plan_from_dict,
 )
 
@@ -98,21 +97,21 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
 
 
 def test_scenes_that_look_the_same_are_one_job() -> None:
-    scenes = [Case({"variant": name}, name, name, name == "other") for name in ("a", "b", "other")]
-    links = [Case({"variant": n}, n, n) for n in (0, 1)]
-    plan = make_plan("x", scenes, links, [0, 1])
+    scenes = tuple(Case({"variant": name}, name, name, name == "other") for name in ("a", "b", "other"))
+    links = tuple(Case({"variant": n}, n, n) for n in (0, 1))
+    plan = Plan("x", scenes, links, (0, 1))
     found = [(job.scene, job.seed, [(task.scene, task.link) for task in job.tasks]) for job in plan.jobs]
     both = [("a", 0), ("a", 1), ("b", 0), ("b", 1)]
     other = [("other", 0), ("other", 1)]
     assert found == [("a", 0, both), ("other", 0, other), ("a", 1, both), ("other", 1, other)]
     # Links that differ in name only are one task.
-    same = make_plan("x", scenes[:1], [Case({"variant": name}, 0, 0) for name in "ab"], [0])
+    same = Plan("x", scenes[:1], tuple(Case({"variant": name}, 0, 0) for name in "ab"), (0,))
     assert [len(job.tasks) for job in same.jobs] == [1]
     assert same.points[0].tasks == same.points[1].tasks
     for job in plan.jobs:
         for task in job.tasks:
             (point,) = (point for point in plan.points if task.id in point.tasks)
-            assert plan.scenes[point.scene].value == task.scene
+            assert point.scene.value == task.scene
 
 
 @pytest.mark.parametrize(

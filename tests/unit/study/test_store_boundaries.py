@@ -17,7 +17,7 @@ from evlcp_sdk.errors import InputError
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.comparison import of_campaign
 from evlcp_sdk.study.jobs import Inline
-from evlcp_sdk.study.plan import Case, make_plan
+from evlcp_sdk.study.plan import Case, Plan
 from evlcp_sdk.study.report import charts_of, page
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.summary import Summary, summarize
@@ -199,11 +199,9 @@ def test_what_was_changed_is_taken_or_refused_in_one_line(results: Path, changed
 @pytest.mark.parametrize(
     ("change", "says"),
     [
-        ({"digest": HOSTILE}, "digest = "),
-        ({"digest": "0" * 64}, "digest = 0000"),
         ({"seeds": [HOSTILE]}, "seeds.0 = "),
         ({"seeds": []}, "seeds"),
-        ({"points": {}}, "points"),
+        ({"scenes": {}}, "scenes"),
         ({"rule": None}, "rule"),
         ("{}", ""),
         ("3", ""),
@@ -224,11 +222,11 @@ def test_what_is_no_plan_is_named_in_one_line(results: Path, change: str | dict[
 
 def test_hostile_names_are_shown_as_they_are(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     identity = {"n": 0, HOSTILE: [HOSTILE], "digest": HOSTILE, "table": {HOSTILE: HOSTILE}}
-    plan = make_plan(
+    plan = Plan(
         HOSTILE,
-        [Case({HOSTILE: HOSTILE, "variant": "[/]$\\frac$"}, {"n": 0}, identity)],
-        [Case({"variant": HOSTILE}, 0, identity)],
-        range(2),
+        (Case({HOSTILE: HOSTILE, "variant": "[/]$\\frac$"}, {"n": 0}, identity),),
+        (Case({"variant": HOSTILE}, 0, identity),),
+        (0, 1),
         environment={HOSTILE: HOSTILE},
     )
     with Store(tmp_path / "a.sqlite", create=True) as store:
