@@ -18,6 +18,7 @@ from scipy import ndimage
 from evlcp_sdk.diagnosis import _kernels
 from evlcp_sdk.diagnosis._kernels import BINS, COARSE, COARSE_US, FINE, FINE_US, SHORT
 from evlcp_sdk.diagnosis.readout import ReadoutTally
+from evlcp_sdk.rx import boxes
 from evlcp_sdk.rx.sweeps import find_sweeps
 from evlcp_sdk.values import Events
 
@@ -171,8 +172,8 @@ class LightSurvey:
         self._intervals = np.zeros((*cells, BINS), np.uint32)
         self._gaps = np.zeros((*cells, SHORT), np.uint32)
         self.signs = np.zeros((*cells, 2), np.int64)
-        self._windows: list[tuple[int, list[NDArray[np.uint32]]]] = []
-        self._every_us = _EVERY_US
+        self._windows: list[Events] = []
+        self._every_us, self._next_us = _EVERY_US, long_ago
         self._speeds: list[float] = []
         self.readout = ReadoutTally()
         self.first_us = self.last_us = math.nan
@@ -292,38 +293,29 @@ class LightSurvey:
 
     def _size(self, box: tuple[int, int, int, int]) -> tuple[float, float]:
         """Width and height of what is in a box, the median of the windows that show it, px."""
-        left, top, right, bottom = box
+        left, top, _, _ = box
         sizes = []
-        for _, pieces in self._windows:
-            where = np.concatenate(pieces) if pieces else np.empty(0, np.uint32)
-            rows, columns = where // self.width, where % self.width
-            inside = (columns >= left) & (columns < right) & (rows >= top) & (rows < bottom)
-            if inside.sum() < 40:
-                continue
-            image = np.zeros((bottom - top, right - left))
-            np.add.at(image, (rows[inside] - top, columns[inside] - left), 1)
-            sizes.append([_extent(image.sum(axis)) for axis in (0, 1)])
-        if not sizes:
-            return 0.0, 0.0
-        wide, high = np.median(sizes, 0)
-        return float(wide), float(high)
+        for window in self._windows:
+            within = boxes.inside(window, box)
+            if within.sum() >= 40:
+                ends = (np.bincount(window.x[within] - left), np.bincount(window.y[within] - top))
+                sizes.append([_extent(profile) for profile in ends])
+        wide, high = np.median(sizes, 0).tolist() if sizes else (0.0, 0.0)
+        return wide, high
 
     def _keep(self, events: Events) -> None:
         """Keep the positive events of a short window now and then; of too many windows every second one."""
-        if not self._windows or events.t_us[0] >= self._windows[-1][0] + self._every_us:
-            self._windows.append((int(events.t_us[0]), []))
-            part = events[: int(np.searchsorted(events.t_us, events.t_us[0] + _WINDOW_US))]
-            swept = find_sweeps(part, int(events.t_us[0]), _WINDOW_US, None, [], (self.width, self.height))
-            self._speeds.append(max((math.hypot(*one.speed) for one in swept), default=0.0))
-            if len(self._windows) > _MOST_WINDOWS:
-                self._windows = self._windows[::2]
-                self._every_us *= 2
-        start, pieces = self._windows[-1]
-        part = events[: int(np.searchsorted(events.t_us, start + _WINDOW_US))]
-        if len(part) and sum(map(len, pieces)) < _MOST_KEPT:
-            up = part.p == 1
-            pixels = part.y[up].astype(np.uint32) * np.uint32(self.width) + part.x[up]
-            pieces.append(pixels[:_MOST_KEPT])
+        start_us = int(events.t_us[0])
+        if start_us < self._next_us:
+            return
+        part = events[: int(np.searchsorted(events.t_us, start_us + _WINDOW_US))]
+        swept = find_sweeps(part, start_us, _WINDOW_US, None, [], (self.width, self.height))
+        self._speeds.append(max((math.hypot(*one.speed) for one in swept), default=0.0))
+        self._windows.append(part[part.p == 1][:_MOST_KEPT])
+        if len(self._windows) > _MOST_WINDOWS:
+            self._windows = self._windows[::2]
+            self._every_us *= 2
+        self._next_us = start_us + self._every_us
 
 
 def comb(times: NDArray[np.generic], frequencies_hz: Floats) -> Floats:
@@ -389,7 +381,7 @@ def _blind_us(gaps: NDArray[np.int64]) -> float:
     return early if first >= 0.9 * early else 0.0
 
 
-def _extent(profile: Floats) -> float:
+def _extent(profile: NDArray[np.int64]) -> float:
     """Pixels of a profile from the first to the last with a fifth and more of what its bright ones have."""
     lit = profile[profile > 0]
     level = 0.2 * np.quantile(lit, 0.9)
