@@ -17,20 +17,11 @@ from evlcp_sdk.scene.camera import CameraModel, CameraSigma
 
 Floats = NDArray[np.float64]
 
-REJECTION_REASONS = {
-    "no-site": "no bar in view stands at a known place",
-    "no-facing": "the clusters are not in line, and no site says where its LEDs face",
-    "site-contradicted": "the bars' own beacons say other places or lengths than their sites",
-    "too-few-clusters": "no bar shows as many clusters as a position needs",
-    "heading-unknown": "one bar alone, and the camera's heading is not known",
-    "gravity-unknown": "fewer than three bars, or bars in line, and gravity is not known",
-    "not-determined": "no start, no end of the fit, or equations that are singular",
-    "two-solutions": "two places fit the image alike",
-    "end-on": "a lone bar points along the line of sight",
-    "misfit": "the image does not fit the sites: another place, bar or attitude than was said",
-    "uncertain": "the position is less certain than `position.max_sigma_m`, or along a curve",
-}
-"""Kinds of refusal, and what they mean."""
+REJECTION_REASONS = (
+    *("no-site", "no-facing", "site-contradicted", "too-few-clusters", "heading-unknown"),
+    *("gravity-unknown", "not-determined", "two-solutions", "end-on", "misfit", "uncertain"),
+)
+"""Kinds of refusal; `docs/position.md` says what each means."""
 
 CONTRADICTIONS = frozenset({"site-contradicted", "not-determined", "misfit"})
 """Those where what is seen and what is said do not fit together; of the others, too little is known."""

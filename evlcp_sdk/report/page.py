@@ -4,7 +4,6 @@ What is shown is kept as it comes, a bounded share of it, so that a recording of
 memory; all frames are in `frames.csv`, all messages in `packets.jsonl`.
 """
 
-import math
 from collections import deque
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
@@ -109,7 +108,10 @@ class Report(Kept):
                 for m in messages
             ],
             left_out=self._many_messages - len(messages),
-            symbols=self._symbols(axis),
+            axis=axis,
+            books={number: self.run.link_of(seen.link).codebook for number, seen in self.seen.items()},
+            name_transmitter=name_transmitter,
+            counted=counted,
         )
         self.folder.open("report.html").write(page)
 
@@ -166,27 +168,6 @@ class Report(Kept):
             if len(frames) and np.isfinite(places[-1]).all():
                 image.name(float(places[-1, 0]), float(places[-1, 1]), str(number))
         return image
-
-    def _symbols(self, axis: TimeAxis) -> list[tuple[str, int, int, list[Any]]]:
-        """The symbols of the first frames of each transmitter: title, clusters, codewords, and rows."""
-        tables = []
-        for number, seen in sorted(self.seen.items()):
-            rows = []
-            book = self.run.link_of(seen.link).codebook
-            for frame in seen.first:
-                depth = frame.range
-                found = f"{depth.distance_m:.2f} ± {depth.sigma_m:.2f}"
-                start = (
-                    f"{frame.packet}/{frame.frame}",
-                    f"{axis.ms(frame.t_us):.1f}",
-                    found if math.isfinite(depth.distance_m) else "-",
-                    f"{frame.soft.quality:.2f}",
-                )
-                rows.append((start, frame.soft.symbols.tolist()))
-            title = f"{name_transmitter(number, seen.echo_of, seen.link)}: {counted(seen.count, 'frame')}"
-            title += f", the first {len(seen.first)}" * (seen.count > len(seen.first))
-            tables.append((title, book.clusters, max(len(book.codewords), 1), rows))
-        return tables
 
 
 def _distances(own: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str]]:

@@ -8,7 +8,7 @@ from pathlib import Path
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import csv_number, read_csv
 from evlcp_sdk.results.folder import check_result_file, read_summary
-from evlcp_sdk.values import Frame, Packet
+from evlcp_sdk.values import Packet
 
 
 @dataclass(frozen=True)
@@ -32,25 +32,24 @@ class FrameRow:
     link: str = ""
 
 
-def row_of_frame(frame: Frame) -> FrameRow:
-    """What is scored of a frame."""
-    return FrameRow(
-        transmitter=frame.transmitter,
-        t_us=frame.t_us,
-        symbols=tuple(frame.soft.symbols.tolist()),
-        distance_m=frame.range.distance_m,
-        sigma_m=frame.range.sigma_m,
-        filtered_m=math.nan if frame.filtered is None else frame.filtered.distance_m,
-        x_px=frame.x_px,
-        y_px=frame.y_px,
-        echo_of=frame.echo_of,
-        link=frame.link,
-    )
-
-
 def frames_of(packets: Iterable[Packet]) -> list[FrameRow]:
     """What is scored of packets, in order."""
-    return [row_of_frame(frame) for packet in packets for frame in packet.frames]
+    return [
+        FrameRow(
+            transmitter=frame.transmitter,
+            t_us=frame.t_us,
+            symbols=tuple(frame.soft.symbols.tolist()),
+            distance_m=frame.range.distance_m,
+            sigma_m=frame.range.sigma_m,
+            filtered_m=math.nan if frame.filtered is None else frame.filtered.distance_m,
+            x_px=frame.x_px,
+            y_px=frame.y_px,
+            echo_of=frame.echo_of,
+            link=frame.link,
+        )
+        for packet in packets
+        for frame in packet.frames
+    ]
 
 
 FRAMES = "frames.csv"

@@ -215,7 +215,7 @@ def test_every_error_that_is_stated_is_in_the_covariance(places, known, errors, 
     rng, squares, off_m, open_ones = np.random.default_rng(11), [], [], 0
     for _ in range(120):
         seen, told, sigma = drawn(rng, places, known, **errors)
-        found = solve_pose(seen, CAMERA, told, errors.get("spec"), sigma)
+        found = solve_pose(seen, CAMERA, told, errors.get("spec", USUAL), sigma)
         if isinstance(found, Rejection):
             # Two bars on gravity and a survey of 5 cm leave metres along an arc.
             assert found.kind in ("uncertain", "two-solutions"), found
@@ -423,7 +423,7 @@ def test_what_is_not_determined_is_refused() -> None:
     rng = np.random.default_rng(1)
 
     def kind_of(
-        places: list[Place], known: Attitude | None, spec: ErrorModel | None = None, axis: Any = (0, 0, 1)
+        places: list[Place], known: Attitude | None, spec: ErrorModel = USUAL, axis: Any = (0, 0, 1)
     ) -> str:
         seen = views([bar(p, axis) for p in places], np.zeros(3), UP.rotation(), rng, 0.1)
         found = solve_pose(seen, CAMERA, known, spec)
@@ -447,7 +447,7 @@ def test_what_is_not_determined_is_refused() -> None:
     assert kind_of(POLES[:1], COMPASS, ErrorModel(max_sigma_m=0.01)) == "uncertain"
     # A bar that points at the camera.
     sight = np.array(POLES[0]) / np.linalg.norm(POLES[0])
-    assert kind_of(POLES[:1], COMPASS, None, sight + np.array([0.1, 0, 0])) == "end-on"
+    assert kind_of(POLES[:1], COMPASS, USUAL, sight + np.array([0.1, 0, 0])) == "end-on"
     swapped = at_each_others(*views([bar(p) for p in POLES], np.zeros(3), UP.rotation(), rng, 0.1))
     assert refused(solve_pose(swapped, CAMERA, COMPASS)).kind in ("misfit", "not-determined")
 

@@ -72,7 +72,7 @@ def test_numbers_are_those_of_the_files(result: Path) -> None:
     page = (result / "report.html").read_text()
     given = rows(result / "frames.csv")
     assert len(given) == 21
-    body = re.findall(r"<tr><td>(\d+)/(\d+)</td>(.*?)</tr>", page)
+    body = re.findall(r"<tr><td>(\d+)/(\d+)</td>(.*?)</tr>", page, re.DOTALL)
     for row, (packet, frame, cells) in zip(given, body, strict=True):
         values = re.findall(r"<td[^>]*>(.*?)</td>", cells)
         assert (packet, frame) == (row["packet"], row["frame"])
