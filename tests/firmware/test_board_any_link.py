@@ -5,16 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import (
-    board_link,
-    board_on,
-    check_fault,
-    options_of,
-    shown,
-    some_bank,
-    symbols_of,
-    well,
-)
+from board_lines import board_link, board_on, check_fault, options_of, shown, some_bank, symbols_of, well
 from hypothesis import given, settings, strategies as st
 from numpy.typing import NDArray
 

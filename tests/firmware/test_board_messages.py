@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import LINK, SITE, board_link, check_fault, options_of, well
+from board_lines import LINK, SITE, check_fault, well
 from test_board_cli import EVLCP
 
 from evlcp_sdk.air.beacons import Beacon
@@ -88,29 +88,6 @@ def test_a_text_a_file_and_a_beacon(evlcp, site: Path, tmp_path: Path) -> None:
     beacon = Beacon.unpack(found[Kind.BEACON].payload)
     assert beacon == Beacon(35.156789, 136.965432, 52.4, 90.0, 1.5, 0.96, b"lane 2")
     assert (symbols_of(np.load(chips)) == table["symbols"]).all()
-
-
-@pytest.mark.parametrize(
-    "settings",
-    [
-        ("modulation.id=raw8", "air.frames_per_packet=20", "air.pilot_every=4"),
-        ("modulation.id=wh8", "error-correction.id=reed-solomon"),
-    ],
-)
-def test_any_link(evlcp, tmp_path: Path, settings: tuple[str, ...]) -> None:
-    chips, link = tmp_path / "c.npy", board_link(*settings)
-    message = ("tx", "message", *options_of(*settings), "--text")
-    well(evlcp(*message, "Hello", "--port", "native:"))
-    done = well(evlcp(*message, "Hello " * 40, "--chips", chips, "--repeat", 2, "--json"))
-    symbols = symbols_of(np.load(chips), link)
-    assert (symbols[::2] == symbols[1::2]).all()
-    found = messages_of(symbols, link)[Kind.TEXT]
-    assert found.text == "Hello " * 40
-    told = json.loads(done.out)
-    assert told["symbols"] == symbols.tolist()
-    assert told["duration_s"] == pytest.approx(len(np.load(chips)) / 1e4)
-    # Without a number it is the time, so that a later message has a higher one.
-    assert abs(found.sequence - time.time()) < 60
 
 
 @pytest.mark.parametrize(

@@ -7,16 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from board_lines import (
-    FatalLine,
-    NoisyLine,
-    board_link,
-    board_on,
-    deafen,
-    some_bank,
-    state_of,
-    symbols_of,
-)
+from board_lines import FatalLine, NoisyLine, board_link, board_on, deafen, some_bank, state_of, symbols_of
 
 from evlcp_sdk.errors import InputError
 from firmware_host.board.bank import bank_of, symbol_chips

@@ -79,12 +79,7 @@ def pixel_events(
     light = np.array(light_w_m2, np.float64)
     none = np.zeros(len(light), np.int64)
     line = _kernels.TimeLine(
-        np.array(edge_us, np.float64),
-        none,
-        none,
-        light,
-        none,
-        np.zeros((0, len(light)), np.int64),
+        np.array(edge_us, np.float64), none, none, light, none, np.zeros((0, len(light)), np.int64)
     )
     scenery = scenery._replace(field=np.ones_like(scenery.field), light=np.array([0.0, 1.0]))
     world = (line, strips, halos, near, scenery)

@@ -14,15 +14,7 @@ from typing import Any
 import pytest
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
-from evlcp_sdk.files import (
-    Outputs,
-    check_columns,
-    defused,
-    open_log,
-    read_csv,
-    read_json,
-    write_secret,
-)
+from evlcp_sdk.files import Outputs, check_columns, defused, open_log, read_csv, read_json, write_secret
 from evlcp_sdk.specs import read_toml
 
 UNREADABLE = [

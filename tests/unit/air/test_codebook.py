@@ -12,13 +12,7 @@ from evlcp_wh.modulation import Raw8, Wh4x2, Wh8
 from evlcp_wh.pilots import WhPilots
 
 from evlcp_sdk.air.codebook import Codebook, chips_of_values, hadamard, word_of_chips
-from evlcp_sdk.air.frames import (
-    PacketFormat,
-    bits_of_symbols,
-    chips_behind,
-    packet_chips,
-    symbols_of_bits,
-)
+from evlcp_sdk.air.frames import PacketFormat, bits_of_symbols, chips_behind, packet_chips, symbols_of_bits
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.plugin.roles import Modulation
 

@@ -16,11 +16,7 @@ from evlcp_sdk.link.resolve import _SPECS, load_link, resolve
 from evlcp_sdk.link.text import to_toml
 from evlcp_sdk.plugin.hooks import Algorithm
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.plugin.roles import (
-    ROLES,
-    Measure,
-    Ranging,
-)
+from evlcp_sdk.plugin.roles import ROLES, Measure, Ranging
 from evlcp_sdk.scene.bar import BarLayout, LedGrid
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.specs import build

@@ -342,32 +342,3 @@ def test_the_clock_tolerance_is_a_bound(ppm, tolerance_ppm):
     # The packets are heard where they are all the same.
     late = [lock.packet_t_us - START_US - k * PERIOD_US * (1 + ppm * 1e-6) for k, lock in enumerate(locks)]
     assert np.ptp(late) < 8
-
-
-def starts_of(locks):
-    """How late each packet is, us."""
-    return np.array(
-        [k.packet_t_us - START_US - round(n) * PERIOD_US for k, n in zip(locks, numbers(locks), strict=True)]
-    )
-
-
-def among(events, t_us, p):
-    """Events with others among them, in order."""
-    t = np.concatenate([events[0], t_us])
-    order = np.argsort(t, kind="stable")
-    return t[order], np.concatenate([events[1], p])[order].astype(np.uint8)
-
-
-@pytest.mark.parametrize(("rate_hz", "seed"), [(1000, 0), (2000, 0), (2000, 1)])
-def test_a_panel_behind_is_no_latency(rate_hz, seed):
-    rng = np.random.default_rng(seed)
-    bar = events_of(packets_of(rng, 6), rng, START_US, per_edge=6)
-    apart_us = 5e5 / rate_hz
-    switches = rng.uniform(0, 2 * apart_us) + apart_us * np.arange(bar[0][-1] / apart_us - 1)
-    # As many at each switch as half of the bar's clusters have at an edge, or all of them.
-    when = np.repeat(np.arange(len(switches)), 200_000 // rate_hz)
-    t = np.floor(switches[when] + 30 + rng.normal(0, 8, len(when))).astype(np.int64)
-    locks, _ = locks_of(*among(bar, t, when % 2))
-    assert len(locks) >= 5
-    assert np.ptp(starts_of(locks)[1:]) < 8
-    assert max(abs(lock.chip_us / CHIP_US - 1) for lock in locks) < 30e-6

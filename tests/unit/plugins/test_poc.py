@@ -60,15 +60,6 @@ def twin_correlation(one, other, down, across):
     return np.fft.irfft2(np.divide(spectra, size, out=0 * spectra, where=size > 0), one.shape[1:])
 
 
-def twin_scale(middles, apart, seen):
-    """The median, px a metre, of pairs that are half as far apart as the farthest, or more."""
-    pairs = [(a, b) for a in seen for b in seen if a < b]
-    far = max((apart[pair] for pair in pairs), default=0) / 2
-    return np.median(
-        [np.hypot(*(middles[a] - middles[b])) / apart[a, b] for a, b in pairs if apart[a, b] >= far]
-    )
-
-
 def jackknife(values, weights, first, second, kept):
     """Sigma of a weighted mean of pairs by leaving out one cluster after another."""
     means = []
@@ -138,16 +129,6 @@ def test_a_noisy_peak_is_fitted_by_least_squares(seed):
 @pytest.mark.parametrize("samples", [[0, 0, 0], [-1, -2, -1], [0, 1, 0]])
 def test_no_peak_is_no_shift(samples):
     assert fit_peak(samples, 24, 23) == 0
-
-
-def test_what_has_no_phase_counts_for_nothing():
-    images = np.ones((6, 2, 8), np.float32)
-    images[:, 1] = 0
-    pairs = np.array([0, 0]), np.array([0, 1])
-    found = phase_only_correlation(images, (6, 8), pairs, full_band(6, 8), range(6), range(8))
-    # Of an even image, the mean alone.
-    assert_allclose(found[:, 0], 1 / 48, rtol=1e-6)
-    assert not found[:, 1].any()
 
 
 # Exact shifts

@@ -283,12 +283,3 @@ def lost(code: Code, blocks: int, bit_error_rate: float, hard: bool, seed: int =
 def test_no_message_is_lost_where_the_link_works(length: int, blocks: int, bit_error_rate: float) -> None:
     """Soft input; none of 1000 is a frame error rate below 3e-3 with 95 % confidence."""
     assert lost(Polar().compile(length), blocks, bit_error_rate, hard=False) == 0
-
-
-def test_giving_up_early_loses_nothing() -> None:
-    """A list of which all paths are implausible ends the search; the longest list from the start does not."""
-    patient = Polar(list_size=32).compile(256)
-    hasty = Polar().compile(256)
-    for bit_error_rate, hard, most in ((0.06, False, 0), (0.04, True, 0), (0.06, True, 4)):
-        extra = lost(hasty, 500, bit_error_rate, hard) - lost(patient, 500, bit_error_rate, hard)
-        assert extra <= most

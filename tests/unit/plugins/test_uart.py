@@ -605,7 +605,4 @@ def test_the_beacons_bit_errors_are_those_against_the_text_that_is_repeated(tmp_
         savemat(tmp_path / f"{name}.mat", {"event": 2.0 * events.p - 1, "event_t": events.t_us * 1e-6})
     script = [sys.executable, str(ROOT / "benchmarks" / "beacons.py"), str(tmp_path)]
     printed = subprocess.run(script, capture_output=True, text=True, check=True).stdout.splitlines()[2:]
-    assert [line.split(" | ")[3:5] for line in printed] == [
-        ["3 of 10150", "0.0003"],
-        ["1 of 630", "0.0016"],
-    ]
+    assert [line.split(" | ")[3:5] for line in printed] == [["3 of 10150", "0.0003"], ["1 of 630", "0.0016"]]

@@ -26,7 +26,7 @@ from tests.unit.results.test_positions import packets
 def test_the_built_in_formats_come_by_the_same_hook() -> None:
     sinks = installed_sinks(Registry.load())
     assert {name for name, sink in sinks.items() if sink.record.default} == {
-        *("frames", "packets", "fixes", "track", "geojson", "nmea"),
+        *("frames", "packets", "fixes", "track", "geojson", "nmea")
     }
     assert {"parquet", "figures", "mcap"} <= sinks.keys()
     for sink in sinks.values():

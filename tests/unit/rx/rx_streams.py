@@ -84,12 +84,7 @@ def lamp_events(
     t = np.repeat(edges, n) + np.tile(np.repeat([0, 12, 24], v.size), len(edges))
     t = np.floor(t + rng.normal(25, 5, len(t)))
     order = np.argsort(t, kind="stable")
-    columns = (
-        t,
-        np.tile(u.ravel(), 3 * len(edges)),
-        np.tile(v.ravel(), 3 * len(edges)),
-        np.repeat(on, n),
-    )
+    columns = (t, np.tile(u.ravel(), 3 * len(edges)), np.tile(v.ravel(), 3 * len(edges)), np.repeat(on, n))
     return Events.of(*(c[order] for c in columns))
 
 

@@ -9,10 +9,7 @@ from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.stats import norm
 
-from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.rx.guard import tracker_of
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
-from evlcp_sdk.rx.reading import Steps
 from evlcp_sdk.scene.lean import BarSight
 from evlcp_sdk.values import Bend, Range
 
@@ -246,16 +243,6 @@ def test_what_bends_an_image_does_not_average_away(height_px: float) -> None:
     # Some time after it is gone, nothing is left of it.
     _, again = kept(measured + bent(1500, 0 * PLACES, rng))
     assert again[-1].sigma_m == pytest.approx(straight[-1].sigma_m, rel=0.3)
-
-
-def test_tracking_does_not_filter_it_out() -> None:
-    link, at = load_link(overrides=["tracking.id=kalman"]), PLACES / 4 - 1
-    steps = Steps(link, None, tracker_of(link))
-    state = steps.distance_init()
-    for i, one in enumerate(bent(60, at * np.exp((1 - at**2) / 2), np.random.default_rng(14))):
-        state, found, filtered = steps.follow(state, i * FRAME_US, CHIP_US, one, AHEAD)
-    assert found.sigma_m >= filtered.sigma_m >= found.standing_m > 0.1
-    assert abs(filtered.distance_m - 45) < 2 * filtered.sigma_m
 
 
 def test_clusters_with_dark_leds_are_taken_out_and_shown() -> None:

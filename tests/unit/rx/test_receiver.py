@@ -15,12 +15,7 @@ from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.framing import SkippedFrame
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.testing.recordings import (
-    IdealBar,
-    ideal_events,
-    merged,
-    random_symbols,
-)
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Packet, PresenceMap
 
 

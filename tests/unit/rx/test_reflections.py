@@ -12,11 +12,7 @@ from rx_streams import LINK, frames_of, received
 import evlcp_sdk as evlcp
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.rx.reflections import (
-    FrameDetection,
-    Reflections,
-    repeats,
-)
+from evlcp_sdk.rx.reflections import FrameDetection, Reflections, repeats
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
 
@@ -202,15 +198,6 @@ def test_memory_is_bounded() -> None:
         echoes.judge([sighting(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
         assert sum(map(len, echoes._seen.values())) <= 4 * (3 * FORMAT.frames + 1)
         assert len(echoes._pairs) <= 3 + 2 * 8
-
-
-def test_what_was_shown_then_and_there_is_known() -> None:
-    echoes = Reflections(FORMAT, CODEWORDS)
-    one = sighting(0, 3, said(3), x_px=300.0, y_px=350.0)
-    echoes.judge([one])
-    assert echoes.shown(one.t_us + 40, (304.0, 350.0))
-    assert not echoes.shown(one.t_us + 60, (304.0, 350.0))
-    assert not echoes.shown(one.t_us + 40, (306.0, 350.0))
 
 
 def reflected(events: Events, *, missing: float) -> Events:

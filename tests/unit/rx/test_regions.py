@@ -15,12 +15,7 @@ from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.boxes import clear_of, cut_off
 from evlcp_sdk.rx.regions import Followed, Places, RegionFollower, Rhythm
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.testing.recordings import (
-    IdealBar,
-    ideal_events,
-    merged,
-    random_symbols,
-)
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events
 
 SPEC = RegionSpec(step_us=1000)

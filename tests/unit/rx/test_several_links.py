@@ -51,9 +51,7 @@ def right(packets: list[Packet], link: Link, bar: IdealBar) -> int:
 
 
 @pytest.mark.parametrize(
-    "links",
-    [(BAR, HALF), (BAR, SLOW), (BAR, WH8), (WH8, BAR), (BAR, LAMP)],
-    ids=lambda links: links[-1].name,
+    "links", [(BAR, HALF), (BAR, SLOW), (BAR, WH8), (WH8, BAR), (BAR, LAMP)], ids=lambda links: links[-1].name
 )
 def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links: tuple[Link, Link]) -> None:
     (one, here), (two, there) = at(links[0], LEFT), at(links[1], RIGHT)

@@ -88,10 +88,7 @@ def test_a_key_is_valid_from_and_to(valid_from: str, valid_to: str, now_days: fl
 
 
 def test_a_revoked_key_signs_nothing() -> None:
-    assert judged(revoked_keys=(operator().public,)) == (
-        "forged",
-        "signed by a key that is revoked",
-    )
+    assert judged(revoked_keys=(operator().public,)) == ("forged", "signed by a key that is revoked")
     # Revoked only, and trusted never.
     message, signature = operator().beacon(SIGNED_S)
     judge = judge_of(revoked_keys=(operator().public,))

@@ -14,7 +14,6 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.link.text import to_toml
 from evlcp_sdk.plugin.registry import Registry
-from evlcp_sdk.plugin.roles import ROLES
 from evlcp_sdk.scene.bar import BarLayout, LedColumns, LedGrid, LedRing, LedTable
 from evlcp_sdk.sim.scene import load_scene
 
@@ -80,17 +79,6 @@ def test_a_link_s_table_comes_back(table: dict[str, Any], tmp_path: Path) -> Non
     assert load_link(path).digest == link.digest
     assert link.codebook.clusters == link.bar.clusters
     assert "shape" not in link.table["bar"] or link.table["bar"]["shape"] == table["shape"]
-
-
-def test_the_default_ranging_reads_the_codes() -> None:
-    """`joint-scale` reads pilots alone where codewords are no pair codes, `poc` any."""
-    panel = BarLayout(LedGrid(16, 16, cluster_rows=4, cluster_columns=4))
-    for bar in (BarLayout(), panel):
-        assert ROLES["ranging"].default_for(bar, {"preamble", "codewords"}) == "joint-scale"
-        assert ROLES["ranging"].default_for(bar, {"pilots"}) == "poc"
-    assert resolve({"modulation": {"id": "nrz"}}).table["ranging"]["id"] == "joint-scale"
-    dimmed = {"modulation": {"id": "wh4x2-dimmed"}, "pilots": {"id": "wh-dimmed"}}
-    assert resolve(dimmed).table["ranging"]["id"] == "poc"
 
 
 def test_sides_say_where_light_goes_on() -> None:

@@ -18,14 +18,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.sim import (
-    BarSpec,
-    Truth,
-    load_scene,
-    resolve_scene,
-    sites_of,
-    truth_of,
-)
+from evlcp_sdk.sim import BarSpec, Truth, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.light import BarLight, sources_of
 from evlcp_sdk.sim.scene import LensSpec, links_of
 from evlcp_sdk.study.measure import message_tallies
