@@ -38,6 +38,7 @@ class DueFrame:
         end_us: When the events of its last edge end, us.
         lock: What these times come from.
         read_us: When those of the chips after it that are read with it end, too, us.
+        middle_us: See `AlignedFrame`.
     """
 
     number: int
@@ -50,6 +51,7 @@ class DueFrame:
     end_us: float
     lock: SyncLock
     read_us: float
+    middle_us: float
 
 
 class Pilot(NamedTuple):
@@ -155,15 +157,15 @@ class FrameAligner:
         start_us, chip_us = float(due.start_us), float(lock.chip_us)
         centre_px = region.positions.at(self._halves[: due.chips + self._after], start_us, chip_us)
         middle = min(due.chips, packet.pilot_chips) // 2
-        seen_us = start_us + (middle + 0.5) * chip_us
+        seen_us = due.middle_us + chip_us / 2
         if due.has_pilot:
             size = self._size(*region.positions.size_at(seen_us))
         elif pilot is None or pilot.frame != due.number - due.index + packet.pilot_frame(due.index):
             return None
         else:
             size = pilot.size_px
-        pieces = [e for t, e in region.pieces if t < due.read_us and t + self._spec.step_us > due.start_us]
-        sums, offset_px = polarity_sums(pieces, lock, due.start_us, centre_px, size)
+        pieces = region.pieces_between(due.start_us, due.read_us, self._spec.step_us)
+        sums, offset_px = polarity_sums((e for _, e in pieces), lock, due.start_us, centre_px, size)
         if due.has_pilot:
             heard, moved = sums[: packet.pilot_chips], offset_px[:, : packet.pilot_chips]
             presence = self._separate(heard)
@@ -195,8 +197,7 @@ class FrameAligner:
             centre_x - (size[0] - 1) / 2 - sum(rests_x) / many,
             centre_y - (size[1] - 1) / 2 - sum(rests_y) / many,
         )
-        middle_us = seen_us - chip_us / 2
-        return AlignedFrame(pilot, sums, offset_px[:, :chips], corner_px, middle_us)
+        return AlignedFrame(pilot, sums, offset_px[:, :chips], corner_px, due.middle_us)
 
     def box(
         self, aligned: AlignedFrame, placement: Placement

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from itertools import count
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from evlcp_sdk.clock import CameraClock, TimeStep
 from evlcp_sdk.errors import EvlcpError, PluginError
@@ -16,6 +16,9 @@ from evlcp_sdk.rx.regions import Followed
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Frame, Region, SyncLock, changed
+
+if TYPE_CHECKING:
+    from evlcp_sdk.rx.workers import Workers
 
 _MOST_LIT = 1024
 """Transmitters that are remembered: those seen last."""
@@ -89,6 +92,7 @@ class StreamContext:
         announcer: Announces finished stages; None where nobody listens.
         limits: How much each link holds at the most.
         numbers: Where the numbers of transmitters come from.
+        workers: Processes that decode frames; None where this one does.
     """
 
     clock: CameraClock
@@ -97,6 +101,7 @@ class StreamContext:
     announcer: Announcer | None = None
     limits: Limits = LIMITS
     numbers: Iterator[int] = field(default_factory=count)
+    workers: "Workers | None" = None
 
 
 class Framer(ABC):
@@ -121,6 +126,10 @@ class Framer(ABC):
     @abstractmethod
     def step(self, regions: list[Followed], step: TimeStep) -> None:
         """Receive and decode what the regions of a time step send."""
+
+    def catch_up(self, start_us: int) -> None:
+        """Apply what was decoded some time steps before, at the start of a time step, us."""
+        return
 
     def ahead(self, step: TimeStep) -> None:
         """Decode the frames that are due in the part so far of a time step, if there can be any."""

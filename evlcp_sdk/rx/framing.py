@@ -10,7 +10,7 @@ from end to end at 50 m, 90 us at 16 m.
 import cmath
 import math
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any
@@ -23,11 +23,11 @@ from evlcp_sdk.clock import TimeStep
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Synchronizer
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner, Pilot
+from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame
 from evlcp_sdk.rx.framer import Framer, StreamContext, note_lit
 from evlcp_sdk.rx.guard import Guard, compiled
 from evlcp_sdk.rx.limits import Limits
-from evlcp_sdk.rx.reading import FrameReader, Steps
+from evlcp_sdk.rx.reading import BarDecoder, Bars, BarState, FrameDecoder, FrameJob, FrameResult, ShownPlace
 from evlcp_sdk.rx.reflections import LONGEST_ROW_US, FrameDetection, PacketAssembler, ReflectionQueue
 from evlcp_sdk.rx.regions import (
     MARGIN_PX,
@@ -72,6 +72,10 @@ _PLACE_SIGMA_US = 2.0
 
 _TAIL_CHIPS = 0.5
 """A frame is whole if the stream goes on for this long after its last edge's events: some come later."""
+
+_APPLIED_STEPS = 2
+"""Steps after which a frame of a bar that is followed well sets its region right, counts and is given,
+whoever decodes it: the next one of its bar is due by then, and more would only make it later."""
 
 _MOST_OLD = 2
 """Frames decoded in a step beyond those that end in one: all that came before a first lock would take as long
@@ -221,6 +225,7 @@ class PacketGrid:
             end_us=end_us,
             lock=lock,
             read_us=end_us + self.chips_after * lock.chip_us,
+            middle_us=float(start_us) + min(end - begin, form.pilot_chips) // 2 * float(lock.chip_us),
         )
 
     def due(self, until_us: float) -> DueFrame | None:
@@ -307,14 +312,12 @@ class Transmitter:
     Attributes:
         region: Where it is in the image, and its events.
         sync: State of its synchronization.
+        state: What its frames left for the next, unless a decoder has it.
         packets: Collects its frames.
         grid: Where its frames stand on the clock.
-        distance: What is known of its distance.
         number: Transmitter number, None before the first frame.
         first: Number of the first packet on the grid that had a frame, None before.
         rows: How late the rows of its bar are read.
-        pilot: The newest pilot, None where it showed no bar.
-        said: Number of the newest frame that was decoded, on the grid, and its symbols.
         given: Number of the newest frame on the grid that was given before any was rejected since the
             newest preamble on it.
         doubtful: Frames since the first that was rejected since then, by what they count as: maybe another
@@ -324,18 +327,19 @@ class Transmitter:
         tried: Number of the newest frame on the grid that was not given as soon as it was due.
         lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
         step_events: How many of its events were in the time step in which its lock came.
+        steady: Its region follows the bar so well that frames can be decoded by themselves.
+        decoder: Who does so, and has its state.
+        pending: Frames that are decoded, and not applied.
     """
 
     region: Followed
     sync: Any
+    state: BarState
     packets: PacketAssembler
     grid: PacketGrid
-    distance: Any = None
     number: int | None = None
     first: int | None = None
     rows: RowDelay = field(default_factory=RowDelay)
-    pilot: Pilot | None = None
-    said: tuple[int, NDArray[np.int64]] = (-1, np.empty(0, np.int64))
     given: int = -1
     doubtful: Counter[str] = field(default_factory=Counter)
     missed: Counter[str] = field(default_factory=Counter)
@@ -343,6 +347,16 @@ class Transmitter:
     tried: int = -1
     lit_us: float | None = None
     step_events: int = 0
+    steady: bool = False
+    decoder: Bars | None = None
+    pending: deque[DueFrame] = field(default_factory=deque)
+
+    def fetch_state(self) -> BarState:
+        """Its state, taken from where its frames were decoded."""
+        if self.decoder is not None:
+            assert self.number is not None
+            self.state, self.decoder = self.decoder.take(self.number), None
+        return self.state
 
     def settle(self) -> None:
         """Take a preamble on the grid: the frames before it are its own."""
@@ -370,17 +384,17 @@ class Transmitters:
         self._released: list[Transmitter] = []
         self._numbers = numbers
 
-    def open(self, region: Followed, sync: Any, distance: Any) -> Transmitter:
-        """Take a new region, with the first states of its synchronization and its distance filter."""
+    def open(self, region: Followed, sync: Any, state: BarState) -> Transmitter:
+        """Take a new region, with the first states of its synchronization and its frames."""
         packets, grid = PacketAssembler(self._packet.frames), self._grid()
-        transmitter = Transmitter(region, sync, packets, grid, distance)
+        transmitter = Transmitter(region, sync, state, packets, grid)
         self.alive[region.id] = transmitter
         return transmitter
 
     def adopt(self, transmitter: Transmitter, lock: SyncLock) -> None:
         """Take a lock that is off the grid; frames start with the first whole one of the region's events."""
         region, grid = transmitter.region, transmitter.grid
-        transmitter.pilot = None
+        transmitter.state = transmitter.fetch_state()._replace(pilot=None)
         # Half a chip before the first event, at 0, is still within the first edge's delay.
         earliest_us = max(region.first_us, -lock.chip_us / 2)
         if grid.lock is None and self._inherit(transmitter, lock):
@@ -396,7 +410,7 @@ class Transmitters:
         oldest_us = region.pieces[0][0] if region.pieces else 0
         region.first_us = max(region.first_us, oldest_us, int(old.grid.start_us(old.given + 1)))
         # The same LEDs, as far as one knows: where the bar is does not begin anew.
-        new = self.open(region, old.sync, old.distance)
+        new = self.open(region, old.sync, old.fetch_state()._replace(frame=-1, pilot=None))
         new.rows = old.rows
         return new
 
@@ -415,7 +429,8 @@ class Transmitters:
             if unseen_us < _UNSEEN_STEPS * self._step_us or not lost.grid.follow(lock):
                 continue
             transmitter.number, transmitter.first = lost.number, lost.first
-            transmitter.distance, transmitter.given = lost.distance, lost.given
+            transmitter.state = transmitter.state._replace(distance=lost.fetch_state().distance)
+            transmitter.given = lost.given
             lost.number, lost.first, lost.given = None, None, -1
             transmitter.packets, lost.packets = lost.packets, transmitter.packets
             transmitter.grid, lost.grid = lost.grid, self._grid()
@@ -448,7 +463,8 @@ class Transmitters:
 
     def forget(self, transmitter: Transmitter, now_us: float) -> None:
         """Drop the events that no frame can need any more."""
-        region, due = transmitter.region, transmitter.grid.next
+        region = transmitter.region
+        due = transmitter.pending[0] if transmitter.pending else transmitter.grid.next
         oldest_us = now_us - self._lookback_us
         if due is None:
             keep_us = oldest_us
@@ -471,7 +487,7 @@ class Transmitters:
         del self.alive[region.id]
         region.hold(deque())
         region.positions = Places([region.latest])
-        transmitter.sync = transmitter.pilot = None
+        transmitter.sync, transmitter.state = None, transmitter.fetch_state()._replace(pilot=None)
         oldest_us = region.latest.t_us - _REMEMBER_US
         kept = [r for r in self._released if r.region.latest.t_us > oldest_us]
         self._released = [*kept, transmitter][-self._remembered :]
@@ -483,11 +499,33 @@ class Transmitters:
         return alive
 
 
+@dataclass(frozen=True, eq=False)
+class PendingFrame:
+    """A frame that is decoded by itself, and not applied.
+
+    Attributes:
+        transmitter: Whose it is.
+        due: Which frame.
+        step_us: Start of the time step in which it was due, us.
+        ranged: Its distance is measured.
+        answer: Gives what it says, once that is known; None where it is to be decoded again, here.
+        frame: The same for those who listen, if it was told already.
+    """
+
+    transmitter: Transmitter
+    due: DueFrame
+    step_us: int
+    ranged: bool
+    answer: Callable[[], FrameResult | None]
+    frame: Frame | None
+
+
 class PacketFraming(Framer):
     """Finds the packets of the regions of a stream, decodes their frames, and sets the regions right by them.
 
     The `follower` is the same as the regions where frames correct them; None where they stay as a detector
-    has them. Decoded frames go to the `queue`.
+    has them. Decoded frames go to the `queue`. Frames of a bar that its region follows well are decoded by
+    themselves, and applied a fixed number of time steps later: so it is all the same who decodes them.
     """
 
     cut_by_the_end = True
@@ -497,7 +535,7 @@ class PacketFraming(Framer):
         link: Link,
         name: str,
         stream: StreamContext,
-        steps: Steps,
+        decoder: FrameDecoder,
         regions: RegionTracker,
         follower: RegionFollower | None,
         queue: ReflectionQueue,
@@ -513,24 +551,14 @@ class PacketFraming(Framer):
         self._synchronizer: Synchronizer = compiled(
             link, "synchronization", link.codebook, link.packet, methods=("init", "step")
         )
-        self._steps = steps
+        self._decoder, self._aligner = decoder, decoder.aligner
+        self._bars: Sequence[Bars] = stream.workers.bars(name) if stream.workers else [BarDecoder(decoder)]
+        self._pending: deque[PendingFrame] = deque()
         self._regions, self._follower = regions, follower
         self._name = name
         self._transmitters = Transmitters(
             link.packet, self._step_us, stream.limits, stream.numbers, link.codebook.chips_after
         )
-        self._aligner = FrameAligner(
-            link.packet,
-            link.regions,
-            link.bar.cluster_centres_m(),
-            link.codebook,
-            self._steps.separate,
-            (link.camera.width, link.camera.height),
-        )
-        self._reader = FrameReader(link, steps, self._aligner)
-        self._codebook = link.codebook
-        self._unknown = np.full(link.codebook.clusters, -1, np.int8)
-        self._unknown.setflags(write=False)
         self._preamble = 2 * link.codebook.preamble.astype(np.float64) - 1
         self._reflections = queue.reflections
         self._queue = queue
@@ -543,11 +571,19 @@ class PacketFraming(Framer):
         self._most_due = math.ceil(per_step) + _MOST_OLD
         caught_up = math.ceil(LOOKBACK_PACKETS * link.packet.frames / (self._most_due - per_step))
         packets_us = LOOKBACK_PACKETS * link.packet.packet_chips * link.packet.chip_us
-        self.patience_us = packets_us + caught_up * self._step_us
+        self.patience_us = packets_us + (caught_up + _APPLIED_STEPS) * self._step_us
         self.counts = dict.fromkeys(_COUNTS, 0)
         self.lit: dict[int, tuple[float, float]] = {}
         self.ranging_every = 1
         self._measurable = 0
+        self._now_us = 0
+
+    def catch_up(self, start_us: int) -> None:
+        """Apply the frames whose time it is at the start of a time step."""
+        self._now_us = start_us
+        self._joined.clear()
+        while self._pending and self._pending[0].step_us + _APPLIED_STEPS * self._step_us <= start_us:
+            self._apply(self._pending.popleft())
 
     def step(self, regions: list[Followed], step: TimeStep) -> None:
         """Receive and decode what the regions of a time step send."""
@@ -586,7 +622,7 @@ class PacketFraming(Framer):
         """Decode the frames that are due in the part so far of a time step."""
         if self._follower is None:
             return
-        self._joined.clear()
+        self.catch_up(step.start_us)
         self._due.clear()
         until_us = step.end_us - self._tail_us
         alive = self._transmitters.alive.values()
@@ -638,7 +674,7 @@ class PacketFraming(Framer):
             self.counts["regions_opened"] += 1
             with guard:
                 state = self._synchronizer.init()
-            transmitter = self._transmitters.open(region, state, self._steps.distance_init())
+            transmitter = self._transmitters.open(region, state, self._decoder.first_state())
         for start_us, events in pieces:
             self.counts["events_in_regions"] += events.t_us.size
             until_us = min(start_us + self._step_us, step.end_us)
@@ -670,6 +706,7 @@ class PacketFraming(Framer):
 
     def _succeed(self, old: Transmitter) -> Transmitter:
         """End a transmitter that another is in the place of; what was read since, or rejected, is not its."""
+        self._flush(old)
         self.counts["restarts"] += 1
         self._discarded(old.doubtful)
         old.missed[Skipped.REJECTED] -= old.doubtful[Skipped.REJECTED]
@@ -698,10 +735,13 @@ class PacketFraming(Framer):
         due = transmitter.grid.due(until_us)
         if due is None or transmitter.region.id in self._joined:
             return
-        pilot, said = transmitter.pilot, transmitter.said
+        if transmitter.steady:
+            self._hand_over(transmitter, due)
+            return
+        state = transmitter.state
         found = self._decode(transmitter, due)
         if isinstance(found, Skipped):
-            transmitter.pilot, transmitter.said, transmitter.tried = pilot, said, due.number
+            transmitter.state, transmitter.tried = state, due.number
             return
         self._take(transmitter, due, found)
 
@@ -712,6 +752,12 @@ class PacketFraming(Framer):
             self.counts["frames_cut"] += transmitter.grid.skip_before(cut_us)
         while most > 0 and (due := transmitter.grid.due(until_us)) is not None:
             most -= 1
+            if transmitter.steady and until_us - due.read_us <= self._step_us:
+                self._hand_over(transmitter, due)
+                continue
+            if transmitter.pending:
+                self._flush(transmitter)
+                continue
             found = self._decode(transmitter, due)
             if found is Skipped.REJECTED and self._put_together(transmitter):
                 continue
@@ -724,7 +770,8 @@ class PacketFraming(Framer):
                 if found is not Skipped.DARK:
                     self._lit_in(transmitter, self._clock.camera_us(due.start_us))
                     transmitter.missed[found] += 1
-                    if found is Skipped.REJECTED and transmitter.number is not None:
+                    known = transmitter.number is not None and due.number > transmitter.given
+                    if found is Skipped.REJECTED and known:
                         transmitter.doubtful[found] += 1
                         transmitter.packets.in_doubt = True
                 self.counts[found] += 1
@@ -741,9 +788,11 @@ class PacketFraming(Framer):
 
     def _take(self, transmitter: Transmitter, due: DueFrame, found: FrameDetection) -> None:
         """Hand a frame on."""
-        transmitter.grid.go_to(due.number + 1)
+        if transmitter.grid.frame <= due.number:
+            transmitter.grid.go_to(due.number + 1)
         if not transmitter.doubtful:
-            transmitter.given = due.number
+            transmitter.given = max(due.number, transmitter.given)
+        transmitter.steady = self._follower is not None
         self._lit_in(transmitter, found.frame.t_us)
         self.counts["frames"] += 1
         self._queue.add(transmitter.packets, found)
@@ -768,52 +817,126 @@ class PacketFraming(Framer):
             self._regions.drop(transmitter.region)
             self.let_go(transmitter.region)
             return Skipped.REJECTED
+        attitude = self._attitude_at(self._clock.camera_us(aligned.middle_us)) if due.has_pilot else None
         ranged = due.has_pilot and self._is_ranged()
-        middle_us = self._clock.camera_us(aligned.middle_us)
-        attitude = self._attitude_at(middle_us) if due.has_pilot else None
-        before = self._before(transmitter, due)
-        reading = self._reader.read(aligned, due, before, attitude, ranged=ranged)
-        transmitter.said = due.number, reading.symbols
-        distance, soft = reading.distance, reading.soft
-        self._note(transmitter, "frames_askew", reading.sight.askew)
-        if max(soft.symbols.tolist()) < 0 and (
-            transmitter.number is None or not math.isfinite(distance.distance_m)
-        ):
-            # What says nothing is no transmitter, and of one that is known its distance may still be of use.
-            return Skipped.UNREAD
-        self._note(transmitter, "frames_flooded", reading.flooded)
-        if transmitter.number is None:
-            self._find_parts(transmitter.region, due.start_us)
-        number = self._transmitters.number(transmitter)
-        transmitter.distance, distance, filtered = self._steps.follow(
-            transmitter.distance, due.start_us, due.lock.chip_us, distance, reading.sight
+        known = transmitter.number is not None
+        found, transmitter.state = self._decoder.read(
+            aligned, due, transmitter.state, attitude, ranged=ranged, known=known
         )
+        self.counts["frames_not_ranged"] += due.has_pilot and not ranged
+        if not found.given:
+            self._note(transmitter, "frames_askew", found.reading.sight.askew)
+            return Skipped.UNREAD
+        if not known:
+            self._find_parts(transmitter.region, due.start_us)
+        self._transmitters.number(transmitter)
+        frame = self._frame(transmitter, due, found)
+        self._tell(frame)
+        return self._detection(transmitter, due, found, frame)
+
+    def _frame(self, transmitter: Transmitter, due: DueFrame, found: FrameResult) -> Frame:
+        """What is given of a frame."""
+        reading = found.reading
         if transmitter.first is None:
             transmitter.first = due.packet
-        frame = Frame(
-            transmitter=number,
+        assert transmitter.number is not None
+        return Frame(
+            transmitter=transmitter.number,
             packet=due.packet - transmitter.first,
             frame=due.index,
             t_us=self._clock.camera_us(due.start_us),
-            soft=soft,
-            range=distance,
-            filtered=filtered,
+            soft=reading.soft,
+            range=reading.distance,
+            filtered=found.filtered,
             x_px=reading.centre_px[0],
             y_px=reading.centre_px[1],
             points_px=reading.points_px,
             points_sigma_px=reading.sigma_px,
             points_flank_px=reading.flank_px,
-            points_t_us=middle_us,
-            echo_of=self._reflections.echo_of(number),
+            points_t_us=self._clock.camera_us(found.middle_us),
+            echo_of=self._reflections.echo_of(transmitter.number),
             link=self._name,
         )
+
+    def _tell(self, frame: Frame) -> None:
         if self._on_frame is not None:
             self._on_frame(frame)
         if self._announcer is not None:
             self._announcer.frame(frame)
-        placed, times = aligned.pilot.placement, (due.start_us, due.end_us, due.packet_us, due.lock.chip_us)
-        seen = max(sum(placed.seen.tolist()), 1)
-        return FrameDetection(frame, *times, placed.cells / seen, seen, placed.mirrored, reading.spread)
+
+    def _detection(
+        self, transmitter: Transmitter, due: DueFrame, found: FrameResult, frame: Frame
+    ) -> FrameDetection:
+        """A frame with what tells a bar from its reflection; counts what it notes."""
+        self._note(transmitter, "frames_askew", found.reading.sight.askew)
+        self._note(transmitter, "frames_flooded", found.reading.flooded)
+        times = due.start_us, due.end_us, due.packet_us, due.lock.chip_us
+        return FrameDetection(frame, *times, found.cells, found.seen, found.mirrored, found.reading.spread)
+
+    def _hand_over(self, transmitter: Transmitter, due: DueFrame) -> None:
+        """Have a frame decoded by itself."""
+        if self._announcer is not None:
+            self._announcer.start()
+        assert transmitter.number is not None
+        if transmitter.decoder is None:
+            transmitter.decoder = min(self._bars, key=len)
+            transmitter.decoder.put(transmitter.number, transmitter.state)
+        due = self._retimed(transmitter, due)
+        ranged = due.has_pilot and self._is_ranged()
+        middle_us = self._clock.camera_us(due.middle_us)
+        attitude = self._attitude_at(middle_us) if due.has_pilot else None
+        job = FrameJob(transmitter.region, due, attitude, ranged)
+        answer = transmitter.decoder.decode(transmitter.number, job)
+        frame = None
+        if transmitter.decoder.at_once and (found := answer()) is not None:
+            frame = self._frame(transmitter, due, found)
+            self._tell(frame)
+        self._pending.append(PendingFrame(transmitter, due, self._now_us, ranged, answer, frame))
+        transmitter.pending.append(due)
+        transmitter.grid.go_to(due.number + 1)
+
+    def _flush(self, transmitter: Transmitter) -> None:
+        """Apply all frames of a transmitter that are decoded."""
+        for one in [one for one in self._pending if one.transmitter is transmitter]:
+            # One of those before may have let go of it.
+            if one in self._pending:
+                self._pending.remove(one)
+                self._apply(one)
+
+    def _apply(self, pending: PendingFrame) -> None:
+        """Let a frame that was decoded by itself set its region right, and hand it on."""
+        transmitter, due, found = pending.transmitter, pending.due, pending.answer()
+        transmitter.pending.popleft()
+        if found is None:
+            # It, and those after it, are decoded here: with what is around.
+            for one in [one for one in self._pending if one.transmitter is transmitter]:
+                one.answer()
+                self._pending.remove(one)
+            transmitter.pending.clear()
+            transmitter.fetch_state()
+            transmitter.steady = False
+            transmitter.grid.go_to(due.number)
+            return
+        region, shown, follower = transmitter.region, found.shown, self._follower
+        assert follower is not None
+        if shown is not None and not region.released:
+            follower.shape(region, *shown[:5])
+            if not self._join(region, shown.t_us):
+                return
+            self._open_beside(region, shown)
+        frame = self._frame(transmitter, due, found) if pending.frame is None else pending.frame
+        if pending.frame is None:
+            self._tell(frame)
+        self.counts["frames_not_ranged"] += due.has_pilot and not pending.ranged
+        self._take(transmitter, due, self._detection(transmitter, due, found, frame))
+
+    def _open_beside(self, region: Followed, shown: ShownPlace) -> None:
+        """Open regions for other images of a bar that are not followed yet."""
+        assert self._follower is not None
+        for centre_px, size_px in shown.others:
+            known = any(one.covers(shown.t_us, centre_px) for one in self._regions.alive)
+            if not known and self._follower.has_room():
+                self._due.append(self._follower.beside(region, shown.t_us, centre_px, size_px))
 
     def _retimed(self, transmitter: Transmitter, due: DueFrame) -> DueFrame:
         """A frame that is due, timed anew where light has changed since the preamble."""
@@ -842,46 +965,28 @@ class PacketFraming(Framer):
     def _is_ranged(self) -> bool:
         """Whether the turn of a frame with a pilot has come to be ranged."""
         self._measurable += 1
-        ranged = self._measurable % self.ranging_every == 0
-        self.counts["frames_not_ranged"] += not ranged
-        return ranged
-
-    def _before(self, transmitter: Transmitter, due: DueFrame) -> NDArray[np.int8]:
-        """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known.
-
-        In a pair code it says nothing new, and is not looked up.
-        """
-        book = self._codebook
-        if book.pairs:
-            return self._unknown
-        if due.has_pilot:
-            return book.pilots[:, -1].astype(np.int8)
-        number, symbols = transmitter.said
-        if number != due.number - 1 or due.index == 0:
-            return self._unknown
-        return np.where(symbols >= 0, book.codewords[symbols, -1].astype(np.int8), np.int8(-1))
+        return self._measurable % self.ranging_every == 0
 
     def _align(self, transmitter: Transmitter, due: DueFrame) -> AlignedFrame | None:
         """Look at a frame; set its region right by it, join what is of the same bar, open what is another."""
         region, follower = transmitter.region, self._follower
-        others: list[tuple[float, tuple[float, float], tuple[float, float]]] = []
+        seen: list[ShownPlace] = []
         most_px = 0.0
         for _ in range(_LOOKS):
             whole = region.size_px is not None
-            aligned = self._aligner.align(region, due, transmitter.pilot)
+            aligned = self._aligner.align(region, due, transmitter.state.pilot)
             if aligned is None or not due.has_pilot:
                 break
-            transmitter.pilot = pilot = aligned.pilot
-            centre_px, size_px = self._aligner.box(aligned, pilot.placement)
+            transmitter.state = transmitter.state._replace(pilot=aligned.pilot)
+            shown = self._decoder.shown_place(aligned)
             if follower is None:
-                region.size_px = size_px
+                region.size_px = shown.size_px
                 break
             # What the first look shows beside the bar is out of the second one's sight.
-            others += [(aligned.middle_us, *self._aligner.box(aligned, other)) for other in pilot.others]
-            lit_px, strips_px = self._aligner.lit_rows(aligned), self._aligner.strips(aligned)
-            off_px = follower.shape(region, aligned.middle_us, centre_px, size_px, lit_px, strips_px)
+            seen.append(shown)
+            off_px = follower.shape(region, *shown[:5])
             most_px = max(most_px, off_px)
-            if off_px > 0 and not self._join(region, aligned.middle_us):
+            if off_px > 0 and not self._join(region, shown.t_us):
                 return None
             # Within half of the seam, motion in the frame is known as well as by its next look.
             if off_px == 0 or (whole and off_px <= MARGIN_PX / 2):
@@ -889,12 +994,8 @@ class PacketFraming(Framer):
             follower.gather(region, due.start_us, due.read_us)
         if follower is not None and most_px > MARGIN_PX / 2:
             follower.gather(region)
-        if follower is None or aligned is None:
-            return aligned
-        for middle_us, centre_px, size_px in others:
-            known = any(one.covers(middle_us, centre_px) for one in self._regions.alive)
-            if not known and follower.has_room():
-                self._due.append(follower.beside(region, middle_us, centre_px, size_px))
+        for shown in seen if aligned is not None else ():
+            self._open_beside(region, shown)
         return aligned
 
     def _join(self, region: Followed, t_us: float) -> bool:
@@ -924,6 +1025,7 @@ class PacketFraming(Framer):
         self._joined.add(region.id)
         transmitter = self._transmitters.alive.get(region.id)
         if transmitter is not None:
+            self._flush(transmitter)
             self.counts["regions_released"] += 1
             self._was_part(transmitter.missed)
             self._queue.add(transmitter.packets, None)
@@ -944,7 +1046,11 @@ class PacketFraming(Framer):
     def _end(self, transmitter: Transmitter, now_us: float) -> None:
         """Decode what a region that has ended still shows; its last packet is over."""
         seen_us = transmitter.region.latest.t_us + self._step_us
-        self._decode_due(transmitter, min(now_us - self._tail_us, seen_us))
+        until_us = min(now_us - self._tail_us, seen_us)
+        self._decode_due(transmitter, until_us)
+        while transmitter.pending:
+            self._flush(transmitter)
+            self._decode_due(transmitter, until_us)
         if transmitter.region.id in self._joined:
             return
         number, missed = transmitter.number, transmitter.missed
@@ -977,7 +1083,8 @@ def _is_part(bar: Followed, t_us: float, place_px: tuple[float, float], fade_us:
 
 def _went_dark(transmitter: Transmitter, due: DueFrame, packet: PacketFormat) -> bool:
     """Whether a bar that was seen before has few events in a frame by now."""
-    if transmitter.number is None or transmitter.pilot is None:
+    pilot = transmitter.state.pilot
+    if transmitter.number is None or pilot is None:
         return False
-    expected = int(np.abs(transmitter.pilot.sums).sum(dtype=np.int64)) * due.chips / packet.pilot_chips
+    expected = int(np.abs(pilot.sums).sum(dtype=np.int64)) * due.chips / packet.pilot_chips
     return transmitter.region.events_between(due.start_us, due.end_us) < _DARK * expected

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,12 +12,13 @@ from evlcp_sdk.air.frames import chips_behind
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import Tracker
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner
+from evlcp_sdk.rx.alignment import AlignedFrame, DueFrame, FrameAligner, Pilot
 from evlcp_sdk.rx.framer import Announcer
-from evlcp_sdk.rx.guard import Guard, compiled
+from evlcp_sdk.rx.guard import Guard, compiled, tracker_of
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
+from evlcp_sdk.rx.regions import MARGIN_PX, Followed
 from evlcp_sdk.rx.spread import LateSpread, Spread, neighbours
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
@@ -176,6 +177,82 @@ class Reading(NamedTuple):
     flooded: bool
 
 
+class BarState(NamedTuple):
+    """What the frames of a bar leave for the next one.
+
+    Attributes:
+        pilot: The newest pilot; None where it showed no bar, and before the first.
+        frame: Number of the newest frame that was decoded, on the packet grid; -1 before the first.
+        symbols: Its symbols, int64 (K,).
+        distance: What is known of the distance.
+    """
+
+    pilot: Pilot | None
+    frame: int
+    symbols: NDArray[np.int64]
+    distance: tuple[Ranges, Any]
+
+
+class ShownPlace(NamedTuple):
+    """Where a frame with a pilot showed its bar.
+
+    Attributes:
+        t_us: When, us.
+        centre_px: Centre (column, row) of the whole bar on the sensor.
+        size_px: Its (width, height).
+        lit_px: Where it shines, see `Followed.lit_px`.
+        strips_px: See `Followed.strips_px`.
+        others: (centre, size) of other instances of it in the same image, best first.
+    """
+
+    t_us: float
+    centre_px: tuple[float, float]
+    size_px: tuple[float, float]
+    lit_px: tuple[float, float] | None
+    strips_px: NDArray[np.float64] | None
+    others: tuple[tuple[tuple[float, float], tuple[float, float]], ...]
+
+
+class FrameResult(NamedTuple):
+    """A frame as it was decoded.
+
+    Attributes:
+        reading: What it says; its distance as it holds together with those before.
+        filtered: The distance filtered; None without tracking.
+        middle_us: See `AlignedFrame`.
+        cells: Grid cells that show a cluster, on average.
+        seen: Clusters that are seen.
+        mirrored: The order of the clusters is the opposite of the layout's.
+        given: It says something: a symbol, or of a known transmitter its distance.
+        shown: Where it showed the bar, of one that was decoded by itself; None without a pilot.
+    """
+
+    reading: "Reading"
+    filtered: Range | None
+    middle_us: float
+    cells: float
+    seen: int
+    mirrored: bool
+    given: bool
+    shown: ShownPlace | None = None
+
+
+class FrameJob(NamedTuple):
+    """A frame to decode, with what its bar's earlier frames do not say.
+
+    Attributes:
+        region: Where the bar is, with the events of the frame.
+        due: Which frame.
+        attitude: What is known of the camera's attitude in its pilot.
+        ranged: Its distance is measured.
+    """
+
+    region: Followed
+    due: DueFrame
+    attitude: Attitude | None
+    ranged: bool
+
+
 class FrameReader:
     """Reads one frame after the other, as the aligner aligned it; it keeps no state of a stream."""
 
@@ -250,6 +327,160 @@ class FrameReader:
         spread = LateSpread(heard.copy(), self._pilots, self._every, self._layout, self._pairs, placement)
         image = points_px, sigma_px, flank_px, centre_px
         return Reading(soft.symbols, given, distance, *image, sight, spread, flooded)
+
+
+class FrameDecoder:
+    """Decodes one frame after the other: aligns and reads it; it keeps no state of a stream.
+
+    Attributes:
+        aligner: Holds frames still.
+        steps: The link's roles.
+    """
+
+    def __init__(self, link: Link, announcer: Announcer | None = None) -> None:
+        self.steps = Steps(link, announcer, tracker_of(link))
+        self.aligner = FrameAligner(
+            link.packet,
+            link.regions,
+            link.bar.cluster_centres_m(),
+            link.codebook,
+            self.steps.separate,
+            (link.camera.width, link.camera.height),
+        )
+        self._reader = FrameReader(link, self.steps, self.aligner)
+        self._codebook = link.codebook
+        self._unknown = np.full(link.codebook.clusters, -1, np.int8)
+        self._unknown.setflags(write=False)
+
+    def first_state(self) -> BarState:
+        """Before a transmitter's first frame."""
+        return BarState(None, -1, np.empty(0, np.int64), self.steps.distance_init())
+
+    def decode(self, job: FrameJob, state: BarState) -> tuple[FrameResult, BarState] | None:
+        """Decode a frame of a known bar, see `read`; None where it takes more than its events to do so.
+
+        It shows no bar, or not where the region has it, or no symbol: then it is to be looked at again with
+        what is around.
+        """
+        region, due = job.region, job.due
+        aligned = self.aligner.align(region, due, state.pilot)
+        if aligned is None:
+            return None
+        shown = self.shown_place(aligned) if due.has_pilot else None
+        # Within half of the seam, all events are there.
+        if shown is not None and region.off_px(shown.t_us, shown.centre_px, shown.size_px) > MARGIN_PX / 2:
+            return None
+        found, state = self.read(aligned, due, state, job.attitude, ranged=job.ranged)
+        return (found._replace(shown=shown), state) if found.given else None
+
+    def shown_place(self, aligned: AlignedFrame) -> ShownPlace:
+        """Where a frame with a pilot shows its bar."""
+        aligner, pilot = self.aligner, aligned.pilot
+        box = aligner.box(aligned, pilot.placement)
+        others = tuple(aligner.box(aligned, other) for other in pilot.others)
+        return ShownPlace(aligned.middle_us, *box, aligner.lit_rows(aligned), aligner.strips(aligned), others)
+
+    def read(
+        self,
+        aligned: AlignedFrame,
+        due: DueFrame,
+        state: BarState,
+        attitude: Attitude | None,
+        *,
+        ranged: bool,
+        known: bool = True,
+    ) -> tuple[FrameResult, BarState]:
+        """Read an aligned frame, of a transmitter that is known or not; what it leaves for the next."""
+        reading = self._reader.read(aligned, due, self._before(state, due), attitude, ranged=ranged)
+        distance, filtered = state.distance, None
+        given = max(reading.soft.symbols.tolist()) >= 0
+        # What says nothing is no transmitter, and of one that is known its distance may still be of use.
+        given |= known and math.isfinite(reading.distance.distance_m)
+        if given:
+            distance, holds, filtered = self.steps.follow(
+                distance, due.start_us, due.lock.chip_us, reading.distance, reading.sight
+            )
+            reading = reading._replace(distance=holds)
+        placed = aligned.pilot.placement
+        seen = max(sum(placed.seen.tolist()), 1)
+        state = BarState(aligned.pilot, due.number, reading.symbols, distance)
+        image = placed.cells / seen, seen, placed.mirrored
+        return FrameResult(reading, filtered, aligned.middle_us, *image, given), state
+
+    def _before(self, state: BarState, due: DueFrame) -> NDArray[np.int8]:
+        """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known.
+
+        In a pair code it says nothing new, and is not looked up.
+        """
+        book = self._codebook
+        if book.pairs:
+            return self._unknown
+        if due.has_pilot:
+            return book.pilots[:, -1].astype(np.int8)
+        if state.frame != due.number - 1 or due.index == 0:
+            return self._unknown
+        symbols = state.symbols
+        return np.where(symbols >= 0, book.codewords[symbols, -1].astype(np.int8), np.int8(-1))
+
+
+class Bars(Protocol):
+    """Decodes the frames of known bars, each by what its bar's earlier ones left; bars go by numbers.
+
+    After one that it cannot decode, a bar's frames are not, until its state is put there again.
+
+    Attributes:
+        at_once: Answers are known when they are asked for.
+    """
+
+    at_once: bool
+
+    def __len__(self) -> int:
+        """How many bars there are."""
+        ...
+
+    def put(self, bar: int, state: BarState) -> None:
+        """Have a bar's frames decoded here from now on."""
+        ...
+
+    def take(self, bar: int) -> BarState:
+        """Give a bar's state back: its frames are decoded elsewhere."""
+        ...
+
+    def decode(self, bar: int, job: FrameJob) -> Callable[[], FrameResult | None]:
+        """Have a bar's next frame decoded, see `FrameDecoder.decode`; gives what to call for the answer."""
+        ...
+
+
+class BarDecoder:
+    """`Bars` that are decoded in this process."""
+
+    at_once = True
+
+    def __init__(self, decoder: FrameDecoder) -> None:
+        self._decoder = decoder
+        self._states: dict[int, BarState] = {}
+        self._stopped: set[int] = set()
+
+    def __len__(self) -> int:
+        return len(self._states)
+
+    def put(self, bar: int, state: BarState) -> None:
+        """See `Bars`."""
+        self._states[bar] = state
+        self._stopped.discard(bar)
+
+    def take(self, bar: int) -> BarState:
+        """See `Bars`."""
+        return self._states.pop(bar)
+
+    def decode(self, bar: int, job: FrameJob) -> Callable[[], FrameResult | None]:
+        """See `Bars`."""
+        found = None if bar in self._stopped else self._decoder.decode(job, self._states[bar])
+        if found is None:
+            self._stopped.add(bar)
+            return lambda: None
+        result, self._states[bar] = found
+        return lambda: result
 
 
 def calibrate_llr(soft: SoftSymbols, seen: NDArray[np.bool_]) -> SoftSymbols:

@@ -20,9 +20,10 @@ from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
 from evlcp_sdk.rx.multi import EarlyFrames, SeveralLinks, shared_rhythms
 from evlcp_sdk.rx.plugin_framing import PluginFraming
-from evlcp_sdk.rx.reading import Steps
+from evlcp_sdk.rx.reading import FrameDecoder
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
 from evlcp_sdk.rx.regions import RegionFollower, RegionTracker, Rhythm, same_place
+from evlcp_sdk.rx.workers import Workers
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Events, Frame, Packet, Region, changed
@@ -51,12 +52,17 @@ class Receiver:
             is by what is known then. Of several links, frames come with their packet until their transmitter
             holds its place; where another link takes that from it, the count `frames_withdrawn` has those
             told of packets that are not given. None for nobody.
+        workers: Processes at work, this one among them: more than one decode whole bars, with the same
+            results; each takes a second or two to start, and a script that asks for them needs the usual
+            `if __name__ == "__main__":`. Frames then come some time steps later to `on_frame`.
 
     Attributes:
         left: Packets that were complete when an algorithm failed in the last `feed`, which did not give them.
 
     Raises:
-        ConfigError: Links that cannot be received together, or nothing tells them apart.
+        ConfigError: Links that cannot be received together, or nothing tells them apart; workers beside a
+            plugin that follows the stages.
+        EvlcpError: A worker does not start.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
@@ -77,6 +83,7 @@ class Receiver:
         clock_zero: ClockZero = None,
         limits: Limits = LIMITS,
         on_frame: Callable[[Frame], None] | None = None,
+        workers: int = 1,
     ) -> None:
         links = named_links(link)
         first, camera = next(iter(links.values())), next(iter(links.values())).camera
@@ -86,7 +93,9 @@ class Receiver:
         announcer = None
         if hook is not None and hook.evlcp_stage_finished.get_hookimpls():
             announcer = Announcer(hook.evlcp_stage_finished, clock.camera_us)
-        stream = StreamContext(clock, attitude_source(attitude), clock_zero, announcer, limits)
+        self._workers = Workers.beside(links, workers, announced=announcer is not None)
+        known = attitude_source(attitude), clock_zero
+        stream = StreamContext(clock, *known, announcer, limits, workers=self._workers)
         self._early = EarlyFrames(on_frame)
         self._several: SeveralLinks | None = None
         if len(links) == 1:
@@ -148,6 +157,7 @@ class Receiver:
         Raises:
             StreamError: The stream was closed, or a polarity is neither 0 nor 1.
             PluginError: An algorithm failed; `left` has the packets that were complete by then.
+            EvlcpError: A worker ended, or does not answer.
         """
         if self._closed:
             raise StreamError("the receiver is closed: make a new one for a new stream")
@@ -176,6 +186,8 @@ class Receiver:
             packets += self._judged(self._several, math.inf)
         for one in self._receivers:
             one.close()
+        if self._workers is not None:
+            self._workers.close()
         return packets
 
     def _waits(self) -> bool:
@@ -262,9 +274,9 @@ class LinkReceiver:
         self._queue = ReflectionQueue(Reflections(link.packet, len(link.codebook.codewords)))
         self.framing: Framer
         if link.algorithm("framing").roles >= STEPS:
-            steps = Steps(link, self._announcer, tracker)
+            decoder = FrameDecoder(link, self._announcer)
             self.framing = PacketFraming(
-                link, name, stream, steps, self._regions, follower, self._queue, on_frame
+                link, name, stream, decoder, self._regions, follower, self._queue, on_frame
             )
         else:
             self.framing = PluginFraming(link, name, stream, self._queue, on_frame)
@@ -312,6 +324,7 @@ class LinkReceiver:
             self._leave(taken, owning)
         if self._announcer is not None:
             self._announcer.start()
+        self.framing.catch_up(step.start_us)
         regions = self._regions.step(step.start_us, step.events, taken)
         if self._announcer is not None:
             for region in regions:

@@ -339,6 +339,10 @@ class Followed:
         self.held_bytes -= held_bytes(events)
         return events.t_us.size
 
+    def pieces_between(self, from_us: float, until_us: float, step_us: int) -> list[Piece]:
+        """Its pieces, of steps of some length, that reach from one time to before another."""
+        return [piece for piece in self.pieces if piece[0] < until_us and piece[0] + step_us > from_us]
+
     def events_between(self, from_us: float, until_us: float) -> int:
         """How many of its events there are from one time to before another."""
         return sum(
@@ -351,6 +355,14 @@ class Followed:
     def latest(self) -> Region:
         """The newest position."""
         return self.positions.latest
+
+    def off_px(self, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]) -> float:
+        """How far it is off a bar that a frame showed at a time, in place or size, px."""
+        if self.size_px is None:
+            return math.inf
+        x, y = self.positions.place_at(t_us)
+        wider, higher = size_px[0] - self.size_px[0], size_px[1] - self.size_px[1]
+        return max(abs(centre_px[0] - x), abs(centre_px[1] - y), abs(wider), abs(higher))
 
     def covers(self, t_us: float, point_px: tuple[float, float]) -> bool:
         """Whether a point on the sensor (column, row) is inside the region at a time."""
@@ -782,7 +794,7 @@ class RegionFollower(RegionTracker):
         x, y = followed.positions.place_at(t_us)
         off = centre_px[0] - x, centre_px[1] - y
         known, before_us, followed.shown_us = followed.size_px, followed.shown_us, t_us
-        off_px = math.inf
+        off_px = followed.off_px(t_us, centre_px, size_px)
         if known is None:
             followed.heights.clear()
             # Beside the bar itself there may be a halo.
@@ -790,11 +802,8 @@ class RegionFollower(RegionTracker):
             last = followed.latest
             until_us = last.t_us + _LEFT_STEPS * self._spec.step_us
             followed.outgrown = -off[0], -off[1], last.width_px, last.height_px, until_us
-        else:
-            wider, higher = size_px[0] - known[0], size_px[1] - known[1]
-            off_px = max(abs(off[0]), abs(off[1]), abs(wider), abs(higher))
-            if off_px < _RESHAPE_PX:
-                return 0.0
+        elif off_px < _RESHAPE_PX:
+            return 0.0
         followed.size_px = size_px
         # Where less of the bar was seen, or more than it, its place is not that of what was seen.
         most_px = 2 * MARGIN_PX if known is None else math.inf
