@@ -3,6 +3,7 @@
     python benchmarks/receive.py                    of ../shared, and made: clutter, four bars
     python benchmarks/receive.py REC.raw -c examples/links/paper.toml
     python benchmarks/receive.py --against 9c93e22  the same beside that commit, built by git
+    python benchmarks/receive.py --cores 2          how much sooner two processes are done, by the clock
 
 Events are received from memory, kernels warm. Each version is a process of its own, on one thread; they take
 turns scene by scene, so that both meet the same pace of the machine. Printed of each scene: the least time a
@@ -36,16 +37,17 @@ import json, sys, time
 import evlcp_sdk as evlcp
 chunks = {}
 for line in sys.stdin:
-    path, link = json.loads(line)
+    path, link, workers = json.loads(line)
     if path not in chunks:
         with evlcp.open(path) as source:
             chunks[path] = list(source.chunks())
-    receiver = evlcp.Receiver(evlcp.load_link(link))
-    begin_s = time.process_time()
+    receiver = evlcp.Receiver(evlcp.load_link(link), **({"workers": workers} if workers > 1 else {}))
+    begin_s, clock_s = time.process_time(), time.perf_counter()
     for events in chunks[path]:
         receiver.feed(events)
     receiver.close()
-    print(json.dumps([time.process_time() - begin_s, receiver.counts["frames"]]), flush=True)
+    spent_s = time.perf_counter() - clock_s if workers else time.process_time() - begin_s
+    print(json.dumps([spent_s, receiver.counts["frames"]]), flush=True)
 """
 
 
@@ -57,7 +59,7 @@ def started(*folders: Path) -> subprocess.Popen[str]:
 
 
 def receive(child: subprocess.Popen[str], *scene: Any) -> tuple[float, int]:
-    """Processor time, s, to receive a scene (recording, link), and its frames."""
+    """Time, s, to receive a scene (recording, link, processes), of the processor if 0; and its frames."""
     assert child.stdin is not None
     assert child.stdout is not None
     print(json.dumps(scene), file=child.stdin, flush=True)
@@ -115,6 +117,7 @@ def main() -> None:
     parser.add_argument("recordings", nargs="*", type=Path)
     parser.add_argument("-c", "--config", type=Path, help="a link.toml")
     parser.add_argument("--against", help="a commit of this repository")
+    parser.add_argument("--cores", type=int, default=0)
     parser.add_argument("--pairs", type=int, default=10)
     given = parser.parse_args()
     link = None if given.config is None else str(given.config.resolve())
@@ -127,16 +130,20 @@ def main() -> None:
             versions.append(started(old))
         for path in given.recordings or usual_recordings(Path(name)):
             scene = str(path.resolve()), link
+            runs = [(child, given.cores) for child in versions]
+            if given.cores:
+                runs.append((versions[0], 1))
             # The first loads, or compiles, the kernels.
-            turns = [[receive(child, *scene) for child in versions] for _ in range(given.pairs + 1)]
+            turns = [[receive(child, *scene, many) for child, many in runs] for _ in range(given.pairs + 1)]
             rounds = turns[1:]
             best_s, frames = min(pair[0] for pair in rounds)
             t_us = read_events(path).t_us
             line = f"{path.stem:24} {best_s / max(frames, 1) * 1e6:6.0f} us/frame"
             line += f"  {(t_us[-1] - t_us[0]) * 1e-6 / best_s:6.2f} x real time"
-            if given.against:
+            if given.against or given.cores:
                 ratios = [one[0] / other[0] for one, other in rounds]
-                line += f"  {median(ratios):5.3f} of {given.against} ({min(ratios):.2f} to {max(ratios):.2f})"
+                peer = given.against or "one core"
+                line += f"  {median(ratios):5.3f} of {peer} ({min(ratios):.2f} to {max(ratios):.2f})"
             print(line, flush=True)
 
 

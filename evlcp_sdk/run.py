@@ -66,6 +66,7 @@ def receive(
     registry: Registry | None = None,
     attitude: Attitude | AttitudeLog | None = None,
     clock_zero: ClockZero = None,
+    workers: int = 1,
 ) -> Reception:
     """Receive a recording or a camera: an iterator over its packets, in constant memory.
 
@@ -79,6 +80,7 @@ def receive(
             against the sensor. None for nothing.
         clock_zero: UTC of the camera clock's 0, or pulses on its trigger input that say it (a `PulseClock`
             for each recording), for the age of signed beacons; None if it is not known.
+        workers: Processes at work, see `Receiver`.
 
     Raises:
         InputError: The source cannot be opened.
@@ -90,7 +92,7 @@ def receive(
     with ExitStack() as stack:
         opened = stack.enter_context(open_until(source, registry, never))
         pulses = _check_source(opened, _name_of(source, opened), links, clock_zero)
-        receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
+        receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero, workers=workers)
         stack.pop_all()
     return Reception(opened, receiver, links[0], pulses)
 
@@ -235,6 +237,7 @@ def receive_to_folder(
     plan: PositionPlan | None = None,
     attitude: Attitude | AttitudeLog | None = None,
     clock_zero: ClockZero = None,
+    workers: int = 1,
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
     advance: Advance = _say_nothing,
@@ -274,7 +277,9 @@ def receive_to_folder(
             sinks=sinks,
             lines=lines,
         ) as writer:
-            receiver = Receiver(links, registry.hook, attitude=attitude, clock_zero=clock_zero)
+            receiver = Receiver(
+                links, registry.hook, attitude=attitude, clock_zero=clock_zero, workers=workers
+            )
             pieces = ((events, receiver.feed(events)) for events in _events_of(opened, pulses, stopped))
             return _run(opened, url, receiver, writer, pieces, receiver.close, advance, stopped)
 
@@ -288,6 +293,7 @@ def live(
     plan: PositionPlan | None = None,
     attitude: Attitude | AttitudeLog | None = None,
     clock_zero: ClockZero = None,
+    workers: int = 1,
     sinks: Sequence[str] = (),
     lines: Callable[[str], None] | None = None,
     publisher: Publisher | None = None,
@@ -317,20 +323,31 @@ def live(
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     publisher = Publisher() if publisher is None else publisher
+    loop: LiveLoop
+
+    def start() -> Receiver:
+        if warm:
+            warm_up(links, positions=plan is not None)
+        return Receiver(
+            links,
+            registry.hook,
+            attitude=attitude,
+            clock_zero=clock_zero,
+            on_frame=lambda frame: loop.frame(frame),
+            workers=workers,
+        )
+
     try:
         # A recording waits for its reader, and what is wrong with its name is said at once.
         waits = not isinstance(source, EventSource) and is_recording(source)
-        if warm and not waits:
-            warm_up(links, positions=plan is not None)
+        receiver = None if waits else start()
         opened = open_until(source, registry, stopped)
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
         with opened:
             url = _name_of(source, opened)
             check_sensor(opened, url, links[0].camera)
-            if warm and waits:
-                warm_up(links, positions=plan is not None)
-            loop: LiveLoop
+            receiver = receiver or start()
             with ResultWriter(
                 folder,
                 links,
@@ -343,13 +360,6 @@ def live(
                 lines=lines,
                 placed=lambda placed: loop.placed(placed),
             ) as writer:
-                receiver = Receiver(
-                    links,
-                    registry.hook,
-                    attitude=attitude,
-                    clock_zero=clock_zero,
-                    on_frame=lambda frame: loop.frame(frame),
-                )
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
                 loop = LiveLoop(opened, receiver, links, publisher, budget, pulses=pulses)
                 ends = loop.close, _say_nothing, stopped, loop.summary

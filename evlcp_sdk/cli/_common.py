@@ -51,7 +51,7 @@ Workers = Annotated[
     ),
 ]
 Dask = Annotated[
-    str | None, typer.Option("--dask", metavar="ADDRESS", help="Run on the workers of this Dask scheduler.")
+    str | None, typer.Option("--dask", metavar="ADDRESS", help="Run on this Dask scheduler's workers.")
 ]
 
 

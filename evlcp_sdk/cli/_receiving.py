@@ -117,6 +117,12 @@ class ResultOptions:
         return asked
 
 
+Cores = Annotated[
+    int,
+    typer.Option("--cores", min=1, metavar="N", show_default=False, help="Processes for a recording's bars."),
+]
+
+
 @dataclass(frozen=True)
 class PlaceOptions:
     """What places the camera: bars, its attitude over time, satellites, and UTC of its clock's 0."""

@@ -14,7 +14,7 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import console
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.cli._receiving import CameraOptions, LinkOptions, PlaceOptions, ResultOptions
+from evlcp_sdk.cli._receiving import CameraOptions, Cores, LinkOptions, PlaceOptions, ResultOptions
 from evlcp_sdk.cli._summary import delays_text, print_end
 
 if TYPE_CHECKING:
@@ -118,6 +118,7 @@ def live(
             "--waiting-ms", hidden=True, min=1.0, help="How long events may wait before some are left out."
         ),
     ] = 20.0,
+    cores: Cores = 1,
     serving: ServingOptions,
 ) -> None:
     """Receive in real time: results as they come, delays measured.
@@ -169,6 +170,7 @@ def live(
             plan=plan,
             attitude=attitude,
             clock_zero=clock,
+            workers=cores,
             sinks=sinks,
             lines=lines,
             publisher=publisher,

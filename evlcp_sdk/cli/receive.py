@@ -14,7 +14,14 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import Dask, bytes_bar, hush, make_executor, print_json, progress_bar
 from evlcp_sdk.cli._complain import complain
-from evlcp_sdk.cli._receiving import CameraOptions, LinePrinter, LinkOptions, PlaceOptions, ResultOptions
+from evlcp_sdk.cli._receiving import (
+    CameraOptions,
+    Cores,
+    LinePrinter,
+    LinkOptions,
+    PlaceOptions,
+    ResultOptions,
+)
 from evlcp_sdk.cli._summary import print_end
 from evlcp_sdk.errors import DEGRADED, InputError, InterruptedRunError, OutputError
 
@@ -59,6 +66,7 @@ def receive(
             "--workers", min=0, metavar="N", show_default=False, help="Processes for many recordings."
         ),
     ] = 0,
+    cores: Cores = 1,
     dask: Dask = None,
     place: PlaceOptions,
     camera: CameraOptions,
@@ -89,6 +97,7 @@ def receive(
     plan = place.plan(links, mcap=result.mcap)
     sinks = result.names(registry, positions=plan is not None)
     given: dict[str, Any] = {"links": links, "plan": plan, "attitude": camera.attitude(place), "sinks": sinks}
+    given["workers"] = cores
     decode = partial(_decode, clock=partial(camera.clock, place), lines=lines, **given)
     here = dask is None and (not workers or len(jobs) == 1)
     if lines is not None and not here:

@@ -4,19 +4,25 @@ What they answer is applied when it would be if it had been decoded here, so res
 """
 
 import multiprocessing
+import os
 import signal
+import socket
+import struct
 import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from multiprocessing.connection import Connection
+from pickle import PickleError
 from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, EvlcpError
+from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
+from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx import _kernels
 from evlcp_sdk.rx.framing import PacketGrid
 from evlcp_sdk.rx.placement import layout_of
@@ -24,8 +30,9 @@ from evlcp_sdk.rx.reading import BarDecoder, BarState, FrameDecoder, FrameJob, F
 from evlcp_sdk.rx.regions import EVENT_BYTES, Followed, Places
 from evlcp_sdk.values import Events, Region, SyncLock
 
-_ROOM_BYTES: Final = 1 << 25
-"""Memory that a worker's events wait in: some dozen frames of near bars; for more, answers are awaited."""
+_ROOM_BYTES: Final = 1 << 26
+"""Memory that a worker's events wait in, as much as usual limits let a frame have; where it is full, answers
+are awaited."""
 
 _START_S, _STALL_S = 600.0, 60.0
 """How long it may take to start, where kernels have to be compiled, and to answer: a frame takes some ms."""
@@ -50,21 +57,27 @@ class Workers:
 
     def __init__(self, links: Mapping[str, Link], many: int) -> None:
         self._links = links
+        for link in links.values():
+            # Compiled here, where that is said, and kept.
+            load_kernels(link)
         self._all = [_Worker(number, links) for number in range(1, many + 1)]
         for one in self._all:
             one.receive(_START_S)
 
     @classmethod
     def beside(cls, links: Mapping[str, Link], processes: int, *, announced: bool) -> "Workers | None":
-        """The workers beside this process; None where it is the only one.
+        """The workers beside this process; None where it is the only one, or has nothing to share.
 
         Raises:
-            ConfigError: There is none, or somebody follows the stages, which workers do not announce.
+            ConfigError: There is none, or somebody follows the stages, which workers do not announce; or an
+                algorithm cannot be sent to them.
+            EvlcpError: One does not start.
         """
         if processes < 1 or (processes > 1 and announced):
             why = ", as a plugin has evlcp_stage_finished()" if announced else " or more"
             raise ConfigError(f"workers: {processes}, expected 1{why}")
-        return cls(links, processes - 1) if processes > 1 else None
+        shared = {name: link for name, link in links.items() if _decodes_frames(link)}
+        return cls(shared, processes - 1) if processes > 1 and shared else None
 
     def bars(self, link: str) -> list["_WorkerBars"]:
         """Those that they decode of a link."""
@@ -74,6 +87,11 @@ class Workers:
         """End them."""
         for one in self._all:
             one.close()
+
+
+def _decodes_frames(link: Link) -> bool:
+    """Whether a link has frames of bars that can be decoded by themselves."""
+    return link.algorithm("framing").roles >= STEPS and link.algorithm("detection").rhythmic
 
 
 class _Worker:
@@ -86,8 +104,14 @@ class _Worker:
         self._memory = np.frombuffer(memory, np.uint8)
         arguments = far_end, memory, dict(links)
         self._process = spawn.Process(target=_work, args=arguments, name=f"worker {number}", daemon=True)
-        self._process.start()
+        try:
+            self._process.start()
+        except (PickleError, AttributeError, TypeError) as fault:
+            raise ConfigError(f"workers: an algorithm cannot be sent to another process: {fault}") from fault
         far_end.close()
+        with socket.socket(fileno=os.dup(self._pipe.fileno())) as sender:
+            timeout = struct.pack("ll", *divmod(int(_STALL_S * 1e6), 1_000_000))
+            sender.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeout)
         # Of each request that is not answered, oldest first, where its events lie and where the answer goes.
         self._open: deque[tuple[range, list[Any]]] = deque()
         self._next = 0
@@ -96,6 +120,8 @@ class _Worker:
         """Send what has no answer."""
         try:
             self._pipe.send(request)
+        except BlockingIOError as fault:
+            raise self._stalled(_STALL_S) from fault
         except OSError as fault:
             raise self._ended() from fault
 
@@ -127,7 +153,7 @@ class _Worker:
         total = sum(sizes)
         if total > _ROOM_BYTES:
             raise EvlcpError(
-                f"a frame of {total} bytes of events; a worker takes {_ROOM_BYTES}: use one core"
+                f"a frame has {total} bytes of events, a worker takes {_ROOM_BYTES}: use one core"
             )
         begin = self._next if self._next + total <= _ROOM_BYTES else 0
         room = range(begin, begin + total)
@@ -137,17 +163,13 @@ class _Worker:
         for (start_us, events), size in zip(pieces, sizes, strict=True):
             many = events.t_us.size
             where.append((start_us, begin, many))
-            columns = _columns_at(self._memory, begin, many)
-            columns[0][:], columns[1][:], columns[2][:], columns[3][:] = (
-                events.t_us,
-                events.x,
-                events.y,
-                events.p,
-            )
+            columns = events.t_us, events.x, events.y, events.p
+            for into, column in zip(_columns_at(self._memory, begin, many), columns, strict=True):
+                into[:] = column
             begin += size
         return where, room
 
-    def receive(self, within_s: float = _STALL_S) -> Any:
+    def receive(self, within_s: float) -> Any:
         """The next answer.
 
         Raises:
@@ -155,8 +177,7 @@ class _Worker:
         """
         try:
             if not _poll(self._pipe, within_s):
-                self._process.kill()
-                raise EvlcpError(f"{self._name} did not answer for {within_s:g} s, and was ended")
+                raise self._stalled(within_s)
             answer = self._pipe.recv()
         except (OSError, EOFError) as fault:
             raise self._ended() from fault
@@ -171,12 +192,17 @@ class _Worker:
         self._process.join()
 
     def _receive_oldest(self) -> None:
-        self._open[0][1].append(self.receive())
+        self._open[0][1].append(self.receive(_STALL_S))
         self._open.popleft()
 
     @property
     def _name(self) -> str:
         return f"{self._process.name} of the receiver, process {self._process.pid},"
+
+    def _stalled(self, for_s: float) -> EvlcpError:
+        """It does nothing, and is ended."""
+        self._process.kill()
+        return EvlcpError(f"{self._name} did not answer for {for_s:g} s, and was ended: receive again")
 
     def _ended(self) -> EvlcpError:
         """It has ended, and how."""
@@ -244,7 +270,7 @@ def _work(pipe: Connection, memory: Any, links: Mapping[str, Link]) -> None:
     try:
         bars = {name: BarDecoder(FrameDecoder(link)) for name, link in links.items()}
         for link in links.values():
-            _load_kernels(link)
+            load_kernels(link)
         pipe.send(None)
         while True:
             _poll(pipe, None)
@@ -283,7 +309,7 @@ def _measure_spread(found: FrameResult | None) -> None:
         found.reading.spread()
 
 
-def _load_kernels(link: Link) -> None:
+def load_kernels(link: Link) -> None:
     """Decode two frames of a drawn bar, a clear one and one of few events: takes a second, the first time."""
     book, rng = link.codebook, np.random.default_rng(0)
     layout = layout_of(link.bar.cluster_centres_m())
@@ -315,4 +341,6 @@ def _load_kernels(link: Link) -> None:
         region.size_px = ends
         region.add(round(due.start_us), some)
         bars.put(0, decoder.first_state())
-        _measure_spread(bars.decode(0, FrameJob(region, due, None, ranged=True))())
+        # An algorithm that fails here and with no frame of a camera is no matter.
+        with suppress(PluginError):
+            _measure_spread(bars.decode(0, FrameJob(region, due, None, ranged=True))())

@@ -1,0 +1,129 @@
+"""Bars that other processes decode: the same results, and an end that names the process."""
+
+import multiprocessing
+import os
+import signal
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import pytest
+from rx_streams import LINK, frames_of, noise_events, received, said
+
+from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError
+from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.plugin.hooks import hookimpl
+from evlcp_sdk.plugin.registry import Registry
+from evlcp_sdk.rx import workers
+from evlcp_sdk.rx.receiver import Receiver
+from evlcp_sdk.rx.workers import load_kernels
+from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
+from evlcp_sdk.values import Frame, FrameView, Range
+
+OWN = ideal_events(LINK, IdealBar(random_symbols(LINK, 3), ppm=50, shake_px=6, shake_hz=12))
+OTHER = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1), 900.7, 300.2, start_us=19_350))
+EVENTS = merged(OWN, OTHER, noise_events(20_000, 120_000))
+
+
+@dataclass(frozen=True)
+class Broken:
+    """A ranging that measures nothing but fails."""
+
+    def compile(self, *_given: Any) -> Callable[[FrameView], Range]:
+        return fail
+
+
+def fail(view: FrameView) -> Range:
+    raise ZeroDivisionError("boom")
+
+
+def test_the_same_whoever_decodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Frames, counts and order, of two links, where memory for events is short."""
+    links: list[Link] = [LINK, replace(load_link(overrides=["modulation.id=wh8"]), name="wh8")]
+    monkeypatch.setattr(workers, "_ROOM_BYTES", 1 << 20)
+    for link in (LINK, links):
+        outcomes = []
+        for many in (1, 3):
+            told: list[Frame] = []
+            receiver, packets = received(link, EVENTS, (40_000,), on_frame=told.append, workers=many)
+            frames = [(p.t_us, p.link, p.echo_of, [said(f) for f in p.frames]) for p in packets]
+            outcomes.append((frames, receiver.counts, sorted(said(f)[1:] for f in told)))
+        assert outcomes[0] == outcomes[1]
+        assert len(frames_of(packets)) >= 50
+    assert not any(child.name in ("worker 1", "worker 2") for child in multiprocessing.active_children())
+
+
+@pytest.mark.parametrize("begun", [40_000, 1_500_000])
+@pytest.mark.parametrize(
+    ("sent", "says"),
+    [(signal.SIGKILL, "ended by SIGKILL"), (signal.SIGSTOP, "did not answer for 0.5 s, and was ended")],
+)
+def test_a_worker_that_ends_or_stalls_is_named(
+    monkeypatch: pytest.MonkeyPatch, sent: signal.Signals, says: str, begun: int
+) -> None:
+    """Before it has a bar, and among frames."""
+    monkeypatch.setattr(workers, "_STALL_S", 0.5)
+    receiver = Receiver(LINK, workers=2)
+    (child,) = multiprocessing.active_children()
+    receiver.feed(EVENTS[:begun])
+    assert child.pid is not None
+    os.kill(child.pid, sent)
+    with pytest.raises(EvlcpError, match=f"^worker 1 of the receiver, process {child.pid}, {says}"):
+        receiver.feed(EVENTS[begun:])
+    child.join(10)
+    assert child.exitcode == -signal.SIGKILL
+
+
+def test_what_fails_in_a_worker_is_named() -> None:
+    """As it is where it runs here."""
+    broken = LINK.with_algorithm("ranging", Broken(), id="broken")
+    for many in (1, 2):
+        with pytest.raises(PluginError, match=r"^ranging algorithm .broken.: ZeroDivisionError: boom"):
+            received(broken, EVENTS, workers=many)
+
+
+def test_what_cannot_be() -> None:
+    with pytest.raises(ConfigError, match=r"^workers: 0, expected 1 or more"):
+        Receiver(LINK, workers=0)
+
+    class Listens:
+        @hookimpl
+        def evlcp_stage_finished(self) -> None: ...
+
+    with pytest.raises(ConfigError, match=r"^workers: 2, expected 1, as a plugin has evlcp_stage_finished"):
+        Receiver(LINK, Registry.load(Listens()).hook, workers=2)
+    local = LINK.with_algorithm("ranging", type("Local", (Broken,), {})(), id="local")
+    with pytest.raises(ConfigError, match=r"^workers: an algorithm cannot be sent to another process"):
+        Receiver(local, workers=2)
+    lamp = load_link(
+        overrides=[
+            "bar.rows=6",
+            "bar.columns=1",
+            "bar.cluster_rows=6",
+            "bar.cluster_columns=1",
+            "framing.id=uart",
+        ]
+    )
+    before = multiprocessing.active_children()
+    Receiver(lamp, workers=2)
+    assert multiprocessing.active_children() == before, "a lamp's characters are not shared"
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [
+        ["modulation.id=nrz"],
+        ["modulation.id=ppm"],
+        ["bar.shape=ring"],
+        ["bar.rows=24", "bar.columns=2", "bar.led_pitch_m=0.04", "bar.cluster_rows=3"],
+        ["ranging.id=poc", "decoding.id=wh-transform"],
+    ],
+)
+def test_kernels_are_loaded_by_frames_that_are_read(
+    monkeypatch: pytest.MonkeyPatch, overrides: list[str]
+) -> None:
+    """Or else most would be loaded with the first frame of a stream."""
+    read = []
+    monkeypatch.setattr(workers, "_measure_spread", read.append)
+    load_kernels(link := load_link(overrides=overrides))
+    assert read[0].reading.soft.symbols.tolist() == list(range(link.codebook.clusters))
