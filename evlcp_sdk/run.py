@@ -323,31 +323,20 @@ def live(
     registry = Registry.load() if registry is None else registry
     links = load_links(link, registry=registry)
     publisher = Publisher() if publisher is None else publisher
-    loop: LiveLoop
-
-    def start() -> Receiver:
-        if warm:
-            warm_up(links, positions=plan is not None)
-        return Receiver(
-            links,
-            registry.hook,
-            attitude=attitude,
-            clock_zero=clock_zero,
-            on_frame=lambda frame: loop.frame(frame),
-            workers=workers,
-        )
-
     try:
         # A recording waits for its reader, and what is wrong with its name is said at once.
         waits = not isinstance(source, EventSource) and is_recording(source)
-        receiver = None if waits else start()
+        if warm and not waits:
+            warm_up(links, positions=plan is not None)
         opened = open_until(source, registry, stopped)
         if not opened.live and opened.size_bytes is not None:
             opened = ReplaySource(opened)
         with opened:
             url = _name_of(source, opened)
             check_sensor(opened, url, links[0].camera)
-            receiver = receiver or start()
+            if warm and waits:
+                warm_up(links, positions=plan is not None)
+            loop: LiveLoop
             with ResultWriter(
                 folder,
                 links,
@@ -360,6 +349,14 @@ def live(
                 lines=lines,
                 placed=lambda placed: loop.placed(placed),
             ) as writer:
+                receiver = Receiver(
+                    links,
+                    registry.hook,
+                    attitude=attitude,
+                    clock_zero=clock_zero,
+                    on_frame=lambda frame: loop.frame(frame),
+                    workers=workers,
+                )
                 pulses = clock_zero if isinstance(clock_zero, PulseClock) else None
                 loop = LiveLoop(opened, receiver, links, publisher, budget, pulses=pulses)
                 ends = loop.close, _say_nothing, stopped, loop.summary

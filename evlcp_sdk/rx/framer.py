@@ -3,10 +3,10 @@
 import math
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import Any, ClassVar
 
 from evlcp_sdk.clock import CameraClock, TimeStep
 from evlcp_sdk.errors import EvlcpError, PluginError
@@ -16,9 +16,6 @@ from evlcp_sdk.rx.regions import Followed
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.utc import ClockZero
 from evlcp_sdk.values import Frame, Region, SyncLock, changed
-
-if TYPE_CHECKING:
-    from evlcp_sdk.rx.workers import Workers
 
 _MOST_LIT = 1024
 """Transmitters that are remembered: those seen last."""
@@ -92,7 +89,7 @@ class StreamContext:
         announcer: Announces finished stages; None where nobody listens.
         limits: How much each link holds at the most.
         numbers: Where the numbers of transmitters come from.
-        workers: Processes that decode frames; None where this one does.
+        bars: Decoders of a link's known bars, by its name, see `reading.Bars`; None for this process.
     """
 
     clock: CameraClock
@@ -101,7 +98,7 @@ class StreamContext:
     announcer: Announcer | None = None
     limits: Limits = LIMITS
     numbers: Iterator[int] = field(default_factory=count)
-    workers: "Workers | None" = None
+    bars: Callable[[str], Sequence[Any]] | None = None
 
 
 class Framer(ABC):

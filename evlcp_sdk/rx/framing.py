@@ -552,7 +552,7 @@ class PacketFraming(Framer):
             link, "synchronization", link.codebook, link.packet, methods=("init", "step")
         )
         self._decoder, self._aligner = decoder, decoder.aligner
-        self._bars: Sequence[Bars] = stream.workers.bars(name) if stream.workers else [BarDecoder(decoder)]
+        self._bars: Sequence[Bars] = [BarDecoder(decoder)] if stream.bars is None else stream.bars(name)
         self._pending: deque[PendingFrame] = deque()
         self._regions, self._follower = regions, follower
         self._name = name

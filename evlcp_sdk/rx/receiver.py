@@ -95,7 +95,8 @@ class Receiver:
             announcer = Announcer(hook.evlcp_stage_finished, clock.camera_us)
         self._workers = Workers.beside(links, workers, announced=announcer is not None)
         known = attitude_source(attitude), clock_zero
-        stream = StreamContext(clock, *known, announcer, limits, workers=self._workers)
+        bars = None if self._workers is None else self._workers.bars
+        stream = StreamContext(clock, *known, announcer, limits, bars=bars)
         self._early = EarlyFrames(on_frame)
         self._several: SeveralLinks | None = None
         if len(links) == 1:

@@ -24,7 +24,7 @@ from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.framing import PacketGrid
+from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.reading import BarDecoder, BarState, FrameDecoder, FrameJob, FrameResult
 from evlcp_sdk.rx.regions import EVENT_BYTES, Followed, Places
@@ -74,7 +74,7 @@ class Workers:
             EvlcpError: One does not start.
         """
         if processes < 1 or (processes > 1 and announced):
-            why = ", as a plugin has evlcp_stage_finished()" if announced else " or more"
+            why = ", as a sink or plugin follows the stages" if announced and processes > 0 else " or more"
             raise ConfigError(f"workers: {processes}, expected 1{why}")
         shared = {name: link for name, link in links.items() if _decodes_frames(link)}
         return cls(shared, processes - 1) if processes > 1 and shared else None
@@ -323,11 +323,12 @@ def load_kernels(link: Link) -> None:
     cluster, chip = np.nonzero(edges)
     shape = len(chip), places[0].size
     ends = np.ptp(centres.real) + _DRAWN_PX, np.ptp(centres.imag) + _DRAWN_PX
-    grid = PacketGrid(link.packet, book.chips_after)
-    grid.restart(SyncLock(0.0, link.packet.chip_us, 0.0, 0.0, 1.0), 0.0)
-    due = grid.next
-    assert due is not None
-    t_us = due.start_us + (chip[:, None] + rng.uniform(0.1, 0.9, shape)) * link.packet.chip_us
+    chip_us, many = link.packet.chip_us, chips.shape[1]
+    lock, end_us = SyncLock(0.0, chip_us, 0.0, 0.0, 1.0), many * chip_us
+    middle_us = link.packet.pilot_chips // 2 * chip_us
+    read_us = end_us + book.chips_after * chip_us
+    due = DueFrame(0, 0, 0, many, True, 0.0, 0.0, end_us, lock, read_us, middle_us)
+    t_us = (chip[:, None] + rng.uniform(0.1, 0.9, shape)) * chip_us
     pixels = places.reshape(book.clusters, -1)[cluster]
     columns = t_us, pixels.real, pixels.imag, np.broadcast_to(edges[cluster, chip][:, None] > 0, shape)
     order = np.argsort(t_us, axis=None)
@@ -339,7 +340,7 @@ def load_kernels(link: Link) -> None:
             0, Places([Region(0, t, middle.real, middle.imag, *ends) for t in (0.0, due.end_us)]), 0
         )
         region.size_px = ends
-        region.add(round(due.start_us), some)
+        region.add(0, some)
         bars.put(0, decoder.first_state())
         # An algorithm that fails here and with no frame of a camera is no matter.
         with suppress(PluginError):

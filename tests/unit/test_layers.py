@@ -118,7 +118,7 @@ RX = (
     {"points", "spread"},
     {"alignment"},
     {"reflections", "reading"},
-    {"plugin_framing", "framing"},
+    {"plugin_framing", "framing", "workers"},
     {"multi"},
     {"receiver"},
 )

@@ -90,7 +90,7 @@ def test_what_cannot_be() -> None:
         @hookimpl
         def evlcp_stage_finished(self) -> None: ...
 
-    with pytest.raises(ConfigError, match=r"^workers: 2, expected 1, as a plugin has evlcp_stage_finished"):
+    with pytest.raises(ConfigError, match=r"^workers: 2, expected 1, as a sink or plugin follows the stages"):
         Receiver(LINK, Registry.load(Listens()).hook, workers=2)
     local = LINK.with_algorithm("ranging", type("Local", (Broken,), {})(), id="local")
     with pytest.raises(ConfigError, match=r"^workers: an algorithm cannot be sent to another process"):
