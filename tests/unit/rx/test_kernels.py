@@ -34,6 +34,16 @@ def rhythm_of(pixels, chip_us=CHIP_US, min_score=8):
     return rhythm
 
 
+@pytest.mark.parametrize("before", [0, 2**15 - 9])
+def test_hits_of_a_cell_stop_at_what_they_hold(before):
+    hits, pixels = np.full((4, 6), before, np.int16), states(np.full((HEIGHT, WIDTH), -200), 3, 20)
+    v, u = np.indices((4, 4)).reshape(2, -1)
+    rises = Events.of(np.zeros(16), u, v, np.ones(16))
+    assert rhythm_of(pixels).step(0, rises, hits, 2) == 16
+    assert hits[0, 0] == min(before + 16, 2**15 - 1)
+    assert (hits.ravel()[1:] == before).all()
+
+
 @pytest.mark.parametrize("chip_us", [50.0, 100.0, 333.3, 1e5, 2e6])
 def test_times_count_alike_at_every_chip_rate(chip_us):
     """A clock of ticks longer than a microsecond serves slow chips."""
