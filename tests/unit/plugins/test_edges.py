@@ -1,4 +1,4 @@
-"""Codes of any chips: their words, and separation and decoding by edges against plain twins and in scenes."""
+"""Codes of any chips: their words, and separation by edges against Bayes' rule, and decoding in scenes."""
 
 import itertools
 

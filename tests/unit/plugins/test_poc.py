@@ -1,4 +1,4 @@
-"""Ranging by phase-only correlation: kernels against twins, exact shifts, ideal images."""
+"""Ranging by phase-only correlation: peaks by brute force, exact shifts, ideal images."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Walsh-Hadamard separation and decoding: kernels against twins; what was sent comes back."""
+"""Walsh-Hadamard separation and decoding: against Bayes' rule and brute force; what was sent comes back."""
 
 from dataclasses import replace
 
@@ -125,7 +125,7 @@ def presence_of(rng, clusters, rows, columns, grid):
     return PresenceMap(probability, grid, probability > 0.5, np.zeros(0, np.float32))
 
 
-# Kernels
+# Separation
 
 
 @pytest.mark.parametrize("shape", [(5, 4), (2, 2), (0, 3), (33, 7)])
@@ -140,9 +140,6 @@ def test_presence_is_bayes_rule(shape, grid, density):
     assert_allclose(found.probability, want, rtol=1e-5, atol=2e-9)
     assert found.probability.shape == (CLUSTERS, shape[0] // grid, shape[1] // grid)
     assert_array_equal(found.selected, found.probability >= 0.5)
-
-
-# Separation
 
 
 # Decoding
