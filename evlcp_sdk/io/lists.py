@@ -48,13 +48,9 @@ Read = Callable[[Path, ExitStack, Fields | None], EventTable]
 def open_list(url: Path | str, read: Read | None = None) -> ColumnSource:
     """A table of times and polarities of events, and of places where it has them; see `ColumnSource`.
 
-    CSV (`,` `;` `|` tab or blanks, UTF-8 or UTF-16, plain or gzipped, `#` `%` `//` before comments, up to
-    ten lines of titles above), NPZ of arrays, of one structured or (n, 2) or (n, 4) array, and NPY of
-    such a one. Columns are known by their names, or else by their values; the unit of the times by their name
-    (`t_us`, `time [ms]`) or a line of units below. Without places every event is of pixel (0, 0).
-
-    An NPZ file of `t_us`, `x`, `y`, `p` may have the numbers `width` and `height`, and external triggers
-    in `trigger_t_us`, `trigger_channel`, `trigger_value`, by rising time.
+    Text, NPZ and NPY are read as `docs/cli.md` says. Without places every event is of pixel (0, 0). An NPZ
+    file of `t_us`, `x`, `y`, `p` may have the numbers `width` and `height`, and external triggers in
+    `trigger_t_us`, `trigger_channel`, `trigger_value`, by rising time.
 
     Args:
         url: The file; or `list:PATH`, with `?columns=t,p`, `unit=ms` and `inverted=1` (the larger polarity is

@@ -58,16 +58,13 @@ class LoopSource(WrappingSource):
 
     Args:
         opened: Opens the recording.
-        seam_us: Time between the last event of a pass and the first of the next one, us.
         for_us: Ends with the pass in which so much time is over, us; None: never.
     """
 
-    def __init__(
-        self, opened: Callable[[], EventSource], seam_us: int = SEAM_US, for_us: float = math.inf
-    ) -> None:
+    def __init__(self, opened: Callable[[], EventSource], for_us: float = math.inf) -> None:
         super().__init__(opened())
         self.live = self._source.live
-        self._opened, self._seam_us, self._for_us = opened, seam_us, for_us
+        self._opened, self._for_us = opened, for_us
         self._shift_us = 0
         self._start_us: int | None = None
         self._last_us = 0
@@ -87,7 +84,7 @@ class LoopSource(WrappingSource):
         if self._start_us is None:
             self._start_us = first_us
         elif begins:
-            self._shift_us = self._last_us + self._seam_us - first_us
+            self._shift_us = self._last_us + SEAM_US - first_us
         self._last_us = last_us + self._shift_us
         if not self._shift_us:
             return piece

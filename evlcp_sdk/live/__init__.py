@@ -5,21 +5,8 @@ source --reader (a thread)--> slices --LiveLoop--> receiver --> Publisher --> Su
                                                      +-> PictureSlot (drawn when asked for, the newest only)
 ```
 
-How a viewer, a server or a recorder joins, from threads of its own:
-
-```
-publisher = Publisher()
-mine = publisher.subscribe({"frame", "message", "fix", "status"}, most=1000, wake=wake_my_loop)
-threading.Thread(target=run.live, args=("replay:REC.raw",), kwargs={"publisher": publisher})
-for news in mine.take(timeout_s=1.0):     # [] after the time-out; mine.ended once all is said
-    news.kind, news.t_us, news.value, news.late_ms
-picture = publisher.pictures.take(timeout_s=0.5)    # asks for one, and waits for it; None after the time-out
-```
-
-The loop never waits for a subscriber: of a queue that is full the oldest go, counted in
-`Subscription.dropped`. `run.live` may as well have the main thread, and listeners threads of their own;
-`wake` is called in the loop's thread and must return at once, as `loop.call_soon_threadsafe` does.
-What is published:
+How a viewer, a server or a recorder listens, from threads of its own, is in `docs/live.md`. A picture is
+drawn for whoever asks: `publisher.pictures.take(timeout_s=0.5)`. What is published:
 
 | kind | value | when |
 |---|---|---|

@@ -39,7 +39,7 @@ class NavSat(Sink):
         latitude, longitude, height = place
         message = self._bag.make(
             "sensor_msgs/msg/NavSatFix",
-            header=self._bag.header(stamp_ns, "camera"),
+            header=self._bag.header(stamp_ns),
             status=self._bag.make("sensor_msgs/msg/NavSatStatus", status=status, service=0),
             latitude=float(latitude),
             longitude=float(longitude),

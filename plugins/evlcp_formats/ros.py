@@ -47,10 +47,10 @@ class RosBag:
         """A message, or a part of one, of a type."""
         return self._store.types[kind](**values)
 
-    def header(self, at_ns: int, frame_id: str) -> Any:
-        """The header of a message."""
+    def header(self, at_ns: int) -> Any:
+        """The header of a message of the camera's."""
         stamp = self.make("builtin_interfaces/msg/Time", sec=at_ns // 10**9, nanosec=at_ns % 10**9)
-        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id=frame_id)
+        return self.make("std_msgs/msg/Header", stamp=stamp, frame_id="camera")
 
     def write(self, topic: str, message: Any, at_ns: int) -> None:
         """Write a message; the topic is of its type from the first one on."""
@@ -114,7 +114,7 @@ class EventBagWriter(EventWriter):
         words = b"".join(self._encoder.encode(events, triggers))
         message = self._bag.make(
             EVENT_PACKET,
-            header=self._bag.header(end_us * 1000, "camera"),
+            header=self._bag.header(end_us * 1000),
             height=self.height,
             width=self.width,
             seq=self._seq,

@@ -152,10 +152,10 @@ def test_a_loop_goes_on_with_its_clock(tmp_path: Path) -> None:
     table = {"t_us": [1000, 2000, 3000, 4000], "x": [1, 2, 700, 3], "y": [0] * 4, "p": [1] * 4}
     edge = {"trigger_t_us": [4500], "trigger_channel": [1], "trigger_value": [1]}
     np.savez(tmp_path / "a.npz", width=640, height=480, **table, **edge)
-    with LoopSource(lambda: open_source(tmp_path / "a.npz"), seam_us=500, for_us=8000) as source:
+    with LoopSource(lambda: open_source(tmp_path / "a.npz"), for_us=600_000) as source:
         got, triggers = source.read()
-    assert got.t_us.tolist() == [1000, 2000, 4000, 5000, 6000, 8000, 9000, 10000, 12000]
+    assert got.t_us.tolist() == [shift + t for shift in (0, 503_500, 1_007_000) for t in (1000, 2000, 4000)]
     assert got.x.tolist() == [1, 2, 3] * 3
-    assert triggers.t_us.tolist() == [4500, 8500, 12500]
+    assert triggers.t_us.tolist() == [4500, 508_000, 1_011_500]
     assert source.counts == {"events": 9, "triggers": 3}
     assert source.losses["outside_sensor"].count == 3
