@@ -61,11 +61,7 @@ _NEXT_STEPS: Final = (
 
 
 def open_camera(url: str) -> "CameraSource":
-    """Open `camera:`, or `camera:SERIAL`, with options as `camera:?diff_on=20&events_per_s=2e7`.
-
-    Biases by the driver's names are relative to the camera's own, of an EVK4; `events_per_s` limits the rate
-    on the chip; `area=X,Y,W,H` (more of them apart by `;`) masks all rows and columns outside; `trigger=0`
-    turns its trigger input off.
+    """Open `camera:`, or `camera:SERIAL`, with the options that `docs/live.md` has.
 
     Raises:
         ConfigError: The extra is not installed, or an option is not known or out of its bounds.

@@ -1,7 +1,4 @@
-"""`fixes.mcap`: what a run finds as MCAP with well-known schemas, as it comes.
-
-`examples/foxglove-layout.json` is a layout of Foxglove that shows all of it.
-"""
+"""`fixes.mcap`: what a run finds as MCAP with well-known schemas, as it comes."""
 
 import json
 import math
@@ -44,17 +41,7 @@ _FRAME = {
 
 
 class Mcap(Sink):
-    """Writes `fixes.mcap`, message by message.
-
-    `/fix` (foxglove.LocationFix) and `/pose` (foxglove.PoseInFrame, camera axes in ENU) hold each fix as it
-    was measured, `/pose` those of bars; `/track` (foxglove.LocationFix) the filtered position at its time;
-    `/integrity` (google.protobuf.Struct) protection levels, what was left out and alarms, of refused fixes,
-    too; `/scene` (foxglove.SceneUpdate) the bars in the local axes.
-
-    Of what the camera sees, 25 times a second of its clock, `/image` (foxglove.CompressedImage, PNG) holds
-    the events of 10 ms, and `/regions` (foxglove.ImageAnnotations) the regions of that time; `/frames` (JSON,
-    as lines of `--json-lines`) each frame.
-    """
+    """Writes `fixes.mcap`, message by message; its topics and their types are in `docs/outputs.md`."""
 
     def __init__(self, folder: ResultFolder, run: Run) -> None:
         from mcap.writer import Writer
