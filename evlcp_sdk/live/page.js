@@ -12,7 +12,7 @@ const distances = new Map();
 // No number is "-0.00".
 const fixed = (value, n) => value.toFixed(n).replace(/^-(?=[0.]+$)/, "");
 const ms = (us) => fixed(us / 1e3, 1);
-const cell = (row, text) => { const td = row.insertCell(); td.textContent = text; return td; };
+const make = (tag, ...inside) => { const made = document.createElement(tag); made.append(...inside); return made; };
 const meters = (news, n) => (news && news.ranged ? fixed(news.ranged.distance_m, n) : "-");
 const colour = (bar) => about.colours[bar % about.colours.length];
 const digits = (value, n) => (value === null || value === undefined ? "-" : fixed(value, n));
@@ -144,8 +144,7 @@ function drawZooms() {
   }
   for (const bar of near) {
     if (!zooms.has(bar.transmitter)) {
-      const figure = document.createElement("figure");
-      figure.append(document.createElement("canvas"), document.createElement("figcaption"));
+      const figure = make("figure", make("canvas"), make("figcaption"));
       by("zooms").append(figure);
       zooms.set(bar.transmitter, figure);
     }
@@ -294,20 +293,24 @@ function drawMap() {
 // Words and numbers
 
 function tile(label, value, unit, note) {
-  const div = document.createElement("div"), name = document.createElement("span"), b = document.createElement("b");
-  div.className = "tile"; name.textContent = label; b.textContent = value;
-  if (unit) { const small = document.createElement("small"); small.textContent = ` ${unit}`; b.append(small); }
-  div.append(name, b);
-  if (note) { const small = document.createElement("small"); small.textContent = note; div.append(small); }
+  const number = make("b", value, ...(unit ? [make("small", ` ${unit}`)] : []));
+  const div = make("div", make("span", label), number, ...(note ? [make("small", note)] : []));
+  div.className = "tile";
   return div;
 }
 
 function fill(id, rows) {
-  by(id).replaceChildren(...rows.map((texts) => {
-    const row = document.createElement("tr");
-    for (const text of texts) cell(row, text);
-    return row;
-  }));
+  by(id).replaceChildren(...rows.map((cells) => make("tr", ...cells.map((one) => make("td", one)))));
+}
+
+function symbols(news) {
+  const most = Math.max(about.links[news.link || ""].symbols - 1, 1), all = document.createDocumentFragment();
+  for (const symbol of news.symbols) {
+    const i = make("i", symbol === null ? "-" : symbol);
+    if (symbol === null) i.className = "none"; else i.style.setProperty("--hue", Math.round(300 * symbol / most));
+    all.append(i, " ");
+  }
+  return all;
 }
 
 function drawWords() {
@@ -343,22 +346,8 @@ function drawWords() {
   by("alarm").textContent = alarms.join(" ");
   by("alarm").hidden = !alarms.length;
 
-  const frames = document.createDocumentFragment();
-  for (const news of [...rows].reverse()) {
-    const row = document.createElement("tr");
-    for (const text of [ms(news.t_us), news.transmitter, news.packet, news.frame, digits(news.distance_m, 2),
-      fixed(news.quality, 2)]) cell(row, text);
-    const td = cell(row, "");
-    for (const symbol of news.symbols) {
-      const i = document.createElement("i");
-      i.textContent = symbol === null ? "-" : symbol;
-      if (symbol === null) i.className = "none";
-      else i.style.setProperty("--hue", Math.round(300 * symbol / Math.max(about.links[news.link || ""].symbols - 1, 1)));
-      td.append(i, " ");
-    }
-    frames.append(row);
-  }
-  by("frames").replaceChildren(frames);
+  fill("frames", [...rows].reverse().map((news) => [ms(news.t_us), news.transmitter, news.packet, news.frame,
+    digits(news.distance_m, 2), fixed(news.quality, 2), symbols(news)]));
 
   fill("messages", messages.map((one) =>
     [fixed(one.t_us / 1e6, 2), one.transmitter, one.transmitter_id, one.kind, one.trust, said(one)]));
