@@ -31,32 +31,25 @@ def info(
 def _text(table: dict[str, Any]) -> str:
     from evlcp_sdk.io.describe import RATE_WINDOW_US
 
-    def line(name: str, value: str) -> str:
-        return f"{name:<11}{value}"
-
     size = "" if table["bytes"] is None else f", {table['bytes']:,} bytes"
     sensor = "of unknown size" if table["width"] is None else f"{table['width']} x {table['height']}"
-    lines = [line("recording", table["path"]), line("format", f"{table['format']}{size}")]
-    lines.append(line("sensor", sensor))
-    lines += [
-        line("header" if i == 0 else "", f"{k} {v}") for i, (k, v) in enumerate(table["header"].items())
-    ]
+    rows = {
+        "recording": [table["path"]],
+        "format": [f"{table['format']}{size}"],
+        "sensor": [sensor],
+        "header": [f"{name} {value}" for name, value in table["header"].items()],
+    }
     if table["first_us"] is None:
-        lines.append(line("events", "none"))
+        rows["events"] = ["none"]
     else:
-        lines.append(
-            line(
-                "time", f"{table['duration_s']:.6f} s, from {table['first_us']:,} to {table['last_us']:,} us"
-            )
-        )
+        span = f"from {table['first_us']:,} to {table['last_us']:,} us"
+        rows["time"] = [f"{table['duration_s']:.6f} s, {span}"]
         share = f"{table['positive_share']:.0%} positive"
-        lines.append(line("events", f"{table['counts']['events']:,}, {share}"))
+        rows["events"] = [f"{table['counts']['events']:,}, {share}"]
         mean = "-" if table["events_per_s"] is None else f"{table['events_per_s'] / 1e6:.3f}"
         peak = f"{table['peak_events_per_s'] / 1e6:.3f}"
-        lines.append(line("rate", f"{mean} Mev/s, at most {peak} Mev/s over {RATE_WINDOW_US / 1e3:.0f} ms"))
-    triggers = [f"channel {t['channel']} {t['edge']}: {t['count']:,}" for t in table["triggers"]] or ["none"]
-    lines += [line("triggers" if i == 0 else "", text) for i, text in enumerate(triggers)]
-    lines += [
-        line("anomalies" if i == 0 else "", text) for i, text in enumerate(table["anomalies"] or ["none"])
-    ]
-    return "\n".join(lines)
+        rows["rate"] = [f"{mean} Mev/s, at most {peak} Mev/s over {RATE_WINDOW_US / 1e3:.0f} ms"]
+    triggers = [f"channel {t['channel']} {t['edge']}: {t['count']:,}" for t in table["triggers"]]
+    rows |= {"triggers": triggers or ["none"], "anomalies": table["anomalies"] or ["none"]}
+    lines = ((name if not i else "", text) for name, texts in rows.items() for i, text in enumerate(texts))
+    return "\n".join(f"{name:<11}{text}" for name, text in lines)
