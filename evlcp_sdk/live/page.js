@@ -72,16 +72,6 @@ function take(news) {
   }
 }
 
-function said(message) {
-  for (const key of ["text", "data", "time", "signal"]) if (message[key] !== undefined) return String(message[key]);
-  if (message.latitude_deg !== undefined) {
-    return `${fixed(message.latitude_deg, 7)}, ${fixed(message.longitude_deg, 7)} deg, ${fixed(message.height_m, 2)} m`;
-  }
-  const known = ["line", "kind", "transmitter", "packet", "t_us", "transmitter_id", "sequence", "verified", "trust",
-    "reason", "age_s"];
-  return JSON.stringify(Object.fromEntries(Object.entries(message).filter(([key]) => !known.includes(key))));
-}
-
 // The image, and each bar close by
 
 const image = by("image").querySelector("canvas"), caption = by("image").querySelector("figcaption");
@@ -350,7 +340,7 @@ function drawWords() {
     digits(news.distance_m, 2), fixed(news.quality, 2), symbols(news)]));
 
   fill("messages", messages.map((one) =>
-    [fixed(one.t_us / 1e6, 2), one.transmitter, one.transmitter_id, one.kind, one.trust, said(one)]));
+    [fixed(one.t_us / 1e6, 2), one.transmitter, one.transmitter_id, one.kind, one.trust, one.said]));
   by("silent").hidden = messages.length > 0;
 
   const lost = [];

@@ -18,6 +18,9 @@ from evlcp_sdk.results.packets_jsonl import message_line
 from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.values import Fix, Frame, ReceivedMessage
 
+_MOST_SAID: Final = 200
+"""Characters of a message that are shown."""
+
 _LATEST_US: Final = 500_000
 _MOST_BARS: Final = 64
 """A bar is drawn as its newest frame shows it, for so long, and so many of them."""
@@ -112,8 +115,8 @@ def _shown(message: ReceivedMessage) -> dict[str, Any]:
     except (PluginError, ValueError) as fault:
         about = {name: getattr(message, name) for name in ("transmitter", "t_us", "trust")}
         ids = {"kind": message.kind.name, "transmitter_id": message.message.transmitter_id}
-        return {**about, **ids, "text": f"cannot be shown: {fault}"}
-    return shown
+        return {**about, **ids, "said": f"cannot be shown: {fault}"}
+    return shown | {"said": message.said(_MOST_SAID)}
 
 
 def _not_a_number(name: str) -> None:

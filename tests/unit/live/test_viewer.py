@@ -237,8 +237,8 @@ def test_a_message_that_cannot_be_shown_says_why(stage: Stage) -> None:
         while len(lines) < 3:
             lines += next_of(link)[0]["news"]
     assert [line["line"] for line in lines] == ["message"] * 3
-    assert "to_dict() fails: ZeroDivisionError: by nothing" in lines[0]["text"]
-    assert lines[1]["text"] == "cannot be shown: a message kind shows NaN, which JSON has not"
+    assert "to_dict() fails: ZeroDivisionError: by nothing" in lines[0]["said"]
+    assert lines[1]["said"] == "cannot be shown: a message kind shows NaN, which JSON has not"
     assert lines[2]["text"] == "read me"
 
 
