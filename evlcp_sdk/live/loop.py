@@ -29,10 +29,6 @@ _END_TO_END: Final = "end_to_end"
 
 _STATUS_EVERY_S: Final = 0.2
 _IDLE_S: Final = 0.05
-_HELD_EVENTS: Final = 1 << 16
-_HELD_PIECES: Final = 64
-"""How many events are handed on together, unless there is a packet."""
-
 _TURN_EVENTS: Final = 1 << 16
 _TURN_US: Final = 8_000
 """How much is taken at once where slices wait."""
@@ -116,7 +112,7 @@ class LiveLoop:
         self._status_events = 0
 
     def run(self, stopped: Stopped) -> Iterator[tuple[Events, list[Packet]]]:
-        """Yield what is received: the events that the receiver got, some pieces together, and its packets.
+        """Yield what is received: the events that the receiver got, and its packets.
 
         The listeners have had the frames, packets and messages by then. Ends where the source ends, or when
         `stopped`; what waits then is still received where the source has ended.
@@ -126,24 +122,14 @@ class LiveLoop:
         """
         self._start_s = self._status_s = self._taken_s = time.monotonic()
         self._reader.start()
-        held: list[Events] = []
-        many = 0
         try:
             while not stopped():
                 piece = self._reader.take(_IDLE_S)
                 if piece is None and self._reader.ended:
                     break
                 if piece is not None:
-                    events, packets = self._turn(piece)
-                    held.append(events)
-                    many += len(events)
-                    # What is tallied of events takes as long for few as for many.
-                    if packets or many > _HELD_EVENTS or len(held) == _HELD_PIECES:
-                        yield Events.concat(held), packets
-                        held, many = [], 0
+                    yield self._turn(piece)
                 self._tell_status()
-            if held:
-                yield Events.concat(held), []
         finally:
             self._reader.stop()
         if self._reader.fault is not None and not stopped():
