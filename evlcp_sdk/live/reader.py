@@ -12,8 +12,10 @@ from evlcp_sdk.values import Events, Triggers
 _MOST_EVENTS: Final = 1 << 24
 """Events that wait at the most, half a second of the most that a camera gives: the oldest go."""
 
-_BUCKET_S: Final = 1.0
-_BUCKETS: Final = 3
+_FORGOTTEN: Final = 1e-3
+"""Of the least delay, a second: ten times as much as clocks drift."""
+
+_LEAP_S: Final = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +36,8 @@ class Slice:
 class ArrivalClock:
     """When a camera time was on our own clock, by the slices that came soonest after their last event.
 
-    The least delay of the last seconds counts as none: what camera and cable take cannot be seen.
+    The least delay counts as none: what camera and cable take cannot be seen. It is forgotten slowly, as
+    clocks drift, and at once where the camera's clock leaps.
 
     >>> clock = ArrivalClock()
     >>> clock.arrived(1_000, 7.0021)
@@ -44,24 +47,18 @@ class ArrivalClock:
     """
 
     def __init__(self) -> None:
-        self._least: deque[tuple[float, float]] = deque()
+        self._offset_s = self._arrived_s = 0.0
 
     def arrived(self, t_us: float, arrived_s: float) -> None:
         """Take a slice's last time and when it was there."""
         offset_s = arrived_s - t_us * 1e-6
-        if not self._least or arrived_s >= self._least[-1][0] + _BUCKET_S:
-            self._least.append((arrived_s, offset_s))
-            while len(self._least) > _BUCKETS:
-                self._least.popleft()
-        elif offset_s < self._least[-1][1]:
-            self._least[-1] = self._least[-1][0], offset_s
-        if self._least and offset_s < min(least_s for _, least_s in self._least) - 1.0:
-            # The camera's clock has leaped ahead.
-            self._least = deque([(arrived_s, offset_s)])
+        least_s = self._offset_s + _FORGOTTEN * (arrived_s - self._arrived_s)
+        self._offset_s = offset_s if offset_s > least_s + _LEAP_S else min(offset_s, least_s)
+        self._arrived_s = arrived_s
 
     def at_s(self, t_us: float) -> float:
         """When a camera time was, s."""
-        return t_us * 1e-6 + min((offset_s for _, offset_s in self._least), default=0.0)
+        return t_us * 1e-6 + self._offset_s
 
 
 class Reader:
