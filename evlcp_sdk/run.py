@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from html import escape
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -213,13 +212,6 @@ class Reception(Iterator[Packet]):
         counts = self.counts
         found = ", ".join(f"{counts[name]} {name}" for name in ("events", "packets", "frames"))
         return f"Reception({self.source.path}: {found} so far)"
-
-    def _repr_html_(self) -> str:
-        """What a notebook shows: everything counted so far, and what was lost; reads nothing."""
-        rows = [(name.replace("_", " "), str(number)) for name, number in self.counts.items() if number]
-        rows += [("lost", str(loss)) for loss in self.losses.values()]
-        cells = "".join(f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows)
-        return f"<p>{escape(repr(self))}</p><table><tbody>{cells}</tbody></table>"
 
     def __enter__(self) -> Self:
         return self

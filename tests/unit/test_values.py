@@ -128,20 +128,6 @@ def test_a_packet_in_a_notebook() -> None:
     assert found["li"][0].startswith('"<script>alert(')
 
 
-def test_a_reception_in_a_notebook(demo_raw: Path, tmp_path: Path) -> None:
-    evil = tmp_path / "<b>&.raw"
-    evil.symlink_to(demo_raw)
-    with evlcp.receive(evil) as reception:
-        first = next(reception)
-        page = reception._repr_html_()
-    found = texts_of(page)
-    assert found["p"] == [repr(reception)]
-    assert repr(reception).startswith(f"Reception({evil}: ")
-    rows = dict(zip(found["td"][::2], found["td"][1::2], strict=True))
-    assert int(rows["frames"]) >= len(first.frames)
-    assert rows.keys() <= {name.replace("_", " ") for name in reception.counts} | {"lost"}
-
-
 def test_events_as_tables() -> None:
     pandas = pytest.importorskip("pandas", reason="the extra pandas is not installed")
     pyarrow = pytest.importorskip("pyarrow", reason="the extra parquet is not installed")
