@@ -43,29 +43,21 @@ def heard_by(handler: Handler, *numbers: signal.Signals) -> Iterator[Callable[[]
         restore()
 
 
-class _Asked:
-    """What a signal has said, and whether it may end a wait."""
-
-    # Dataclasses would take longer to import than all of this.
-    def __init__(self) -> None:
-        self.asked = False
-        self.waits = False
-
-
 class EndRequest:
     """Whether a run was asked to end; made by `stop_on_request`, and called as a `Stopped`."""
 
-    def __init__(self, state: _Asked | None = None, also: Stopped = lambda: False) -> None:
-        self._state = _Asked() if state is None else state
+    def __init__(self, root: "EndRequest | None" = None, also: Stopped = never) -> None:
+        self._root = self if root is None else root
         self._also = also
+        self._asked = self._waits = False
 
     def __call__(self) -> bool:
         """Whether it was asked."""
-        return self._state.asked or self._also()
+        return self._root._asked or self._also()
 
     def or_when(self, also: Stopped) -> "EndRequest":
         """The same request, and another reason to end."""
-        return EndRequest(self._state, lambda: self._also() or also())
+        return EndRequest(self._root, lambda: self._also() or also())
 
     def ask(self) -> None:
         """Ask it to end, now where it waits.
@@ -73,8 +65,8 @@ class EndRequest:
         Raises:
             KeyboardInterrupt: Within `waiting`.
         """
-        self._state.asked = True
-        if self._state.waits:
+        self._root._asked = True
+        if self._root._waits:
             raise KeyboardInterrupt
 
     @contextmanager
@@ -85,13 +77,13 @@ class EndRequest:
             KeyboardInterrupt: The run was asked to end, before or within.
         """
         # In this order: a signal between the two ends it, too.
-        self._state.waits = True
+        self._root._waits = True
         try:
-            if self._state.asked:
+            if self._root._asked:
                 raise KeyboardInterrupt
             yield
         finally:
-            self._state.waits = False
+            self._root._waits = False
 
 
 @contextmanager
