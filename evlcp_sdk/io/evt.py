@@ -53,11 +53,11 @@ LOSSES: Final = {
 """What a RAW file may lose: name -> (row of the tally, meaning)."""
 
 COUNTS: Final = {
-    "rollovers": (_kernels.ROLLOVERS, "rollovers of the camera clock"),
-    "time_gaps": (_kernels.TIME_GAPS, "steps of TIME_HIGH by more than one"),
-    "other_words": (_kernels.OTHER_WORDS, "OTHERS and CONTINUED words, which carry no events"),
+    "rollovers": _kernels.ROLLOVERS,
+    "time_gaps": _kernels.TIME_GAPS,
+    "other_words": _kernels.OTHER_WORDS,
 }
-"""What is worth knowing about a RAW file and is not a loss: name -> (row of the tally, meaning)."""
+"""What is no loss: rollovers of the clock, its steps by more than one, words without events."""
 
 
 @dataclass(frozen=True)
@@ -263,4 +263,4 @@ class Decoder:
     @property
     def counts(self) -> dict[str, int]:
         """The format's own part of `EventSource.counts`."""
-        return {name: int(self._tally[row, 0]) for name, (row, _) in COUNTS.items()}
+        return {name: int(self._tally[row, 0]) for name, row in COUNTS.items()}
