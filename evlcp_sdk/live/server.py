@@ -77,6 +77,7 @@ class Server(ABC):
     ) -> None:
         self._publisher, self._host, self.port = publisher, host, port
         self._mine = publisher.subscribe(kinds, most=most, wake=wake)
+        self._unsent = 0
 
     @property
     @abstractmethod
@@ -84,9 +85,9 @@ class Server(ABC):
         """Where it is to be found, once started."""
 
     @property
-    @abstractmethod
     def dropped(self) -> int:
-        """Results that clients were not sent, so far."""
+        """Results that clients were not sent as they did not take them, or as there was no time, so far."""
+        return self._mine.dropped + self._unsent
 
     @abstractmethod
     async def _listen(self) -> Any:

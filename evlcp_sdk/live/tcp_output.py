@@ -46,17 +46,11 @@ class TcpOutput(Server):
         self._gpsd, self._zero = gpsd, clock_zero
         self._clients: dict[asyncio.StreamWriter, dict[str, Any]] = {}
         self._newest: dict[str, dict[str, Any]] = {}
-        self._unsent = 0
 
     @property
     def url(self) -> str:
         """Address and port."""
         return f"{self._host}:{self.port}"
-
-    @property
-    def dropped(self) -> int:
-        """What clients were not sent as they did not take it, or as there was no time, so far."""
-        return self._mine.dropped + self._unsent
 
     def _wake(self) -> None:
         # The loop may be over before the receiver is.

@@ -76,10 +76,12 @@ class _Browser:
     ready: bool = False
     picture: int = -1
 
-    def put(self, line: str) -> None:
-        """Have something sent; of a queue that is full the oldest goes."""
-        self.dropped += len(self.waiting) == self.waiting.maxlen
+    def put(self, line: str) -> bool:
+        """Have something sent; whether the oldest has gone for it, as the queue was full."""
+        full = len(self.waiting) == self.waiting.maxlen
+        self.dropped += full
         self.waiting.append(line)
+        return full
 
 
 class Viewer(Server):
@@ -114,18 +116,12 @@ class Viewer(Server):
         self._browsers: set[_Browser] = set()
         self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
         self._page = ""
-        self._left = 0
 
     @property
     def url(self) -> str:
         """What to open in a browser; who has it may look on."""
         host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self._host, self._host)
         return f"http://{host}:{self.port}/{self._token}/"
-
-    @property
-    def dropped(self) -> int:
-        """Results that browsers were not sent as they did not take them, or as there was no time, so far."""
-        return self._mine.dropped + self._left + sum(browser.dropped for browser in self._browsers)
 
     async def _listen(self) -> Any:
         serve = import_extra("websockets.asyncio.server", "live").serve
@@ -212,7 +208,6 @@ class Viewer(Server):
             raise
         finally:
             self._browsers.discard(browser)
-            self._left += browser.dropped
 
     def _heard(self, browser: _Browser, said: str | bytes) -> bool:
         """Do what a browser says, if it may; whether that was understood."""
@@ -263,7 +258,7 @@ class Viewer(Server):
         if kind != "frame":
             self._kept.setdefault(kind, deque(maxlen=1)).append(line)
         for browser in self._browsers:
-            browser.put(line)
+            self._unsent += browser.put(line)
 
     def _send_all(self) -> None:
         """Send a bundle to each browser that is ready for one."""
