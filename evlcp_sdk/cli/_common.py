@@ -144,22 +144,15 @@ def progress_bar(name: str, *, by_bytes: bool = False) -> "Iterator[Callable[...
     if not shows_bars():
         yield lambda _done, _total, _words="": None
         return
-    from rich.progress import (
-        BarColumn,
-        DownloadColumn,
-        Progress,
-        TaskProgressColumn,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich import progress
 
     err = console(stderr=True)
-    shown = DownloadColumn() if by_bytes else TaskProgressColumn()
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), shown, TimeElapsedColumn())
-    with Progress(
-        *columns, TimeRemainingColumn(), console=err, transient=True, disable=not err.is_terminal
-    ) as bar:
+    columns = (
+        *(progress.TextColumn("{task.description}", markup=False), progress.BarColumn()),
+        progress.DownloadColumn() if by_bytes else progress.TaskProgressColumn(),
+        *(progress.TimeElapsedColumn(), progress.TimeRemainingColumn()),
+    )
+    with progress.Progress(*columns, console=err, transient=True, disable=not err.is_terminal) as bar:
         task = bar.add_task(name, total=None)
         yield lambda done, total, words="": bar.update(
             task, completed=done, total=total, description=f"{name} {words}".rstrip()
