@@ -30,6 +30,7 @@ if TYPE_CHECKING:
         StreamError as StreamError,
         UnknownAlgorithmError as UnknownAlgorithmError,
         UnpluggedError as UnpluggedError,
+        WorkerError as WorkerError,
     )
     from evlcp_sdk.io.open import open_source, read_events as read_events, write_events as write_events
     from evlcp_sdk.io.replay import ReplaySource as ReplaySource
@@ -111,8 +112,8 @@ _HOMES = {
     "air.kinds": "MessageKind",
     "diagnosis.diagnose": "diagnose",
     "errors": (
-        "ConfigError EvlcpError InputError InterruptedRunError OutputError "
-        "PluginError PluginWarning RawFormatError StreamError UnknownAlgorithmError UnpluggedError"
+        "ConfigError EvlcpError InputError InterruptedRunError OutputError PluginError PluginWarning "
+        "RawFormatError StreamError UnknownAlgorithmError UnpluggedError WorkerError"
     ),
     "io.open": "open_source read_events write_events",
     "io.replay": "ReplaySource",

@@ -10,6 +10,7 @@ EvlcpError                     1   anything the SDK raises on purpose
 │   ├── RawFormatError         3   a RAW file's header or words; names byte offset, found, expected
 │   └── UnpluggedError         5   a camera that went away while it was read
 ├── InterruptedRunError      130   the user stopped the run; it says what was kept
+├── WorkerError                1   a process that decodes for a receiver ended, or does not answer
 └── StreamError                1   events fed in an order or shape the receiver cannot take
 ```
 
@@ -81,6 +82,10 @@ class UnpluggedError(InputError):
     """A camera that went away while it was read; what was received until then is kept."""
 
     exit_code = 5
+
+
+class WorkerError(EvlcpError):
+    """A process that decodes for a receiver ended, or does not answer."""
 
 
 class StreamError(EvlcpError):

@@ -14,7 +14,14 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
-from evlcp_sdk.errors import ConfigError, InputError, InterruptedRunError, PluginError, UnpluggedError
+from evlcp_sdk.errors import (
+    ConfigError,
+    InputError,
+    InterruptedRunError,
+    PluginError,
+    UnpluggedError,
+    WorkerError,
+)
 from evlcp_sdk.files import Outputs, writing
 from evlcp_sdk.io import EventSource, Loss, ReplaySource, open_source, open_writer
 from evlcp_sdk.io.describe import check_sensor, recording_table
@@ -155,7 +162,7 @@ class Reception(Iterator[Packet]):
             try:
                 for events in _events_of(self.source, self._pulses):
                     yield from self.receiver.feed(events)
-            except PluginError:
+            except (PluginError, WorkerError):
                 yield from self.receiver.left
                 raise
             except InputError:
@@ -427,7 +434,7 @@ def _run(
     """Receive a source to its end, or until it is stopped or fails; return the summary."""
     status: Status = "complete"
     error = None
-    broken: PluginError | None = None
+    broken: PluginError | WorkerError | None = None
     given = 0
     pieces = iter(pieces)
     first_us = last_us = None
@@ -439,7 +446,7 @@ def _run(
                     events, packets = next(pieces)
                 except StopIteration:
                     break
-                except PluginError as fault:
+                except (PluginError, WorkerError) as fault:
                     if not given and not receiver.left:
                         raise
                     # What it has let through is kept; the receiver cannot be asked for more.

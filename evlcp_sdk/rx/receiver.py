@@ -62,7 +62,7 @@ class Receiver:
     Raises:
         ConfigError: Links that cannot be received together, or nothing tells them apart; workers beside a
             plugin that follows the stages.
-        EvlcpError: A worker does not start.
+        WorkerError: A worker does not start.
 
     >>> from evlcp_sdk.link.resolve import load_link
     >>> receiver = Receiver(load_link())
@@ -158,7 +158,7 @@ class Receiver:
         Raises:
             StreamError: The stream was closed, or a polarity is neither 0 nor 1.
             PluginError: An algorithm failed; `left` has the packets that were complete by then.
-            EvlcpError: A worker ended, or does not answer.
+            WorkerError: A worker ended, or does not answer.
         """
         if self._closed:
             raise StreamError("the receiver is closed: make a new one for a new stream")

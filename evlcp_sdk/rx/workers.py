@@ -20,7 +20,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError
+from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError, WorkerError
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx import _kernels
@@ -52,7 +52,7 @@ class Workers:
         many: How many.
 
     Raises:
-        EvlcpError: One does not start.
+        WorkerError: One does not start.
     """
 
     def __init__(self, links: Mapping[str, Link], many: int) -> None:
@@ -71,7 +71,7 @@ class Workers:
         Raises:
             ConfigError: There is none, or somebody follows the stages, which workers do not announce; or an
                 algorithm cannot be sent to them.
-            EvlcpError: One does not start.
+            WorkerError: One does not start.
         """
         if processes < 1 or (processes > 1 and announced):
             why = ", as a sink or plugin follows the stages" if announced and processes > 0 else " or more"
@@ -147,12 +147,12 @@ class _Worker:
             (start us, first byte, how many) of each piece, and the part of the memory that they take.
 
         Raises:
-            EvlcpError: There are more than it holds.
+            WorkerError: There are more than it holds.
         """
         sizes = [-(-EVENT_BYTES * events.t_us.size // 8) * 8 for _, events in pieces]
         total = sum(sizes)
         if total > _ROOM_BYTES:
-            raise EvlcpError(
+            raise WorkerError(
                 f"a frame has {total} bytes of events, a worker takes {_ROOM_BYTES}: use one core"
             )
         begin = self._next if self._next + total <= _ROOM_BYTES else 0
@@ -173,7 +173,7 @@ class _Worker:
         """The next answer.
 
         Raises:
-            EvlcpError: It has ended, or takes too long, or what failed there.
+            WorkerError: It has ended, or takes too long, or what failed there.
         """
         try:
             if not _poll(self._pipe, within_s):
@@ -199,17 +199,17 @@ class _Worker:
     def _name(self) -> str:
         return f"{self._process.name} of the receiver, process {self._process.pid},"
 
-    def _stalled(self, for_s: float) -> EvlcpError:
+    def _stalled(self, for_s: float) -> WorkerError:
         """It does nothing, and is ended."""
         self._process.kill()
-        return EvlcpError(f"{self._name} did not answer for {for_s:g} s, and was ended: receive again")
+        return WorkerError(f"{self._name} did not answer for {for_s:g} s, and was ended: receive again")
 
-    def _ended(self) -> EvlcpError:
+    def _ended(self) -> WorkerError:
         """It has ended, and how."""
         self._process.join(1.0)
         code = self._process.exitcode
         how = f"by {signal.Signals(-code).name}" if code is not None and code < 0 else f"with code {code}"
-        return EvlcpError(f"{self._name} ended {how}; what it was decoding is lost: receive again")
+        return WorkerError(f"{self._name} ended {how}; what it was decoding is lost: receive again")
 
 
 class _WorkerBars:

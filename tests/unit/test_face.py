@@ -24,8 +24,8 @@ FACE_NAMES = """
     PositionPlan PresenceMap Range Ranging RawFormatError ReceivedMessage Receiver Reception Region
     Registry ReplaySource ResultFolder Run Separate Separation Settled SimulatedSource Sink SinkRecord
     SoftSymbols StreamError SyncLock Synchronization Synchronizer Tracker Tracking Triggers
-    UnknownAlgorithmError UnpluggedError compose diagnose frames_table hookimpl load_link load_sites
-    open read_events receive receive_to_folder simulate write_events
+    UnknownAlgorithmError UnpluggedError WorkerError compose diagnose frames_table hookimpl load_link
+    load_sites open read_events receive receive_to_folder simulate write_events
 """
 NAMES = FACE_NAMES.split()
 

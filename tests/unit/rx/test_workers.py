@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from rx_streams import LINK, frames_of, noise_events, received, said
 
-from evlcp_sdk.errors import ConfigError, EvlcpError, PluginError
+from evlcp_sdk.errors import ConfigError, PluginError, WorkerError
 from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
@@ -68,7 +68,7 @@ def test_a_worker_that_ends_or_stalls_is_named(
     receiver.feed(EVENTS[:begun])
     assert child.pid is not None
     os.kill(child.pid, sent)
-    with pytest.raises(EvlcpError, match=f"^worker 1 of the receiver, process {child.pid}, {says}"):
+    with pytest.raises(WorkerError, match=f"^worker 1 of the receiver, process {child.pid}, {says}"):
         receiver.feed(EVENTS[begun:])
     child.join(10)
     assert child.exitcode == -signal.SIGKILL
