@@ -60,7 +60,6 @@ def demo(
 
 
 def _drive(out: Path, workers: int | None, as_json: bool) -> None:
-    from contextlib import suppress
     from dataclasses import replace
 
     from evlcp_sdk.cli._campaign import campaign_bar, show_faults
@@ -80,8 +79,7 @@ def _drive(out: Path, workers: int | None, as_json: bool) -> None:
         out.mkdir(parents=True, exist_ok=True)
     results = out / f"{CAMPAIGN_NAME}.sqlite"
     for name in (results, *(results.with_name(results.name + end) for end in ("-wal", "-shm"))):
-        with suppress(FileNotFoundError):
-            name.unlink()
+        name.unlink(missing_ok=True)
     with Store(results, create=True) as store:
         with campaign_bar(plan.name) as show_progress:
             # Here, where it shows and is done once: what each worker would compile by itself.

@@ -121,16 +121,11 @@ def _run_jobs(
         InterruptedRunError: Whoever started it ended it.
     """
     from evlcp_sdk.signals import stop_on_request
-
-    def pass_on() -> None:
-        if registry is None:
-            from evlcp_sdk.study.jobs import stop_workers
-
-            stop_workers()
+    from evlcp_sdk.study.jobs import stop_workers
 
     outcomes: list[Outcome[ReceiveJob, dict[str, Any]]] = []
     with (
-        stop_on_request(pass_on) as stopped,
+        stop_on_request(stop_workers) as stopped,
         progress_bar("recordings") if registry is None else nullcontext() as advance,
         ExitStack() as stack,
     ):

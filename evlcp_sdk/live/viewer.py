@@ -217,12 +217,9 @@ class Viewer(Server):
             return False
         if asked == {"next": True}:
             browser.ready = True
-            return True
-        if self._recorder is None or not isinstance(asked, dict) or list(asked) != ["record"]:
-            return False
-        if asked["record"] is True:
+        elif self._recorder is not None and asked == {"record": True}:
             self._recorder.start()
-        elif asked["record"] is False:
+        elif self._recorder is not None and asked == {"record": False}:
             self._recorder.stop()
         else:
             return False
@@ -230,7 +227,6 @@ class Viewer(Server):
 
     def _about(self) -> dict[str, Any]:
         """What a browser is sent first."""
-        camera = next(iter(self._links.values())).camera
         return {
             "about": {
                 "name": self._name,
@@ -243,8 +239,6 @@ class Viewer(Server):
                     for name, link in self._links.items()
                 },
                 "colours": list(TRANSMITTER_COLOURS),
-                "width": camera.width,
-                "height": camera.height,
                 "levels": list(LEVELS),
                 "sites": self._sites,
                 "may_record": self._recorder is not None,
