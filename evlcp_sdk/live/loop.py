@@ -43,7 +43,6 @@ class LiveStatus:
         elapsed_s: Since the start, s.
         events: Events so far, those shed too.
         events_per_s: In the time since the last status.
-        waiting_ms: How long the oldest slice waits, ms.
         level: What is shed, a number of `LEVELS`.
         shed: Events left out so far, by reason, and frames without a distance.
         delays: Of all frames so far, by stage, and of messages `time` from end to end: count, p50, p99 and
@@ -59,7 +58,6 @@ class LiveStatus:
     elapsed_s: float
     events: int
     events_per_s: float
-    waiting_ms: float
     level: int
     shed: Mapping[str, int]
     delays: Mapping[str, Mapping[str, float | int | None]]
@@ -267,7 +265,6 @@ class LiveLoop:
             elapsed_s=at_s - self._start_s,
             events=self._events,
             events_per_s=(self._events - self._status_events) / since_s if since_s > 0 else 0.0,
-            waiting_ms=max(at_s - self._reader.oldest_s, 0.0) * 1e3,
             level=self._level,
             shed=self.shed,
             delays={stage: tally.to_dict() for stage, tally in self.delays.items()},

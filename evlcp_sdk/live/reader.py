@@ -95,12 +95,6 @@ class Reader:
         """Nothing more will come, and nothing waits."""
         return self._over and not self._waiting
 
-    @property
-    def oldest_s(self) -> float:
-        """Since when the oldest slice waits, s; now where nothing does."""
-        with self._changed:
-            return self._waiting[0].arrived_s if self._waiting else time.monotonic()
-
     def take(self, timeout_s: float) -> Slice | None:
         """The next slice; None after the time-out, or at the end."""
         with self._changed:
