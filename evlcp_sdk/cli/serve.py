@@ -31,7 +31,6 @@ def serve(
 
     A recording begins when somebody has connected. Nothing is encrypted, and whoever can connect gets all.
     """
-    from evlcp_sdk.errors import InputError
     from evlcp_sdk.io.patience import open_until
     from evlcp_sdk.io.replay import ReplaySource
     from evlcp_sdk.live.sender import Sender
@@ -53,9 +52,6 @@ def serve(
                 return
             try:
                 sender.run(stopped)
-            except InputError as fault:
-                complain(str(fault))
-                raise typer.Exit(fault.exit_code) from fault
             finally:
                 if dropped := sender.counts["pieces_dropped"]:
                     complain(f"{dropped} pieces dropped: who received them was too slow")
