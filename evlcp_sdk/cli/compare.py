@@ -118,7 +118,6 @@ def _of_recordings(
     overrides: Sequence[str],
     workers: int,
 ) -> tuple[int, Comparison]:
-    from evlcp_sdk.errors import InterruptedRunError
     from evlcp_sdk.plugin.registry import Registry
     from evlcp_sdk.study.compare import comparison_of, load_variants
 
@@ -132,15 +131,12 @@ def _of_recordings(
     executor = make_executor(0 if here else workers, None)
     tables: dict[str, Table] = {}
     code = 0
-    try:
-        for outcome in executor.run(partial(_run, variants=variants, here=here), urls):
-            if outcome.value is not None:
-                tables[outcome.job] = outcome.value
-            elif outcome.fault is not None:
-                complain(outcome.fault.message)
-                code = max(code, outcome.fault.exit_code)
-    except KeyboardInterrupt:
-        raise InterruptedRunError("interrupted; nothing is written") from None
+    for outcome in executor.run(partial(_run, variants=variants, here=here), urls):
+        if outcome.value is not None:
+            tables[outcome.job] = outcome.value
+        elif outcome.fault is not None:
+            complain(outcome.fault.message)
+            code = max(code, outcome.fault.exit_code)
     ordered = [tables[url] for url in urls if url in tables]
     return code, comparison_of(ordered, variants, registry.versions())
 
