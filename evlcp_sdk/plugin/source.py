@@ -3,6 +3,7 @@
 import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Protocol, Self
@@ -184,14 +185,8 @@ class EventSource(ABC):
 
     def _taken(self, max_events: int) -> tuple[Events, Triggers] | None:
         """What `take` gives, checked: kernels trust it."""
-        try:
+        with self._guarded():
             piece: object = self.take(max_events)
-        except EvlcpError:
-            raise
-        except (Exception, SystemExit) as fault:
-            if type(self).__module__.startswith("evlcp_sdk."):
-                raise
-            raise self._failed(fault) from fault
         if piece is None:
             return None
         if not isinstance(piece, tuple) or tuple(map(type, piece)) != (Events, Triggers):
@@ -202,10 +197,19 @@ class EventSource(ABC):
             raise self._refused(f"gave polarity {events.p.max()}, expected 0 or 1")
         return events, triggers
 
-    def _failed(self, fault: BaseException) -> PluginError:
-        last = traceback.extract_tb(fault.__traceback__)[-1]
-        what = f"{type(fault).__name__}: {fault}".splitlines()[0]
-        return self._refused(f"{what} ({Path(last.filename).name}, line {last.lineno})")
+    @contextmanager
+    def _guarded(self) -> Iterator[None]:
+        """A plugin's source that fails is named; a fault of the SDK's own stays what it is."""
+        try:
+            yield
+        except EvlcpError:
+            raise
+        except (Exception, SystemExit) as fault:
+            if type(self).__module__.startswith("evlcp_sdk."):
+                raise
+            last = traceback.extract_tb(fault.__traceback__)[-1]
+            what = f"{type(fault).__name__}: {fault}".splitlines()[0]
+            raise self._refused(f"{what} ({Path(last.filename).name}, line {last.lineno})") from fault
 
     def _refused(self, what: str) -> PluginError:
         return PluginError(f"{self.path}: source {type(self).__name__}: {what}")
@@ -234,13 +238,6 @@ class EventSource(ABC):
         return self
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        try:
+        # What went wrong before says more than a source that cannot be closed after it.
+        with nullcontext() if error is None else suppress(PluginError), self._guarded():
             self.close()
-        except EvlcpError:
-            raise
-        except (Exception, SystemExit) as fault:
-            if type(self).__module__.startswith("evlcp_sdk."):
-                raise
-            # What went wrong before says more than a source that cannot be closed after it.
-            if error is None:
-                raise self._failed(fault) from fault
