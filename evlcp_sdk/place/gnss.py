@@ -10,11 +10,10 @@ grid is 0.15 m over the earth, and it is never more than 4 m.
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from datetime import UTC, datetime, timedelta
+from datetime import datetime
 from functools import cache, reduce
 from importlib.resources import files
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,25 +64,13 @@ PLACE = {
 """Columns of a place on earth, and what they may be, least and most."""
 
 
-_HALF_DAY_S = 43_200
+_DAY_S = 86_400
 _UP = 2.0
 """How much less precise heights of satellites are than places, where only the latter's sigma is said."""
 
 
 _LETTERS = {3: ("N", "S"), 5: ("E", "W"), 10: ("M", ""), 12: ("M", "")}
 """Fields of GGA that are a letter: hemispheres, and metres."""
-
-
-class NmeaFix(NamedTuple):
-    """A GGA with its GST: the line of the first, UTC, latitude, longitude and height, sigmas.
-
-    The height is above the ellipsoid; `covariance_m2` is of east, north and up, float64 (3, 3).
-    """
-
-    line: int
-    utc: datetime
-    place: tuple[float, float, float]
-    covariance_m2: Floats
 
 
 def checksum(body: str) -> str:
@@ -95,21 +82,21 @@ def checksum(body: str) -> str:
     return f"{reduce(lambda a, b: a ^ b, body.encode('ascii'), 0):02X}"
 
 
-def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[NmeaFix]:
+def read_nmea(path: Path | str, clock_zero: datetime, usual_sigma_m: float) -> "GnssLog":
     """The fixes of a file, of any talker; a GGA that says that it has no fix gives none.
 
-    The day of the first fix is that within half a day of `near`; later ones follow it. `usual_sigma_m` is of
-    east and north where a GGA has no GST of its time, of up twice that; 0: none.
+    The day of the first fix is that within half a day of the UTC of the camera clock's 0; later ones follow
+    it. `usual_sigma_m` is of east and north where a GGA has no GST of its time, of up twice that; 0: none.
 
     Raises:
         InputError: The file cannot be read.
         ConfigError: A checksum is wrong, a value is not a number or is out of range, a height is above an
-            unknown geoid, or nothing says how precise a fix is.
+            unknown geoid, times do not rise, nothing says how precise a fix is, or there is none.
     """
     fixes: list[tuple[int, float, tuple[float, float, float]]] = []
     sigmas: dict[float, Floats] = {}
     # One day for both kinds: the last time that is known.
-    last = near.timestamp()
+    last = clock_zero.timestamp()
 
     def value(field: int, name: str, within: tuple[float, float], piece: slice = slice(None)) -> float:
         return csv_number(path, line, name, fields[field][piece], within)
@@ -138,9 +125,8 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
             value(1, f"{kind}'s time", (0, most), piece)
             for most, piece in ((23, slice(0, 2)), (59, slice(2, 4)), (61, slice(4, None)))
         )
-        day = datetime.fromtimestamp(last, UTC).replace(hour=0, minute=0, second=0, microsecond=0).timestamp()
-        at = day + 3600 * hours + 60 * minutes + seconds
-        at += 2 * _HALF_DAY_S * ((at < last - _HALF_DAY_S) - (at > last + _HALF_DAY_S))
+        at = last // _DAY_S * _DAY_S + 3600 * hours + 60 * minutes + seconds
+        at = round(at + _DAY_S * ((at < last - _DAY_S / 2) - (at > last + _DAY_S / 2)), 3)
         last = at
         if kind == "GST":
             east, north, up = (value(i, "GST's sigma", (1e-4, 1e4)) for i in (7, 6, 8))
@@ -150,7 +136,7 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
                 both = (major**2 - minor**2) * math.sin(2 * math.radians(turned)) / 2
             # Digits are few: what is left of a correlation of 1 is none.
             both = min(max(both, -0.999 * east * north), 0.999 * east * north)
-            sigmas[round(at, 3)] = np.array([[east**2, both, 0], [both, north**2, 0], [0, 0, up**2]])
+            sigmas[at] = np.array([[east**2, both, 0], [both, north**2, 0], [0, 0, up**2]])
             continue
         if not fields[11]:
             raise ConfigError(
@@ -159,19 +145,20 @@ def read_nmea(path: Path | str, near: datetime, usual_sigma_m: float) -> list[Nm
             )
         height = value(9, "height_m", PLACE["height_m"]) + value(11, "height of the geoid", (-200, 200))
         fixes.append((line, at, (angle(2, "latitude_deg", "NS"), angle(4, "longitude_deg", "EW"), height)))
-    found = []
-    for line, at, place in fixes:
-        spread = sigmas.get(round(at, 3))
-        if spread is None:
-            if not usual_sigma_m:
-                raise ConfigError(
-                    f"{path}: line {line}: GGA without a GST of its time: expected one, or --set"
-                    " position.gnss_sigma_m=METRES"
-                )
-            spread = usual_sigma_m**2 * np.diag([1.0, 1.0, _UP**2])
-        utc = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(milliseconds=round(at * 1e3))
-        found.append(NmeaFix(line, utc, place, spread))
-    return found
+    if not fixes:
+        raise ConfigError(f"{path}: expected a GGA with a fix or more")
+    usual = usual_sigma_m**2 * np.diag([1.0, 1.0, _UP**2])
+    for line, at, _ in fixes:
+        if at not in sigmas and not usual_sigma_m:
+            raise ConfigError(
+                f"{path}: line {line}: GGA without a GST of its time: expected one, or --set"
+                " position.gnss_sigma_m=METRES"
+            )
+    zero_us = round(clock_zero.timestamp() * 1e6)
+    t_us = np.array([round(at * 1e3) * 1000.0 - zero_us for _, at, _ in fixes])
+    check_rising(path, [line for line, _, _ in fixes], "t_us", t_us)
+    spread = np.array([sigmas.get(at, usual) for _, at, _ in fixes])
+    return GnssLog(t_us, np.array([place for _, _, place in fixes]), spread)
 
 
 def _sentences(path: Path | str) -> Iterator[tuple[int, str, list[str]]]:
@@ -232,13 +219,7 @@ class GnssLog:
                     f"{path}: NMEA tells UTC: expected --clock-zero, the UTC of the camera clock's 0, as"
                     " `evlcp receive` takes it, or a CSV file"
                 )
-            fixes = read_nmea(path, clock_zero, usual_sigma_m)
-            if not fixes:
-                raise ConfigError(f"{path}: expected a GGA with a fix or more")
-            t_us = np.array([(fix.utc - clock_zero).total_seconds() * 1e6 for fix in fixes])
-            check_rising(path, [fix.line for fix in fixes], "t_us", t_us)
-            place, spread = (np.array([fix[k] for fix in fixes]) for k in (2, 3))
-            return cls(t_us, place, spread)
+            return read_nmea(path, clock_zero, usual_sigma_m)
         if Path(path).suffix.lower() == ".pos":
             raise ConfigError(f"{path}: a solution of RTKLIB: expected its NMEA (rnx2rtkp -n), or a CSV file")
         needed = {"t_us": ANY_NUMBER, **PLACE, **dict.fromkeys(_SIGMAS, _SIGMA_M)}

@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -189,23 +189,24 @@ def test_a_place_with_its_sigmas(tmp_path: Path) -> None:
 def test_an_ellipse_is_that_of_the_covariance(tmp_path: Path) -> None:
     covariance = np.array([[4.0, -1.5, 0.0], [-1.5, 1.0, 0.0], [0.0, 0.0, 9.0]])
     told = gst(clock_of(0.0, NOON), 1.0, covariance).strip()
-    (found,) = read_nmea(write(tmp_path, told, at("120000.00")), NOON, 0.0)
-    np.testing.assert_allclose(found.covariance_m2, covariance, atol=0.01)
+    found = read_nmea(write(tmp_path, told, at("120000.00")), NOON, 0.0)
+    np.testing.assert_allclose(found.covariance_m2, [covariance], atol=0.01)
 
 
 def test_days_follow_one_another(tmp_path: Path) -> None:
     path = write(
         tmp_path, at("235959.50"), at("000000.50"), at("000001.5", 0), "", at("120000"), at("235900")
     )
-    found = read_nmea(path, datetime(2026, 3, 2, 0, 0, 1, tzinfo=UTC), 2.0)
-    assert [fix.utc.isoformat() for fix in found] == [
+    zero = datetime(2026, 3, 2, 0, 0, 1, tzinfo=UTC)
+    found = read_nmea(path, zero, 2.0)
+    assert [(zero + timedelta(microseconds=t_us)).isoformat() for t_us in found.t_us] == [
         "2026-03-01T23:59:59.500000+00:00",
         "2026-03-02T00:00:00.500000+00:00",
         "2026-03-02T12:00:00+00:00",
         "2026-03-02T23:59:00+00:00",
     ]
-    assert found[0].place == pytest.approx((-35.5, -0.25, 90.0))
-    np.testing.assert_allclose(found[0].covariance_m2, np.diag([4.0, 4.0, 16.0]))
+    assert found.place[0] == pytest.approx((-35.5, -0.25, 90.0))
+    np.testing.assert_allclose(found.covariance_m2[0], np.diag([4.0, 4.0, 16.0]))
 
 
 @pytest.mark.parametrize(
