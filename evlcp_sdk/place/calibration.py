@@ -282,18 +282,15 @@ class SeenView:
     @classmethod
     def of(cls, view: CalibrationView, camera: CameraModel, spec: ErrorModel) -> "SeenView | None":
         """The points of the bars of which enough is seen; None where none is."""
-        enu, points, whiten, number, arm, bend = [], [], [], [], [], []
-        survey: dict[int, tuple[float, float, float]] = {}
+        seen, whiten, survey = [], [], {}
         between = between_of(view.bars)
         for bar in view.bars:
             good = np.isfinite(bar.points_px).all(1) & (bar.sigma_px > 0)
             if good.sum() < spec.min_points:
                 continue
-            enu.append(bar.enu_m[good])
-            points.append(bar.points_px[good])
-            number.append(np.full(int(good.sum()), bar.transmitter))
-            arm.append(bar.enu_m[good] - bar.enu_m.mean(0))
-            bend.append(spec.bend_sigma_px * _bend(bar.enu_m, good, bar.points_px))
+            arm, number = (bar.enu_m - bar.enu_m.mean(0))[good], np.full(good.sum(), bar.transmitter)
+            bend = spec.bend_sigma_px * _bend(bar.enu_m, good, bar.points_px)
+            seen.append((bar.enu_m[good], bar.points_px[good], number, arm, bend))
             shared = shared_errors(bar, good, spec, between)
             place, turn, length = shared.survey.tolist()
             survey[bar.transmitter] = place, turn, length
@@ -301,31 +298,20 @@ class SeenView:
             shift = float(np.linalg.eigvalsh(shared.root)[-1])
             covariance = np.diag((max(bar.across, 1.0) * bar.sigma_px[good]) ** 2) + shift**2
             whiten.append(np.linalg.inv(np.linalg.cholesky(covariance)))
-        if not enu:
+        if not seen:
             return None
-        flat, seen = np.concatenate(enu), np.concatenate(points)
+        enu, points, numbers, arms, bends = (np.concatenate(column) for column in zip(*seen, strict=True))
         rotation = view.rotation
         shaken_rad = between * spec.shaken_sigma_px / camera.focal_px
         sigma = math.hypot(math.radians(view.attitude_sigma_deg), shaken_rad)
         if rotation is None:
             # Brings sights best onto directions.
-            sights = np.column_stack([camera.undistort(seen), np.ones(len(seen))])
-            world = flat - view.enu_m
+            sights = np.column_stack([camera.undistort(points), np.ones(len(points))])
+            world = enu - view.enu_m
             sights, world = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (sights, world))
             rotation, sigma = Rotation.align_vectors(world, sights)[0].as_matrix(), _FREE_SIGMA_RAD
-        return cls(
-            flat,
-            seen,
-            block_diag(*whiten),
-            np.concatenate(number),
-            np.concatenate(arm),
-            np.concatenate(bend),
-            survey,
-            view.enu_m,
-            view.position_sigma_m,
-            rotation,
-            sigma,
-        )
+        camera_at = view.enu_m, view.position_sigma_m, rotation, sigma
+        return cls(enu, points, block_diag(*whiten), numbers, arms, bends, survey, *camera_at)
 
 
 def _bend(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
