@@ -88,15 +88,14 @@ def _draw_segments(plot: Plot, series: Series, kind: str, shift: float, colour: 
     """Draw a figure of each segment with its interval; on a logarithmic axis, none is an upper limit."""
     xs, ys, labels, dots, stems = [], [], [], [], []
     for begin, end in _spans(series, kind):
-        recordings = series.between(begin, end)
-        figure = measure(recordings, kind)
+        figure = measure(series.between(begin, end), kind)
         if not figure.count:
             continue
         none = plot.log_y and figure.none
         x, y = (begin + end) / 2 + shift, figure.high if none else figure.value
         shown = f"below {figure.high:.2g}" if none else f"{figure.value:.4g}"
-        what = _counts(Tally.together(recordings), kind)
-        labels.append(f"{series.name}\n{begin} to {end} m: {shown}\n{_interval(figure)}\n{what}")
+        what = f"{shown}, counted on {figure.count:,}"
+        labels.append(f"{series.name}\n{begin} to {end} m: {what}\n{_interval(figure)}")
         xs.append(x)
         ys.append(y)
         dots.append(math.nan if none else y)
@@ -123,19 +122,6 @@ def _spans(series: Series, kind: str) -> list[tuple[int, int]]:
         if any(few) and measure(series.between(*whole), kind).none:
             spans = [span for span in spans if span not in inside] + [whole]
     return sorted(spans)
-
-
-def _counts(tally: Tally, kind: str) -> str:
-    """What a figure was counted on."""
-    return {
-        "ber": f"{tally.bit_errors} of {tally.bits} bits wrong",
-        "rmse_m": f"{tally.ranged} distances, bias {tally.bias_m:+.3f} m",
-        "gross_share": f"{tally.gross} of {tally.ranged} distances",
-        "found_share": f"{tally.frames_found} of {tally.frames_sent} frames",
-        "position_rmse_m": f"{tally.fixes} position{'s' * (tally.fixes != 1)},"
-        f" half within {tally.position_median_m:.3f} m,"
-        f" 95 % within {tally.position_95_m:.3f} m; {tally.fixes_refused} refused",
-    }[kind]
 
 
 def _interval(figure: Figure) -> str:
