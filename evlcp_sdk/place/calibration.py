@@ -7,7 +7,6 @@ far as these are not known. A parameter that the views do not determine keeps it
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +19,7 @@ from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.files import check_columns, csv_number, read_csv
 from evlcp_sdk.place.error_model import USUAL, ErrorModel
 from evlcp_sdk.place.gnss import PLACE
-from evlcp_sdk.place.observations import BarView, between_of, project_bars, shared_errors
+from evlcp_sdk.place.observations import BarView, between_of, camera_off, project_bars, shared_errors
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
@@ -129,8 +128,9 @@ _MOST_USUAL = 4.0
 MOST_MISFIT = 4.0
 """Mean square of the misses, in sigmas, above which nothing is believed."""
 
-_OF_BAR = 8
-"""Unknowns of a bar: of its site three of place, three of turn, its length; how it looks bent."""
+_OF_CAMERA, _OF_BAR = len(CAMERA_PARAMETERS), 8
+"""Unknowns of the camera, and of a bar: of its site three of place, three of turn, its length; how it looks
+bent."""
 
 _LINE = 1e-6
 """Share of the squares of a line's points about their middle that may lie across it."""
@@ -204,16 +204,18 @@ def calibrate(
     if not seen:
         raise ConfigError("no view shows a bar at a known site: nothing to calibrate from")
     start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
-    loose = np.diag([1 / sigma for sigma in _usual_sigma(start).values()])
-    solved = solve_views(seen, start, loose)
-    found, misfit, covariance = solved.camera, solved.misfit, solved.covariance[: len(CAMERA_PARAMETERS)]
-    covariance = covariance[:, : len(CAMERA_PARAMETERS)]
+    usual = _usual_sigma(start)
+    # The focal length in mm.
+    own, lens = np.array([start.focal_mm / start.focal_px, *np.ones(6)]), np.diag([*usual.values()])
+    solved = solve_views(seen, start, lens / own[:, None])
+    found, misfit = solved.camera, solved.misfit
+    covariance = lens @ solved.covariance[:_OF_CAMERA, :_OF_CAMERA] @ lens.T
     sigma = dict(zip(CAMERA_PARAMETERS, np.sqrt(np.diag(covariance)).tolist(), strict=True))
     # How far the image's farthest corner moves by each.
     corners = np.array([[x, y] for x in (0.0, start.width) for y in (0.0, start.height)])
-    moved = np.linalg.norm(_slopes(start, (corners - start.centre_px) / start.focal_px), axis=1).max(0)
+    slopes = start.parameter_slope((corners - start.centre_px) / start.focal_px) / own
+    moved = np.linalg.norm(slopes, axis=1).max(0)
     corner = {name: float(far) * sigma[name] for name, far in zip(CAMERA_PARAMETERS, moved, strict=True)}
-    usual = _usual_sigma(start)
     sure = [n for n in CAMERA_PARAMETERS if corner[n] <= limit_px and sigma[n] <= _LEARNT * usual[n]]
     if "focal_mm" not in sure:
         raise ConfigError(
@@ -226,10 +228,10 @@ def calibrate(
             " a site or pose is not as was said"
         )
     for name in CAMERA_PARAMETERS[1:]:
-        value, own = getattr(found, name), getattr(start, name)
-        if abs(value - own) > _MOST_USUAL * usual[name]:
+        value, said = getattr(found, name), getattr(start, name)
+        if abs(value - said) > _MOST_USUAL * usual[name]:
             raise ConfigError(
-                f"{name} = {value:.4g} would fit the views, {own:.4g} is configured and {usual[name]:.2g} a"
+                f"{name} = {value:.4g} would fit the views, {said:.4g} is configured and {usual[name]:.2g} a"
                 " usual difference: angles of the poses, a place, or the configuration are not as was said"
             )
     kept = replace(start, **{name: getattr(found, name) for name in sure})
@@ -329,21 +331,14 @@ def _bend(enu_m: Floats, seen: NDArray[np.bool_], points_px: Floats) -> Floats:
     return np.asarray(modes[seen, 2][:, None] * (way / max(float(np.linalg.norm(way)), 1e-9)))
 
 
-def _slopes(camera: CameraModel, direction: Floats) -> Floats:
-    """Derivatives of image points by the camera's parameters, its focal length in mm, float64 (n, 2, 7)."""
-    slope = camera.parameter_slope(direction)
-    slope[:, :, 0] *= camera.focal_px / camera.focal_mm
-    return slope
-
-
 @dataclass(frozen=True, eq=False)
 class SolvedViews:
     """All views solved together.
 
     Attributes:
         camera: With its parameters as found.
-        x: All unknowns: the camera's parameters, six of each view, eight of each bar, in its sigmas, and six
-            that all views share, float64 (n,).
+        x: All unknowns, in their sigmas: the camera's parameters, six of each view, eight of each bar, and
+            six that all views share, float64 (n,).
         covariance: Of these, float64 (n, n).
         bars: Where a bar's eight are: its site's place, turn and length, and how it looks bent.
         misfit: Mean square of the misses in sigmas, over the degrees of freedom.
@@ -358,62 +353,37 @@ class SolvedViews:
 
 @dataclass(frozen=True)
 class _Model:
-    """What the unknowns of `solve_views` make of each view, and what is known of them beforehand.
+    """What the unknowns of `solve_views` make of each view.
 
     Attributes:
-        views: What is seen.
-        camera: Where the fit starts.
-        loose: What whitens the camera's errors, float64 (7, 7).
-        common: Sigmas of errors that all views share, m and radians; None for none.
+        root: A root of the covariance of the camera's parameters as they are known beforehand, the focal
+            length in px, float64 (7, 7).
+        common: Sigmas of an error of place, m, and of a turn, radians, that all views share.
         surveys: Sigmas of each bar's site that has any: of place, turn and length.
     """
 
     views: Sequence[SeenView]
     camera: CameraModel
-    loose: Floats
-    common: tuple[float, float] | None
+    root: Floats
+    common: tuple[float, float]
     surveys: Mapping[int, tuple[float, float, float]]
-
-    @cached_property
-    def prior(self) -> Floats:
-        """What whitens the unknowns as they are known before anything is seen, float64 (n, n)."""
-        poses = [(view.place_sigma_m, view.turn_sigma_rad) for view in self.views]
-        sigmas = np.concatenate([np.repeat(poses, 3), np.ones(_OF_BAR * len(self.surveys))])
-        return block_diag(self.loose, np.diag(1 / np.append(sigmas, np.repeat(self.common or (), 3))))
-
-    @cached_property
-    def start(self) -> Floats:
-        """The unknowns before anything is seen."""
-        first = [float(getattr(self.camera, name)) for name in CAMERA_PARAMETERS]
-        size = self.last.stop if self.common is not None else self.last.start
-        return np.concatenate([first, np.zeros(size - len(first))])
 
     @property
     def bars(self) -> dict[int, int]:
         """Where a bar's unknowns begin: errors of its site, in sigmas, behind the views."""
-        begin = len(CAMERA_PARAMETERS) + 6 * len(self.views)
+        begin = _OF_CAMERA + 6 * len(self.views)
         return {number: begin + _OF_BAR * i for i, number in enumerate(sorted(self.surveys))}
-
-    @property
-    def last(self) -> slice:
-        """The errors that all views share, where there are such."""
-        begin = len(CAMERA_PARAMETERS) + 6 * len(self.views) + _OF_BAR * len(self.surveys)
-        return slice(begin, begin + 6)
 
     def camera_of(self, x: Floats) -> CameraModel:
         """The camera by the unknowns."""
-        values = dict(zip(CAMERA_PARAMETERS, x[: len(CAMERA_PARAMETERS)].tolist(), strict=True))
-        values["focal_mm"] = max(values["focal_mm"], 1e-3)
-        return replace(self.camera, **values)
+        return camera_off(self.camera, self.root @ x[:_OF_CAMERA])
 
     def parts(self, x: Floats) -> tuple[Floats, Floats]:
         """Misses in sigmas, float64 (m,), and their slopes, float64 (m, n)."""
-        shared, last = len(CAMERA_PARAMETERS), self.last
-        misses, rows = [self.prior @ (x - self.start)], [self.prior]
-        drift = x[last] if self.common is not None else np.zeros(6)
+        misses, rows = [x], [np.eye(len(x))]
         now = self.camera_of(x)
         for i, view in enumerate(self.views):
-            place, block = self._seen(x, view, shared + 6 * i, now, drift)
+            place, block = self._seen(x, view, _OF_CAMERA + 6 * i, now)
             for axis in (0, 1):
                 # A step that turns a point behind the camera is not to be taken.
                 off = np.nan_to_num(place[:, axis] - view.points_px[:, axis], nan=1e6)
@@ -421,13 +391,12 @@ class _Model:
                 rows.append(view.whiten @ np.nan_to_num(block[:, axis]))
         return np.concatenate(misses), np.concatenate(rows)
 
-    def _seen(
-        self, x: Floats, view: SeenView, at: int, now: CameraModel, drift: Floats
-    ) -> tuple[Floats, Floats]:
+    def _seen(self, x: Floats, view: SeenView, at: int, now: CameraModel) -> tuple[Floats, Floats]:
         """Where a view has its points, px, float64 (p, 2), and the slopes of these, float64 (p, 2, n)."""
-        turn = x[at + 3 : at + 6] + drift[3:]
-        rotation = Rotation.from_rotvec(turn).as_matrix() @ view.rotation
-        position = view.place_m + x[at : at + 3] + drift[:3]
+        own, common = np.repeat([view.place_sigma_m, view.turn_sigma_rad], 3), np.repeat(self.common, 3)
+        off = own * x[at : at + 6] + common * x[-6:]
+        rotation = Rotation.from_rotvec(off[3:]).as_matrix() @ view.rotation
+        position = view.place_m + off[:3]
         stands, moves = view.enu_m.copy(), {}
         for number, column in self.bars.items():
             mine = view.bar == number
@@ -439,11 +408,9 @@ class _Model:
             place[mine] += x[column + 7] * view.bend_px[mine]
         seen = (stands - position) @ rotation
         block = np.zeros((len(place), 2, len(x)))
-        block[:, :, : len(CAMERA_PARAMETERS)] = _slopes(now, seen[:, :2] / seen[:, 2:])
-        block[:, :, at : at + 3] = slope[:, :, :3]
-        block[:, :, at + 3 : at + 6] = slope[:, :, 3:] @ _turn_slope(turn)
-        if self.common is not None:
-            block[:, :, self.last] = block[:, :, at : at + 6]
+        block[:, :, :_OF_CAMERA] = now.parameter_slope(seen[:, :2] / seen[:, 2:]) @ self.root
+        slope[:, :, 3:] = slope[:, :, 3:] @ _turn_slope(off[3:])
+        block[:, :, at : at + 6], block[:, :, -6:] = slope * own, slope * common
         for column, (mine, by_site) in moves.items():
             block[mine, :, column : column + 7] = -slope[mine][:, :, :3] @ by_site
             block[mine, :, column + 7] = view.bend_px[mine]
@@ -453,8 +420,8 @@ class _Model:
 def solve_views(
     views: Sequence[SeenView],
     camera: CameraModel,
-    loose: Floats,
-    common: tuple[float, float] | None = None,
+    root: Floats,
+    common: tuple[float, float] = (0.0, 0.0),
 ) -> SolvedViews:
     """Least squares over everything; `camera` is where the fit starts, the others as in `_Model`."""
     surveys = {
@@ -463,7 +430,7 @@ def solve_views(
         for number, sigma in view.survey.items()
         if any(sigma) or view.bend_px.any()
     }
-    model = _Model(views, camera, loose, common, surveys)
+    model = _Model(views, camera, root, common, surveys)
 
     def misses_of(x: Floats) -> Floats:
         return model.parts(x)[0]
@@ -471,13 +438,14 @@ def solve_views(
     def slopes_of(x: Floats) -> Floats:
         return model.parts(x)[1]
 
-    fit = least_squares(misses_of, model.start, slopes_of, x_scale="jac", max_nfev=_STEPS)
+    start = np.zeros(_OF_CAMERA + 6 * len(views) + _OF_BAR * len(surveys) + 6)
+    fit = least_squares(misses_of, start, slopes_of, x_scale="jac", max_nfev=_STEPS)
     misses, rows = model.parts(fit.x)
     scale = 1 / np.sqrt((rows**2).sum(0))
     half = np.linalg.inv(np.linalg.qr(rows * scale, mode="r"))
     covariance = (half @ half.T) * scale * scale[:, None]
     points = 2 * sum(len(v.points_px) for v in views)
-    freedom = max(points - len(CAMERA_PARAMETERS) - 3 * len(views), 1)
+    freedom = max(points - _OF_CAMERA - 3 * len(views), 1)
     where = {number: slice(column, column + _OF_BAR) for number, column in model.bars.items()}
     return SolvedViews(model.camera_of(fit.x), fit.x, covariance, where, float(misses @ misses) / freedom)
 

@@ -8,7 +8,7 @@ east, north and up, and of its attitude about these; all in their own sigmas.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from itertools import combinations
 from typing import NamedTuple
@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.linalg.lapack import dposv
 
 from evlcp_sdk.place.error_model import chi_square
-from evlcp_sdk.place.observations import Problem, Rejection, skewed
-from evlcp_sdk.scene.camera import CAMERA_PARAMETERS
+from evlcp_sdk.place.observations import Problem, Rejection, camera_off, skewed
 
 Floats = NDArray[np.float64]
 
@@ -329,15 +328,7 @@ def linearize(problem: Problem, at: Fit) -> Equations | None:
         return None
     camera = problem.camera
     if at.lens.any():
-        focal, x, y, *bent = (problem.lens_root @ at.lens).tolist()
-        names, centre = CAMERA_PARAMETERS[3:], camera.centre_px
-        camera = replace(
-            camera,
-            focal_mm=(camera.focal_px + focal) * camera.pitch_um / 1e3,
-            centre_x_px=centre[0] + x,
-            centre_y_px=centre[1] + y,
-            **{name: getattr(camera, name) + more for name, more in zip(names, bent, strict=True)},
-        )
+        camera = camera_off(camera, problem.lens_root @ at.lens)
     direction = seen[:, :2] / seen[:, 2:]
     expected = camera.distort(direction)
     miss = _by((points[:, 6:8] - expected - _by(own[:, :2], root)) * points[:, 8:9], even)

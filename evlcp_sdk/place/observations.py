@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.scene.attitude import Attitude
-from evlcp_sdk.scene.camera import CameraModel, CameraSigma
+from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
 Floats = NDArray[np.float64]
 
@@ -132,6 +132,19 @@ def project_bars(
     slope = camera.project_slope(ahead) @ rotation.T
     turned = np.cross(slope, offset[:, None, :])
     return camera.project(ahead), np.concatenate([-slope, turned], -1)
+
+
+def camera_off(camera: CameraModel, errors: Floats) -> CameraModel:
+    """A camera whose `CAMERA_PARAMETERS` are off by so much, the focal length in px, float64 (7,)."""
+    focal_px, x_px, y_px, *bent = errors.tolist()
+    names, centre = CAMERA_PARAMETERS[3:], camera.centre_px
+    return replace(
+        camera,
+        focal_mm=max(camera.focal_px + focal_px, 1.0) * camera.pitch_um / 1e3,
+        centre_x_px=centre[0] + x_px,
+        centre_y_px=centre[1] + y_px,
+        **{name: getattr(camera, name) + more for name, more in zip(names, bent, strict=True)},
+    )
 
 
 def skewed(vectors: Floats) -> Floats:

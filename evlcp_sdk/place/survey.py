@@ -126,9 +126,6 @@ _PLACE_M, _TURN_RAD = 100.0, 0.5
 _PASSES, _TURNED_RAD = 8, 1e-4
 """Fits about the last one's attitudes, until these stay: a turn is a straight line in each."""
 
-_EXACT = 1e-9
-"""Sigma of a camera's parameter that is exact, so that it stays solvable."""
-
 
 @dataclass(frozen=True, eq=False)
 class SurveyedBar:
@@ -169,15 +166,13 @@ def survey(
     numbers = sorted({bar.transmitter for view in views for bar in view.bars})
     long_m = length_m if isinstance(length_m, Mapping) else dict.fromkeys(numbers, length_m)
     started = {number: _start(views, number, camera, long_m[number]) for number in numbers}
-    start = replace(camera, centre_x_px=camera.centre_px[0], centre_y_px=camera.centre_px[1])
-    loose = _whitening(camera, sigma)
     for _ in range(_PASSES):
         about = [_placed(view, started, long_m) for view in views]
         placed = [one for view in about if (one := SeenView.of(view, camera, spec)) is not None]
         if not placed:
             raise ConfigError("no view shows a bar: nothing to survey")
         common = (max(v.place_sigma_m for v in placed), max(v.turn_sigma_rad for v in placed))
-        solved = solve_views(placed, start, loose, common)
+        solved = solve_views(placed, camera, sigma.root(camera), common)
         turned = 0.0
         for number, at in solved.bars.items():
             centre, axis = started[number]
@@ -251,10 +246,3 @@ def _placed(
         survey = (_PLACE_M, _TURN_RAD, 0.0)
         bars.append(replace(bar, enu_m=centre + along[:, None] * axis, survey=survey))
     return replace(view, bars=tuple(bars))
-
-
-def _whitening(camera: CameraModel, sigma: CameraSigma) -> Floats:
-    """What makes the camera's errors independent and of sigma 1, its focal length in mm: float64 (7, 7)."""
-    root = sigma.root(camera)
-    root[0] *= camera.focal_mm / camera.focal_px
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(root @ root.T + _EXACT**2 * np.eye(7))))
