@@ -79,15 +79,11 @@ def read_poses(path: Path | str) -> list[KnownPose]:
         raise ConfigError(f"{path}: expected one line of values or more")
     poses = []
     for line, row in rows:
-        given = [n for n in _RANGES if n in ("t_us", *PLACE) or row.get(n)]
-        angles = [name for name in _ANGLES if name in given]
-        if angles:
-            if absent := [name for name in _ANGLES if name not in names]:
-                raise ConfigError(
-                    f"{path}: line 1: no column {absent[0]}: angles come together, {', '.join(_ANGLES)}"
-                )
-            given = [*dict.fromkeys([*given, *_ANGLES])]
-        value = {name: csv_number(path, line, name, row[name], _RANGES[name]) for name in given}
+        # Angles come together.
+        angles = any(row.get(name) for name in _ANGLES)
+        needed = ("t_us", *PLACE, *(_ANGLES if angles else ()))
+        given = [name for name in _RANGES if name in needed or row.get(name)]
+        value = {name: csv_number(path, line, name, row.get(name), _RANGES[name]) for name in given}
         poses.append(
             KnownPose(
                 row.get("recording") or "",

@@ -118,9 +118,8 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     scene = _sending(job.scene, job.tasks[0].link[0])
     simulation = Simulation(scene, job.seed, registry=registry)
     truth = truth_of(simulation, registry=registry)
-    links, decoded = [], []
     received: dict[str, tuple[Receiver, list[Packet]]] = {}
-    attitudes = []
+    parts = []
     for task in job.tasks:
         table, digest = task.link
         link = resolve(table, registry)
@@ -129,14 +128,12 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
         check_link(truth, link, "the scene", messages=True)
         world = task.scene.world
         attitude = None if world is None else attitude_log(task.scene, job.seed, simulation.path)
-        links.append(link)
-        attitudes.append(attitude)
         # What is reported of sites, and what is made of it, makes no difference to what is received.
         read = {section: dict(keys) for section, keys in link.table.items() if section not in _OF_POSITIONS}
         key = digest_of([read, None if world is None else asdict(replace(world, survey_sigma_m=0.0))])
         if key not in received:
             received[key] = Receiver(link, attitude=attitude), []
-        decoded.append(received[key][1])
+        parts.append((task, link, attitude, received[key][1]))
     messages = any(bar.sends_frames and bar.payload != "symbols" for bar in truth.bars)
     number = 0
     for events in simulation.stream():
@@ -146,7 +143,7 @@ def run_job(job: Job) -> list[tuple[str, Statistics]]:
     for receiver, packets in received.values():
         packets += receiver.close()
     results = []
-    for task, link, attitude, packets in zip(job.tasks, links, attitudes, decoded, strict=True):
+    for task, link, attitude, packets in parts:
         others = message_tallies(packets, truth, link.block_coder()) if messages else []
         if scene.world is not None:
             sites = sites_said(_sending(task.scene, task.link[0]), job.seed, registry)
