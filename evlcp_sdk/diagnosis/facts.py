@@ -110,10 +110,8 @@ class Facts:
 
     Attributes:
         link: The link that it was received with.
-        tally: Figures of its transmitters.
-        counts: The receiver's counts.
-        first_us: The recording's first event, camera clock, us.
-        last_us: Its last, us.
+        tally, counts: Figures of its transmitters, and the receiver's counts.
+        first_us, last_us: The recording's first event and its last, camera clock, us.
         lit_us: Of each transmitter, from when until when frames of it were due and its light was there, by
             number, us.
         readout: Events in each millisecond; None where they were not counted.

@@ -160,8 +160,7 @@ class Calibrated:
         sigma: Standard deviation of each parameter that was determined, in its unit.
         refused: Parameters that the views do not determine: how far the corners of the image would be
             uncertain by each, px.
-        views: Number of views.
-        points: Number of image points.
+        views, points: Numbers of these.
         misfit: Mean square of the misses in sigmas, over the degrees of freedom.
         camera_sigma: How precisely the camera is known by this, with what was not determined; as a link has
             it.

@@ -66,7 +66,6 @@ class Pose:
     """A camera's position and attitude; what is not said here is as in a `Fix`.
 
     Attributes:
-        enu_m: Position in the local axes, m, float64 (3,).
         rotation: Camera axes (right, down, forward) as columns in ENU, float64 (3, 3).
         covariance: Of position, m, and of a small turn about east, north and up, radians, float64 (6, 6);
             0 where an angle was taken as exact.

@@ -29,11 +29,9 @@ CONTRADICTIONS = frozenset({"site-contradicted", "not-determined", "misfit"})
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One of the poses that fit.
+    """One of the poses that fit: position, m, float64 (3,), and camera axes as columns in ENU, (3, 3).
 
     Attributes:
-        enu_m: Position in the local axes, m, float64 (3,).
-        rotation: Camera axes as columns in ENU, float64 (3, 3).
         covariance_m2: Of the position, if it is the right one, float64 (3, 3); NaN where an ellipse does not
             describe its error.
         likelihood: How likely the image is from here, against the likeliest.

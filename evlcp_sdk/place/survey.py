@@ -129,12 +129,11 @@ _PASSES, _TURNED_RAD = 8, 1e-4
 
 @dataclass(frozen=True, eq=False)
 class SurveyedBar:
-    """A bar as it was surveyed.
+    """A bar as it was surveyed, from so many views.
 
     Attributes:
         site: With its sigmas.
         covariance_m2: Of its place, to the east, north and up, float64 (3, 3).
-        views: From how many places it was seen.
         contradicted: How its own beacon contradicts that, beyond both sigmas; empty where it does not, or is
             not asked (`position.beacons`).
     """

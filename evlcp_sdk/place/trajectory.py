@@ -209,12 +209,10 @@ _TURN_US = 1e6
 
 @dataclass(frozen=True)
 class Cause:
-    """Standing errors of one part, that are states of a trajectory.
+    """So many standing errors of one part, that are states of a trajectory.
 
-    Attributes:
-        name: As in `Fix.standing`: `camera`, `attitude`, `bar N`.
-        size: How many they are.
-        t_us: Of the last fix that they entered, us.
+    The name is as in `Fix.standing`: `camera`, `attitude`, `bar N`; the time is of the last fix that they
+    entered.
     """
 
     name: str
@@ -224,13 +222,9 @@ class Cause:
 
 @dataclass(frozen=True, eq=False)
 class Course:
-    """Where fixes of some bars go on to, errors that stay included: a line through the last of them.
+    """Where fixes of some bars go on to, errors that stay included: a line through the last `count` of them.
 
-    Attributes:
-        place_m: East, north, up at the last of them, m, float64 (3,).
-        speed_m_s: The same of the speed, m/s, float64 (3,).
-        count: How many there were.
-        transmitters: Of which bars.
+    Place and speed, east, north, up, float64 (3,), are those at the last of them.
     """
 
     place_m: Floats
@@ -250,9 +244,8 @@ class TrajectoryPoint:
             `causes` in a row, in their own sigmas, float64 (n,).
         covariance: Of these, float64 (n, n).
         causes: What the standing errors are of.
-        heading_deg: Of the camera, as a fix or the IMU said last.
-        heading_t_us: When that was.
-        heading_sigma_deg: Of it.
+        heading_deg: Of the camera, as a fix or the IMU said last; when and how surely: `heading_t_us`,
+            `heading_sigma_deg`.
         motion: How the camera turned from the point before to this one.
         misses: Fixes in a row that were left out, this one included; 0 where it counts.
         starts: A trajectory starts here.

@@ -68,17 +68,12 @@ class Plot:
 
     Args:
         id: Of its element in the page, and its file's name.
-        x_name: What its x axis is, with the unit.
-        y_name: The same of y.
-        title: Heading.
+        x_name, y_name: What its axes are, with the unit.
         note: What a reader must know of it.
         aspect: Width by height of its box, in which x and y are then to one scale; None for a low wide box,
             filled by what is shown.
         down: y grows downwards, as rows of an image do.
-        log_y: The y axis is logarithmic.
-        from_zero: The y axis begins at 0.
-        y_limits: Ends of the y axis; None for what is shown. With `x_limits` an image's.
-        x_limits: The same of x.
+        x_limits, y_limits: Ends of the axes; None for what is shown.
 
     Attributes:
         shapes: What is drawn.

@@ -370,8 +370,7 @@ class LayoutBound:
     """Smallest standard deviations of what one frame shows; infinite where it shows nothing.
 
     Attributes:
-        x_px: Of the layout's place in the image, to the right.
-        y_px: The same, downward.
+        x_px, y_px: Of the layout's place in the image, to the right and downward.
         distance_m: Of its distance.
         turn_deg: Of its turn in the image.
         lean_deg: Of a lean of its top towards the camera or from it, of a layout that hardly leans.

@@ -194,13 +194,9 @@ COLUMNS = (
 
 @dataclass(frozen=True)
 class Table:
-    """All variants on one recording, or on all.
+    """What each variant gave, by its name, on one recording, or on all of the other tables together.
 
-    Attributes:
-        name: Of the recording.
-        rows: What each variant gave, by its name.
-        bounds_m: The frames' Cramer-Rao bounds, m.
-        together: It is of all the other tables' recordings.
+    `bounds_m` are the frames' Cramer-Rao bounds, m.
     """
 
     name: str
@@ -298,7 +294,6 @@ class Comparison:
         variants: Name to what sets it apart, with digest and resolved table.
         tables: One per recording; over all, the last, where there are several.
         notes: What a reader must know.
-        versions: What was installed.
         each: What a table is of, in a word.
     """
 
