@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.errors import InputError
 from evlcp_sdk.link.resolve import Link, resolve
 from evlcp_sdk.link.shared import differences
 from evlcp_sdk.plugin.records import SUMMARY
@@ -112,10 +112,4 @@ def _link_of(path: Path, where: str, part: Any, registry: Registry | None) -> Li
     table = part.get("configuration") if isinstance(part, dict) else None
     if not isinstance(table, dict):
         raise InputError(f"{path}: {where}configuration: expected a table")
-    try:
-        return resolve(table, registry, source=str(path))
-    except ConfigError as fault:
-        lines = (
-            line if line.startswith(str(path)) else f"{path}: {line}" for line in str(fault).splitlines()
-        )
-        raise ConfigError("\n".join(lines)) from fault
+    return resolve(table, registry, source=str(path))
