@@ -14,15 +14,11 @@ from numpy.typing import NDArray
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.formatting import number_or_none, sigmas
-from evlcp_sdk.late import Late
 from evlcp_sdk.link.resolve import Link
 from evlcp_sdk.values import Fix, Frame, Packet, ReceivedMessage
 
 if TYPE_CHECKING:
-    from evlcp_sdk.place import observations, trajectory
     from evlcp_sdk.place.navigator import EstimatedBias, Navigator, Placed
-else:
-    observations, trajectory = (Late(f"evlcp_sdk.place.{name}") for name in ("observations", "trajectory"))
 
 _CELL_M = 0.01
 _FARTHEST_M = 1_000.0
@@ -376,7 +372,7 @@ class PositionTally:
             self.refused[placed.fix.refusal] += 1
             self.suspects.update(placed.fix.suspects)
             return
-        if placed.fix.source == trajectory.GNSS:
+        if placed.fix.source != "bars":
             return
         self.given += 1
         self.last = placed.fix
@@ -391,9 +387,7 @@ class PositionTally:
             "fixes": self.given,
             "fixes_verified": self.verified,
             "last": None if self.last is None else _last(self.last),
-            "refused": {
-                kind: self.refused[kind] for kind in observations.REJECTION_REASONS if self.refused[kind]
-            },
+            "refused": dict(sorted(self.refused.items())),
             "alarms": dict(sorted(self.alarms.items())),
             "excluded": dict(sorted(self.excluded.items())),
             "suspects": dict(sorted(self.suspects.items())),

@@ -17,14 +17,8 @@ from evlcp_sdk.scene.camera import CAMERA_PARAMETERS, CameraModel, CameraSigma
 
 Floats = NDArray[np.float64]
 
-REJECTION_REASONS = (
-    *("no-site", "no-facing", "site-contradicted", "too-few-clusters", "heading-unknown"),
-    *("gravity-unknown", "not-determined", "two-solutions", "end-on", "misfit", "uncertain"),
-)
-"""Kinds of refusal; `docs/position.md` says what each means."""
-
 CONTRADICTIONS = frozenset({"site-contradicted", "not-determined", "misfit"})
-"""Those where what is seen and what is said do not fit together; of the others, too little is known."""
+"""Kinds of refusal where what is seen and what is said do not fit together; of others too little is known."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +42,7 @@ class Rejection:
     """Why there is no position.
 
     Attributes:
-        kind: One of `REJECTION_REASONS`.
+        kind: One of those of `docs/position.md`.
         detail: The same in words, with the figures of this case.
         candidates: Of `two-solutions`, the poses that fit, the likeliest first.
         suspects: Of `misfit`, the parts of which one, if it were left out, would explain it.

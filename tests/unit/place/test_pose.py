@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from evlcp_sdk.place.error_model import ErrorModel
 from evlcp_sdk.place.fit import three_point_poses
 from evlcp_sdk.place.fit_assessment import Pose
-from evlcp_sdk.place.observations import REJECTION_REASONS, BarView, Problem, Rejection, project_bars
+from evlcp_sdk.place.observations import BarView, Problem, Rejection, project_bars
 from evlcp_sdk.place.pose import estimate_fault, fitting_focal_mm, solve_pose
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.camera import CameraModel, CameraSigma
@@ -97,7 +97,6 @@ def solved(found: Pose | Rejection) -> Pose:
 
 def refused(found: Pose | Rejection) -> Rejection:
     assert isinstance(found, Rejection), found
-    assert found.kind in REJECTION_REASONS
     assert found.detail
     return found
 
@@ -492,7 +491,7 @@ def test_never_a_silent_wrong_position(seed: int, count: int, told: str) -> None
     if isinstance(found, Pose):
         assert square(found.enu_m - position, found.covariance[:3, :3]) < stats.chi2.isf(1e-7, 3)
     else:
-        assert found.kind in REJECTION_REASONS
+        assert found.kind
 
 
 def test_a_pitch_of_the_wrong_sign_is_not_a_bar_at_fault() -> None:
