@@ -409,9 +409,6 @@ _STEPS = 50
 _OTHER_STEPS = 15
 """Steps of a fit from another start, once there is one."""
 
-_HOPELESS = 50.0
-"""How many times as much as is usual a fit costs that is given up: by Huber's weights it falls slowly."""
-
 _SAME = 1e-3
 """Fits that are nearer to each other than this share of the distance, and fit alike, are one."""
 
@@ -421,15 +418,9 @@ _MISSING = 20.0
 _ROUNDING = 1e-14
 """Share of a diagonal that rounding may leave of nothing."""
 
-_STALLED = 4
-"""Steps in a row that hardly lower the cost before it is asked whether it can still fall below the limit."""
-
 
 def likely_fits(problem: Problem) -> list[Equations] | Rejection:
-    """Where fits from all starts settle, each place once, the likeliest first; or why there is none.
-
-    What is hopeless ends before it is at its least cost.
-    """
+    """Where fits from all starts settle, each place once, the likeliest first; or why there is none."""
     starts = closed_form_starts(problem)
     if not starts:
         return Rejection("not-determined", "no place from which the bars would be seen so")
@@ -437,8 +428,7 @@ def likely_fits(problem: Problem) -> list[Equations] | Rejection:
     fits: list[Equations] = []
     for position, rotation in starts:
         steps = _STEPS if all(fit.cost > usual for fit in fits) else _OTHER_STEPS
-        start = Fit.at(problem, position, rotation)
-        fit, settled = fit_pose(problem, start, steps, hopeless=_HOPELESS * usual)
+        fit, settled = fit_pose(problem, Fit.at(problem, position, rotation), steps)
         if fit is None or not settled:
             continue
         far = _SAME * np.linalg.norm(fit.at.position - problem.points[0, :3])
@@ -463,13 +453,10 @@ def usual_cost(problem: Problem) -> float:
     return chi_square(problem.spec.false_alarm / 2, problem.freedom)
 
 
-def fit_pose(
-    problem: Problem, start: Fit, steps: int = _STEPS, *, hopeless: float = math.inf
-) -> tuple[Equations | None, bool]:
+def fit_pose(problem: Problem, start: Fit, steps: int = _STEPS) -> tuple[Equations | None, bool]:
     """Levenberg-Marquardt with Huber's weights.
 
-    The damping follows how much of what the equations promise a step wins (Nielsen 1999). Above the cost
-    `hopeless` it counts as settled where steps hardly lower it, nor promise to.
+    The damping follows how much of what the equations promise a step wins (Nielsen 1999).
 
     Returns:
         Where it ends, None where the start has a point behind the camera; and whether it settled there.
@@ -477,7 +464,7 @@ def fit_pose(
     equations = linearize(problem, start)
     if equations is None:
         return None, False
-    damping, growth, stalled = 1e-4, 4.0, 0
+    damping, growth = 1e-4, 4.0
     for _ in range(steps):
         cost, (matrix, side) = equations.cost, equations.normal
         step = _solve(matrix, side, damping)
@@ -491,7 +478,6 @@ def fit_pose(
             found = linearize(problem, found.moved(np.zeros(SHARED)))
         promise = float(side @ step)
         hoped = promise + damping * float(step @ (np.diag(matrix) * step))
-        stalled = 0 if found is not None and found.cost < 0.7 * cost else stalled + 1
         if found is not None and found.cost <= cost:
             won = cost - found.cost
             equations = found
@@ -507,11 +493,6 @@ def fit_pose(
             if damping > 1e12 or abs(promise) < 1e-9:
                 # No step is an improvement any more: rounding decides.
                 return equations, promise < 1e-3
-        if stalled == _STALLED and equations.cost > hopeless:
-            stalled = 0
-            last = _solve(*equations.normal, 1e-9)
-            if equations.cost - (0.0 if last is None else float(equations.normal[1] @ last)) > hopeless:
-                return equations, True
     return equations, False
 
 

@@ -16,7 +16,7 @@ from itertools import combinations
 import numpy as np
 
 from evlcp_sdk.place.error_model import EXACT, USUAL, ErrorModel, chi_square
-from evlcp_sdk.place.fit import ODDS, Equations, fit_pose, likely_fits, misfits
+from evlcp_sdk.place.fit import ODDS, Equations, likely_fits, misfits
 from evlcp_sdk.place.fit_assessment import FOCAL, Pose, assess_fit, covering
 from evlcp_sdk.place.observations import BarView, Candidate, Problem, Rejection, project_bars
 from evlcp_sdk.scene.attitude import Attitude
@@ -234,8 +234,7 @@ def _plain(problem: Problem) -> Pose | Rejection:
     if isinstance(fits, Rejection) or not misfits(fits[0]):
         return fits if isinstance(fits, Rejection) else _settled(fits)
     # What is off matters, not whether it is as much off from elsewhere, nor how surely it is there.
-    fitted, _ = fit_pose(problem, fits[0].at)
-    found = assess_fit(fitted or fits[0])
+    found = assess_fit(fits[0])
     if isinstance(found, Pose):
         return found
     return Rejection("not-determined", "nothing explains what is seen")

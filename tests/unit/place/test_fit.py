@@ -343,19 +343,6 @@ def test_a_doubt_is_the_mean_over_both_hypotheses(off: float) -> None:
     assert (np.trace(out) > 0.1 * np.trace(spread[:6, :6])) == (off > 5)
 
 
-def test_a_fit_that_stalls_far_off_ends() -> None:
-    """A site that is metres off: hopeless from the start of the search, and after few steps."""
-    p, position, rotation = problem(np.random.default_rng(30), bars=2, noise=1.0)
-    wrong = p.points.copy()
-    wrong[p.bar == 1, 0] += 30.0
-    p = dataclasses.replace(p, points=wrong)
-    whole = fitted(p, position, rotation)
-    short, settled = fit_pose(p, Fit.at(p, position, rotation), hopeless=1000.0)
-    assert settled
-    assert short.cost > 1000
-    assert whole.cost <= short.cost
-
-
 def test_points_that_say_nothing_determine_no_position() -> None:
     p, position, rotation = problem(np.random.default_rng(31))
     p.points[:, 8] = 0.0
