@@ -8,7 +8,7 @@ that the rest contradicts is left out, and named. Frames and signs: `docs/positi
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import combinations
@@ -68,10 +68,11 @@ def solve_pose(
     Returns:
         The pose, or why the geometry does not determine one, or the parts contradict one another.
     """
-    problem = Problem.of(views, camera, attitude, spec, sigma)
+    problem_of = partial(Problem.of, camera=camera, attitude=attitude, spec=spec, sigma=sigma)
+    problem = problem_of(views)
     if isinstance(problem, Rejection):
         return problem
-    mixed_up = partial(_mixed_up, views, camera, attitude, spec, sigma)
+    mixed_up = partial(_mixed_up, views, problem_of)
     found = _plain(problem)
     if isinstance(found, Rejection):
         if found.kind != "not-determined":
@@ -204,11 +205,7 @@ def fitting_focal_mm(
 
 
 def _mixed_up(
-    views: Sequence[BarView],
-    camera: CameraModel,
-    attitude: Attitude | None,
-    spec: ErrorModel,
-    sigma: CameraSigma,
+    views: Sequence[BarView], problem_of: Callable[[Sequence[BarView]], Problem | Rejection]
 ) -> list[tuple[str, Pose]]:
     """Which two sites would explain all, too, if they stood at each other's place, and the pose by that.
 
@@ -220,7 +217,7 @@ def _mixed_up(
         one, two, mixed = views[i], views[j], list(views)
         mixed[i] = replace(one, enu_m=two.enu_m, survey=two.survey)
         mixed[j] = replace(two, enu_m=one.enu_m, survey=one.survey)
-        swapped = Problem.of(mixed, camera, attitude, spec, sigma)
+        swapped = problem_of(mixed)
         pose = _explained(swapped) if isinstance(swapped, Problem) else None
         if isinstance(pose, Pose):
             name = f"bar {one.transmitter} at the site of bar {two.transmitter} and the reverse"
