@@ -1,10 +1,9 @@
 """What a driver board is sent: symbols or chips, as the content of a bank."""
 
 import zlib
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,7 +14,7 @@ from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_numbers
 from evlcp_sdk.link.resolve import Link
 from firmware_host.protocol.generated.requests import CLUSTERS, LEDS, ROW_BYTES, Format
-from firmware_host.protocol.rows import BOARD_LEDS, masks_of_clusters, rows_of_chips
+from firmware_host.protocol.rows import BOARD_LEDS, rows_of_leds
 
 WORD_CHIPS = 16
 """Chips of a pilot, and of an info segment, that the board composes."""
@@ -48,7 +47,6 @@ class Bank:
         composed: Whether the board knows the codebook, so that it can put packets together.
         rest: What its LEDs must do while nothing is sent, as the link's framing says.
         chips: Whole packets, uint8 (chips, clusters or LEDs); none in the queue of a stream.
-        content: The bank's bytes; none if the link has more LEDs than any board.
     """
 
     format: Format
@@ -56,9 +54,8 @@ class Bank:
     packet: PacketFormat
     led_clusters: NDArray[np.int64]
     composed: bool
-    rest: int | None = None
-    chips: Chips = field(default_factory=lambda: np.zeros((0, 1), np.uint8))
-    content: bytes = b""
+    rest: int | None
+    chips: Chips
 
     @classmethod
     def of_symbols(
@@ -78,10 +75,9 @@ class Bank:
         >>> Bank.of_symbols([[[0] * 16]], resolve({}).codebook).content[:2].hex()
         '5555'
         """
-        s = _checked(symbols)
-        packet = PacketFormat.of(codebook, s.shape[1], chip_rate_hz, pilot_every)
-        like = _like(codebook, packet, led_clusters)
-        return like.holding(symbol_chips(s, codebook, pilot_every))
+        chips = symbol_chips(symbols, codebook, pilot_every)
+        packet = PacketFormat.of(codebook, np.shape(symbols)[1], chip_rate_hz, pilot_every)
+        return _bank(codebook, packet, led_clusters, chips)
 
     @classmethod
     def of_chips(
@@ -94,36 +90,37 @@ class Bank:
         """Chips as they are, uint8 (chips, clusters or LEDs), that fill whole packets.
 
         Raises:
-            ConfigError: Another number of chips or columns, or no board can play them.
+            ConfigError: Another number of chips or columns, they are not 0 and 1, or no board can play them.
         """
-        like = _like(codebook, packet, led_clusters)
         c = np.asarray(chips)
         if c.ndim != 2 or not len(c) or len(c) % packet.packet_chips:
             raise ConfigError(
                 f"array of shape {c.shape}, expected whole packets of {packet.packet_chips} chips"
                 f" ({packet.frames} frames)"
             )
-        by_cluster = like.format == Format.CLUSTERS and c.shape[1] == codebook.clusters
-        return replace(like, format=Format.CLUSTERS if by_cluster else Format.MASKS).holding(c)
-
-    def holding(self, chips: NDArray[Any]) -> "Bank":
-        """The same with other packets.
-
-        Raises:
-            ConfigError: The chips are not 0 and 1, or there are other columns.
-        """
-        if len(self.led_clusters) > LEDS:
-            return replace(self, chips=chips)
-        return replace(self, chips=chips, content=self.table + (self.encode(chips) if len(chips) else b""))
-
-    def encode(self, chips: NDArray[Any]) -> bytes:
-        """Whole packets as they stand in a bank; faults as of `holding`."""
-        if self.format == Format.MASKS:
-            return rows_of_chips(chips, self.led_clusters).tobytes()
-        if chips.dtype.kind not in "uib" or not np.isin(chips, (0, 1)).all():
+        if c.shape[1] not in (len(led_clusters), codebook.clusters):
+            raise ConfigError(
+                f"chips of shape {c.shape}: expected one column for each of {len(led_clusters)} LEDs or"
+                f" {codebook.clusters} clusters"
+            )
+        if c.dtype.kind not in "uib" or not np.isin(c, (0, 1)).all():
             raise ConfigError("chips: expected integers 0 and 1")
+        bank = _bank(codebook, packet, led_clusters, c.astype(np.uint8))
+        by_cluster = bank.format == Format.CLUSTERS and c.shape[1] == codebook.clusters
+        return replace(bank, format=Format.CLUSTERS if by_cluster else Format.MASKS)
+
+    @cached_property
+    def content(self) -> bytes:
+        """The bank's bytes; of a link that has no more LEDs than a board."""
+        return self.table + (self.encode(self.chips) if len(self.chips) else b"")
+
+    def encode(self, chips: Chips) -> bytes:
+        """Whole packets as they stand in a bank."""
+        if self.format == Format.MASKS:
+            by_cluster = chips.shape[1] == self.clusters
+            return rows_of_leds(chips[:, self.led_clusters] if by_cluster else chips).tobytes()
         if self.format == Format.CLUSTERS:
-            return np.packbits(chips.astype(np.uint8), axis=1).tobytes()
+            return np.packbits(chips, axis=1).tobytes()
         packet = self.packet
         ends = [packet.frame_start_chip(frame + 1) for frame in range(packet.frames)]
         info = np.array([range(end - WORD_CHIPS, end) for end in ends])
@@ -133,7 +130,7 @@ class Bank:
     def chip_by_chip(self) -> "Bank":
         """The same with every chip in the bank, where the board would compose packets."""
         form = Format.CLUSTERS if self.format == Format.WORDS else self.format
-        return replace(self, format=form, composed=False).holding(self.chips)
+        return replace(self, format=form, composed=False)
 
     @property
     def packets(self) -> int:
@@ -158,7 +155,9 @@ class Bank:
     @property
     def table(self) -> bytes:
         """What stands before the first packet: the masks of the clusters."""
-        return masks_of_clusters(self.led_clusters).tobytes() if self.format == Format.CLUSTERS else b""
+        if self.format != Format.CLUSTERS:
+            return b""
+        return rows_of_leds(self.led_clusters == np.arange(self.clusters)[:, None]).tobytes()
 
     @property
     def packet_bytes(self) -> int:
@@ -183,8 +182,14 @@ class Bank:
         return zlib.crc32(self.content)
 
 
-def _like(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int64]) -> Bank:
-    """A bank without packets in the most compact format that takes a link.
+def _bank(
+    codebook: Codebook,
+    packet: PacketFormat,
+    led_clusters: NDArray[np.int64],
+    chips: Chips | None = None,
+    rest: int | None = None,
+) -> Bank:
+    """A bank in the most compact format that takes a link, without chips for a queue.
 
     Raises:
         ConfigError: No board can play it.
@@ -195,7 +200,8 @@ def _like(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int
         raise ConfigError(f"LEDs of {clusters} clusters, expected {codebook.clusters}, one for each pilot")
     composed = not word_limits(codebook, packet, led_clusters)
     form = Format.WORDS if composed else Format.CLUSTERS if -(-clusters // 8) < ROW_BYTES else Format.MASKS
-    return Bank(form, codebook, packet, led_clusters, composed)
+    none = np.zeros((0, clusters), np.uint8)
+    return Bank(form, codebook, packet, led_clusters, composed, rest, none if chips is None else chips)
 
 
 def word_limits(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int64]) -> list[str]:
@@ -217,13 +223,12 @@ def word_limits(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[
 
 def check_rate(packet: PacketFormat) -> None:
     """Raise ConfigError, one line, if no driver board plays so many chips a second; the rest HELLO says."""
-    rate, fault = packet.chip_rate_hz, ""
-    if rate != round(rate):
-        fault = "a board takes whole chips per second"
-    elif rate > MOST_CHIPS_A_SECOND:
-        fault = f"expected at most {MOST_CHIPS_A_SECOND}"
-    if fault:
-        raise ConfigError(f"the driver board cannot play this link: air.chip_rate_hz = {rate}: {fault}")
+    rate = packet.chip_rate_hz
+    if rate != round(rate) or rate > MOST_CHIPS_A_SECOND:
+        raise ConfigError(
+            f"the driver board cannot play this link: air.chip_rate_hz = {rate}: expected whole chips per second, at"
+            f" most {MOST_CHIPS_A_SECOND}"
+        )
 
 
 def bank_of(symbols: ArrayLike, link: Link) -> Bank:
@@ -245,16 +250,9 @@ def queue_of(link: Link) -> Bank:
         ConfigError: No board can play it.
     """
     rest = link.algorithm("framing").rest()
-    like = replace(_like(link.codebook, link.packet, link.bar.led_clusters()), rest=rest)
+    bank = _bank(link.codebook, link.packet, link.bar.led_clusters(), rest=rest)
     # A board that composes packets has words for no pause.
-    return like.holding(like.chips) if rest is None else like.chip_by_chip()
-
-
-def _checked(symbols: ArrayLike) -> NDArray[Any]:
-    s = np.asarray(symbols)
-    if s.ndim != 3 or not s.size:
-        raise ConfigError(f"symbols of shape {s.shape}: expected (packets, frames, clusters)")
-    return s
+    return bank if rest is None else bank.chip_by_chip()
 
 
 def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.random.Generator) -> Symbols:
@@ -269,7 +267,10 @@ def symbol_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -
     Raises:
         ConfigError: Symbols of another shape or outside the codebook.
     """
-    return np.concatenate([packet_chips(packet, codebook, pilot_every) for packet in _checked(symbols)])
+    s = np.asarray(symbols)
+    if s.ndim != 3 or not s.size:
+        raise ConfigError(f"symbols of shape {s.shape}: expected (packets, frames, clusters)")
+    return np.concatenate([packet_chips(packet, codebook, pilot_every) for packet in s])
 
 
 def read_masks(path: Path, link: Link) -> Bank:

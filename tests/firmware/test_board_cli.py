@@ -151,7 +151,7 @@ EMULATE = ("board", "emulate", "native")
         (("board", "flash", "no.bin", "--port", "tcp:127.0.0.1:1"), 3, None, "no.bin"),
         (("loop", "--text", ""), 2, None, "text: expected at least one character"),
         (("loop", "--distance", "5"), 2, None, "the bar, 0.96 m high, fits into the image from 9.6 m on"),
-        (("loop", "--set", "air.chip_rate_hz=12.5"), 2, None, "a board takes whole chips per second"),
+        (("loop", "--set", "air.chip_rate_hz=12.5"), 2, None, "expected whole chips per second"),
     ],
 )
 def test_a_fault_is_one_line_and_json_too(evlcp, tmp_path, monkeypatch, arguments, code, kind, says) -> None:
