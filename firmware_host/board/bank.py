@@ -226,8 +226,8 @@ def check_rate(packet: PacketFormat) -> None:
     rate = packet.chip_rate_hz
     if rate != round(rate) or rate > MOST_CHIPS_A_SECOND:
         raise ConfigError(
-            f"the driver board cannot play this link: air.chip_rate_hz = {rate}: expected whole chips per second, at"
-            f" most {MOST_CHIPS_A_SECOND}"
+            f"the driver board cannot play this link: air.chip_rate_hz = {rate},"
+            f" expected whole chips per second, at most {MOST_CHIPS_A_SECOND}"
         )
 
 

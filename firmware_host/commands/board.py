@@ -636,8 +636,8 @@ def emulate(
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import check_output
     from evlcp_sdk.signals import stop_on_request
-    from firmware_host.emulators import processes
     from firmware_host.emulators.listening import HostLine, check_free
+    from firmware_host.emulators.models import part_image, serve_part
     from firmware_host.emulators.native import NativeBoard, serve
     from firmware_host.ports.transport import socket_address
 
@@ -652,45 +652,18 @@ def emulate(
     check_free(listen)
     if leds is not None:
         check_output(leds, regular=False)
-    if emulator == "native":
-        with contextlib.ExitStack() as stack:
+    with contextlib.ExitStack() as stack:
+        if emulator == "native":
             board = stack.enter_context(contextlib.closing(NativeBoard(leds, flash, unique_id)))
-            line = stack.enter_context(contextlib.closing(HostLine(listen, link)))
-            stopped = stack.enter_context(stop_on_request())
-            echo(f"listening on {line.place}")
+        else:
+            image = part_image(emulator == "rom", flash)
+        line = stack.enter_context(contextlib.closing(HostLine(listen, link)))
+        stopped = stack.enter_context(stop_on_request())
+        echo(f"listening on {line.place}")
+        if emulator == "native":
             serve(board, line, stopped)
-        return
-    if emulator == "rom":
-        command = processes.rom_command(listen, flash, leds)
-    else:
-        command = processes.stm32_command(listen, leds)
-    _run_in_foreground(emulator, command, listen)
-
-
-def _run_in_foreground(emulator: str, command: list[str], listen: str) -> None:
-    """Run an emulator that ends with this command, however that comes."""
-    import signal
-    import subprocess
-
-    from evlcp_sdk.errors import InputError
-    from firmware_host.emulators.processes import wait_for
-    from firmware_host.errors import ToolchainError
-
-    process = subprocess.Popen(command, stdin=subprocess.DEVNULL)
-    signal.signal(signal.SIGTERM, lambda *_: process.terminate())
-    try:
-        if (line := wait_for(listen, process)) is not None:
-            line.close()
-            echo(f"listening on {listen}")
-        code = process.wait()
-    except KeyboardInterrupt:
-        process.terminate()
-        process.wait()
-        return
-    if code == InputError.exit_code:
-        raise typer.Exit(code)  # a file of the board's, which has said so
-    if code not in (0, -signal.SIGTERM, -signal.SIGINT):
-        raise ToolchainError(f"the {emulator} board ended with {code}; see its message above")
+        else:
+            serve_part(line, image, flash, leds, stopped)
 
 
 @app.command(cls=JsonCommand)

@@ -23,7 +23,6 @@ from firmware_host.board.board import Board
 from firmware_host.board.session import Session
 from firmware_host.board.survey import find, survey
 from firmware_host.emulators.led_record import RECORD, LedRecord
-from firmware_host.emulators.processes import bound
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.transport import open_transport
 from firmware_host.ports.usb import SerialPort
@@ -36,7 +35,7 @@ class Emulated:
     """`evlcp board emulate` in the background."""
 
     def __init__(self, *options: object) -> None:
-        command = bound([*EVLCP, "board", "emulate", *map(str, options)])
+        command = [*EVLCP, "board", "emulate", *map(str, options)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True, stdin=subprocess.DEVNULL)
         self.said = self.process.stdout.readline()
 

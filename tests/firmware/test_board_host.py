@@ -1,12 +1,10 @@
 """What the host tool says and does about a board that is left, taken, silent, gone or of another rate."""
 
 import json
-import os
 import re
 import signal
 import socket
 import subprocess
-import sys
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
@@ -209,35 +207,6 @@ def test_a_monitor_finds_its_board_again(device: SimulatedBoard) -> None:
     assert not list(lines)
     with pytest.raises(NoBoardError):
         list(watch(off, 0.01, count=1))  # type: ignore[arg-type]
-
-
-def is_there(pid: int) -> bool:
-    """Whether a process runs; one that has ended and is not yet waited for does not."""
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def test_what_is_bound_ends_with_its_parent() -> None:
-    code = (
-        "import subprocess, sys, time\n"
-        "from firmware_host.emulators.processes import bound\n"
-        "print(subprocess.Popen(bound(['sleep', '600'])).pid, flush=True)\n"
-        "time.sleep(600)\n"
-    )
-    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    child = int(parent.stdout.readline())
-    try:
-        assert within(60, lambda: "sleep" in Path(f"/proc/{child}/cmdline").read_text().split("\0")[0])
-        parent.kill()
-        parent.wait()
-        assert within(60, lambda: not is_there(child))
-    finally:
-        parent.kill()
-        parent.stdout.close()
-        if is_there(child):
-            os.kill(child, signal.SIGKILL)
 
 
 def test_a_trace_follows_no_link_and_outlasts_its_host(device: SimulatedBoard, tmp_path: Path) -> None:

@@ -6,12 +6,11 @@ part, and never faster: its time is that of the clock, or behind it. A record ho
 took while the outputs were on, and the time, in ticks of 14 MHz.
 """
 
-import argparse
 import contextlib
 import importlib.util
 import struct
-import sys
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO
 
@@ -44,12 +43,12 @@ def records(log: "list[Shown]", chip: int, units_a_tick: int) -> tuple[bytes, in
     return b"".join(out), chip
 
 
-def serve(chip: "Stm32", line: HostLine, leds: BinaryIO | None) -> None:
-    """Run a model for hosts, one at a time, until it is ended."""
+def serve(chip: "Stm32", line: HostLine, leds: BinaryIO | None, stopped: Callable[[], bool]) -> None:
+    """Run a model for hosts, one at a time, until it is stopped."""
     from tests.models.stm32 import UNIT_HZ
 
     begun, number = time.monotonic(), 0
-    while True:
+    while not stopped():
         chip.run(_STEP_US)
         ahead = chip.now / UNIT_HZ - (time.monotonic() - begun)
         if ahead < 0:
@@ -66,16 +65,17 @@ def serve(chip: "Stm32", line: HostLine, leds: BinaryIO | None) -> None:
                 leds.flush()
 
 
-def serve_rom(rom: RomEmulator, line: HostLine, flash: Path | None) -> None:
-    """Let hosts talk to a ROM, one after the other, until one has it run something.
+def serve_rom(rom: RomEmulator, line: HostLine, flash: Path | None, stopped: Callable[[], bool]) -> None:
+    """Let hosts talk to a ROM, one after the other, until one has it run something, or it is stopped.
 
     Args:
         rom: The part.
         line: Where hosts come.
         flash: File that holds its flash whenever it has changed.
+        stopped: Ends it.
     """
     answer, held = b"", b""
-    while rom.started is None:
+    while rom.started is None and not stopped():
         data = line.exchange(answer, 0.0 if answer else 0.2)
         answer = rom.receive(data) if data else b""
         if not data and flash is not None and rom.flash != held:
@@ -98,36 +98,22 @@ def flashed(flash: bytes) -> "Stm32":
     raise ToolchainError("what was flashed does not run on the model")
 
 
-def main(arguments: list[str] | None = None) -> None:
-    """Be a part until it is ended."""
-    parser = argparse.ArgumentParser(prog="python -m tests.models.server")
-    parser.add_argument("--image", type=Path)
-    parser.add_argument("--listen", required=True)
-    parser.add_argument("--flash", type=Path)
-    parser.add_argument("--leds", type=Path)
-    options = parser.parse_args(arguments)
+def serve_part(
+    line: HostLine, image: Path | None, flash: Path | None, leds: Path | None, stopped: Callable[[], bool]
+) -> None:
+    """Be a part until it is stopped."""
     with contextlib.ExitStack() as stack:
-        stack.enter_context(contextlib.suppress(KeyboardInterrupt))
-        try:
-            leds = stack.enter_context(options.leds.open("wb")) if options.leds else None
-            if options.image:
-                from tests.models.stm32 import Stm32
+        record = None if leds is None else stack.enter_context(leds.open("wb"))
+        if image is None:
+            rom = RomEmulator(flash.read_bytes() if flash is not None and flash.exists() else None)
+            serve_rom(rom, line, flash, stopped)
+            if stopped():
+                return
+            if importlib.util.find_spec("unicorn") is None:
+                raise ToolchainError("told to run; 'pip install unicorn' for the model that does")
+            chip = flashed(bytes(rom.flash))
+        else:
+            from tests.models.stm32 import Stm32
 
-                chip = Stm32(options.image)
-                line = HostLine(options.listen)
-            else:
-                held = options.flash.read_bytes() if options.flash and options.flash.exists() else None
-                rom, line = RomEmulator(held), HostLine(options.listen)
-                serve_rom(rom, line, options.flash)
-                if importlib.util.find_spec("unicorn") is None:
-                    sys.stderr.write("rom: told to run; 'pip install unicorn' for the model that does\n")
-                    return
-                chip = flashed(bytes(rom.flash))
-            serve(chip, line, leds)
-        except (OSError, ToolchainError) as fault:
-            sys.stderr.write(f"stm32: {fault}\n")
-            raise SystemExit(1) from None
-
-
-if __name__ == "__main__":
-    main()
+            chip = Stm32(image)
+        serve(chip, line, record, stopped)
