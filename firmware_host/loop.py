@@ -113,11 +113,13 @@ class Step:
 
     Attributes:
         name: message, board, light, scene, receiver or text.
-        figures: What was measured, as JSON values.
+        said: What was measured, for a person.
+        figures: The same as JSON values.
         files: What it wrote, within the folder.
     """
 
     name: str
+    said: str
     figures: dict[str, Any]
     files: tuple[str, ...] = ()
 
@@ -172,6 +174,8 @@ def loop(
     programmed = light.programmed
     yield Step(
         "board",
+        f"emulated, firmware {light.firmware}: programmed over its line ({programmed.length} bytes),"
+        " read back, started",
         {"firmware": light.firmware, "payload_bytes": programmed.length, "retries": programmed.retries},
         ("wire.jsonl",),
     )
@@ -182,10 +186,11 @@ def loop(
     decoded = _DecodedTexts()
     yield _receiver_step(link, folder, decoded, sinks)
     texts = list(dict.fromkeys(decoded.texts))
-    yield Step(
-        "text",
-        {"texts": texts, "packets": decoded.packets, "as_sent": text in texts},
-    )
+    read, as_sent = ", ".join(f'"{one}"' for one in texts), text in texts
+    times = "once" if decoded.packets == 1 else f"from {decoded.packets} packets"
+    said = f"{read}, read {times}" + ("" if as_sent else ": not what was sent")
+    figures = {"texts": texts, "packets": decoded.packets, "as_sent": as_sent}
+    yield Step("text", said if texts else "none was read", figures)
 
 
 def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link: Link, folder: Path) -> Step:
@@ -197,16 +202,27 @@ def _message_step(text: str, message: Message, symbols: NDArray[np.int64], link:
             json.dumps(symbols_table(symbols, link, messages=True)) + "\n", folder / "message.json"
         )
         outputs.commit()
+    count, size = len(symbols), len(message.payload)
+    bits, chips = link.block_coder().bits * count, packet.packet_chips * count
+    duration_s = round(chips / link.air.chip_rate_hz, 6)
     figures = {
         "text": text,
-        "bytes": len(message.payload),
-        "packets": len(symbols),
+        "bytes": size,
+        "packets": count,
         "symbols": symbols.size,
-        "bits": link.block_coder().bits * len(symbols),
-        "chips": packet.packet_chips * len(symbols),
-        "duration_s": round(packet.packet_chips * len(symbols) / link.air.chip_rate_hz, 6),
+        "bits": bits,
+        "chips": chips,
+        "duration_s": duration_s,
     }
-    return Step("message", figures, ("link.toml", "message.json"))
+    said = (
+        f'"{text}", {size} bytes: {_number(count, "packet")} with error correction, {bits} bits as'
+        f" {symbols.size} symbols in {chips} chips, {1e3 * duration_s:.4g} ms"
+    )
+    return Step("message", said, figures, ("link.toml", "message.json"))
+
+
+def _number(count: int, of: str) -> str:
+    return f"{count} {of}{'s' * (count != 1)}"
 
 
 def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
@@ -215,13 +231,14 @@ def _light_step(light: EmulatedLight, link: Link, folder: Path) -> Step:
         outputs.open_binary(folder / "leds.bin").write(light.record.to_bytes())
         outputs.write_array(light.chips, folder / _CHIPS)
         outputs.commit()
-    figures = {
-        "leds": len(link.bar.led_clusters()),
-        "chips": len(light.chips),
-        "chip_rate_hz": round(light.rate_hz, 3),
-        "on_share": round(float(light.chips.mean()), 4),
-    }
-    return Step("light", figures, ("leds.bin", _CHIPS))
+    leds, chips = len(link.bar.led_clusters()), len(light.chips)
+    rate_hz, on_share = round(light.rate_hz, 3), round(float(light.chips.mean()), 4)
+    figures = {"leds": leds, "chips": chips, "chip_rate_hz": rate_hz, "on_share": on_share}
+    said = (
+        f"{_number(leds, 'LED')}, {rate_hz:g} chips a second, on for {on_share:.0%} of the time;"
+        f" {chips} chips watched, each what the message says"
+    )
+    return Step("light", said, figures, ("leds.bin", _CHIPS))
 
 
 def _scene_of(
@@ -260,13 +277,14 @@ def _scene_step(
     simulated = simulate(scene, seed)
     _, truth_file = simulated.save(raw, lambda done_s: advance(done_s / duration_s))
     _add_symbols(truth_file, symbols, packets)
-    figures = {
-        "distance_m": scene["motion"]["distance_m"],
-        "duration_s": round(duration_s, 6),
-        "events": simulated.simulation.counts["events"],
-        "bytes": raw.stat().st_size,
-    }
-    return Step("scene", figures, (raw.name, truth_file.name))
+    distance_m, events = scene["motion"]["distance_m"], simulated.simulation.counts["events"]
+    size, duration_s = raw.stat().st_size, round(duration_s, 6)
+    figures = {"distance_m": distance_m, "duration_s": duration_s, "events": events, "bytes": size}
+    said = (
+        f"a still camera {distance_m:g} m away looks for {duration_s:.2g} s:"
+        f" {events / 1e6:.2f} million events, {size / 1e6:.1f} MB"
+    )
+    return Step("scene", said, figures, (raw.name, truth_file.name))
 
 
 def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Sequence[str]) -> Step:
@@ -290,7 +308,17 @@ def _receiver_step(link: Link, folder: Path, decoded: "_DecodedTexts", sinks: Se
         "warnings": summary["warnings"],
     }
     files = tuple(f"{RECEIVED}/{name}" for name in (*summary["files"], "summary.json"))
-    return Step("receiver", figures, files)
+    return Step("receiver", _received(figures), figures, files)
+
+
+def _received(figures: dict[str, Any]) -> str:
+    """What of the frames was received, for a person."""
+    frames, sent, errors, bits = (figures[key] for key in ("frames", "frames_sent", "bit_errors", "bits"))
+    if not frames:
+        return f"{figures['result']}; {sent} frames were sent"
+    share = errors / bits if bits else 0.0
+    said = f"{frames} of {sent} frames, {errors} of {bits} bits wrong (BER {share:.2g})"
+    return said + ("" if figures["distance_m"] is None else f"; distance {figures['distance_m']:.2f} m")
 
 
 class _DecodedTexts:

@@ -8,9 +8,9 @@ import pytest
 from board_lines import LINK, well
 
 from firmware_host.board.bank import symbol_chips
-from firmware_host.commands.loop import _receiver
 from firmware_host.emulators import simulated
 from firmware_host.emulators.led_record import LedRecord
+from firmware_host.loop import _received
 
 
 def test_a_text_arrives_and_every_file_is_what_others_read(evlcp, tmp_path: Path) -> None:
@@ -70,6 +70,6 @@ def test_without_a_compiler(evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPat
 def test_wrong_bits_are_said_of_a_light_without_a_distance_too() -> None:
     step = {"result": "1 transmitter", "frames": 9, "frames_sent": 10, "bits": 72, "bit_errors": 36}
     said = "9 of 10 frames, 36 of 72 bits wrong (BER 0.5)"
-    assert _receiver(step | {"distance_m": None}) == said
-    assert _receiver(step | {"distance_m": 30.0}) == f"{said}; distance 30.00 m"
-    assert _receiver(step | {"frames": 0, "distance_m": None}) == "1 transmitter; 10 frames were sent"
+    assert _received(step | {"distance_m": None}) == said
+    assert _received(step | {"distance_m": 30.0}) == f"{said}; distance 30.00 m"
+    assert _received(step | {"frames": 0, "distance_m": None}) == "1 transmitter; 10 frames were sent"
