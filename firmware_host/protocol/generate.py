@@ -7,7 +7,6 @@ import argparse
 import sys
 import tomllib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -18,117 +17,60 @@ from evlcp_sdk.link.resolve import resolve
 
 HERE = Path(__file__).parents[1]
 
-_SIZES = {"u8": 1, "u16": 2, "u32": 4, "i16": 2}
-_CODES = {"u8": "B", "u16": "H", "u32": "I", "i16": "h"}
+_BASES = {
+    "u8": ("B", 1, "uint8_t"),
+    "u16": ("H", 2, "uint16_t"),
+    "u32": ("I", 4, "uint32_t"),
+    "i16": ("h", 2, "int16_t"),
+    "bytes": ("s", 1, "uint8_t"),
+}
+"""Types of an element: their `struct` code, bytes, and C type."""
+
+Table = dict[str, Any]
 
 
-@dataclass(frozen=True)
-class Field:
-    """One field of a payload.
-
-    Attributes:
-        name: Its name.
-        base: Type of an element: u8, u16, u32, i16 or bytes.
-        count: Elements; 0 for the rest of the payload.
-        doc: Meaning.
-        since: Minor version that brought it.
-
-    >>> Field.parse({"name": "pilots", "type": "u16[16]", "doc": "Pilot words."}).size
-    32
-    """
-
-    name: str
-    base: str
-    count: int
-    doc: str
-    since: int = 0
-
-    @classmethod
-    def parse(cls, table: dict[str, Any]) -> "Field":
-        """Read one field of the definition."""
-        base, bracket, count = table["type"].partition("[")
-        n = int(count[:-1]) if bracket else (0 if base == "bytes" else 1)
-        return cls(table["name"], base, n, table["doc"], table.get("since", 0))
-
-    @property
-    def size(self) -> int:
-        """Bytes; 0 for the rest of the payload."""
-        return _SIZES.get(self.base, 1) * self.count
-
-    @property
-    def bits(self) -> int:
-        """Of an element."""
-        return 8 * _SIZES[self.base]
-
-    @property
-    def c_type(self) -> str:
-        """C type of an element."""
-        return (
-            f"{'int' if self.base[0] == 'i' else 'uint'}{self.bits}_t" if self.base in _SIZES else "uint8_t"
-        )
-
-    @property
-    def python_type(self) -> str:
-        """Annotation, with its `struct` code."""
-        if self.base == "bytes":
-            return f'Annotated[bytes, "{self.count}s"]' if self.count else "Rest"
-        if self.count == 1:
-            return self.base.upper()
-        return f'Annotated[tuple[int, ...], "{self.count}{_CODES[self.base]}"]'
-
-    @property
-    def python_default(self) -> str:
-        """What stands for it where it is not known; empty if it always is."""
-        if not self.since:
-            return ""
-        absent = "0" if self.count == 1 else f"(0,) * {self.count}"
-        if self.base == "bytes":
-            absent = f"bytes({self.count})"
-        return f' = field(default={absent}, metadata={{"since": {self.since}}})'
+def _field(table: Table) -> Table:
+    """A field of a payload, with what templates need of it; its count is 0 for the rest of the payload."""
+    base, _, number = table["type"].removesuffix("]").partition("[")
+    code, size, c_type = _BASES[base]
+    count = int(number) if number else int(base != "bytes")
+    if base == "bytes":
+        python, absent = f'Annotated[bytes, "{count}s"]' if count else "Rest", f"bytes({count})"
+    elif count == 1:
+        python, absent = base.upper(), "0"
+    else:
+        python, absent = f'Annotated[tuple[int, ...], "{count}{code}"]', f"(0,) * {count}"
+    since = table.get("since", 0)
+    return table | {
+        "base": base,
+        "count": count,
+        "since": since,
+        "size": size * count,
+        "bits": 8 * size,
+        "c_type": c_type,
+        "python_type": python,
+        # what stands for it where it is not known
+        "python_default": f' = field(default={absent}, metadata={{"since": {since}}})' if since else "",
+    }
 
 
-@dataclass(frozen=True)
-class Exchange:
-    """A request and its reply.
-
-    Attributes:
-        name: Its name.
-        type: Its number.
-        kind: session, query, data or control.
-        doc: Meaning.
-        request: Fields of the request.
-        reply: Fields of the reply.
-        since: Minor version that brought it.
-    """
-
-    name: str
-    type: int
-    kind: str
-    doc: str
-    request: list[Field]
-    reply: list[Field]
-    since: int = 0
-
-    @classmethod
-    def parse(cls, table: dict[str, Any]) -> "Exchange":
-        """Read one message of the definition."""
-        parts = {part: [Field.parse(f) for f in table[part]] for part in ("request", "reply")}
-        for fields in parts.values():
-            if [f.since for f in fields] != sorted(f.since for f in fields):
-                raise ValueError(f"message {table['name']}: a field with `since` stands before one without")
-            if any(f.since and not f.size for f in fields):
-                raise ValueError(f"message {table['name']}: a field of any length cannot come later")
-        return cls(**table | parts)
-
-    @property
-    def request_bytes(self) -> int:
-        """Of the request, data left out."""
-        return sum(f.size for f in self.request)
-
-    @property
-    def takes_more(self) -> bool:
-        """Whether a request may be longer; the board leaves alone what a later host adds to HELLO."""
-        return self.kind == "session" or any(not f.size for f in self.request)
+def _message(table: Table) -> Table:
+    """A request and its reply, with what templates need of them."""
+    parts = {part: [_field(f) for f in table[part]] for part in ("request", "reply")}
+    for fields in parts.values():
+        if [f["since"] for f in fields] != sorted(f["since"] for f in fields):
+            raise ValueError(f"message {table['name']}: a field with `since` stands before one without")
+        if any(f["since"] and not f["size"] for f in fields):
+            raise ValueError(f"message {table['name']}: a field of any length cannot come later")
+    request = parts["request"]
+    return {
+        "since": 0,
+        **table,
+        **parts,
+        "request_bytes": sum(f["size"] for f in request),
+        # the board leaves alone what a later host adds to HELLO
+        "takes_more": table["kind"] == "session" or not all(f["size"] for f in request),
+    }
 
 
 _CLASSES = {"fault": "BoardFault"}
@@ -145,25 +87,25 @@ def _camel(name: str) -> str:
     return _CLASSES.get(name) or "".join(part.capitalize() for part in name.split("_"))
 
 
-def _reply_class(message: Exchange) -> str:
-    return f"{_camel(message.name)}Reply" if message.reply else "EmptyReply"
+def _reply_class(message: Table) -> str:
+    return f"{_camel(message['name'])}Reply" if message["reply"] else "EmptyReply"
 
 
-def _with_offsets(fields: Sequence[Field]) -> list[tuple[Field, int]]:
-    return list(zip(fields, accumulate((f.size for f in fields), initial=0), strict=False))
+def _with_offsets(fields: list[Table]) -> list[tuple[Table, int]]:
+    return list(zip(fields, accumulate((f["size"] for f in fields), initial=0), strict=False))
 
 
-def _fields_table(message: Exchange, major: int) -> str:
+def _fields_table(message: Table, major: int) -> str:
     rows = []
-    for kind, fields in (("request", message.request), ("reply", message.reply)):
-        for f in fields:
-            many = f"[{f.count}]" if f.count > 1 else "" if f.size else " to the end"
-            later = f" Since {major}.{f.since}." if f.since else ""
-            rows.append(("" if f is not fields[0] else kind, f.name, f"{f.base}{many}", f"{f.doc}{later}"))
+    for kind in ("request", "reply"):
+        for n, f in enumerate(message[kind]):
+            type_ = f["type"] if f["size"] else "bytes to the end"
+            later = f" Since {major}.{f['since']}." if f["since"] else ""
+            rows.append(("" if n else kind, f["name"], type_, f["doc"] + later))
     return _columns(rows)
 
 
-def _numbers_table(enum: dict[str, Any]) -> str:
+def _numbers_table(enum: Table) -> str:
     return _columns([(str(e["value"]), k.upper(), e["doc"]) for k, e in enum.items() if k != "doc"])
 
 
@@ -183,19 +125,19 @@ _TEMPLATES.filters |= {
 }
 
 
-def render(template: str, definition: dict[str, Any]) -> str:
+def render(template: str, definition: Table) -> str:
     """A generated file: `requests.py`, `profiles.py`, `protocol.h`, `profiles.h` or `protocol.md`.
 
     Raises:
         ValueError: The definition contradicts itself.
     """
-    messages = [Exchange.parse(table) for table in definition["message"]]
+    messages = [_message(table) for table in definition["message"]]
     numbers = [(key.upper(), definition[part][key]) for part, keys in _NUMBERS.items() for key in keys]
     return _TEMPLATES.get_template(f"{template}.j2").render(
         definition,
         messages=messages,
         numbers=numbers,
-        stored=[(t["name"], t["doc"], [Field.parse(f) for f in t["fields"]]) for t in definition["stored"]],
+        stored=[(t["name"], t["doc"], [_field(f) for f in t["fields"]]) for t in definition["stored"]],
         digests={
             # those that the firmware is built with: of the default link with another profile
             profile: resolve({"modulation": {"id": profile}}).codebook.digest

@@ -2,7 +2,7 @@
 
 import dataclasses
 import struct
-from functools import cache, cached_property
+from functools import cache
 from typing import Annotated, Any, ClassVar, Generic, Self, TypeVar, get_type_hints
 
 from firmware_host.errors import DatagramError
@@ -17,33 +17,8 @@ Rest = Annotated[bytes, "*"]
 Reply = TypeVar("Reply", bound="WireMessage")
 
 
-@dataclasses.dataclass(frozen=True)
-class _Layout:
-    """How the fields that a minor version knows stand in a payload: their `struct` codes."""
-
-    codes: dict[str, str]
-
-    @cached_property
-    def rest(self) -> str | None:
-        """The field that takes the rest."""
-        return next((name for name, code in self.codes.items() if code == "*"), None)
-
-    @cached_property
-    def head(self) -> struct.Struct:
-        """What stands before the rest."""
-        return struct.Struct("<" + " ".join(code for code in self.codes.values() if code != "*"))
-
-
-@cache
-def _read_layout(message: Any, minor: int | None) -> _Layout:
-    hints = get_type_hints(message, include_extras=True)
-    known = (f for f in _fields(message) if minor is None or f.metadata.get("since", 0) <= minor)
-    return _Layout({field.name: hints[field.name].__metadata__[0] for field in known})
-
-
-def _layout(message: Any, minor: int | None = None) -> _Layout:
-    """What of a message a minor version knows; without one, all."""
-    return _read_layout(message, minor)
+_ALL = 255
+"""As a minor version: one that knows all that this host does."""
 
 
 def _fields(message: Any) -> tuple[dataclasses.Field[Any], ...]:
@@ -58,36 +33,51 @@ class WireMessage:
     """
 
     @classmethod
+    @cache
+    def _codes(cls, minor: int = _ALL) -> dict[str, str]:
+        """The `struct` code of each field that a minor version knows."""
+        hints = get_type_hints(cls, include_extras=True)
+        known = (f for f in _fields(cls) if f.metadata.get("since", 0) <= minor)
+        return {field.name: hints[field.name].__metadata__[0] for field in known}
+
+    @classmethod
+    @cache
+    def _head(cls, minor: int = _ALL) -> struct.Struct:
+        """What stands before a field that takes the rest."""
+        return struct.Struct("<" + " ".join(code for code in cls._codes(minor).values() if code != "*"))
+
+    @classmethod
     def fixed_bytes(cls) -> int:
         """Length without a trailing field of any length, bytes."""
-        return _layout(cls).head.size
+        return cls._head().size
 
     @classmethod
     def takes_more(cls) -> bool:
         """Whether it ends with a field of any length."""
-        return _layout(cls).rest is not None
+        return "*" in cls._codes().values()
 
-    def pack(self, minor: int | None = None) -> bytes:
+    def pack(self, minor: int = _ALL) -> bytes:
         """The payload as bytes, for a board of a minor version, or as long as it is.
 
         Raises:
             DatagramError: A value does not fit its field.
         """
-        layout = _layout(type(self), minor)
         values: list[Any] = []
-        for name, code in layout.codes.items():
+        rest = b""
+        for name, code in self._codes(minor).items():
             value = getattr(self, name)
-            if isinstance(value, tuple):
+            if code == "*":
+                rest = value
+            elif isinstance(value, tuple):
                 values += value
-            elif code != "*":
+            else:
                 if isinstance(value, bytes) and len(value) != struct.calcsize(code):
                     raise DatagramError(f"{type(self).__name__}.{name}: {len(value)} bytes")
                 values.append(value)
         try:
-            head = layout.head.pack(*values)
+            return self._head(minor).pack(*values) + rest
         except struct.error as fault:
             raise DatagramError(f"{type(self).__name__}: {fault}") from fault
-        return head + (getattr(self, layout.rest) if layout.rest else b"")
 
     @classmethod
     def unpack(cls, data: bytes) -> Self:
@@ -96,15 +86,15 @@ class WireMessage:
         Raises:
             DatagramError: The length is no minor version's.
         """
-        layout, size = _layout(cls), cls.fixed_bytes()
+        size = cls.fixed_bytes()
         if len(data) < size:
-            minors = {f.metadata.get("since", 0) - 1 for f in _fields(cls)}
-            if len(data) not in {_layout(cls, max(0, minor)).head.size for minor in minors}:
+            minors = {max(0, f.metadata.get("since", 0) - 1) for f in _fields(cls)}
+            if len(data) not in {cls._head(minor).size for minor in minors}:
                 raise DatagramError(f"{cls.__name__}: {len(data)} bytes, expected {size}")
             data += bytes(size - len(data))
-        flat = list(layout.head.unpack(data[:size]))
+        flat = list(cls._head().unpack(data[:size]))
         values: list[Any] = []
-        for code in layout.codes.values():
+        for code in cls._codes().values():
             if code == "*":
                 values.append(bytes(data[size:]))
             elif code[:-1] and code[-1] != "s":
