@@ -32,6 +32,7 @@ from evlcp_sdk.rx.reflections import LONGEST_ROW_US, FrameDetection, PacketAssem
 from evlcp_sdk.rx.regions import (
     MARGIN_PX,
     SAME_PX,
+    STILL,
     Followed,
     Places,
     RegionFollower,
@@ -327,7 +328,7 @@ class Transmitter:
         tried: Number of the newest frame on the grid that was not given as soon as it was due.
         lit_us: When the first frame was due in which its light was there, camera clock, us; None before.
         step_events: How many of its events were in the time step in which its lock came.
-        steady: Its region follows the bar so well that frames can be decoded by themselves.
+        strayed: Its newest frame was not found, or not where its region was.
         decoder: Who does so, and has its state.
         pending: Frames that are decoded, and not applied.
     """
@@ -347,7 +348,7 @@ class Transmitter:
     tried: int = -1
     lit_us: float | None = None
     step_events: int = 0
-    steady: bool = False
+    strayed: bool = True
     decoder: Bars | None = None
     pending: deque[DueFrame] = field(default_factory=deque)
 
@@ -730,18 +731,20 @@ class PacketFraming(Framer):
         """Decode the next frame before its time step is over.
 
         One that cannot be given is left to the step's end: by then a lock may say that the transmitter has
-        begun anew.
+        begun anew. So is one that others wait before.
         """
         due = transmitter.grid.due(until_us)
         if due is None or transmitter.region.id in self._joined:
             return
-        if transmitter.steady:
+        if self._is_steady(transmitter):
             self._hand_over(transmitter, due)
             return
-        state = transmitter.state
+        if transmitter.pending:
+            return
+        state = transmitter.fetch_state()
         found = self._decode(transmitter, due)
         if isinstance(found, Skipped):
-            transmitter.state, transmitter.tried = state, due.number
+            transmitter.state, transmitter.tried, transmitter.strayed = state, due.number, True
             return
         self._take(transmitter, due, found)
 
@@ -752,12 +755,13 @@ class PacketFraming(Framer):
             self.counts["frames_cut"] += transmitter.grid.skip_before(cut_us)
         while most > 0 and (due := transmitter.grid.due(until_us)) is not None:
             most -= 1
-            if transmitter.steady and until_us - due.read_us <= self._step_us:
+            if until_us - due.read_us <= self._step_us and self._is_steady(transmitter):
                 self._hand_over(transmitter, due)
                 continue
             if transmitter.pending:
                 self._flush(transmitter)
                 continue
+            transmitter.fetch_state()
             found = self._decode(transmitter, due)
             if found is Skipped.REJECTED and self._put_together(transmitter):
                 continue
@@ -766,6 +770,7 @@ class PacketFraming(Framer):
                 transmitter.grid.go_to(due.number + 1)
                 return
             if isinstance(found, Skipped):
+                transmitter.strayed = True
                 transmitter.grid.go_to(due.number + 1)
                 if found is not Skipped.DARK:
                     self._lit_in(transmitter, self._clock.camera_us(due.start_us))
@@ -792,7 +797,6 @@ class PacketFraming(Framer):
             transmitter.grid.go_to(due.number + 1)
         if not transmitter.doubtful:
             transmitter.given = max(due.number, transmitter.given)
-        transmitter.steady = self._follower is not None
         self._lit_in(transmitter, found.frame.t_us)
         self.counts["frames"] += 1
         self._queue.add(transmitter.packets, found)
@@ -873,6 +877,14 @@ class PacketFraming(Framer):
         times = due.start_us, due.end_us, due.packet_us, due.lock.chip_us
         return FrameDetection(frame, *times, found.cells, found.seen, found.mirrored, found.reading.spread)
 
+    def _is_steady(self, transmitter: Transmitter) -> bool:
+        """Whether frames of a transmitter can be decoded by themselves.
+
+        What sweeps over the image is a region off by more than its seam soon: each frame sets it right.
+        """
+        still = transmitter.region.speed == STILL and self._follower is not None
+        return still and not transmitter.strayed and transmitter.number is not None
+
     def _hand_over(self, transmitter: Transmitter, due: DueFrame) -> None:
         """Have a frame decoded by itself."""
         if self._announcer is not None:
@@ -914,7 +926,7 @@ class PacketFraming(Framer):
                 self._pending.remove(one)
             transmitter.pending.clear()
             transmitter.fetch_state()
-            transmitter.steady = False
+            transmitter.strayed = True
             transmitter.grid.go_to(due.number)
             return
         region, shown, follower = transmitter.region, found.shown, self._follower
@@ -994,6 +1006,8 @@ class PacketFraming(Framer):
             follower.gather(region, due.start_us, due.read_us)
         if follower is not None and most_px > MARGIN_PX / 2:
             follower.gather(region)
+        if due.has_pilot:
+            transmitter.strayed = most_px > MARGIN_PX / 2
         for shown in seen if aligned is not None else ():
             self._open_beside(region, shown)
         return aligned

@@ -75,7 +75,8 @@ _LEAST_SWEPT, _SWEPT_STEPS = 300, 4
 """Events beside all regions from which on it is looked for a bar that sweeps; and steps whose events it has
 when it is found: it was seen in two of them, and was in the same motion before."""
 
-_STILL = 0.0, 0.0
+STILL = 0.0, 0.0
+"""Speed of a region whose pixels blink."""
 
 _CENTRE_SIGMA_PX = 0.25
 """Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
@@ -299,7 +300,7 @@ class Followed:
         cut_us: Until when its events were forgotten for want of room, us; None where none were.
         held_bytes: What its pieces take.
         calm_us: When the pixels beside its bar were seen to be calm, us.
-        speed: How fast it sweeps to the right and down, px/us; `_STILL` of one whose pixels blink.
+        speed: How fast it sweeps to the right and down, px/us; `STILL` of one whose pixels blink.
     """
 
     id: int
@@ -318,7 +319,7 @@ class Followed:
     cut_us: int | None = None
     held_bytes: int = 0
     calm_us: int = 0
-    speed: tuple[float, float] = _STILL
+    speed: tuple[float, float] = STILL
 
     def __post_init__(self) -> None:
         self.hold(self.pieces)
@@ -651,7 +652,7 @@ class RegionFollower(RegionTracker):
         boxes = self._boxes(start_us + spec.step_us / 2, taken)
         # Before a frame shows where in its box a bar is, panels and moving textures around it would drown it:
         # only what blinks in rhythm counts.
-        unknown = [one.size_px is None and one.speed == _STILL for one in self.alive]
+        unknown = [one.size_px is None and one.speed == STILL for one in self.alive]
         selected = self._rhythm.select(events, boxes, unknown) if boxes else []
         beside = events.t_us.size
         for followed, inside, own in zip(self.alive, selected, self._own(boxes), strict=True):
@@ -666,7 +667,7 @@ class RegionFollower(RegionTracker):
         if held > self._limits.region_bytes:
             self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, spec.step_us)
         self._open(end_us, rises, taken)
-        if beside >= _LEAST_SWEPT and all(one.speed != _STILL or one.size_px is None for one in self.alive):
+        if beside >= _LEAST_SWEPT and all(one.speed != STILL or one.size_px is None for one in self.alive):
             self._open_swept(start_us, events, taken)
         seen = list(self.alive)
         gone = False
@@ -908,7 +909,7 @@ class RegionFollower(RegionTracker):
             if predicted is not None:
                 return float(predicted[0][0]), float(predicted[0][1])
         last, before = followed.positions.latest, followed.positions.before
-        if followed.speed != _STILL:
+        if followed.speed != STILL:
             after_us = t_us - last.t_us
             return last.x_px + after_us * followed.speed[0], last.y_px + after_us * followed.speed[1]
         if before is last:
@@ -966,13 +967,13 @@ class RegionFollower(RegionTracker):
         last, before = followed.positions.latest, followed.positions.before
         right, down, apart_us = last.x_px - before.x_px, last.y_px - before.y_px, last.t_us - before.t_us
         sweep = None
-        if followed.speed != _STILL or max(abs(right), abs(down)) > FAST_PX_US * apart_us:
+        if followed.speed != STILL or max(abs(right), abs(down)) > FAST_PX_US * apart_us:
             sweep = self._sweep(followed, box, middle_us)
         if sweep is not None:
             t_us, rows, speed = middle_us - self._chip_us, sweep.rows, sweep.speed
             seen: Place | None = sweep[:4]
         else:
-            t_us, rows, speed = now_us - self._age_us, np.empty(box[3] - box[1], np.int64), _STILL
+            t_us, rows, speed = now_us - self._age_us, np.empty(box[3] - box[1], np.int64), STILL
             seen = self._measure(followed, box, now_us, rows)
         if seen is None:
             return None
@@ -1106,7 +1107,7 @@ class RegionFollower(RegionTracker):
         """
         step_us, merge_px = self._spec.step_us, self._spec.merge_px
         known = [box_of(place) for place in taken]
-        known += [grown(box_of(one.latest), merge_px) for one in self.alive if one.speed != _STILL]
+        known += [grown(box_of(one.latest), merge_px) for one in self.alive if one.speed != STILL]
         before, self._swept = (
             self._swept,
             find_sweeps(events, start_us, step_us, self._chip_us, known, self._sensor_px),
@@ -1131,7 +1132,7 @@ class RegionFollower(RegionTracker):
             self.gather(followed)
             swept = around([box_of(places.before), box_of(places.latest)])
             for other in self.alive:
-                other.released |= other.speed == _STILL and overlap(swept, box_of(other.latest))
+                other.released |= other.speed == STILL and overlap(swept, box_of(other.latest))
             self.alive.append(followed)
 
     def _place_for_one(self, now_us: int) -> bool:
