@@ -1,28 +1,34 @@
 """ROS bags with `event_camera_msgs/EventPacket`, EVT3 inside: ROS 1, and ROS 2 in SQLite or MCAP."""
 
 import importlib
-import itertools
 import re
 import sqlite3
 import struct
-from collections.abc import Iterator
+import zlib
+from collections import OrderedDict
+from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import EvlcpError, InputError
 from evlcp_sdk.io.evt import EVT3
-from evlcp_sdk.io.raw import ChunkBytes, RawSource, format_header
+from evlcp_sdk.io.raw import RawSource, format_header
 from evlcp_sdk.io.urls import split_options
 from evlcp_sdk.plugin.source import Loss
 
 TYPES: Final = ("event_camera_msgs/msg/EventPacket", "event_camera_msgs/EventPacket")
 
+_MOST_HELD: Final = 256
+"""Packets that wait for earlier ones: some seconds of a camera, 30 MB."""
+
 _STEPS: Final = 1_000_000
 _STEPS_A_BYTE: Final = 4
 _STEPS_AT_ONCE: Final = 10_000
 """Steps that SQLite may take, and those between two looks; a row of a message takes twenty."""
+
+_MAGICS: Final = {b"#ROSBAG V2.0": "ROS 1", b"SQLite format 3": "SQLite", b"\x89MCAP0\r\n": "MCAP"}
 
 
 @dataclass(frozen=True)
@@ -51,13 +57,22 @@ def open_bag(url: str) -> "BagSource":
         InputError: It is no bag, has no such topic, or other words than EVT3; or the extra `ros` is needed.
     """
     named, options = split_options(url, {"topic": str}) if url.startswith("bag:") else (url, {})
-    return BagSource(named.removeprefix("bag:"), options.get("topic"))
+    path = named.removeprefix("bag:")
+    try:
+        return BagSource(path, options.get("topic"))
+    except EvlcpError:
+        raise
+    except Exception as fault:
+        # A damaged bag makes a reader fail in any way.
+        raise InputError(f"{path}: a damaged bag: {type(fault).__name__}: {fault}") from fault
 
 
 class BagSource(RawSource):
     """The events of a bag's topic, its packets decoded one after another as one stream of words.
 
-    Packets whose numbers are missing are the loss `packets_lost`.
+    Packets are taken by their numbers, as far as they are in disorder by no more than a few hundred; those
+    that are there twice are left out, and counted (`packets_twice`), and missing ones are the loss
+    `packets_lost`.
 
     Args:
         path: The bag.
@@ -68,7 +83,8 @@ class BagSource(RawSource):
         target = Path(path)
         self._stack = ExitStack()
         try:
-            self._packets = _BagBytes(target, _messages(target, topic, self._stack))
+            self._order = _Order(_messages(target, topic, self._stack))
+            self._packets = _BagBytes(target, iter(self._order))
             super().__init__(target, file=self._packets)
         except BaseException:
             self._stack.close()
@@ -79,8 +95,16 @@ class BagSource(RawSource):
     @property
     def losses(self) -> dict[str, Loss]:
         """As `EventSource.losses`, with the packets that are missing."""
-        lost = self._packets.lost
-        return super().losses | ({"packets_lost": lost} if lost.count else {})
+        lost, first = self._packets.lost, self._packets.first_lost
+        if not lost:
+            return super().losses
+        return super().losses | {"packets_lost": Loss(lost, first, "byte", "packets missing in the bag")}
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """As `EventSource.counts`, with packets that were there twice, or not in their order."""
+        found = {"packets_twice": self._order.twice, "packets_out_of_order": self._order.out_of_order}
+        return super().counts | {name: count for name, count in found.items() if count}
 
     def close(self) -> None:
         """Close the bag."""
@@ -88,30 +112,85 @@ class BagSource(RawSource):
         self._stack.close()
 
 
-class _BagBytes(ChunkBytes):
-    """The words of a bag's packets behind a header of their sensor."""
+class _Order:
+    """Packets by their numbers, each once; a number far below begins anew, as a driver does.
+
+    Args:
+        packets: As the bag gives them.
+
+    Attributes:
+        twice: How many were left out.
+        out_of_order: How many came after a later one.
+    """
+
+    def __init__(self, packets: Iterable[EventPacket]) -> None:
+        self._packets = packets
+        self._held: dict[int, EventPacket] = {}
+        self._given: OrderedDict[int, int] = OrderedDict()
+        self.twice = self.out_of_order = 0
+
+    def __iter__(self) -> Iterator[EventPacket]:
+        latest = -1
+        for packet in self._packets:
+            digest, same = zlib.crc32(packet.data), self._held.get(packet.seq)
+            if self._given.get(packet.seq) == digest or (same is not None and same.data == packet.data):
+                self.twice += 1
+                continue
+            self.out_of_order += packet.seq < latest <= packet.seq + _MOST_HELD
+            latest = packet.seq
+            while packet.seq in self._held or len(self._held) >= _MOST_HELD:
+                yield self._pop()
+            self._held[packet.seq] = packet
+        while self._held:
+            yield self._pop()
+
+    def _pop(self) -> EventPacket:
+        """The one that goes on where the last one ended, or else the first."""
+        expected = next(reversed(self._given), -1) + 1
+        near = [seq for seq in self._held if expected <= seq <= expected + _MOST_HELD] if self._given else []
+        packet = self._held.pop(min(near or self._held))
+        self._given[packet.seq] = zlib.crc32(packet.data)
+        self._given.move_to_end(packet.seq)
+        if len(self._given) > _MOST_HELD:
+            self._given.popitem(last=False)
+        return packet
+
+
+class _BagBytes:
+    """The words of a bag's packets, as `RawSource` reads them, behind a header of their sensor."""
 
     def __init__(self, path: Path, packets: Iterator[EventPacket]) -> None:
         self._path = path
+        self._iterator = packets
         self._next_seq: int | None = None
-        self.lost = Loss(0, 0, "byte", "packets missing in the bag")
+        self._bytes = 0
+        self.lost = self.first_lost = 0
         first = next(packets, None)
         if first is None:
             raise InputError(f"{path}: no packets on its topic")
         self._encoding_of(first)
-        super().__init__(format_header(EVT3, first.width, first.height))
-        self._iterator: Iterator[EventPacket] = itertools.chain((first,), packets)
+        self._ready = memoryview(format_header(EVT3, first.width, first.height))
+        self._waiting: EventPacket | None = first
 
-    def more(self) -> memoryview:
-        """The words of the next packet that has any; nothing at the end."""
-        for packet in self._iterator:
+    def readinto(self, room: memoryview, /) -> int:
+        """Give bytes; 0 at the end."""
+        while not len(self._ready):
+            packet = self._waiting or next(self._iterator, None)
+            self._waiting = None
+            if packet is None:
+                return 0
             self._encoding_of(packet)
             if self._next_seq is not None and packet.seq > self._next_seq:
-                self.lost = self.lost.more(packet.seq - self._next_seq, self.given)
+                if not self.lost:
+                    self.first_lost = self._bytes
+                self.lost += packet.seq - self._next_seq
             self._next_seq = packet.seq + 1
-            if len(packet.data):
-                return packet.data
-        return memoryview(b"")
+            self._ready = packet.data
+        size = min(len(room), len(self._ready))
+        room[:size] = self._ready[:size]
+        self._ready = self._ready[size:]
+        self._bytes += size
+        return size
 
     def _encoding_of(self, packet: EventPacket) -> None:
         if packet.encoding != "evt3":
@@ -122,16 +201,26 @@ class _BagBytes(ChunkBytes):
 
     def close(self) -> None:
         """Give no more."""
-        self._iterator, self._ready = iter(()), memoryview(b"")
+        self._iterator, self._waiting = iter(()), None
+        self._ready = memoryview(b"")
 
 
 def _files_of(path: Path) -> list[Path]:
-    """The files of a bag: itself, or those of its folder in the order of the numbers in their names."""
+    """The files of a bag: itself, or those of its folder as metadata.yaml or their numbers order them."""
     if not path.is_dir():
         return [path]
-    found = [one for one in path.iterdir() if one.suffix in (".db3", ".mcap")]
-    if not found:
-        raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
+    try:
+        text = (path / "metadata.yaml").read_text("utf-8", "replace")
+    except OSError:
+        text = ""
+    listed = re.search(r"relative_file_paths:[ ]*\n((?:[ ]*-.*\n?)+)", text)
+    if listed is not None:
+        names = [line.strip()[1:].strip(" \"'") for line in listed[1].splitlines()]
+        missing = next((name for name in names if not (path / name).is_file()), None)
+        if missing is not None:
+            raise InputError(f"{path}: metadata.yaml names {missing}, which is not there")
+        return [path / name for name in names]
+    found = (one for one in path.iterdir() if one.suffix in (".db3", ".mcap"))
     return sorted(
         found,
         key=lambda one: [int(part) if part.isdigit() else part for part in re.split(r"(\d+)", one.name)],
@@ -140,21 +229,22 @@ def _files_of(path: Path) -> list[Path]:
 
 def _messages(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
     """The packets of a bag, file by file."""
-    file = path
-    try:
-        for file in _files_of(path):
-            with file.open("rb") as opened:
-                start = opened.read(16)
-            read = next((read for magic, read in _READERS.items() if start.startswith(magic)), None)
-            if read is None:
-                found = start[:8].hex(" ")
-                raise InputError(f"{file}: starts with {found}, expected a bag of ROS 1, SQLite or MCAP")
-            yield from read(file, topic, stack)
-    except InputError:
-        raise
-    except Exception as fault:
-        # A damaged bag makes a reader fail in any way.
-        raise InputError(f"{file}: a damaged bag: {type(fault).__name__}: {fault}") from fault
+    if not path.exists():
+        raise InputError(f"{path}: No such file or directory")
+    files = _files_of(path)
+    if not files:
+        raise InputError(f"{path}: a folder without .db3 or .mcap files, expected a bag")
+    parts = []
+    for file in files:
+        with file.open("rb") as opened:
+            start = opened.read(16)
+        kind = next((kind for magic, kind in _MAGICS.items() if start.startswith(magic)), None)
+        if kind is None:
+            raise InputError(
+                f"{file}: starts with {start[:8].hex(' ')}, expected a bag of ROS 1, SQLite or MCAP"
+            )
+        parts.append(_read(file, kind, topic, stack))
+    return (packet for part in parts for packet in part)
 
 
 def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
@@ -170,6 +260,17 @@ def _chosen(path: Path, topics: dict[str, str], topic: str | None) -> str:
         hint = "" if not fitting else "; choose one by ?topic=NAME"
         raise InputError(f"{path}: {what} of type event_camera_msgs/EventPacket (topics: {listed}){hint}")
     return fitting[0]
+
+
+def _read(path: Path, kind: str, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
+    """The packets of a file."""
+    try:
+        yield from {"ROS 1": _ros1, "SQLite": _sqlite, "MCAP": _mcap}[kind](path, topic, stack)
+    except InputError:
+        raise
+    except Exception as fault:
+        # A damaged bag makes a reader fail in any way.
+        raise InputError(f"{path}: {type(fault).__name__}: {fault}") from fault
 
 
 def _sqlite(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPacket]:
@@ -226,10 +327,6 @@ def _ros1(path: Path, topic: str | None, stack: ExitStack) -> Iterator[EventPack
     chosen = _chosen(path, {one.topic: one.msgtype for one in made.connections}, topic)
     for _, _, data in made.messages([one for one in made.connections if one.topic == chosen]):
         yield _of_ros1(path, data)
-
-
-_READERS: Final = {b"#ROSBAG V2.0": _ros1, b"SQLite format 3": _sqlite, b"\x89MCAP0\r\n": _mcap}
-"""By how a file starts."""
 
 
 def _needed(path: Path, module: str) -> Any:

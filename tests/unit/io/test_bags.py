@@ -57,40 +57,55 @@ def packets() -> list[Packet]:
     return list(enumerate(words[k : k + size] for k in range(0, len(words), size)))
 
 
-def same_as_the_recording(path: Path) -> None:
+def same_as_the_recording(path: Path) -> Any:
     expected = read_events(RECORDING)
     with open_source(path) as source:
         got, _ = source.read()
     for name in ("t_us", "x", "y", "p"):
         np.testing.assert_array_equal(getattr(got, name), getattr(expected, name))
     assert not source.losses
+    return source
 
 
-def test_files_of_a_folder_are_read_in_their_order(packets, tmp_path) -> None:
+@pytest.mark.parametrize("listed", [True, False])
+def test_files_of_a_folder_are_read_in_their_order(listed, packets, tmp_path) -> None:
     """Twelve: by their names, 10 would come before 2."""
     for n in range(12):
         messages = list(map(packed, packets[n * 6 : n * 6 + 6]))
         write_sqlite(tmp_path / f"name_{n}.db3", messages, range(6))
-    (tmp_path / "metadata.yaml").touch()
-    same_as_the_recording(tmp_path)
+    paths = "".join(f"    - name_{n}.db3\n" for n in range(12)) if listed else ""
+    head = "rosbag2_bagfile_information:\n  version: 5\n  relative_file_paths:\n" if listed else ""
+    (tmp_path / "metadata.yaml").write_text(f"{head}{paths}  duration:\n    nanoseconds: 80000000\n")
+    source = same_as_the_recording(tmp_path)
+    assert "packets_out_of_order" not in source.counts
+    if listed:
+        (tmp_path / "name_3.db3").unlink()
+        with pytest.raises(InputError, match=r"metadata\.yaml names name_3\.db3, which is not there"):
+            open_source(tmp_path)
 
 
 @pytest.mark.parametrize(
-    ("write", "how"),
-    [
-        (write_ros1, "rise"),
-        *((write, how) for write in (write_sqlite, write_mcap) for how in ("jitter", "go round")),
-    ],
+    ("write", "pack"), [(write_sqlite, packed), (write_mcap, packed), (write_ros1, packed_ros1)]
 )
-def test_packets_are_in_order_whatever_their_log_times(how, write, packets, tmp_path) -> None:
+@pytest.mark.parametrize("how", ["one is 0", "jitter", "go round"])
+def test_packets_are_in_order_whatever_their_log_times(how, write, pack, packets, tmp_path) -> None:
     times = 10**9 + 10**7 * np.arange(len(packets))
-    if how == "jitter":
+    if how == "one is 0":
+        times[30] = 0
+    elif how == "jitter":
         times += np.random.default_rng(1).integers(-3 * 10**7, 3 * 10**7, len(times))
-    elif how == "go round":
+    else:
         times[35:] -= times[35]
-    pack = packed_ros1 if write is write_ros1 else packed
     write(tmp_path / "a.bag", [pack(packet) for packet in packets], times.tolist())
-    same_as_the_recording(tmp_path / "a.bag")
+    source = same_as_the_recording(tmp_path / "a.bag")
+    assert write is not write_ros1 or how == "go round" or source.counts["packets_out_of_order"] > 0
+
+
+@pytest.mark.parametrize("how", ["one after the other", "a hundred later"])
+def test_packets_that_are_there_twice_are_left_out(how: str, packets: list[Packet], tmp_path: Path) -> None:
+    both = [m for one in packets for m in (one, one)] if how.startswith("one") else packets * 2
+    source = same_as_the_recording(write_sqlite(tmp_path / "a.db3", list(map(packed, both)), range(999)))
+    assert source.counts["packets_twice"] == len(packets)
 
 
 def test_packets_that_are_missing_are_counted(packets: list[Packet], tmp_path: Path) -> None:
@@ -103,7 +118,7 @@ def test_packets_that_are_missing_are_counted(packets: list[Packet], tmp_path: P
 
 
 def test_a_driver_that_begins_anew(packets: list[Packet], tmp_path: Path) -> None:
-    """Numbers from 0 again: nothing is missing."""
+    """Numbers from 0 again, other words: what came before is given first, and nothing is missing."""
     again = [(n - 40, words) for n, words in packets[40:]]
     messages = [packed(one, order=">") for one in packets[:40] + again]
     same_as_the_recording(write_sqlite(tmp_path / "a.db3", messages, range(999)))
