@@ -23,6 +23,9 @@ _LOOKED_AT: Final = 1 << 14
 _TRIGGER_ROWS: Final = 1 << 12
 _MOST_COLUMNS: Final = 8
 
+_MOST_RATIO, _SMALL_BYTES = 100, 1 << 29
+"""How many times more bytes an archive may unpack to than it has, events make 16; and how many in any case."""
+
 
 class Array(Protocol):
     """Values (n,), records (n,) or a table (n, k), of which some rows are read at a time."""
@@ -165,16 +168,24 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
     except (zipfile.BadZipFile, UnicodeDecodeError, NotImplementedError) as error:
         raise InputError(f"{path}: found no NPZ file, expected one ({error})") from error
     names = [member.removesuffix(".npy") for member in archive.namelist() if member.endswith(".npy")]
+    size, whole = path.stat().st_size, sum(member.file_size for member in archive.infolist())
+    if whole > _MOST_RATIO * size + _SMALL_BYTES:
+        raise InputError(f"{path}: {size} bytes are said to unpack to {whole}, more than events can")
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="evlcp-"))
 
     def array(name: str) -> NDArray[Any]:
-        return _mapped(f"{path}: array {name}", Path(archive.extract(f"{name}.npy", folder)))
+        try:
+            file = archive.extract(f"{name}.npy", folder)
+        except Exception as error:
+            # Codecs and encryption fail in many ways.
+            raise InputError(f"{path}: array {name}: damaged: {one_line(error)}") from error
+        return _mapped(f"{path}: array {name}", Path(file))
 
     columns, found = choose_columns(path, names, array, fields)
     pieces = pieces_of(columns, path.stat().st_size)
     if fields is not None or not set(COLUMNS) <= set(names):
         return EventTable("NPZ", pieces, found.unit)
-    size = [_one(path, name, array(name)) if name in names else None for name in ("width", "height")]
+    sensor = [_one(path, name, array(name)) if name in names else None for name in ("width", "height")]
     triggers: dict[str, Array] = {}
     if "trigger_t_us" in names:
         for name in TRIGGER_COLUMNS:
@@ -183,7 +194,9 @@ def read_npz(path: Path, stack: ExitStack, fields: Fields | None) -> EventTable:
             triggers[name] = array(name)
     _check_lengths(path, triggers)
     given = _triggers(path, triggers) if triggers else None
-    return EventTable("NPZ", pieces, found.unit, size=(size[0], size[1]), triggers=given, window_us=WINDOW_US)
+    return EventTable(
+        "NPZ", pieces, found.unit, size=(sensor[0], sensor[1]), triggers=given, window_us=WINDOW_US
+    )
 
 
 def _triggers(path: Path, columns: Mapping[str, Array]) -> Iterator[Triggers]:
