@@ -24,7 +24,7 @@ _TRIGGER_ROWS: Final = 1 << 12
 _MOST_COLUMNS: Final = 8
 
 _MOST_RATIO, _SMALL_BYTES = 100, 1 << 29
-"""How many times more bytes an archive may unpack to than it has, events make 16; and how many in any case."""
+"""How many times more bytes an archive may unpack to than it has, events make 16; how many in any case."""
 
 
 class Array(Protocol):
