@@ -17,6 +17,10 @@ Floats = NDArray[np.floating[Any]]
 LIMIT_HZ = 3000.0
 """Above this frequency the recommendation sets no bound."""
 
+NO_EFFECT = (0.01, 1 / 30, LIMIT_HZ)
+LOW_RISK = (0.025, 0.08, 1250.0)
+"""Modulation in percent a hertz below 90 Hz and from there on, and the frequency above which none is set."""
+
 
 @dataclass(frozen=True)
 class ClusterFlicker:
@@ -49,26 +53,17 @@ class ClusterFlicker:
         return asdict(self) | {"limit_percent": limit}
 
 
-def no_effect_percent(frequency_hz: Floats) -> Floats:
-    """Largest modulation without observable effect at frequencies in Hz, percent.
+def bound_percent(frequency_hz: Floats, bound: tuple[float, float, float]) -> Floats:
+    """Largest modulation within a bound at frequencies in Hz, percent.
 
-    >>> no_effect_percent(np.array([60.0, 1200.0, 4000.0])).round(2).tolist()
+    >>> bound_percent(np.array([60.0, 1200.0, 4000.0]), NO_EFFECT).round(2).tolist()
     [0.6, 40.0, inf]
-    """
-    f = np.asarray(frequency_hz)
-    bound = np.where(f < 90.0, 0.01 * f, f / 30.0)
-    return np.where(f > LIMIT_HZ, np.inf, bound)
-
-
-def low_risk_percent(frequency_hz: Floats) -> Floats:
-    """Largest modulation of low risk at frequencies in Hz, percent.
-
-    >>> low_risk_percent(np.array([60.0, 1000.0, 1300.0])).round(2).tolist()
+    >>> bound_percent(np.array([60.0, 1000.0, 1300.0]), LOW_RISK).round(2).tolist()
     [1.5, 80.0, inf]
     """
-    f = np.asarray(frequency_hz)
-    bound = np.where(f < 90.0, 0.025 * f, 0.08 * f)
-    return np.where(f > 1250.0, np.inf, bound)
+    below, above, end_hz = bound
+    percent = np.where(frequency_hz < 90.0, below, above) * frequency_hz
+    return np.where(frequency_hz > end_hz, np.inf, percent)
 
 
 def check(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[ClusterFlicker]:
@@ -86,26 +81,28 @@ def check(chips: NDArray[np.uint8], chip_rate_hz: float) -> list[ClusterFlicker]
     spectrum = np.abs(np.fft.rfft(chips.astype(np.float64), axis=0)) / n
     amplitude = 2.0 * spectrum * np.sinc(frequency / chip_rate_hz)[:, None]
     low = (frequency > 0) & (frequency <= LIMIT_HZ)
-    found = []
-    for k in range(chips.shape[1]):
-        share = float(chips[:, k].mean())
-        percent = 100.0 * amplitude[low, k] / share if share else np.zeros(int(low.sum()))
-        percent[percent < 1e-9] = 0.0
-        bound = no_effect_percent(frequency[low])
-        worst = int(np.argmax(percent / bound)) if percent.size else -1
-        found.append(
-            ClusterFlicker(
-                cluster=k,
-                on_share=share,
-                longest_run=_longest_run(chips[:, k]),
-                line_hz=float(frequency[low][worst]) if percent.size else 0.0,
-                line_percent=float(percent[worst]) if percent.size else 0.0,
-                limit_percent=float(bound[worst]) if percent.size else float("inf"),
-                low_risk=bool((percent <= low_risk_percent(frequency[low])).all()),
-                no_effect=bool((percent <= bound).all()),
-            )
+    share = chips.mean(axis=0)
+    percent = 100.0 * amplitude[low] / np.where(share, share, np.inf)
+    percent[percent < 1e-9] = 0.0
+    # a line without modulation stands for none
+    percent = np.vstack([percent, np.zeros(len(share))])
+    line_hz = np.append(frequency[low], 0.0)
+    bound = np.append(bound_percent(frequency[low], NO_EFFECT), np.inf)
+    risk = np.append(bound_percent(frequency[low], LOW_RISK), np.inf)
+    worst = np.argmax(percent / bound[:, None], axis=0)
+    return [
+        ClusterFlicker(
+            cluster=k,
+            on_share=float(share[k]),
+            longest_run=_longest_run(chips[:, k]),
+            line_hz=float(line_hz[w]),
+            line_percent=float(percent[w, k]),
+            limit_percent=float(bound[w]),
+            low_risk=bool((percent[:, k] <= risk).all()),
+            no_effect=bool((percent[:, k] <= bound).all()),
         )
-    return found
+        for k, w in enumerate(worst)
+    ]
 
 
 def _longest_run(chips: NDArray[np.uint8]) -> int:

@@ -1,16 +1,11 @@
 """What a host does with a board: program it, start and stop it, ask how it is."""
 
 import zlib
-from bisect import bisect_right
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-
-import numpy as np
-from numpy.typing import ArrayLike
+from dataclasses import dataclass
 
 from evlcp_sdk.air.codebook import word_of_chips
-from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
 from firmware_host.board.bank import Bank, queue_of, word_limits
@@ -387,21 +382,8 @@ class Board:
             raise ConfigError(
                 f"ahead = {ahead}, {self.session.name} holds {slots - 1} packets of this length"
             )
-        acts = status.watchdog != Watchdog.KEEP
-
-        def content(symbols: ArrayLike) -> bytes:
-            packet, shape = np.asarray(symbols), (link.packet.frames, link.codebook.clusters)
-            if packet.shape != shape:
-                raise ConfigError(f"symbols of shape {packet.shape}, expected {shape}: frames, clusters")
-            return like.encode(packet_chips(packet, link.codebook, link.packet.pilot_every))
-
-        chips = like.packet.packet_chips
-        packet_s = chips / like.chip_rate_hz
-        pulse_s = min(0.5, status.watchdog_ms / 3e3) if acts else 0.5
-        pause = None
-        if like.rest is not None:
-            pause = like.encode(np.full((chips, like.clusters), like.rest, np.uint8))
-        stream = Stream(self.session, bank, content, packet_s, ahead, pulse_s, pause)
+        pulse_s = 0.5 if status.watchdog == Watchdog.KEEP else min(0.5, status.watchdog_ms / 3e3)
+        stream = Stream(self.session, bank, like, ahead, pulse_s)
         if status.state != State.PLAYING:
             self.start()
         return stream
@@ -452,11 +434,9 @@ class Board:
             )
         self.check_same_air(bank, s)
         if not self._same_packets(bank, s):
-            holds = f"{s.packet_chips // s.hold} chips" if s.hold else _in_frames(s.frames, s.pilot_every)
-            wanted = _in_frames(*_frames(bank)) if bank.composed else f"{bank.packet.packet_chips} chips"
             raise VerifyError(
-                f"{name}: holds {s.packets} packets of {holds}, {s.length} bytes; expected {bank.packets} of"
-                f" {wanted}, {len(bank.content)} bytes; {again}"
+                f"{name}: holds {s.packets} packets, {s.length} bytes; expected {bank.packets},"
+                f" {len(bank.content)} bytes, or of other lengths; {again}"
             )
         held = self.read(s.active_bank, 0, s.length)
         differ = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
@@ -494,12 +474,12 @@ class Board:
         # a stream needs room for one that plays and one that comes
         queue = not bank.packets
         if bank.packet_bytes * (2 if queue else 1) > room:
-            most = _most(bank, room // 2 if queue else room)
-            length = f"{bank.packet.frames} frames" if bank.composed else f"{bank.packet.packet_chips} chips"
+            words = bank.format == Format.WORDS
+            unit_bytes, unit = (2 * CLUSTERS, "frames") if words else (bank.chip_bytes, "chips")
             raise ConfigError(
-                f"a packet of {length} takes {bank.packet_bytes} bytes, {what}:"
-                f" {'a stream needs room for two' if queue else 'not one fits'};"
-                f" a packet may have at most {most}"
+                f"a packet of {bank.packet_bytes // unit_bytes} {unit} takes {bank.packet_bytes} bytes,"
+                f" {what}: {'a stream needs room for two' if queue else 'not one fits'};"
+                f" a packet may have at most {(room // 2 if queue else room) // unit_bytes} {unit}"
             )
         if bank.packet_bytes * bank.packets > room:
             raise ConfigError(
@@ -652,21 +632,6 @@ def _set_level(board: Board, level_ma: int) -> bool:
 def _frames(bank: Bank) -> tuple[int, int]:
     """Frames of a packet, and from one pilot to the next; one each where the board composes none."""
     return (bank.packet.frames, bank.packet.pilot_every) if bank.composed else (1, 1)
-
-
-def _in_frames(frames: int, pilot_every: int) -> str:
-    return f"{frames} frames, pilot in every {pilot_every}"
-
-
-def _most(bank: Bank, room: int) -> str:
-    """How long a bank's packets may be, for a person."""
-    if not bank.composed:
-        return f"{room // bank.chip_bytes} chips"
-
-    def size(frames: int) -> int:
-        return replace(bank, packet=replace(bank.packet, frames=frames)).packet_bytes
-
-    return f"{bisect_right(range(1, bank.packet.frames + 1), room, key=size)} frames"
 
 
 def profile_number(bank: Bank) -> int:

@@ -7,8 +7,12 @@ from itertools import takewhile
 from types import TracebackType
 from typing import Self
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from evlcp_sdk.air.frames import packet_chips
+from evlcp_sdk.errors import ConfigError
+from firmware_host.board.bank import Bank
 from firmware_host.board.session import Session
 from firmware_host.errors import BoardError, LineError
 from firmware_host.protocol.client import RequestOutcome
@@ -40,19 +44,17 @@ class Stream:
     """A board's queue of packets; `Board.stream` makes one.
 
     `send` puts a packet in; the board plays it after those before it, and shows its idle pattern while it
-    has none. If it is given a packet of pause, one of these waits whenever nothing else does, so that the
-    board is never without. As a context manager it ends in the dark: after the last packet, or, if something
-    was raised, after the one that plays.
+    has none. If the link's framing says what LEDs do meanwhile, a packet of that waits whenever nothing else
+    does, so that the board is never without. As a context manager it ends in the dark: after the last packet,
+    or, if something was raised, after the one that plays.
 
     Args:
         session: The session with the board; nothing else may use it meanwhile.
-        bank: The bank that is the queue.
-        content: What a packet is in the bank: symbols (frames, clusters) to bytes.
-        packet_s: How long a packet takes, s.
+        bank: Number of the bank that is the queue.
+        like: What is in it, as `bank.queue_of` makes it.
         ahead: Packets that wait on the board, the one that plays among them: few for a short delay, many for
             a host that may be held up.
         pulse_s: How long the board may hear nothing, s.
-        pause: A packet during which nothing is sent, as it is in the bank; None to leave that to the board.
 
     Attributes:
         sent: Packets that were given to `send`.
@@ -66,25 +68,26 @@ class Stream:
         self,
         session: Session,
         bank: int,
-        content: Callable[[ArrayLike], bytes],
-        packet_s: float,
+        like: Bank,
         ahead: int,
         pulse_s: float,
-        pause: bytes | None = None,
     ) -> None:
         self._session = session
         self._bank = bank
-        self._content = content
+        self._like = like
         self._ahead = ahead
         self._pulse_s = pulse_s
-        self._pause = pause
+        self._pause = None
+        if like.rest is not None:
+            shape = (like.packet.packet_chips, like.clusters)
+            self._pause = like.encode(np.full(shape, like.rest, np.uint8))
         self._room = session.max_payload - _PIECE_OVERHEAD
         self._retries = session.client.retries
         self._submitted = 0
         self._pieces: list[_Piece] = []
         self._flight: dict[int, tuple[_Piece | None, PushRequest]] = {}
         self._position = (0, 0)
-        self.packet_s = packet_s
+        self.packet_s = like.packet.packet_chips / like.chip_rate_hz
         self._heard_s = session.transport.now()
         self._hold_s = self._heard_s
         # the latest at which the newest packet that is known to have begun did so; the first begins at once
@@ -93,7 +96,7 @@ class Stream:
         self.pauses = 0
         self.begun = 0
         self.underruns = 0
-        if pause is not None:
+        if self._pause is not None:
             # Before the board starts: it begins with a pause.
             self._pump(0.0)
             while self._pieces or self._flight:
@@ -164,8 +167,11 @@ class Stream:
             ConfigError: They are not a packet of the link.
             BoardError: The line or the board fails.
         """
-        content = self._content(symbols)
-        number = self._put(content)
+        packet, like = np.asarray(symbols), self._like
+        shape = (like.packet.frames, like.clusters)
+        if packet.shape != shape:
+            raise ConfigError(f"symbols of shape {packet.shape}, expected {shape}: frames, clusters")
+        number = self._put(like.encode(packet_chips(packet, like.codebook, like.packet.pilot_every)))
         self.sent += 1
         while self._pieces and self._pieces[0].number <= number:
             self._pump(self._pulse_s)
