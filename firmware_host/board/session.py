@@ -145,12 +145,11 @@ class Session:
         self.client.window = 1
         self.client.minor = MINOR
         found: list[RequestOutcome] = []
+        request = protocol.HelloRequest(MAJOR, MINOR, self._nonce)
         try:
             # Ends what a host before this one may have left half sent.
             self.transport.write(b"\0")
-            self.run(
-                [protocol.HelloRequest(MAJOR, MINOR, self._nonce)], lambda _, outcome: found.append(outcome)
-            )
+            self.run([request], lambda _, outcome: found.append(outcome))
         except LineError as fault:
             if not on_network(self.name):
                 raise
@@ -158,7 +157,7 @@ class Session:
                 f"{self.name}: hangs up before it answers: another host is connected to it, or the board"
                 " has ended; end that host, or start the board again"
             ) from fault
-        outcome = found[0]
+        (outcome,) = found
         if outcome.status is None:
             advice = "check power, cable and --baud, or find it with 'evlcp board ports'"
             if on_network(self.name):
@@ -275,14 +274,14 @@ class Session:
         sent: dict[int, Request] = {}
         more = True
         try:
-            while True:
+            while sent or more:
                 while more and self.client.room:
                     request = next(source, None)
                     if request is None:
                         more = False
-                        break
-                    self._check_known(request)
-                    sent[self.client.submit(request)] = request
+                    else:
+                        self._check_known(request)
+                        sent[self.client.submit(request)] = request
                 data, deadline = self.client.poll(self.transport.now())
                 if data:
                     self.transport.write(data)
@@ -290,7 +289,5 @@ class Session:
                 received = self.transport.read(wait) if sent else b""
                 for outcome in self.client.receive(received, self.transport.now()):
                     handle(sent.pop(outcome.token), outcome)
-                if not sent and not more:
-                    return
         finally:
             self.client.forget()

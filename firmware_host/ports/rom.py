@@ -3,8 +3,10 @@
 The part runs it when BOOT0 is high at reset. Bytes have even parity, the rate is taken from the first byte.
 """
 
+from bisect import bisect_left, bisect_right
 from collections.abc import Callable, Sequence
 from functools import reduce
+from itertools import accumulate
 from operator import xor
 
 from firmware_host.errors import LineError, NoBoardError, RefusedError, VerifyError
@@ -68,7 +70,7 @@ class RomLoader:
         while len(found) < count:
             byte = self._byte(_ANSWER_S)
             if byte is None:
-                raise _SilenceError
+                raise _FailedError(silent=True)
             found.append(byte)
         return bytes(found)
 
@@ -80,22 +82,19 @@ class RomLoader:
 
     def _acknowledged(self, timeout_s: float = _ANSWER_S) -> None:
         byte = self._byte(timeout_s)
-        if byte is None:
-            raise _SilenceError
         if byte != _ACK:
-            raise _RefusalError
+            raise _FailedError(silent=byte is None)
 
     def _in_step(self) -> bool:
         """After a byte was lost: fill up what it waits for, until it refuses that; whether it did."""
         self._drop()
-        answered = False
-        for _ in range(_PIECE + 8):
-            self.line.write(b"\xff")
-            if self._byte(0.005) is not None:
-                answered = True
-                break
+        answered = any(self._answers() for _ in range(_PIECE + 8))
         self._drop()
         return answered
+
+    def _answers(self) -> bool:
+        self.line.write(b"\xff")
+        return self._byte(0.005) is not None
 
     def _command(
         self, code: int, what: str, *parts: bytes, count: int = 0, timeout_s: float = _ANSWER_S
@@ -110,10 +109,8 @@ class RomLoader:
                     self.line.write(part)
                     self._acknowledged(timeout_s)
                 return self._bytes(count)
-            except _SilenceError:
-                silent = True
-            except _RefusalError:
-                silent = False
+            except _FailedError as failed:
+                silent = failed.silent
             self._in_step()
         if silent:
             raise LineError(f"{self.line.name}: no answer to {what} after {_TRIES} tries; check the line")
@@ -140,6 +137,22 @@ class RomLoader:
         body = _checked(bytes([len(data) - 1]) + data)
         self._command(_WRITE, f"WRITE at {address:#x}", _place(address), body)
 
+    def verify(self, address: int, data: bytes) -> None:
+        """Read up to 256 bytes back.
+
+        Raises:
+            VerifyError: The flash holds something else.
+        """
+        for _ in range(_TRIES):  # what is read has no check sum
+            found = self.read(address, len(data))
+            if found == data:
+                return
+        wrong = next(i for i, (a, b) in enumerate(zip(found, data, strict=True)) if a != b)
+        raise VerifyError(
+            f"{self.line.name}: the flash holds {found[wrong]:#04x} at {address + wrong:#x},"
+            f" expected {data[wrong]:#04x}; flash it again, then replace the part"
+        )
+
     def erase(self, sectors: Sequence[int]) -> None:
         """Erase sectors."""
         body = _checked(b"".join(number.to_bytes(2, "big") for number in (len(sectors) - 1, *sectors)))
@@ -165,12 +178,12 @@ class RomLoader:
         self.write(_OPTIONS, bytes(options))
 
 
-class _SilenceError(Exception):
-    pass
+class _FailedError(Exception):
+    """A part of a command that was not answered, or refused."""
 
-
-class _RefusalError(Exception):
-    pass
+    def __init__(self, silent: bool) -> None:
+        super().__init__()
+        self.silent = silent
 
 
 def _checked(data: bytes) -> bytes:
@@ -203,36 +216,21 @@ def flash_image(
         raise RefusedError(
             f"{loader.line.name}: the part says {product:#x}, expected {PRODUCT:#x}, an STM32F405", _NACK
         )
-    sectors, at = [], FLASH_START
-    end = image.address + len(image.data)
-    for number, size in enumerate(SECTORS):
-        if at < end and at + size > image.address:
-            sectors.append(number)
-        at += size
+    begin = image.address - FLASH_START
+    ends = list(accumulate(SECTORS))
+    sectors = list(range(bisect_right(ends, begin), bisect_left(ends, begin + len(image.data)) + 1))
     data = image.data + b"\xff" * (-len(image.data) % 4)
     total, done = len(data) * (2 if verify else 1), 0
-    advance = progress or (lambda _done, _total: None)
-    advance(0, total)
+    pieces = [(image.address + at, data[at : at + _PIECE]) for at in range(0, len(data), _PIECE)]
     loader.erase(sectors)
-    pieces = range(0, len(data), _PIECE)
-    for at in pieces:
-        loader.write(image.address + at, data[at : at + _PIECE])
-        done += len(data[at : at + _PIECE])
-        advance(done, total)
-    for at in pieces if verify else ():
-        piece = data[at : at + _PIECE]
-        for _ in range(_TRIES):  # what is read has no check sum
-            found = loader.read(image.address + at, len(piece))
-            if found == piece:
-                break
-        else:
-            wrong = next(i for i, (a, b) in enumerate(zip(found, piece, strict=True)) if a != b)
-            raise VerifyError(
-                f"{loader.line.name}: the flash holds {found[wrong]:#04x} at {image.address + at + wrong:#x},"
-                f" expected {piece[wrong]:#04x}; flash it again, then replace the part"
-            )
-        done += len(piece)
-        advance(done, total)
+    for do in (loader.write, loader.verify)[: 1 + verify]:
+        for at, piece in pieces:
+            if progress is not None:
+                progress(done, total)
+            do(at, piece)
+            done += len(piece)
+    if progress is not None:
+        progress(done, total)
     if start:
         loader.go(image.address)
     return sectors

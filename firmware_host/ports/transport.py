@@ -10,12 +10,13 @@ import re
 import select
 import socket
 import time
+from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Protocol
 
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.files import open_log, writing
+from evlcp_sdk.files import open_log, read_whole, writing
 from firmware_host.errors import LineError, NoBoardError
 from firmware_host.ports.serial_port import SerialTransport
 from firmware_host.ports.usb import device_of
@@ -212,30 +213,22 @@ class ReplayTransport:
 
     def __init__(self, path: Path) -> None:
         self.name = f"replay of {path}"
-        self._events: list[tuple[float, str, bytes]] = []
+        self._events: deque[tuple[float, str, bytes]] = deque()
+        number = 1
         try:
-            lines = path.read_text(encoding="utf-8").splitlines()
-        except OSError as fault:
-            raise InputError(f"{path}: {fault.strerror}") from fault
-        except UnicodeDecodeError as fault:
-            raise InputError(f"{path}: not a trace of the wire: it is no text") from fault
-        if not lines:
-            raise InputError(f"{path}: empty, expected a trace of the wire")
-        self._number = 0
-        try:
-            head = json.loads(lines[0])
-            self.first, self.nonce, self.baud = int(head["first"]), int(head["nonce"]), int(head["baud"])
+            head, *lines = read_whole(path).decode("utf-8").splitlines()
+            table = json.loads(head)
+            self.first, self.nonce, self.baud = int(table["first"]), int(table["nonce"]), int(table["baud"])
             if not (0 <= self.nonce < 1 << 32 and self.baud > 0):
                 raise ValueError(f"nonce {self.nonce}, baud {self.baud}")
-            for self._number, line in enumerate(lines[1:], 1):
+            for line in lines:
+                number += 1
                 event = json.loads(line)
                 if event["dir"] not in ("tx", "rx"):
                     raise ValueError(f"dir = {event['dir']!r}, expected 'tx' or 'rx'")
                 self._events.append((float(event["t"]), event["dir"], bytes.fromhex(event["hex"])))
         except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as fault:
-            raise InputError(
-                f"{path}: line {self._number + 1}: not a trace of the wire: {fault!r}"
-            ) from fault
+            raise InputError(f"{path}: line {number}: not a trace of the wire: {fault!r}") from fault
         self._now = 0.0
         self._sent = 0
 
@@ -246,7 +239,7 @@ class ReplayTransport:
     def read(self, timeout_s: float) -> bytes:
         """What was received here in the trace; else time passes."""
         if self._events and self._events[0][1] == "rx":
-            at, _, data = self._events.pop(0)
+            at, _, data = self._events.popleft()
             self._now = max(self._now, at)
             return data
         if not self._events:
@@ -261,23 +254,18 @@ class ReplayTransport:
             LineError: It is something else.
         """
         while data:
-            if not self._events:
-                raise LineError(f"{self.name}: the trace ends here; record it again with --trace")
-            if self._events[0][1] != "tx":
-                raise LineError(f"{self.name}: sends more than was recorded; {self._advice}")
-            at, _, expected = self._events[0]
+            at, direction, expected = self._events.popleft() if self._events else (0.0, "end", b"")
             n = min(len(data), len(expected))
-            if data[:n] != expected[:n]:
-                raise LineError(f"{self.name}: byte {self._sent} sent is another one; {self._advice}")
+            if direction != "tx" or data[:n] != expected[:n]:
+                raise LineError(
+                    f"{self.name}: byte {self._sent} sent is another one than was recorded; replay the command,"
+                    " options and files that were"
+                )
             self._now = max(self._now, at)
             data = data[n:]
             self._sent += n
-            if n == len(expected):
-                self._events.pop(0)
-            else:
-                self._events[0] = (at, "tx", expected[n:])
-
-    _advice = "replay the command, the options and the files that were recorded"
+            if n < len(expected):
+                self._events.appendleft((at, "tx", expected[n:]))
 
     def close(self) -> None:
         """Nothing to let go."""

@@ -222,7 +222,7 @@ def test_trace_and_replay(evlcp, tmp_path: Path) -> None:
     assert {x["dir"] for x in lines[1:]} == {"tx", "rx"}
     replayed = evlcp(*arguments, "--replay", trace)
     assert (replayed.code, replayed.out) == (0, live.out)
-    check_fault(evlcp(*arguments[:-1], 4, "--replay", trace), 6, "is another one")
+    check_fault(evlcp(*arguments[:-1], 4, "--replay", trace), 6, "is another one than was recorded")
     trace.write_text("\n".join(trace.read_text().splitlines()[:5]) + "\n")
     check_fault(evlcp(*arguments, "--replay", trace), 6, "the trace ends here")
     check_fault(evlcp(*arguments, "--replay", trace, "--trace", trace), 2, "give one of the two")
