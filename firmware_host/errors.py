@@ -1,25 +1,10 @@
-"""The exceptions of the transmitter's host tool; each carries the exit code the command line ends with.
-
-```
-EvlcpError
-└── BoardError                     6
-    ├── NoBoardError               4   no board answers, or more than one could be meant
-    ├── RefusedError               5   the board refuses a request; carries its status
-    ├── LineError                  6   no answer after all tries, or the line went away
-    │   └── BoardResetError        6   the board forgot this session: it was reset, or another host took over
-    ├── VerifyError                7   what the board holds is not what was sent
-    ├── IncompatibleError          8   protocol or codebook is another one than the host's
-    ├── FleetError                 *   boards of an inventory failed; the exit code of the first that did
-    └── ToolchainError             1   a compiler or emulator is missing or failed
-DatagramError                          bytes that are not a datagram of the protocol (never leaves the client)
-```
-"""
+"""The exceptions of the transmitter's host tool; each carries the exit code the command line ends with."""
 
 from evlcp_sdk.errors import EvlcpError
 
 
 class DatagramError(ValueError):
-    """Bytes that are not a datagram, or a payload of another length than its message's."""
+    """Bytes that are no datagram, or a payload of another length than its message's; stays in the client."""
 
 
 class BoardError(EvlcpError):

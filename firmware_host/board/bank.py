@@ -261,6 +261,21 @@ def random_symbols(packets: int, frames: int, codebook: Codebook, generator: np.
     return generator.integers(0, codebook.carrying, shape, dtype=np.int64)
 
 
+def random_packets(packets: int, link: Link, seed: int) -> Symbols:
+    """Random symbols of a link, int64 (packets, frames, clusters).
+
+    Raises:
+        ConfigError: None, or too many.
+    """
+    frames = link.packet.frames
+    if not 0 < packets * frames <= MOST_RANDOM_FRAMES:
+        raise ConfigError(
+            f"random = {packets}, air.frames_per_packet = {frames}: expected at least 1 packet,"
+            f" at most {MOST_RANDOM_FRAMES} frames in all"
+        )
+    return random_symbols(packets, frames, link.codebook, np.random.default_rng(seed))
+
+
 def symbol_chips(symbols: ArrayLike, codebook: Codebook, pilot_every: int = 1) -> NDArray[np.uint8]:
     """Chips of packets one after another: symbols (P, F, K) to uint8 (chips, K), 1 = on.
 

@@ -8,8 +8,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError
@@ -17,7 +15,7 @@ from evlcp_sdk.link.compose import messages_of, packets_of, utf8
 from evlcp_sdk.link.resolve import Link, load_link, resolve
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.specs import SpecError, build, read_toml, shown
-from firmware_host.board.bank import MOST_RANDOM_FRAMES, Bank, bank_of, check_rate, random_symbols, read_masks
+from firmware_host.board.bank import Bank, bank_of, random_packets, read_masks
 from firmware_host.board.board import Board, Settings, provision
 from firmware_host.board.keys import read_board_key
 from firmware_host.board.messages import site_that_sends
@@ -214,18 +212,11 @@ def _bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank:
             symbols, link = read_symbols(folder / entry.payload, given, registry)
             return bank_of(symbols, link)
         link = given or resolve({}, registry)
-        check_rate(link.packet)
         if entry.has_message:
-            return bank_of(_message(folder, entry, link), link)
+            return _message(folder, entry, link)
         if entry.payload is not None:
             return read_masks(folder / entry.payload, link)
-        packets, frames = entry.random or 0, link.packet.frames
-        if packets * frames > MOST_RANDOM_FRAMES:
-            raise ConfigError(
-                f"random = {packets}: {packets * frames} frames, expected at most {MOST_RANDOM_FRAMES}"
-            )
-        generator = np.random.default_rng(entry.seed)
-        return bank_of(random_symbols(packets, frames, link.codebook, generator), link)
+        return bank_of(random_packets(entry.random or 0, link, entry.seed), link)
     except EvlcpError as fault:
         kind = next(
             k for k in (IncompatibleError, InputError, ConfigError, EvlcpError) if isinstance(fault, k)
@@ -234,8 +225,8 @@ def _bank(path: Path, index: int, entry: Entry, registry: Registry) -> Bank:
         raise kind("\n".join(f"{place}: {line}" for line in str(fault).splitlines())) from fault
 
 
-def _message(folder: Path, entry: Entry, link: Link) -> NDArray[np.int64]:
-    """The packets of a board's message, int64 (packets, frames, clusters)."""
+def _message(folder: Path, entry: Entry, link: Link) -> Bank:
+    """The packets of a board's message."""
     site = None
     if entry.beacon is not None:
         site = site_that_sends(folder / entry.beacon, entry.transmitter_id, "transmitter_id")
@@ -248,7 +239,7 @@ def _message(folder: Path, entry: Entry, link: Link) -> NDArray[np.int64]:
         transmitter_id=entry.transmitter_id,
         sequence=entry.sequence,
     )
-    return packets_of(messages, link.block_coder(), entry.repeat)
+    return bank_of(packets_of(messages, link.block_coder(), entry.repeat), link)
 
 
 @contextlib.contextmanager

@@ -156,14 +156,15 @@ def update(
             Status.OUT_OF_RANGE,
         )
     session.call(protocol.UpdateBeginRequest(before.next, len(data), zlib.crc32(data)))
-    advance = progress or (lambda _done, _total: None)
-    piece = (board.session.max_payload - protocol.UpdateWriteRequest.fixed_bytes()) // 4 * 4
+    piece = (session.max_payload - protocol.UpdateWriteRequest.fixed_bytes()) // 4 * 4
+
     done = 0
 
     def handle(request: protocol.UpdateWriteRequest, _: protocol.UpdateWriteReply) -> None:
         nonlocal done
         done += len(request.data)
-        advance(done, len(data))
+        if progress is not None:
+            progress(done, len(data))
 
     pieces = (protocol.UpdateWriteRequest(at, data[at : at + piece]) for at in range(0, len(data), piece))
     try:

@@ -35,13 +35,8 @@ def build_images(
 
     elf = arm_image(TARGETS[target])
     image = FlashImage.read(elf)
-    package = Package.built(target).to_json()
-    contents = {
-        ".elf": elf.read_bytes(),
-        ".hex": elf.with_suffix(".hex").read_bytes(),
-        ".bin": elf.with_suffix(".bin").read_bytes(),
-        ".update.json": package.encode(),
-    }
+    contents = {suffix: elf.with_suffix(suffix).read_bytes() for suffix in (".elf", ".hex", ".bin")}
+    contents[".update.json"] = Package.built(target).to_json().encode()
     paths = [output / f"{target}{suffix}" for suffix in contents]
     with writing(output):
         output.mkdir(parents=True, exist_ok=True)

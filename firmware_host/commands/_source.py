@@ -48,25 +48,17 @@ class SymbolOptions:
             IncompatibleError: The file was made with another link.
             InputError: The file is wrong.
         """
-        import numpy as np
-
         from evlcp_sdk.link.resolve import load_link
-        from firmware_host.board.bank import MOST_RANDOM_FRAMES, random_symbols
+        from firmware_host.board.bank import random_packets
         from firmware_host.board.symbols import read_symbols
 
-        if (self.symbols is None) == (self.random is None):
-            raise ConfigError("give symbols as SYMBOLS.json or with --random N, one of the two")
         link = self.given_link()
-        if self.symbols is not None:
+        if self.symbols is not None and self.random is None:
             return read_symbols(self.symbols, link)
+        if self.random is None or self.symbols is not None:
+            raise ConfigError("give symbols as SYMBOLS.json or with --random N, one of the two")
         link = link or load_link()
-        frames, packets = link.packet.frames, self.random or 0
-        if not 0 < packets * frames <= MOST_RANDOM_FRAMES:
-            raise ConfigError(
-                f"--random {packets}, air.frames_per_packet = {frames}: expected at least 1 packet,"
-                f" at most {MOST_RANDOM_FRAMES} frames in all"
-            )
-        return random_symbols(packets, frames, link.codebook, np.random.default_rng(self.seed)), link
+        return random_packets(self.random, link, self.seed), link
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,6 @@
 
 import contextlib
 import errno
-import re
 import time
 from typing import Any
 
@@ -17,8 +16,6 @@ _ADVICE: dict[int | None, str] = {
     **dict.fromkeys((errno.EBUSY, errno.EAGAIN), _TAKEN),
 }
 """What to do about a device that cannot be opened."""
-
-_NEEDS_PORT = ("socket://", "rfc2217://")
 
 
 class SerialTransport:
@@ -85,15 +82,14 @@ def _text(fault: BaseException) -> str:
 
 def _why(url: str, baud: int, fault: Exception) -> str:
     """Why a port cannot be opened, and what to do."""
-    if url.startswith(_NEEDS_PORT):
-        scheme, _, place = url.partition("://")
-        if not re.search(r":\d{1,5}(?:[/?]|$)", place) or place.startswith(":"):
-            return f"expected {scheme}://HOST:PORT"
-        return f"{_text(fault)}; start what listens there, or name another --port"
-    if "://" not in url:
-        advice = _ADVICE.get(getattr(fault, "errno", None))
-        if advice is not None:
-            return advice.format(url)
-        if "baud" in str(fault).lower():
-            return f"{_text(fault)}: its driver does not take --baud {baud}"
+    scheme, on_network, _ = url.partition("://")
+    if scheme in ("socket", "rfc2217"):
+        return (
+            f"{_text(fault)}; expected {scheme}://HOST:PORT; start what listens there, or name another --port"
+        )
+    advice = _ADVICE.get(getattr(fault, "errno", None))
+    if advice is not None and not on_network:
+        return advice.format(url)
+    if "baud" in str(fault).lower():
+        return f"{_text(fault)}: its driver does not take --baud {baud}"
     return f"{_text(fault)}; 'evlcp board ports' lists the ports"

@@ -258,8 +258,8 @@ class ReplayTransport:
             n = min(len(data), len(expected))
             if direction != "tx" or data[:n] != expected[:n]:
                 raise LineError(
-                    f"{self.name}: byte {self._sent} sent is another one than was recorded; replay the command,"
-                    " options and files that were"
+                    f"{self.name}: byte {self._sent} sent is another one than was recorded;"
+                    " replay the command, the options and the files that were"
                 )
             self._now = max(self._now, at)
             data = data[n:]

@@ -51,17 +51,13 @@ class UsbFilter:
     """USB devices by id and serial number.
 
     Attributes:
-        vendor: Vendor id, four hex digits.
-        product: Product id, four hex digits; None for any.
-        serial_number: Serial number; None for any.
+        parts: Vendor and product id, four hex digits each, and serial number; as many as are given.
 
     >>> UsbFilter.parse("0403:6015:D30A1").takes(SerialPort("COM7", "", "0403:6015", "D30A1"))
     True
     """
 
-    vendor: str
-    product: str | None = None
-    serial_number: str | None = None
+    parts: tuple[str, ...]
 
     @classmethod
     def parse(cls, text: str) -> "UsbFilter":
@@ -73,19 +69,13 @@ class UsbFilter:
         found = re.fullmatch(r"([0-9a-fA-F]{4})(?::([0-9a-fA-F]{4})(?::(.+))?)?", text)
         if found is None:
             raise ConfigError(f"USB id {text!r}: expected VID, VID:PID or VID:PID:SERIAL, such as 0403:6015")
-        vendor, product, serial = found.groups()
-        return cls(vendor.lower(), product.lower() if product else None, serial)
+        vendor, product, serial = found.groups("")
+        return cls(tuple(part for part in (vendor.lower(), product.lower(), serial) if part))
 
     def takes(self, port: SerialPort) -> bool:
         """Whether a port is one of these."""
-        if port.usb is None:
-            return False
-        vendor, _, product = port.usb.partition(":")
-        return (
-            vendor == self.vendor
-            and self.product in (None, product)
-            and self.serial_number in (None, port.serial_number)
-        )
+        found = (*(port.usb or "").split(":"), port.serial_number)
+        return found[: len(self.parts)] == self.parts
 
 
 def serial_ports() -> list[SerialPort]:
