@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
@@ -28,28 +28,20 @@ class Content:
     """What is to be sent, some of which changes with the time.
 
     Attributes:
+        fixed: What does not: arguments of `messages_of`.
         text: A text; where it is sent anew, `{time}`, `{left}` and `{n}` in it are filled in.
-        data: Bytes.
-        site: Where the transmitter is, for a beacon.
-        user: The beacon's own bytes.
-        key: File of the private key that signs it.
         time: The time is sent.
         ends_s: When what a signal shows ends, seconds since 1970.
         signals: What it shows, and what then.
-        transmitter_id: Whose messages they are; None for the site's, or 0.
         sequence: Number of the first.
     """
 
-    text: str | None = None
-    data: bytes | None = None
-    site: BarSite | None = None
-    user: bytes = b""
-    key: Path | None = None
-    time: bool = False
-    ends_s: float | None = None
-    signals: tuple[str, str] = ("red", "green")
-    transmitter_id: int | None = None
-    sequence: int = 0
+    fixed: Mapping[str, Any]
+    text: str | None
+    time: bool
+    ends_s: float | None
+    signals: tuple[str, str]
+    sequence: int
 
     def at(self, link: Link, at_s: float, number: int | None = None) -> list[Message]:
         """The messages of a time, seconds since 1970; of those sent anew, the ones of this number.
@@ -65,17 +57,8 @@ class Content:
         if text is not None and number is not None:
             text = text.replace("{time}", strftime("%H:%M:%S", gmtime(at_s))).replace("{n}", str(number))
             text = text.replace("{left}", f"{left_s:.0f}")
-        return messages_of(
-            link,
-            text=text,
-            data=self.data,
-            beacon=self.site,
-            user=self.user,
-            key=self.key,
-            other=other,
-            transmitter_id=self.transmitter_id,
-            sequence=self.sequence + (number or 0),
-        )
+        sequence = self.sequence + (number or 0)
+        return messages_of(link, **self.fixed, text=text, other=other, sequence=sequence)
 
 
 def site_that_sends(path: Path, transmitter_id: int | None, by: str) -> BarSite:

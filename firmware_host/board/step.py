@@ -70,10 +70,8 @@ def wait_for_pulse(boards: Sequence[Board], timeout_s: float) -> None:
             for board in boards:
                 with contextlib.suppress(BoardError):
                     board.stop()
-            told = ", ".join(
-                f"{board.session.name} has counted {count}"
-                for board, count in zip(waiting, pulses, strict=True)
-            )
+            names = (board.session.name for board in waiting)
+            told = ", ".join(map("{} has counted {}".format, names, pulses))
             raise LineError(
                 f"{waiting[0].session.name}: the pulse that it waits for has not come in {timeout_s:g} s"
                 f" (pulses since reset: {told}): check the wire of the pulse input; all are stopped"

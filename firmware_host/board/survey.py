@@ -73,11 +73,9 @@ def find(baud: int, ports: list[SerialPort] | None = None) -> str:
     if boards:
         names = ", ".join(f.port.device for f in boards)
         raise NoBoardError(f"{len(boards)} boards answer ({names}); choose one with --port or EVLCP_PORT")
-    silent = (
-        ", ".join(f.port.device for f in found if f.asked) or "there is none with a USB id that boards have"
-    )
-    left = ", ".join(f.port.device for f in found if not f.asked)
+    asked, others = (", ".join(f.port.device for f in found if f.asked is which) for which in (True, False))
     raise NoBoardError(
-        f"no board answers on any serial port ({silent}){f'; not asked: {left}' if left else ''};"
+        f"no board answers on any serial port with a USB id that boards have (asked: {asked or 'none'};"
+        f" not asked: {others or 'none'});"
         " check power and cable, name its port with --port, or use --port native: for an emulated one"
     )

@@ -87,17 +87,21 @@ class ContentOptions:
         for option, given in (("--text", self.text), ("--user", self.user)):
             utf8(given or "", option)
         site = None if self.beacon is None else site_that_sends(self.beacon, self.transmitter_id, "--id")
+        fixed = {
+            "data": None if self.file is None else read_whole(self.file),
+            "beacon": site,
+            "user": self.user.encode(),
+            "key": self.key,
+            "transmitter_id": self.transmitter_id,
+        }
+        now_s = clock_s()
         return Content(
+            fixed,
             text=self.text,
-            data=None if self.file is None else read_whole(self.file),
-            site=site,
-            user=self.user.encode(),
-            key=self.key,
             time=self.time,
-            ends_s=None if self.countdown is None else clock_s() + self.countdown,
+            ends_s=None if self.countdown is None else now_s + self.countdown,
             signals=(self.signal, self.next_signal),
-            transmitter_id=self.transmitter_id,
-            sequence=int(clock_s()) if self.sequence is None else self.sequence,
+            sequence=int(now_s) if self.sequence is None else self.sequence,
         )
 
 

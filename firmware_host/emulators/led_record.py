@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.errors import InputError
+from evlcp_sdk.errors import ConfigError, InputError
+from evlcp_sdk.files import read_whole
 from firmware_host.protocol.generated.requests import CHIP_DARK, CHIP_TEST, ROW_BYTES
-from firmware_host.protocol.rows import BOARD_LEDS, chips_of_rows
+from firmware_host.protocol.rows import BOARD_LEDS
 
 RECORD = np.dtype([("tick", "<u4"), ("chip", "<u4"), ("row", "u1", (ROW_BYTES,))])
 """One record."""
@@ -50,10 +51,7 @@ class LedRecord:
         Raises:
             InputError: It cannot be read, has no whole record, or its chips do not follow one another.
         """
-        try:
-            data = path.read_bytes()
-        except OSError as fault:
-            raise InputError(f"{path}: cannot be read: {fault.strerror}") from fault
+        data = read_whole(path)
         whole, cut = divmod(len(data), RECORD.itemsize)
         if not whole:
             raise InputError(
@@ -62,17 +60,16 @@ class LedRecord:
             )
         records = np.frombuffer(data, RECORD, whole)
         chip = records["chip"].astype(np.int64)
-        is_chip = chip < CHIP_TEST
-        places, chip = np.flatnonzero(is_chip), chip[is_chip]
+        places = np.flatnonzero(chip < CHIP_TEST)
+        chip = chip[places]
         # within one START each chip follows the one before
-        wrong = np.flatnonzero((chip[1:] != chip[:-1] + 1) & (chip[1:] != 0)) + 1
-        if len(chip) and chip[0] != 0:
-            wrong = np.array([0])
+        before = np.append(-1, chip[:-1])
+        wrong = np.flatnonzero((chip != before + 1) & ((chip != 0) | (before == -1)))
         if len(wrong):
-            at = int(wrong[0])
-            before = f"after chip {chip[at - 1]}" if at else "at the start"
+            at = wrong[0]
+            after = f"after chip {before[at]}" if at else "at the start"
             raise InputError(
-                f"{path}: at byte {places[at] * RECORD.itemsize}: chip {chip[at]} {before}:"
+                f"{path}: at byte {places[at] * RECORD.itemsize}: chip {chip[at]} {after}:"
                 " not an LED record, or a part of it is missing"
             )
         return replace(cls.of_records(records), cut_bytes=cut)
@@ -98,7 +95,25 @@ class LedRecord:
         Raises:
             ConfigError: LEDs of one cluster differ, or one that is in none is lit.
         """
-        return chips_of_rows(self.rows, led_clusters)
+        leds = np.unpackbits(self.rows, axis=1)
+        if led_clusters is None:
+            return leds
+        if len(led_clusters) > leds.shape[1]:
+            raise ConfigError(f"rows of {leds.shape[1]} LEDs, the link's bar has {len(led_clusters)}")
+        _, first = np.unique(led_clusters, return_index=True)
+        chips = np.ascontiguousarray(leds[:, first])
+        expected = np.zeros_like(leds)
+        expected[:, : len(led_clusters)] = chips[:, led_clusters]
+        wrong = np.argwhere(leds != expected)
+        if len(wrong):
+            chip, led = wrong[0]
+            if led >= len(led_clusters):
+                raise ConfigError(f"chip {chip}: LED {led} is lit, the link's bar has {len(led_clusters)}")
+            raise ConfigError(
+                f"chip {chip}: the LEDs of cluster {led_clusters[led]} differ; take every LED for itself"
+                " with --per-led"
+            )
+        return chips
 
     def __len__(self) -> int:
         return len(self.ticks)

@@ -41,8 +41,8 @@ class Timing:
         baud: Line rate, bit/s; a byte takes ten bits.
         latency_s: What board and host operating system add, s.
 
-    >>> round(Timing(1_000_000, 0.05).timeout_s(100, 100, 0), 3)
-    0.054
+    >>> Timing(1_000_000).wire_s(200)
+    0.002
     """
 
     baud: int = 1_000_000
@@ -51,16 +51,6 @@ class Timing:
     def wire_s(self, count: int) -> float:
         """Time that `count` bytes take on the line, s."""
         return 10.0 * count / self.baud
-
-    def timeout_s(self, queued: int, reply: int, tries: int) -> float:
-        """Time after which the answer is overdue, s.
-
-        Args:
-            queued: Bytes on the line before and with the request.
-            reply: Bytes of the longest answer to it and to those before.
-            tries: How often it was sent before.
-        """
-        return (2 * self.wire_s(queued + reply) + self.latency_s) * BACKOFF**tries
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +229,7 @@ class Client:
     def _send(self, waiting: _Waiting, now: float) -> bytes:
         queued = sum(len(w.wire) for w in self._flight.values())
         replies = sum(w.reply_bytes for w in self._flight.values())
-        waiting.wire_s = self.timing.timeout_s(queued, replies, 0) - self.timing.latency_s
+        waiting.wire_s = 2 * self.timing.wire_s(queued + replies)
         waiting.due = now + (waiting.wire_s + self.latency_s) * BACKOFF**waiting.tries
         waiting.sent = now
         waiting.tries += 1
