@@ -13,17 +13,13 @@ from evlcp_sdk.air.frames import PacketFormat, packet_chips
 from evlcp_sdk.errors import ConfigError, InputError
 from evlcp_sdk.files import read_numbers
 from evlcp_sdk.link.resolve import Link
-from firmware_host.protocol.generated.requests import CLUSTERS, LEDS, ROW_BYTES, Format
+from firmware_host.protocol.generated.requests import CLUSTERS, ROW_BYTES, Format
 from firmware_host.protocol.rows import BOARD_LEDS, rows_of_leds
 
 WORD_CHIPS = 16
-"""Chips of a pilot, and of an info segment, that the board composes."""
-
 PREAMBLE_CHIPS = 32
-"""Chips of a preamble at most that the board composes."""
-
 MOST_FRAMES = 65_535
-"""Frames of a packet at most that the board composes."""
+"""What a board composes: chips of a pilot and of an info segment, and at most of a preamble; and frames."""
 
 MOST_RANDOM_FRAMES = 100_000
 """Random frames at most: minutes of light, far beyond any bank, and within memory."""
@@ -198,27 +194,20 @@ def _bank(
     clusters = int(led_clusters.max()) + 1
     if clusters != codebook.clusters:
         raise ConfigError(f"LEDs of {clusters} clusters, expected {codebook.clusters}, one for each pilot")
-    composed = not word_limits(codebook, packet, led_clusters)
+    composed = is_composed(packet, led_clusters)
     form = Format.WORDS if composed else Format.CLUSTERS if -(-clusters // 8) < ROW_BYTES else Format.MASKS
     none = np.zeros((0, clusters), np.uint8)
     return Bank(form, codebook, packet, led_clusters, composed, rest, none if chips is None else chips)
 
 
-def word_limits(codebook: Codebook, packet: PacketFormat, led_clusters: NDArray[np.int64]) -> list[str]:
-    """Why a board cannot compose the packets of a link, so that it is sent every chip; empty if it can."""
-    faults = []
-    if not np.array_equal(led_clusters, BOARD_LEDS):
-        faults.append(
-            f"{len(led_clusters)} LEDs in {codebook.clusters} clusters, not {LEDS} in {CLUSTERS} equal ones"
-        )
-    for name, chips in (("pilots", packet.pilot_chips), ("modulation", packet.info_chips)):
-        if chips != WORD_CHIPS:
-            faults.append(f"{name}: codes of {chips} chips, not {WORD_CHIPS}")
-    if packet.preamble_chips > PREAMBLE_CHIPS:
-        faults.append(f"preamble of {packet.preamble_chips} chips, more than {PREAMBLE_CHIPS}")
-    if packet.frames > MOST_FRAMES:
-        faults.append(f"air.frames_per_packet = {packet.frames}, more than {MOST_FRAMES}")
-    return faults
+def is_composed(packet: PacketFormat, led_clusters: NDArray[np.int64]) -> bool:
+    """Whether a board can compose the packets of a link; otherwise it is sent every chip."""
+    return (
+        np.array_equal(led_clusters, BOARD_LEDS)
+        and packet.pilot_chips == packet.info_chips == WORD_CHIPS
+        and packet.preamble_chips <= PREAMBLE_CHIPS
+        and packet.frames <= MOST_FRAMES
+    )
 
 
 def check_rate(packet: PacketFormat) -> None:

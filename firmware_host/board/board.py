@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from evlcp_sdk.air.codebook import word_of_chips
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import Link
-from firmware_host.board.bank import Bank, queue_of, word_limits
+from firmware_host.board.bank import PREAMBLE_CHIPS, WORD_CHIPS, Bank, queue_of
 from firmware_host.board.session import Session
 from firmware_host.board.stream import AHEAD, Stream
 from firmware_host.board.tables import name_of
@@ -403,19 +403,13 @@ class Board:
 
     def check_same_air(self, bank: Bank, status: protocol.StatusReply) -> None:
         """Raise IncompatibleError unless what plays and what comes are of one codebook and one chip rate."""
-        plays, comes = f"codebook {status.digest.hex()[:16]}", f"codebook {bank.digest[:16]}"
-        if status.digest.hex() == bank.digest:
-            rate_hz = status.chip_rate_hz // max(1, status.hold)
-            if rate_hz == bank.chip_rate_hz:
-                return
-            plays, comes = (
-                f"{rate_hz} chips per second",
-                f"air.chip_rate_hz = {bank.chip_rate_hz}",
+        book, rate_hz = status.digest.hex(), status.chip_rate_hz // max(1, status.hold)
+        if (book, rate_hz) != (bank.digest, bank.chip_rate_hz):
+            raise IncompatibleError(
+                f"{self.session.name}: plays codebook {book[:16]} at {rate_hz} chips per second,"
+                f" this payload's link has {bank.digest[:16]} ({bank.codebook.profile}) at air.chip_rate_hz ="
+                f" {bank.chip_rate_hz}; give its link with -c or --set, or 'evlcp board program' to change it"
             )
-        raise IncompatibleError(
-            f"{self.session.name}: plays {plays}, this payload's link has {comes} ({bank.codebook.profile});"
-            " give its link with -c or --set, or 'evlcp board program' to change it"
-        )
 
     def verify(self, bank: Bank) -> int:
         """Read the active bank back and compare it; its number.
@@ -462,10 +456,10 @@ class Board:
                 f" and {about.leds}: HELLO says so"
             )
         if not bank.composed and not about.formats >> bank.format & 1:
-            reasons = "; ".join(word_limits(bank.codebook, bank.packet, bank.led_clusters))
             raise IncompatibleError(
                 f"{name}: its firmware (protocol {about.major}.{about.minor}) plays packets that it composes"
-                f" alone, and this link has {reasons}; update the firmware"
+                f" alone: of {LEDS} LEDs in {CLUSTERS} equal clusters, codes of {WORD_CHIPS} chips, a preamble"
+                f" of at most {PREAMBLE_CHIPS}; update the firmware"
             )
         room = about.bank_bytes - len(bank.table)
         what = f"a bank of {name} has {about.bank_bytes}" + (

@@ -6,21 +6,13 @@ from dataclasses import dataclass
 from evlcp_sdk.errors import ConfigError
 from firmware_host.errors import NoBoardError
 
-BRIDGES = {
-    "0403:6001": "FTDI FT232R",
-    "0403:6010": "FTDI FT2232",
-    "0403:6011": "FTDI FT4232",
-    "0403:6014": "FTDI FT232H",
-    "0403:6015": "FTDI FT-X",
-    "0483:374b": "ST-LINK/V2-1",
-    "0483:374e": "ST-LINK/V3",
-    "0483:374f": "ST-LINK/V3",
-    "0483:3753": "ST-LINK/V3",
-    "10c4:ea60": "Silicon Labs CP210x",
-    "1a86:55d4": "WCH CH9102",
-    "1a86:7523": "WCH CH340",
-    "2e8a:000c": "Raspberry Pi Debug Probe",
-}
+BRIDGES = (
+    *("0403:6001", "0403:6010", "0403:6011", "0403:6014", "0403:6015"),  # FTDI
+    *("0483:374b", "0483:374e", "0483:374f", "0483:3753"),  # ST-LINK
+    "10c4:ea60",  # Silicon Labs CP210x
+    *("1a86:55d4", "1a86:7523"),  # WCH CH9102, CH340
+    "2e8a:000c",  # Raspberry Pi Debug Probe
+)
 """USB ids of the bridges that boards usually have: unless told otherwise, only these ports are written to."""
 
 

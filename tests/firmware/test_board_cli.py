@@ -76,8 +76,8 @@ def test_a_users_first_hour(evlcp, native: str, tmp_path: Path) -> None:
     check_fault(board("verify", "--random", 8, "--seed", 4), 7, "byte 0 of bank 0")
     check_fault(board("verify", "--random", 9, "--seed", 4), 7)
     for other, says in (
-        ("modulation.id=wh8", "this payload's link has codebook"),
-        ("air.chip_rate_hz=5000.0", "plays 10000 chips per second, this payload's link has air.chip_rate_hz"),
+        ("modulation.id=wh8", "(wh8) at air.chip_rate_hz = 10000"),
+        ("air.chip_rate_hz=5000.0", "at 10000 chips per second, this payload's link has"),
     ):
         for command in ("send", "verify"):
             check_fault(board(command, *eight, "--set", other), 8, says)
