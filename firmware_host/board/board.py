@@ -258,12 +258,10 @@ class Board:
 
     def _configure(self, bank: Bank, level_limit_ma: int = 0, duty_limit: int = 0) -> None:
         about, rate = self.about, bank.chip_rate_hz * self._hold(bank)
-        frames, every = _frames(bank)
-        configure = protocol.ConfigureRequest(
-            rate, profile_number(bank), frames, every, level_limit_ma, duty_limit
-        )
+        packet = (bank.packet.frames, bank.packet.pilot_every) if bank.composed else (1, 1)
+        limits = (level_limit_ma, duty_limit)
         try:
-            self.session.call(configure)
+            self.session.call(protocol.ConfigureRequest(rate, profile_number(bank), *packet, *limits))
         except RefusedError as fault:
             # the chip rate is what the board looks at first
             wrong = not about.chip_rate_min_hz <= rate <= about.chip_rate_max_hz or about.tick_hz % rate
@@ -280,22 +278,29 @@ class Board:
 
     def holds(self, bank: Bank, status: protocol.StatusReply) -> bool:
         """Whether the active bank is this one."""
-        if status.active_bank == NO_BANK or not self._same_packets(bank, status):
-            return False
-        held = (status.crc, status.chip_rate_hz, status.profile, status.digest.hex())
-        rate_hz = bank.chip_rate_hz * self._hold(bank)
-        return held == (bank.crc, rate_hz, profile_number(bank), bank.digest)
+        same = status.active_bank != NO_BANK and status.crc == bank.crc
+        return same and self._difference(bank, status) is None
 
-    def _same_packets(self, bank: Bank, status: protocol.StatusReply) -> bool:
-        """Whether the active bank has packets of the same number and lengths."""
-        if (status.format, status.packets, status.length) != (bank.format, bank.packets, len(bank.content)):
-            return False
+    def _difference(self, bank: Bank, status: protocol.StatusReply) -> str | None:
+        """What STATUS says otherwise of the active bank than it would of this one; its CRC left alone."""
+        packet, hold = bank.packet, self._hold(bank)
+        expected: dict[str, object] = {
+            "format": bank.format,
+            "packets": bank.packets,
+            "length": len(bank.content),
+            "chip_rate_hz": bank.chip_rate_hz * hold,
+            "profile": profile_number(bank),
+            "digest": bytes.fromhex(bank.digest),
+        }
         if bank.composed:
-            return not status.hold and (status.frames, status.pilot_every) == _frames(bank)
-        clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
-        hold = self._hold(bank)
-        expected = (hold * bank.packet.packet_chips, hold, clusters)
-        return (status.packet_chips, status.hold, status.clusters) == expected
+            expected |= {"hold": 0, "frames": packet.frames, "pilot_every": packet.pilot_every}
+        else:
+            clusters = bank.clusters if bank.format == Format.CLUSTERS else 0
+            expected |= {"hold": hold, "packet_chips": hold * packet.packet_chips, "clusters": clusters}
+        for name, value in expected.items():
+            if getattr(status, name) != value:
+                return f"{name} = {getattr(status, name)}, expected {value}"
+        return None
 
     def program(self, content: Bank, verify: bool = True, progress: Progress | None = None) -> Programmed:
         """Bring a bank's content onto the board and make it active; what is there already is not sent again.
@@ -427,11 +432,9 @@ class Board:
                 f"{name}: its bank is the queue of a stream, which holds nothing to compare; {again}"
             )
         self.check_same_air(bank, s)
-        if not self._same_packets(bank, s):
-            raise VerifyError(
-                f"{name}: holds {s.packets} packets, {s.length} bytes; expected {bank.packets},"
-                f" {len(bank.content)} bytes, or of other lengths; {again}"
-            )
+        difference = self._difference(bank, s)
+        if difference is not None:
+            raise VerifyError(f"{name}: holds other packets: {difference}; {again}")
         held = self.read(s.active_bank, 0, s.length)
         differ = next((i for i, (a, b) in enumerate(zip(held, bank.content, strict=True)) if a != b), None)
         if differ is not None:
@@ -458,8 +461,8 @@ class Board:
         if not bank.composed and not about.formats >> bank.format & 1:
             raise IncompatibleError(
                 f"{name}: its firmware (protocol {about.major}.{about.minor}) plays packets that it composes"
-                f" alone: of {LEDS} LEDs in {CLUSTERS} equal clusters, codes of {WORD_CHIPS} chips, a preamble"
-                f" of at most {PREAMBLE_CHIPS}; update the firmware"
+                f" alone: of {LEDS} LEDs in {CLUSTERS} equal clusters, codes of {WORD_CHIPS} chips, a"
+                f" preamble of at most {PREAMBLE_CHIPS}; update the firmware"
             )
         room = about.bank_bytes - len(bank.table)
         what = f"a bank of {name} has {about.bank_bytes}" + (
@@ -621,11 +624,6 @@ def _set_level(board: Board, level_ma: int) -> bool:
             raise
         return False
     return True
-
-
-def _frames(bank: Bank) -> tuple[int, int]:
-    """Frames of a packet, and from one pilot to the next; one each where the board composes none."""
-    return (bank.packet.frames, bank.packet.pilot_every) if bank.composed else (1, 1)
 
 
 def profile_number(bank: Bank) -> int:
