@@ -80,8 +80,9 @@ class Workers:
         return cls(shared, processes - 1) if processes > 1 and shared else None
 
     def bars(self, link: str) -> list["_WorkerBars"]:
-        """Those that they decode of a link."""
-        return [_WorkerBars(one, link, self._links[link].regions.step_us) for one in self._all]
+        """Those that they decode of a link; nothing of one that has none."""
+        shared = self._links.get(link)
+        return [] if shared is None else [_WorkerBars(one, link, shared.regions.step_us) for one in self._all]
 
     def close(self) -> None:
         """End them."""

@@ -107,6 +107,8 @@ def test_what_cannot_be() -> None:
     before = multiprocessing.active_children()
     Receiver(lamp, workers=2)
     assert multiprocessing.active_children() == before, "a lamp's characters are not shared"
+    spots = replace(load_link(overrides=["detection.id=spots", "modulation.id=wh8"]), name="spots")
+    Receiver([LINK, spots], workers=2).close()
 
 
 @pytest.mark.parametrize(
