@@ -118,38 +118,6 @@ class Inventory:
     banks: Mapping[str, Bank]
 
 
-@dataclass(frozen=True)
-class Result:
-    """How one board ended: what was done, for a person and as plain values, or why it failed."""
-
-    entry: Entry
-    said: str
-    table: dict[str, Any]
-    fault: EvlcpError | None
-    elapsed_s: float
-
-    @property
-    def line(self) -> str:
-        """One line for a person."""
-        head = f"{self.entry.id}  {self.entry.port}"
-        if self.fault is not None:
-            return f"{head}  FAILED ({self.fault.exit_code}): {self.fault}"
-        return f"{head}  {self.said}"
-
-    def to_dict(self) -> dict[str, Any]:
-        """As plain values."""
-        return {
-            "id": self.entry.id,
-            "port": self.entry.port,
-            "position_m": list(self.entry.position_m),
-            "ok": self.fault is None,
-            **self.table,
-            "exit_code": self.fault.exit_code if self.fault else 0,
-            "fault": str(self.fault) if self.fault else None,
-            "elapsed_s": round(self.elapsed_s, 3),
-        }
-
-
 def read_inventory(path: Path) -> Inventory:
     """Read an inventory, with what each board plays.
 
@@ -264,11 +232,11 @@ def board_of(entry: Entry, folder: Path) -> Iterator[Board]:
         yield board
 
 
-Report = Callable[[Result], None]
-"""Called with each result as it comes."""
-
 Work = Callable[[Entry, Board], tuple[str, dict[str, Any]]]
 """What is done with a board; what it did, for a person and as plain values."""
+
+Report = Callable[[str, dict[str, Any]], None]
+"""Called with how each board ended, as it comes: a line for a person, and plain values."""
 
 
 def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) -> None:
@@ -277,30 +245,32 @@ def run_fleet(path: Path, entries: Sequence[Entry], work: Work, report: Report) 
     Raises:
         FleetError: A board failed; it has the exit code of the first of them.
     """
+    codes: dict[str, int] = {}
 
-    def one(entry: Entry) -> Result:
+    def one(entry: Entry) -> tuple[str, dict[str, Any]]:
         start = time.monotonic()
-        said, table, failed = "", dict[str, Any](), None
+        table, code, fault = dict[str, Any](), 0, None
         try:
             with board_of(entry, path.parent) as board:
                 said, table = work(entry, board)
-        except EvlcpError as fault:
-            failed = fault
-        return Result(entry, said, table, failed, time.monotonic() - start)
+        except EvlcpError as failed:
+            code, fault = failed.exit_code, str(failed)
+            codes[entry.id] = code
+            said = f"FAILED ({code}): {fault}"
+        elapsed_s = round(time.monotonic() - start, 3)
+        named = {"id": entry.id, "port": entry.port, "position_m": list(entry.position_m), "ok": not code}
+        ended = {"exit_code": code, "fault": fault, "elapsed_s": elapsed_s}
+        return f"{entry.id}  {entry.port}  {said}", named | table | ended
 
-    faults: dict[str, EvlcpError] = {}
     with ThreadPoolExecutor(min(64, len(entries))) as pool:
         for future in as_completed([pool.submit(one, entry) for entry in entries]):
-            result = future.result()
-            if result.fault is not None:
-                faults[result.entry.id] = result.fault
-            report(result)
-    failed = [entry.id for entry in entries if entry.id in faults]
+            report(*future.result())
+    failed = [entry.id for entry in entries if entry.id in codes]
     if failed:
         raise FleetError(
             f"{path}: {len(failed)} of {len(entries)} boards failed"
             f" ({', '.join(failed)}); the others are done; run it again for the rest",
-            faults[failed[0]].exit_code,
+            codes[failed[0]],
         )
 
 

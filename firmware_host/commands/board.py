@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
     from firmware_host.board.bank import Bank
     from firmware_host.board.board import Board
-    from firmware_host.board.fleet import Entry, Result
+    from firmware_host.board.fleet import Entry
     from firmware_host.board.monitor import Back, Gone, Unheard
     from firmware_host.protocol.generated.requests import StatusReply
 
@@ -218,9 +218,9 @@ def _beside_inventory(context: typer.Context, *allowed: str) -> None:
         )
 
 
-def _report(as_json: bool) -> Callable[[Result], None]:
-    """Prints the result of each board of an inventory."""
-    return lambda result: say(result.line, result.to_dict(), as_json)
+def _report(as_json: bool) -> Callable[[str, dict[str, Any]], None]:
+    """Prints how each board of an inventory ended."""
+    return lambda said, table: say(said, table, as_json)
 
 
 def _each(

@@ -167,17 +167,16 @@ class TraceTransport:
         self._path = path
         self._file = open_log(path)
         self._start = inner.now()
-        head = {"evlcp_trace": 1, "port": inner.name, "baud": baud, "first": first, "nonce": nonce}
-        self._put(head)
-
-    def _note(self, direction: str, data: bytes) -> None:
-        if data:
-            line = {"t": round(self._inner.now() - self._start, 6), "dir": direction, "hex": data.hex()}
-            self._put(line)
+        self._put({"evlcp_trace": 1, "port": inner.name, "baud": baud, "first": first, "nonce": nonce})
 
     def _put(self, line: Mapping[str, Any]) -> None:
         with writing(self._path):
             self._file.write(json.dumps(line) + "\n")
+
+    def _note(self, direction: str, data: bytes) -> None:
+        if data:
+            t = round(self._inner.now() - self._start, 6)
+            self._put({"t": t, "dir": direction, "hex": data.hex()})
 
     def now(self) -> float:
         """The inner line's time, s."""
