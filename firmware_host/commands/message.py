@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import json
 import os
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
 from evlcp_sdk.cli._command import command
-from evlcp_sdk.cli._common import LinkFile, Overrides, echo, print_json, progress_bar
+from evlcp_sdk.cli._common import LinkFile, Overrides, progress_bar
 from firmware_host.commands._json import AsJson, say
 from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, say_done
 from firmware_host.commands.stream import Ahead, say_stream
@@ -20,7 +21,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from evlcp_sdk.link.resolve import Link
-    from firmware_host.board.bank import Bank
     from firmware_host.board.messages import Content
 
 _MOST_NUMBER = 2**32 - 1
@@ -173,13 +173,12 @@ def message(
     Onto a board:    [bold]evlcp tx message --text "Tempo 30" --port /dev/ttyUSB0[/]
     A countdown:     [bold]evlcp tx message --countdown 30 --every 1 --port /dev/ttyUSB0[/]
     """
-    import json
-
     from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import Outputs
     from evlcp_sdk.link.resolve import load_link
     from evlcp_sdk.plugin.registry import Registry
     from firmware_host.board.bank import bank_of, symbol_chips
+    from firmware_host.board.board import Settings, provision
     from firmware_host.board.symbols import symbols_table
 
     link = load_link(link_file, overrides or [], Registry.load())
@@ -201,14 +200,21 @@ def message(
         outputs.commit()
     written = [str(path) for path in (out, chips) if path is not None]
     line = board.line(only_named=bool(written))
-    if line is not None:
-        _program(bank_of(symbols, link), line, summary, table, written, stay=stay, as_json=as_json)
-    elif as_json:
-        print_json(summary | {"board": None} | table)
-    else:
-        _tell(summary, written, plays=False)
-        if not written:
+    said = _said(summary, written)
+    if line is None:
+        say(said, summary | {"board": None} | table, as_json)
+        if not written and not as_json:
             raise ConfigError("nothing is sent or written: give --port (or EVLCP_PORT), -o or --chips")
+        return
+    bank = bank_of(symbols, link)
+    with line.open() as opened:
+        with progress_bar("programming") as progress:
+            done = provision(opened, bank, Settings(), True, progress)
+        say(f"{said}, again and again", summary | {"board": asdict(done)} | table, as_json)
+        if not as_json:
+            say_done(done, as_json)
+        if stay:
+            keep_alive(opened)
 
 
 def _send_anew(
@@ -264,44 +270,16 @@ def _compose(content: Content, link: Link, repeat: int) -> tuple[NDArray[np.int6
     }
 
 
-def _program(
-    bank: Bank,
-    line: BoardLine,
-    summary: dict[str, Any],
-    table: dict[str, Any],
-    written: list[str],
-    *,
-    stay: bool,
-    as_json: bool,
-) -> None:
-    """Program a board with packets; say what was done."""
-    import dataclasses
-
-    from firmware_host.board.board import Settings, provision
-
-    with line.open() as board:
-        with progress_bar("programming") as progress:
-            programmed = provision(board, bank, Settings(), True, progress)
-        if as_json:
-            print_json(summary | {"board": dataclasses.asdict(programmed)} | table)
-        else:
-            _tell(summary, written, plays=True)
-            say_done(programmed, as_json=False)
-        if stay:
-            keep_alive(board)
-
-
-def _tell(summary: dict[str, Any], written: list[str], plays: bool) -> None:
-    """Say what was put on packets, and where they are."""
-    for m in summary["messages"]:
-        echo(
-            f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
-        )
+def _said(summary: dict[str, Any], written: list[str]) -> str:
+    """What was put on packets, and where they are, for a person."""
+    lines = [
+        f"{m['kind']:9} {m['bytes']:5} bytes, transmitter {m['transmitter_id']}, sequence {m['sequence']}"
+        for m in summary["messages"]
+    ]
     number = summary["packets"]
-    said = f"{number} packet{'s' * (number != 1)}, {summary['duration_s']:.4g} s"
-    if written:
-        said += f", in {' and '.join(written)}"
-    echo(said + ", again and again" * plays)
+    where = f", in {' and '.join(written)}" if written else ""
+    lines.append(f"{number} packet{'s' * (number != 1)}, {summary['duration_s']:.4g} s{where}")
+    return "\n".join(lines)
 
 
 def keygen(
