@@ -4,7 +4,7 @@ import contextlib
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -110,6 +110,14 @@ class Entry:
 
 
 @dataclass(frozen=True)
+class _Tables:
+    """An inventory as it is written."""
+
+    board: Annotated[list[dict[str, Any]], Field(min_length=1)]
+    defaults: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
 class Inventory:
     """The boards of a file, and what each plays, by its id."""
 
@@ -138,20 +146,15 @@ def read_entries(path: Path) -> tuple[Entry, ...]:
         ConfigError: The inventory cannot be read, or a value is wrong; the message names the place, the value
             and what was expected.
     """
-    table = read_toml(path)
-    unknown = sorted(set(table) - {"defaults", "board"})
-    if unknown:
-        raise ConfigError(f"{path}: {unknown[0]}: unknown table, expected [defaults] and [[board]]")
-    defaults, rows = table.get("defaults", {}), table.get("board", [])
-    if not isinstance(defaults, dict):
-        raise ConfigError(f"{path}: defaults = {shown(defaults)}, expected a table [defaults]")
-    if not isinstance(rows, list) or not rows or not all(isinstance(r, dict) for r in rows):
-        raise ConfigError(f"{path}: board: expected at least one [[board]] table")
+    try:
+        tables = build(_Tables, read_toml(path))
+    except SpecError as refused:
+        raise ConfigError("\n".join(refused.lines(f"{path}: "))) from refused
     entries = []
-    for i, row in enumerate(rows):
+    for i, row in enumerate(tables.board):
         place = f"{path}: board[{i}]"
         try:
-            entries.append(build(Entry, defaults | row))
+            entries.append(build(Entry, tables.defaults | row))
         except SpecError as refused:
             raise ConfigError("\n".join(refused.lines(f"{place}."))) from refused
         except ConfigError as fault:

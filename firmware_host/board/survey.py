@@ -23,16 +23,6 @@ class Found:
     fault: str
 
 
-def ask(port: SerialPort, baud: int) -> Found:
-    """Say HELLO on a port, briefly."""
-    try:
-        line = open_transport(port.device, baud)
-        with Session(line, Timing(baud, latency_s=0.15), tries=_PROBE_TRIES) as session:
-            return Found(port, True, session.hello(), "")
-    except BoardError as fault:
-        return Found(port, True, None, str(fault))
-
-
 def survey(
     baud: int, ports: list[SerialPort] | None = None, usb: UsbFilter | None = None, every: bool = False
 ) -> list[Found]:
@@ -52,9 +42,14 @@ def survey(
         return []
 
     def look(port: SerialPort) -> Found:
-        if every or usb is not None or port.likely:
-            return ask(port, baud)
-        return Found(port, False, None, "no USB id of a board's bridge: not asked")
+        if not (every or usb is not None or port.likely):
+            return Found(port, False, None, "no USB id of a board's bridge: not asked")
+        try:
+            line = open_transport(port.device, baud)
+            with Session(line, Timing(baud, latency_s=0.15), tries=_PROBE_TRIES) as session:
+                return Found(port, True, session.hello(), "")
+        except BoardError as fault:
+            return Found(port, True, None, str(fault))
 
     with ThreadPoolExecutor(len(listed)) as pool:
         return list(pool.map(look, listed))

@@ -107,10 +107,12 @@ def _packets(
     from firmware_host.board.symbols import symbols_of
 
     sequence = 0
-    for number, line in _lines(file):
+    number = 0
+    for line in _lines(file):
         if line is None:
             yield None
             continue
+        number += 1
         if not line.strip():
             continue
         try:
@@ -138,8 +140,8 @@ def _depth(table: Any) -> int:
     return max(1, depth) if depth else 3
 
 
-def _lines(file: Path) -> Iterator[tuple[int, str | None]]:
-    """Number and text of each line as it comes; None as its text while none does."""
+def _lines(file: Path) -> Iterator[str | None]:
+    """Each line as it comes; None while none does."""
     import queue
     import sys
     import threading
@@ -160,16 +162,13 @@ def _lines(file: Path) -> Iterator[tuple[int, str | None]]:
 
     # it may be waiting for input when the command ends
     threading.Thread(target=read, daemon=True).start()
-    number = 0
     while True:
-        try:
-            line = came.get_nowait()
-        except queue.Empty:
-            yield number, None
+        if came.empty():
+            yield None
             continue
+        line = came.get()
         if line is None:
             return
         if isinstance(line, Exception):
             raise InputError(f"{file}: cannot be read: {line}") from line
-        number += 1
-        yield number, line
+        yield line

@@ -11,6 +11,7 @@ from evlcp_sdk.files import Outputs, read_whole, writing
 from firmware_host.emulators.listening import HostLine
 from firmware_host.emulators.simulated import SimulatedBoard
 from firmware_host.images import check_flash_file
+from firmware_host.ports.transport import Transport
 
 _PIECE = 2048
 """Bytes that the board receives at once: half of what it has room for."""
@@ -84,18 +85,14 @@ class NativeBoard:
         self._held = held
 
 
-class NativeLine:
-    """A native board in this process, as a `Transport`; it ends with the line."""
+class NativeLine(Transport):
+    """A native board in this process; it ends with the line."""
 
     name = "native:"
 
     def __init__(self, board: NativeBoard) -> None:
         self._board = board
         self._came = b""
-
-    def now(self) -> float:
-        """Monotonic time, s."""
-        return time.monotonic()
 
     def read(self, timeout_s: float) -> bytes:
         """See `Transport.read`."""

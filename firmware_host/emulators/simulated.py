@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from firmware_host import build
 from firmware_host.emulators.led_record import RECORD, LedRecord
+from firmware_host.ports.transport import Transport
 from firmware_host.protocol.generated.requests import LEDS, ROW_BYTES
 
 
@@ -118,8 +119,8 @@ class SimulatedBoard:
         return np.unpackbits(np.array(self.bench.shown, np.uint8))[:LEDS]
 
 
-class SimulatedLine:
-    """A line to a simulated board, as a `Transport`; its clock is the board's.
+class SimulatedLine(Transport):
+    """A line to a simulated board; its clock is the board's.
 
     Args:
         board: The board.

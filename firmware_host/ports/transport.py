@@ -62,7 +62,8 @@ class Transport(Protocol):
     name: str
 
     def now(self) -> float:
-        """The time, s."""
+        """The time, s: monotonic, but for a line of its own time."""
+        return time.monotonic()
 
     def read(self, timeout_s: float) -> bytes:
         """Bytes that came, after at most `timeout_s`; empty if none did.
@@ -82,7 +83,7 @@ class Transport(Protocol):
         """Let go of the line."""
 
 
-class SocketTransport:
+class SocketTransport(Transport):
     """A connected stream socket."""
 
     def __init__(self, name: str, connected: socket.socket) -> None:
@@ -120,10 +121,6 @@ class SocketTransport:
             ) from fault
         return cls(spec, connected)
 
-    def now(self) -> float:
-        """Monotonic time, s."""
-        return time.monotonic()
-
     def read(self, timeout_s: float) -> bytes:
         """See `Transport.read`."""
         try:
@@ -151,7 +148,7 @@ class SocketTransport:
         self._socket.close()
 
 
-class TraceTransport:
+class TraceTransport(Transport):
     """Passes everything through and records it as JSON lines.
 
     The first line has port, line rate and what the client drew at random; each further one is
@@ -200,7 +197,7 @@ class TraceTransport:
             self._file.close()
 
 
-class ReplayTransport:
+class ReplayTransport(Transport):
     """Plays a trace back: gives what was received, once what was sent before it has been sent again.
 
     Args:

@@ -150,8 +150,8 @@ def test_the_packets_of_an_inventory_are_those_of_tx_message(evlcp, tmp_path: Pa
     ("text", "code", "expected"),
     [
         ("[[board", 2, "not TOML"),
-        ("", 2, "expected at least one [[board]]"),
-        ("[other]\n", 2, "other: unknown table"),
+        ("", 2, "board: missing"),
+        (GOOD + "[other]\n", 2, "other: unknown table"),
         ("defaults = 3\n" + GOOD, 2, "defaults = 3"),
         (BOARD, 2, "give payload or random or a message"),
         (GOOD + 'link = {modulation = {id = "wh9"}}', 2, "board[0]: link: no modulation algorithm named"),
