@@ -29,7 +29,7 @@ from firmware_host.protocol.generated.requests import DEFAULT_BAUD, Watchdog
 
 @dataclass(frozen=True)
 class Entry:
-    """One board of an inventory.
+    """One board of an inventory: what it plays, and what `Settings` has; paths begin at the inventory's.
 
     Attributes:
         id: Transmitter id, unique in the inventory.
@@ -37,26 +37,17 @@ class Entry:
         position_m: Coordinates x, y, z of the bar's centre, m.
         payload: Symbols `[packet][frame][cluster]` in a JSON file, or chip masks in a `.npy` file.
         random: Instead of `payload`: that many packets of random symbols.
-        seed: Seed of `random`.
         text: Instead of `payload`: a message, a text.
-        beacon: Instead of `payload`, or beside `text`: the file of sites whose bar's beacon it sends,
-            its path relative to the inventory's.
+        beacon: Instead of `payload`, or beside `text`: the file of sites whose bar's beacon it sends.
         user: The beacon's own bytes, as text.
-        key: File of the private key that signs the beacon, its path relative to the inventory's.
+        key: File of the private key that signs the beacon.
         transmitter_id: Number of the transmitter in its messages; without it the site's, or 0.
         sequence: Number of its messages: raise it when they change.
         repeat: How many times in a row each packet is sent.
-        link: The link: a file, its path relative to the inventory's, or its tables. Without it a payload's
-            own, or all defaults.
+        link: The link, a file or its tables. Without it a payload's own, or all defaults.
         unique_id: The part's own number in hex, as `evlcp board hello` shows it; another board is refused.
-        level_ma: LED current, mA.
-        watchdog: What the board does when the host is silent.
-        watchdog_ms: After which silence, ms.
-        start: Whether to play when done.
         baud: Line rate, bit/s.
-        level_limit_ma: Largest LED current from now on, mA.
-        duty_limit: Largest share of time that a LED is on from now on.
-        board_key: File of the board's key, its path relative to the inventory's.
+        board_key: File of the board's key.
 
     Raises:
         ConfigError: Not exactly one of payload, random and a message is given.

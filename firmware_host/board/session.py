@@ -86,7 +86,6 @@ class Session:
         trace: File to record the line in.
 
     Attributes:
-        key: The same.
         max_payload: Largest payload that the board takes, bytes; HELLO says it.
 
     Raises:

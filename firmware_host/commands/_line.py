@@ -19,15 +19,7 @@ _BAUD = 1_000_000
 
 @dataclass(frozen=True)
 class BoardLine:
-    """Where the board is.
-
-    Attributes:
-        port: Port; None to ask all.
-        baud: Line rate, bit/s.
-        trace: File to record the wire in.
-        replay: Recorded wire to play back, without a board.
-        key: File of the board's key.
-    """
+    """Where the board is, as the options of `line_options` say."""
 
     port: str | None = None
     baud: int = _BAUD

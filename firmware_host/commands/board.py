@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -101,20 +101,13 @@ def ports(
         listed = [p for p in serial_ports() if wanted is None or wanted.takes(p)]
         found = [Found(p, False, None, "not asked") for p in listed]
     if as_json:
-        print_json(
-            [
-                {
-                    "port": f.port.device,
-                    "description": f.port.description,
-                    "usb": f.port.usb,
-                    "serial_number": f.port.serial_number,
-                    "asked": f.asked,
-                    "board": about_table(f.about) if f.about else None,
-                    "fault": f.fault or None,
-                }
-                for f in found
-            ]
-        )
+        rows = []
+        for f in found:
+            port = asdict(f.port)
+            about = about_table(f.about) if f.about else None
+            said = {"asked": f.asked, "board": about, "fault": f.fault or None}
+            rows.append({"port": port.pop("device"), **port, **said})
+        print_json(rows)
         return
     for f in found:
         what = f.fault
@@ -442,14 +435,14 @@ def monitor(
 
     That keeps the board's watchdog from acting. A board that is gone is looked for until it answers again.
     """
-    from firmware_host.board.monitor import watch
-
     if inventory is not None:
         from firmware_host.board.fleet import read_entries
 
         _beside_inventory(context, "interval", "count", "reconnect")
         _watch_fleet(inventory, read_entries(inventory), interval, count, reconnect, as_json)
         return
+    from firmware_host.board.monitor import watch
+
     line: BoardLine = context.obj
     # Where no port is named the one that is found now is meant, whatever comes later.
     named = line if line.port or line.replay else replace(line, port=line.found())
