@@ -8,24 +8,45 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import typer
 
+from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import echo, print_json
 from firmware_host.commands._json import JsonCommand
 
 if TYPE_CHECKING:
     from firmware_host.board.board import Board
 
-_BAUD = 1_000_000
-
 
 @dataclass(frozen=True)
 class BoardLine:
-    """Where the board is, as the options of `line_options` say."""
+    """Where the board is."""
 
-    port: str | None = None
-    baud: int = _BAUD
-    trace: Path | None = None
-    replay: Path | None = None
-    key: Path | None = None
+    PANEL: ClassVar[str] = "Line"
+
+    port: Annotated[
+        str | None,
+        typer.Option(
+            envvar="EVLCP_PORT",
+            show_envvar=False,
+            metavar="PORT",
+            help="Device, URL, usb:VID:PID, unix:PATH, native:; or all are asked.",
+        ),
+    ] = None
+    baud: Annotated[
+        int, typer.Option(help="Line rate, bit/s.", min=1200, metavar="RATE", show_default=False)
+    ] = 1_000_000
+    trace: Annotated[Path | None, typer.Option(metavar="FILE", help="Record the wire.")] = None
+    replay: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Play a recorded wire back; no board.")
+    ] = None
+    key: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            envvar="EVLCP_BOARD_KEY",
+            show_envvar=False,
+            help="The board's key, or EVLCP_BOARD_KEY.",
+        ),
+    ] = None
 
     def found(self) -> str:
         """The port: the one that is named, or the one of those that are asked that has a board."""
@@ -62,49 +83,15 @@ LINE = tuple(field.name for field in fields(BoardLine))
 """The options of a line."""
 
 
-def line_options(
-    context: typer.Context,
-    port: Annotated[
-        str | None,
-        typer.Option(
-            envvar="EVLCP_PORT",
-            show_envvar=False,
-            metavar="PORT",
-            rich_help_panel="Line",
-            help="Device, URL, usb:VID:PID, unix:PATH, native:; or all are asked.",
-        ),
-    ] = None,
-    baud: Annotated[
-        int,
-        typer.Option(
-            help="Line rate, bit/s.", min=1200, metavar="RATE", rich_help_panel="Line", show_default=False
-        ),
-    ] = _BAUD,
-    trace: Annotated[
-        Path | None, typer.Option(metavar="FILE", rich_help_panel="Line", help="Record the wire.")
-    ] = None,
-    replay: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", rich_help_panel="Line", help="Play a recorded wire back; no board."),
-    ] = None,
-    key: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            envvar="EVLCP_BOARD_KEY",
-            show_envvar=False,
-            rich_help_panel="Line",
-            help="The board's key, or EVLCP_BOARD_KEY.",
-        ),
-    ] = None,
-) -> None:
+@command
+def line_options(*, context: typer.Context, line: BoardLine) -> None:
     """The callback of a group whose commands work on a board."""
     name = context.invoked_subcommand or ""
     taken = getattr(getattr(context.command, "commands", {}).get(name), "line", ())
     for option in LINE:
         if option not in taken and from_command_line(context, option):
             raise typer.BadParameter(f"'{name}' takes no --{option}", param_hint=f"--{option}")
-    context.obj = BoardLine(port, baud, trace, replay, key)
+    context.obj = line
 
 
 class LineCommand(JsonCommand):
