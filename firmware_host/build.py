@@ -37,8 +37,7 @@ def make(*targets: str) -> Path:
     Raises:
         ToolchainError: A tool is missing, or a step fails.
     """
-    if shutil.which("make") is None:
-        raise ToolchainError("make is missing: apt-get install make gcc, then run this again")
+    _need("make", "make gcc")
     folder = build_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -65,7 +64,7 @@ def make(*targets: str) -> Path:
     return folder
 
 
-def _compiler(name: str, package: str) -> None:
+def _need(name: str, package: str) -> None:
     if shutil.which(name) is None:
         raise ToolchainError(f"{name} is missing: apt-get install --no-install-recommends {package}")
 
@@ -76,7 +75,7 @@ def native_library() -> Path:
     Raises:
         ToolchainError: No C compiler, or it fails.
     """
-    _compiler(os.environ.get("CC", "cc"), "gcc libc6-dev make")
+    _need(os.environ.get("CC", "cc"), "gcc libc6-dev make")
     return make("library") / "libevlcp-board.so"
 
 
@@ -88,5 +87,5 @@ def arm_image(board: str) -> Path:
     Raises:
         ToolchainError: The cross compiler is missing, or fails.
     """
-    _compiler("arm-none-eabi-gcc", "gcc-arm-none-eabi")
+    _need("arm-none-eabi-gcc", "gcc-arm-none-eabi")
     return make("images" if board[-2:] in ("-1", "-2") else "stm32") / f"{board}.elf"

@@ -178,11 +178,10 @@ class Board:
     def read(self, bank: int, offset: int, length: int) -> bytes:
         """A bank's bytes."""
         most = self.about.max_payload - protocol.ReadReply.fixed_bytes()
-        found: dict[int, bytes] = {}
-        pieces = [(at, min(most, offset + length - at)) for at in range(offset, offset + length, most)]
-        reads = (protocol.ReadRequest(bank, at, n) for at, n in pieces)
-        self.session.call_each(reads, lambda _, reply: found.update({reply.offset: reply.data}))
-        data = b"".join(found.get(at, b"") for at, _ in pieces)
+        end, found = offset + length, list[tuple[int, bytes]]()
+        reads = (protocol.ReadRequest(bank, at, min(most, end - at)) for at in range(offset, end, most))
+        self.session.call_each(reads, lambda _, reply: found.append((reply.offset, reply.data)))
+        data = b"".join(piece for _, piece in sorted(found))
         if len(data) != length:
             raise LineError(f"{self.session.name}: READ gave {len(data)} bytes, expected {length}; try again")
         return data
@@ -494,9 +493,9 @@ class Board:
         """
         missing = self._missing(bank, content)
         total = sum(n for _, n in missing)
-        advance = progress or (lambda _done, _total: None)
         done = len(content) - total
-        advance(done, len(content))
+        if progress is not None:
+            progress(done, len(content))
         piece = self.session.max_payload - protocol.WriteRequest.fixed_bytes()
         left = deque((at, at + n) for at, n in missing)
 
@@ -517,7 +516,8 @@ class Board:
                 return
             self.session.checked(request, outcome)
             done += n
-            advance(done, len(content))
+            if progress is not None:
+                progress(done, len(content))
 
         while left:
             self.session.run(requests(), handle)
@@ -528,11 +528,13 @@ class Board:
         missing: list[tuple[int, int]] = []
 
         def handle(request: protocol.CrcRequest, reply: protocol.CrcReply) -> None:
-            if zlib.crc32(content[request.offset : request.offset + request.length]) != reply.crc:
-                missing.append((request.offset, request.length))
+            at, n = request.offset, request.length
+            if zlib.crc32(content[at : at + n]) != reply.crc:
+                missing.append((at, n))
 
-        blocks = ((at, min(_BLOCK, len(content) - at)) for at in range(0, len(content), _BLOCK))
-        self.session.call_each((protocol.CrcRequest(bank, at, n) for at, n in blocks), handle)
+        blocks = range(0, len(content), _BLOCK)
+        crcs = (protocol.CrcRequest(bank, at, min(_BLOCK, len(content) - at)) for at in blocks)
+        self.session.call_each(crcs, handle)
         return sorted(missing)
 
     def _settled(self) -> protocol.StatusReply:

@@ -1,7 +1,6 @@
 """Another firmware for a board in the field: over its line, on trial first, and back if it does not start."""
 
 import base64
-import binascii
 import json
 import zlib
 from collections.abc import Mapping
@@ -56,17 +55,14 @@ class Package:
         """
         try:
             table = read_json(path)
-        except InputError as fault:
-            if isinstance(fault.__cause__, OSError):
-                raise
-            raise InputError(f"{path}: {_NO_UPDATE}") from fault
-        try:
             images = {n: base64.b64decode(table["images"][str(n)], validate=True) for n in (1, 2)}
             crcs = [zlib.crc32(images[n]) for n in (1, 2)]
             good = table["evlcp_update"] == 1 and crcs == table["crc32"] and all(images.values())
             if not good or not isinstance(table["target"], str):
                 raise ValueError
-        except (KeyError, TypeError, ValueError, binascii.Error) as fault:
+        except (InputError, KeyError, TypeError, ValueError) as fault:
+            if isinstance(fault.__cause__, OSError):
+                raise
             raise InputError(f"{path}: {_NO_UPDATE}") from fault
         return cls(table["target"], images)
 
