@@ -626,23 +626,13 @@ def emulate(
 
     For example: [bold]evlcp board emulate native --listen unix:/tmp/board --leds leds.bin[/]
     """
-    from evlcp_sdk.errors import ConfigError
     from evlcp_sdk.files import check_output
     from evlcp_sdk.signals import stop_on_request
-    from firmware_host.emulators.listening import HostLine, check_free
+    from firmware_host.emulators.listening import HostLine, check_listen
     from firmware_host.emulators.models import part_image, serve_part
     from firmware_host.emulators.native import NativeBoard, serve
-    from firmware_host.ports.transport import socket_address
 
-    known = ("unix", "tcp", "pty") if emulator == "native" else ("unix", "tcp")
-    if listen.partition(":")[0] not in known:
-        raise ConfigError(f"--listen {listen}: expected {' or '.join(known)} for {emulator}")
-    if listen != "pty":
-        try:
-            socket_address(listen)
-        except ValueError as fault:
-            raise ConfigError(f"--listen {listen}: {fault}") from fault
-    check_free(listen)
+    check_listen(listen, pty=emulator == "native")
     if leds is not None:
         check_output(leds, regular=False)
     with contextlib.ExitStack() as stack:

@@ -13,10 +13,19 @@ from firmware_host.ports.transport import SocketTransport, socket_address
 _MOST_BYTES = 2048
 
 
-def check_free(listen: str) -> None:
-    """Raise ConfigError if somebody answers where an emulator is to listen; a socket left behind may be."""
-    if not listen.startswith(("unix:", "tcp:")):
+def check_listen(listen: str, pty: bool) -> None:
+    """Raise ConfigError unless an emulator can listen there, and nobody answers; a socket left behind may be.
+
+    Args:
+        listen: What `--listen` says.
+        pty: Whether it may be a pseudo-terminal.
+    """
+    if listen == "pty" and pty:
         return
+    try:
+        socket_address(listen)
+    except ValueError as fault:
+        raise ConfigError(f"--listen {listen}: {fault}{', or pty' * pty}") from fault
     try:
         SocketTransport.connect(listen).close()
     except NoBoardError:

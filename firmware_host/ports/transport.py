@@ -41,14 +41,12 @@ def socket_address(spec: str) -> str | tuple[str, int]:
         ValueError: It is neither; the message says what was expected.
     """
     scheme, _, place = spec.partition(":")
-    if scheme == "unix":
-        if not place:
-            raise ValueError("expected unix:PATH")
+    if scheme == "unix" and place:
         return place
     host, _, port = place.rpartition(":")
     # Not left to the system: some take a port modulo 65536.
-    if not host or not re.fullmatch("[0-9]{1,5}", port) or not 1 <= int(port) <= 65535:
-        raise ValueError("expected tcp:HOST:PORT with a port from 1 to 65535")
+    if scheme != "tcp" or not host or not re.fullmatch("[0-9]{1,5}", port) or not 1 <= int(port) <= 65535:
+        raise ValueError("expected unix:PATH, or tcp:HOST:PORT with a port from 1 to 65535")
     return host, int(port)
 
 

@@ -64,11 +64,9 @@ class Datagram:
             body = cobs.decode(wire)
         except cobs.DecodeError as fault:
             raise DatagramError(f"no COBS: {fault}") from fault
-        if not HEADER_BYTES + CRC_BYTES <= len(body) <= HEADER_BYTES + CRC_BYTES + MAX_PAYLOAD:
-            raise DatagramError(f"{len(body)} bytes are not a datagram")
         head, crc = body[:-CRC_BYTES], int.from_bytes(body[-CRC_BYTES:], "little")
-        if zlib.crc32(head) != crc:
-            raise DatagramError(f"CRC {crc:08x}, expected {zlib.crc32(head):08x}")
+        if not HEADER_BYTES <= len(head) <= HEADER_BYTES + MAX_PAYLOAD or zlib.crc32(head) != crc:
+            raise DatagramError(f"{len(body)} bytes that are no datagram: length or CRC is wrong")
         type_, status, sequence, session = _HEADER.unpack(head[:HEADER_BYTES])
         return cls(type_, status, sequence, session, head[HEADER_BYTES:])
 
