@@ -251,6 +251,7 @@ def _poll(pipe: Connection, within_s: float | None) -> bool:
     """
     sleeps_s = time.perf_counter() + _AWAKE_S
     while time.perf_counter() < sleeps_s:
+        os.sched_yield()
         if pipe.poll():
             return True
     return pipe.poll(within_s)
