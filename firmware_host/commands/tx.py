@@ -32,7 +32,7 @@ def frames(
     *,
     sent: SymbolOptions,
     form: Annotated[
-        Literal["table", "hex", "json"], typer.Option("--format", help="How the words are printed.")
+        Literal["table", "hex", "c", "json"], typer.Option("--format", help="How the words are printed.")
     ] = "table",
     chips: Annotated[
         Path | None,
@@ -106,7 +106,29 @@ def _json(symbols: NDArray[np.int64], link: Link) -> str:
     )
 
 
-_FORMS = {"table": _table, "hex": _hex, "json": _json}
+def _c(symbols: NDArray[np.int64], link: Link) -> str:
+    from evlcp_sdk.errors import ConfigError
+
+    book = link.codebook
+    bits = next((n for n in (16, 32, 64) if n >= link.packet.info_chips), None)
+    if bits is None:
+        raise ConfigError(f"--format c: info segments of {link.packet.info_chips} chips, at most 64")
+    info = _words(book.codewords)
+    packets, frames, clusters = symbols.shape
+    lines = [
+        "/* Info words of evlcp tx frames; pilots and preamble are in codebook.h. */",
+        "#include <stdint.h>",
+        f"/* Codebook {book.digest[:16]}, profile {book.profile}, pilot in every frame f with"
+        f" f % {link.packet.pilot_every} == 0. */",
+        f"static const uint{bits}_t evlcp_info[{packets}][{frames}][{clusters}] = {{",
+    ]
+    for packet in symbols.tolist():
+        rows = [", ".join(f"0x{info[symbol]}u" for symbol in frame) for frame in packet]
+        lines.append("    {" + ",\n     ".join(f"{{{row}}}" for row in rows) + "},")
+    return "\n".join([*lines, "};"])
+
+
+_FORMS = {"table": _table, "hex": _hex, "c": _c, "json": _json}
 
 
 @app.command(cls=JsonCommand)

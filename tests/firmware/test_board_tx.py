@@ -43,6 +43,8 @@ def test_every_form_has_the_same_words(evlcp, example: Path) -> None:
     hexed = evlcp("tx", "frames", example, "--format", "hex", *TWO_FRAMES).out.split()
     assert [h[4:] for h in hexed] == expected
     assert [h[:4] for h in hexed] == 2 * AIR["pilot_words"]
+    c = evlcp("tx", "frames", example, "--format", "c", *TWO_FRAMES).out
+    assert [w for w in expected if f"0x{w}u" not in c] == []
     rows = evlcp("tx", "frames", example, *TWO_FRAMES).out.splitlines()[1:]
     assert [r.split()[5] for r in rows] == expected
 
