@@ -821,7 +821,7 @@ class PacketFraming(Framer):
             self._regions.drop(transmitter.region)
             self.let_go(transmitter.region)
             return Skipped.REJECTED
-        attitude = self._attitude_at(self._clock.camera_us(aligned.middle_us)) if due.has_pilot else None
+        attitude = self._attitude_at(self._clock.camera_us(due.middle_us)) if due.has_pilot else None
         ranged = due.has_pilot and self._is_ranged()
         known = transmitter.number is not None
         found, transmitter.state = self._decoder.read(
@@ -857,7 +857,7 @@ class PacketFraming(Framer):
             points_px=reading.points_px,
             points_sigma_px=reading.sigma_px,
             points_flank_px=reading.flank_px,
-            points_t_us=self._clock.camera_us(found.middle_us),
+            points_t_us=self._clock.camera_us(due.middle_us),
             echo_of=self._reflections.echo_of(transmitter.number),
             link=self._name,
         )

@@ -219,7 +219,6 @@ class FrameResult(NamedTuple):
     Attributes:
         reading: What it says; its distance as it holds together with those before.
         filtered: The distance filtered; None without tracking.
-        middle_us: See `AlignedFrame`.
         cells: Grid cells that show a cluster, on average.
         seen: Clusters that are seen.
         mirrored: The order of the clusters is the opposite of the layout's.
@@ -227,9 +226,8 @@ class FrameResult(NamedTuple):
         shown: Where it showed the bar, of one that was decoded by itself; None without a pilot.
     """
 
-    reading: "Reading"
+    reading: Reading
     filtered: Range | None
-    middle_us: float
     cells: float
     seen: int
     mirrored: bool
@@ -405,7 +403,7 @@ class FrameDecoder:
         seen = max(sum(placed.seen.tolist()), 1)
         state = BarState(aligned.pilot, due.number, reading.symbols, distance)
         image = placed.cells / seen, seen, placed.mirrored
-        return FrameResult(reading, filtered, aligned.middle_us, *image, given), state
+        return FrameResult(reading, filtered, *image, given), state
 
     def _before(self, state: BarState, due: DueFrame) -> NDArray[np.int8]:
         """The chip that each cluster sent before a frame's info segment, int8 (K,); -1 if not known.

@@ -15,6 +15,16 @@ from firmware_host.commands._json import JsonCommand
 if TYPE_CHECKING:
     from firmware_host.board.board import Board
 
+BoardKey = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        envvar="EVLCP_BOARD_KEY",
+        show_envvar=False,
+        help="The board's key, or EVLCP_BOARD_KEY.",
+    ),
+]
+
 
 @dataclass(frozen=True)
 class BoardLine:
@@ -38,15 +48,7 @@ class BoardLine:
     replay: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Play a recorded wire back; no board.")
     ] = None
-    key: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            envvar="EVLCP_BOARD_KEY",
-            show_envvar=False,
-            help="The board's key, or EVLCP_BOARD_KEY.",
-        ),
-    ] = None
+    key: BoardKey = None
 
     def found(self) -> str:
         """The port: the one that is named, or the one of those that are asked that has a board."""
