@@ -15,16 +15,6 @@ from firmware_host.commands._json import JsonCommand
 if TYPE_CHECKING:
     from firmware_host.board.board import Board
 
-BoardKey = Annotated[
-    Path | None,
-    typer.Option(
-        metavar="FILE",
-        envvar="EVLCP_BOARD_KEY",
-        show_envvar=False,
-        help="The board's key, or EVLCP_BOARD_KEY.",
-    ),
-]
-
 
 @dataclass(frozen=True)
 class BoardLine:
@@ -48,7 +38,15 @@ class BoardLine:
     replay: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Play a recorded wire back; no board.")
     ] = None
-    key: BoardKey = None
+    key: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            envvar="EVLCP_BOARD_KEY",
+            show_envvar=False,
+            help="The board's key, or EVLCP_BOARD_KEY.",
+        ),
+    ] = None
 
     def found(self) -> str:
         """The port: the one that is named, or the one of those that are asked that has a board."""

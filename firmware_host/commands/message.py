@@ -13,7 +13,7 @@ import typer
 from evlcp_sdk.cli._command import command
 from evlcp_sdk.cli._common import LinkFile, Overrides, progress_bar
 from firmware_host.commands._json import AsJson, say
-from firmware_host.commands._line import BoardKey, BoardLine, KeepAlive, keep_alive, say_done
+from firmware_host.commands._line import BoardLine, KeepAlive, keep_alive, say_done
 from firmware_host.commands.stream import Ahead, say_stream
 
 if TYPE_CHECKING:
@@ -118,7 +118,15 @@ class LineOptions:
         ),
     ] = None
     baud: Annotated[int, typer.Option(hidden=True, help="Line rate, bit/s.", min=1200)] = 1_000_000
-    board_key: BoardKey = None
+    board_key: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            envvar="EVLCP_BOARD_KEY",
+            show_envvar=False,
+            help="The board's key, or EVLCP_BOARD_KEY.",
+        ),
+    ] = None
 
     def line(self, *, only_named: bool = False) -> BoardLine | None:
         """The line that is named, or else that of the environment; None for no board."""
