@@ -336,11 +336,11 @@ def select_box(events: Columns, box: tuple[int, int, int, int], out: Columns) ->
     return int(np.int64(n))
 
 
-MOST_BOXES = 8
+MOST_BOXES = 16
 """Boxes that events are handed to in one pass: a bit each."""
 
-_LOWEST = np.array([MOST_BOXES, *((n & -n).bit_length() - 1 for n in range(1, 1 << MOST_BOXES))], np.uint8)
-"""Number of the lowest bit that is set; of none, one beyond."""
+_LOWEST = np.array([8, *((n & -n).bit_length() - 1 for n in range(1, 1 << 8))], np.uint8)
+"""Number of the lowest of eight bits that is set; of none, one beyond."""
 
 
 @njit
@@ -362,14 +362,14 @@ def select_boxes(
     t_us, x, y, p = events
     out_t, out_x, out_y, out_p = out
     # By a column's bits and a row's, boxes are found in the same time however many they are.
-    columns, rows = np.zeros(pixels.shape[1], np.uint8), np.zeros(pixels.shape[0], np.uint8)
-    filtered, least, most_same = np.uint8(rhythmic[0]), np.uint32(rhythmic[1]), np.uint32(rhythmic[2])
+    columns, rows = np.zeros(pixels.shape[1], np.uint16), np.zeros(pixels.shape[0], np.uint16)
+    filtered, least, most_same = np.uint16(rhythmic[0]), np.uint32(rhythmic[1]), np.uint32(rhythmic[2])
     for k in range(len(boxes)):
         left, top, right, bottom = boxes[k]
         for u in range(left, right):
-            columns[u] |= np.uint8(1 << k)
+            columns[u] |= np.uint16(1 << k)
         for v in range(top, bottom):
-            rows[v] |= np.uint8(1 << k)
+            rows[v] |= np.uint16(1 << k)
     ends = np.empty(MOST_BOXES + 1, np.int64)
     for k in range(ends.size):
         ends[k] = k * apart
@@ -379,17 +379,19 @@ def select_boxes(
             state = pixels[y[i], x[i]]
             same = (state >> np.uint32(SAME_AT)) & np.uint32(MOST_SAME)
             is_rhythmic = ((state & np.uint32(SCORES)) >= least) & (same < most_same)
-            inside = inside if is_rhythmic else np.uint8(inside & ~filtered)
+            inside = inside if is_rhythmic else np.uint16(inside & ~filtered)
         while True:
             # Written always, kept if inside; of two boxes that overlap, in both.
-            box = _LOWEST[inside]
+            box = _LOWEST[inside & np.uint16(255)]
+            if box == 8:
+                box += _LOWEST[inside >> np.uint16(8)]
             n = np.uint64(ends[box])
             out_t[n] = t_us[i]
             out_x[n] = x[i]
             out_y[n] = y[i]
             out_p[n] = p[i]
             ends[box] += inside != 0
-            inside &= np.uint8(inside - 1)
+            inside &= np.uint16(inside - 1)
             if not inside:
                 break
     for k in range(len(boxes)):

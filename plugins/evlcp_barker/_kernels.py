@@ -54,16 +54,15 @@ def count_bins(t_us: Array, p: Array, where: tuple[int, float, int], known: Arra
 
 
 @njit
-def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: int, rho: Array) -> float:
+def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: int, rho: Array) -> None:
     """Normalised correlation of signed counts in windows of one chip (`steps` bins) with chips (-1, +1).
 
     The lesser of two norms: by the number of events, which is small unless all clusters blink in phase, and
     by the length of the vector of chips (a cosine), which is small where few chips hold all events, as in
     a flash. In chips that are not `due` (0, else 1), without an edge, late events agree with the chip and say
-    nothing; others count against it. Lags at which fewer than `min_events` were counted get 0. Returns the
-    largest.
+    nothing; others count against it. Lags at which fewer than `min_events` were counted get 0.
     """
-    top, many, lags = 0.0, 0.0, rho.size
+    many, lags = 0.0, rho.size
     bins = lags - 1 + steps * chips.size
     sums = np.empty((2, bins + 1))
     signed, total = sums[0], sums[1]
@@ -87,31 +86,49 @@ def correlate(counts: Array, chips: Array, due: Array, steps: int, min_events: i
         seen = total[lag + steps * chips.size] - total[lag]
         if seen >= min_events and fit[lag] > 0:
             rho[lag] = min(fit[lag] / seen, fit[lag] / np.sqrt(many * power[lag]))
-            top = max(top, rho[lag])
-    return top
 
 
 @njit
-def mean_squares(
-    rho: Array, counts: Array, span: int, lag: int, past: tuple[float, int, int], out: Array
-) -> tuple[float, int]:
-    """Mean square of the positive correlations up to each, from a lag on; it and their number at the end.
+def find_peaks(
+    rho: Array,
+    counts: Array,
+    span: int,
+    lag: int,
+    guard: int,
+    past: tuple[float, int, int],
+    enough: tuple[float, float],
+    peaks: Array,
+) -> tuple[float, int, int]:
+    """Lags from one on that correlate enough, and best within `guard` on both sides, the first of equals.
 
-    The newest weigh most: `past` are mean square and number before the lag, and the most that count. Infinite
-    as long as less than half as many are known. Where light ends, windows of `span` bins hold fewer events
-    than those that the mean squares are of: they are no less than that of as many events of random sign.
+    Enough is the second of `enough` in any case, and from half of it the first times the root of the mean
+    square of the positive correlations up to each. The newest weigh most: `past` are mean square and number
+    before the lag, and the most that count. Infinite as long as less than half as many are known. Where light
+    ends, windows of `span` bins hold fewer events than those that the mean squares are of: they are no less
+    than that of as many events of random sign.
+
+    Returns:
+        Mean square and number at the end, and how many `peaks` (n,) there are among so many lags.
     """
     power, known, memory = past
-    seen = 0.0
+    outstands, least = enough
+    seen, many = 0.0, 0
     for b in range(lag, lag + span):
         seen += counts[0, b] + counts[1, b]
-    for i in range(out.size):
-        value = rho[lag + i]
+    for at in range(lag, lag + peaks.size):
+        value = rho[at]
         if value > 0:
             known = min(known + 1, memory)
             power += (value**2 - power) / known
-        out[i] = max(power if 2 * known >= memory else np.inf, 1 / max(seen, 1.0))
-        if lag + i + span < counts.shape[1]:
+        square = max(power if 2 * known >= memory else np.inf, 1 / max(seen, 1.0))
+        if at + span < counts.shape[1]:
             for kind in range(2):
-                seen += counts[kind, lag + i + span] - counts[kind, lag + i]
-    return power, known
+                seen += counts[kind, at + span] - counts[kind, at]
+        if value >= least / 2 and value >= min(outstands * np.sqrt(square), least):
+            best = max(at - guard, 0)
+            for near in range(best, min(at + guard + 1, rho.size)):
+                best = near if rho[near] > rho[best] else best
+            if best == at:
+                peaks[many] = at
+                many += 1
+    return power, known, many

@@ -139,8 +139,17 @@ class _Clock:
     quality: float
 
 
+class _Peak(NamedTuple):
+    """A peak of the correlation at a lag of some event counts: a preamble within a chip of there."""
+
+    first_bin: int
+    counts: Floats
+    lag: int
+    quality: float
+
+
 class SyncState(NamedTuple):
-    """What synchronization remembers: recent event counts (OFF, ON) a step, its lock, and a preamble off it.
+    """What synchronization remembers: recent event counts (OFF, ON) a step, its lock, and a peak off it.
 
     `power` and `known` are the mean square of the positive correlations lately, and their number.
     """
@@ -151,7 +160,7 @@ class SyncState(NamedTuple):
     power: float = 0.0
     known: int = 0
     clock: _Clock | None = None
-    stray: _Preamble | None = None
+    stray: _Peak | None = None
 
 
 class BarkerSynchronizer:
@@ -208,22 +217,21 @@ class BarkerSynchronizer:
         where = first_bin, self._bin_us, first_bin - before_bin
         _kernels.count_bins(plain(t_us), plain(p), where, before, counts)
         if lags - guard > lo:
-            rho, squares = np.empty(lags), np.empty(lags - guard - lo)
-            top = _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)
-            past = power, known, self._most_known
-            power, known = _kernels.mean_squares(rho, counts, span, lo, past, squares)
-            if 2 * top >= self._least:
-                for lag in find_peaks(rho, lo, guard, squares, self._least):
-                    found = self._refine(lag, counts, first_bin, float(rho[lag]))
-                    old = clock
-                    clock, stray = self._accept(clock, stray, found)
-                    if clock is not None and clock is not old:
-                        locks.append(self._lock(clock, found.quality))
+            rho, peaks = np.empty(lags), np.empty(lags - guard - lo, np.int64)
+            _kernels.correlate(counts, self._chips, self._due, _STEPS, _MIN_EVENTS, rho)
+            past, enough = (power, known, self._most_known), (_OUTSTANDS, self._least)
+            power, known, many = _kernels.find_peaks(rho, counts, span, lo, guard, past, enough, peaks)
+            for lag in peaks[:many].tolist():
+                peak, old = _Peak(first_bin, counts, lag, float(rho[lag])), clock
+                clock, stray = self._accept(clock, stray, peak)
+                if clock is not old:
+                    locks.append(self._lock(clock, peak.quality))
             lo = lags - guard
         return SyncState(first_bin, counts, first_bin + lo, power, known, clock, stray), locks
 
-    def _refine(self, lag: int, counts: Floats, first_bin: int, quality: float) -> _Preamble:
+    def _refine(self, peak: _Peak) -> _Preamble:
         """Times of one preamble, for positive and negative events apart, us."""
+        first_bin, counts, lag, quality = peak
         (off, off_noise), (on, on_noise) = self._fit(counts, lag)
         response = counts[1].take(lag + self._near_rises, mode="clip")
         onset, onset_noise = _jackknife(_onsets(_without_each(response)))
@@ -256,28 +264,41 @@ class BarkerSynchronizer:
         found = map(_jackknife, _middles(_without_each(parts)).tolist())
         return [(first + middle, noise) for middle, noise in found]
 
-    def _accept(
-        self, clock: _Clock | None, stray: _Preamble | None, found: _Preamble
-    ) -> tuple[_Clock | None, _Preamble | None]:
+    def _accept(self, clock: _Clock | None, stray: _Peak | None, peak: _Peak) -> tuple[_Clock, _Peak | None]:
         """Add a preamble to the lock it fits; off it, a better one than its only one, or a second, begins.
 
-        One symbol on all clusters at once blinks in phase, too, but can agree with 16 chips of 26 only.
+        One symbol on all clusters at once blinks in phase, too, but can agree with 16 chips of 26 only. Most
+        peaks of a lamp are on no grid: only those that may be have their times found.
         """
         if clock is None:
-            return self._first(found), None
-        packets = self._packets_between(clock, found)
-        if packets is not None:
-            return self._next(clock, found, packets), None
-        if clock.preambles == 1 and found.quality > clock.quality + _CLEARLY:
-            return self._first(found), None
-        if found.quality < clock.quality - _CLEARLY:
+            return self._first(self._refine(peak)), None
+        if self._may_follow(clock.on_us, clock.rate_us, peak, 1):
+            found = self._refine(peak)
+            packets = self._packets_between(clock, found)
+            if packets is not None:
+                return self._next(clock, found, packets), None
+        if clock.preambles == 1 and peak.quality > clock.quality + _CLEARLY:
+            return self._first(self._refine(peak)), None
+        if peak.quality < clock.quality - _CLEARLY:
             return clock, stray
-        if stray is not None:
-            anew = self._first(stray)
+        if stray is not None and self._may_follow(self._near_us(stray), 0.0, peak, 2):
+            anew, found = self._first(self._refine(stray)), self._refine(peak)
             packets = self._packets_between(anew, found)
             if packets is not None:
                 return self._next(anew, found, packets), None
-        return clock, found
+        return clock, peak
+
+    def _near_us(self, peak: _Peak) -> float:
+        """Where a peak's preamble begins, to within a chip."""
+        return (peak.first_bin + peak.lag) * self._bin_us
+
+    def _may_follow(self, before_us: float, rate_us: float, peak: _Peak, chips: int) -> bool:
+        """Whether a peak may be whole packets after a preamble; the two are known to so many chips."""
+        packet_us = self._packet.packet_chips * self._packet.chip_us + rate_us
+        apart_us = self._near_us(peak) - before_us
+        packets = round(apart_us / packet_us)
+        off_us = abs(apart_us - packets * packet_us) - packets * self._most_us()
+        return packets > 0 and off_us < (chips + _ON_GRID_CHIPS) * self._packet.chip_us
 
     def _most_us(self) -> float:
         """How much longer or shorter than nominal a packet may be."""
@@ -354,22 +375,6 @@ class BarkerSynchronizer:
             delay_off_us=clock.apart.value - onset,
             quality=quality,
         )
-
-
-def find_peaks(rho: Floats, first: int, guard: int, squares: Floats, least: float) -> list[int]:
-    """Lags from the first on that correlate enough, best within `guard` on both sides; the first of equals.
-
-    `squares` are the mean squares up to each; what is `_OUTSTANDS` times their root is enough, from half of
-    `least`, and `least` is in any case.
-    """
-    high = np.flatnonzero(rho[first : first + len(squares)] >= least / 2)
-    high = first + high[rho[first + high] >= np.minimum(_OUTSTANDS * np.sqrt(squares[high]), least)]
-    found = []
-    for lag in high.tolist():
-        low = max(lag - guard, 0)
-        if lag == low + int(rho[low : lag + guard + 1].argmax()):
-            found.append(lag)
-    return found
 
 
 def _without_each(parts: Floats) -> Floats:

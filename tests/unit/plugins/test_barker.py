@@ -116,11 +116,35 @@ def test_correlation(seed, steps, min_events, share):
     counts[1, at : at + steps * 26] += 2 * np.repeat(chips > 0, steps)
     lags = counts.shape[1] - 26 * steps + 1
     rho = np.empty(lags)
-    top = _kernels.correlate(counts, chips, due, steps, min_events, rho)
+    _kernels.correlate(counts, chips, due, steps, min_events, rho)
     want = correlate(counts, chips, due, steps, min_events, lags)
     assert_allclose(rho, want, rtol=1e-12, atol=1e-12)
-    assert top == rho.max()
     assert abs(int(rho.argmax()) - at) <= 1
+
+
+@pytest.mark.parametrize("memory", [8, 60, 1000])
+@pytest.mark.parametrize("seed", range(3))
+def test_peaks(seed, memory):
+    """Against running means over lists; equal neighbours, both ends, and too little known before are met."""
+    rng = np.random.default_rng(seed)
+    span, guard, first, past = 12, 3, 5, (0.01, 6)
+    rho = np.round(np.maximum(rng.normal(0, 0.3, 90), 0), 1)
+    counts = rng.poisson(0.4, (2, len(rho) + span)).astype(float)
+    power, known, want = *past, []
+    for lag in range(first, len(rho) - guard):
+        if rho[lag] > 0:
+            known = min(known + 1, memory)
+            power += (rho[lag] ** 2 - power) / known
+        square = power if 2 * known >= memory else np.inf
+        square = max(square, 1 / max(counts[:, lag : lag + span].sum(), 1))
+        near = rho[max(lag - guard, 0) : lag + guard + 1]
+        if rho[lag] >= max(min(2 * square**0.5, 0.5), 0.25) and near.argmax() == min(lag, guard):
+            want.append(lag)
+    peaks = np.empty(len(rho) - guard - first, np.int64)
+    found = _kernels.find_peaks(rho, counts, span, first, guard, (*past, memory), (2.0, 0.5), peaks)
+    assert want
+    assert peaks[: found[2]].tolist() == want
+    assert_allclose(found[:2], (power, known), rtol=1e-12)
 
 
 @pytest.mark.parametrize("rate_hz", [1e5, 5e5, 2e6])
