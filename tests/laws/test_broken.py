@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,20 +22,7 @@ from evlcp_wh.separation import WhCorrelation
 from evlcp_sdk.air.codebook import Codebook, chips_of_values
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
-from evlcp_sdk.plugin.roles import (
-    ROLES,
-    Decoding,
-    Detection,
-    ErrorCorrection,
-    Framing,
-    Modulation,
-    Pilots,
-    Ranging,
-    Separation,
-    Synchronization,
-    Tracker,
-    Tracking,
-)
+from evlcp_sdk.plugin.roles import ROLES, Ranging, Tracker
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing import LawError, laws_of
 from evlcp_sdk.testing.form import DESCRIPTION, FUNCTION, RESULT
@@ -46,54 +34,27 @@ Change = Callable[..., Any]
 
 
 @dataclass(frozen=True)
-class TamperedPilots(Pilots):
-    """Walsh-Hadamard pilots, tampered with."""
+class Changed:
+    """A built-in algorithm, what a method of which gives is changed."""
 
-    change_codes: Change | None = None
-    change_preamble: Change | None = None
-
-    def preamble(self) -> Any:
-        code = WhPilots().preamble()
-        return self.change_preamble(code) if self.change_preamble else code
-
-    def codes(self, clusters: int) -> Any:
-        codes = WhPilots().codes(clusters)
-        return self.change_codes(codes) if self.change_codes else codes
-
-
-@dataclass(frozen=True)
-class TamperedModulation(Modulation):
-    """Profile wh8, tampered with."""
-
+    inner: Any
+    method: str
     change: Change
 
-    def codewords(self) -> Any:
-        return self.change(Wh8().codewords())
+    def __getattr__(self, name: str) -> Any:
+        found = getattr(self.inner, name)
+        return (lambda *given: self.change(found(*given))) if name == self.method else found
 
 
-def tampered(abstract: type, inner: Any) -> Callable[[Change], Any]:
-    """A role whose compiled function is changed; `change(function) -> function`."""
-
-    @dataclass(frozen=True)
-    class Tampered(abstract):  # type: ignore[misc]
-        """A built-in algorithm, tampered with."""
-
-        change: Change
-
-        def compile(self, *given: Any) -> Any:
-            return self.change(inner.compile(*given))
-
-        def codebook(self, clusters: int) -> Any:
-            return inner.codebook(clusters)
-
-    return Tampered
+def compiled(inner: Any) -> Callable[[Change], Changed]:
+    """What changes the function that an algorithm compiles to; `change(function) -> function`."""
+    return lambda change: Changed(inner, "compile", change)
 
 
-separation = tampered(Separation, WhCorrelation())
-decoding = tampered(Decoding, WhTransform())
-ranging = tampered(Ranging, CentroidRanging())
-tracking = tampered(Tracking, KalmanTracking())
-correction = tampered(ErrorCorrection, Polar())
+separation = compiled(WhCorrelation())
+decoding = compiled(WhTransform())
+ranging = compiled(CentroidRanging())
+tracking = compiled(KalmanTracking())
 
 
 def after(change: Change) -> Change:
@@ -128,15 +89,11 @@ def before(act: Change) -> Change:
 
 @dataclass(frozen=True)
 class NoDefault(CentroidRanging):
-    """A parameter without a default."""
-
     focus_m: float = field(kw_only=True)
 
 
 @dataclass
 class Thawed(Ranging):
-    """Parameters that can be assigned."""
-
     def compile(self, *given: Any) -> Any:
         return CentroidRanging().compile(*given)
 
@@ -150,16 +107,12 @@ class MuteField(CentroidRanging):
 
 @dataclass(frozen=True)
 class Forgetful(CentroidRanging):
-    """A parameter that is lost."""
-
     def __post_init__(self) -> None:
         object.__setattr__(self, "min_clusters", self.min_clusters + 1)
 
 
 @dataclass(frozen=True)
 class Refusing(Ranging):
-    """Fits no bar."""
-
     def compile(self, *given: Any) -> Any:
         raise ConfigError("a panel of 7 x 3 clusters only")
 
@@ -227,8 +180,13 @@ class Stepping:
         return self.inner.counts(state[0])
 
 
-def stepping(abstract: type, inner: Any, change: Change) -> Any:
-    return tampered(abstract, inner)(lambda made: Stepping(made, change))
+def stepping(inner: Any) -> Callable[[Change], Changed]:
+    return lambda change: Changed(inner, "compile", lambda made: Stepping(made, change))
+
+
+sync = stepping(BarkerSync())
+detection = stepping(Whole())
+framing = stepping(Uart())
 
 
 def giving(change: Change) -> Change:
@@ -246,10 +204,6 @@ def mutating(inner: Any, state: Any, *given: Any) -> Any:
     return state, found
 
 
-def sync(change: Change) -> Any:
-    return stepping(Synchronization, BarkerSync(), change)
-
-
 def locks_changed(change: Change) -> Any:
     return sync(giving(lambda locks: [change(lock) for lock in locks]))
 
@@ -264,18 +218,10 @@ def credulous(inner: Any, state: Any, t_us: Any, p: Any, until_us: int) -> Any:
     return [then, b""], [*locks, *invented]
 
 
-def detection(change: Change) -> Any:
-    return stepping(Detection, Whole(), change)
-
-
 def grown(inner: Any, state: Any, start_us: int, events: Any) -> Any:
     found, regions = inner.step(state[0], start_us, events)
     state[0] = replace(found, number=found.number + 1)
     return state, regions
-
-
-def framing(change: Change) -> Any:
-    return stepping(Framing, Uart(), change)
 
 
 def forgetful_framing(inner: Any, state: Any, events: Any, until_us: int) -> Any:
@@ -339,20 +285,14 @@ def no_nan(found: Range) -> Range:
     return Range(0.0, 0.0, 0) if np.isnan(found.distance_m) else found
 
 
-@dataclass(frozen=True)
 class OneCamera(CentroidRanging):
-    """Knows one lens."""
-
     def compile(self, camera: CameraModel, bar: Any, codebook: Any) -> Any:
-        return CentroidRanging().compile(CameraModel(), bar, codebook)
+        return super().compile(CameraModel(), bar, codebook)
 
 
-@dataclass(frozen=True)
-class OneOrder(Separation):
-    """Knows one order of pilots."""
-
+class OneOrder(WhCorrelation):
     def compile(self, codebook: Any) -> Any:
-        return WhCorrelation().compile(load_link().codebook)
+        return super().compile(load_link().codebook)
 
 
 class TwoInputs(EdgeDecoding):
@@ -370,27 +310,21 @@ def numbered(soft: Any) -> Any:
 # Error correction.
 
 
-@dataclass(frozen=True)
-class TamperedCode:
-    """A code whose ends are changed."""
-
-    inner: Any
-    change: Mapping[str, Change]
-    message_bits: int
-    coded_bits: int
-
-    def _changed(self, name: str, value: Any) -> Any:
-        return self.change[name](value) if name in self.change else value
-
-    def encode(self, bits: Any) -> Any:
-        return self._changed("coded", self.inner.encode(self._changed("bits", bits)))
-
-    def decode(self, llr: Any) -> Any:
-        return self._changed("found", self.inner.decode(self._changed("llr", llr)))
-
-
 def code_changed(**change: Change) -> Any:
-    return correction(lambda inner: TamperedCode(inner, change, inner.message_bits, inner.coded_bits))
+    """A code whose ends are changed: its bits and coded bits, its LLRs and what is found."""
+
+    def by(name: str, value: Any) -> Any:
+        return change[name](value) if name in change else value
+
+    def tamper(code: Any) -> Any:
+        return SimpleNamespace(
+            message_bits=code.message_bits,
+            coded_bits=code.coded_bits,
+            encode=lambda bits: by("coded", code.encode(by("bits", bits))),
+            decode=lambda llr: by("found", code.decode(by("llr", llr))),
+        )
+
+    return Changed(Polar(), "compile", tamper)
 
 
 def credulous_code(found: Any) -> Any:
@@ -419,6 +353,7 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
     "form": [
         ("defaults", NoDefault(focus_m=1.0), "a default of field 'focus_m'"),
         ("frozen", Thawed(), "frozen=True"),
+        ("described", Refusing(), "a docstring of class Refusing"),
         ("described", MuteField(), "field 'knob' as Annotated"),
         ("round-trip", Forgetful(), "min_clusters=7"),
         ("picklable", ranging(lambda function: function), "pickle"),
@@ -434,19 +369,19 @@ BROKEN: Mapping[str, list[tuple[str, Any, str]]] = {
         ("deterministic", ranging(before(lambda _: np.random.random())), "take a Generator"),  # noqa: NPY002
     ],
     "pilots": [
-        ("shapes", TamperedPilots(lambda codes: codes.astype(float)), "uint8"),
-        ("pilots-apart", TamperedPilots(star), "correlate by 0.25 at most"),
+        ("shapes", Changed(WhPilots(), "codes", lambda codes: codes.astype(float)), "uint8"),
+        ("pilots-apart", Changed(WhPilots(), "codes", star), "correlate by 0.25 at most"),
         (
             "sharp-preamble",
-            TamperedPilots(change_preamble=lambda _: chips_of_values(np.ones(13))),
+            Changed(WhPilots(), "preamble", lambda _: chips_of_values(np.ones(13))),
             "sidelobes",
         ),
-        ("tells-apart", TamperedPilots(star), "of cluster 0, whose pilot has [0-9]+ edges"),
+        ("tells-apart", Changed(WhPilots(), "codes", star), "of cluster 0, whose pilot has [0-9]+ edges"),
     ],
     "modulation": [
-        ("shapes", TamperedModulation(lambda words: words[:1]), "two codewords or more, got 1"),
-        ("codewords-distinct", TamperedModulation(twins), "16 codewords of different edges, got 15"),
-        ("comes-back", TamperedModulation(twins), "are equal"),
+        ("shapes", Changed(Wh8(), "codewords", lambda words: words[:1]), "two codewords or more, got 1"),
+        ("codewords-distinct", Changed(Wh8(), "codewords", twins), "16 codewords of different edges, got 15"),
+        ("comes-back", Changed(Wh8(), "codewords", twins), "are equal"),
     ],
     "detection": [
         ("shapes", detection(giving(lambda regions: [*regions, *regions])), "regions of different ids"),
