@@ -25,23 +25,32 @@ class CameraSource(EventSource):
     def __init__(self) -> None:
         super().__init__(Path("cam:0"), "CAMERA", 1280, 720)
         self.left = [(EVENTS, Triggers.empty())]
-        self.closed = False
 
     def take(self, max_events: int) -> tuple[Events, Triggers] | None:
         return self.left.pop() if self.left else None
 
     def close(self) -> None:
-        self.closed = True
+        pass
 
 
 class Camera:
+    """Opens that camera, and files that the SDK's own plugin would take; writes nothing well."""
+
     @hookimpl
     def evlcp_open_events(self, url: str) -> Any:
         if url == "cam:broken":
             raise KeyError("no such device")
+        if url == "cam:none":
+            raise InputError(f"{url}: no camera is plugged in")
         if url == "cam:file":
             return Path("a.raw")
-        return CameraSource() if url.startswith("cam:") else None
+        return CameraSource() if url.startswith("cam:") or url.endswith(".dat") else None
+
+    @hookimpl
+    def evlcp_open_writer(self, path: Path) -> Any:
+        if path.suffix == ".bad":
+            raise KeyError("no room")
+        return Events.empty() if path.suffix == ".odd" else None
 
 
 @pytest.fixture
@@ -53,9 +62,7 @@ def installed(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("installed")
 def test_the_command_line_sees_it(evlcp: Callable[..., Any], tmp_path: Path) -> None:
-    done = evlcp("info", "cam:0", "--json")
-    assert done.code == 0
-    assert json.loads(done.out)["counts"]["events"] == 50
+    assert json.loads(evlcp("info", "cam:0", "--json").out)["counts"]["events"] == 50
     assert evlcp("receive", "cam:0", "-o", tmp_path / "out").code == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["recording"]["format"] == "CAMERA"
@@ -108,13 +115,8 @@ def test_a_plugin_that_fails_is_named(url: str, reason: str, evlcp: Callable[...
 
 
 def test_a_camera_that_is_not_there_says_so() -> None:
-    class Unplugged:
-        @hookimpl
-        def evlcp_open_events(self, url: str) -> Any:
-            raise InputError(f"{url}: no camera is plugged in")
-
-    with pytest.raises(InputError, match=r"^cam:0: no camera is plugged in$"):
-        open_source("cam:0", Registry.load(Unplugged()))
+    with pytest.raises(InputError, match=r"^cam:none: no camera is plugged in$"):
+        open_source("cam:none", Registry.load(Camera()))
 
 
 def test_what_is_a_recording_waits_for_its_reader(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -126,23 +128,9 @@ def test_what_is_a_recording_waits_for_its_reader(tmp_path: Path, monkeypatch: p
         assert not is_recording(name), name
 
 
-class OwnDat:
-    """Reads and writes a format that the SDK's own plugin would take."""
-
-    @hookimpl
-    def evlcp_open_events(self, url: str) -> Any:
-        return CameraSource() if url.endswith(".dat") else None
-
-    @hookimpl
-    def evlcp_open_writer(self, path: Path) -> Any:
-        if path.suffix == ".bad":
-            raise KeyError("no room")
-        return Events.empty() if path.suffix == ".odd" else None
-
-
 def test_a_strangers_plugin_comes_before_the_formats_of_ours(tmp_path: Path) -> None:
     (tmp_path / "x.dat").write_bytes(bytes(64))
-    with open_source(tmp_path / "x.dat", Registry.load(OwnDat())) as source:
+    with open_source(tmp_path / "x.dat", Registry.load(Camera())) as source:
         assert isinstance(source, CameraSource)
 
 
@@ -151,7 +139,7 @@ def test_a_strangers_plugin_comes_before_the_formats_of_ours(tmp_path: Path) -> 
     [("bad", "fails: KeyError: 'no room'"), ("odd", "gave Events, expected an EventWriter")],
 )
 def test_a_writer_that_cannot_be_used_is_named(tmp_path: Path, suffix: str, reason: str) -> None:
-    registry = Registry.load(OwnDat())
+    registry = Registry.load(Camera())
     with (
         pytest.warns(PluginWarning, match=re.escape(reason)),
         pytest.raises(StreamError, match=f"suffix '.{suffix}', expected"),
