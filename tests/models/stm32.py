@@ -47,7 +47,28 @@ SLICE = 240
 """Instructions from one look at the events to the next, at most: 1.4 us at 168 MHz."""
 
 
-class Timer:
+class Peripheral:
+    """Registers that are attributes, by their offsets, and events that end when it is set up anew."""
+
+    REGISTERS: ClassVar[dict[int, str]] = {}
+    generation = 0
+
+    def __init__(self, chip: "Stm32") -> None:
+        self.chip = chip
+
+    def read(self, offset: int) -> int:
+        return int(getattr(self, self.REGISTERS[offset]))
+
+    def write(self, offset: int, value: int) -> None:
+        setattr(self, self.REGISTERS[offset], value)
+
+    def later(self, time: int, event: Callable[[], None]) -> None:
+        """Do this then, in this generation."""
+        generation = self.generation
+        self.chip.at(time, lambda: event() if generation == self.generation else None)
+
+
+class Timer(Peripheral):
     """TIM1 to TIM3, as far as the board needs: up-counting, update, PWM mode 1 on channel 1, trigger mode."""
 
     CR1, CR2, SMCR, DIER, SR, EGR, CCMR1, CCER, CNT, PSC, ARR, CCR1 = (
@@ -55,7 +76,8 @@ class Timer:
     )
 
     def __init__(self, chip: "Stm32", name: str) -> None:
-        self.chip, self.name = chip, name
+        super().__init__(chip)
+        self.name = name
         self.r = dict.fromkeys((0x00, 0x04, 0x08, 0x0C, 0x10, 0x18, 0x20, 0x24, 0x28, 0x34), 0)
         self.r[self.ARR] = 0xFFFFFFFF if name == "TIM2" else 0xFFFF
         self.since = 0  # when the counter stood at `held`
@@ -63,19 +85,22 @@ class Timer:
         self.unit = UNIT_HZ // HSI_HZ  # time of a count
         self.stands = False  # broken: the counter does not move
         self.request = False  # of the update, for DMA
-        self.generation = 0
         self.on_edge: Callable[[bool], None] = lambda _: None
         self.slave: Timer | None = None
         self.master: Timer | None = None
 
     @property
+    def gated(self) -> bool:
+        """It counts while its master does."""
+        return self.r[self.SMCR] & 0x77 == 0x05
+
+    @property
     def running(self) -> bool:
         """Whether the counter moves."""
-        gate = self.master is None or self.r[self.SMCR] & 0x77 != 0x05 or self.master.running
+        gate = self.master is None or not self.gated or self.master.running
         return bool(self.r[self.CR1] & 1) and gate and not self.stands
 
     def counter(self) -> int:
-        """The counter now."""
         period = self.r[self.ARR] + 1
         moved = (self.chip.now - self.since) // self.unit if self.running else 0
         return (self.held + moved) % period
@@ -110,13 +135,13 @@ class Timer:
             allowed = {self.CR1: 1, self.CR2: 0x70, self.SMCR: 0x77, self.DIER: 0x100, self.PSC: 0}
             assert not value & ~allowed.get(offset, 0xFFFFFFFF), (self.name, hex(offset), hex(value))
             started = offset == self.CR1 and value & 1 and not self.r[self.CR1] & 1
-            gates = offset == self.CR1 and self.slave is not None and self.slave.r[self.SMCR] & 0x77 == 0x05
-            if gates and self.slave is not None:
-                self.slave.hold(self.slave.counter())
+            slave = self.slave if offset == self.CR1 and self.slave and self.slave.gated else None
+            if slave:
+                slave.hold(slave.counter())
             self.r[offset] = value
-            if gates and self.slave is not None:
-                self.slave.hold(self.slave.held)
-                self.slave.plan()
+            if slave:
+                slave.hold(slave.held)
+                slave.plan()
             if offset == self.DIER and not value & 0x100:
                 self.request = False
             if started and self.slave and self.r[self.CR2] & 0x70 == 0x10 and not self.stands:
@@ -149,21 +174,19 @@ class Timer:
         if not self.running or self.name == "TIM2":
             return
         here, unit = self.counter(), self.unit
-        base = self.since + (here - self.held) % (self.r[self.ARR] + 1) * unit
-        generation = self.generation
+        period, edge = self.r[self.ARR] + 1, self.r[self.CCR1]
+        base = self.since + (here - self.held) % period * unit
+        self.later(base + (period - here) * unit, lambda: self.event(True))
+        if here < edge < period:
+            self.later(base + (edge - here) * unit, lambda: self.event(False))
 
-        def event(wraps: bool) -> None:
-            if generation != self.generation or not self.running:
-                return
-            if wraps:
-                self.hold(0)
-                self.update()
-            self.plan()
-
-        to_wrap = self.r[self.ARR] + 1 - here
-        self.chip.at(base + to_wrap * unit, lambda: event(True))
-        if here < self.r[self.CCR1] < self.r[self.ARR] + 1:
-            self.chip.at(base + (self.r[self.CCR1] - here) * unit, lambda: event(False))
+    def event(self, wraps: bool) -> None:
+        if not self.running:
+            return
+        if wraps:
+            self.hold(0)
+            self.update()
+        self.plan()
 
     def stop_for_good(self) -> None:
         """Broken: the counter stands, whatever is written."""
@@ -172,25 +195,18 @@ class Timer:
         self.generation += 1
 
 
-class Dma:
+class Dma(Peripheral):
     """Stream 5 of DMA2: direct mode, memory to peripheral, 16 bits, circular (RM0090 10)."""
 
     IRQ = 68
     HALF, ALL, TRANSFER_ERROR, DIRECT_ERROR, FIFO_ERROR = 1 << 10, 1 << 11, 1 << 9, 1 << 8, 1 << 6
 
-    def __init__(self, chip: "Stm32") -> None:
-        self.chip = chip
-        self.cr = self.left = self.count = self.par = self.memory = self.flags = 0
-        self.fcr = 0x21
-        self.ahead = 0  # the word fetched ahead
-        self.dead = False
-
-    OTHERS: ClassVar = {0x8C: "left", 0x90: "par", 0x94: "memory", 0x9C: "fcr"}
-
-    def read(self, offset: int) -> int:
-        if offset in self.OTHERS:
-            return int(getattr(self, self.OTHERS[offset]))
-        return {0x04: self.flags, 0x0C: 0, 0x88: self.cr}[offset]
+    REGISTERS: ClassVar = {0x04: "flags", 0x0C: "cleared", 0x88: "cr", 0x8C: "left"}
+    REGISTERS |= {0x90: "par", 0x94: "memory", 0x9C: "fcr"}
+    cr = left = count = par = memory = flags = cleared = 0
+    fcr = 0x21
+    ahead = 0  # the word fetched ahead
+    dead = False
 
     def write(self, offset: int, value: int) -> None:
         on = self.cr & 1
@@ -206,11 +222,10 @@ class Dma:
                 if not on:
                     self.start()
         elif not on:  # these are protected while the stream runs
-            setattr(self, self.OTHERS[offset], value)
+            super().write(offset, value)
         self.line()
 
     def start(self) -> None:
-        """The stream is enabled."""
         # channel 6, 16 bits both sides, memory counts up, circular, to the peripheral: all the model knows
         assert self.cr & ~0x1E == 6 << 25 | 3 << 16 | 1 << 13 | 1 << 11 | 1 << 10 | 1 << 8 | 1 << 6 | 1
         assert not self.fcr & 4  # direct mode
@@ -220,7 +235,6 @@ class Dma:
         self.serve()
 
     def fetch(self) -> None:
-        """Fetch the next word ahead."""
         at = self.memory + 2 * (self.count - self.left)
         self.ahead = struct.unpack("<H", self.chip.uc.mem_read(at, 2))[0]
 
@@ -255,17 +269,19 @@ class Dma:
         self.chip.set_line(16 + self.IRQ, bool(self.flags & enabled))
 
 
-class Spi:
+class Spi(Peripheral):
     """SPI1, master, 16 bits, and the chain of shift registers on it."""
 
-    def __init__(self, chip: "Stm32") -> None:
-        self.chip = chip
-        self.cr1 = self.cr2 = 0
-        self.buffer: int | None = None
-        self.word: int | None = None
-        self.began = 0
-        self.chain = 0  # 96 bits; the one that left first is the highest
-        self.dead = False
+    REGISTERS: ClassVar = {0x00: "cr1", 0x04: "cr2", 0x08: "status", 0x0C: "received"}
+    cr1 = cr2 = received = began = 0
+    buffer: int | None = None
+    word: int | None = None
+    chain = 0  # 96 bits; the one that left first is the highest
+    dead = False
+
+    @property
+    def status(self) -> int:
+        return (self.buffer is None) << 1 | (self.word is not None) << 7
 
     def bits_done(self) -> int:
         """Bits of the word under way that have left."""
@@ -275,7 +291,6 @@ class Spi:
 
     @property
     def bit(self) -> int:
-        """Time of a bit."""
         return UNIT_HZ // self.chip.pclk2 * (2 << (self.cr1 >> 3 & 7))
 
     def outputs(self) -> int:
@@ -283,23 +298,14 @@ class Spi:
         done = self.bits_done()
         return (self.chain << done | (self.word or 0) >> (16 - done)) & (1 << LEDS) - 1
 
-    def read(self, offset: int) -> int:
-        if offset == 0x08:
-            return (self.buffer is None) << 1 | (self.word is not None) << 7
-        return {0x00: self.cr1, 0x04: self.cr2, 0x0C: 0}[offset]
-
     def write(self, offset: int, value: int) -> None:
         if offset == 0x0C:
             self.send(value)
-        elif offset == 0x00:
-            assert value & ~0x78 == 1 << 11 | 1 << 9 | 1 << 8 | 1 << 2, hex(value)
-            self.cr1 = value
         else:
-            assert offset == 0x04, hex(offset)
-            self.cr2 = value
+            assert offset or value & ~0x78 == 1 << 11 | 1 << 9 | 1 << 8 | 1 << 2, hex(value)
+            super().write(offset, value)
 
     def send(self, word: int) -> None:
-        """A word is written."""
         if not self.cr1 & 0x40:
             return
         if self.word is None and not self.dead:
@@ -352,7 +358,6 @@ class Drivers:
 
     @property
     def row(self) -> int:
-        """What the LEDs show."""
         return 0 if self.dark else self.held
 
     def look(self) -> None:
@@ -367,17 +372,20 @@ class Drivers:
             self.log.append(Shown(self.chip.now, self.row, closes, self.dark))
 
 
-class Usart:
+class Usart(Peripheral):
     """USART1 and the host at its other end, which keeps to 1 Mbit/s."""
 
     IRQ = 37
     BYTE = 10 * US
 
+    REGISTERS: ClassVar = {0x00: "sr", 0x04: "dr", 0x08: "brr", 0x0C: "cr1"}
+    sr = 0xC0
+    dr = brr = cr1 = 0
+    free_at = 0  # when the transmitter has room
+    line_free = 0
+
     def __init__(self, chip: "Stm32") -> None:
-        self.chip = chip
-        self.sr, self.dr, self.brr, self.cr1 = 0xC0, 0, 0, 0
-        self.free_at = 0  # when the transmitter has room
-        self.line_free = 0
+        super().__init__(chip)
         self.to_host = bytearray()
 
     def right_rate(self) -> bool:
@@ -407,8 +415,7 @@ class Usart:
         if offset == 0x04:
             self.sr &= ~0x28
             self.line()
-            return self.dr
-        return {0x08: self.brr, 0x0C: self.cr1}[offset]
+        return super().read(offset)
 
     def write(self, offset: int, value: int) -> None:
         if offset == 0x04:
@@ -417,12 +424,9 @@ class Usart:
                 self.free_at = leaves
                 if self.right_rate():
                     self.chip.at(leaves, lambda: self.to_host.append(value & 0xFF))
-        elif offset == 0x08:
-            self.brr = value
         else:
-            assert offset == 0x0C, hex(offset)
-            assert not value & ~0x202C, hex(value)
-            self.cr1 = value
+            assert offset == 0x08 or (offset == 0x0C and not value & ~0x202C), (hex(offset), hex(value))
+            super().write(offset, value)
         self.line()
 
     def line(self) -> None:
@@ -430,61 +434,47 @@ class Usart:
         self.chip.set_line(16 + self.IRQ, bool(self.cr1 & 0x20 and self.sr & 0x28))
 
 
-class SysTick:
+class SysTick(Peripheral):
     """The core's own timer, on the core's clock."""
 
-    def __init__(self, chip: "Stm32") -> None:
-        self.chip = chip
-        self.csr = self.rvr = 0
-        self.generation = 0
-
-    def read(self, offset: int) -> int:
-        return {0x10: self.csr, 0x14: self.rvr, 0x18: 0}[offset]
+    REGISTERS: ClassVar = {0x10: "csr", 0x14: "rvr", 0x18: "cvr"}
+    csr = rvr = cvr = 0
 
     def write(self, offset: int, value: int) -> None:
-        if offset == 0x10:
-            assert not value & ~7
-            assert value in (0, 5, 7), "on the core's clock"
-            self.csr = value
-        elif offset == 0x14:
-            self.rvr = value & 0xFFFFFF
+        assert offset != 0x10 or value in (0, 5, 7), "on the core's clock"
+        if offset != 0x18:
+            super().write(offset, value & 0xFFFFFF)
         self.plan()  # a write to the counter clears it: it begins again with the reload value
 
     def plan(self) -> None:
         """Look ahead to the end."""
         self.generation += 1
-        generation = self.generation
-
-        def ends() -> None:
-            if generation == self.generation:
-                if self.csr & 2:
-                    self.chip.pending.add(15)
-                self.plan()
-
         if self.csr & 1 and self.rvr:
-            self.chip.at(self.chip.now + (self.rvr + 1) * self.chip.cycle, ends)
+            self.later(self.chip.now + (self.rvr + 1) * self.chip.cycle, self.ends)
+
+    def ends(self) -> None:
+        if self.csr & 2:
+            self.chip.pending.add(15)
+        self.plan()
 
 
-class Iwdg:
+class Iwdg(Peripheral):
     """The independent watchdog, on the LSI (RM0090 21)."""
 
-    def __init__(self, chip: "Stm32") -> None:
-        self.chip = chip
-        self.pr, self.rlr = 0, 0xFFF
-        self.open = self.on = False
-        self.busy_until = 0
-        self.generation = 0
-        self.due = 0
-        self.looks_at = 1 << 62
+    REGISTERS: ClassVar = {0x0: "key", 0x4: "pr", 0x8: "rlr", 0xC: "busy"}
+    key = pr = busy_until = due = 0
+    rlr = 0xFFF
+    open = on = False
+    looks_at = 1 << 62
+
+    @property
+    def busy(self) -> int:
+        return 3 if self.chip.now < self.busy_until else 0
 
     @property
     def timeout(self) -> int:
         """How long it waits."""
         return (self.rlr + 1) * (4 << self.pr) * UNIT_HZ // LSI_HZ
-
-    def read(self, offset: int) -> int:
-        busy = 3 if self.chip.now < self.busy_until else 0
-        return {0x0: 0, 0x4: self.pr, 0x8: self.rlr, 0xC: busy}[offset]
 
     def write(self, offset: int, value: int) -> None:
         if offset == 0x0:
@@ -494,10 +484,7 @@ class Iwdg:
                 self.feed()
         elif self.open:
             self.busy_until = self.chip.now + 5 * UNIT_HZ // LSI_HZ
-            if offset == 0x4:
-                self.pr = value
-            elif offset == 0x8:
-                self.rlr = value
+            super().write(offset, value)
 
     def feed(self) -> None:
         """Begin anew."""
@@ -508,30 +495,25 @@ class Iwdg:
     def _look_at(self, time: int) -> None:
         """Look then whether it bites: it is fed much more often than it could."""
         self.looks_at = time
-        generation = self.generation
+        self.later(time, lambda: self._look(time))
 
-        def looks() -> None:
-            if generation != self.generation or self.looks_at != time:
-                return
-            if self.chip.now >= self.due:
-                self.chip.reset(RESET_BY_IWDG)
-            else:
-                self._look_at(self.due)
-
-        self.chip.at(time, looks)
+    def _look(self, time: int) -> None:
+        if self.looks_at != time:
+            return
+        if self.chip.now >= self.due:
+            self.chip.reset(RESET_BY_IWDG)
+        else:
+            self._look_at(self.due)
 
 
-class Flash:
+class Flash(Peripheral):
     """The flash's registers; words take no time, and a sector a second, in which the core stands."""
 
-    def __init__(self, chip: "Stm32") -> None:
-        self.chip = chip
-        self.acr, self.cr = 0, 0x80000000
-        self.keys: list[int] = []
-        self.stale = False  # the caches may hold what was erased
-
-    def read(self, offset: int) -> int:
-        return {0x00: self.acr, 0x0C: 0, 0x10: self.cr}[offset]
+    REGISTERS: ClassVar = {0x00: "acr", 0x0C: "sr", 0x10: "cr"}
+    acr = sr = 0
+    cr = 0x80000000
+    keys = (0, 0)
+    stale = False  # the caches may hold what was erased
 
     def write(self, offset: int, value: int) -> None:
         if offset == 0x00:
@@ -541,8 +523,8 @@ class Flash:
                 self.stale = False
             self.acr = value
         elif offset == 0x04:
-            self.keys = [*self.keys, value][-2:]
-            if self.keys == [0x45670123, 0xCDEF89AB]:
+            self.keys = self.keys[1], value
+            if self.keys == (0x45670123, 0xCDEF89AB):
                 self.cr &= 0x7FFFFFFF
         elif offset == 0x10 and not self.cr & 0x80000000:
             self.cr = value
@@ -555,15 +537,12 @@ class Flash:
                 self.cr &= ~0x10000
 
 
-class Rng:
+class Rng(Peripheral):
     """Random numbers, a word in 40 cycles of the PLL's 48 MHz (RM0090 24)."""
 
     WORD = 40 * UNIT_HZ // 48_000_000
 
-    def __init__(self, chip: "Stm32") -> None:
-        self.chip = chip
-        self.control = 0
-        self.ready = 0
+    control = ready = 0
 
     def read(self, offset: int) -> int:
         clocked = self.chip.plain.get(0x40023834, 0) >> 6 & 1 and self.chip.plain[0x40023800] >> 25 & 1
@@ -581,6 +560,15 @@ class Rng:
             self.ready = self.chip.now + self.WORD
 
 
+def numbers(offset: int, value: int) -> set[int]:
+    """The exceptions that the bits of a register of the NVIC are."""
+    return {16 + 8 * offset + n for n in range(32) if value >> n & 1}
+
+
+KEPT = (*(getattr(arm_const, f"UC_ARM_REG_R{n}") for n in (0, 1, 2, 3, 12)), arm_const.UC_ARM_REG_LR)
+"""What an exception puts onto the stack, before the place and the status."""
+
+
 class Stm32:
     """The part, from power-up on.
 
@@ -588,10 +576,6 @@ class Stm32:
         image: What is flashed.
         hse_hz: The crystal.
     """
-
-    iwdg: Iwdg
-    drivers: Drivers
-    spi: Spi
 
     def __init__(self, image: Path | FlashImage, hse_hz: int = HSE_HZ) -> None:
         self.hse_hz = hse_hz
@@ -619,14 +603,11 @@ class Stm32:
 
     def reset(self, cause: int) -> None:
         """All but RAM, flash and the log of the LEDs begins anew."""
-        if hasattr(self, "iwdg"):
-            self.iwdg.generation += 1
-        log = self.drivers.log if hasattr(self, "drivers") else []
-        chain = self.spi.chain if hasattr(self, "spi") else 0
-        held = self.drivers.held if hasattr(self, "drivers") else 0
+        before = vars(self).get("drivers"), vars(self).get("spi")
         self.resets.append(cause)
         self.events.clear()
         self.plain: dict[int, int] = {0x40023800: 0x83, 0x40023874: cause, 0x40023804: 0x24003010}
+        self.plain[0x40020000] = 0xA8000000
         self.cycle = UNIT_HZ // HSI_HZ
         self.enabled: set[int] = set()
         self.pending: set[int] = set()
@@ -641,7 +622,9 @@ class Stm32:
         self.dma, self.spi, self.usart = Dma(self), Spi(self), Usart(self)
         self.systick, self.iwdg, self.flash = SysTick(self), Iwdg(self), Flash(self)
         self.drivers = Drivers(self)
-        self.drivers.log, self.drivers.held, self.spi.chain = log, held, chain
+        if before[0]:
+            self.drivers.log, self.drivers.held = before[0].log, before[0].held
+            self.spi.chain = before[1].chain
         self.places: dict[int, Any] = {
             0x40000000: self.tim2,
             0x40000400: self.tim3,
@@ -686,20 +669,21 @@ class Stm32:
 
     @property
     def stack(self) -> int:
-        """The stack pointer."""
         return int(self.uc.reg_read(arm_const.UC_ARM_REG_SP))
+
+    def bus_shift(self, place: int) -> int:
+        """By how many bits the clock of APB1 (10) or APB2 (13) is divided."""
+        divider = self.plain.get(0x40023808, 0) >> place & 7
+        return divider - 3 if divider & 4 else 0
 
     @property
     def pclk2(self) -> int:
         """Clock of APB2, Hz."""
-        divider = self.plain.get(0x40023808, 0) >> 13 & 7
-        return UNIT_HZ // self.cycle >> (divider - 3 if divider & 4 else 0)
+        return UNIT_HZ // self.cycle >> self.bus_shift(13)
 
     def timer_unit(self, name: str) -> int:
         """Time of a count: timers get twice the bus clock if that is divided (RM0090 7.2)."""
-        divider = self.plain.get(0x40023808, 0) >> (13 if name == "TIM1" else 10) & 7
-        shift = divider - 3 if divider & 4 else 0
-        return self.cycle << max(0, shift - 1)
+        return self.cycle << max(0, self.bus_shift(13 if name == "TIM1" else 10) - 1)
 
     def _rcc_write(self, offset: int, value: int) -> None:
         at = 0x40023800 + offset
@@ -769,7 +753,7 @@ class Stm32:
 
     def pin(self, port: int, number: int) -> bool | None:
         """What a pin drives; None if it does not."""
-        mode = self.plain.get(port, 0xA8000000 if port == 0x40020000 else 0) >> 2 * number & 3
+        mode = self.plain.get(port, 0) >> 2 * number & 3
         if mode == 1:
             return bool(self.plain.get(port + 0x14, 0) >> number & 1)
         if mode == 2 and (port, number) == (0x40020000, 6):
@@ -796,8 +780,6 @@ class Stm32:
         if at == 0x40020410:  # the thermal switch: closed to ground while it is cool
             pulled_up = self.plain.get(0x4002040C, 0) >> 2 & 3 == 1
             return int(self.thermal_open and pulled_up) << 1
-        if at == 0x40020000:
-            return self.plain.get(at, 0xA8000000)
         return self.plain.get(at, 0)
 
     def _write(self, uc: object, offset: int, size: int, value: int, base: int) -> None:
@@ -812,16 +794,12 @@ class Stm32:
             old = self.plain.get(port + 0x14, 0)
             self.plain[port + 0x14] = old & ~(value >> 16) | value & 0xFFFF
             self.drivers.look()
-        elif at in (0x40020000, 0x40020400):
-            self.plain[at] = value
-            self.drivers.look()
         elif 0xE000E010 <= at < 0xE000E020:
             self.systick.write(at & 0xFF, value)
         elif 0xE000E100 <= at < 0xE000E120:
-            self.enabled |= {16 + 8 * (at - 0xE000E100) + n for n in range(32) if value >> n & 1}
+            self.enabled |= numbers(at - 0xE000E100, value)
         elif 0xE000E280 <= at < 0xE000E2A0:
-            gone = {16 + 8 * (at - 0xE000E280) + n for n in range(32) if value >> n & 1}
-            self.pending -= gone - self.lines
+            self.pending -= numbers(at - 0xE000E280, value) - self.lines
         elif 0xE000E400 <= at < 0xE000E500:
             self.priorities[16 + at - 0xE000E400] = value & 0xF0
         elif at == 0xE000ED0C:
@@ -833,11 +811,12 @@ class Stm32:
             self.pending.discard(15)
         else:
             self.plain[at] = value
+            if at in (0x40020000, 0x40020400):
+                self.drivers.look()
 
     # -- exceptions
 
     def set_line(self, number: int, high: bool) -> None:
-        """Raise or drop an interrupt line."""
         if high:
             self.lines.add(number)
             self.pending.add(number)
@@ -861,9 +840,7 @@ class Stm32:
     def exception(self, number: int) -> None:
         """Enter an exception: eight words go onto the stack."""
         c, uc = arm_const, self.uc
-        kept = (c.UC_ARM_REG_R0, c.UC_ARM_REG_R1, c.UC_ARM_REG_R2, c.UC_ARM_REG_R3, c.UC_ARM_REG_R12)
-        frame = [*(uc.reg_read(r) for r in kept), uc.reg_read(c.UC_ARM_REG_LR), self.pc]
-        frame.append(uc.reg_read(c.UC_ARM_REG_XPSR) | 1 << 24)
+        frame = [*map(uc.reg_read, KEPT), self.pc, uc.reg_read(c.UC_ARM_REG_XPSR) | 1 << 24]
         stack = uc.reg_read(c.UC_ARM_REG_SP)
         odd = stack >> 2 & 1
         frame[7] |= odd << 9
@@ -881,11 +858,9 @@ class Stm32:
     def _leave(self) -> None:
         c, uc = arm_const, self.uc
         stack = uc.reg_read(c.UC_ARM_REG_SP)
-        *kept, link, self.pc, status = struct.unpack("<8I", uc.mem_read(stack, 32))
-        names = (c.UC_ARM_REG_R0, c.UC_ARM_REG_R1, c.UC_ARM_REG_R2, c.UC_ARM_REG_R3, c.UC_ARM_REG_R12)
-        for name, value in zip(names, kept, strict=True):
-            uc.reg_write(name, value)
-        uc.reg_write(c.UC_ARM_REG_LR, link)
+        *kept, self.pc, status = struct.unpack("<8I", uc.mem_read(stack, 32))
+        for register, value in zip(KEPT, kept, strict=True):
+            uc.reg_write(register, value)
         uc.reg_write(c.UC_ARM_REG_XPSR, status & ~(1 << 9) & 0xFF000000)
         uc.reg_write(c.UC_ARM_REG_SP, stack + 32 + 4 * (status >> 9 & 1))
         ended = self.active.pop()
@@ -943,7 +918,6 @@ class ModelLine:
         self.chip = chip
 
     def now(self) -> float:
-        """Time of the model, s."""
         return self.chip.now / UNIT_HZ
 
     def read(self, timeout_s: float) -> bytes:
@@ -956,7 +930,6 @@ class ModelLine:
         return data
 
     def write(self, data: bytes) -> None:
-        """Bytes to the board."""
         self.chip.usart.arrive(data)
 
     def close(self) -> None:
