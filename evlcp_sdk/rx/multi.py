@@ -15,7 +15,8 @@ import numpy as np
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.link.resolve import Link
-from evlcp_sdk.rx.regions import Rhythm, same_place
+from evlcp_sdk.rx.regions import same_place
+from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.values import Frame, Packet, Region, changed
 
 _CLEARLY = 1.25

@@ -18,7 +18,7 @@ from evlcp_sdk.rx.guard import Guard, compiled, tracker_of
 from evlcp_sdk.rx.placement import layout_of
 from evlcp_sdk.rx.points import points_finder
 from evlcp_sdk.rx.ranges import RangeKeeper, Ranges
-from evlcp_sdk.rx.regions import MARGIN_PX, Followed
+from evlcp_sdk.rx.regions import MARGIN_PX, Followed, ShownPlace
 from evlcp_sdk.rx.spread import LateSpread, Spread, neighbours
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.lean import BarSight, magnification_of, sight_of
@@ -55,6 +55,7 @@ _SURE = 0.98
 is less. A halo and a jolt look like a step of light now and then."""
 
 _NO_RANGE, _NO_SIGHT = Range(math.nan, math.nan, 0), BarSight()
+
 _NO_POINTS = np.empty((0, 2)), np.empty(0), math.nan
 
 
@@ -191,26 +192,6 @@ class BarState(NamedTuple):
     frame: int
     symbols: NDArray[np.int64]
     distance: tuple[Ranges, Any]
-
-
-class ShownPlace(NamedTuple):
-    """Where a frame with a pilot showed its bar.
-
-    Attributes:
-        t_us: When, us.
-        centre_px: Centre (column, row) of the whole bar on the sensor.
-        size_px: Its (width, height).
-        lit_px: Where it shines, see `Followed.lit_px`.
-        strips_px: See `Followed.strips_px`.
-        others: (centre, size) of other instances of it in the same image, best first.
-    """
-
-    t_us: float
-    centre_px: tuple[float, float]
-    size_px: tuple[float, float]
-    lit_px: tuple[float, float] | None
-    strips_px: NDArray[np.float64] | None
-    others: tuple[tuple[tuple[float, float], tuple[float, float]], ...]
 
 
 class FrameResult(NamedTuple):
@@ -366,7 +347,7 @@ class FrameDecoder:
             return None
         shown = self.shown_place(aligned) if due.has_pilot else None
         # Within half of the seam, all events are there.
-        if shown is not None and region.off_px(shown.t_us, shown.centre_px, shown.size_px) > MARGIN_PX / 2:
+        if shown is not None and region.off_px(shown) > MARGIN_PX / 2:
             return None
         found, state = self.read(aligned, due, state, job.attitude, ranged=job.ranged)
         return (found._replace(shown=shown), state) if found.given else None

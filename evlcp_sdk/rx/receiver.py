@@ -14,7 +14,7 @@ from evlcp_sdk.link.several import named_links
 from evlcp_sdk.plugin.roles import STEPS
 from evlcp_sdk.rx.detected import DetectedRegions
 from evlcp_sdk.rx.framer import Announcer, Framer, StreamContext, on_camera
-from evlcp_sdk.rx.framing import LOOKBACK_PACKETS, PacketFraming
+from evlcp_sdk.rx.framing import PacketFraming
 from evlcp_sdk.rx.guard import tracker_of
 from evlcp_sdk.rx.inbox import MessageAssembler
 from evlcp_sdk.rx.limits import LIMITS, Limits
@@ -22,7 +22,9 @@ from evlcp_sdk.rx.multi import EarlyFrames, SeveralLinks, shared_rhythms
 from evlcp_sdk.rx.plugin_framing import PluginFraming
 from evlcp_sdk.rx.reading import FrameDecoder
 from evlcp_sdk.rx.reflections import ReflectionQueue, Reflections
-from evlcp_sdk.rx.regions import RegionFollower, RegionTracker, Rhythm, same_place
+from evlcp_sdk.rx.regions import RegionFollower, RegionTracker, same_place
+from evlcp_sdk.rx.rhythm import Rhythm
+from evlcp_sdk.rx.transmitters import LOOKBACK_PACKETS
 from evlcp_sdk.rx.workers import Workers
 from evlcp_sdk.scene.attitude import Attitude, AttitudeLog, attitude_source
 from evlcp_sdk.utc import ClockZero

@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import combinations
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,7 +31,7 @@ from evlcp_sdk.rx.boxes import (
     shows_again,
 )
 from evlcp_sdk.rx.limits import LIMITS, Limits
-from evlcp_sdk.rx.rhythm import LAMP, SAME, RhythmTables
+from evlcp_sdk.rx.rhythm import SAME, Rhythm
 from evlcp_sdk.rx.sweeps import FAST_PX_US, Sweep, find_sweeps, fit_sweep
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.values import Events, Region
@@ -39,52 +39,14 @@ from evlcp_sdk.values import Events, Region
 MARGIN_PX = 5
 """Seam around a region: how far it may move in a step, 1.5 px/ms and more, and how far it is blurred."""
 
-_LEAST_RISES = 20
-"""Rises of candidate pixels in a step that a new region needs: a cluster at 100 m has as many, noise few."""
-
-_MEASURE_GAPS = 1.5
-"""A blinking pixel rises once in the longest time of the code; half of that again allows for a late event."""
-
-_AGE_CHIPS = 5
-"""Age of a measured centre. A moving bar's leading end counts once its pixels have risen in rhythm twice,
-some six chips late and more where events go missing; its trailing end stays for the six chips of the
-measurement. In recordings and simulated scenes the centre is 3 to 8 chips late."""
-
 STRAY_PX = 2.0
 """How much too long a region may be before what is too much must be strays: an edge is good to a pixel."""
-
-_LONGEST_US = 200_000
-"""How long events of the whole image are kept at the most, to gather those of a region anew: a packet that is
-longer than that starts with the frames in reach."""
-
-_BLUR_PX = 2.0
-"""How much longer than a bar its blinking pixels are: blur of a pixel at either end; in motion twice that."""
-
-_SEAM_PX = 2
-"""Columns at either side of a box that a bar should leave dark: some of the least seam of a region."""
-
-_MIN_PIXELS = 4
-"""Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
-
-_CALM, _FLOODED, _FLOOD_STEPS = 0.25, 0.5, 3
-"""Share of the pixels beside a bar that rose lately up to which they are calm; from which on, soon after
-that, the light of all changes: pixels that the bar has left show as it does, and would drag its region along.
-And steps that this may last; what goes on, a halo, is no change. Leaves make 0.45 at the most."""
-
-_LEAST_SWEPT, _SWEPT_STEPS = 300, 4
-"""Events beside all regions from which on it is looked for a bar that sweeps; and steps whose events it has
-when it is found: it was seen in two of them, and was in the same motion before."""
 
 STILL = 0.0, 0.0
 """Speed of a region whose pixels blink."""
 
-_CENTRE_SIGMA_PX = 0.25
-"""Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
-
 BACKFILL_STEPS = 12
 """Steps kept from before a region was found: a pixel needs about 1 ms to score, a region two steps."""
-
-_COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
 
 SAME_PX = 5.0
 """How far apart centres of two regions of one image may be: before lit leaves an end is good to some px."""
@@ -94,13 +56,6 @@ _HEIGHTS = 9
 
 _MOST_AHEAD_STEPS = 2
 """Steps beyond the measured centres for which a region goes straight on, before a shaking camera turns."""
-
-_RESHAPE_PX = 1.0
-"""How far a region may be off its bar, in place and in size, before it is set right: a fifth of its seam."""
-
-_LEFT_STEPS = 6
-"""Steps in which what is left of a region that turned out to be smaller may become one: it blinks all the
-time. What wakes there later is a halo, or leaves that its light falls on."""
 
 _ROOM = 64
 """Places that find room at first; a second of steps does not fit, and is moved once in a while."""
@@ -112,9 +67,6 @@ PIECE_BYTES: Final = 768
 """Of four arrays and what holds them, however few events there are."""
 
 Piece = tuple[int, Events]
-
-Place = tuple[float, float, float, float]
-"""Column and row of a centre, width and height, px."""
 
 
 class Places:
@@ -276,6 +228,26 @@ def held_bytes(events: Events) -> int:
     return PIECE_BYTES + EVENT_BYTES * events.t_us.size
 
 
+class ShownPlace(NamedTuple):
+    """Where a frame with a pilot showed its bar.
+
+    Attributes:
+        t_us: When, us.
+        centre_px: Centre (column, row) of the whole bar on the sensor.
+        size_px: Its (width, height).
+        lit_px: Where it shines, see `Followed.lit_px`.
+        strips_px: See `Followed.strips_px`.
+        others: (centre, size) of other instances of it in the same image, best first.
+    """
+
+    t_us: float
+    centre_px: tuple[float, float]
+    size_px: tuple[float, float]
+    lit_px: tuple[float, float] | None = None
+    strips_px: NDArray[np.float64] | None = None
+    others: tuple[tuple[tuple[float, float], tuple[float, float]], ...] = ()
+
+
 @dataclass
 class Followed:
     """A region followed over time, and its events since the first.
@@ -357,13 +329,16 @@ class Followed:
         """The newest position."""
         return self.positions.latest
 
-    def off_px(self, t_us: float, centre_px: tuple[float, float], size_px: tuple[float, float]) -> float:
-        """How far it is off a bar that a frame showed at a time, in place or size, px."""
+    def off_px(self, shown: ShownPlace) -> float:
+        """How far it is off a bar that a frame showed, in place or size, px."""
         if self.size_px is None:
             return math.inf
-        x, y = self.positions.place_at(t_us)
-        wider, higher = size_px[0] - self.size_px[0], size_px[1] - self.size_px[1]
-        return max(abs(centre_px[0] - x), abs(centre_px[1] - y), abs(wider), abs(higher))
+        (x, y), (at_x, at_y), (width, height) = (
+            self.positions.place_at(shown.t_us),
+            shown.centre_px,
+            shown.size_px,
+        )
+        return max(abs(at_x - x), abs(at_y - y), abs(width - self.size_px[0]), abs(height - self.size_px[1]))
 
     def covers(self, t_us: float, point_px: tuple[float, float]) -> bool:
         """Whether a point on the sensor (column, row) is inside the region at a time."""
@@ -449,148 +424,50 @@ class RegionTracker(ABC):
         self.alive = [other for other in self.alive if other is not followed]
 
 
-class Rhythm:
-    """Scores of a sensor's pixels, one uint32 each, whose bits `_kernels` names.
+_LEAST_RISES = 20
+"""Rises of candidate pixels in a step that a new region needs: a cluster at 100 m has as many, noise few."""
 
-    Their clock of 17 bits goes round in an eighth of a second. Rows are looked at in turn, where rises so
-    long ago that all such times are alike become the youngest of these; and so soon that none looks young.
+_MEASURE_GAPS = 1.5
+"""A blinking pixel rises once in the longest time of the code; half of that again allows for a late event."""
 
-    Args:
-        width: Columns of the sensor.
-        height: Its rows.
-        chip_us: Nominal length of a chip, us.
-        min_score: Score at which a pixel is a candidate; half of it is enough inside a region.
-        gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
-        shared: Several followers ask for the same steps; the first one's answer is kept for the others.
-    """
+_AGE_CHIPS = 5
+"""Age of a measured centre. A moving bar's leading end counts once its pixels have risen in rhythm twice,
+some six chips late and more where events go missing; its trailing end stays for the six chips of the
+measurement. In recordings and simulated scenes the centre is 3 to 8 chips late."""
 
-    def __init__(
-        self,
-        width: int,
-        height: int,
-        chip_us: float,
-        min_score: int,
-        gap_chips: int = 4,
-        *,
-        shared: bool = False,
-    ) -> None:
-        self._tables = RhythmTables.of(chip_us, gap_chips)
-        self._shift = self._tables.tick_shift
-        self._min_score = min_score
-        self._pixels = np.zeros((height, width), np.uint32)
-        # No time that is looked up is longer; nor are rows looked at one by one after so long a gap.
-        self._turn = _kernels.CLOCK_ROUND // 4
-        self._old = self._turn + self._turn // 8
-        self._every = _kernels.CLOCK_ROUND - self._turn - self._old
-        self._row = 0
-        self._seen: int | None = None
-        self._open_us, self._taken, self._rises = -1, 0, 0
-        self._shared = shared
-        # Where events are selected into, box by box, so many places apart.
-        self._apart = -1
-        self._columns: _kernels.Columns = (np.empty(0),) * 4
-        self._kept: tuple[tuple[int, int], int, NDArray[np.int16]] | None = None
+_LONGEST_US = 200_000
+"""How long events of the whole image are kept at the most, to gather those of a region anew: a packet that is
+longer than that starts with the frames in reach."""
 
-    def step(self, start_us: int, events: Events, hits: NDArray[np.int16], cell_shift: int) -> int:
-        """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
+_BLUR_PX = 2.0
+"""How much longer than a bar its blinking pixels are: blur of a pixel at either end; in motion twice that."""
 
-        Args:
-            start_us: Start of the step, us.
-            events: Those in it, in order; a part of a step comes again with the rest, and counts once.
-            hits: Of cells of 2^cell_shift px, int16 (rows, columns).
-            cell_shift: See there.
-        """
-        if self._kept is not None and self._kept[0] == (start_us, len(events)):
-            hits[:] = self._kept[2]
-            return self._kept[1]
-        old = self._row, 0, 0, 0, self._old
-        if start_us != self._open_us:
-            self._open_us, self._taken, self._rises = start_us, 0, 0
-            # As many rows as the time since the last step asks for, all after a gap.
-            now, height = start_us >> self._shift, len(self._pixels)
-            passed = self._turn if self._seen is None else now - self._seen
-            whole = passed >= self._turn
-            many = height if whole else -(-height * passed // self._every)
-            old = self._row, many, now, 0 if whole else self._old, self._old
-            self._row, self._seen = (self._row + many) % height, now
-        first, tables = self._taken, self._tables
-        newest = events.t_us[first:], events.x[first:], events.y[first:], events.p[first:]
-        limits, shifts = (tables.soon, self._min_score, SAME), (self._shift, cell_shift)
-        self._rises += _kernels.score_rises(
-            newest, self._pixels, hits, tables.kinds, tables.lows, limits, shifts, old
-        )
-        self._taken = events.t_us.size
-        if self._shared:
-            self._kept = (start_us, len(events)), self._rises, hits.copy()
-        return self._rises
+_MIN_PIXELS = 4
+"""Blinking pixels below which a region has no position: one cluster at 100 m has a dozen."""
 
-    def select(
-        self, events: Events, boxes: Sequence[Box], rhythmic: Sequence[bool], most_same: int = LAMP
-    ) -> list[Events]:
-        """Those inside each of some boxes (left, top, right, bottom), copied.
+_CALM, _FLOODED, _FLOOD_STEPS = 0.25, 0.5, 3
+"""Share of the pixels beside a bar that rose lately up to which they are calm; from which on, soon after
+that, the light of all changes: pixels that the bar has left show as it does, and would drag its region along.
+And steps that this may last; what goes on, a halo, is no change. Leaves make 0.45 at the most."""
 
-        Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
-        all of it.
+_LEAST_SWEPT, _SWEPT_STEPS = 300, 4
+"""Events beside all regions from which on it is looked for a bar that sweeps; and steps whose events it has
+when it is found: it was seen in two of them, and was in the same motion before."""
 
-        Args:
-            events: Those of a step.
-            boxes: Which boxes.
-            rhythmic: Of which of them only those of candidates are meant that are no lamps.
-            most_same: How often a candidate's time must not have come again.
-        """
-        most = _kernels.MOST_BOXES
-        if len(boxes) > most:
-            first = self.select(events, boxes[:most], rhythmic[:most], most_same)
-            return first + self.select(events, boxes[most:], rhythmic[most:], most_same)
-        if events.t_us.size > self._apart:
-            self._apart = events.t_us.size + events.t_us.size // 4
-            room = most * self._apart + 1
-            into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
-            self._columns = into
-        columns, apart = (events.t_us, events.x, events.y, events.p), self._apart
-        if len(boxes) == 1 and not rhythmic[0]:
-            # Of a bar alone, whole blocks of events.
-            ends = [_kernels.select_box(columns, boxes[0], self._columns)]
-        else:
-            filtered = sum(one << k for k, one in enumerate(rhythmic)), self._min_score, most_same
-            numbers = np.empty(len(boxes), np.int64)
-            _kernels.select_boxes(
-                columns, np.array(boxes), self._pixels, filtered, apart, self._columns, numbers
-            )
-            ends = numbers.tolist()
-        t_us, x, y, p = self._columns
-        begin, found = 0, []
-        for many in ends:
-            end = begin + many
-            inside = t_us[begin:end].copy(), x[begin:end].copy(), y[begin:end].copy(), p[begin:end].copy()
-            found.append(Events.as_is(*inside))
-            begin += apart
-        return found
+_CENTRE_SIGMA_PX = 0.25
+"""Error of a measured centre: the edge of a row of pixels, a third of one, at the top and at the bottom."""
 
-    def of(self, events: Events) -> Events:
-        """Those of candidates that are no lamps."""
-        height, width = self._pixels.shape
-        return self.select(events, [(0, 0, width, height)], [True])[0]
+_COUNTS = ("steps_forgotten", "dropped_no_room", "regions_left_out", "regions_gave_way", "areas_left_out")
 
-    def measure(
-        self,
-        box: Box,
-        end_us: int,
-        span_us: int,
-        reach_px: float,
-        rows: NDArray[np.int64],
-        strips: tuple[float, float, NDArray[np.float64]] | None,
-    ) -> tuple[int, float, int, int, float, float, float]:
-        """Where in a box pixels blink that rose in the last `span_us`, see `_kernels.measure_box`.
+_RESHAPE_PX = 1.0
+"""How far a region may be off its bar, in place and in size, before it is set right: a fifth of its seam."""
 
-        `strips` are (expected, near, strips) of `_kernels.measure_strips` for a bar whose light stands in
-        strips of columns, None for others.
-        """
-        # Half the score suffices inside a region: its seam is new to the light as the bar moves.
-        awake = end_us >> self._shift, span_us >> self._shift, max(self._min_score // 2, 1)
-        if strips is not None:
-            return _kernels.measure_strips(self._pixels, box, awake, *strips, rows)
-        return _kernels.measure_box(self._pixels, box, awake, _SEAM_PX, reach_px, rows)
+_LEFT_STEPS = 6
+"""Steps in which what is left of a region that turned out to be smaller may become one: it blinks all the
+time. What wakes there later is a halo, or leaves that its light falls on."""
+
+Place = tuple[float, float, float, float]
+"""Column and row of a centre, width and height, px."""
 
 
 class RegionFollower(RegionTracker):
@@ -766,36 +643,24 @@ class RegionFollower(RegionTracker):
         followed.hold(deque((start, gathered.get(start, events)) for start, events in followed.pieces))
         self.counts["dropped_no_room"] += make_room(self.alive, self._limits.region_bytes, step_us)
 
-    def shape(
-        self,
-        followed: Followed,
-        t_us: float,
-        centre_px: tuple[float, float],
-        size_px: tuple[float, float],
-        lit_px: tuple[float, float] | None = None,
-        strips_px: NDArray[np.float64] | None = None,
-    ) -> float:
+    def shape(self, followed: Followed, shown: ShownPlace) -> float:
         """Set a region right by what a frame showed of its bar; return by how much, px, 0 for nothing.
 
         It is infinite at the first time. Its events are those of where it was taken to be, until they are
         gathered anew; within half of the seam, they are all there.
-
-        Args:
-            followed: The region.
-            t_us: When the bar was seen, us.
-            centre_px: Centre (column, row) of the whole bar at that time.
-            size_px: Its (width, height).
-            lit_px: Where it shines, see `Followed.lit_px`.
-            strips_px: See `Followed.strips_px`.
         """
-        if followed.lit_px != lit_px and abs(_height(followed.lit_px) - _height(lit_px)) > STRAY_PX:
+        t_us, (x_px, y_px), size_px = shown.t_us, shown.centre_px, shown.size_px
+        if (
+            followed.lit_px != shown.lit_px
+            and abs(_height(followed.lit_px) - _height(shown.lit_px)) > STRAY_PX
+        ):
             # Heights of another part.
             followed.heights.clear()
-        followed.lit_px, followed.strips_px = lit_px, strips_px
+        followed.lit_px, followed.strips_px = shown.lit_px, shown.strips_px
         x, y = followed.positions.place_at(t_us)
-        off = centre_px[0] - x, centre_px[1] - y
+        off = x_px - x, y_px - y
         known, before_us, followed.shown_us = followed.size_px, followed.shown_us, t_us
-        off_px = followed.off_px(t_us, centre_px, size_px)
+        off_px = followed.off_px(shown)
         if known is None:
             followed.heights.clear()
             # Beside the bar itself there may be a halo.
@@ -808,13 +673,9 @@ class RegionFollower(RegionTracker):
         followed.size_px = size_px
         # Where less of the bar was seen, or more than it, its place is not that of what was seen.
         most_px = 2 * MARGIN_PX if known is None else math.inf
+        grown_us = None if known is None or before_us is None else (before_us, t_us)
         followed.positions = followed.positions.moved(
-            followed.id,
-            *off,
-            size_px,
-            row_px=centre_px[1],
-            most_px=most_px,
-            grown_us=None if known is None or before_us is None else (before_us, t_us),
+            followed.id, *off, size_px, row_px=y_px, most_px=most_px, grown_us=grown_us
         )
         followed.filter = self._position.init() if self._position else None
         return off_px
@@ -851,7 +712,7 @@ class RegionFollower(RegionTracker):
         )
         self._next_id += 1
         self.alive.append(followed)
-        self.shape(followed, t_us, centre_px, size_px)
+        self.shape(followed, ShownPlace(t_us, centre_px, size_px))
         self.gather(followed)
         return followed
 
@@ -1165,7 +1026,6 @@ class RegionFollower(RegionTracker):
                 apart_px = max(abs(one.x_px - other.x_px), abs(one.y_px - other.y_px))
                 if shown == 0 or apart_px <= SAME_PX or (shown == 1 and same_place(one, other)):
                     younger.released = True
-        # The survivor reaches over both within a few steps, as its seam finds the other's pixels.
 
 
 def _goes_on(before: Sweep, sweep: Sweep, step_us: int) -> bool:

@@ -22,6 +22,7 @@ opened by rises only that come soon after the one before. One pass, four bytes a
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -30,6 +31,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from evlcp_sdk.rx import _kernels
+from evlcp_sdk.rx.boxes import Box
+from evlcp_sdk.values import Events
 
 _MOST_SCORE = 40
 """Scores rise no further: what has blinked in rhythm for long is forgotten after so many rises off it."""
@@ -135,3 +138,151 @@ def _repeats() -> NDArray[np.int64]:
             what = again if same else _kernels.MISSED if multiple else _kernels.OTHER
             said[shorter, longer] = said[longer, shorter] = what
     return said
+
+
+_SEAM_PX = 2
+"""Columns at either side of a box that a bar should leave dark: some of the least seam of a region."""
+
+
+class Rhythm:
+    """Scores of a sensor's pixels, one uint32 each, whose bits `_kernels` names.
+
+    Their clock of 17 bits goes round in an eighth of a second. Rows are looked at in turn, where rises so
+    long ago that all such times are alike become the youngest of these; and so soon that none looks young.
+
+    Args:
+        width: Columns of the sensor.
+        height: Its rows.
+        chip_us: Nominal length of a chip, us.
+        min_score: Score at which a pixel is a candidate; half of it is enough inside a region.
+        gap_chips: The longest time from rise to rise in the codes; 4 in pair codes.
+        shared: Several followers ask for the same steps; the first one's answer is kept for the others.
+    """
+
+    def __init__(
+        self,
+        width: int,
+        height: int,
+        chip_us: float,
+        min_score: int,
+        gap_chips: int = 4,
+        *,
+        shared: bool = False,
+    ) -> None:
+        self._tables = RhythmTables.of(chip_us, gap_chips)
+        self._shift = self._tables.tick_shift
+        self._min_score = min_score
+        self._pixels = np.zeros((height, width), np.uint32)
+        # No time that is looked up is longer; nor are rows looked at one by one after so long a gap.
+        self._turn = _kernels.CLOCK_ROUND // 4
+        self._old = self._turn + self._turn // 8
+        self._every = _kernels.CLOCK_ROUND - self._turn - self._old
+        self._row = 0
+        self._seen: int | None = None
+        self._open_us, self._taken, self._rises = -1, 0, 0
+        self._shared = shared
+        # Where events are selected into, box by box, so many places apart.
+        self._apart = -1
+        self._columns: _kernels.Columns = (np.empty(0),) * 4
+        self._kept: tuple[tuple[int, int], int, NDArray[np.int16]] | None = None
+
+    def step(self, start_us: int, events: Events, hits: NDArray[np.int16], cell_shift: int) -> int:
+        """Take the events of a time step; add the rises of candidates to their cell's `hits`; how many.
+
+        Args:
+            start_us: Start of the step, us.
+            events: Those in it, in order; a part of a step comes again with the rest, and counts once.
+            hits: Of cells of 2^cell_shift px, int16 (rows, columns).
+            cell_shift: See there.
+        """
+        if self._kept is not None and self._kept[0] == (start_us, len(events)):
+            hits[:] = self._kept[2]
+            return self._kept[1]
+        old = self._row, 0, 0, 0, self._old
+        if start_us != self._open_us:
+            self._open_us, self._taken, self._rises = start_us, 0, 0
+            # As many rows as the time since the last step asks for, all after a gap.
+            now, height = start_us >> self._shift, len(self._pixels)
+            passed = self._turn if self._seen is None else now - self._seen
+            whole = passed >= self._turn
+            many = height if whole else -(-height * passed // self._every)
+            old = self._row, many, now, 0 if whole else self._old, self._old
+            self._row, self._seen = (self._row + many) % height, now
+        first, tables = self._taken, self._tables
+        newest = events.t_us[first:], events.x[first:], events.y[first:], events.p[first:]
+        limits, shifts = (tables.soon, self._min_score, SAME), (self._shift, cell_shift)
+        self._rises += _kernels.score_rises(
+            newest, self._pixels, hits, tables.kinds, tables.lows, limits, shifts, old
+        )
+        self._taken = events.t_us.size
+        if self._shared:
+            self._kept = (start_us, len(events)), self._rises, hits.copy()
+        return self._rises
+
+    def select(
+        self, events: Events, boxes: Sequence[Box], rhythmic: Sequence[bool], most_same: int = LAMP
+    ) -> list[Events]:
+        """Those inside each of some boxes (left, top, right, bottom), copied.
+
+        Where leaves move, chance takes a third of their pixels to half of a candidate's score, and a tenth to
+        all of it.
+
+        Args:
+            events: Those of a step.
+            boxes: Which boxes.
+            rhythmic: Of which of them only those of candidates are meant that are no lamps.
+            most_same: How often a candidate's time must not have come again.
+        """
+        most = _kernels.MOST_BOXES
+        if len(boxes) > most:
+            first = self.select(events, boxes[:most], rhythmic[:most], most_same)
+            return first + self.select(events, boxes[most:], rhythmic[most:], most_same)
+        if events.t_us.size > self._apart:
+            self._apart = events.t_us.size + events.t_us.size // 4
+            room = most * self._apart + 1
+            into = np.empty(room, np.int64), *np.empty((2, room), np.uint16), np.empty(room, np.uint8)
+            self._columns = into
+        columns, apart = (events.t_us, events.x, events.y, events.p), self._apart
+        if len(boxes) == 1 and not rhythmic[0]:
+            # Of a bar alone, whole blocks of events.
+            ends = [_kernels.select_box(columns, boxes[0], self._columns)]
+        else:
+            filtered = sum(one << k for k, one in enumerate(rhythmic)), self._min_score, most_same
+            numbers = np.empty(len(boxes), np.int64)
+            _kernels.select_boxes(
+                columns, np.array(boxes), self._pixels, filtered, apart, self._columns, numbers
+            )
+            ends = numbers.tolist()
+        t_us, x, y, p = self._columns
+        begin, found = 0, []
+        for many in ends:
+            end = begin + many
+            inside = t_us[begin:end].copy(), x[begin:end].copy(), y[begin:end].copy(), p[begin:end].copy()
+            found.append(Events.as_is(*inside))
+            begin += apart
+        return found
+
+    def of(self, events: Events) -> Events:
+        """Those of candidates that are no lamps."""
+        height, width = self._pixels.shape
+        return self.select(events, [(0, 0, width, height)], [True])[0]
+
+    def measure(
+        self,
+        box: Box,
+        end_us: int,
+        span_us: int,
+        reach_px: float,
+        rows: NDArray[np.int64],
+        strips: tuple[float, float, NDArray[np.float64]] | None,
+    ) -> tuple[int, float, int, int, float, float, float]:
+        """Where in a box pixels blink that rose in the last `span_us`, see `_kernels.measure_box`.
+
+        `strips` are (expected, near, strips) of `_kernels.measure_strips` for a bar whose light stands in
+        strips of columns, None for others.
+        """
+        # Half the score suffices inside a region: its seam is new to the light as the bar moves.
+        awake = end_us >> self._shift, span_us >> self._shift, max(self._min_score // 2, 1)
+        if strips is not None:
+            return _kernels.measure_strips(self._pixels, box, awake, *strips, rows)
+        return _kernels.measure_box(self._pixels, box, awake, _SEAM_PX, reach_px, rows)

@@ -9,7 +9,7 @@ from rx_streams import LINK, frames_of, noise_events, received
 
 from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.alignment import DueFrame
-from evlcp_sdk.rx.framing import PacketGrid, RowDelay, measure_row_delay
+from evlcp_sdk.rx.transmitters import PacketGrid, RowDelay, measure_row_delay
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, SyncLock
 

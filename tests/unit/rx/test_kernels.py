@@ -7,7 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
 from evlcp_sdk.rx import _kernels
-from evlcp_sdk.rx.regions import Rhythm
+from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.values import Events
 
 WIDTH, HEIGHT = 24, 16

@@ -13,7 +13,8 @@ from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.boxes import clear_of, cut_off
-from evlcp_sdk.rx.regions import Followed, Places, RegionFollower, Rhythm
+from evlcp_sdk.rx.regions import Followed, Places, RegionFollower, ShownPlace
+from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events
@@ -117,7 +118,7 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
     for start, found in stepped(regions, merged(BAR_EVENTS[~hidden], raised(leaf, 9)), 60_000):
         if start == 12_000:
             (region,) = found
-            regions.shape(region, region.latest.t_us, CENTRE, SIZE, (-64.0, 32.0))
+            regions.shape(region, ShownPlace(region.latest.t_us, CENTRE, SIZE, (-64.0, 32.0)))
         elif start > 12_000:
             assert region.latest.y_px == pytest.approx(CENTRE[1], abs=1.5), start
 
@@ -238,7 +239,7 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
     regions = follower(keep_us=50_000)
     *_, (_, (region, *_)) = stepped(regions, kept, 25_000)
     before = sum(len(e) for _, e in region.pieces)
-    assert regions.shape(region, 24_000.0, CENTRE, SIZE) == np.inf
+    assert regions.shape(region, ShownPlace(24_000.0, CENTRE, SIZE)) == np.inf
     assert region.positions.place_at(24_000.0) == pytest.approx(CENTRE)
     old = list(region.pieces)
     regions.gather(region, 18_000.5, 21_000)
@@ -248,8 +249,8 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
     within = (kept.t_us >= region.pieces[0][0]) & (kept.t_us < 25_000)
     assert sum(len(e) for _, e in region.pieces) == int(within.sum()) >= before
     x, y = CENTRE
-    assert regions.shape(region, 24_000.0, (x + 0.1, y), (4.0, 128.2)) == 0
-    assert regions.shape(region, 24_000.0, (x + 1, y), (4.0, 131.0)) == pytest.approx(3)
+    assert regions.shape(region, ShownPlace(24_000.0, (x + 0.1, y), (4.0, 128.2))) == 0
+    assert regions.shape(region, ShownPlace(24_000.0, (x + 1, y), (4.0, 131.0))) == pytest.approx(3)
 
 
 def test_what_frames_have_shown_to_be_two_stays_two() -> None:
@@ -264,14 +265,14 @@ def test_what_frames_have_shown_to_be_two_stays_two() -> None:
             (whole,) = regions.alive
             assert whole.latest.height_px > 250
             t_us = whole.latest.t_us
-            regions.shape(whole, t_us, below, SIZE)
+            regions.shape(whole, ShownPlace(t_us, below, SIZE))
             beside = regions.beside(whole, t_us, CENTRE, SIZE)
         elif start == 20_000:
             whole.positions = Places(replace(p, y_px=p.y_px - 30) for p in whole.positions)
         elif start == 25_000:
             # The next frame shows where it is.
             assert now == {whole.id, beside.id}
-            regions.shape(whole, whole.latest.t_us, below, SIZE)
+            regions.shape(whole, ShownPlace(whole.latest.t_us, below, SIZE))
         elif start == 45_000:
             assert now == {whole.id}
     # What is seen where it was is no halo: it is found again.
@@ -288,7 +289,7 @@ def test_a_region_does_not_go_on_to_the_bar_below() -> None:
         if start == 10_000:
             (own,) = found
             t_us = own.latest.t_us
-            regions.shape(own, t_us, CENTRE, SIZE)
+            regions.shape(own, ShownPlace(t_us, CENTRE, SIZE))
             other = regions.beside(own, t_us, below, SIZE)
             own.positions = Places(
                 replace(p, y_px=p.y_px + 7 * k) for k, p in enumerate(own.positions, 1 - len(own.positions))
@@ -340,6 +341,6 @@ def test_of_two_regions_that_follow_the_same_the_older_stays() -> None:
     for start, found in stepped(regions, BAR_EVENTS, 15_000):
         if start == 10_000:
             (first,) = found
-            regions.shape(first, first.latest.t_us, CENTRE, SIZE)
+            regions.shape(first, ShownPlace(first.latest.t_us, CENTRE, SIZE))
             regions.beside(first, first.latest.t_us, (CENTRE[0], CENTRE[1] + 3), SIZE)
     assert regions.alive == [first]
