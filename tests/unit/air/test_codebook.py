@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,8 @@ def test_packet_is_the_vector() -> None:
     book = book_of(want["profile"])
     chips = packet_chips(want["symbols"], book)
     assert len(chips) == PacketFormat.of(book, want["frames"]).packet_chips
+    rate_bit_s = PacketFormat.of(book, 10).gross_bit_s(book.bits_per_symbol, 16)
+    assert rate_bit_s == pytest.approx(27_746, abs=0.5)
     assert ["".join(map(str, row)) for row in chips] == [f"{int(m, 16):016b}" for m in want["cluster_masks"]]
     bits = bits_of_symbols(want["symbols"], book.bits_per_symbol)
     assert "".join(map(str, bits)) == want["bits"]
@@ -83,36 +86,31 @@ def test_what_follows_a_frame_is_what_is_on_air(frames, every, preamble, first) 
         assert chips_behind(book, form, frame).tolist() == np.where(alike, behind[0], -1).tolist()
 
 
-@pytest.mark.parametrize(
-    ("profile", "frames", "every", "bit_s"),
-    # Air interface 1 for every frame with its pilot; beyond, bits over chips by hand.
-    [
-        ("wh4x2", 10, 1, 27_746),
-        ("wh8", 10, 1, 18_497),
-        ("raw8", 10, 1, 36_994),
-        ("raw8", 10, 4, 1280 / 234 * 1e4),
-        ("raw8", 20, 4, 2560 / 426 * 1e4),
-    ],
-)
-def test_gross_rate(profile: str, frames: int, every: int, bit_s: float) -> None:
-    book = book_of(profile)
-    form = PacketFormat.of(book, frames, pilot_every=every)
-    assert form.gross_bit_s(book.bits_per_symbol, 16) == pytest.approx(bit_s, abs=0.5)
-
-
-def test_codes_are_checked() -> None:
-    with pytest.raises(ConfigError, match="pilots: rows 0 and 1 are equal"):
-        Codebook.of_values("x", hadamard(2)[0], np.ones((2, 8), np.int8), hadamard(8))
-    with pytest.raises(ConfigError, match="preamble: expected values of -1 and"):
-        Codebook.of_values("x", np.zeros(13, np.int8), hadamard(8), hadamard(8))
-    with pytest.raises(ConfigError, match="preamble: expected a 1-D array of chips 0 and 1; values of -1"):
-        Codebook("x", hadamard(2)[1], hadamard(8), hadamard(8))
-    words = [[1, 1, 1], [0, 1, 0], [0, 0, 0]]
-    with pytest.raises(ConfigError, match="codewords: rows 0 and 2 have the same edges"):
-        Codebook("x", np.array([0, 1]), np.eye(3, dtype=int), np.array(words))
-
-
 CHIPS = Codebook("ppm", np.array([0, 1, 1]), np.array([[0, 1, 0], [1, 0, 0]]), np.eye(3, 4, dtype=int))
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda: Codebook.of_values("x", hadamard(2)[0], np.ones((2, 8), np.int8), hadamard(8)),
+         "pilots: rows 0 and 1 are equal"),
+        (lambda: Codebook.of_values("x", np.zeros(13, np.int8), hadamard(8), hadamard(8)),
+         "preamble: expected values of -1 and"),
+        (lambda: Codebook("x", np.array([-1, 1]), CHIPS.pilots, CHIPS.codewords),
+         "preamble: expected a 1-D array of chips 0 and 1; values of -1"),
+        (lambda: Codebook("x", CHIPS.preamble, CHIPS.pilots, np.array([[1, 1, 1], [0, 1, 0], [0, 0, 0]])),
+         "codewords: rows 0 and 2 have the same edges"),
+        (lambda: CHIPS.require_pairs("decoding", "a", "b"),
+         r"decoding 'a' reads pair codes.*the preamble are others; try"),
+        (lambda: packet_chips([[0] * 15], book_of("wh4x2")), r"expected \(frames, 16 clusters\)"),
+        (lambda: packet_chips([[0] * 15 + [64]], book_of("wh4x2")),
+         "symbol 64 at frame 0, cluster 15: expected 0 to 63"),
+        (lambda: packet_chips([[0.5] * 16], book_of("wh4x2")), "expected integers"),
+    ],
+)  # fmt: skip
+def test_what_is_no_code_or_symbol_is_named(make: Callable[[], object], says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        make()
 
 
 def test_codes_of_any_chips() -> None:
@@ -125,27 +123,22 @@ def test_codes_of_any_chips() -> None:
     chips = packet_chips([[2, 0]], CHIPS)
     assert "".join(map(str, chips[:, 0])) == "0110100010"
     assert "".join(map(str, chips[:, 1])) == "0111001000"
-    with pytest.raises(ConfigError, match=r"decoding 'a' reads pair codes.*the preamble are others; try"):
-        CHIPS.require_pairs("decoding", "a", "b")
 
 
-@pytest.mark.parametrize("name", ["pairs", "ppm", "nrz", "dimmed"])
-def test_the_longest_time_between_rises(name: str) -> None:
-    pilots, words = {
-        "pairs": (WhPilots(), Wh4x2()),
-        "ppm": (WhPilots(), Ppm(4, 3)),
-        "nrz": (WhPilots(), Nrz()),
-        "dimmed": (DimmedPilots(), DimmedWh4x2()),
-    }[name]
-    book = Codebook(name, pilots.preamble(), pilots.codes(16), words.codewords())
+@pytest.mark.parametrize(
+    ("pilots", "words"),
+    [(WhPilots(), Wh4x2()), (WhPilots(), Ppm(4, 3)), (WhPilots(), Nrz()), (DimmedPilots(), DimmedWh4x2())],
+    ids=["pairs", "ppm", "nrz", "dimmed"],
+)
+def test_the_longest_time_between_rises(pilots: WhPilots | DimmedPilots, words: Modulation) -> None:
+    book = Codebook("x", pilots.preamble(), pilots.codes(16), words.codewords())
     # Every codeword behind every other, in all of 16 clusters, with a pilot now and then.
     n = len(book.codewords)
     pairs = np.stack([np.arange(n).repeat(n), np.tile(np.arange(n), n)], 1).ravel()
     chips = packet_chips(np.tile(pairs[:, None], 16), book, pilot_every=64).astype(np.int8)
     gaps = [np.diff(np.flatnonzero(np.diff(chips[:, k]) > 0)).max() for k in range(16)]
-    found = max(gaps)
-    assert book.longest_gap_chips == found
-    assert book.pairs == (name == "pairs")
+    assert book.longest_gap_chips == max(gaps)
+    assert book.pairs == isinstance(words, Wh4x2)
 
 
 def test_c_table_holds_the_words() -> None:
@@ -154,16 +147,3 @@ def test_c_table_holds_the_words() -> None:
     words = re.findall(r"0x([0-9a-f]{4})u", text)
     assert words == VECTORS["pilot_words"] + VECTORS["info_words"]["wh4x2"]
     assert f"{int(VECTORS['preamble_chips'], 2):08x}" in text
-
-
-@pytest.mark.parametrize(
-    ("symbols", "message"),
-    [
-        ([[0] * 15], "expected \\(frames, 16 clusters\\)"),
-        ([[0] * 15 + [64]], "symbol 64 at frame 0, cluster 15: expected 0 to 63"),
-        ([[0.5] * 16], "expected integers"),
-    ],
-)
-def test_bad_symbols_are_named(symbols: list[list[float]], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        packet_chips(symbols, book_of("wh4x2"))
