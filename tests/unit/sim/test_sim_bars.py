@@ -16,11 +16,14 @@ from evlcp_sdk.air.blocks import Block, Kind
 from evlcp_sdk.air.frames import bits_of_symbols
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link, resolve
+from evlcp_sdk.link.sections import AirSpec
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.camera import CameraModel
+from evlcp_sdk.scene.sites import BarSite, to_toml
 from evlcp_sdk.sim import BarSpec, Truth, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.light import BarLight, sources_of
 from evlcp_sdk.sim.scene import LensSpec, links_of
+from evlcp_sdk.simulated import simulate
 from evlcp_sdk.study.measure import message_tallies
 from evlcp_sdk.study.tally import Tally
 from evlcp_sdk.values import Packet
@@ -37,20 +40,11 @@ def test_a_bar_lays_its_tables_over_the_scene_s(tmp_path: Path) -> None:
         '[bars.link.modulation]\nid = "wh8"\n[[bars]]\nlink = "other.toml"\n'
     )
     scene = load_scene(tmp_path / "scene.toml", ["link.air.pilot_every=2", "bars.1.link.bar.rows=48"])
-    found = [
-        (
-            k.air.chip_rate_hz,
-            k.air.frames_per_packet,
-            k.air.pilot_every,
-            k.codebook.profile,
-            len(k.bar.led_clusters()),
-        )
-        for k in links_of(scene)
-    ]
-    assert found == [
-        (8000.0, 20, 2, "wh4x2", 96),
-        (5000.0, 20, 2, "wh8", 48),
-        (10_000.0, 10, 1, "raw8", 96),  # a file stands for itself
+    # A file stands for itself.
+    assert [(k.air, k.codebook.profile, len(k.bar.led_clusters())) for k in links_of(scene)] == [
+        (AirSpec(8000.0, 20, 2), "wh4x2", 96),
+        (AirSpec(5000.0, 20, 2), "wh8", 48),
+        (AirSpec(10_000.0, 10, 1), "raw8", 96),
     ]
     for name in ("scene", "common", "other"):
         (tmp_path / f"{name}.toml").unlink()
@@ -68,25 +62,18 @@ def turned(bar: BarSpec, points_m: NDArray[np.float64]) -> NDArray[np.float64]:
     return ahead @ back.T @ aside.T + [bar.x_m, bar.y_m, bar.z_m]
 
 
-LAYOUTS: dict[str, dict[str, Any]] = {
-    "ring": {"shape": "ring", "leds": 12, "radius_m": 0.3},
-    "apart": {"shape": "columns", "apart_m": 0.4, "rows": 24, "cluster_rows": 6},
-    "table": {
-        "shape": "table",
-        "leds": [[0, 0, 0.2, 0], [0.31, 0, 0, 2], [0.1, -0.2, 0.4, 1], [0.3, 0, 0, 1]],
-    },
-    "one": {"shape": "table"},
-}
+RING = {"shape": "ring", "leds": 12, "radius_m": 0.3}
+LEDS = [[0, 0, 0.2, 0], [0.31, 0, 0, 2], [0.1, -0.2, 0.4, 1], [0.3, 0, 0, 1]]
 
 
 @pytest.mark.parametrize(
     ("layout", "cluster"),
     [
-        (LAYOUTS["ring"], 0),
-        (LAYOUTS["ring"], 4),
-        (LAYOUTS["apart"], 6),
-        (LAYOUTS["table"], 0),
-        (LAYOUTS["one"], 0),
+        (RING, 0),
+        (RING, 4),
+        ({"shape": "columns", "apart_m": 0.4, "rows": 24, "cluster_rows": 6}, 6),
+        ({"shape": "table", "leds": LEDS}, 0),
+        ({"shape": "table"}, 0),
         (PANEL, 6),
     ],
 )
@@ -115,21 +102,17 @@ def test_leds_that_no_scene_can_hold_are_refused() -> None:
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 136.9, "height_m": 50.0, "heading_deg": 20.0}
 
 
-def blocks_of(symbols: Any, table: dict[str, Any] | None = None) -> list[Block]:
-    link = resolve(table or {})
-    coder, found = link.block_coder(), []
-    for packet in symbols:
-        llr = 4 - 8.0 * bits_of_symbols(packet, link.codebook.bits_per_symbol)
-        content = coder.block(llr.astype(np.float32))
-        assert content is not None
-        found.append(Block.unpack(content))
-    return found
+def blocks_of(light: BarLight, packets: int, first: int = 0) -> list[Block]:
+    """What packets of a bar say."""
+    coder, bits = light.link.block_coder(), light.link.codebook.bits_per_symbol
+    sent = [bits_of_symbols(light.symbols(first + q), bits) for q in range(packets)]
+    return [Block.unpack(coder.block((4 - 8.0 * one).astype(np.float32)) or b"") for one in sent]
 
 
 def test_random_data_is_a_message_a_packet() -> None:
     scene = resolve_scene({"bars": [{"payload": "data"}, {"payload": "data", "transmitter_id": 9}]})
     for light, transmitter_id in zip(sources_of(scene)[0], (1, 9), strict=True):
-        blocks = blocks_of([light.symbols(q) for q in range(3)])
+        blocks = blocks_of(light, 3)
         assert [(b.kind, b.transmitter_id, b.sequence, b.index) for b in blocks] == [
             (Kind.DATA, transmitter_id, q, 0) for q in range(3)
         ]
@@ -141,17 +124,14 @@ def test_random_data_is_a_message_a_packet() -> None:
         "error-correction": {"id": "none"},
     }
     light = sources_of(resolve_scene({"bars": [{"payload": "data", "link": other}]}))[0][0]
-    (block,) = blocks_of([light.symbols(5)], other)
-    assert block.sequence == 5
+    assert [block.sequence for block in blocks_of(light, 1, first=5)] == [5]
 
 
 def test_a_bar_in_the_world_sends_its_beacon() -> None:
     scene = resolve_scene({"bars": [{"payload": "messages", "text": "Tempo 30"}], "world": WORLD})
-    known = truth_of(scene).to_table()
-    assert known["bars"][0]["payload"] == "messages"
     light = sources_of(scene)[0][0]
     assert (light.symbols(0) == light.symbols(2)).all()
-    beacon, text = blocks_of([light.symbols(0), light.symbols(1)])
+    beacon, text = blocks_of(light, 2)
     assert (beacon.kind, beacon.transmitter_id) == (Kind.BEACON, 1)
     assert (text.kind, text.part) == (Kind.TEXT, b"Tempo 30")
     said, (site,) = Beacon.unpack(beacon.part), sites_of(scene)
@@ -174,15 +154,10 @@ def test_what_cannot_be_sent_is_told(bar: dict[str, Any], told: str) -> None:
         sources_of(resolve_scene({"bars": [bar]}))
 
 
-@pytest.fixture(scope="module")
-def received() -> tuple[Truth, list[Packet]]:
+def test_a_campaign_counts_messages() -> None:
     scene = load_scene("drive-30kmh", {"duration_s": 0.15, "bars.payload": "data", "bars.start_chip": 300.0})
     receiver = Receiver(load_link())
-    return truth_of(scene, 3), receiver.feed(every(scene, 3)) + receiver.close()
-
-
-def test_a_campaign_counts_messages(received: tuple[Truth, list[Packet]]) -> None:
-    known, packets = received
+    known, packets = truth_of(scene, 3), receiver.feed(every(scene, 3)) + receiver.close()
     coder = load_link().block_coder()
 
     def total(packets: list[Packet], known: Truth = known) -> tuple[int, int, int]:
@@ -201,19 +176,15 @@ def test_a_campaign_counts_messages(received: tuple[Truth, list[Packet]]) -> Non
 def test_from_a_scene_to_the_lines_of_a_result(evlcp: Any, tmp_path: Path) -> None:
     key, chips, rec, out = (tmp_path / n for n in ("k.pem", "chips.npy", "rec.raw", "out"))
     site = tmp_path / "site.toml"
-    site.write_text(
-        "[[bar]]\ntransmitter_id = 7\nlatitude_deg = 35.1\nlongitude_deg = 136.9\nheight_m = 52.4\n"
-    )
+    site.write_text(to_toml([BarSite(7, 35.1, 136.9, 52.4)]))
     pytest.importorskip("cryptography", reason="the extra sign is not installed")
     public = evlcp("tx", "keygen", key).out.strip()
     assert "a key is not overwritten; --show prints it again" in evlcp("tx", "keygen", key).err
     assert evlcp("tx", "keygen", key, "--show").out.strip() == public
     said = f"--text Tempo_30 --beacon {site} --key {key} --sequence 5 --chips {chips}"
     assert evlcp("tx", "message", *said.split()).code == 0
-    scene = (
-        f"--preset drive-30kmh --set duration_s=0.2 --set bars.start_chip=1380 --set bars.chips_file={chips}"
-    )
-    assert evlcp("simulate", *scene.split(), "-o", rec).code == 0
+    settings = {"duration_s": 0.2, "bars.start_chip": 1380.0, "bars.chips_file": str(chips)}
+    simulate(load_scene("drive-30kmh", settings)).save(rec)
     told = evlcp("receive", rec, "-o", out, "--set", f'messages.trusted_keys=[{{key="{public}"}}]')
     assert told.code == 0, told.err
     lines = [json.loads(line) for line in (out / "packets.jsonl").read_text().splitlines()]

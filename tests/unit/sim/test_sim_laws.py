@@ -86,20 +86,13 @@ def test_the_truth_counts_what_was_rendered() -> None:
     assert found["events"] == events
     assert found["signal_events"] + 30_000 > events
     assert len(found["t_s"]) == len(found["distance_m"][1]) == len(found["bar_centre_px"][1][0]) == 30
-    json.dumps(found)
-
-
-@pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")
-def test_the_truth_has_the_schema_of_the_recordings() -> None:
-    theirs = json.loads((SHARED / "two-bars-60m-75m.truth.json").read_text())
-    simulation = Simulation(SHORT)
-    for _ in simulation.stream():
-        pass
-    ours = truth_of(simulation).to_table() | {"bytes": 0}
-    assert set(theirs) <= set(ours)
-    assert set(theirs["scene"]) == set(ours["scene"])
-    assert set(theirs["bars"][0]) | {"link", "pilot_every", "payload"} == set(ours["bars"][0])
-    assert theirs["camera"] == ours["camera"]
+    if SHARED.exists():
+        # What an independent generator writes, ours does, too.
+        theirs, ours = json.loads((SHARED / "two-bars-60m-75m.truth.json").read_text()), found | {"bytes": 0}
+        assert set(theirs) <= set(ours)
+        assert set(theirs["scene"]) == set(ours["scene"])
+        assert set(theirs["bars"][0]) | {"link", "pilot_every", "payload"} == set(ours["bars"][0])
+        assert theirs["camera"] == ours["camera"]
 
 
 @pytest.mark.skipif(not SHARED.exists(), reason="the recordings of ../shared are not there")

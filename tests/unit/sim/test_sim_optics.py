@@ -1,7 +1,6 @@
 """The lens against closed forms and brute force: the Airy pattern's wings, a strip's light on the pixels."""
 
 import math
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,21 +10,15 @@ from scipy.ndimage import map_coordinates
 from scipy.special import j0, j1
 
 from evlcp_sdk.scene.camera import CameraModel
-from evlcp_sdk.sim import BackgroundSpec, BarSpec, MotionSpec, Scene, SensorSpec, Simulation, _kernels
+from evlcp_sdk.sim import BackgroundSpec, BarSpec, Scene, SensorSpec, Simulation, _kernels
 from evlcp_sdk.sim.motion import project
 from evlcp_sdk.sim.optics import blur_of
 from evlcp_sdk.sim.scene import LensSpec
+from tests.unit.sim.scenes import STILL
 
 Floats = NDArray[np.float64]
 
 CAMERA = CameraModel()
-IDEAL = LensSpec(blur_px=0.05)
-
-
-def beyond(radius_px: Floats | float, lens: LensSpec) -> Floats:
-    """Share of the light that an ideal lens throws further than a radius."""
-    v = math.pi * np.asarray(radius_px) * CAMERA.pitch_um / (lens.wavelength_nm * 1e-3 * lens.f_number)
-    return j0(v) ** 2 + j1(v) ** 2
 
 
 def image_of_rectangle(
@@ -49,15 +42,17 @@ def image_of_rectangle(
 
 @pytest.mark.parametrize("f_number", [1.4, 2.0, 4.0])
 def test_the_gaussians_throw_as_much_light_aside_as_the_airy_pattern(f_number: float) -> None:
-    lens = replace(IDEAL, f_number=f_number)
+    lens = LensSpec(blur_px=0.05, f_number=f_number)
     blur = blur_of(lens.focus_m, lens, CAMERA)
     assert blur.share.sum() == pytest.approx(1, abs=1e-12)
     assert (blur.share > 0).all()
     radius = np.linspace(0.4 * f_number, 10.0, 60)
     found = (blur.share * np.exp(-(radius[:, None] ** 2) / (2 * blur.sigma_px**2))).sum(1)
-    # The rings are averaged out, as pixels and blur do: over one of them about each radius.
-    ring = lens.wavelength_nm * 1e-3 * f_number / CAMERA.pitch_um * np.linspace(-0.5, 0.5, 41)
-    closed = beyond(radius[:, None] + ring, lens).mean(1)
+    # The rings are averaged out, as pixels and blur do: over one of them about each radius. What an ideal
+    # lens throws further than a radius is J0(v)^2 + J1(v)^2.
+    ring_px = lens.wavelength_nm * 1e-3 * f_number / CAMERA.pitch_um
+    v = math.pi * (radius[:, None] / ring_px + np.linspace(-0.5, 0.5, 41))
+    closed = (j0(v) ** 2 + j1(v) ** 2).mean(1)
     np.testing.assert_allclose(found, closed, rtol=0.07)
     np.testing.assert_allclose(found[radius < 4], closed[radius < 4], rtol=0.03)
 
@@ -66,12 +61,12 @@ def test_the_light_on_each_pixel_is_that_of_the_lens(tmp_path: Path) -> None:
     """A bar that stands still, as its pixels see it, beside the transfer functions of all that blurs it."""
     lit = np.array([1, 0, 0, 1, 1, 0, 0, 0, 1, 0, 1, 1, 0, 0, 0, 1])
     # A last chip of darkness, never sent in this time, says that the bar blinks.
-    np.save(tmp_path / "chips.npy", np.concatenate([np.tile(lit, (99, 1)), np.zeros((1, 16), int)]))
+    np.save(tmp_path / "chips.npy", [*[lit] * 99, 0 * lit])
     lens = LensSpec(halo=0.0)
     scene = Scene(
         duration_s=0.004,
         lens=lens,
-        motion=MotionSpec(speed_mps=0.0, vib_rate_rad_s=0.0),
+        motion=STILL,
         background=BackgroundSpec(light_w_m2=0.01, texture=0.0),
         sensor=SensorSpec(noise_hz=0.0, hot_share=0.0),
         bars=(BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=10.0),),
