@@ -6,35 +6,25 @@ from pathlib import Path
 
 import pytest
 
-SDK = Path(__file__).parents[2] / "evlcp_sdk"
+ROOT = Path(__file__).parents[2]
+SDK = ROOT / "evlcp_sdk"
 
-LAYERS = (
-    {"errors", "files", "kernels", "late", "printable", "signals", "specs", "spelling", "stopwatch"},
-    {"air"},
-    {"values", "scene", "clock", "utc", "_kernels"},
-    {"plugin"},
-    {"link"},
-    {"io", "rx", "place", "sim"},
-    {"formatting"},
-    {"diagnosis"},
-    {"results"},
-    {"report"},
-    {"study", "live"},
-    {"run", "simulated", "warming"},
-    {"testing"},
-    {"cli"},
-)
-"""From the ground up: a module imports from its own layer and those below."""
-
-
-def layer_of(module: str) -> int:
-    """Layer of a module named from the package's root; the longest name decides."""
-    parts = module.split(".")
-    for n in range(len(parts), 0, -1):
-        for i, names in enumerate(LAYERS):
-            if ".".join(parts[:n]) in names:
-                return i
-    raise AssertionError(f"evlcp_sdk.{module}: put it in a layer")
+ROWS = {
+    "evlcp_sdk": (
+        *("errors files kernels late printable signals specs spelling stopwatch", "air"),
+        *("values scene clock utc _kernels", "plugin", "link", "io rx place sim", "formatting", "diagnosis"),
+        *("results", "report", "study live", "run simulated warming", "testing", "cli"),
+    ),
+    "evlcp_sdk/rx": (
+        *("_kernels", "boxes limits straight", "rhythm sweeps", "guard regions trust", "detected framer"),
+        *("inbox placement ranges", "points spread", "alignment", "reflections reading"),
+        *("plugin_framing transmitters workers", "framing multi", "receiver"),
+    ),
+    "firmware_host": (
+        *("errors build flicker images", "protocol", "ports", "emulators", "board", "loop", "commands"),
+    ),
+}
+"""Of a package, from the ground up: a room imports from below its row only, a lone module beside it, too."""
 
 
 @cache
@@ -54,7 +44,7 @@ def imports_of(path: Path) -> frozenset[str]:
             assert node.module
             for alias in node.names:
                 inner = f"{node.module}.{alias.name}"
-                own = SDK.parent / inner.replace(".", "/")
+                own = ROOT / inner.replace(".", "/")
                 found.add(inner if own.is_dir() or own.with_suffix(".py").exists() else node.module)
     return frozenset(found)
 
@@ -72,68 +62,30 @@ def modules(folder: Path) -> dict[str, Path]:
 MODULES = modules(SDK)
 
 
-def test_imports_go_down_and_none_is_of_a_plugin() -> None:
-    plugins = {p.name for p in (SDK.parent / "plugins").iterdir()} | {"firmware_host"}
-    for module, path in MODULES.items():
-        for name in imports_of(path):
-            assert name.split(".")[0] not in plugins, f"evlcp_sdk.{module} imports the plugin {name}"
-            if name.startswith("evlcp_sdk."):
-                above = layer_of(name.removeprefix("evlcp_sdk.")) > layer_of(module)
-                assert not above, f"evlcp_sdk.{module} imports {name}, which stands above it"
-
-
-BOARD = ("errors build flicker images", "protocol", "ports", "emulators", "board", "loop", "commands")
-"""The layers of the board's host tool."""
-
-
-def test_imports_of_the_board_go_down() -> None:
-    def layer(module: str) -> int:
-        (level,) = (n for n, names in enumerate(BOARD) if module.split(".")[0] in names.split())
-        return level
-
-    found = modules(SDK.parent / "firmware_host")
+@pytest.mark.parametrize("package", ROWS)
+def test_imports_go_down(package: str) -> None:
+    folder = ROOT / package
+    row = {name: i for i, names in enumerate(ROWS[package]) for name in names.split()}
+    found = modules(folder)
+    assert {module.split(".")[0] for module in found} == set(row)
     for module, path in found.items():
+        own = module.split(".")[0]
+        # The receiver's stages are rooms of their own.
+        room = (folder / own).is_dir() or package == "evlcp_sdk/rx"
         for name in imports_of(path):
-            if name.startswith("firmware_host."):
-                other = name.removeprefix("firmware_host.")
-                assert layer(other) <= layer(module), f"{module} imports {other}, which is above"
-                assert other != "protocol.generate", "the generator is a developer's tool"
+            inside, _, other = name.partition(package.replace("/", ".") + ".")
+            below = other.split(".")[0]
+            if not inside and other and below != own:
+                assert row[below] <= row[own] - room, f"{package}: {module} imports {other}"
 
 
-@pytest.mark.parametrize("package", ["io", "rx", "place", "sim"])
-def test_the_middle_packages_do_not_import_one_another(package: str) -> None:
-    others = {"io", "rx", "place", "sim"} - {package}
+def test_nothing_imports_a_plugin_or_the_generator() -> None:
+    plugins = {path.name for path in (ROOT / "plugins").iterdir()} | {"firmware_host"}
     for module, path in MODULES.items():
-        if module.split(".")[0] == package:
-            for name in imports_of(path):
-                assert name.removeprefix("evlcp_sdk.").split(".")[0] not in others, f"{module} imports {name}"
-
-
-RX = (
-    {"boxes", "limits", "straight"},
-    {"rhythm", "sweeps"},
-    {"guard", "regions", "trust"},
-    {"detected", "framer"},
-    {"inbox", "placement", "ranges"},
-    {"points", "spread"},
-    {"alignment"},
-    {"reflections", "reading"},
-    {"plugin_framing", "transmitters", "workers"},
-    {"framing", "multi"},
-    {"receiver"},
-)
-"""The receiver from its stages up to what joins them: a module imports from below its own row only."""
-
-
-def test_receiver_stages_do_not_import_one_another() -> None:
-    row = {name: i for i, names in enumerate(RX) for name in names}
-    modules = [m.removeprefix("rx.") for m in MODULES if m.startswith("rx.") and not m.startswith("rx._")]
-    assert sorted(row) == sorted(modules)
-    for module in modules:
-        for name in imports_of(MODULES[f"rx.{module}"]):
-            other = name.removeprefix("evlcp_sdk.")
-            if other.startswith("rx.") and not other.startswith("rx._"):
-                assert row[other.removeprefix("rx.")] < row[module], f"{module} imports {name}"
+        named = {name.split(".")[0] for name in imports_of(path)} & plugins
+        assert not named, f"evlcp_sdk.{module} imports the plugin {named}"
+    for path in (ROOT / "firmware_host").rglob("*.py"):
+        assert "firmware_host.protocol.generate" not in imports_of(path), "it is a developer's tool"
 
 
 def test_commands_do_not_import_one_another() -> None:
@@ -148,7 +100,7 @@ def test_commands_do_not_import_one_another() -> None:
 @pytest.mark.parametrize("package", ["evlcp_sdk", "firmware_host"])
 def test_no_import_circle(package: str) -> None:
     """Imports inside functions and for typing count, too; that of a package's own parts does not."""
-    found, done = modules(SDK.parent / package), set[str]()
+    found, done = modules(ROOT / package), set[str]()
 
     def visit(module: str, path: tuple[str, ...]) -> None:
         assert module not in path, f"circle: {' > '.join([*path, module])}"
@@ -167,9 +119,8 @@ def test_no_import_circle(package: str) -> None:
 
 def test_no_two_public_classes_have_one_name() -> None:
     homes: dict[str, list[Path]] = {}
-    root = SDK.parent
     for path in (
-        p for room in ("evlcp_sdk", "firmware_host", "plugins") for p in (root / room).rglob("*.py")
+        p for room in ("evlcp_sdk", "firmware_host", "plugins") for p in (ROOT / room).rglob("*.py")
     ):
         for node in tree_of(path).body:
             if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
