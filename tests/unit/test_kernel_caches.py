@@ -4,20 +4,18 @@ import json
 import subprocess
 import sys
 import time
+from dataclasses import asdict
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
-from evlcp_sdk.cli import _app
 from evlcp_sdk.kernels import COMPILING, njit
 from evlcp_sdk.stopwatch import Stopwatch
 from evlcp_sdk.warming import STEPS, Warmth, warm_up
+from tests.conftest import ROOT
 
-SDK = Path(__file__).parents[2]
-KERNELS = sorted(SDK.glob("evlcp_sdk/**/_kernels.py")) + sorted(SDK.glob("plugins/*/_kernels.py"))
 OWN = """
 import logging, sys
 logging.basicConfig(level="INFO", format="%(message)s")
@@ -95,8 +93,9 @@ def test_a_disk_without_room_takes_no_cache(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_every_kernel_is_compiled_in_this_way() -> None:
-    assert len(KERNELS) > 7
-    for path in KERNELS:
+    kernels = [path for room in ("evlcp_sdk", "plugins") for path in (ROOT / room).glob("**/_kernels.py")]
+    assert len(kernels) > 7
+    for path in kernels:
         assert "from evlcp_sdk.kernels import njit\n" in path.read_text()
         assert "from numba import" not in path.read_text()
 
@@ -108,13 +107,8 @@ def busy(seconds: float) -> None:
 
 
 def test_time_for_kernels_is_left_out() -> None:
-    watch = Stopwatch()
-
-    def compile_(_sig: object) -> None:
-        busy(0.05)
-
-    stats = SimpleNamespace(cache_misses={})
-    inner = COMPILING.watched(SimpleNamespace(compile=compile_, stats=stats))
+    watch, stats = Stopwatch(), SimpleNamespace(cache_misses={})
+    inner = COMPILING.watched(SimpleNamespace(compile=lambda _: busy(0.05), stats=stats))
     outer = COMPILING.watched(SimpleNamespace(compile=lambda sig: (busy(0.05), inner(sig)), stats=stats))
     with watch.running():
         began_s = time.perf_counter()
@@ -142,15 +136,9 @@ def test_a_warm_up_leaves_nothing_to_compile() -> None:
         (Warmth(7, 31.0, None), "7 kernels compiled in 31 s they cannot be kept"),
     ],
 )
-def test_the_command_says_what_it_did(monkeypatch: pytest.MonkeyPatch, warmth: Warmth, words: str) -> None:
+def test_the_command_says_what_it_did(evlcp, monkeypatch, warmth: Warmth, words: str) -> None:
     monkeypatch.setattr("evlcp_sdk.warming.warm_up", lambda advance: [advance(s) for s in STEPS] and warmth)
-    runner, app = CliRunner(), _app.make_app()
-    done = runner.invoke(app, ["warm-up"])
-    assert done.exit_code == 0
-    assert " ".join(done.stdout.split()).startswith(words)
-    done = runner.invoke(app, ["warm-up", "--json"])
-    assert json.loads(done.stdout) == {
-        "compiled": warmth.compiled,
-        "elapsed_s": warmth.elapsed_s,
-        "kept_in": None,
-    }
+    done = evlcp("warm-up")
+    assert done.code == 0
+    assert " ".join(done.out.split()).startswith(words)
+    assert json.loads(evlcp("warm-up", "--json").out) == asdict(warmth)
