@@ -22,9 +22,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *args: str | Path) -> int:
     return int(end.value.code or 0)
 
 
-def test_it_shows_the_speed_of_the_recording(
-    demo_raw: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_it_shows_the_speed_of_the_recording(demo_raw, monkeypatch, capsys) -> None:
     assert run(monkeypatch, "speed", demo_raw) == 0
     lines = capsys.readouterr().out.splitlines()
     truth = json.loads(demo_raw.with_suffix(".truth.json").read_text())
@@ -41,9 +39,7 @@ def test_it_shows_the_speed_of_the_recording(
     assert km_h == pytest.approx(3.6 * speed, abs=0.1)
 
 
-def test_the_plugins_commands_are_there_and_a_fault_is_one_line(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_plugins_commands_are_there_and_a_fault_is_one_line(tmp_path, monkeypatch, capsys) -> None:
     assert run(monkeypatch, "--help") == 0
     assert {"speed", "board"} <= set(capsys.readouterr().out.split())
     assert run(monkeypatch, "speed", tmp_path / "none.raw") == 3

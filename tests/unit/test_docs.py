@@ -146,9 +146,7 @@ def test_links_files_and_modules_that_a_page_names_exist(path: Path) -> None:
         pkgutil.resolve_name(name)
 
 
-def test_the_message_that_is_shown_is_the_message(
-    workplace: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_message_that_is_shown_is_the_message(workplace, capsys) -> None:
     page = ROOT / "docs" / "configuration.md"
     (code,) = [block for block in blocks(page, "python") if "source=" in block]
     exec(code, {})

@@ -35,9 +35,7 @@ UNREADABLE = [
 
 
 @pytest.mark.parametrize(("read", "name", "content", "says"), UNREADABLE)
-def test_what_cannot_be_read_is_one_line(
-    read: Callable[[Path], Any], name: str, content: bytes | None, says: str, tmp_path: Path
-) -> None:
+def test_what_cannot_be_read_is_one_line(read, name, content, says, tmp_path) -> None:
     if content is not None:
         (tmp_path / name).write_bytes(content)
     with pytest.raises((ConfigError, InputError), match=says) as caught:
@@ -120,9 +118,7 @@ def test_a_pipe_is_written_and_stays(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("step", range(4))
 @pytest.mark.parametrize("seal", ["seal.json", "seal.npy"])
-def test_a_death_between_two_renames_leaves_a_mark(
-    tmp_path: Path, step: int, seal: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_death_between_two_renames_leaves_a_mark(tmp_path, step, seal, monkeypatch) -> None:
     """Two runs' files side by side never have the seal of one of them."""
     names = ("a.csv", "b.csv", seal)
 
@@ -158,9 +154,7 @@ def test_a_death_between_two_renames_leaves_a_mark(
             read_json(tmp_path / seal)
 
 
-def test_a_full_disk_leaves_nothing_half_written_and_no_key_is_overwritten(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_disk_leaves_nothing_half_written_and_no_key_is_overwritten(tmp_path, monkeypatch) -> None:
     write_secret(b"key", tmp_path / "k")
     assert stat.S_IMODE((tmp_path / "k").stat().st_mode) == 0o600
     with pytest.raises(OutputError, match="k: exists; a key is not overwritten"):

@@ -14,9 +14,7 @@ NOTEBOOKS = sorted((DOCS / "notebooks").glob("*.ipynb"))
 
 
 @pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
-def test_a_notebook_prints_what_it_shows(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_notebook_prints_what_it_shows(path, monkeypatch, capsys) -> None:
     """In this process: to start a kernel takes longer than most of them."""
     pyplot = pytest.importorskip("matplotlib.pyplot", reason="the extra notebook is not installed")
     pyplot.switch_backend("agg")

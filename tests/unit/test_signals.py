@@ -31,9 +31,7 @@ def start(*arguments: str | Path) -> subprocess.Popen[str]:
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])
-def test_a_run_that_is_told_to_end_keeps_what_it_has(
-    number: signal.Signals, demo_raw: Path, tmp_path: Path
-) -> None:
+def test_a_run_that_is_told_to_end_keeps_what_it_has(number, demo_raw, tmp_path) -> None:
     pipe, out = tmp_path / "live.raw", tmp_path / "out"
     os.mkfifo(pipe)
     process = start("receive", pipe, "-o", out)

@@ -148,9 +148,7 @@ def test_frames_as_arrow_with_nulls_and_the_filtered_distance() -> None:
 @pytest.mark.parametrize(
     ("method", "library", "extra"), [("to_pandas", "pandas", "pandas"), ("to_arrow", "pyarrow", "parquet")]
 )
-def test_a_library_that_is_missing_is_named(
-    method: str, library: str, extra: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_library_that_is_missing_is_named(method, library, extra, monkeypatch) -> None:
     monkeypatch.setitem(sys.modules, library, None)
     with pytest.raises(evlcp.ConfigError, match=rf"{library} is not installed.*evlcp-sdk\[{extra}\]"):
         getattr(EVENTS, method)()

@@ -78,9 +78,7 @@ def test_help_teaches_by_example(evlcp: Evlcp, command: str) -> None:
     assert "\x1b" not in done.out
 
 
-def test_every_help_fits_a_screen_and_names_what_it_leaves_out(
-    evlcp: Evlcp, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_help_fits_a_screen_and_names_what_it_leaves_out(evlcp, monkeypatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     app = make_app()
     add_plugin_commands(app, Registry.load())
@@ -172,9 +170,7 @@ def test_no_transmitter_is_no_failure(evlcp: Evlcp, noise_raw: Path, tmp_path: P
     assert names_in(tmp_path / "out") == FILES | {"regions.png"}
 
 
-def test_a_recording_of_which_much_is_dropped_is_degraded(
-    evlcp: Evlcp, noise_raw: Path, tmp_path: Path
-) -> None:
+def test_a_recording_of_which_much_is_dropped_is_degraded(evlcp, noise_raw, tmp_path) -> None:
     data = noise_raw.read_bytes()
     middle = data.index(b"% end\n") + 6 + len(data) // 4 * 2
     path = tmp_path / "torn.raw"
@@ -189,9 +185,7 @@ def test_a_recording_of_which_much_is_dropped_is_degraded(
     assert f"lost: {len(data) // 10} " in done.out
 
 
-def test_receive_json_is_one_line_a_recording(
-    evlcp: Evlcp, noise_raw: Path, demo_raw: Path, tmp_path: Path
-) -> None:
+def test_receive_json_is_one_line_a_recording(evlcp, noise_raw, demo_raw, tmp_path) -> None:
     done = evlcp("receive", noise_raw, demo_raw, tmp_path / "none.raw", "-o", tmp_path / "out", "--json")
     assert done.code == 3
     tables = [json.loads(line) for line in done.out.splitlines()]
@@ -230,9 +224,7 @@ SITES = [BarSite(1, 35.1, 137.0, 50.0)]
         ("REC -o OUT --gnss none.csv", "needs --sites"),
     ],
 )
-def test_usage_and_configuration_end_with_2(
-    evlcp: Evlcp, demo_raw: Path, tmp_path: Path, args: str, told: str
-) -> None:
+def test_usage_and_configuration_end_with_2(evlcp, demo_raw, tmp_path, args, told) -> None:
     (tmp_path / "site.toml").write_text(to_toml(SITES))
     places = {"REC": demo_raw, "OUT": tmp_path / "out", "S": tmp_path / "site.toml"}
     done = evlcp("receive", *(places.get(one, one) for one in args.split()))
@@ -288,9 +280,7 @@ class InterruptedSource(RawSource):
             yield piece
 
 
-def test_interrupt_keeps_what_was_decoded(
-    evlcp: Evlcp, demo_raw: Path, noise_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_interrupt_keeps_what_was_decoded(evlcp, demo_raw, noise_raw, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("evlcp_sdk.io.open.RawSource", InterruptedSource)
     before = signal.getsignal(signal.SIGINT)
     done = evlcp("receive", demo_raw, noise_raw, "-o", tmp_path / "out")
@@ -353,9 +343,7 @@ def test_demo_against_the_truth(evlcp: Evlcp, tmp_path: Path) -> None:
     assert all(len(line) <= 80 for line in shown.splitlines() if "±" in line)
 
 
-def test_a_preset_named_as_a_file_is_told_as_one(
-    evlcp: Evlcp, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_preset_named_as_a_file_is_told_as_one(evlcp, tmp_path, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     done = evlcp("simulate", "drive-30kmh", "-o", "rec.raw")
     assert done.code == 2

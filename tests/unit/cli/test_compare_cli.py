@@ -115,14 +115,7 @@ def test_text_and_files(evlcp: Evlcp, recording: Path, tmp_path: Path) -> None:
         (("--variant", "a:camera.width=640"), 2, "recorded with 1280 x 720 pixels"),
     ],
 )
-def test_faults(
-    evlcp: Evlcp,
-    recording: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: tuple[str, ...],
-    code: int,
-    told: str,
-) -> None:
+def test_faults(evlcp, recording, monkeypatch, arguments, code, told) -> None:
     monkeypatch.chdir(recording.parent)
     done = evlcp("compare", "REC.raw", *arguments)
     assert done.code == code

@@ -39,9 +39,7 @@ def gathered(subscription: Subscription) -> dict[str, list[Any]]:
     return found
 
 
-def test_a_replay_gives_what_the_file_gives(
-    demo_raw: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_replay_gives_what_the_file_gives(demo_raw, tmp_path, capsys) -> None:
     publisher = Publisher()
     publisher.pictures.ask()
     mine = publisher.subscribe(most=100_000)

@@ -28,9 +28,7 @@ def served() -> Iterator[tuple[Publisher, dict[str, Server]]]:
         publisher.close()
 
 
-def test_nmea_has_the_time_of_day_where_no_other_is_known(
-    served: tuple[Publisher, dict[str, Server]],
-) -> None:
+def test_nmea_has_the_time_of_day_where_no_other_is_known(served) -> None:
     publisher, services = served
     got, n = b"", 0
     with socket.create_connection(("127.0.0.1", services["nmea"].port), 10) as link:

@@ -276,9 +276,7 @@ def test_a_recording_is_what_came(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("why", ["disk", "clock"])
-def test_what_was_recorded_stays_where_a_recording_has_to_end(
-    why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_recorded_stays_where_a_recording_has_to_end(why, tmp_path, monkeypatch) -> None:
     publisher = Publisher()
     recorder = Recorder(publisher, tmp_path, 1280, 720)
     recorder.start()
@@ -306,9 +304,7 @@ def test_a_port_that_is_taken_is_one_line(stage: Stage) -> None:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="chromium is not installed")
-def test_a_browser_shows_what_the_files_say(
-    demo_raw: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_browser_shows_what_the_files_say(demo_raw, tmp_path, monkeypatch) -> None:
     """Beside one that stalls: a lost link comes back, pictures change, numbers are those of frames.csv."""
     # A slow machine shows the last of it late.
     monkeypatch.setattr(server, "FINISH_S", 60.0)
