@@ -1,5 +1,6 @@
 """What tests share: the shipped recording and how the command line is run."""
 
+import csv
 import gc
 import os
 import signal
@@ -102,6 +103,12 @@ def evlcp(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -
         return Run(code, said.out, "".join(err))
 
     return run
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Of a CSV file with a heading."""
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 @pytest.fixture(scope="session")

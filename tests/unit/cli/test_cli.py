@@ -1,6 +1,5 @@
 """The command line: what it prints, what it writes, how it ends."""
 
-import csv
 import dataclasses
 import json
 import shutil
@@ -22,6 +21,7 @@ from evlcp_sdk.place.gnss import checksum
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.scene.sites import BarSite, LocalAxes, load_sites, to_toml
 from evlcp_sdk.values import Events, Triggers
+from tests.conftest import rows_of
 
 Evlcp = Callable[..., Any]
 FIGURE_NAMES = ("regions.png", "presence.png", "distance.png")
@@ -42,11 +42,6 @@ def noise_raw(tmp_path: Path) -> Path:
 def summary_of(folder: Path) -> dict[str, Any]:
     table: dict[str, Any] = json.loads((folder / "summary.json").read_text())
     return table
-
-
-def rows_of(file: Path) -> list[dict[str, str]]:
-    with file.open(newline="") as opened:
-        return list(csv.DictReader(opened))
 
 
 def words(text: str) -> str:

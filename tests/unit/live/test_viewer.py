@@ -1,6 +1,5 @@
 """The web view: who may look on, what a browser gets and when, and what it shows."""
 
-import csv
 import http.client
 import io
 import json
@@ -32,6 +31,7 @@ from evlcp_sdk.place.navigator import Place, Placed
 from evlcp_sdk.run import live
 from evlcp_sdk.scene.sites import LocalAxes
 from evlcp_sdk.values import Events, Fix, ReceivedMessage, Triggers
+from tests.conftest import rows_of
 from tests.unit.live.helpers import LINKS, PATIENT, sender, until
 from tests.unit.report.test_pages import HOSTILE
 from tests.unit.results.test_positions import SITE, packets
@@ -344,8 +344,7 @@ def test_a_browser_shows_what_the_files_say(demo_raw, tmp_path, monkeypatch) -> 
         runner.join(60)
         assert (summary["status"], summary["live"]["shed"]["too_late"]) == ("complete", 0)
         assert "complete" in browser.until("document.querySelector('#alarm:not([hidden])')?.innerText")
-        with (tmp_path / "out" / "frames.csv").open(newline="") as file:
-            rows = list(csv.DictReader(file))
+        rows = rows_of(tmp_path / "out" / "frames.csv")
         for row, frame in zip(rows, browser.value("shown.last"), strict=True):
             for name in ("transmitter", "packet", "frame"):
                 assert int(row[name]) == frame[name]

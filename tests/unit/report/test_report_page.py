@@ -23,8 +23,9 @@ from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.values import Events, Frame, FrameView, Packet, PresenceMap, Range, SoftSymbols
+from tests.conftest import rows_of
 from tests.unit.report.test_pages import HOSTILE, Elements
-from tests.unit.results.test_positions import ATTITUDE, SITE, packets, rows
+from tests.unit.results.test_positions import ATTITUDE, SITE, packets
 from tests.unit.study.browser import CHROMIUM, Browser
 
 LINK = load_link()
@@ -70,7 +71,7 @@ def reported(folder: Path, name: str = "a.raw", **summary: Any) -> Iterator[Repo
 
 def test_numbers_are_those_of_the_files(result: Path) -> None:
     page = (result / "report.html").read_text()
-    given = rows(result / "frames.csv")
+    given = rows_of(result / "frames.csv")
     assert len(given) == 21
     body = re.findall(r"<tr><td>(\d+)/(\d+)</td>(.*?)</tr>", page, re.DOTALL)
     for row, (packet, frame, cells) in zip(given, body, strict=True):
@@ -105,7 +106,7 @@ def test_numbers_are_those_of_the_files(result: Path) -> None:
 def test_the_slow_motion_is_what_was_sent(result: Path) -> None:
     (first,) = held((result / "report.html").read_text())["motions"]
     named = "transmitter {transmitter}, packet {packet}, frame {frame}"
-    (row,) = [one for one in rows(result / "frames.csv") if named.format(**one) == first["name"]]
+    (row,) = [one for one in rows_of(result / "frames.csv") if named.format(**one) == first["name"]]
     symbols = [int(s) for s in row["symbols"].split()]
     assert first["symbols"] == symbols
     sent = packet_chips(np.array([symbols]), LINK.codebook)[LINK.packet.preamble_chips :]
@@ -194,7 +195,7 @@ def test_the_map_shows_fixes_and_bars(tmp_path: Path) -> None:
         recording = {"path": "a.raw", "duration_s": 0.5, "counts": {"events": 1}}
         summary = out.finish(RunEnd("complete", recording, {"times_real_time": 1.0}))
     told = held((tmp_path / "report.html").read_text())["plots"]
-    fixes = rows(tmp_path / "fixes.csv")
+    fixes = rows_of(tmp_path / "fixes.csv")
     assert summary["positions"]["fixes"] == len(fixes) == len(told["track"]) == len(told["map"]) - 1
     for fix, (_, _, text, _) in zip(fixes, told["track"], strict=True):
         east, north, up = (float(value) for value in re.findall(r"± (\S+) m", text))

@@ -1,6 +1,5 @@
 """The three files of a result: columns, values, streaming, and what is left after a stop or a crash."""
 
-import csv
 import hashlib
 import json
 import math
@@ -25,7 +24,7 @@ from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
-from tests.conftest import ROOT
+from tests.conftest import ROOT, rows_of
 from tests.unit.results.test_positions import packets
 
 LINK = load_link(overrides=["modulation.id=wh8", "air.frames_per_packet=3", "messages.decode=false"])
@@ -59,18 +58,13 @@ def lines_of(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "packets.jsonl").read_text().splitlines()]
 
 
-def rows_of(folder: Path) -> list[dict[str, str]]:
-    with (folder / "frames.csv").open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 def test_the_files_of_a_result(tmp_path: Path) -> None:
     out = tmp_path / "out"
     first, later = packet(0, frame(0, 0), frame(0, 2, math.nan)), packet(2, frame(2, 1, 51.0))
     table = result(out, first, later, packet(0, transmitter=1))
     assert sorted(p.name for p in out.iterdir()) == ["frames.csv", "packets.jsonl", "summary.json"]
 
-    rows = rows_of(out)
+    rows = rows_of(out / "frames.csv")
     assert tuple(rows[0]) == FRAME_COLUMNS
     assert list(rows[0].values()) == [
         *("0", "0", "0", "12345.68", "0 1 2 3 4 5 6 7 8 9 10 11 12 13 14 15", "0.8750"),
@@ -124,7 +118,7 @@ def test_a_symbol_that_is_not_given_is_a_dash_and_null(tmp_path: Path) -> None:
     symbols[[0, 5]] = -1
     hidden = replace(one, soft=replace(one.soft, symbols=symbols))
     result(tmp_path, packet(0, hidden), sinks=["parquet"])
-    (row,), (line,) = rows_of(tmp_path), lines_of(tmp_path)
+    (row,), (line,) = rows_of(tmp_path / "frames.csv"), lines_of(tmp_path)
     assert row["symbols"] == "- 1 2 3 4 - 6 7 8 9 10 11 12 13 14 15"
     assert line["symbols"][0] == [None, 1, 2, 3, 4, None, *range(6, 16)]
     assert line["bits"][:24] == "????" + "0001" + "0010" + "0011" + "0100" + "????"
@@ -137,7 +131,7 @@ def test_a_reflection_is_named_as_one(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
     own, echo = frame(0, 0), replace(frame(0, 0, transmitter=1), echo_of=0)
     table = result(tmp_path, packet(0, own), packet(0, echo, transmitter=1), sinks=["parquet"])
-    assert [row["echo_of"] for row in rows_of(tmp_path)] == ["", "0"]
+    assert [row["echo_of"] for row in rows_of(tmp_path / "frames.csv")] == ["", "0"]
     assert [line["echo_of"] for line in lines_of(tmp_path)] == [None, 0]
     column = parquet.read_table(tmp_path / "frames.parquet")["echo_of"]
     assert (str(column.type), column.to_pylist()) == ("int64", [None, 0])
@@ -158,7 +152,7 @@ def test_a_new_result_replaces_all_of_the_old_one_and_only_at_the_end(tmp_path: 
     assert (table["status"], table["error"]) == ("failed", "found x")
     names = sorted(p.name for p in tmp_path.iterdir())
     assert names == ["frames.csv", "notes.txt", "packets.jsonl", "summary.json"]
-    assert len(rows_of(tmp_path)) == 1
+    assert len(rows_of(tmp_path / "frames.csv")) == 1
 
 
 def test_the_summary_names_every_file_by_its_digest(tmp_path: Path) -> None:
@@ -206,7 +200,10 @@ def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path) -> None:
     parquet = pytest.importorskip("pyarrow.parquet", reason="the extra parquet is not installed")
     link = load_link(overrides=["tracking.id=kalman"])
     result(tmp_path, packet(0, frame(0, 0), frame(0, 1, math.nan)), link=link, sinks=["parquet"])
-    told = [(row["distance_filtered_m"], row["distance_filtered_sigma_m"]) for row in rows_of(tmp_path)]
+    told = [
+        (row["distance_filtered_m"], row["distance_filtered_sigma_m"])
+        for row in rows_of(tmp_path / "frames.csv")
+    ]
     assert told == [("51.0000", "0.0250"), ("", "")]
     table = parquet.read_table(tmp_path / "frames.parquet").to_pylist()
     assert [row["distance_filtered_m"] for row in table] == [51.0, None]

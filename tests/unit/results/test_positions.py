@@ -1,6 +1,5 @@
 """Position files: what is in them, what is not left behind."""
 
-import csv
 import dataclasses
 import io
 import json
@@ -53,8 +52,8 @@ from evlcp_sdk.values import (
     SoftSymbols,
     Triggers,
 )
+from tests.conftest import ROOT, rows_of
 
-EXAMPLES = Path(__file__).parents[3] / "examples"
 LINK = load_link()
 ZERO = datetime(2026, 3, 1, 10, 15, tzinfo=UTC)
 SITE = BarSite(7, 35.0, 137.0, 54.0, length_m=0.96)
@@ -102,11 +101,6 @@ def write(
         return dict(results.finish(RunEnd("complete"))["positions"])
 
 
-def rows(path: Path) -> list[dict[str, str]]:
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
 @contextmanager
 def sink_of(kind: type[AlternativesCsv | PointsCsv], folder: Path) -> Iterator[Sink]:
     with ResultFolder(folder, [kind.name]) as files:
@@ -135,13 +129,13 @@ def sentences(folder: Path) -> list[Any]:
 
 def test_files_of_a_drive(tmp_path: Path) -> None:
     told = write(tmp_path, packets(13), PositionPlan((SITE,)), "figures", clock_zero=ZERO)
-    fixes = rows(tmp_path / "fixes.csv")
+    fixes = rows_of(tmp_path / "fixes.csv")
     assert told["fixes"] == len(fixes) == 12
     assert told["bars"] == {"0": 7}
     assert [(r["part"], r["what"]) for r in told["learnt"]] == [
         ("attitude", name) for name in ("pitch_deg", "roll_deg", "heading_deg")
     ]
-    track = rows(tmp_path / "track.csv")
+    track = rows_of(tmp_path / "track.csv")
     check_places(fixes + track)
     assert {row["refusal"] for row in fixes} == {""}
     assert float(track[6]["speed_m_s"]) == pytest.approx(10, abs=0.5)
@@ -193,7 +187,7 @@ def test_covariance_and_integrity_are_in_every_file(tmp_path: Path) -> None:
             sink.fix(wrong, None)
             sink.finish()
         folder.finish()
-    given, refused = rows(tmp_path / "fixes.csv")
+    given, refused = rows_of(tmp_path / "fixes.csv")
     for axis, i in (("east", 0), ("north", 1), ("up", 2)):
         assert float(given[f"sigma_{axis}_m"]) == pytest.approx(math.sqrt(spread[i, i]), abs=1e-4)
     for pair, (i, j) in (("east_north", (0, 1)), ("east_up", (0, 2)), ("north_up", (1, 2))):
@@ -231,7 +225,7 @@ def test_a_track_goes_on_between_bars(tmp_path: Path) -> None:
     plan = PositionPlan((SITE,), satellites(np.arange(-5, 40) * 1e5 + 7))
     told = write(tmp_path, stream, plan, "figures", "mcap", clock_zero=ZERO, last_us=int(60 * PACKET_US))
     assert (told["gnss"], told["gnss_left_out"], told["gnss_without_heading"]) == (21, 0, 0)
-    fixes, track = rows(tmp_path / "fixes.csv"), rows(tmp_path / "track.csv")
+    fixes, track = rows_of(tmp_path / "fixes.csv"), rows_of(tmp_path / "track.csv")
     assert told["gnss_outside"] == 24
     assert [r["t_us"] for r in fixes] == [r["t_us"] for r in track]
     assert [float(r["t_us"]) for r in track] == sorted(float(r["t_us"]) for r in track)
@@ -247,7 +241,7 @@ def test_bars_and_satellites_that_contradict_one_another(tmp_path: Path) -> None
     plan = PositionPlan((SITE,), satellites(np.arange(5, 20) * 1e5 + 7, 20.0))
     told = write(tmp_path, packets(60), plan, clock_zero=ZERO, last_us=int(60 * PACKET_US))
     assert told["alarms"]["contradicted"] == told["gnss_left_out"] == told["gnss"] == 15
-    fixes = rows(tmp_path / "fixes.csv")
+    fixes = rows_of(tmp_path / "fixes.csv")
     assert {r["contradicted"] for r in fixes if r["source"] == "gnss"} == {"bars"}
     warnings = json.loads((tmp_path / "summary.json").read_text())["warnings"]
     (line,) = [w["text"] for w in warnings if w["code"] == "gnss-contradicted"]
@@ -274,7 +268,7 @@ def test_the_poses_that_fit_are_a_file(tmp_path: Path) -> None:
     with sink_of(AlternativesCsv, tmp_path) as sink:
         sink.fix(fix, None)
         sink.fix(Fix.refused(3e6, (0,), "heading-unknown", ""), None)
-    first, second = rows(tmp_path / "alternatives.csv")
+    first, second = rows_of(tmp_path / "alternatives.csv")
     assert (first["number"], first["likelihood"], first["sigma_up_m"]) == ("0", "1", "0.2000")
     assert (second["latitude_deg"], second["sigma_up_m"], second["bars"]) == ("35.1000000000", "", "0 1")
 
@@ -323,7 +317,7 @@ def test_points_of_frames(tmp_path: Path) -> None:
     ]
     with sink_of(PointsCsv, tmp_path) as sink:
         sink.packet(dataclasses.replace(packet, frames=tuple(frames)))
-    (row,) = rows(tmp_path / "points.csv")
+    (row,) = rows_of(tmp_path / "points.csv")
     point = np.array([float(row[f"{axis}_m"]) for axis in "xyz"])
     np.testing.assert_allclose(LINK.camera.project(point), [700, 300], atol=0.02)
     assert point[2] == 50
@@ -339,11 +333,11 @@ def test_refused_fixes_are_listed_and_counted(tmp_path: Path) -> None:
     told = write(tmp_path, packets(7), PositionPlan((SITE,)), attitude=Attitude(5.0, 0.0))
     assert told["fixes"] == 0
     assert told["refused"] == {"heading-unknown": 6}
-    found = rows(tmp_path / "fixes.csv")
+    found = rows_of(tmp_path / "fixes.csv")
     assert {r["refusal"] for r in found} == {"heading-unknown"}
     assert found[0]["latitude_deg"] == ""
     assert found[0]["detail"]
-    assert rows(tmp_path / "track.csv") == []
+    assert rows_of(tmp_path / "track.csv") == []
     assert sentences(tmp_path)[0].gps_qual == 0
     assert plot_positions([], {}, seconds_since(0.0)) == []
 
@@ -353,7 +347,7 @@ def test_a_long_track_is_smoothed_in_blocks(tmp_path: Path, monkeypatch: pytest.
     write(tmp_path / "whole", stream, plan)
     monkeypatch.setattr(navigator, "_BLOCK", 12)
     write(tmp_path / "blocks", stream, plan)
-    whole, blocks = (rows(tmp_path / name / "track.csv") for name in ("whole", "blocks"))
+    whole, blocks = (rows_of(tmp_path / name / "track.csv") for name in ("whole", "blocks"))
     assert [r["t_us"] for r in whole] == [r["t_us"] for r in blocks]
     apart = [abs(float(a["height_m"]) - float(b["height_m"])) for a, b in zip(whole, blocks, strict=True)]
     assert max(apart) < 0.2 * float(whole[0]["sigma_up_m"])
@@ -372,7 +366,7 @@ def test_kml_is_read_back(tmp_path: Path) -> None:
     sea_m = geoid_m(35.0, 137.0)
     assert 37 < sea_m < 39
     points = [mark for mark in placemarks if mark.find("k:Point", names) is not None]
-    fixes = rows(tmp_path / "fixes.csv")
+    fixes = rows_of(tmp_path / "fixes.csv")
     assert len(points) == len(fixes) + 1
     for row, mark in zip(fixes, points, strict=False):
         where = mark.findtext("k:Point/k:coordinates", "", names).split(",")
@@ -384,7 +378,7 @@ def test_kml_is_read_back(tmp_path: Path) -> None:
     assert points[-1].findtext("k:name", "", names) == "bar 0, id 7"
     (line,) = (mark.findtext("k:LineString/k:coordinates", "", names) for mark in placemarks[len(fixes) : -1])
     track = [[float(part) for part in place.split(",")] for place in line.split()]
-    for row, (longitude, latitude, _) in zip(rows(tmp_path / "track.csv"), track, strict=True):
+    for row, (longitude, latitude, _) in zip(rows_of(tmp_path / "track.csv"), track, strict=True):
         assert (longitude, latitude) == pytest.approx(
             (float(row["longitude_deg"]), float(row["latitude_deg"])), abs=1e-8
         )
@@ -427,7 +421,7 @@ def test_mcap_is_read_back(tmp_path: Path) -> None:
         registry.hook.evlcp_stage_finished(stage="regions", value=region, elapsed_s=0.0)
         results.write(stream)
         results.finish(RunEnd("complete"))
-    fixes = rows(tmp_path / "fixes.csv")
+    fixes = rows_of(tmp_path / "fixes.csv")
     found: dict[str, list[tuple[str, int, Any]]] = {}
     with (tmp_path / "fixes.mcap").open("rb") as file:
         source = reader.make_reader(file, decoder_factories=[DecoderFactory(), JsonDecoderFactory()])
@@ -483,7 +477,7 @@ def texts(node: Any) -> list[str]:
 
 def test_the_layout_shows_what_is_written() -> None:
     """Each panel topics of schemas that Foxglove and its fork Lichtblick can show in it, and all together."""
-    layout = json.loads((EXAMPLES / "foxglove-layout.json").read_text())
+    layout = json.loads((ROOT / "examples" / "foxglove-layout.json").read_text())
     panels, shown = layout["configById"], set()
     assert set(panels) <= set(texts(layout["layout"]))
     assert panels["3D!evlcp"]["followTf"] == FRAME_ID
@@ -517,7 +511,7 @@ def test_navsat_is_read_back(tmp_path: Path) -> None:
             (schema.name, channel.topic, message.log_time, store.deserialize_cdr(message.data, schema.name))
             for schema, channel, message in source.iter_messages()
         ]
-    fixes = rows(tmp_path / "fixes.csv")
+    fixes = rows_of(tmp_path / "fixes.csv")
     places = [one for one in sentences(tmp_path) if one.sentence_type == "GGA"]
     assert {(name, topic) for name, topic, _, _ in told} == {("sensor_msgs/msg/NavSatFix", "/evlcp/fix")}
     assert len(told) == len(fixes) > 2
@@ -539,7 +533,7 @@ def test_times_by_pulses(tmp_path: Path) -> None:
     t_us = [100_000 + round(k * 1_000_040) for k in range(3)]
     pulses.add(Triggers.of(t_us, [0, 0, 0], [1, 1, 1]), 0.0, 0.0)
     write(tmp_path, packets(6), PositionPlan((SITE,)), "kml", "mcap", "navsat", clock_zero=pulses)
-    fixes = rows(tmp_path / "fixes.csv")
+    fixes = rows_of(tmp_path / "fixes.csv")
     moved = [one for one in sentences(tmp_path) if one.sentence_type == "RMC"]
     told = [datetime.combine(one.datestamp, one.timestamp) for one in moved]
     assert len(told) == len(fixes) > 2

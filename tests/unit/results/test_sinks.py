@@ -1,6 +1,5 @@
 """Sinks: a format is one file and one hook; what fails is named, and leaves nothing."""
 
-import csv
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +18,7 @@ from evlcp_sdk.results.summary import RunEnd
 from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive, receive_to_folder
 from evlcp_sdk.values import Packet
+from tests.conftest import rows_of
 from tests.unit.results import distances
 from tests.unit.results.test_positions import packets
 
@@ -37,8 +37,7 @@ def test_the_built_in_formats_come_by_the_same_hook() -> None:
 def test_a_format_is_one_file_and_one_hook(demo_raw: Path, tmp_path: Path) -> None:
     registry = Registry.load(distances)
     table = receive_to_folder(demo_raw, tmp_path, registry=registry, sinks=["distances"])
-    with (tmp_path / "frames.csv").open(newline="") as file:
-        rows = [row for row in csv.DictReader(file) if row["distance_m"]]
+    rows = [row for row in rows_of(tmp_path / "frames.csv") if row["distance_m"]]
     lines = (tmp_path / "distances.line").read_text().splitlines()
     found = [line.split() for line in lines]
     assert [value for _, value, _ in found] == [f"depth_m={row['distance_m']}" for row in rows]
