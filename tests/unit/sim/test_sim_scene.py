@@ -62,19 +62,17 @@ def test_faults_are_told_with_their_path(table: dict[str, Any], says: str) -> No
 
 
 @pytest.mark.parametrize(
-    ("scene", "override", "says"),
+    ("override", "says"),
     [
-        ("night", "nonsense", "--set nonsense: expected table.key=value"),
-        ("night", "mation.x=1", "--set mation.x: unknown table; did you mean 'motion'?"),
-        ("night", "seed.seed=5", "--set seed.seed: unknown table"),
-        ("night", "bars.7.ppm=1", "--set bars.7.ppm: expected one of 1 bar, from 0 on"),
-        ("nigt", "seed=1", "nigt: no such file, and no preset of that name; did you mean 'night'?"),
+        ("nonsense", "--set nonsense: expected table.key=value"),
+        ("mation.x=1", "--set mation.x: unknown table; did you mean 'motion'?"),
+        ("seed.seed=5", "--set seed.seed: unknown table"),
+        ("bars.7.ppm=1", "--set bars.7.ppm: expected one of 1 bar, from 0 on"),
     ],
 )
-def test_wrong_overrides_and_names_are_told(scene: str, override: str, says: str) -> None:
-    with pytest.raises(ConfigError) as fault:
-        load_scene(scene, [override])
-    assert str(fault.value).startswith(says)
+def test_wrong_overrides_are_told(override: str, says: str) -> None:
+    with pytest.raises(ConfigError, match=f"^{re.escape(says)}"):
+        load_scene("night", [override])
 
 
 def test_a_bar_sends_what_the_air_interface_says() -> None:
@@ -97,14 +95,12 @@ def test_a_bar_sends_given_symbols_and_chips(tmp_path: Path) -> None:
     assert light.sent_symbols(0.05) == [[list(range(16))] * 10] * 2
     chips = np.random.default_rng(0).integers(0, 2, (50, 16))
     np.save(tmp_path / "chips.npy", chips)
-    sent = BarLight(
-        BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=40.0), LINK, LensSpec(), seed=0
-    )
+    bar = BarSpec(chips_file=str(tmp_path / "chips.npy"), start_chip=40.0)
+    sent = BarLight(bar, LINK, LensSpec(), seed=0)
     assert (sent.switches(0.0, 3000.0)[1] == np.concatenate([chips[40:], chips[:20]])).all()
     assert sent.sent_symbols(1.0) == []
-    assert sent.longest_us == 100 * max(
-        len(run) for row in np.tile(chips, (2, 1)).T for run in re.findall("0+|1+", "".join(map(str, row)))
-    )
+    texts = ["".join(map(str, row)) for row in np.tile(chips, (2, 1)).T]
+    assert sent.longest_us == 100 * max(len(run) for text in texts for run in re.findall("0+|1+", text))
     (tmp_path / "text.npy").write_text("chips")
     for link, wrong, says in (
         (LINK, {"symbols": ((tuple(range(16)),),)}, r"bars\.0\.symbols\.0: 1 frames, expected 10"),
@@ -144,11 +140,9 @@ def test_a_path_of_a_file_is_followed(tmp_path: Path) -> None:
     assert truth_of(scene).to_table()["distance_m"][0][100] == pytest.approx(39, abs=0.05)
     with pytest.raises(ConfigError, match=r"lasts from 0\.0 to 0\.2 s"):
         Simulation(load_scene(tmp_path / "scene.toml", ["duration_s=0.3"]))
+    ahead = [line.replace("-", "") for line in lines]
     for wrong, says in (
-        (
-            [line.replace("-", "") for line in lines],
-            r"bars\.0: the bar is behind the camera .*depth -40\.00 m",
-        ),
+        (ahead, r"bars\.0: the bar is behind the camera .*depth -40\.00 m"),
         ([lines[0], "0,0,0,x,0,0,0"], "line 2: z_m = 'x': expected a number"),
         ([lines[0], lines[2], lines[1]], "rising t_s"),
     ):
@@ -180,26 +174,22 @@ def test_the_vibration_has_its_rate_and_its_spectrum() -> None:
 
 def test_simulate_writes_a_recording_and_its_truth(tmp_path, evlcp, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
-    first = evlcp("simulate", "--preset", "night", "-o", "a.raw", "--set", "duration_s=0.02", "--json")
+    short = ("--set", "duration_s=0.02")
+    first = evlcp("simulate", "--preset", "night", "-o", "a.raw", *short, "--json")
     assert first.code == 0, first.err
-    summary = json.loads(first.out)
-    found = json.loads((tmp_path / "a.truth.json").read_text())
-    assert summary["bytes"] == found["bytes"] == (tmp_path / "a.raw").stat().st_size
+    summary, found = json.loads(first.out), json.loads(Path("a.truth.json").read_text())
+    assert summary["bytes"] == found["bytes"] == Path("a.raw").stat().st_size
     assert found["events"] == summary["events"] > 1000
-    assert evlcp("info", "a.raw").code == 0
     # The truth holds the scene, which gives the recording again.
     again = Simulation(resolve_scene(found["simulator"]))
     assert sum(map(len, again.stream())) == found["events"]
-    second = evlcp("simulate", "--preset", "night", "--seed", "5", "-o", "b.raw", "--set", "duration_s=0.02")
+    second = evlcp("simulate", "--preset", "night", "--seed", "5", "-o", "b.raw", *short)
     assert second.code == 0
     assert "written: b.raw, b.truth.json" in second.out
-    assert (tmp_path / "b.raw").read_bytes() != (tmp_path / "a.raw").read_bytes()
-    shown = evlcp("simulate", "--preset", "night", "--show")
-    (tmp_path / "c.toml").write_text(shown.out)
-    third = evlcp("simulate", "c.toml", "-o", "c.raw", "--set", "duration_s=0.02", "--threads", "2")
-    assert third.code == 0
-    body = [(tmp_path / f"{n}.raw").read_bytes().split(b"% end\n", 1)[1] for n in "ac"]
-    assert body[0] == body[1]
+    Path("c.toml").write_text(evlcp("simulate", "--preset", "night", "--show").out)
+    assert evlcp("simulate", "c.toml", "-o", "c.raw", *short, "--threads", "2").code == 0
+    bodies = [Path(f"{name}.raw").read_bytes().split(b"% end\n", 1)[1] for name in "abc"]
+    assert bodies[0] == bodies[2] != bodies[1]
     assert set(json.loads(evlcp("simulate", "--presets", "--json").out)) == set(preset_names())
     assert "drive-30kmh" in evlcp("simulate", "--presets").out
 
@@ -215,11 +205,13 @@ def test_simulate_writes_a_recording_and_its_truth(tmp_path, evlcp, monkeypatch)
         (("-o", "a.raw"), 2, ""),
         (("--preset", "night"), 2, ""),
         (("x.toml", "--show"), 2, ""),
+        (("nigt", "-o", "a.raw"), 2, "nigt: no such file, and no preset of that name; did you mean 'night'?"),
+        (("drive-30kmh", "-o", "a.raw"), 2, "drive-30kmh: no such file; for the preset: --preset drive-30km"),
     ],
 )
 def test_simulate_tells_what_is_wrong(arguments, code, says, tmp_path, evlcp, monkeypatch) -> None:
     monkeypatch.chdir(tmp_path)
     done = evlcp("simulate", *arguments)
     assert done.code == code
-    assert says in done.err
+    assert says in " ".join(done.err.replace("│", " ").split())
     assert list(tmp_path.iterdir()) == []
