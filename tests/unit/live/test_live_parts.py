@@ -63,17 +63,14 @@ def test_quantiles_are_those_of_numpy_to_two_percent() -> None:
 @pytest.mark.parametrize("size", [(5, 4), (3, 7), (16, 1), (1, 2), (1, 1), (34, 50), (640, 480)])
 @pytest.mark.parametrize("density", [0.0, 0.0003, 0.01, 0.3, 3.0])
 def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
-    width, height = size
-    rng = np.random.default_rng(1)
+    (width, height), rng = size, np.random.default_rng(1)
     image, cells = EventImage(width, height), np.zeros((height, width), np.uint8)
     for _ in range(2):
         n = int(width * height * density)
         # Some lie outside.
-        x, y, p = rng.integers(0, width + 2, n), rng.integers(0, height + 1, n), rng.integers(0, 2, n)
-        image.paint(Events.of(np.arange(n), x, y, p))
-        for column, row, sign in zip(x.tolist(), y.tolist(), p.tolist(), strict=True):
-            if row < height and column < width:
-                cells[row, column] |= 1 << sign
+        events = Events.of(*(rng.integers(0, most, n) for most in (9, width + 2, height + 1, 2)))
+        image.paint(events)
+        paint(cells, events)
     assert (image.cells == cells).all()
     told = image.png()
     with Image.open(io.BytesIO(told)) as picture:
@@ -86,27 +83,30 @@ def test_a_picture_is_read_back(size: tuple[int, int], density: float) -> None:
     assert not image.cells.any()
 
 
+def paint(cells: np.ndarray, events: Events) -> None:
+    """One by one: 1 where a pixel went off, 2 where it went on, 3 both."""
+    height, width = cells.shape
+    for column, row, sign in zip(events.x.tolist(), events.y.tolist(), events.p.tolist(), strict=True):
+        if row < height and column < width:
+            cells[row, column] |= 1 << sign
+
+
 def test_a_picture_shows_what_each_pixel_did() -> None:
     slot = PictureSlot()
     slot.ask()
     events = events_at(np.sort(np.random.default_rng(2).integers(0, 50_000, 4000)))
     drawn = []
     for from_us in range(0, 50_000, 5000):
-        piece = events[(events.t_us >= from_us) & (events.t_us < from_us + 5000)]
         if from_us in (25_000, 45_000):
             slot.ask()
         before = slot.newest
-        slot.add(piece, 1280, 720, [])
+        slot.add(events[(events.t_us >= from_us) & (events.t_us < from_us + 5000)], 1280, 720, [])
         if slot.newest is not before:
             drawn.append(slot.newest)
-    assert [picture.number for picture in drawn if picture] == [0, 1, 2]
+    assert [picture.number for picture in drawn] == [0, 1, 2]
     for picture in drawn:
-        assert picture is not None
         cells = np.zeros((720, 1280), np.uint8)
-        inside = (events.t_us > picture.t_us - 10_000) & (events.t_us <= picture.t_us)
-        for polarity in (0, 1):
-            some = events[inside & (events.p == polarity)]
-            cells[some.y, some.x] |= 1 << polarity
+        paint(cells, events[(events.t_us > picture.t_us - 10_000) & (events.t_us <= picture.t_us)])
         assert (picture.image().cells == cells).all()
 
 
@@ -116,14 +116,13 @@ def test_what_is_shed_and_counted_is_what_lies_outside() -> None:
     shedder = Shedder(1280, 720)
     assert shedder.shed(events, 0, regions) is events
     assert shedder.shed(events, 4, []) is events
-    rows = [y for y in range(720) if any(abs(y - r.y_px) <= r.height_px / 2 + 16 for r in regions)]
-    by_rows = shedder.shed(events, 1, regions)
-    assert (by_rows.t_us == events.t_us[np.isin(events.y, rows)]).all()
-    inside = np.zeros(len(events), bool)
+    rows, inside = set(), np.zeros(len(events), bool)
     for r in regions:
-        near_x = np.abs(events.x - r.x_px) <= r.width_px / 2 + 16
-        inside |= near_x & (np.abs(events.y - r.y_px) <= r.height_px / 2 + 16)
-    by_area = shedder.shed(events, 3, regions)
+        near_y = np.abs(events.y - r.y_px) <= r.height_px / 2 + 16
+        inside |= near_y & (np.abs(events.x - r.x_px) <= r.width_px / 2 + 16)
+        rows |= set(events.y[near_y].tolist())
+    by_rows, by_area = shedder.shed(events, 1, regions), shedder.shed(events, 3, regions)
+    assert (by_rows.t_us == events.t_us[np.isin(events.y, list(rows))]).all()
     assert (by_area.t_us == events.t_us[inside]).all()
     assert shedder.counts == {
         "rows_outside_regions": len(events) - len(by_rows),
@@ -184,33 +183,29 @@ class Counted(EventSource):
         pass
 
 
-def read_all(reader: Reader, source: Counted) -> list[int]:
-    """What a reader gives that has read all there is, or all that it may, before it is asked."""
+def read_all(source: Counted) -> tuple[Reader, list[int]]:
+    """A reader that has read all there is, or all that it may, before it is asked; and what it gives."""
+    reader, got = Reader(source), []
     reader.start()
     if source.live:
         assert source.all_taken.wait(60)
-    got = []
     while not reader.ended:
         piece = reader.take(0.05)
         if piece is not None:
             got.append(int(piece.events.t_us[0]))
-    return got
+    return reader, got
 
 
 def test_a_file_waits_for_its_reader_and_a_camera_does_not(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("evlcp_sdk.live.reader._MOST_EVENTS", 50)
-    source = Counted(live=False)
-    reader = Reader(source)
-    assert read_all(reader, source) == list(range(1000))
+    reader, got = read_all(Counted(live=False))
+    assert got == list(range(1000))
     assert (reader.dropped, reader.fault) == (0, None)
-    source = Counted(live=True)
-    reader = Reader(source)
-    got = read_all(reader, source)
+    reader, got = read_all(Counted(live=True))
     assert got == list(range(1000 - len(got), 1000))
     assert reader.dropped == 10 * (1000 - len(got)) > 0
     monkeypatch.undo()
     fault = InputError("unplugged")
-    source = Counted(live=True, fault=fault)
-    reader = Reader(source)
-    assert len(read_all(reader, source)) == 1000
+    reader, got = read_all(Counted(live=True, fault=fault))
+    assert len(got) == 1000
     assert reader.fault is fault
