@@ -33,29 +33,21 @@ class Outer:
     ("table", "says"),
     [
         ({}, "count: missing"),
-        ({"count": "1"}, 'count = "1": expected a valid integer'),
-        ({"count": 1, "iner": {}}, "iner: unknown table; did you mean 'inner'? (known: count, inner,"),
-        ({"count": 1, "inner": {"width": 3}}, "inner.width = 3: unknown key; did you mean 'width_m'?"),
-        ({"count": 1, "rows": {}}, "rows: expected a list"),
-        ({"count": 1, "rows": [{}, {"width_m": -1}]}, "rows.1.width_m = -1: expected greater than 0"),
-        ({"count": 1, "rows": [{"nam": "y"}]}, "rows.0.nam = \"y\": unknown key; did you mean 'name'?"),
-        ({"count": 1, "maybe": {"nam": "y"}}, "maybe.nam = \"y\": unknown key; did you mean 'name'?"),
-        ({"count": 1, "inner": {"name": "X"}}, 'inner.name = "X": expected to match pattern'),
+        ({"iner": {}}, "iner: unknown table; did you mean 'inner'? (known: count, inner,"),
+        ({"rows": {}}, "rows: expected a list"),
+        ({"rows": [{}, {"width_m": -1}]}, "rows.1.width_m = -1: expected greater than 0"),
+        ({"rows": [{"nam": "y"}]}, "rows.0.nam = \"y\": unknown key; did you mean 'name'?"),
+        ({"maybe": {"nam": "y"}}, "maybe.nam = \"y\": unknown key; did you mean 'name'?"),
+        ({"inner": {"name": "X"}}, 'inner.name = "X": expected to match pattern'),
+        ({"either": 3}, "either = 3: expected a valid string or a table"),
     ],
 )
-def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table: dict[str, Any], says: str) -> None:
+def test_a_fault_is_one_line_with_path_value_and_what_was_expected(table, says) -> None:
     with pytest.raises(SpecError) as caught:
-        build(Outer, table)
+        build(Outer, {"count": 1} | table if table else {})
     (line,) = caught.value.lines("f.toml: ")
     assert line.startswith(f"f.toml: {says}")
     assert caught.value.exit_code == 2
-
-
-def test_a_value_that_may_be_of_two_types_has_one_line() -> None:
-    assert build(Outer, {"count": 1, "either": {"a": 1}}).either == {"a": 1}
-    with pytest.raises(SpecError) as refused:
-        build(Outer, {"count": 1, "either": 3})
-    assert refused.value.lines() == ["either = 3: expected a valid string or a table"]
 
 
 def test_what_the_dataclass_refuses_passes_and_a_hint_stands_for_the_nearest() -> None:
