@@ -2,7 +2,6 @@
 point in the camera's axes, against drawn errors.
 """
 
-import dataclasses
 import math
 from dataclasses import replace
 
@@ -23,6 +22,8 @@ T_US = (np.arange(9) - 4.3) * 3600.0
 BAR_PX = np.stack([np.full(16, 300.0), 200.0 + 8.0 * np.arange(16)], 1)
 LINE_M = np.stack([np.zeros(16), 0.06 * np.arange(16), np.zeros(16)], 1)
 LEVER = (np.arange(16) - 7.5) / 7.5
+LINE = math.sqrt(np.linalg.inv(np.vander(T_US / 1e4, 2).T @ np.vander(T_US / 1e4, 2))[1, 1])
+"""Sigma at 0 of a straight line through the frames, of errors of 1."""
 
 
 def seen(
@@ -40,11 +41,10 @@ def seen(
 
 
 def trials(
-    step_px: float, white_px: float, lean: float, stated_px: float, pixel_px: float, seed: int
-) -> tuple[Floats, Floats, Floats, Floats]:
-    """Errors of the shape, float64 (trials, 16, 2), and what is said of them.
-
-    Sigmas, that of pixels, and how much it is across.
+    seed: int, step_px: float, white_px: float | list[float], *,
+    pixel_px: float = 0.0, lean: float = 0.0, stated_px: float = 0.1, spec: ErrorModel = SPEC,
+) -> tuple[Floats, Floats, Floats, Floats]:  # fmt: skip
+    """Errors of the shape, float64 (400, 16, 2), and what is said of them: sigmas, of pixels, and across.
 
     Between two frames the image moves by a step to the right. An error within pixels is a Gaussian process of
     the place, which forgets within a pixel; beside it white errors, and in each frame another lean.
@@ -53,26 +53,23 @@ def trials(
     course = T_US[:, None, None] / 3600.0 * np.array([step_px, 0.0])
     apart = np.abs(T_US[:, None] - T_US) / 3600.0 * step_px
     root = np.linalg.cholesky(np.exp(-apart) + 1e-9 * np.eye(9))
-    errors, sigmas, pixels, across = [], [], [], []
+    errors, views = [], []
     for _ in range(400):
         pixel = np.einsum("ij,jkl->ikl", root, rng.normal(0, pixel_px, (9, 16, 2)))
         points = BAR_PX + course + pixel + rng.normal(0, white_px, (9, 16, 2))
         points[:, :, 0] += 60.0 * LEVER * rng.normal(0, lean, 9)[:, None]
-        found = seen(points, stated_px)
-        error = found.points_px - BAR_PX
-        errors.append(error - error.mean(0))
-        sigmas.append(found.sigma_px)
-        pixels.append(found.pixel_px)
-        across.append(found.across)
-    return np.array(errors), np.array(sigmas), np.array(pixels), np.array(across)
+        views.append(seen(points, stated_px, spec))
+        errors.append(views[-1].points_px - BAR_PX)
+    off = np.array(errors)
+    told = ([getattr(view, name) for view in views] for name in ("sigma_px", "pixel_px", "across"))
+    return off - off.mean(1, keepdims=True), *map(np.array, told)
 
 
 @pytest.mark.parametrize("step_px", [0.0, 0.5, 3.0])
 def test_an_error_within_pixels_stays_as_long_as_the_image_does(step_px: float) -> None:
-    errors, sigmas, pixels, _ = trials(step_px, 0.1, 0.0, 0.1, 0.08, seed=1)
+    errors, sigmas, pixels, _ = trials(1, step_px, 0.1, pixel_px=0.08)
     # Their mean is taken with the bar's place.
-    drawn = 0.1 * math.sqrt(float((weights() ** 2).sum()))
-    pixel = math.sqrt(errors.var() * 16 / 15 - drawn**2)
+    pixel = math.sqrt(errors.var() * 16 / 15 - (0.1 * LINE) ** 2)
     assert pixels.mean() == pytest.approx(pixel, rel=0.12)
     # Where it moves, frames scatter by it, too, which is not told from a lean.
     assert 0.7 < math.sqrt((errors**2).mean() * 16 / 15) / sigmas.mean() < 1.1
@@ -80,22 +77,15 @@ def test_an_error_within_pixels_stays_as_long_as_the_image_does(step_px: float) 
         assert pixels == pytest.approx(0.08, abs=0.003)
 
 
-def weights() -> Floats:
-    """Of frames in a straight line's value at 0, by its normal equations."""
-    line = np.stack([np.ones(9), T_US / 1e4], 1)
-    return np.asarray(np.linalg.solve(line.T @ line, line.T)[0])
-
-
 def test_frames_that_scatter_as_they_say_say_it_all() -> None:
-    _, sigmas, pixels, _ = trials(3.0, 0.1, 0.0, 0.1, 0.0, seed=2)
+    _, sigmas, pixels, _ = trials(2, 3.0, 0.1)
     drawn = np.sqrt(sigmas[:, 0] ** 2 - pixels**2)
-    said = 0.1 * math.sqrt(float((weights() ** 2).sum()))
-    assert (drawn >= said * (1 - 1e-9)).all()
-    assert drawn.mean() < 1.25 * said
+    assert (drawn >= 0.1 * LINE * (1 - 1e-9)).all()
+    assert drawn.mean() < 1.25 * 0.1 * LINE
 
 
 def test_a_bar_that_leans_otherwise_in_each_frame_is_less_sure() -> None:
-    errors, sigmas, _, across = trials(3.0, 0.05, 0.01, 0.05, 0.0, seed=3)
+    errors, sigmas, _, across = trials(3, 3.0, 0.05, lean=0.01, stated_px=0.05)
     mode = LEVER / np.linalg.norm(LEVER)
     lean = errors[:, :, 0] @ mode
     said = across * np.sqrt((sigmas**2) @ mode**2)
@@ -105,25 +95,17 @@ def test_a_bar_that_leans_otherwise_in_each_frame_is_less_sure() -> None:
     # Along it, they scatter as they say.
     assert float(np.mean(sigmas**2)) < 0.2 * float(np.mean(said**2))
     # By what frames state alone it was beyond 3 sigmas in the mean.
-    stated = math.hypot(0.05 * math.sqrt(float((weights() ** 2).sum())), 0.03)
-    assert float(np.mean((lean / stated) ** 2)) > 10
+    assert float(np.mean((lean / math.hypot(0.05 * LINE, 0.03)) ** 2)) > 10
 
 
 @pytest.mark.parametrize("across_px", [0.02, 0.06, 0.18])
 def test_errors_across_a_bar_are_said_by_what_it_shows(across_px: float) -> None:
     """White errors of another size across than along: said within a factor of what there is, safe side."""
-    rng = np.random.default_rng(4)
-    errors, said = [], []
-    for _ in range(300):
-        points = BAR_PX + rng.normal(0, [across_px, 0.06], (9, 16, 2))
-        found = seen(points, 0.06, EXACT)
-        error = found.points_px - BAR_PX
-        errors.append((error - error.mean(0)).T)
-        said.append([found.across * found.sigma_px.mean(), found.sigma_px.mean()])
-    there, said_px2 = np.var(errors, axis=(0, 2)) * 16 / 15, np.mean(np.square(said), axis=0)
+    errors, sigmas, _, across = trials(4, 0.0, [across_px, 0.06], stated_px=0.06, spec=EXACT)
+    there, along = np.var(errors, axis=(0, 1)) * 16 / 15, sigmas.mean(1)
     # The lean's share is taken larger than the points' about a line, by 1.8, and of two estimates the larger.
-    assert 1.2 < said_px2[0] / there[0] < 2.3
-    assert 1.0 < said_px2[1] / there[1] < 1.5
+    assert 1.2 < np.mean((across * along) ** 2) / there[0] < 2.3
+    assert 1.0 < np.mean(along**2) / there[1] < 1.5
 
 
 def seen_as(layout_m: Floats, noise_px: float, seed: int) -> BarView:
@@ -156,13 +138,10 @@ def test_a_layouts_own_form_and_its_perspective_are_no_errors(shape: str) -> Non
     assert 1.2 < np.mean(squares) / 0.05**2 < 2.2
 
 
-def test_too_few_clusters_show_nothing_of_their_errors() -> None:
-    few = np.repeat(BAR_PX[None, :4], 9, 0)
-    assert seen(few, 0.1, replace(EXACT, min_points=2), LINE_M[:4]).across == 1.0
-
-
-def test_points_without_an_error_are_not_exact_across() -> None:
-    assert seen(np.repeat(BAR_PX[None], 9, 0), 0.1, EXACT).across == pytest.approx(0.1)
+def test_too_few_clusters_show_nothing_of_their_errors_and_points_without_are_not_exact() -> None:
+    still = np.repeat(BAR_PX[None], 9, 0)
+    assert seen(still[:, :4], 0.1, replace(EXACT, min_points=2), LINE_M[:4]).across == 1.0
+    assert seen(still, 0.1, EXACT).across == pytest.approx(0.1)
 
 
 def test_what_a_thin_line_does_not_show_is_that_of_a_sampled_profile() -> None:
@@ -223,7 +202,7 @@ def test_the_point_is_the_one_that_is_seen() -> None:
     np.testing.assert_allclose(found.point_m, true, atol=1e-6)
     # The sigma of the distance is along the line of sight, not along the axis.
     along = true / 40.0
-    spec = dataclasses.replace(POINTS_ONLY, stretch_share=0.001)
+    spec = replace(POINTS_ONLY, stretch_share=0.001)
     exact = bar_point(ranged(x, y, 40.0, 0.1), 0.96, BENT, spec=spec)
     stretched = 0.1**2 + (40 * 0.001) ** 2
     np.testing.assert_allclose(exact.covariance_m2, stretched * np.outer(along, along), atol=1e-9)
@@ -251,7 +230,7 @@ def test_every_error_is_in_its_covariance() -> None:
         values = {
             name: getattr(BENT, name) + v for name, v in zip(CAMERA_PARAMETERS[1:], off[1:], strict=True)
         }
-        lens = dataclasses.replace(BENT, focal_mm=BENT.focal_mm * (1 + off[0] / BENT.focal_px), **values)
+        lens = replace(BENT, focal_mm=BENT.focal_mm * (1 + off[0] / BENT.focal_px), **values)
         shift = math.hypot(0.2, 0.002 * BENT.focal_px * 0.96 / 25)
         x, y = lens.project(true) + rng.normal(0, shift, 2)
         # By its length in the image a bar is the farther, the longer the lens is said to be.

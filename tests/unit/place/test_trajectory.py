@@ -1,6 +1,7 @@
 """The track against dense solutions and fine steps of its model, and its consistency on simulated drives."""
 
 import dataclasses
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -15,20 +16,6 @@ from tests.unit.place.place_scenes import Floats, by_chance, fix, square
 SPEC = ErrorModel(acceleration_m2_s3=2.0)
 SIGMA_M = np.array([0.3, 0.1, 0.05])
 NOISE_M2 = np.diag(SIGMA_M**2)
-
-
-def drive(rng: np.random.Generator, n: int) -> tuple[Floats, Floats]:
-    """Times, us, at uneven steps, and states (n, 6) of white acceleration from a likely start."""
-    t_s = np.cumsum(rng.uniform(0.01, 0.2, n))
-    states = np.empty((n, 6))
-    states[0] = np.concatenate([rng.normal(0, 100, 3), rng.normal(0, 30, 3)])
-    for i in range(1, n):
-        dt = t_s[i] - t_s[i - 1]
-        power = SPEC.acceleration_m2_s3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        kick = np.linalg.cholesky(power) @ rng.normal(size=(2, 3))
-        states[i, :3] = states[i - 1, :3] + dt * states[i - 1, 3:] + kick[0]
-        states[i, 3:] = states[i - 1, 3:] + kick[1]
-    return t_s * 1e6, states
 
 
 def test_an_outlier_is_left_out_and_a_new_place_starts_a_trajectory() -> None:
@@ -58,21 +45,14 @@ def seen_by(t_us: float) -> list[str]:
     return ["camera", *(f"bar {i}" for i in range(3) if abs(at - 0.5 * i) < 0.6)]
 
 
-def disturbed(rng: np.random.Generator, t_us: Floats, states: Floats, slow_m: float) -> list[Fix]:
-    """Fixes with noise, with errors of a memory, and with standing errors."""
-    standing = {name: rng.normal(size=2) for name in ("camera", "bar 0", "bar 1", "bar 2")}
-    slow, fixes, last = rng.normal(size=3), [], t_us[0]
-    for t, state in zip(t_us, states, strict=True):
-        fade = np.exp(-(t - last) * 1e-6 / SPEC.slow_s)
-        slow = fade * slow + np.sqrt(1 - fade**2) * rng.normal(size=3)
-        last = t
-        moves = {name: moves_at(t, name) for name in seen_by(t)}
-        place = state[:3] + rng.normal(size=3) * SIGMA_M + slow_m * slow
-        place = place + sum((m @ standing[n] for n, m in moves.items()), np.zeros(3))
-        slow_m2 = slow_m**2 * np.eye(3)
-        spread = NOISE_M2 + slow_m2 + sum(m @ m.T for m in moves.values())
-        fixes.append(fix(t, place, NOISE_M2, covariance_m2=spread, slow_m2=slow_m2, standing=moves))
-    return fixes
+def disturbed(rng: np.random.Generator, count: int) -> list[Fix]:
+    """Fixes at uneven times with noise, errors of a memory and standing errors, anywhere: all is linear."""
+    found = []
+    for t_us in 1e6 * np.cumsum(rng.uniform(0.01, 0.2, count)):
+        moves = {name: moves_at(t_us, name) for name in seen_by(t_us)}
+        place = rng.normal(0, 3, 3)
+        found.append(fix(t_us, place, NOISE_M2, slow_m2=0.04 * np.eye(3), standing=moves))
+    return found
 
 
 def dense(fixes: list[Fix], names: list[str]) -> tuple[Floats, Floats, Floats]:
@@ -122,10 +102,8 @@ def dense(fixes: list[Fix], names: list[str]) -> tuple[Floats, Floats, Floats]:
 
 
 def test_standing_and_slow_errors_are_those_of_the_dense_problem() -> None:
-    rng = np.random.default_rng(21)
-    t_us, states = drive(rng, 14)
-    fixes = disturbed(rng, t_us, states, 0.2)
-    spec = dataclasses.replace(SPEC, gate_sigmas=50.0)
+    fixes = disturbed(np.random.default_rng(21), 14)
+    spec = dataclasses.replace(SPEC, gate_sigmas=1e3)
     points = filter_fixes(fixes, spec)
     smooth = smooth_trajectory(points, spec)
     names = [cause.name for cause in points[-1].causes]
@@ -235,97 +213,75 @@ STRONG = ErrorModel(acceleration_m2_s3=0.7, rate_white_deg_rts=2.0, push_white_m
 VELOCITY = np.array([8.0, 5.0, -1.0])
 
 
-def motion(*, gyro: bool = False, push: bool = False) -> ImuMotion:
+def motion(push: bool) -> ImuMotion:
     t = np.linspace(0, 3, 61)
-    turn = 0.6 * t + 0.3 * np.sin(2 * t)
     pushed = np.stack([2 * np.sin(t), np.cos(3 * t), 0.5 * t], 1) if push else None
-    return ImuMotion(t, turn, gyro, pushed)
+    return ImuMotion(t, 0.6 * t + 0.3 * np.sin(2 * t), True, pushed)
 
 
 def stepped(
-    way: ImuMotion, velocity: Floats, heading: float, imu: Floats, turned: Floats | float = 0.0
-) -> Floats:
-    """Place and velocity in the end, by many short steps; `turned` is added to the heading at each."""
-    steps = 6000
-    t = (np.arange(steps) + 0.5) * way.t_s[-1] / steps
-    dt = way.t_s[-1] / steps
-    bias = imu * imu_sigmas(way, STRONG)
-    angle = np.interp(t, way.t_s, way.turn_rad) - (bias[0] * t if way.gyro else 0.0) + turned
+    way: ImuMotion, velocity: Floats, heading: float, imu: Floats,
+    kicked_s: float = np.inf, turn: float = 0.0, kick: Floats | float = 0.0,
+) -> Floats:  # fmt: skip
+    """Place and velocity in the end, by many short steps; from a time on heading and velocity are off."""
+    steps, end = 6000, way.t_s[-1]
+    dt = end / steps
+    t = np.append((np.arange(steps) + 0.5) * dt, end)
+    late, bias = (t > kicked_s)[:, None], imu * imu_sigmas(way, STRONG)
+    angle = np.interp(t, way.t_s, way.turn_rad) - bias[0] * t + turn * late[:, 0]
+    speed = velocity + late * kick
     if way.push_m_s2 is None:
-        east = velocity[0] * np.cos(angle) + velocity[1] * np.sin(angle)
-        north = -velocity[0] * np.sin(angle) + velocity[1] * np.cos(angle)
-        place = np.array([east.sum(), north.sum(), velocity[2] * steps]) * dt
-        last = way.turn_rad[-1] - (bias[0] * way.t_s[-1] if way.gyro else 0.0)
-        last += turned[-1] if isinstance(turned, np.ndarray) else turned
-        cos, sin = np.cos(last), np.sin(last)
-        after = [velocity[0] * cos + velocity[1] * sin, velocity[1] * cos - velocity[0] * sin, velocity[2]]
-        return np.append(place, after)
-    push = np.stack([np.interp(t, way.t_s, c) for c in way.push_m_s2.T], 1) - bias[-3:]
-    facing = heading + angle
-    right = np.stack([np.cos(facing), -np.sin(facing)], 1)
-    ahead = np.stack([np.sin(facing), np.cos(facing)], 1)
-    rise = push[:, :1] * right + push[:, 1:2] * ahead
-    rise = np.concatenate([rise, push[:, 2:]], 1)
-    speed = velocity + (np.cumsum(rise, 0) - rise / 2) * dt
-    return np.append(speed.sum(0) * dt, velocity + rise.sum(0) * dt)
+        speed = turned(speed, angle)
+    else:
+        pushed = np.stack([np.interp(t, way.t_s, c) for c in way.push_m_s2.T], 1) - bias[-3:]
+        rise = turned(pushed, heading + angle) * dt
+        rise[-1] = 0
+        speed = speed + np.cumsum(rise, 0) - rise / 2
+    return np.append(speed[:-1].sum(0) * dt, speed[-1])
+
+
+def turned(vectors: Floats, angle: Floats) -> Floats:
+    """Vectors (n, 3) turned about up, clockwise."""
+    level = (vectors[:, 0] + 1j * vectors[:, 1]) * np.exp(-1j * angle)
+    return np.stack([level.real, level.imag, vectors[:, 2]], 1)
+
+
+def slopes(of: Callable[[Floats], Floats], size: int) -> Floats:
+    """How what is given depends on each of so many numbers near 0, one a column."""
+    steps = 1e-2 * np.eye(size)
+    return np.stack([(of(step) - of(-step)) / 2e-2 for step in steps], 1)
 
 
 @pytest.mark.parametrize("push", [False, True])
 def test_the_way_is_that_of_short_steps(push: bool) -> None:
-    way, imu = motion(gyro=True, push=push), np.array([3.0, 1.0, -2.0, 0.5])[: 4 if push else 1]
+    way, imu = motion(push), np.array([3.0, 1.0, -2.0, 0.5])[: 4 if push else 1]
     found = reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG)
-    exact = stepped(way, VELOCITY, 0.4, imu)
     start = np.append(np.zeros(3), VELOCITY)
-    np.testing.assert_allclose(found.move @ start + found.added, exact, atol=2e-3)
-    for i in range(3):
-        step = np.eye(3)[i] * 0.1
-        slope = (stepped(way, VELOCITY + step, 0.4, imu) - stepped(way, VELOCITY - step, 0.4, imu)) / 0.2
-        np.testing.assert_allclose(found.move[:, 3 + i], slope, atol=1e-3)
-    for i in range(len(imu)):
-        step = np.eye(len(imu))[i] * 0.1
-        slope = (stepped(way, VELOCITY, 0.4, imu + step) - stepped(way, VELOCITY, 0.4, imu - step)) / 0.2
-        np.testing.assert_allclose(found.by_imu[:, i], slope, atol=1e-3)
+    np.testing.assert_allclose(found.move @ start + found.added, stepped(way, VELOCITY, 0.4, imu), atol=2e-3)
+    by_speed = slopes(lambda off: stepped(way, VELOCITY + off, 0.4, imu), 3)
+    np.testing.assert_allclose(found.move[:, 3:], by_speed, atol=1e-3)
+    by_imu = slopes(lambda off: stepped(way, VELOCITY, 0.4, imu + off), len(imu))
+    np.testing.assert_allclose(found.by_imu, by_imu, atol=1e-3)
 
 
 def test_headings_error_pushes_aside() -> None:
-    way = motion(gyro=True, push=True)
-    quiet = dataclasses.replace(STRONG, rate_white_deg_rts=0.0)
-    without = reckon(way, VELOCITY, 0.4, 0.0, np.zeros(4), quiet).noise
-    found = reckon(way, VELOCITY, 0.4, 0.01, np.zeros(4), quiet).noise - without
-    slope = stepped(way, VELOCITY, 0.401, np.zeros(4)) - stepped(way, VELOCITY, 0.399, np.zeros(4))
-    np.testing.assert_allclose(found, np.outer(slope, slope) * 25, atol=1e-4)
+    way, imu = motion(True), np.zeros(4)
+    exact, off = (reckon(way, VELOCITY, 0.4, sigma, imu, STRONG).noise for sigma in (0.0, 0.01))
+    slope = slopes(lambda turn: stepped(way, VELOCITY, 0.4 + turn[0], imu), 1)
+    np.testing.assert_allclose(off - exact, 0.01**2 * slope @ slope.T, atol=1e-4)
 
 
 @pytest.mark.parametrize("push", [False, True])
 def test_noise_is_that_of_kicks(push: bool) -> None:
     """White acceleration, and a gyroscope's random walk, kick by kick through what follows each."""
-    way = motion(gyro=True, push=push)
-    found = reckon(way, VELOCITY, 0.4, 0.0, np.zeros(4 if push else 1), STRONG).noise
-    t, kicks = way.t_s, 120
-    noise, middles = np.zeros((6, 6)), (np.arange(kicks) + 0.5) * 3 / kicks
-    grid = (np.arange(6000) + 0.5) * 3 / 6000
+    way, imu = motion(push), np.zeros(4 if push else 1)
     white = STRONG.push_white_m2_s3 if push else STRONG.acceleration_m2_s3
-    for s in middles:
-        rest = 3 - s
-        angle = np.interp(s + np.linspace(0, rest, 400), t, way.turn_rad) - np.interp(s, t, way.turn_rad)
-        if push:
-            by = np.concatenate([rest * np.eye(3), np.eye(3)])
-        else:
-            cos, sin, even = np.cos(angle), np.sin(angle), np.full(400, rest / 400)
-            even[[0, -1]] /= 2
-            even *= 400 / 399
-            along, aside = even @ cos, even @ sin
-            by = np.zeros((6, 3))
-            by[:2, :2] = [[along, aside], [-aside, along]]
-            by[3:5, :2] = [[cos[-1], sin[-1]], [-sin[-1], cos[-1]]]
-            by[2, 2], by[5, 2] = rest, 1
-        noise += white * 3 / kicks * by @ by.T
-        # The heading is wrong from the kick on.
-        late = np.where(grid > s, 0.005, 0.0)
-        slope = stepped(way, VELOCITY, 0.4, np.zeros(4 if push else 1), late)
-        slope = (slope - stepped(way, VELOCITY, 0.4, np.zeros(4 if push else 1), -late)) / 0.01
-        noise += np.radians(STRONG.rate_white_deg_rts) ** 2 * 3 / kicks * np.outer(slope, slope)
-    np.testing.assert_allclose(found, noise, atol=5e-3)
+    power = np.array([np.radians(STRONG.rate_white_deg_rts) ** 2, *3 * [white]])
+    noise = np.zeros((6, 6))
+    for s in (np.arange(120) + 0.5) * 3 / 120:
+        by = slopes(lambda k, s=s: stepped(way, VELOCITY, 0.4, imu, s, k[0], k[1:]), 4)
+        noise += 3 / 120 * (by * power) @ by.T
+    np.testing.assert_allclose(reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG).noise, noise, atol=5e-3)
 
 
 def turning_drive(

@@ -24,11 +24,15 @@ from evlcp_sdk.study.tally import Statistics
 from tests.conftest import ROOT
 from tests.unit.study.fake import fake_plan, run_fake
 
+Watch = Callable[[Progress], None]
 
-def collected(plan: Plan, path: Path, executor: Executor | None = None) -> tuple[Progress, list[Statistics]]:
+
+def collected(
+    plan: Plan, path: Path, executor: Executor | None = None, watch: Watch = lambda _: None
+) -> tuple[Progress, list[Statistics]]:
     """How a collection ended, and what counts of each point in its store."""
     with Store(path, create=True) as store:
-        progress = collect(plan, store, executor or Inline(), run_fake)
+        progress = collect(plan, store, executor or Inline(), run_fake, watch)
         results = store.results()
     return progress, [sum(Counted(p.tasks, plan.rule, results).recordings, Statistics()) for p in plan.points]
 
@@ -217,44 +221,27 @@ def test_what_is_no_store_or_cannot_be_opened_is_refused(tmp_path: Path) -> None
         store.plan()
 
 
-QUIET = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-
-
 class Cluster:
     """A scheduler and its workers, each a process."""
 
     def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.file = folder / "scheduler.json"
+        self.folder, file = folder, folder / "scheduler.json"
         self.processes: list[subprocess.Popen[bytes]] = []
-        options = ["--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--no-show"]
-        self._start("distributed.cli.dask_scheduler", *options, "--scheduler-file", self.file)
-        until = time.monotonic() + 30
+        self._start("scheduler", "--port", "0", "--no-show", "--scheduler-file", file)
         # The file is there before what it says is.
-        while not (self.file.exists() and self.file.stat().st_size) and time.monotonic() < until:
-            time.sleep(0.05)
-        self.address: str = json.loads(self.file.read_text())["address"]
+        wait_for(lambda: file.stat().st_size if file.exists() else 0, 0)
+        self.address: str = json.loads(file.read_text())["address"]
 
-    def _start(self, module: str, *options: str | Path) -> subprocess.Popen[bytes]:
-        command = [sys.executable, "-m", module, *map(str, options)]
-        process = subprocess.Popen(
-            command,
-            cwd=ROOT,
-            env=os.environ | {"HOME": str(self.folder), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "3s"},
-            **QUIET,
-        )  # type: ignore[call-overload]
+    def _start(self, what: str, *options: str | Path) -> None:
+        command = [sys.executable, "-m", f"distributed.cli.dask_{what}", "--host", "127.0.0.1"]
+        env = os.environ | {"HOME": str(self.folder), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "3s"}
+        quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+        process = subprocess.Popen([*command, "--no-dashboard", *options], cwd=ROOT, env=env, **quiet)  # type: ignore[call-overload]
         self.processes.append(process)
-        return process  # type: ignore[no-any-return]
 
-    def add_worker(self) -> subprocess.Popen[bytes]:
-        options = ["--nthreads", "1", "--no-nanny", "--no-dashboard", "--host", "127.0.0.1"]
-        space = ["--local-directory", self.folder]
-        return self._start("distributed.cli.dask_worker", self.address, *options, *space)
-
-    def end(self) -> None:
-        for process in reversed(self.processes):
-            process.kill()
-            process.wait()
+    def add_worker(self) -> None:
+        space = ("--local-directory", self.folder)
+        self._start("worker", self.address, "--nthreads", "1", "--no-nanny", *space)
 
 
 @pytest.fixture
@@ -262,44 +249,41 @@ def cluster(tmp_path: Path) -> Iterator[Cluster]:
     pytest.importorskip("distributed", reason="the extra cluster is not installed")
     made = Cluster(tmp_path)
     yield made
-    made.end()
+    for process in reversed(made.processes):
+        process.kill()
+        process.wait()
 
 
 def test_workers_may_die_and_come(cluster: Cluster, tmp_path: Path) -> None:
     """64 tasks; one of two workers is killed in the middle, and another comes."""
     plan = fake_plan(8, 2, 4, seconds=0.02)
-    workers = [cluster.add_worker() for _ in range(2)]
+    for _ in range(2):
+        cluster.add_worker()
 
     def watch(progress: Progress) -> None:
-        if progress.done >= 10 and workers:
-            workers.pop().kill()
-            workers.clear()
+        if progress.done >= 10 and len(cluster.processes) == 3:
+            cluster.processes[1].kill()
             cluster.add_worker()
 
-    with Store(tmp_path / "dask.sqlite", create=True) as store:
-        progress = collect(plan, store, DaskCluster(cluster.address), run_fake, watch)
-        found = store.results()
-    assert not workers
-    assert progress.faults == ()
-    assert progress.done == 64
-    with Store(tmp_path / "inline.sqlite", create=True) as store:
-        collect(fake_plan(8, 2, 4), store, Inline(), run_fake)
-        assert store.results() == found
+    progress, totals = collected(plan, tmp_path / "a.sqlite", DaskCluster(cluster.address), watch)
+    assert len(cluster.processes) == 4
+    assert (progress.faults, progress.done) == ((), 64)
+    assert totals == collected(fake_plan(8, 2, 4), tmp_path / "b.sqlite")[1]
 
 
 def test_a_scheduler_that_dies_keeps_what_was_finished(cluster: Cluster, tmp_path: Path) -> None:
     cluster.add_worker()
-    plan = fake_plan(25, 2, 4, seconds=0.02)
 
     def watch(progress: Progress) -> None:
         if progress.done == 40:
             cluster.processes[0].kill()
 
-    with Store(tmp_path / "a.sqlite", create=True) as store:
-        with pytest.raises(EvlcpError, match="scheduler is gone; what was finished is kept") as told:
-            collect(plan, store, DaskCluster(cluster.address), run_fake, watch)
-        assert len(str(told.value).splitlines()) == 1
-        assert len(store.results()) >= 40
+    with pytest.raises(EvlcpError, match="scheduler is gone; what was finished is kept") as told:
+        collected(
+            fake_plan(25, 2, 4, seconds=0.02), tmp_path / "a.sqlite", DaskCluster(cluster.address), watch
+        )
+    assert len(str(told.value).splitlines()) == 1
+    assert kept(tmp_path / "a.sqlite") >= 40
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:9", "nonsense", "tcp://127.0.0.1", "nonsense://x:1"])
