@@ -9,13 +9,7 @@ from typing import Any
 import pytest
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.study.plan import (
-    Case,
-    Plan,
-    StopRule,
-    load_plan,
-    plan_from_dict,
-)
+from evlcp_sdk.study.plan import Case, Plan, StopRule, load_plan, plan_from_dict
 
 TEXT = """
 [campaign]
@@ -53,13 +47,9 @@ def plan_of(tmp_path: Path, text: str = TEXT, overrides: Sequence[str] = (), env
 
 def test_a_grid_with_variants(tmp_path: Path) -> None:
     plan = plan_of(tmp_path)
-    assert plan.name == "try"
-    assert plan.rule == StopRule(None, 100)
-    assert plan.seeds == (10, 11, 12)
+    assert (plan.name, plan.rule, plan.seeds) == ("try", StopRule(None, 100), (10, 11, 12))
     assert plan.merge == ("scene.distance_m",)
-    assert len(plan.scenes) == 6
-    assert len(plan.points) == 12
-    assert len(plan.jobs) == 18
+    assert (len(plan.scenes), len(plan.points), len(plan.jobs)) == (6, 12, 18)
     labels = {"scene.speed_kmh": 20, "scene.distance_m": 60.0, "link.variant": "two clusters"}
     assert plan.points[3].labels == labels
     base, overrides = plan.scenes[1].value
@@ -85,12 +75,12 @@ def test_an_id_follows_everything_that_determines_the_result_and_nothing_else(tm
         return len(ids & {task for point in other.points for task in point.tasks})
 
     assert shared() == 36
-    assert shared(overrides=["campaign.name=other day", "campaign.max_bits=5"]) == 36
     assert shared(TEXT.replace("16 clusters", "all")) == 36
-    assert shared(overrides=["campaign.seeds=5"]) == 36
-    assert shared(overrides=["campaign.first_seed=11"]) == 24
-    assert shared(overrides=["scene.sensor.noise_ln=0.03"]) == 0
-    assert shared(overrides=["scene.speed_kmh=20"]) == 18
+    for setting, same in (
+        *(("campaign.name=other day", 36), ("campaign.max_bits=5", 36), ("campaign.seeds=5", 36)),
+        *(("campaign.first_seed=11", 24), ("scene.sensor.noise_ln=0.03", 0), ("scene.speed_kmh=20", 18)),
+    ):
+        assert shared(overrides=[setting]) == same, setting
     assert shared(TEXT.replace("[20, 30]", "[30]")) == 18
     assert shared(TEXT.replace("[1, 14]", "[2, 13]")) == 18
     assert shared(environment={"evlcp-sdk": "2"}) == 0
@@ -135,19 +125,19 @@ def test_faults_are_reported_with_their_path(tmp_path: Path, old: str, new: str,
     assert told in str(fault.value)
 
 
-def test_a_grid_of_too_many_points_is_refused_at_once(tmp_path: Path) -> None:
-    values = list(range(59))
-    axes = "\n".join(f"{axis} = {values}" for axis in "abcde")
-    with pytest.raises(ConfigError) as caught:
-        plan_of(tmp_path, f'[campaign]\nname = "x"\n[scene.grid]\n{axes}\n')
-    assert str(caught.value) == (
-        f"{tmp_path}/c.toml: scene: 714924299 cases of grid and variants, expected at most 10000"
-    )
-    two = f"[scene.grid]\na = {values}\n[link.grid]\nb = {values}\n"
-    with pytest.raises(
-        ConfigError, match=r"59 scenes x 59 links x 1000 seeds: 3481000 tasks, expected at most"
-    ):
-        plan_of(tmp_path, f'[campaign]\nname = "x"\nseeds = 1000\n{two}')
+@pytest.mark.parametrize(
+    ("seeds", "grids", "told"),
+    [
+        (3, {"scene": "abcde"}, "scene: 714924299 cases of grid and variants, expected at most 10000"),
+        (1000, {"scene": "a", "link": "b"}, "59 scenes x 59 links x 1000 seeds: 3481000 tasks, expected at"),
+    ],
+)
+def test_a_grid_of_too_many_points_is_refused_at_once(
+    tmp_path: Path, seeds: int, grids: dict[str, str], told: str
+) -> None:
+    axes = [f"{part}.grid.{axis} = {list(range(59))}" for part, some in grids.items() for axis in some]
+    with pytest.raises(ConfigError, match=told):
+        plan_of(tmp_path, "\n".join([*axes, f'campaign = {{ name = "x", seeds = {seeds} }}']))
 
 
 def test_a_kept_plan_is_the_plan(tmp_path: Path) -> None:

@@ -103,38 +103,31 @@ def test_the_best_are_marked() -> None:
     shared = {"found_share", "filtered_rmse_m"}
     assert best[0] == shared | {"us_per_frame", "bias_m"}
     assert best[1] == shared | {"ber", "rmse_m", "gross_share", "times_real_time"}
-
-
-def test_where_nothing_was_measured_nothing_is_best() -> None:
-    nan = measured(Tally(), Tally())
-    alone, other = table(measured(), nan).best()
     # Two have a BER, only one has distances.
-    assert "ber" in alone & other
-    assert not (alone | other) & {"rmse_m", "bias_m", "gross_share", "filtered_rmse_m"}
+    alone, other_keys = table(measured(), measured(Tally(), Tally())).best()
+    assert "ber" in alone & other_keys
+    assert not (alone | other_keys) & {"rmse_m", "bias_m", "gross_share", "filtered_rmse_m"}
     assert table(measured()).best() == (frozenset(),)
     assert table(BLIND, BLIND).best() == (frozenset({"times_real_time"}),) * 2
 
 
+def rows_of(one: Table) -> list[dict[str, str]]:
+    head, lines = one.cells()
+    assert all(best == text.endswith("*") for line in lines for text, best in line)
+    return [dict(zip(head, (text for text, _ in line), strict=True)) for line in lines]
+
+
 def test_cells() -> None:
-    head, lines = table(measured(), measured(bit_errors=0)).cells()
-    rows = [dict(zip(head, (text for text, _ in line), strict=True)) for line in lines]
-    assert rows[0]["frames"] == "88/100*"
+    some, no_errors, bound = rows_of(table(measured(), measured(bit_errors=0)))
+    assert some["frames"] == "88/100*"
     # One recording has no interval, but a limit where there is no error: 0 of 88 frames.
-    assert rows[0]["95 %"] == "-"
-    assert rows[1]["BER"] == "0*"
-    assert rows[1]["95 %"] == "< 4.1e-02"
-    assert rows[0][">= 0.5 m"] == "33.3% (1)*"
-    assert rows[0]["bias, m"] == "+0.1667*"
-    assert rows[2] == dict.fromkeys(head, "") | {"variant": BOUND_NAME, "RMSE, m": "0.0500"}
-    for line in lines:
-        assert all(best == text.endswith("*") for text, best in line)
-    head, lines = table(BLIND, bound=None).cells()
-    assert head == ["variant", "frames", "packets", "sigma, m", "x real time"]
-    assert [text for text, _ in lines[0]] == ["v0", "5", "1", "0.2000", "1.00"]
-    head, lines = table(
-        measured(visible=200, erased=1, hidden=50, claimed=20), measured(), bound=None
-    ).cells()
-    rows = [dict(zip(head, (text for text, _ in line), strict=True)) for line in lines]
+    assert (some["95 %"], no_errors["BER"], no_errors["95 %"]) == ("-", "0*", "< 4.1e-02")
+    assert (some[">= 0.5 m"], some["bias, m"]) == ("33.3% (1)*", "+0.1667*")
+    assert bound == dict.fromkeys(some, "") | {"variant": BOUND_NAME, "RMSE, m": "0.0500"}
+    blind = {"frames": "5", "packets": "1", "sigma, m": "0.2000", "x real time": "1.00"}
+    assert rows_of(table(BLIND, bound=None)) == [{"variant": "v0"} | blind]
+    hidden = measured(visible=200, erased=1, hidden=50, claimed=20)
+    rows = rows_of(table(hidden, measured(), bound=None))
     assert [(row["erased"], row["claimed"]) for row in rows] == [("0.5%", "40.0%"), ("-", "-")]
 
 
