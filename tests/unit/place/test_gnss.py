@@ -107,13 +107,11 @@ def test_the_antenna_is_not_the_camera() -> None:
 
 
 def test_headings_for_the_antenna() -> None:
-    compass = Attitude(1.0, 2.0, 3.0)
+    compass, gravity = Attitude(1.0, 2.0, 3.0), Attitude(1.0, 2.0, None, 0.3)
     assert attitude_of(compass, None) is compass
     assert attitude_of(None, None) is None
-    found = attitude_of(Attitude(1.0, 2.0, None, 0.3), (-10.0, 0.5))
-    assert found == Attitude(1.0, 2.0, 350.0, 0.3, 0.5)
-    found = attitude_of(None, (10.0, 0.5))
-    assert found.gravity_sigma_deg == pytest.approx(10)
+    assert attitude_of(gravity, (-10.0, 0.5)) == Attitude(1.0, 2.0, 350.0, 0.3, 0.5)
+    assert attitude_of(None, (10.0, 0.5)).gravity_sigma_deg == pytest.approx(10)
 
 
 HEAD = "t_us,latitude_deg,longitude_deg,height_m,sigma_east_m,sigma_north_m,sigma_up_m"
@@ -128,6 +126,9 @@ def test_a_file_of_fixes(tmp_path: Path) -> None:
     np.testing.assert_array_equal(log.covariance_m2[0], [[1, 0.5, 0], [0.5, 4, 0], [0, 0, 9]])
 
 
+COV = ",cov_east_north_m2,cov_east_up_m2,cov_north_up_m2"
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -137,23 +138,18 @@ def test_a_file_of_fixes(tmp_path: Path) -> None:
         (HEAD + "\n0,35,137,5,1,1,1\n0,35,137,5,1,1,1\n", "line 3: t_us = 0: expected more than"),
         (HEAD + ",cov_east_up_m2\n0,35,137,5,1,1,3,-4\n", "cov_east_up_m2 = -4, .*: expected a covariance"),
         (
-            HEAD + ",cov_east_north_m2,cov_east_up_m2,cov_north_up_m2\n0,35,137,5,1,1,1,-.9,.9,.9\n",
+            HEAD + COV + "\n0,35,137,5,1,1,1,-.9,.9,.9\n",
             "line 2: cov_east_north_m2 = -0.9, cov_east_up_m2 = 0.9, cov_north_up_m2 = 0.9: expected a",
         ),
         (HEAD + ",cov_north_east_m2\n0,35,137,5,1,1,1,0\n", "'cov_north_east_m2': expected cov_east_n"),
     ],
 )
 def test_faults_of_a_file(tmp_path: Path, text: str, message: str) -> None:
-    path = tmp_path / "gnss.csv"
-    path.write_text(text)
+    (tmp_path / "gnss.csv").write_text(text)
     with pytest.raises(ConfigError, match=message):
-        GnssLog.read(path)
-
-
-def test_a_solution_of_rtklib_is_told(tmp_path: Path) -> None:
-    (tmp_path / "out.pos").write_text("% program : RTKLIB\n% (lat/lon/height=WGS84/ellipsoidal,Q=1:fix)\n")
-    with pytest.raises(ConfigError, match=r"out\.pos: a solution of RTKLIB: expected its NMEA"):
-        GnssLog.read(tmp_path / "out.pos")
+        GnssLog.read(tmp_path / "gnss.csv")
+    with pytest.raises(ConfigError, match=r"gnss\.pos: a solution of RTKLIB: expected its NMEA"):
+        GnssLog.read((tmp_path / "gnss.csv").rename(tmp_path / "gnss.pos"))
 
 
 GGA = "$GPGGA,172814.0,3723.46587704,N,12202.26957864,W,2,6,1.2,18.893,M,-25.669,M,2.0,0031*4F"
@@ -233,17 +229,14 @@ def test_faults_of_nmea(tmp_path: Path, lines: list[str], message: str) -> None:
         GnssLog.read(write(tmp_path, *lines), NOON)
 
 
-def test_nmea_is_known_by_its_first_letter_too(tmp_path: Path) -> None:
+def test_nmea_is_known_by_its_first_letter_too_and_needs_the_clock(tmp_path: Path) -> None:
     path = write(tmp_path, GGA, GST)
     other = path.rename(tmp_path / "gnss.txt")
-    assert GnssLog.read(other, NOON).place.tolist() == GnssLog.read(other.rename(path), NOON).place.tolist()
-
-
-def test_utc_needs_the_clock(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="NMEA tells UTC: expected --clock-zero"):
-        GnssLog.read(write(tmp_path, GGA, GST))
+        GnssLog.read(other)
+    assert GnssLog.read(other, NOON).place.tolist() == GnssLog.read(other.rename(path), NOON).place.tolist()
     with pytest.raises(InputError, match="cannot be read"):
-        GnssLog.read(tmp_path / "none.txt", NOON)
+        GnssLog.read(other, NOON)
 
 
 # The points and heights that come with EGM96's own program, by interpolation in its grid of a quarter degree.
@@ -257,12 +250,9 @@ PUBLISHED = [
 ]
 
 
-@pytest.mark.parametrize(("latitude", "longitude", "height_m"), PUBLISHED)
-def test_published_points(latitude: float, longitude: float, height_m: float) -> None:
-    assert geoid_m(latitude, longitude) == pytest.approx(height_m, abs=0.5)
-
-
-def test_poles() -> None:
+def test_published_points_and_poles() -> None:
+    for latitude, longitude, height_m in PUBLISHED:
+        assert geoid_m(latitude, longitude) == pytest.approx(height_m, abs=0.5)
     assert {geoid_m(90.0, lon) for lon in (-180, 0.5, 77, 359.9)} == {13.6}
     assert {geoid_m(-90.0, lon) for lon in (-180, 0.5, 77, 359.9)} == {-29.5}
 
