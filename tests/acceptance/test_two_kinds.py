@@ -12,7 +12,6 @@ import pytest
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.place.navigator import PositionPlan
-from evlcp_sdk.results.folder import read_summary
 from evlcp_sdk.run import film, receive, receive_to_folder
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.scene.sites import LocalAxes, load_sites
@@ -71,10 +70,14 @@ def two_links(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Path
     return folder / "two.raw", links
 
 
+def rows_of(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
 def fixes_in(folder: Path) -> list[dict[str, str]]:
     """Rows of positions, each by bars of both links."""
-    with (folder / "fixes.csv").open(newline="") as file:
-        fixes = [row for row in csv.DictReader(file) if not row["refusal"]]
+    fixes = [row for row in rows_of(folder / "fixes.csv") if not row["refusal"]]
     assert {" ".join(sorted(row["link"].split())) for row in fixes} == {"bar short"}
     return fixes
 
@@ -87,14 +90,8 @@ def test_bars_of_two_links_give_one_position(two_links: tuple[Path, list[Path]],
     truth = read_truth(truth_path(recording))
     pitch, roll = (float(np.mean(truth.camera_path[name])) for name in ("pitch_deg", "roll_deg"))
     lines: list[str] = []
-    receive_to_folder(
-        recording,
-        tmp_path,
-        links,
-        plan=PositionPlan(sites),
-        attitude=Attitude(pitch, roll, None, 0.3),
-        lines=lines.append,
-    )
+    known = {"plan": PositionPlan(sites), "attitude": Attitude(pitch, roll, None, 0.3)}
+    receive_to_folder(recording, tmp_path, links, **known, lines=lines.append)
     fixes = fixes_in(tmp_path)
     assert len(fixes) >= 3
     said = {told["link"] for told in map(json.loads, lines) if told["line"] == "fix"}
@@ -124,9 +121,8 @@ def test_bars_of_two_links_are_surveyed(two_links, tmp_path, evlcp) -> None:
     found = load_sites(out)
     assert [(site.link, site.length_m) for site in found] == [("bar", 0.96), ("short", 0.6)]
     for site, told in zip(found, json.loads(done.out)["bars"], strict=True):
-        off = LocalAxes.of([true[site.transmitter_id]]).to_enu(
-            site.latitude_deg, site.longitude_deg, site.height_m
-        )
+        axes = LocalAxes.of([true[site.transmitter_id]])
+        off = axes.to_enu(site.latitude_deg, site.longitude_deg, site.height_m)
         assert off @ np.linalg.solve(told["covariance_m2"], off) < 20
         assert site.position_sigma_m < 1
 
@@ -146,49 +142,43 @@ def test_bars_of_two_links_are_surveyed(two_links, tmp_path, evlcp) -> None:
 
 @pytest.mark.parametrize("other", OTHERS)
 def test_bar_and_another_kind(other: str, tmp_path: Path) -> None:
-    (tmp_path / "bar.toml").write_text("")
-    (tmp_path / f"{other}.toml").write_text(OTHERS[other])
+    links, recording = [tmp_path / "bar.toml", tmp_path / f"{other}.toml"], tmp_path / "two.raw"
+    for path, text in zip(links, ("", OTHERS[other]), strict=True):
+        path.write_text(text)
     (tmp_path / "scene.toml").write_text(
         "duration_s = 0.12\n[background]\nlight_w_m2 = 1e-3\n[motion]\ndistance_m = 50.0\n"
         f'[[bars]]\nlink = "bar.toml"\n[[bars]]\nx_m = 1.5\nlink = "{other}.toml"\n'
     )
-    simulate(tmp_path / "scene.toml", 1).save(tmp_path / "two.raw")
-    links = [tmp_path / "bar.toml", tmp_path / f"{other}.toml"]
+    simulate(tmp_path / "scene.toml", 1).save(recording)
     lines: list[str] = []
-    sinks = ("report", "parquet", "points")
-    table = receive_to_folder(tmp_path / "two.raw", tmp_path / "out", links, sinks=sinks, lines=lines.append)
+    out, sinks, names = tmp_path / "out", ("report", "parquet", "points"), {"bar", other}
+    table = receive_to_folder(recording, out, links, sinks=sinks, lines=lines.append)
     assert table["warnings"] == []
-    assert {one["link"] for one in table["transmitters"]} == {"bar", other}
-    assert len(table["transmitters"]) == 2
-    assert set(table["links"]) == {"bar", other}
+    assert sorted(one["link"] for one in table["transmitters"]) == sorted(names)
+    assert set(table["links"]) == names
     assert "configuration" not in table
 
-    truth = read_truth(tmp_path / "two.truth.json")
-    by_name = links_of_result(tmp_path / "out")
+    truth, by_name = read_truth(truth_path(recording)), links_of_result(out)
     check_link(truth, by_name, "out")
-    found = score_frames(read_frames(tmp_path / "out"), truth, by_name)
+    with pytest.raises(ConfigError, match="bar 1 was sent with another link"):
+        check_link(truth, load_link(), "out")
+    found = score_frames(read_frames(out), truth, by_name)
     assert found["unmatched"] == 0
     assert [bar["link"] for bar in found["bars"]] == ["bar", other]
     for bar in found["bars"]:
         assert bar["bit_errors"] == 0
         assert bar["frames_found"] == bar["frames_sent"] > 0
 
-    with (tmp_path / "out" / "frames.csv").open(newline="") as file:
-        rows = list(csv.DictReader(file))
-    names = {row["transmitter"]: row["link"] for row in rows}
-    assert sorted(names.values()) == sorted(["bar", other])
-    packets = [json.loads(line) for line in (tmp_path / "out" / "packets.jsonl").read_text().splitlines()]
-    assert {line["link"] for line in packets} == {"bar", other}
-    assert {told["link"] for told in map(json.loads, lines) if told["line"] == "frame"} == {"bar", other}
-    page = (tmp_path / "out" / "report.html").read_text()
-    assert f"({other})" in page
-    parquet = pytest.importorskip("pyarrow.parquet").read_table(tmp_path / "out" / "frames.parquet")
+    rows = rows_of(out / "frames.csv")
+    assert len({(row["transmitter"], row["link"]) for row in rows}) == 2
+    packets = (out / "packets.jsonl").read_text().splitlines()
+    said = [told for told in map(json.loads, lines) if told["line"] == "frame"]
+    for of in (map(json.loads, packets), said, rows):
+        assert {one["link"] for one in of} == names
+    assert f"({other})" in (out / "report.html").read_text()
+    parquet = pytest.importorskip("pyarrow.parquet").read_table(out / "frames.parquet")
     assert parquet.column("link").to_pylist() == [row["link"] for row in rows]
-
     if other == "far":
         compare_and_film(tmp_path, links, found)
-    with receive(tmp_path / "two.raw", links) as packets_again:
+    with receive(recording, links) as packets_again:
         assert len(frames_of(packets_again)) == len(rows)
-    with pytest.raises(ConfigError, match="bar 1 was sent with another link"):
-        check_link(truth, load_link(), "out")
-    assert read_summary(tmp_path / "out") is not None

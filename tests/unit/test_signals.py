@@ -23,11 +23,11 @@ def hear_all() -> None:
         signal.signal(number, signal.SIG_DFL)
 
 
-def start(*arguments: str | Path) -> subprocess.Popen[str]:
+def start(*arguments: str | Path, alone: bool = False) -> subprocess.Popen[str]:
+    """A command in a process; `alone`: in a group of its own."""
     command = [sys.executable, "-c", MAIN, *map(str, arguments)]
-    return subprocess.Popen(
-        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, preexec_fn=hear_all
-    )
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    return subprocess.Popen(command, **pipes, text=True, preexec_fn=hear_all, start_new_session=alone)
 
 
 @pytest.mark.parametrize("number", [signal.SIGHUP, signal.SIGTERM])

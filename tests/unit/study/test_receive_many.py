@@ -13,13 +13,9 @@ from typing import Any
 
 import pytest
 
+from tests.unit.test_signals import start
+
 Evlcp = Callable[..., Any]
-
-
-def hear_all() -> None:
-    """Whoever runs the tests may have set some to be ignored."""
-    for number in (signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
-        signal.signal(number, signal.SIG_DFL)
 
 
 def test_processes_give_what_this_one_gives(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
@@ -47,16 +43,7 @@ def test_ctrl_c_and_its_like_end_all_of_them(
     for path in many:
         path.symlink_to(demo_raw)
     out = tmp_path / "out"
-    code = "from evlcp_sdk.cli.main import main; main()"
-    command = [sys.executable, "-c", code, "receive", *many, "-o", out, "--workers", "2"]
-    process = subprocess.Popen(
-        [str(c) for c in command],
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        preexec_fn=hear_all,
-    )
+    process = start("receive", *many, "-o", out, "--workers", "2", alone=True)
     until = time.monotonic() + 60
     while len(list(out.glob("*/summary.json"))) < 2 and time.monotonic() < until:
         time.sleep(0.02)
