@@ -65,9 +65,10 @@ BLINKS = {"events_in_regions": 5_000_000, "regions_opened": 1}
 BLINKING = "something blinks, 5,000,000 events in 1 region, but no"
 
 
-def readout_of(t_us: NDArray[np.int64]) -> ReadoutTally:
+def readout_of(t_us: NDArray[np.int64], y: NDArray[np.int64] | int = 0, pieces: int = 7) -> ReadoutTally:
     tally = ReadoutTally()
-    tally.add(Events.of(t_us, np.zeros_like(t_us), np.zeros_like(t_us), np.zeros_like(t_us)))
+    for part in np.array_split(np.stack([t_us, t_us * 0 + y]), pieces, 1):
+        tally.add(Events.of(part[0], part[0] * 0, part[1], part[0] * 0))
     return tally
 
 
@@ -151,50 +152,39 @@ def test_what_counts_and_frames_say(tally: RunTally, counts: dict[str, int], sai
     assert not said or said in lines[0]
 
 
+STEPS = "times come in steps of {} ms; a chip is 0.1 ms"
+NONE_READ = "none of 6 packets with a block that can be read"
+FLOODED = {"events": 0, "frames": 40, "frames_flooded": 2}
+
+
 @pytest.mark.parametrize(
-    ("given", "said"),
+    ("verdict", "given", "said"),
     [
-        ({"losses": [Loss(200, 0, "byte", "odd")]}, ["200 events or words dropped (200 in the file)"]),
-        ({"step_us": 30}, ["times come in steps of 0.03 ms; a chip is 0.1 ms"]),
-        ({"step_us": 25}, []),
-        (
-            {"readout": readout_of(np.arange(0, 10_000, 65))},
-            ["times come in steps of 0.065 ms; a chip is 0.1 ms"],
-        ),
-        ({"readout": readout_of(np.arange(0, 10_000, 25))}, []),
+        ("doubt", {"losses": [Loss(200, 0, "byte", "odd")]}, "200 events or words dropped (200 in the file)"),
+        ("doubt", {"step_us": 30}, STEPS.format(0.03)),
+        ("doubt", {"step_us": 25}, ""),
+        ("doubt", {"readout": readout_of(np.arange(0, 10_000, 65))}, STEPS.format(0.065)),
+        ("doubt", {"readout": readout_of(np.arange(0, 10_000, 25))}, ""),
         # Two events so far apart say nothing.
-        ({"readout": readout_of(np.array([0, 500]))}, []),
+        ("doubt", {"readout": readout_of(np.array([0, 500]))}, ""),
+        ("note", {"tally": FOUND, "counts": UNREAD}, f"no messages: {NONE_READ}"),
+        ("note", {"tally": FOUND, "counts": UNREAD, "reads_messages": False}, ""),
+        ("note", {"counts": {"events": 9}}, "no frame was read"),
+        ("note", {"counts": {"events": 0}}, ""),
+        ("note", {"counts": FLOODED}, "no symbol in 2 of 40 frames, as all light changed in them"),
     ],
 )
-def test_what_a_recording_is_said_to_lack(given: dict[str, Any], said: list[str]) -> None:
-    assert [one.text for one in find(Facts(LINK, NOTHING, {"events": 50_000}, **given))] == said
+def test_what_is_said_of_a_recording(verdict: str, given: dict[str, Any], said: str) -> None:
+    facts = Facts(**{"link": LINK, "tally": NOTHING, "counts": {"events": 50_000}} | given)
+    assert [one.text for one in find(facts, verdict)] == [said] * bool(said)
 
 
 def test_bars_that_say_the_same_are_doubted_where_it_matters_which_is_which() -> None:
-    counts = {"events": 50_000, "frames_alike": 40}
     for positions, verdict in ({}, "note"), (NO_POSITIONS | {"fixes": 5}, "doubt"):
-        found = find(Facts(LINK, NOTHING, counts, positions=positions), verdict)
+        found = find(
+            Facts(LINK, NOTHING, {"events": 50_000, "frames_alike": 40}, positions=positions), verdict
+        )
         assert [one.code for one in found].count("same-symbols") == 1
-
-
-@pytest.mark.parametrize(
-    ("tally", "counts", "read", "said"),
-    [
-        (FOUND, UNREAD, True, "no messages: none of 6 packets with a block that can be read"),
-        (FOUND, UNREAD, False, None),
-        (NOTHING, {"events": 9}, True, "no frame was read"),
-        (NOTHING, {"events": 0}, True, None),
-        (
-            NOTHING,
-            {"events": 0, "frames": 40, "frames_flooded": 2},
-            True,
-            "no symbol in 2 of 40 frames, as all light changed in them",
-        ),
-    ],
-)
-def test_what_there_is_none_of(tally: RunTally, counts: dict[str, int], read: bool, said: str | None) -> None:
-    facts = Facts(LINK, tally, counts, reads_messages=read)
-    assert [one.text for one in find(facts, "note")] == [said] * (said is not None)
 
 
 @pytest.mark.parametrize(
@@ -301,9 +291,7 @@ def test_a_sensor_that_comes_to_each_row_too_late(rows: int, rests: bool) -> Non
     if rests:
         used = t_us % 1000 < np.random.default_rng(5).integers(500, 1000, 100)[t_us // 1000]
         t_us, y = t_us[used], y[used]
-    readout = ReadoutTally()
-    for part in np.array_split(np.arange(len(t_us)), 9):
-        readout.add(Events.of(t_us[part], part * 0, y[part], part * 0))
+    readout = readout_of(t_us, y)
     assert readout.round_us() == ((0.0, 0.0) if rests else pytest.approx((1, rows), rel=0.03))
     found = find(Facts(LINK, FOUND, {"frames": 60}, 0.0, 1e5, readout=readout))
     late = [doubt.text for doubt in found if doubt.code == "readout"]
@@ -321,10 +309,7 @@ def test_a_readout_at_its_limit() -> None:
         (np.full(300, 20), False),
     ):
         t_us = np.sort(np.concatenate([1000 * i + rng.integers(0, 1000, n) for i, n in enumerate(many)]))
-        readout = ReadoutTally()
-        for piece in np.array_split(t_us, 7):
-            readout.add(Events.of(piece, piece * 0, piece * 0, piece * 0))
-        found = find(Facts(LINK, RunTally(LINK.packet), {}, 0.0, 3e5, readout=readout))
+        found = find(Facts(LINK, NOTHING, {}, 0.0, 3e5, readout=readout_of(t_us)))
         assert [doubt.code for doubt in found] == ["saturated"] * capped
         assert not capped or "hold 3 Mev/s" in found[0].text
 
@@ -333,11 +318,8 @@ def test_a_readout_at_its_limit() -> None:
 def test_events_of_each_millisecond(steps: list[int], pieces: int) -> None:
     """Against NumPy's count of the milliseconds that are over."""
     t_us = np.cumsum(steps) * 7
-    readout = ReadoutTally()
-    for piece in np.array_split(t_us, pieces):
-        readout.add(Events.of(piece, piece * 0, piece * 0, piece * 0))
     many = np.unique(t_us // 1000, return_counts=True)[1][:-1]
-    share, most = readout.events.capped()
+    share, most = readout_of(t_us, 0, pieces).events.capped()
     assert most == pytest.approx(many.max(initial=0), rel=0.004)
     assert share == pytest.approx(
         (many == many.max()).mean() if len(many) else 0.0, abs=0 if most < 100 else 1
