@@ -1,7 +1,9 @@
-"""Scenes that are hard on purpose, in short cuts: a fast drive that shakes, a low sun, few events."""
+"""Scenes that are hard on purpose, in short cuts, and sensors of other makers, as in docs/sensors.md."""
 
+import runpy
 from collections.abc import Iterable
 from functools import cache
+from pathlib import Path
 
 import pytest
 
@@ -68,3 +70,15 @@ def test_motion_feedback_helps() -> None:
     )
     assert soft.bit_errors >= 10
     assert feedback.bit_errors <= 0.5 * soft.bit_errors
+
+
+TABLE = runpy.run_path(str(Path(__file__).parents[2] / "docs" / "figures" / "sensors.py"))
+
+
+@pytest.mark.parametrize("name", sorted(TABLE["SENSORS"]))
+def test_a_sensor_reads_a_bar_whose_clusters_cover_four_pixels(name: str) -> None:
+    tally = TABLE["drive"](name, 1)
+    assert tally.frames_found == tally.frames_sent >= 14
+    assert tally.bits > 1000
+    assert tally.bit_errors == 0
+    assert tally.rmse_m < 0.004 * TABLE["distance_m"](TABLE["load_link"](TABLE["LINKS"] / f"{name}.toml"))

@@ -1,9 +1,10 @@
-"""Collection: the answer is the same whoever runs it, here or on a Dask cluster, and who dies."""
+"""Jobs: the answer is the same whoever runs them, here or on a Dask cluster, and who dies; `receive` too."""
 
 import json
 import os
 import random
 import resource
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -23,6 +25,7 @@ from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics
 from tests.conftest import ROOT
 from tests.unit.study.fake import fake_plan, run_fake
+from tests.unit.test_signals import start
 
 Watch = Callable[[Progress], None]
 
@@ -121,7 +124,7 @@ def test_a_job_that_kills_its_workers_is_given_up(tmp_path: Path) -> None:
     assert progress.done == 4
 
 
-def start(store: Path) -> subprocess.Popen[bytes]:
+def begin(store: Path) -> subprocess.Popen[bytes]:
     command = [sys.executable, "-m", "tests.unit.study.fake", store]
     return subprocess.Popen(command, cwd=ROOT, start_new_session=True)
 
@@ -150,7 +153,7 @@ def test_killed_twice_it_ends_as_if_never(tmp_path: Path) -> None:
     store = tmp_path / "killed.sqlite"
     seen = 0
     for death in range(2):
-        process = start(store)
+        process = begin(store)
         try:
             seen_now = wait_for(lambda: kept(store), seen + rng.randrange(4, 14))
             assert seen_now > seen
@@ -169,7 +172,7 @@ def test_killed_twice_it_ends_as_if_never(tmp_path: Path) -> None:
         assert kept(store) >= seen_now
         seen = kept(store)
     assert 0 < seen < 64
-    process = start(store)
+    process = begin(store)
     assert process.wait(60) == 0
     plan = fake_plan(8, 2, 4)
     progress, totals = collected(plan, store)
@@ -301,3 +304,57 @@ def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(ConfigError, match="pip install 'evlcp-sdk\\[cluster\\]'"):
         DaskCluster("tcp://127.0.0.1:9")
+
+
+Evlcp = Callable[..., Any]
+
+
+def test_processes_give_what_this_one_gives(evlcp: Evlcp, demo_raw: Path, tmp_path: Path) -> None:
+    two = [Path(shutil.copy(demo_raw, tmp_path / f"{name}.raw")) for name in "ab"]
+    (tmp_path / "bad.raw").write_bytes(b"\x89PNG" + bytes(60))
+    done = evlcp("receive", *two, tmp_path / "bad.raw", "-o", tmp_path / "out", "--workers", "2", "--json")
+    assert done.code == 3
+    assert done.err.startswith(f"evlcp: {tmp_path}/bad.raw: ")
+    assert len(done.err.splitlines()) == 1
+    told = [json.loads(line) for line in done.out.splitlines()]
+    assert sorted(t["status"] for t in told) == ["complete"] * 2 + ["failed"]
+    assert evlcp("receive", demo_raw, "-o", tmp_path / "one").code == 0
+    expected = (tmp_path / "one" / "frames.csv").read_bytes()
+    for path in two:
+        assert (tmp_path / "out" / path.stem / "frames.csv").read_bytes() == expected
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+@pytest.mark.parametrize(("number", "tell"), [(signal.SIGINT, os.killpg), (signal.SIGTERM, os.kill)])
+def test_ctrl_c_and_its_like_end_all_of_them(
+    demo_raw: Path, tmp_path: Path, number: int, tell: Callable[[int, int], None]
+) -> None:
+    """A terminal's Ctrl-C reaches workers, too: what they decoded is written, and nothing is begun."""
+    many = [tmp_path / f"r{n}.raw" for n in range(40)]
+    for path in many:
+        path.symlink_to(demo_raw)
+    out = tmp_path / "out"
+    process = start("receive", *many, "-o", out, "--workers", "2", alone=True)
+    until = time.monotonic() + 60
+    while len(list(out.glob("*/summary.json"))) < 2 and time.monotonic() < until:
+        time.sleep(0.02)
+    tell(process.pid, number)
+    _, err = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert err.startswith("evlcp: interrupted; what was decoded until then is in ")
+    assert len(err.splitlines()) == 1
+    folders = list(out.iterdir())
+    assert 2 <= len(folders) < 40
+    for folder in folders:
+        assert {p.name for p in folder.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
+
+
+def test_a_program_that_leaves_its_processes_ends() -> None:
+    """When the jobs under way are done; nobody closes the outcomes."""
+    code = """import time
+from evlcp_sdk.study.jobs import Processes
+if __name__ == "__main__":
+    outcomes = Processes(2).run(time.sleep, [0.01, 1, 1])
+    next(outcomes)
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=30)
