@@ -5,7 +5,6 @@ import json
 import math
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,7 @@ import pytest
 from evlcp_sdk.air.frames import symbols_of_bits
 from evlcp_sdk.diagnosis.tallies import TransmitterTally
 from evlcp_sdk.errors import InputError
-from evlcp_sdk.link.resolve import load_link
+from evlcp_sdk.link.resolve import Link, load_link
 from evlcp_sdk.plugin.source import Loss
 from evlcp_sdk.results.columns import FILTERED_COLUMNS, FRAME_COLUMNS, frame_columns, frame_value
 from evlcp_sdk.results.lines import format_frame
@@ -25,7 +24,6 @@ from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.study.frames import read_frames
 from evlcp_sdk.values import Frame, Packet, Range, SoftSymbols
 from tests.conftest import ROOT, rows_of
-from tests.unit.results.test_positions import packets
 
 LINK = load_link(overrides=["modulation.id=wh8", "air.frames_per_packet=3", "messages.decode=false"])
 
@@ -47,9 +45,9 @@ END = RunEnd("complete", {"path": "a.raw"}, {"elapsed_s": 1.0}, {"events": 3}, {
 
 
 def result(
-    folder: Path, *packets: Packet, end: RunEnd = END, link: Any = LINK, sinks: Sequence[str] = ()
+    folder: Path, *packets: Packet, end: RunEnd = END, link: Link = LINK, **given: Any
 ) -> dict[str, Any]:
-    with ResultWriter(folder, link, sinks=sinks) as writer:
+    with ResultWriter(folder, link, **given) as writer:
         writer.write(packets)
         return writer.finish(end)
 
@@ -60,8 +58,8 @@ def lines_of(folder: Path) -> list[dict[str, Any]]:
 
 def test_the_files_of_a_result(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    first, later = packet(0, frame(0, 0), frame(0, 2, math.nan)), packet(2, frame(2, 1, 51.0))
-    table = result(out, first, later, packet(0, transmitter=1))
+    one, later = packet(0, frame(0, 0), frame(0, 2, math.nan)), packet(2, frame(2, 1, 51.0))
+    table = result(out, one, later, packet(0, transmitter=1))
     assert sorted(p.name for p in out.iterdir()) == ["frames.csv", "packets.jsonl", "summary.json"]
 
     rows = rows_of(out / "frames.csv")
@@ -87,23 +85,24 @@ def test_the_files_of_a_result(tmp_path: Path) -> None:
     assert table["digest"] == LINK.digest
     assert table["codebook"] == {"digest": LINK.codebook.digest, "profile": "wh8"}
     assert table["losses"]["odd"]["first"] == 7
-    assert table["transmitters"][0] == {
+    first, second = table["transmitters"]
+    assert first == {
         "transmitter": 0,
         "packets": 2,
         "frames_found": 3,
         "frames_expected": 8,
+        "frames_ranged": 2,
         "echo_of": None,
         "frames_echo": 0,
         "symbols_given": 48,
         "symbols_erased": 0,
         "quality": 0.875,
         "clock_ppm": 10.0,
-        "frames_ranged": 2,
         "distance_first_m": 50.0,
         "distance_last_m": 51.0,
         "distance_median_m": 50.0,
     }
-    assert {table["transmitters"][1][k] for k in ("quality", "clock_ppm", "distance_median_m")} == {None}
+    assert {second[k] for k in ("quality", "clock_ppm", "distance_median_m")} == {None}
 
 
 def test_packets_too_short_for_messages_are_said(tmp_path: Path) -> None:
@@ -210,24 +209,20 @@ def test_a_filtered_distance_has_columns_of_its_own(tmp_path: Path) -> None:
 
 
 def test_a_line_has_all_columns() -> None:
-    (one,) = packets(1)
-    soft = one.frames[3].soft
-    soft = replace(soft, symbols=np.where(np.arange(16) == 1, -1, soft.symbols))
-    found = replace(one.frames[3], soft=soft, filtered=Range(12.34567, 0.1, 3), echo_of=2)
+    one = frame(0, 3)
+    symbols = np.where(np.arange(16) == 1, -1, one.soft.symbols)
+    found = replace(one, soft=replace(one.soft, symbols=symbols), echo_of=2)
     told = json.loads(format_frame(found, (*FRAME_COLUMNS, *FILTERED_COLUMNS)))
-    assert list(told) == ["line", *FRAME_COLUMNS, *FILTERED_COLUMNS]
-    for name in (*FRAME_COLUMNS, *FILTERED_COLUMNS):
-        value = frame_value(found, name)
-        if isinstance(value, float):
-            assert told[name] == (None if math.isnan(value) else pytest.approx(value, abs=6e-3))
-        else:
-            assert told[name] == value
-    assert told["symbols"][1] is None
+    assert told.pop("line") == "frame"
+    assert list(told) == [*FRAME_COLUMNS, *FILTERED_COLUMNS]
+    assert told["symbols"][:3] == [3, None, 5]
+    for name, value in told.items():
+        given = frame_value(found, name)
+        assert value == (pytest.approx(given, abs=6e-3) if isinstance(given, float) else given)
 
 
 def test_what_is_no_number_is_null() -> None:
-    (one,) = packets(1)
-    found = one.frames[0]
+    found = frame(0, 0)
     for value in (math.nan, math.inf, -math.inf):
         soft = replace(found.soft, quality=value)
         odd = replace(found, soft=soft, range=Range(value, value, 0), x_px=value, link="nan inf None")

@@ -1,7 +1,7 @@
 """Sinks: a format is one file and one hook; what fails is named, and leaves nothing."""
 
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +14,11 @@ from evlcp_sdk.plugin.records import installed_sinks
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.results.folder import ResultFolder
 from evlcp_sdk.results.sink import Run, Sink
-from evlcp_sdk.results.summary import RunEnd
-from evlcp_sdk.results.writer import ResultWriter
 from evlcp_sdk.run import receive, receive_to_folder
 from evlcp_sdk.values import Packet
 from tests.conftest import rows_of
 from tests.unit.results import distances
+from tests.unit.results.test_outputs import result
 from tests.unit.results.test_positions import packets
 
 
@@ -55,45 +54,29 @@ def test_a_format_is_one_file_and_one_hook(demo_raw: Path, tmp_path: Path) -> No
     assert {p.name for p in tmp_path.iterdir()} == {"frames.csv", "packets.jsonl", "summary.json"}
 
 
-class Failing(Sink):
-    def __init__(self, folder: ResultFolder, run: Run) -> None:
-        super().__init__(folder, run)
-        folder.open("failing.txt")
+def opens(*names: str) -> Callable[..., None]:
+    def init(self: Sink, folder: ResultFolder, run: Run) -> None:
+        for name in names:
+            folder.open(name)
 
-    def packet(self, packet: Packet) -> None:
-        raise KeyError("boom")
-
-
-class Stray(Sink):
-    def __init__(self, folder: ResultFolder, run: Run) -> None:
-        folder.open("stray.txt")
+    return init
 
 
-class Twice(Sink):
-    def __init__(self, folder: ResultFolder, run: Run) -> None:
-        folder.open("failing.txt")
-        folder.open_binary("failing.txt")
+def fails(self: Sink, packet: Packet) -> None:
+    raise KeyError("boom")
 
 
-class Saying(Sink):
-    says: Any = None
-
-    def finish(self) -> Any:
-        return self.says
+@hookimpl
+def fails_at_a_stage(self: Sink, stage: str) -> None:
+    raise KeyError(stage)
 
 
-Unsayable = type("Unsayable", (Saying,), {"says": {"what": object()}})
-Counting = type("Counting", (Saying,), {"says": 5})
-
-
-class Watching(Sink):
-    @hookimpl
-    def evlcp_stage_finished(self, stage: str) -> None:
-        raise KeyError(stage)
-
-
-class NoSink:
-    pass
+Failing = type("Failing", (Sink,), {"__init__": opens("failing.txt"), "packet": fails})
+Stray = type("Stray", (Sink,), {"__init__": opens("stray.txt")})
+Twice = type("Twice", (Sink,), {"__init__": opens("failing.txt", "failing.txt")})
+Unsayable = type("Unsayable", (Sink,), {"finish": lambda _: {"what": object()}})
+Counting = type("Counting", (Sink,), {"finish": lambda _: 5})
+Watching = type("Watching", (Sink,), {"evlcp_stage_finished": fails_at_a_stage})
 
 
 def bring(name: str, target: str, **more: Any) -> Registry:
@@ -115,20 +98,15 @@ def bring(name: str, target: str, **more: Any) -> Registry:
         ("Counting", r"sink 'it' of .*: finish\(\) gave int, expected a mapping"),
         ("Stray", r"sink 'it' of .*: 'stray.txt' is not among the files"),
         ("Twice", r"sink 'it' of .*: ValueError: 'failing.txt' was opened before"),
-        ("NoSink", r"sink 'it' of .*: .*:NoSink is not a Sink"),
+        ("Path", r"sink 'it' of .*: .*:Path is not a Sink"),
         ("no_such_module:Sink", r"sink 'it' of .*: cannot import no_such_module:Sink"),
     ],
 )
 def test_what_fails_is_named_and_leaves_nothing(name: str, told: str, tmp_path: Path) -> None:
     registry = bring("it", name if ":" in name else f"{__name__}:{name}")
 
-    def run() -> None:
-        with ResultWriter(tmp_path / "out", load_link(), registry, sinks=["it"]) as writer:
-            writer.write(packets(1))
-            writer.finish(RunEnd("complete"))
-
     with pytest.raises(PluginError, match=told) as caught:
-        run()
+        result(tmp_path / "out", *packets(1), link=load_link(), registry=registry, sinks=["it"])
     assert "\n" not in str(caught.value)
     assert not list(tmp_path.iterdir())
 
@@ -144,12 +122,13 @@ def test_a_sink_that_fails_at_a_stage_is_named(demo_raw: Path, tmp_path: Path) -
 def test_a_format_that_is_not_there(demo_raw: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no sink named 'parquett'; did you mean 'parquet'"):
         receive_to_folder(demo_raw, tmp_path / "out", sinks=["parquett"])
-    missing = bring("far", f"{__name__}:Failing", packages=("no_such_package",))
-    with pytest.raises(ConfigError, match=r"sink 'far' of .* needs no_such_package, or leave --sink far out"):
-        receive_to_folder(demo_raw, tmp_path / "out", registry=missing, sinks=["far"])
-    extra = bring("far", f"{__name__}:Failing", packages=("no_such_package",), extra="evlcp-sdk[far]")
-    with pytest.raises(ConfigError, match=r"needs the extra: pip install 'evlcp-sdk\[far\]'"):
-        receive_to_folder(demo_raw, tmp_path / "out", registry=extra, sinks=["far"])
+    for more, says in (
+        ({}, r"sink 'far' of .* needs no_such_package, or leave --sink far out"),
+        ({"extra": "evlcp-sdk[far]"}, r"needs the extra: pip install 'evlcp-sdk\[far\]'"),
+    ):
+        missing = bring("far", f"{__name__}:Failing", packages=("no_such_package",), **more)
+        with pytest.raises(ConfigError, match=says):
+            receive_to_folder(demo_raw, tmp_path / "out", registry=missing, sinks=["far"])
     assert not (tmp_path / "out").exists()
 
 
