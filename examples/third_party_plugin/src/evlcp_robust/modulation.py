@@ -7,13 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from evlcp_sdk.plugin.roles import Modulation
+import evlcp_sdk as evlcp
 
 __all__ = ["ReturnToZero"]
 
 
 @dataclass(frozen=True)
-class ReturnToZero(Modulation):
+class ReturnToZero(evlcp.Modulation):
     """Each bit has two chips, the first of them lit for a one; a pulse before them keeps time.
 
     >>> ReturnToZero(bits=2).codewords().tolist()
