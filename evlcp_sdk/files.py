@@ -433,11 +433,7 @@ ANY_NUMBER = (-math.inf, math.inf)
 
 
 def csv_number(
-    path: Path | str,
-    line: int,
-    name: str,
-    text: str | None,
-    within: tuple[float, float] = ANY_NUMBER,
+    path: Path | str, line: int, name: str, text: str | None, within: tuple[float, float] = ANY_NUMBER
 ) -> float:
     """A number of a CSV file that was read.
 

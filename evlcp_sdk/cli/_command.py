@@ -22,8 +22,7 @@ def _show_all(ctx: typer.Context, asked: bool) -> None:
 
 
 _HelpAll = Annotated[
-    bool,
-    typer.Option("--help-all", callback=_show_all, is_eager=True, help="Show rarer options, too."),
+    bool, typer.Option("--help-all", callback=_show_all, is_eager=True, help="Show rarer options, too.")
 ]
 
 

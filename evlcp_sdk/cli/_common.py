@@ -26,17 +26,10 @@ LinkFile = Annotated[
     str | None, typer.Option("-c", "--config", metavar="link.toml", help="The link; all defaults without it.")
 ]
 LinkFiles = Annotated[
-    list[str] | None,
-    typer.Option(
-        "-c",
-        "--config",
-        metavar="link.toml",
-        help="The link, or several.",
-    ),
+    list[str] | None, typer.Option("-c", "--config", metavar="link.toml", help="The link, or several.")
 ]
 Overrides = Annotated[
-    list[str] | None,
-    typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; repeat it."),
+    list[str] | None, typer.Option("--set", metavar="TABLE.KEY=VALUE", help="Override one value; repeat it.")
 ]
 Json = Annotated[bool, typer.Option("--json", help="JSON on stdout, nothing else.")]
 

@@ -60,16 +60,10 @@ class ResultOptions:
     PANEL: ClassVar[str] = "Results"
 
     out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be."),
+        Path | None, typer.Option("-o", "--out", metavar="OUT", help="Folder of the result; made if need be.")
     ] = None
     json_lines: Annotated[
-        str | None,
-        typer.Option(
-            "--json-lines",
-            metavar="-",
-            help="Lines of JSON on stdout as they come.",
-        ),
+        str | None, typer.Option("--json-lines", metavar="-", help="Lines of JSON on stdout as they come.")
     ] = None
     as_json: Annotated[bool, typer.Option("--json", help="Each summary as one line of JSON.")] = False
     figures: Annotated[

@@ -36,10 +36,7 @@ class ServingOptions:
     view_host: Annotated[
         str,
         typer.Option(
-            "--view-host",
-            metavar="ADDRESS",
-            show_default=False,
-            help="0.0.0.0: for other machines, too.",
+            "--view-host", metavar="ADDRESS", show_default=False, help="0.0.0.0: for other machines, too."
         ),
     ] = _HERE
     view_port: Annotated[
@@ -64,13 +61,7 @@ class ServingOptions:
     ] = None
     gpsd_port: Annotated[
         int | None,
-        typer.Option(
-            "--gpsd-port",
-            min=0,
-            max=65535,
-            metavar="PORT",
-            help="Serve positions as gpsd does.",
-        ),
+        typer.Option("--gpsd-port", min=0, max=65535, metavar="PORT", help="Serve positions as gpsd does."),
     ] = None
 
     def chosen(self, out: Path | None, *, positions: bool) -> Serving:
@@ -100,18 +91,12 @@ class ServingOptions:
 @command
 def live(
     *,
-    url: Annotated[
-        str,
-        typer.Argument(metavar="URL", help="Where events come from; - for RAW on stdin."),
-    ],
+    url: Annotated[str, typer.Argument(metavar="URL", help="Where events come from; - for RAW on stdin.")],
     link: LinkOptions,
     result: ResultOptions,
     place: PlaceOptions,
     camera: CameraOptions,
-    reconnect: Annotated[
-        bool,
-        typer.Option("--reconnect", help="Go on when a camera is back."),
-    ] = False,
+    reconnect: Annotated[bool, typer.Option("--reconnect", help="Go on when a camera is back.")] = False,
     waiting_ms: Annotated[
         float,
         typer.Option(

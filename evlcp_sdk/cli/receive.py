@@ -48,8 +48,7 @@ class ReceiveJob:
 def receive(
     *,
     recordings: Annotated[
-        list[str],
-        typer.Argument(metavar="REC...", help="Recordings; - for RAW on stdin."),
+        list[str], typer.Argument(metavar="REC...", help="Recordings; - for RAW on stdin.")
     ],
     link: LinkOptions,
     link_mode: Annotated[

@@ -18,8 +18,7 @@ if TYPE_CHECKING:
 def report(
     results: Annotated[Path, typer.Argument(metavar="RESULTS", help="What evlcp sweep wrote.")],
     out: Annotated[
-        Path | None,
-        typer.Option("-o", "--out", metavar="REPORT.html", help="The page.", show_default=False),
+        Path | None, typer.Option("-o", "--out", metavar="REPORT.html", help="The page.", show_default=False)
     ] = None,
     figures: Annotated[
         Path | None,

@@ -38,8 +38,7 @@ class MessageSpec:
         Field(description="Public Ed25519 keys whose beacons are verified, and what each may sign."),
     ] = ()
     revoked_keys: Annotated[
-        tuple[str, ...],
-        Field(description="Public keys whose beacons are forged, whenever they were signed."),
+        tuple[str, ...], Field(description="Public keys whose beacons are forged, whenever they were signed.")
     ] = ()
     max_age_s: Annotated[
         float,
@@ -103,11 +102,7 @@ class PositionSpec:
     ] = 1.0
     focal_fault: Annotated[
         float,
-        Field(
-            ge=0,
-            le=1,
-            description="The same of the focal length, as a share of it; 0: by any amount.",
-        ),
+        Field(ge=0, le=1, description="The same of the focal length, as a share of it; 0: by any amount."),
     ] = 0.005
     max_protection_m: Annotated[
         float, Field(gt=0, description="Protection level above which there is none.")

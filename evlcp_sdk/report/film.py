@@ -189,21 +189,12 @@ def gather_footage(
     shown = [one for one in frames if abs(one.t_us - start_us) <= for_us]
     regions = [one for one in probe.regions if start_us - 1e4 <= one.t_us <= start_us + for_us]
     return Footage(
-        start_us,
-        first_us,
-        sorted(shown, key=lambda one: one.t_us),
-        sorted(regions, key=lambda one: one.t_us),
+        start_us, first_us, sorted(shown, key=lambda one: one.t_us), sorted(regions, key=lambda one: one.t_us)
     )
 
 
 def plan_film(
-    footage: Footage,
-    for_us: float,
-    slow: float,
-    camera: CameraModel,
-    longest_px: int,
-    *,
-    whole: bool = False,
+    footage: Footage, for_us: float, slow: float, camera: CameraModel, longest_px: int, *, whole: bool = False
 ) -> Film:
     """What to show: the bars that are read, with a margin, or else what blinks, or else all.
 

@@ -145,7 +145,7 @@ class Report(Kept):
             note = f"{refused} refused" if refused else ""
             figures.append(("positions", f"{summary['positions']['fixes']:,}", note))
         figures += [
-            ("recording", f"{recording['duration_s']:.3g} s", f"{recording['counts']['events']:,} events"),
+            ("recording", f"{recording['duration_s']:.3g} s", f"{recording['counts']['events']:,} events")
         ]
         return figures
 

@@ -323,11 +323,7 @@ class Simulation:
     """
 
     def __init__(
-        self,
-        scene: Scene,
-        seed: int | None = None,
-        threads: int = 1,
-        registry: Registry | None = None,
+        self, scene: Scene, seed: int | None = None, threads: int = 1, registry: Registry | None = None
     ) -> None:
         self.scene = scene if seed is None else replace(scene, seed=seed)
         scene = self.scene

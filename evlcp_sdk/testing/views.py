@@ -82,12 +82,7 @@ def ideal_presence(
 
 
 def ideal_frame(
-    codebook: Codebook,
-    symbols: ArrayLike,
-    *,
-    after: ArrayLike = -1,
-    missing: float = 0.0,
-    seed: int = 0,
+    codebook: Codebook, symbols: ArrayLike, *, after: ArrayLike = -1, missing: float = 0.0, seed: int = 0
 ) -> tuple[Any, ...]:
     """What the receiver gives a decoding for one ideal frame: `decode(*ideal_frame(book, symbols))`.
 
