@@ -79,6 +79,7 @@ def test_parts_of_two_messages_are_not_joined(payload: bytes, data: st.DataObjec
 
 
 BEACON = dict.fromkeys(BEACON_NAMES, 1.0)
+BEYOND = (90.1, -181.0, math.nan, -1.0, 181.0, 0.0), (-90.1, 181.0, -13e3, 361.0, -1.0, 101.0)
 
 
 @pytest.mark.parametrize(
@@ -91,7 +92,7 @@ BEACON = dict.fromkeys(BEACON_NAMES, 1.0)
         (lambda: next(split(Message(Kind.DATA, 1, 2, bytes(65535)), DIGEST, HEADER_BYTES + 1)),
          "65535 bytes in parts of 1, expected at most 65536 parts"),
         *((partial(Beacon, **(BEACON | {name: value})), f"beacon: {name} = {value}, expected")
-          for name, value in zip(BEACON_NAMES, (90.1, -181.0, math.nan, -1.0, 181.0, 0.0), strict=True)),
+          for values in BEYOND for name, value in zip(BEACON_NAMES, values, strict=True)),
         (lambda: Beacon.unpack(bytes(27)), f"beacon of 27 bytes, expected at least {BEACON_BYTES}"),
         (lambda: Beacon.unpack(struct.pack("<qqiHHI", 91 * 10**9, 0, 0, 0, 0, 1)), "latitude_deg"),
     ],

@@ -33,7 +33,7 @@ def test_words_are_the_vectors(profile: str) -> None:
     assert [f"{word_of_chips(code):04x}" for code in book.codewords] == VECTORS["info_words"][profile]
     assert "".join(map(str, book.preamble)) == VECTORS["preamble_chips"]
     assert book.preamble.tolist() == chips_of_values(VECTORS["barker13"]).tolist()
-    assert book.to_dict()["preamble"] == VECTORS["barker13"]
+    assert (book.to_dict()["air_interface"], book.to_dict()["preamble"]) == (1, VECTORS["barker13"])
 
 
 def test_packet_is_the_vector() -> None:
