@@ -32,8 +32,7 @@ BAR, RING = BarLayout(), BarLayout(LedRing(leds=16, radius_m=0.45))
 
 
 def site(number: int, enu_m: tuple[float, float, float], transmitter: int | None = None) -> BarSite:
-    latitude, longitude, height = (float(v) for v in ORIGIN.to_geodetic(enu_m))
-    return BarSite(number, latitude, longitude, height, transmitter=transmitter)
+    return BarSite(number, *map(float, ORIGIN.to_geodetic(enu_m)), transmitter=transmitter)
 
 
 def camera_at(t_us: float) -> NDArray[np.float64]:
@@ -43,17 +42,16 @@ def camera_at(t_us: float) -> NDArray[np.float64]:
 def packets_of(bar: BarSite, transmitter: int, count: int, start_us: float = 5000.0,
                messages: dict[int, tuple[ReceivedMessage, ...]] | None = None,
                attitude: Attitude = EXACT, dark: tuple[int, ...] = (),
-               enu: NDArray[np.float64] | None = None) -> list[Packet]:  # fmt: skip
+               enu: NDArray[np.float64] | None = None, link: str = "") -> list[Packet]:  # fmt: skip
     """What a receiver of a bar gives while the camera drives, without noise."""
     enu, found = bar.cluster_positions_m(16, ORIGIN) if enu is None else enu, []
     for n in range(count):
-        start = start_us + n * PACKET_US
-        frames = []
+        start, frames = start_us + n * PACKET_US, []
         for k in range(10):
-            t_us = start + 2600 + k * FRAME_US
-            points, _ = project_bars(enu, camera_at(t_us + 800), attitude.rotation(), CAMERA)
+            t_us = start + 3400 + k * FRAME_US
+            points, _ = project_bars(enu, camera_at(t_us), attitude.rotation(), CAMERA)
             points[list(dark)] = np.nan
-            frames.append(frame(points, 0.1, t_us + 800, transmitter, n, k))
+            frames.append(dataclasses.replace(frame(points, 0.1, t_us, transmitter, n, k), link=link))
         heard = (messages or {}).get(n, ())
         found.append(Packet(transmitter, n, start, 100.0, tuple(frames), 10, messages=heard))
     return found
@@ -100,28 +98,15 @@ def assert_right(fixes: list[Fix], most_m: float = 2e-3) -> None:
 LEFT, RIGHT = site(7, (-2.0, 0.0, 0.0), 0), site(9, (2.0, -6.0, 0.0), 1)
 
 
-def with_link(packets: list[Packet], link: str) -> list[Packet]:
-    def named(packet: Packet) -> Packet:
-        frames = tuple(dataclasses.replace(frame, link=link) for frame in packet.frames)
-        return dataclasses.replace(packet, frames=frames)
-
-    return [named(packet) for packet in packets]
-
-
 def test_bars_of_two_links_give_one_fix() -> None:
     """A bar of 16 clusters, and one of half the length, of eight, whose packets are longer."""
     short = BarLayout(LedGrid(rows=48))
     right = dataclasses.replace(RIGHT, length_m=0.48, transmitter_id=7, link="short")
     left = dataclasses.replace(LEFT, link="long")
     gravity = Attitude(4.0, 1.0, None, 0.0)
-    kinds = {
-        "long": BarKind(BarLayout(), PACKET_US, "long"),
-        "short": BarKind(short, 1.3 * PACKET_US, "short"),
-    }
-    one = with_link(packets_of(LEFT, 0, 8), "long")
-    other = with_link(packets_of(right, 1, 8, enu=right.cluster_positions_m(8, ORIGIN)), "short")
-    lamp = with_link(packets_of(LEFT, 2, 8), "lamp")
-
+    kinds = {"long": BarKind(BAR, PACKET_US, "long"), "short": BarKind(short, 1.3 * PACKET_US, "short")}
+    one, lamp = packets_of(LEFT, 0, 8, link="long"), packets_of(LEFT, 2, 8, link="lamp")
+    other = packets_of(right, 1, 8, enu=right.cluster_positions_m(8, ORIGIN), link="short")
     p = Positioner(CAMERA, kinds, [right, left], lambda _t: gravity)
     fixes = fixes_of(p, merged(one, other, lamp))
     assert_right(fixes)
@@ -156,16 +141,18 @@ def test_one_bar_gives_a_fix_a_packet_time() -> None:
     assert {(f.refusal, f.transmitters) for f in fixes} == {("no-site", (3,))}
     assert fixes[0].detail == "no site is known of transmitter 3 (id not received)"
     assert unknown.counts["refused"] == len(fixes)
-
     p = positioner([LEFT])
     fixes = fixes_of(p, packets_of(LEFT, 0, 8))
     assert_right(fixes)
     assert [f.t_us for f in fixes] == [PACKET_US * n for n in range(1, 9)]
     assert p.counts == {"fixes": 8, "refused": 0, "frames_late": 0, "beacons_forged": 0}
-    assert fixes[0].heading_deg == pytest.approx(0, abs=1e-6) or fixes[0].heading_deg > 359
-    assert fixes[0].pitch_deg == pytest.approx(4)
-    assert fixes[0].roll_deg == pytest.approx(1)
+    assert (fixes[0].pitch_deg, fixes[0].roll_deg) == pytest.approx((4, 1))
+    assert math.remainder(fixes[0].heading_deg, 360) == pytest.approx(0, abs=1e-6)
     assert not fixes[0].verified
+    # Dark clusters, and a gap in time.
+    fixes = fixes_of(positioner([LEFT]), packets_of(LEFT, 0, 4, dark=(2, 9)) + packets_of(LEFT, 0, 4, 1e6))
+    assert len(fixes) == 8
+    assert_right(fixes)
 
 
 def test_two_bars_of_other_phases_give_the_heading() -> None:
@@ -192,8 +179,7 @@ def test_gravity_and_north_are_those_of_the_place_not_of_the_first_site() -> Non
     fixes = fixes_of(p, packets_of(LEFT, 0, 6))
     assert_right(fixes)
     assert p.axes == LocalAxes.of([far])
-    heading = fixes[0].heading_deg
-    assert min(heading, 360 - heading) < 1e-3
+    assert abs(math.remainder(fixes[0].heading_deg, 360)) < 1e-3
     # The covariance turns along: its size stays, its axes are those of the track's frame.
     plain = fixes_of(positioner([LEFT]), packets_of(LEFT, 0, 6))
     here = LocalAxes.of([LEFT])
@@ -225,17 +211,9 @@ def test_a_mirror_image_is_no_bar(known_from: int) -> None:
     assert set(both.bars.stands_at) == {0}
 
 
-def test_dark_clusters_and_a_gap_in_time() -> None:
-    stream = packets_of(LEFT, 0, 4, dark=(2, 9)) + packets_of(LEFT, 0, 4, 1e6)
-    fixes = fixes_of(positioner([LEFT]), stream)
-    assert len(fixes) == 8
-    assert_right(fixes)
-
-
 def heard(bar: BarSite, trust: Trust, packet: int) -> ReceivedMessage:
-    beacon = Beacon(
-        bar.latitude_deg, bar.longitude_deg, bar.height_m, bar.heading_deg, bar.tilt_deg, bar.length_m
-    )
+    names = ("latitude_deg", "longitude_deg", "height_m", "heading_deg", "tilt_deg", "length_m")
+    beacon = Beacon(*(getattr(bar, name) for name in names))
     message = Message(Kind.BEACON, bar.transmitter_id, packet, beacon.pack())
     why = "" if trust == "verified" else "why"
     return ReceivedMessage(0, packet, 0.0, message, BeaconKind(), beacon, trust, why)
@@ -295,13 +273,12 @@ def test_which_beacons_are_believed(beacons, messages, known) -> None:
 def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
     """From behind two bars the image of swapped ones is the same; what they say of themselves tells."""
     gravity = Attitude(4.0, 1.0, None, 0.0, 0.0)
-    swapped = [
-        dataclasses.replace(LEFT, transmitter_id=9),
-        dataclasses.replace(RIGHT, transmitter_id=7),
-    ]
+    swapped = [dataclasses.replace(LEFT, transmitter_id=9), dataclasses.replace(RIGHT, transmitter_id=7)]
     stream = merged(
-        packets_of(LEFT, 0, 6, messages={0: (heard(LEFT, "unverified", 0),)}),
-        packets_of(RIGHT, 1, 6, messages={0: (heard(RIGHT, "unverified", 0),)}),
+        *(
+            packets_of(bar, n, 6, messages={0: (heard(bar, "unverified", 0),)})
+            for n, bar in enumerate((LEFT, RIGHT))
+        )
     )
     right = positioner([LEFT, RIGHT], gravity)
     assert_right(fixes_of(right, stream))
@@ -345,8 +322,7 @@ def test_an_attitude_file(tmp_path: Path) -> None:
     # What the file has not are those that are said.
     track = AttitudeLog.read(path, Attitude(gravity_sigma_deg=0.7, heading_sigma_deg=3.0))
     found = track.at(500)
-    angles = (found.pitch_deg, found.roll_deg, found.heading_deg)
-    assert angles == pytest.approx((2, -1, 0))
+    assert (found.pitch_deg, found.roll_deg, found.heading_deg) == pytest.approx((2, -1, 0))
     assert (found.gravity_sigma_deg, found.heading_sigma_deg) == pytest.approx((0.7, 0.3))
     assert track.at(1001) is None
     head = "t_us,pitch_deg,roll_deg\n"

@@ -30,8 +30,7 @@ ROTATION = Attitude(3.0, 1.0, 2.0).rotation()
 
 
 def site_at(number: int, enu: list[float], tilt: float, heading: float) -> BarSite:
-    latitude, longitude, height = (float(v) for v in AXES.to_geodetic(np.array(enu)))
-    return BarSite(number, latitude, longitude, height, heading, tilt)
+    return BarSite(number, *map(float, AXES.to_geodetic(np.array(enu))), heading, tilt)
 
 
 BARS = [site_at(7, [-3.0, 45.0, 3.0], 4.0, 200.0), site_at(9, [3.0, 50.0, 4.0], 90.0, 80.0)]
@@ -130,13 +129,17 @@ SPOTS = {0: (-4.0, 60.0, 3.0), 1: (4.0, 66.0, 4.0), 2: (1.0, 75.0, 5.0)}
 
 
 def site_of(number: int, off: Floats | None = None) -> BarSite:
-    enu = np.array(SPOTS[number]) + (0.0 if off is None else off)
-    latitude, longitude, height = (float(v) for v in AXES.to_geodetic(enu))
-    return BarSite(number, latitude, longitude, height, transmitter=number, position_sigma_m=SITE_M)
+    place = AXES.to_geodetic(np.array(SPOTS[number]) + (0.0 if off is None else off))
+    return BarSite(number, *map(float, place), transmitter=number, position_sigma_m=SITE_M)
 
 
 def where(t_us: float) -> Floats:
     return np.array([0.5, 10e-6 * t_us, 0.0])
+
+
+def shown(number: int, t_us: float) -> Floats:
+    enu = site_of(number).cluster_positions_m(16, AXES)
+    return project_bars(enu, where(t_us), TRUE.rotation(), LINK.camera)[0]
 
 
 def packets(rng: np.random.Generator, first: int = 15, last: int = 45) -> list[Packet]:
@@ -146,25 +149,28 @@ def packets(rng: np.random.Generator, first: int = 15, last: int = 45) -> list[P
         for number in SPOTS:
             if number == 2 and not first <= n < last:
                 continue
-            enu = site_of(number).cluster_positions_m(16, AXES)
             frames = []
             for k in range(3):
                 t_us = n * PACKET_US + 2600 + k * 11_000
-                points, _ = project_bars(enu, where(t_us), TRUE.rotation(), LINK.camera)
-                points = points + rng.normal(0, 0.07, points.shape) + rng.normal(0, 0.05, 2)
+                points = shown(number, t_us) + rng.normal(0, 0.07, (16, 2)) + rng.normal(0, 0.05, 2)
                 frames.append(frame(points, 0.0707, t_us, number, n, k))
             found.append(Packet(number, n, n * PACKET_US, 100.0, tuple(frames), 10))
     return found
 
 
-def own_poses(rng: np.random.Generator, stream: list[Packet]) -> list[KnownPose]:
-    bias = BIAS_DEG * rng.normal(size=3)
-    told = Attitude(2.0 + bias[0], 0.5 + bias[1], 3.0 + bias[2], BIAS_DEG, BIAS_DEG)
-    sites = tuple(site_of(n, SITE_M * rng.normal(size=3)) for n in (0, 1))
-    own = OwnPoses(Navigator(LINK, PositionPlan(sites), told), lambda _t: told, "rec.raw")
+def poses_of(stream: list[Packet], plan: PositionPlan, told: Attitude) -> list[KnownPose]:
+    own = OwnPoses(Navigator(LINK, plan, told), lambda _t: told, "rec.raw")
     for packet in stream:
         own.take(packet)
     return own.close()
+
+
+def own_poses(rng: np.random.Generator, stream: list[Packet]) -> list[KnownPose]:
+    bias = BIAS_DEG * rng.normal(size=3)
+    told = Attitude(2.0 + bias[0], 0.5 + bias[1], 3.0 + bias[2], BIAS_DEG, BIAS_DEG)
+    return poses_of(
+        stream, PositionPlan(tuple(site_of(n, SITE_M * rng.normal(size=3)) for n in (0, 1))), told
+    )
 
 
 def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:
@@ -179,10 +185,7 @@ def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:
         for pose in poses[::3]:
             here = AXES.to_enu(pose.latitude_deg, pose.longitude_deg, pose.height_m)
             off.append(np.linalg.norm(here - where(pose.t_us)) / pose.position_sigma_m)
-            points, _ = project_bars(
-                site_of(2).cluster_positions_m(16, AXES), where(pose.t_us), TRUE.rotation(), LINK.camera
-            )
-            points += rng.normal(0, 0.07, points.shape)
+            points = shown(2, pose.t_us) + rng.normal(0, 0.07, (16, 2))
             seen = (BarView(2, np.empty((0, 3)), points, np.full(16, 0.0707)),)
             sigmas = (pose.position_sigma_m, pose.attitude.rotation(), pose.attitude_sigma_deg)
             views.append(CalibrationView(seen, here, *sigmas))
@@ -208,11 +211,7 @@ def test_satellites_and_a_compass_do_without_known_bars() -> None:
     place = np.stack(AXES.to_geodetic(np.array([where(t) for t in t_us])), 1)
     log = GnssLog(t_us, place, np.tile(0.01 * np.eye(3), (20, 1, 1)))
     told = Attitude(2.0, 0.5, 3.0, 0.2, 0.3)
-    plan = PositionPlan((site_of(0), site_of(1)), log)
-    own = OwnPoses(Navigator(LINK, plan, told), lambda _t: told, "rec.raw")
-    for packet in stream:
-        own.take(packet)
-    poses = own.close()
+    poses = poses_of(stream, PositionPlan((site_of(0), site_of(1)), log), told)
     assert len(poses) >= 4
     for pose in poses:
         assert pose.t_us in t_us

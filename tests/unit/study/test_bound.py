@@ -63,51 +63,39 @@ def test_the_bound_is_that_of_boundaries_by_themselves(blur_px: float) -> None:
 
 
 def view_of(
-    distance_m: float,
-    noise: float,
-    rng: np.random.Generator,
-    *,
-    blur_px: float = 0.45,
-    upside_down: bool = False,
-    across: bool = False,
-    dark: tuple[int, ...] = (),
-    moves_px: float = 0.0,
-    by_sign_px: float = 0.0,
-    noisier: float = 1.0,
-) -> FrameView:
+    distance_m: float, noise: float, rng: np.random.Generator, *,
+    blur_px: float = 0.45, upside_down: bool = False, across: bool = False, dark: tuple[int, ...] = (),
+    moves_px: float = 0.0, by_sign_px: float = 0.0, noisier: float = 1.0,
+) -> FrameView:  # fmt: skip
     """A frame of a bar of `COLUMNS` pixels: the model's values and Gaussian noise, `FULL` events a value.
 
     In each value the bar has moved by chance, `moves_px`; steps up and down are shifted against each other;
     rows away from steps are `noisier`.
     """
-    spacing = LINK.camera.focal_px * 0.06 / distance_m
+    spacing, symbols = LINK.camera.focal_px * 0.06 / distance_m, rng.integers(0, 64, K)
     height, width = 2 * int(spacing * K / 2 + 8), 20
-    symbols = rng.integers(0, 64, K)
-    codes = np.concatenate([LINK.codebook.pilot_edges, LINK.codebook.codeword_edges[symbols]], axis=1).astype(
-        float
-    )
+    book = LINK.codebook
+    codes = np.concatenate([book.pilot_edges, book.codeword_edges[symbols]], axis=1).astype(float)
     codes[list(dark)] = 0
     shift = rng.uniform(-0.5, 0.5)
     rows = np.arange(height) - (height - 1) / 2 - shift
     # Steps from each cluster to the next, (K + 1, values); before the first and after the last is nothing.
     steps = np.diff(codes, axis=0, prepend=0, append=0)
-    moved = moves_px * rng.normal(size=codes.shape[1]) if moves_px else np.zeros(codes.shape[1])
+    moved = moves_px * rng.normal(size=codes.shape[1]) if moves_px else 0.0
     at = spacing * (np.arange(K + 1) - K / 2)[:, None] + by_sign_px * np.sign(steps) + moved
     beyond = (rows - at[..., None]) / blur_px
     level = 0.5 * (steps[..., None] * norm.cdf(beyond)).sum(0)
     stepping = (steps[..., None] * (np.abs(beyond) < 2.5)).any(0)
-    sums = np.zeros((32, height, width))
-    bar = slice(width // 2 - COLUMNS // 2, width // 2 + COLUMNS // 2)
-    sums[1::2, :, bar] = level[:, :, None]
+    sums, bar = np.zeros((32, height, width)), slice(width // 2 - COLUMNS // 2, width // 2 + COLUMNS // 2)
     spread = noise * np.where(stepping, 1.0, noisier)[:, :, None]
-    sums[1::2, :, bar] += spread * rng.normal(size=sums[1::2, :, bar].shape)
+    sums[1::2, :, bar] = level[:, :, None] + spread * rng.normal(size=(16, height, COLUMNS))
     selected = np.zeros((K, height // 2, width // 2), bool)
     pixels = np.zeros((K, height, width), np.float32)
     for k in set(range(K)) - set(dark):
-        middle = (height - 1) / 2 + shift + spacing * (k - (K - 1) / 2)
-        inside = np.abs(np.arange(height) - middle) < spacing / 2
-        pixels[k, inside, bar] = 1
-        cells = np.abs(np.arange(height // 2) * 2 + 0.5 - middle) < spacing / 2
+        near = np.abs(rows - spacing * (k - (K - 1) / 2)) < spacing / 2
+        pixels[k, near, bar] = 1
+        middles = (rows[::2] + rows[1::2]) / 2
+        cells = np.abs(middles - spacing * (k - (K - 1) / 2)) < spacing / 2
         selected[k, cells, bar.start // 2 : bar.stop // 2] = True
     if upside_down:
         sums, selected, pixels = sums[:, ::-1], selected[:, ::-1], pixels[:, ::-1]
@@ -119,12 +107,7 @@ def view_of(
 
 
 FRAMES: list[tuple[float, dict[str, float]]] = [
-    *(
-        (40.0, {"blur_px": 0.45}),
-        (80.0, {"blur_px": 0.45}),
-        (40.0, {"blur_px": 0.6}),
-        (80.0, {"blur_px": 0.6}),
-    ),
+    *((distance_m, {"blur_px": blur_px}) for distance_m in (40.0, 80.0) for blur_px in (0.45, 0.6)),
     # What says nothing of the boundaries is no noise of theirs.
     *((60.0, {"moves_px": 0.15}), (60.0, {"by_sign_px": 0.08}), (60.0, {"noisier": 2.0})),
 ]
@@ -132,20 +115,15 @@ FRAMES: list[tuple[float, dict[str, float]]] = [
 
 @pytest.mark.parametrize(("distance_m", "how"), FRAMES, ids=str)
 def test_statistics_come_from_the_frames(distance_m: float, how: dict[str, float]) -> None:
-    noise, rng = 0.1, np.random.default_rng(0)
-    measure = frame_bound(LINK, full_events=FULL)
-    errors, sigmas, wanted = [], [], []
-    for _ in range(40):
-        view = view_of(distance_m, noise, rng, **how)
-        found = measure(view)
-        errors.append(found.distance_m - distance_m)
-        sigmas.append(found.sigma_m)
-        given = {"blur_px": how.get("blur_px", 0.45), "noise": noise, "columns": COLUMNS, "gain": 0.5}
-        wanted.append(bar_bound(LINK, distance_m, view.soft.symbols, **given))
-    assert np.mean(sigmas) == pytest.approx(np.mean(wanted), rel=0.05)
+    rng, measure = np.random.default_rng(0), frame_bound(LINK, full_events=FULL)
+    given = {"blur_px": how.get("blur_px", 0.45), "noise": 0.1, "columns": COLUMNS, "gain": 0.5}
+    views = [view_of(distance_m, 0.1, rng, **how) for _ in range(40)]
+    found = [measure(view) for view in views]
+    wanted = np.mean([bar_bound(LINK, distance_m, view.soft.symbols, **given) for view in views])
+    assert np.mean([one.sigma_m for one in found]) == pytest.approx(wanted, rel=0.05)
     if "blur_px" in how:
         # 40 errors tell a spread to 11 %: three of these.
-        assert np.std(errors) == pytest.approx(np.mean(wanted), rel=0.33)
+        assert np.std([one.distance_m for one in found]) == pytest.approx(wanted, rel=0.33)
 
 
 def test_boundaries_between_pixels_that_are_sharp_say_nothing() -> None:
