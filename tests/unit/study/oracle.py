@@ -49,14 +49,11 @@ def at(t_us: float, truth: dict[str, Any], values: list[float]) -> float:
     return float(np.interp(t_us, np.array(truth["t_s"]) * 1e6, values))
 
 
-def hidden(
-    bar: dict[str, Any], clusters: int, begin: float, end: float, recovery: float
-) -> tuple[set[int], set[int]]:
+def hidden(bar: dict[str, Any], clusters: int, begin: float, end: float, recovery: float) -> tuple[set, set]:
+    """Clusters that are hidden from begin to end, and at any time of it."""
     whole, part = set(bar.get("covered", ())), set(bar.get("covered", ()))
-    for a, b, first, last in [
-        *bar.get("cover_s", ()),
-        *((a, b, 0, clusters - 1) for a, b in bar.get("pole_s", ())),
-    ]:
+    poles = [(a, b, 0, clusters - 1) for a, b in bar.get("pole_s", ())]
+    for a, b, first, last in [*bar.get("cover_s", ()), *poles]:
         if begin < b * 1e6 + recovery and end > a * 1e6:
             part |= set(range(first, last + 1))
         if begin >= a * 1e6 and end <= b * 1e6:
@@ -97,19 +94,18 @@ def score(rows: list[Row], truth: dict[str, Any], lengths: Lengths, *, road: boo
         if road and row.get("echo_of"):
             echoes += 1
             continue
-        best, away = None, math.inf
-        for one in bars:
-            x, y = (at(t, truth, truth["bar_centre_px"][one["i"]][axis]) for axis in (0, 1))
-            apart = math.hypot(float(row["x_px"]) - x, float(row["y_px"]) - y)
-            if apart < away:
-                best, away = one, apart
-        if best is None:
+        if not bars:
             unmatched += 1
             continue
-        j, off = -1, math.inf
-        for n, (begin, *_) in enumerate(best["sent"]):
-            if abs(begin - t) < off:
-                j, off = n, abs(begin - t)
+
+        def apart(one: dict[str, Any], row: Row = row, t: float = t) -> float:
+            x, y = (at(t, truth, truth["bar_centre_px"][one["i"]][axis]) for axis in (0, 1))
+            return math.hypot(float(row["x_px"]) - x, float(row["y_px"]) - y)
+
+        best = min(bars, key=apart)
+        away, starts = apart(best), [abs(begin - t) for begin, *_ in best["sent"]]
+        off = min(starts, default=math.inf)
+        j = starts.index(off) if starts else -1
         if off > near or away > 60 or j in best["hit"]:
             dark = road and any(
                 t < b * 1e6 + long and t + long > a * 1e6 for a, b in best["bar"].get("pole_s", ())

@@ -48,9 +48,7 @@ def campaign(tmp_path: Path) -> Path:
 def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) -> None:
     results = tmp_path / "r.sqlite"
     dry = evlcp("sweep", campaign, "-o", results, "--dry-run")
-    assert dry.code == 0
-    assert "short: 0 of 4 tasks" in dry.out
-    assert not results.exists()
+    assert (dry.code, "short: 0 of 4 tasks" in dry.out, results.exists()) == (0, True, False)
     done = evlcp("sweep", campaign, "-o", results, "--workers", "1")
     assert (done.code, done.err) == (0, "")
     assert "short: 4 of 4 tasks, 4 of 4 points" in done.out
@@ -68,8 +66,7 @@ def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) ->
 
     shown = evlcp("report", results)
     assert shown.code == 0
-    for text in ("16 clusters", "two clusters", "90 to 100 m", "80 to 90 m"):
-        assert text in shown.out
+    assert all(text in shown.out for text in ("16 clusters", "two clusters", "90 to 100 m", "80 to 90 m"))
     table = json.loads(evlcp("report", results, "--json").out)
     assert [s["name"] for s in table["series"]] == ["16 clusters", "two clusters"]
     assert "| 16 clusters |" in evlcp("report", results, "--markdown").out
