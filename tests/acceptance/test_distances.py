@@ -49,11 +49,8 @@ def drive(distance_m: float, row_px: float, seed: int) -> list[np.ndarray]:
         }
     )
     simulation = Simulation(scene, seed)
-    events, truth, true = (
-        [*simulation.stream()],
-        truth_of(simulation),
-        attitude_log(scene, seed, simulation.path),
-    )
+    events, truth = [*simulation.stream()], truth_of(simulation)
+    true = attitude_log(scene, seed, simulation.path)
     sigma_deg = np.full(len(true.t_us), SIGMA_DEG)
     log = replace(true, pitch_deg=true.pitch_deg - off_deg, gravity_sigma_deg=sigma_deg)
     found = []
@@ -92,10 +89,8 @@ def test_an_independent_generator_s_pitch_is_corrected(tmp_path: Path) -> None:
 @pytest.mark.parametrize(("x_m", "y_m"), [(-3.6, -1.6), (3.6, 1.6)])
 def test_a_stated_distortion_reaches_distances_in_opposite_corners(tmp_path, x_m, y_m) -> None:
     lens = load_link(overrides=["camera.k1=-0.25"])
-    scene = load_scene(
-        "night", {"duration_s": 0.15, "motion.distance_m": 45.0, "camera.k1": -0.25}, link=lens
-    )
-    scene = replace(scene, bars=(replace(scene.bars[0], x_m=x_m, y_m=y_m),))
+    keys = {"duration_s": 0.15, "motion.distance_m": 45.0, "camera.k1": -0.25}
+    scene = load_scene("night", keys | {"bars.0.x_m": x_m, "bars.0.y_m": y_m}, link=lens)
     recording = tmp_path / "corner.raw"
     evlcp.simulate(scene, 3).save(recording)
     stated = bar_of(recording, tmp_path / "stated", lens)

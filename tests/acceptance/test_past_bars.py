@@ -46,14 +46,9 @@ def test_two_bars_of_another_generator_say_where_the_camera_is() -> None:
     places, attitudes = poses(truth, bars, link.camera.focal_px)
     t_us = np.array(truth["t_s"]) * 1e6 + truth["scene"]["t0_us"]
     # An IMU that is off by one sigma of each angle.
-    log = AttitudeLog(
-        t_us,
-        np.array([a.pitch_deg + 0.1 for a in attitudes]),
-        np.array([a.roll_deg - 0.1 for a in attitudes]),
-        np.degrees(np.unwrap([math.radians(a.heading_deg or 0.0) for a in attitudes])) + 0.1,
-        np.full(len(t_us), 0.1),
-        np.full(len(t_us), 0.1),
-    )
+    pitch, roll, heading = np.array([(a.pitch_deg, a.roll_deg, a.heading_deg) for a in attitudes]).T
+    sigma, heading = np.full(len(t_us), 0.1), np.unwrap(heading, period=360)
+    log = AttitudeLog(t_us, pitch + 0.1, roll - 0.1, heading + 0.1, sigma, sigma)
     receiver = Receiver(link, attitude=log)
     with open_source(str(RECORDING)) as source:
         packets = [p for events in source.chunks() for p in receiver.feed(events)] + receiver.close()
@@ -62,10 +57,8 @@ def test_two_bars_of_another_generator_say_where_the_camera_is() -> None:
         frame = next(p for p in packets if p.transmitter == number).frames[0]
         centres = np.transpose(truth["bar_centre_px"], (2, 1, 0))[0]
         i = int(np.argmin(np.hypot(centres[0] - frame.x_px, centres[1] - frame.y_px)))
-        latitude, longitude, height = map(float, AXES.to_geodetic(ENU @ bars[i]))
-        sites.append(
-            BarSite(i + 1, latitude, longitude, height, length_m=said[i]["length_m"], transmitter=number)
-        )
+        place, long_m = map(float, AXES.to_geodetic(ENU @ bars[i])), said[i]["length_m"]
+        sites.append(BarSite(i + 1, *place, length_m=long_m, transmitter=number))
     navigator = Navigator(link, PositionPlan(tuple(sites)), log)
     placed = navigator.feed(packets)
     rest, _ = navigator.close()

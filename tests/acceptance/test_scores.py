@@ -1,14 +1,10 @@
 """The figures that the receiver must reach on recordings with truth, by the independent scorer."""
 
 import csv
-import io
 import json
 import runpy
-import sys
 import warnings
 from collections.abc import Callable, Iterator
-from contextlib import redirect_stdout
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,15 +36,13 @@ FIGURES = {
 }
 
 
-def scored(out: Path, name: str, tool: str = "score.py") -> dict[str, Any]:
+def scored(out: Path, name: str, tool: str = "score") -> dict[str, Any]:
     """What a scorer of ../shared, which is not this project's, says of a result."""
-    told = io.StringIO()
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(told), warnings.catch_warnings():
+    with warnings.catch_warnings():
         # It leaves the files that it reads to be closed by others.
         warnings.simplefilter("ignore", ResourceWarning)
-        patch.setattr(sys, "argv", [tool, str(out), str(RECORDINGS / f"{name}.truth.json"), "--json"])
-        runpy.run_path(str(SHARED / "tools" / tool), run_name="__main__")
-    return json.loads(told.getvalue())
+        run = runpy.run_path(str(SHARED / "tools" / f"{tool}.py"))
+        return run["score"](out, RECORDINGS / f"{name}.truth.json")  # type: ignore[no-any-return]
 
 
 Receive = Callable[..., Path]
@@ -75,16 +69,15 @@ def truth_of(name: str) -> dict[str, Any]:
     return json.loads((RECORDINGS / f"{name}.truth.json").read_text())
 
 
-def frames_beside(
-    truth: dict[str, Any], out: Path
-) -> Iterator[tuple[dict[str, str], int, Callable[..., float]]]:
-    """Rows of `frames.csv`, the nearest bar, and what gives a value of the truth in the middle of a pilot."""
+def frames_beside(name: str, out: Path) -> Iterator[tuple[dict[str, str], int, float, list[float]]]:
+    """Rows of `frames.csv`, the nearest bar, its true distance, and where it is, in the middle of a pilot."""
+    truth = truth_of(name)
     with (out / "frames.csv").open() as file:
         for row in csv.DictReader(file):
             t_s = (float(row["t_us"]) + 800 - truth["scene"]["t0_us"]) * 1e-6
-            at = partial(np.interp, t_s, truth["t_s"])
-            off_px = [abs(float(row["x_px"]) - at(x)) for x, _ in truth["bar_centre_px"]]
-            yield row, int(np.argmin(off_px)), at
+            places = [[np.interp(t_s, truth["t_s"], v) for v in both] for both in truth["bar_centre_px"]]
+            i = int(np.argmin([abs(float(row["x_px"]) - x) for x, _ in places]))
+            yield row, i, float(np.interp(t_s, truth["t_s"], truth["distance_m"][i])), places[i]
 
 
 @pytest.mark.parametrize("name", FIGURES)
@@ -111,12 +104,9 @@ def test_sigma_tells_the_error_and_the_bar_is_where_frames_say(received: Receive
     """
     ratios, errors_px = [], []
     for name in ("night-50m-30kmh", "day-35m-20kmh", "tunnel-90m-30kmh", "lamps-60m-40kmh-rollover"):
-        truth = truth_of(name)
-        for row, i, at in frames_beside(truth, received(name)):
-            error_m = float(row["distance_m"]) - at(truth["distance_m"][i])
-            ratios.append(error_m / float(row["distance_sigma_m"]))
-            for column, true_px in zip(("x_px", "y_px"), truth["bar_centre_px"][i], strict=True):
-                errors_px.append(float(row[column]) - at(true_px))
+        for row, _, true_m, true_px in frames_beside(name, received(name)):
+            ratios.append((float(row["distance_m"]) - true_m) / float(row["distance_sigma_m"]))
+            errors_px += [float(row["x_px"]) - true_px[0], float(row["y_px"]) - true_px[1]]
     # The median is deaf to the few frames whose sigma came out small by chance: 0.6745 for a normal one.
     assert 0.5 < np.median(np.abs(ratios)) / 0.6745 < 2
     assert np.sqrt(np.mean(np.square(errors_px))) < 0.2
@@ -140,10 +130,10 @@ WITH_BARS = [name for name, bars in FIGURES.items() if bars]
 @pytest.mark.parametrize("name", WITH_BARS)
 def test_one_fit_over_all_boundaries_is_better(name: str, received: Receive) -> None:
     """The best variant has at most 0.75 of the paper's error, filtered 0.4 of it."""
-    truth, out = truth_of(name), received(name, *JOINT)
-    errors_m: list[list[float]] = [[] for _ in truth["bars"]]
-    for row, i, at in frames_beside(truth, out):
-        errors_m[i].append(float(row["distance_filtered_m"]) - at(truth["distance_m"][i]))
+    out = received(name, *JOINT)
+    errors_m: list[list[float]] = [[] for _ in FIGURES[name]]
+    for row, i, true_m, _ in frames_beside(name, out):
+        errors_m[i].append(float(row["distance_filtered_m"]) - true_m)
     paper, joint = (scored(one, name)["bars"] for one in (received(name, *PAPER), out))
     for one, other, filtered_m in zip(paper, joint, errors_m, strict=True):
         assert other["rmse_m"] <= 0.75 * one["rmse_m"]
@@ -175,7 +165,7 @@ def test_positive_events_suffice(name: str, tmp_path: Path) -> None:
     raw = tmp_path / "positive.raw"
     write_events(raw, events[events.p == 1], 1280, 720)
     receive_to_folder(raw, tmp_path / "out")
-    (bar,) = scored(tmp_path / "out", name, "score_road.py")["bars"]
+    (bar,) = scored(tmp_path / "out", name, "score_road")["bars"]
     assert bar["frames_found"] >= 0.9 * bar["frames_sent"]
     assert bar["ber"] <= 0.01
     assert bar["erased"] <= 0.02

@@ -2,8 +2,6 @@
 
 import json
 import os
-import random
-import resource
 import shutil
 import signal
 import subprocess
@@ -147,62 +145,24 @@ def wait_for(count: Callable[[], int], more_than: int) -> int:
 
 
 @pytest.mark.skipif(not Path("/proc/self/task").exists(), reason="needs Linux's /proc to find the workers")
-def test_killed_twice_it_ends_as_if_never(tmp_path: Path) -> None:
-    """64 tasks: scheduler and workers are killed at random moments, and nothing finished is lost."""
-    rng = random.Random(4)
-    store = tmp_path / "killed.sqlite"
-    seen = 0
-    for death in range(2):
-        process = begin(store)
-        try:
-            seen_now = wait_for(lambda: kept(store), seen + rng.randrange(4, 14))
-            assert seen_now > seen
-            listed = Path(f"/proc/{process.pid}/task/{process.pid}/children")
-            workers = [int(pid) for pid in listed.read_text().split()]
-            if death % 2:
-                for worker in workers:
-                    os.kill(worker, signal.SIGKILL)
-                wait_for(lambda: kept(store), seen_now)
-            process.kill()
-        finally:
-            process.wait()
-        for worker in workers:
-            wait_for(lambda w=worker: int(not Path(f"/proc/{w}").exists()), 0)  # type: ignore[misc]
-            assert not Path(f"/proc/{worker}/exe").exists(), "a worker outlives its scheduler"
-        assert kept(store) >= seen_now
-        seen = kept(store)
-    assert 0 < seen < 64
+def test_killed_it_ends_as_if_never(tmp_path: Path) -> None:
+    """64 tasks: the scheduler is killed in the middle, its workers end, and nothing finished is lost."""
+    store, plan = tmp_path / "killed.sqlite", fake_plan(8, 2, 4)
     process = begin(store)
-    assert process.wait(60) == 0
-    plan = fake_plan(8, 2, 4)
-    progress, totals = collected(plan, store)
-    _, expected = collected(plan, tmp_path / "whole.sqlite")
-    assert totals == expected
-    assert progress.done == 64
-    with Store(store) as left, Store(tmp_path / "whole.sqlite") as right:
-        assert left.results() == right.results()
-
-
-def test_a_full_disk_is_one_line_and_loses_nothing(tmp_path: Path) -> None:
-    path = tmp_path / "a.sqlite"
-    plan = fake_plan(seeds=40)
-    collected(fake_plan(seeds=2), path)
-    before = kept(path)
-    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
-    ignored = signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
-    with Store(path, create=True) as store:
-        resource.setrlimit(resource.RLIMIT_FSIZE, (path.stat().st_size + 150_000, hard))
-        try:
-            with pytest.raises(
-                EvlcpError, match=r"a\.sqlite: cannot be written: .*; what was finished is kept"
-            ) as told:
-                collect(plan, store, Inline(), run_fake)
-        finally:
-            resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
-            signal.signal(signal.SIGXFSZ, ignored)
-    assert len(str(told.value).splitlines()) == 1
-    assert before < kept(path) < 400
-    assert collected(plan, path)[1] == collected(plan, tmp_path / "b.sqlite")[1]
+    try:
+        before = wait_for(lambda: kept(store), 10)
+        workers = Path(f"/proc/{process.pid}/task/{process.pid}/children").read_text().split()
+    finally:
+        process.kill()
+        process.wait()
+    for worker in workers:
+        wait_for(lambda w=worker: int(not Path(f"/proc/{w}").exists()), 0)  # type: ignore[misc]
+        assert not Path(f"/proc/{worker}/exe").exists(), "a worker outlives its scheduler"
+    assert 10 < before <= kept(store) < 64
+    assert len(workers) >= 2
+    assert begin(store).wait(60) == 0
+    assert kept(store) == 64
+    assert collected(plan, store) == collected(plan, tmp_path / "whole.sqlite")
 
 
 def test_what_is_no_store_or_cannot_be_opened_is_refused(tmp_path: Path) -> None:
