@@ -25,13 +25,11 @@ LINK = load_link()
 SIGMA_DEG = 0.1
 
 
-def bar_of(
-    recording: Path, out: Path, link: evlcp.Link, attitude: Attitude | None = None
-) -> dict[str, float]:
+def bar_of(recording, out, link, attitude=None) -> dict[str, float]:
     """The score of a recording's bar."""
     receive_to_folder(recording, out, link, attitude=attitude)
     (bar,) = score_frames(read_frames(out), read_truth(truth_path(recording)))["road"]["bars"]
-    return bar  # type: ignore[no-any-return]
+    return bar
 
 
 def drive(distance_m: float, row_px: float, seed: int) -> list[np.ndarray]:

@@ -42,7 +42,7 @@ def scored(out: Path, name: str, tool: str = "score") -> dict[str, Any]:
         # It leaves the files that it reads to be closed by others.
         warnings.simplefilter("ignore", ResourceWarning)
         run = runpy.run_path(str(SHARED / "tools" / f"{tool}.py"))
-        return run["score"](out, RECORDINGS / f"{name}.truth.json")  # type: ignore[no-any-return]
+        return run["score"](out, RECORDINGS / f"{name}.truth.json")
 
 
 Receive = Callable[..., Path]

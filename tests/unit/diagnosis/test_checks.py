@@ -23,9 +23,7 @@ LINK = load_link()
 NO_POSITIONS = PositionTally().to_dict(Navigator(LINK, PositionPlan(())))
 
 
-def tally_of(
-    symbols: np.ndarray, *, ppm: float = 0.0, every_us: float = 0.0, start_us: float = 0.0, **of_frame: Any
-) -> RunTally:
+def tally_of(symbols, *, ppm=0.0, every_us=0.0, start_us=0.0, **of_frame: Any) -> RunTally:
     """Packets of ten frames with these symbols, (packets, 10, 16)."""
     tally = RunTally(LINK.packet)
     period_us = LINK.packet.packet_chips * 100.0 / (1 + ppm * 1e-6)

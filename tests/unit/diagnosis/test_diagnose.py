@@ -33,9 +33,7 @@ from tests.unit.study.browser import CHROMIUM, Browser
 LINK = load_link()
 
 
-def rendered(
-    link: tuple[str, ...] = (), duration_s: float = 0.12, seed: int = 3, **changes: Any
-) -> SimulatedSource:
+def rendered(link=(), duration_s=0.12, seed=3, **changes: Any) -> SimulatedSource:
     light = {"background.light_w_m2": 0.01, "bars.0.led_w_m2": 8.0}
     keys = {"duration_s": duration_s, **light, **changes}
     scene = load_scene("night", keys, link=load_link(overrides=link))
@@ -104,14 +102,7 @@ WH8, REED_SOLOMON = ("modulation.id=wh8",), ("error-correction.id=reed-solomon",
         ({"clusters-hidden"}, (), (), 0.12, {"bars.0.covered": [4, 5]}, "is something before them?"),
     ],
 )
-def test_what_receive_warns_of(
-    warned: set[str],
-    sent: tuple[str, ...],
-    read: tuple[str, ...],
-    duration_s: float,
-    changes: dict[str, Any],
-    step: str,
-) -> None:
+def test_what_receive_warns_of(warned, sent, read, duration_s, changes, step) -> None:
     summary = receive_to_folder(rendered(sent, duration_s, **changes), None, load_link(overrides=read))
     assert {one["code"] for one in summary["warnings"]} == warned
     assert not warned or any(step in one["next_step"] for one in summary["warnings"])
@@ -152,13 +143,7 @@ def test_a_restart_is_told_in_words() -> None:
     assert 70 <= float(rest.split()[0]) < 77
 
 
-def judged(
-    *sources: LightSource,
-    quality: float = 1.0,
-    frames: int = 0,
-    rejected: int = 0,
-    duration_us: float = 2e5,
-) -> str:
+def judged(*sources: LightSource, quality=1.0, frames=0, rejected=0, duration_us=200000.0) -> str:
     """What is wrong first of all with light that the survey told, and what the receiver made of it."""
     tally = RunTally(LINK.packet)
     if frames:

@@ -26,9 +26,7 @@ def bar(place: Sequence[float] | Floats, axis: Sequence[float] = (0, 0, 1)) -> F
     return np.asarray(place, float) + along[:, None] * np.array(axis, float)
 
 
-def frame(
-    points_px: Floats, sigma_px: float, t_us: float, transmitter: int = 0, packet: int = 0, number: int = 0
-) -> Frame:
+def frame(points_px, sigma_px, t_us, transmitter=0, packet=0, number=0) -> Frame:
     """A frame with nothing but points."""
     soft = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
     nothing = Range(math.nan, math.nan, 0)

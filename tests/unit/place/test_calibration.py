@@ -19,9 +19,7 @@ TRUE = CameraModel(focal_mm=8.2, centre_x_px=652.0, centre_y_px=351.0, k1=-0.12,
 NOMINAL = CameraModel(focal_mm=8.0)
 
 
-def views(
-    rng: np.random.Generator, count: int, known: bool, noise_px: float = 0.1, bars: int = 6
-) -> list[CalibrationView]:
+def views(rng, count, known, noise_px=0.1, bars=6) -> list[CalibrationView]:
     """A camera among poles 8 to 20 m away, that looks about and is rolled."""
     poles = [bar([rng.uniform(-9, 9), rng.uniform(8, 20), rng.uniform(-4, 4)]) for _ in range(bars)]
     found = []

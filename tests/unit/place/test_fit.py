@@ -145,7 +145,7 @@ def fitted(p: Problem, position: Floats, rotation: Floats) -> Equations:
     """Where the fit ends."""
     found, settled = fit_pose(p, Fit.at(p, position, rotation))
     assert settled
-    return found  # type: ignore[return-value]
+    return found
 
 
 def sigmas_of(p: Problem, equations: Equations) -> Floats:

@@ -26,10 +26,7 @@ LINE = math.sqrt(np.linalg.inv(np.vander(T_US / 1e4, 2).T @ np.vander(T_US / 1e4
 """Sigma at 0 of a straight line through the frames, of errors of 1."""
 
 
-def seen(
-    points_px: Floats, sigma_px: float, spec: ErrorModel = SPEC, layout_m: Floats = LINE_M,
-    flank_px: float = math.nan, t_us: Floats = T_US,
-) -> BarView:  # fmt: skip
+def seen(points_px, sigma_px, spec=SPEC, layout_m=LINE_M, flank_px=math.nan, t_us=T_US) -> BarView:
     """A bar at 0 by its frames, float64 (9, 16, 2)."""
     frames = [
         replace(frame(points, sigma_px, t), points_flank_px=flank_px)

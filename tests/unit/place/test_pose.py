@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,11 +34,7 @@ SURVEY = (0.05, math.radians(0.3), 0.002)
 """A survey of 5 cm, 0.3 degrees and 2 mm in a metre."""
 
 
-def views(
-    bars: list[Floats], position: Floats, rotation: Floats,
-    rng: np.random.Generator | None = None, noise_px: float = 0.3, camera: CameraModel = CAMERA,
-    across: float = 1.0,
-) -> list[BarView]:  # fmt: skip
+def views(bars, position, rotation, rng=None, noise_px=0.3, camera=CAMERA, across=1.0) -> list[BarView]:
     seen = []
     for i, enu in enumerate(bars):
         points, _ = project_bars(enu, position, rotation, camera)
@@ -162,9 +157,7 @@ def test_three_points_give_their_pose_among_the_solutions(seed: int) -> None:
         (THREE, None),
     ],
 )
-def test_without_noise_the_pose_is_exact(
-    camera: CameraModel, places: list[Place], known: Attitude | None
-) -> None:
+def test_without_noise_the_pose_is_exact(camera, places, known) -> None:
     # The whole scene is turned to the heading of 123 degrees and moved.
     rotation = Attitude(4.0, -2.0, 123.0).rotation()
     turn = Rotation.from_euler("z", -123, degrees=True).as_matrix()
@@ -421,9 +414,7 @@ def test_false_alarms_are_as_rare_as_said() -> None:
 def test_what_is_not_determined_is_refused() -> None:
     rng = np.random.default_rng(1)
 
-    def kind_of(
-        places: list[Place], known: Attitude | None, spec: ErrorModel = USUAL, axis: Any = (0, 0, 1)
-    ) -> str:
+    def kind_of(places, known, spec=USUAL, axis=(0, 0, 1)) -> str:
         seen = views([bar(p, axis) for p in places], np.zeros(3), UP.rotation(), rng, 0.1)
         found = solve_pose(seen, CAMERA, known, spec)
         return refused(found).kind if isinstance(found, Rejection) else ""

@@ -61,10 +61,7 @@ def merged(*streams: list[Packet]) -> list[Packet]:
     return sorted((p for s in streams for p in s), key=lambda p: p.t_us)
 
 
-def positioner(
-    sites: list[BarSite], attitude: Attitude | None = EXACT, layout: BarLayout = BAR, link: str = "",
-    **spec: Any,
-) -> Positioner:  # fmt: skip
+def positioner(sites, attitude=EXACT, layout=BAR, link="", **spec: Any) -> Positioner:
     kinds = {"": BarKind(layout, PACKET_US, link)}
     return Positioner(CAMERA, kinds, sites, lambda _t: attitude, ErrorModel(**spec))
 
@@ -307,7 +304,7 @@ def test_sites_that_are_mixed_up_are_contradicted_by_beacons() -> None:
 )
 def test_a_bar_that_is_not_its_site(change: dict[str, float], told: str | None) -> None:
     """A lone bar of the wrong length or place fits the image as well as the right one."""
-    registry = BarRegistry([dataclasses.replace(LEFT, **change)], ErrorModel())  # type: ignore[arg-type]
+    registry = BarRegistry([dataclasses.replace(LEFT, **change)], ErrorModel())
     registry.add_packet(Packet(0, 0, 0.0, 100.0, (), 10, messages=(heard(LEFT, "unverified", 0),)))
     assert (registry.site(0) is None) == (told is not None)
     assert (told or "") in registry.contradiction(0)

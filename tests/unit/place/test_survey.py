@@ -2,7 +2,6 @@
 
 import dataclasses
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
@@ -36,14 +35,7 @@ def site_at(number: int, enu: list[float], tilt: float, heading: float) -> BarSi
 BARS = [site_at(7, [-3.0, 45.0, 3.0], 4.0, 200.0), site_at(9, [3.0, 50.0, 4.0], 90.0, 80.0)]
 
 
-def views(
-    rng: np.random.Generator,
-    place_m: float,
-    turn_deg: float,
-    focal: float = 0.0,
-    bend_px: float = 0.0,
-    bars: Sequence[BarSite] = BARS,
-) -> list[CalibrationView]:
+def views(rng, place_m, turn_deg, focal=0.0, bend_px=0.0, bars=BARS) -> list[CalibrationView]:
     """A drive of 12 m towards the bars; poses are off by one error in common, and by one each.
 
     Bars look bent along themselves, each by the same in all views.

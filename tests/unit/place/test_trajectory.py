@@ -234,10 +234,7 @@ def motion(push: bool) -> ImuMotion:
     return ImuMotion(t, 0.6 * t + 0.3 * np.sin(2 * t), True, pushed)
 
 
-def stepped(
-    way: ImuMotion, velocity: Floats, heading: float, imu: Floats,
-    kicked_s: float = np.inf, turn: float = 0.0, kick: Floats | float = 0.0,
-) -> Floats:  # fmt: skip
+def stepped(way, velocity, heading, imu, kicked_s=np.inf, turn=0.0, kick=0.0) -> Floats:
     """Place and velocity in the end, by many short steps; from a time on heading and velocity are off."""
     steps, end = 6000, way.t_s[-1]
     dt = end / steps
@@ -299,9 +296,7 @@ def test_noise_is_that_of_kicks(push: bool) -> None:
     np.testing.assert_allclose(reckon(way, VELOCITY, 0.4, 0.0, imu, STRONG).noise, noise, atol=5e-3)
 
 
-def turning_drive(
-    rng: np.random.Generator, spec: ErrorModel, *, push: bool, rate_deg_s: float
-) -> tuple[list[Fix], AttitudeLog, Floats, Floats]:
+def turning_drive(rng, spec, *, push, rate_deg_s) -> tuple[list[Fix], AttitudeLog, Floats, Floats]:
     """A car that turns by turns, fixes with a gap of 3 s, an IMU of 50 Hz with biases; truth and biases."""
     steps, dt = 400, 0.02
     t = np.arange(steps + 1) * dt

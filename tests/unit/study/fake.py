@@ -16,9 +16,7 @@ from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics, Tally
 
 
-def fake_plan(
-    scenes: int = 5, links: int = 2, seeds: int = 4, rule: StopRule | None = None, **scene: Any
-) -> Plan:
+def fake_plan(scenes=5, links=2, seeds=4, rule=None, **scene: Any) -> Plan:
     """Scenes of growing difficulty; `scene` says what else their tasks do."""
     return Plan(
         "fake",

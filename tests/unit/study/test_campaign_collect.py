@@ -18,7 +18,7 @@ import pytest
 from evlcp_sdk.errors import ConfigError, EvlcpError, InputError, OutputError
 from evlcp_sdk.study.collect import Counted, Progress, collect
 from evlcp_sdk.study.jobs import DaskCluster, Executor, Inline, Processes
-from evlcp_sdk.study.plan import Plan, StopRule
+from evlcp_sdk.study.plan import StopRule
 from evlcp_sdk.study.store import Store
 from evlcp_sdk.study.tally import Statistics
 from tests.conftest import ROOT
@@ -28,9 +28,7 @@ from tests.unit.test_signals import start
 Watch = Callable[[Progress], None]
 
 
-def collected(
-    plan: Plan, path: Path, executor: Executor | None = None, watch: Watch = lambda _: None
-) -> tuple[Progress, list[Statistics]]:
+def collected(plan, path, executor=None, watch=lambda _: None) -> tuple[Progress, list[Statistics]]:
     """How a collection ended, and what counts of each point in its store."""
     with Store(path, create=True) as store:
         progress = collect(plan, store, executor or Inline(), run_fake, watch)
@@ -61,7 +59,7 @@ def test_a_finished_campaign_runs_nothing_and_a_grown_one_the_rest(tmp_path: Pat
     ran: list[str] = []
 
     def run(job: object) -> list[tuple[str, Statistics]]:
-        results = run_fake(job)  # type: ignore[arg-type]
+        results = run_fake(job)
         ran.extend(task for task, _ in results)
         return results
 
@@ -156,7 +154,7 @@ def test_killed_it_ends_as_if_never(tmp_path: Path) -> None:
         process.kill()
         process.wait()
     for worker in workers:
-        wait_for(lambda w=worker: int(not Path(f"/proc/{w}").exists()), 0)  # type: ignore[misc]
+        wait_for(lambda w=worker: int(not Path(f"/proc/{w}").exists()), 0)
         assert not Path(f"/proc/{worker}/exe").exists(), "a worker outlives its scheduler"
     assert 10 < before <= kept(store) < 64
     assert len(workers) >= 2
@@ -199,7 +197,7 @@ class Cluster:
         command = [sys.executable, "-m", f"distributed.cli.dask_{what}", "--host", "127.0.0.1"]
         env = os.environ | {"HOME": str(self.folder), "DASK_DISTRIBUTED__COMM__TIMEOUTS__CONNECT": "3s"}
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
-        process = subprocess.Popen([*command, "--no-dashboard", *options], cwd=ROOT, env=env, **quiet)  # type: ignore[call-overload]
+        process = subprocess.Popen([*command, "--no-dashboard", *options], cwd=ROOT, env=env, **quiet)
         self.processes.append(process)
 
     def add_worker(self) -> None:
@@ -286,9 +284,7 @@ def test_processes_give_what_this_one_gives(evlcp: Evlcp, demo_raw: Path, tmp_pa
 
 @pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
 @pytest.mark.parametrize(("number", "tell"), [(signal.SIGINT, os.killpg), (signal.SIGTERM, os.kill)])
-def test_ctrl_c_and_its_like_end_all_of_them(
-    demo_raw: Path, tmp_path: Path, number: int, tell: Callable[[int, int], None]
-) -> None:
+def test_ctrl_c_and_its_like_end_all_of_them(demo_raw, tmp_path, number, tell) -> None:
     """A terminal's Ctrl-C reaches workers, too: what they decoded is written, and nothing is begun."""
     many = [tmp_path / f"r{n}.raw" for n in range(40)]
     for path in many:

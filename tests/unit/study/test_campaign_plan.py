@@ -132,9 +132,7 @@ def test_faults_are_reported_with_their_path(tmp_path: Path, old: str, new: str,
         (1000, {"scene": "a", "link": "b"}, "59 scenes x 59 links x 1000 seeds: 3481000 tasks, expected at"),
     ],
 )
-def test_a_grid_of_too_many_points_is_refused_at_once(
-    tmp_path: Path, seeds: int, grids: dict[str, str], told: str
-) -> None:
+def test_a_grid_of_too_many_points_is_refused_at_once(tmp_path, seeds, grids, told) -> None:
     axes = [f"{part}.grid.{axis} = {list(range(59))}" for part, some in grids.items() for axis in some]
     with pytest.raises(ConfigError, match=told):
         plan_of(tmp_path, "\n".join([*axes, f'campaign = {{ name = "x", seeds = {seeds} }}']))

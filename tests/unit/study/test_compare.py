@@ -42,12 +42,7 @@ ERRORS = errors(0.1, -0.2, 0.6)
 FILTERED = Tally(filtered=2, filtered_squares_nm2=29 * 10**14)
 
 
-def measured(
-    error: Tally = ERRORS,
-    filtered: Tally = FILTERED,
-    times: dict[str, Any] | None = None,
-    **changes: int,
-) -> Measured:
+def measured(error=ERRORS, filtered=FILTERED, times=None, **changes: int) -> Measured:
     """A variant with truth and a tracking filter."""
     tally = Tally(**({"frames_sent": 100, "frames_found": 88, "bits": 8448, "bit_errors": 3} | changes))
     counts = {"packets": 9, "rows": 90, "unmatched": 2, "stated": 2, "sigma_squares_nm2": 10**17}

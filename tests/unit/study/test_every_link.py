@@ -152,9 +152,7 @@ BARS: dict[str, tuple[list[str], int, int, float]] = {
 
 
 @pytest.mark.parametrize(("settings", "least", "lost", "rmse_m"), BARS.values(), ids=BARS)
-def test_any_layout_is_received_and_measured(
-    settings: list[str], least: int, lost: int, rmse_m: float
-) -> None:
+def test_any_layout_is_received_and_measured(settings, least, lost, rmse_m) -> None:
     found = received(load_scene("night", settings))
     assert found.frames_found >= found.frames_sent - lost > least
     assert found.bit_errors == 0
@@ -192,9 +190,7 @@ def received(scene: Scene) -> Tally:
         ({"error-correction.id": "none"}, None),
     ],
 )
-def test_another_link_is_refused_by_all(
-    settings: Settings, says: str | None, evlcp: Evlcp, tmp_path: Path
-) -> None:
+def test_another_link_is_refused_by_all(settings, says, evlcp, tmp_path) -> None:
     raw, campaign = tmp_path / "r.raw", tmp_path / "c.toml"
     run(evlcp, "simulate", "--preset", "night", "-o", raw, "--set", "duration_s=0.002")
     run(evlcp, "receive", raw, "-o", tmp_path / "out", *options(settings))

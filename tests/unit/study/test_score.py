@@ -52,7 +52,7 @@ leaves_files = pytest.mark.filterwarnings(
 
 
 def plain(table: Table) -> Table:
-    return json.loads(json.dumps(table))  # type: ignore[no-any-return]
+    return json.loads(json.dumps(table))
 
 
 COVERS = {
@@ -73,9 +73,7 @@ def scene_truths() -> dict[str, Table]:
 @needs_tools
 @leaves_files
 @pytest.mark.parametrize("name", ["two", "dark", "covered", *RECORDED])
-def test_the_numbers_are_those_of_both_independent_scorers(
-    name: str, tmp_path: Path, evlcp: Callable[..., Any]
-) -> None:
+def test_the_numbers_are_those_of_both_independent_scorers(name, tmp_path, evlcp) -> None:
     truth = json.loads(RECORDED[name].read_text()) if name in RECORDED else scene_truths()[name]
     bits = {"wh4x2": 6, "wh8": 4, "raw8": 8}
     lengths = Lengths(bits=bits[truth["bars"][0].get("profile", "wh4x2")]) if truth["bars"] else Lengths()
@@ -306,7 +304,7 @@ def seen(truth: Truth) -> list[Packet]:
 
 @pytest.mark.parametrize("attitude", ["none", "gravity", "heading"])
 def test_positions_are_held_beside_the_cameras_path(attitude: str) -> None:
-    world = {**GATE["world"], "attitude": attitude}  # type: ignore[dict-item]
+    world = {**GATE["world"], "attitude": attitude}
     simulation = Simulation(resolve_scene(GATE | {"world": world}))
     truth = truth_of(simulation)
     packets = seen(truth)

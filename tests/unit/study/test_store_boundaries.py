@@ -160,13 +160,11 @@ def keep(path: Path, plan: str) -> None:
 def plan(results: Path) -> dict[str, Any]:
     """What the file has of the plan."""
     ((body,),) = change(results, "SELECT body FROM plan")
-    return json.loads(body)  # type: ignore[no-any-return]
+    return json.loads(body)
 
 
 @pytest.mark.parametrize("changed", ["plan", "statistics"])
-def test_what_was_changed_is_taken_or_refused_in_one_line(
-    results: Path, plan: dict[str, Any], changed: str
-) -> None:
+def test_what_was_changed_is_taken_or_refused_in_one_line(results, plan, changed) -> None:
     table = {"bar": {"rows": 96, "cluster_rows": 6, "columns": 1, "cluster_columns": 1}}
     plan["links"][0]["identity"] = table | {"digest": "d" * 64, "table": {"ranging": {}, **table}}
     plan["scenes"][0]["identity"] = {"motion": {"speed_mps": 8.0}}
@@ -195,9 +193,7 @@ def test_what_was_changed_is_taken_or_refused_in_one_line(
     ],
     ids=lambda value: str(value)[:20],
 )
-def test_what_is_no_plan_is_named_in_one_line(
-    results: Path, plan: dict[str, Any], body: str | dict[str, Any], says: str
-) -> None:
+def test_what_is_no_plan_is_named_in_one_line(results, plan, body, says) -> None:
     keep(results, body if isinstance(body, str) else json.dumps(plan | body))
     line = refusal(lambda: read(results)) or ""
     assert "a.sqlite: damaged, or no results file of evlcp sweep" in line

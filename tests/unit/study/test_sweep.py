@@ -81,9 +81,7 @@ def test_from_a_file_to_figures(evlcp: Evlcp, campaign: Path, tmp_path: Path) ->
         (["seeds=0"], "--set seeds=0: expected campaign.KEY="),
     ],
 )
-def test_bad_campaigns_are_one_line(
-    evlcp: Evlcp, campaign: Path, tmp_path: Path, overrides: list[str], told: str
-) -> None:
+def test_bad_campaigns_are_one_line(evlcp, campaign, tmp_path, overrides, told) -> None:
     options = [part for text in overrides for part in ("--set", text)]
     done = evlcp("sweep", campaign, "-o", tmp_path / "r.sqlite", *options)
     assert done.code == 2
