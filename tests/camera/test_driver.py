@@ -9,9 +9,7 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +39,7 @@ COMMAND = [sys.executable, "-c", "from evlcp_sdk.cli.main import main; main()"]
 class Emulator:
     """The emulated camera, and how to run a program that sees it."""
 
-    def __init__(self, words: Path, *options: str) -> None:
+    def __init__(self, words, *options):
         command = [
             "umockdev-wrapper",
             SYSTEM,
@@ -53,21 +51,21 @@ class Emulator:
         self.process = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, env=clean
         )
-        self.lines: queue.Queue[str] = queue.Queue()
+        self.lines = queue.Queue()
         threading.Thread(target=self._listen, daemon=True).start()
         self.folder = self.lines.get(timeout=20)
-        self.seen: list[str] = []
-        self.programs: list[subprocess.Popen[str]] = []
+        self.seen = []
+        self.programs = []
 
-    def _listen(self) -> None:
+    def _listen(self):
         for line in self.process.stdout:
             self.lines.put(line.strip())
 
-    def tell(self, what: str) -> None:
+    def tell(self, what):
         self.process.stdin.write(what + "\n")
         self.process.stdin.flush()
 
-    def wait(self, what: str) -> None:
+    def wait(self, what):
         while not self.seen or not self.seen[-1].startswith(what):
             try:
                 self.seen.append(self.lines.get(timeout=120))
@@ -78,13 +76,13 @@ class Emulator:
                     pytest.xfail(f"the driver's own libusb aborted: {ended}")
                 raise AssertionError(f"never {what!r}: {self.seen[-5:]}, {ended}") from None
 
-    def _ended(self) -> str:
+    def _ended(self):
         """What its programs left, once they are ended."""
         for program in self.programs:
             program.kill()
         return "; ".join(f"{program.returncode}: {program.communicate()[1]}" for program in self.programs)
 
-    def run(self, command: list[str], **more: Any) -> "subprocess.Popen[str]":
+    def run(self, command, **more):
         preload = {"LD_PRELOAD": "libumockdev-preload.so.0", "UMOCKDEV_DIR": self.folder}
         pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
         program = subprocess.Popen(command, text=True, env={**os.environ, **preload}, **{**pipes, **more})
@@ -93,7 +91,7 @@ class Emulator:
 
 
 @contextlib.contextmanager
-def emulator(recording: Path, folder: Path, *options: str) -> Iterator[Emulator]:
+def emulator(recording, folder, *options):
     words = folder / "words"
     words.write_bytes(recording.read_bytes().partition(b"% end\n")[2])
     one = Emulator(words, *options)
@@ -112,7 +110,7 @@ def emulator(recording: Path, folder: Path, *options: str) -> Iterator[Emulator]
 
 
 @emulated
-def test_symbols_are_those_of_the_file_and_unplugged_it_ends_whole(demo_raw: Path, tmp_path: Path) -> None:
+def test_symbols_are_those_of_the_file_and_unplugged_it_ends_whole(demo_raw, tmp_path):
     told = ("--tell", "1010,1018,2000,4000,6008,600C,7004")
     url = "camera:12345678?diff_on=20&diff_off=-5&events_per_s=4e7&area=0,1,1280,719&trigger=0"
     with emulator(demo_raw, tmp_path, "--rate", "2e7", "--then", "unplug", *told) as camera:
@@ -147,9 +145,9 @@ def test_symbols_are_those_of_the_file_and_unplugged_it_ends_whole(demo_raw: Pat
 
 
 @emulated
-def test_it_goes_on_when_the_camera_is_back(demo_raw: Path, tmp_path: Path) -> None:
+def test_it_goes_on_when_the_camera_is_back(demo_raw, tmp_path):
     once = sum(len(packet.frames) for packet in receive(demo_raw))
-    lines: queue.Queue[str] = queue.Queue()
+    lines = queue.Queue()
     with emulator(demo_raw, tmp_path, "--rate", "2e7") as camera:
         options = ["--reconnect", "--json-lines", "-", "-o", str(tmp_path / "out"), "--waiting-ms", "10000"]
         with camera.run([*COMMAND, "live", "camera:", *options]) as process:
@@ -175,7 +173,7 @@ def test_it_goes_on_when_the_camera_is_back(demo_raw: Path, tmp_path: Path) -> N
 
 
 @emulated
-def test_what_the_driver_drops_is_counted(demo_raw: Path, tmp_path: Path) -> None:
+def test_what_the_driver_drops_is_counted(demo_raw, tmp_path):
     program = (
         "import time, evlcp_sdk as evlcp\n"
         "source = evlcp.open('camera:')\n"
@@ -201,7 +199,7 @@ def test_what_the_driver_drops_is_counted(demo_raw: Path, tmp_path: Path) -> Non
 
 
 @emulated
-def test_what_is_wrong_is_said_before_anything_is_read(demo_raw: Path, tmp_path: Path) -> None:
+def test_what_is_wrong_is_said_before_anything_is_read(demo_raw, tmp_path):
     program = (
         "import evlcp_sdk as evlcp\n"
         "for url in ('camera:99', 'camera:?diff_of=1', 'camera:?area=0,0,1300,1', 'camera:?diff_off=400'):\n"
@@ -219,7 +217,7 @@ def test_what_is_wrong_is_said_before_anything_is_read(demo_raw: Path, tmp_path:
     assert "diff_off = 400: expected -73 to 182" in bounds
 
 
-def test_each_fault_of_the_driver_is_one_line_with_the_next_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_fault_of_the_driver_is_one_line_with_the_next_step(monkeypatch):
     import neuromorphic_drivers
 
     for said, told in (
@@ -231,7 +229,7 @@ def test_each_fault_of_the_driver_is_one_line_with_the_next_step(monkeypatch: py
         ("never seen before", "the driver says: never seen before"),
     ):
 
-        def fail(said: str = said) -> None:
+        def fail(said=said):
             raise RuntimeError(said)
 
         monkeypatch.setattr(neuromorphic_drivers, "list_devices", fail)
@@ -244,7 +242,7 @@ def test_each_fault_of_the_driver_is_one_line_with_the_next_step(monkeypatch: py
         open_source("camera:")
 
 
-def test_options_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_options_are_checked(monkeypatch):
     for url, told in (
         ("camera:?diff_on=high", "diff_on = 'high': expected a whole number"),
         ("camera:?events_per_s=100", "expected 5000 to "),
@@ -258,7 +256,7 @@ def test_options_are_checked(monkeypatch: pytest.MonkeyPatch) -> None:
         open_source("camera:")
 
 
-def _not_there(name: str) -> None:
+def _not_there(name):
     raise ImportError(name)
 
 
@@ -267,24 +265,24 @@ class Flaky(EventSource):
 
     live = True
 
-    def __init__(self, first_us: int) -> None:
+    def __init__(self, first_us):
         super().__init__(Path("flaky"), "X", 1280, 720)
         self.left = [first_us + 10, first_us]
 
-    def take(self, max_events: int) -> tuple[Events, Triggers] | None:
+    def take(self, max_events):
         if not self.left:
             raise UnpluggedError("flaky: gone")
         return Events.of([self.left.pop()], [1], [1], [1]), Triggers.empty()
 
-    def close(self) -> None:
+    def close(self):
         pass
 
 
-def test_a_source_that_is_gone_is_opened_again() -> None:
-    asked: list[int] = []
-    waited: list[float] = []
+def test_a_source_that_is_gone_is_opened_again():
+    asked = []
+    waited = []
 
-    def opened() -> EventSource:
+    def opened():
         asked.append(len(asked))
         if len(asked) in (2, 3):
             raise InputError("not there yet")
@@ -297,12 +295,12 @@ def test_a_source_that_is_gone_is_opened_again() -> None:
     assert len(waited) == 2
 
 
-def test_masks_leave_the_areas() -> None:
+def test_masks_leave_the_areas():
     import neuromorphic_drivers
 
-    kind: Any = neuromorphic_drivers.prophesee_evk4
+    kind = neuromorphic_drivers.prophesee_evk4
     masks = camera._masks("camera:", kind, [(10, 20, 30, 40), (100, 0, 5, 5)])
-    bits: Callable[[tuple[int, ...]], Any] = lambda words: np.unpackbits(  # noqa: E731
+    bits = lambda words: np.unpackbits(  # noqa: E731
         np.array(words, "<u8").view(np.uint8), bitorder="little"
     )
     columns, rows = bits(masks["x_mask"])[:1280], bits(masks["y_mask"])[:720][::-1]

@@ -21,11 +21,11 @@ from tests.fuzz.test_readers import refused, store_of
 MOST_S, MOST_MB = 20, 500
 
 
-def peak_mb() -> float:
+def peak_mb():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
-def main() -> None:
+def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("kinds", nargs="*", metavar="KIND")
     parser.add_argument("--minutes", type=float, default=5.0)

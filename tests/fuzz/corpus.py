@@ -52,7 +52,7 @@ class Kind:
     read: Callable[[Path], Any]
 
 
-def some_events(n: int = 1500) -> Events:
+def some_events(n=1500):
     rng = np.random.default_rng(1)
     return Events.of(
         100 + rng.integers(0, 40, n).cumsum(),
@@ -62,7 +62,7 @@ def some_events(n: int = 1500) -> Events:
     )
 
 
-def read_recording(path: Path) -> int:
+def read_recording(path):
     """Read all events and triggers of a recording; they are what they claim to be."""
     with open_source(path) as source:
         width, height = source.width, source.height
@@ -77,7 +77,7 @@ def read_recording(path: Path) -> int:
     return n
 
 
-def _recording(folder: Path, name: str, format: str | None = None) -> bytes:
+def _recording(folder, name, format=None):
     path, events = folder / name, some_events()
     triggers = Triggers.of(events.t_us[::300], [0] * 5, [1, 0, 1, 0, 1])
     with open_writer(path, WIDTH, HEIGHT, format) as writer:
@@ -86,17 +86,17 @@ def _recording(folder: Path, name: str, format: str | None = None) -> bytes:
     return path.read_bytes()
 
 
-def _columns() -> dict[str, Any]:
+def _columns():
     events = some_events()
     return {"t": events.t_us, "x": events.x, "y": events.y, "p": events.p}
 
 
-def _written(path: Path, write: Callable[..., Any], *what: Any) -> bytes:
+def _written(path, write, *what):
     write(path, *what)
     return path.read_bytes()
 
 
-def _db3(folder: Path) -> bytes:
+def _db3(folder):
     """The messages of a bag of MCAP in one of SQLite."""
     path = folder / "messages.mcap"
     _recording(folder, path.name)
@@ -105,21 +105,21 @@ def _db3(folder: Path) -> bytes:
     return _written(folder / "a.db3", write_sqlite, messages, range(len(messages)))
 
 
-def _update(folder: Path) -> bytes:
+def _update(folder):
     package = Package("stm32f405-8mhz", {1: bytes(range(200)), 2: bytes(range(100, 250))})
     return package.to_json().encode()
 
 
-def _store(path: Path) -> None:
+def _store(path):
     with Store(path) as store:
         summarize(store)
 
 
-def _frames(path: Path) -> None:
+def _frames(path):
     read_frames(path.parent)
 
 
-def _summary(path: Path) -> None:
+def _summary(path):
     read_summary(path.parent)
 
 
@@ -163,7 +163,7 @@ seed = 1
 """
 
 
-def kinds(folder: Path, store: bytes) -> list[Kind]:
+def kinds(folder, store):
     """Every kind.
 
     Args:

@@ -1,6 +1,5 @@
 """Bytes and texts, damaged as wires, disks and strangers damage them."""
 
-import random
 import re
 
 ODD_NUMBERS = (
@@ -23,53 +22,53 @@ ODD_BYTES = (
 _NUMBER = re.compile(rb"-?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
 
 
-def damaged(data: bytes, rng: random.Random) -> bytes:
+def damaged(data, rng):
     """The bytes after one to four accidents."""
     for _ in range(rng.choice((1, 1, 1, 2, 4))):
         data = rng.choice(_ACCIDENTS)(data, rng)
     return data
 
 
-def _flip(data: bytes, rng: random.Random) -> bytes:
+def _flip(data, rng):
     if not data:
         return data
     at = rng.randrange(len(data))
     return data[:at] + bytes([data[at] ^ 1 << rng.randrange(8)]) + data[at + 1 :]
 
 
-def _write(data: bytes, rng: random.Random) -> bytes:
+def _write(data, rng):
     at = rng.randrange(len(data) + 1)
     odd = rng.choice(ODD_BYTES)
     return data[:at] + odd + data[at + len(odd) :]
 
 
-def _insert(data: bytes, rng: random.Random) -> bytes:
+def _insert(data, rng):
     at = rng.randrange(len(data) + 1)
     return data[:at] + rng.randbytes(rng.choice((1, 2, 3, 16))) + data[at:]
 
 
-def _delete(data: bytes, rng: random.Random) -> bytes:
+def _delete(data, rng):
     at = rng.randrange(len(data) + 1)
     return data[:at] + data[at + rng.choice((1, 2, 4, 100, 4096)) :]
 
 
-def _cut(data: bytes, rng: random.Random) -> bytes:
+def _cut(data, rng):
     return data[: rng.randrange(len(data) + 1)]
 
 
-def _repeat(data: bytes, rng: random.Random) -> bytes:
+def _repeat(data, rng):
     at = rng.randrange(len(data) + 1)
     part = data[at : at + rng.choice((1, 8, 64, 512))]
     return data[:at] + part * rng.choice((2, 3, 50)) + data[at + len(part) :]
 
 
-def _swap(data: bytes, rng: random.Random) -> bytes:
+def _swap(data, rng):
     a, b = sorted(rng.randrange(len(data) + 1) for _ in range(2))
     c = rng.randrange(b, len(data) + 1)
     return data[:a] + data[b:c] + data[a:b] + data[c:]
 
 
-def _number(data: bytes, rng: random.Random) -> bytes:
+def _number(data, rng):
     """A number of a text, where there is one, becomes an odd one."""
     found = list(_NUMBER.finditer(data[:200_000]))
     if not found:

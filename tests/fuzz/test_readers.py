@@ -17,7 +17,7 @@ from evlcp_sdk.errors import EvlcpError
 from evlcp_sdk.study.collect import collect
 from evlcp_sdk.study.jobs import Inline
 from evlcp_sdk.study.store import Store
-from tests.fuzz.corpus import Kind, kinds
+from tests.fuzz.corpus import kinds
 from tests.fuzz.mutate import damaged
 from tests.unit.study.fake import fake_plan, run_fake
 
@@ -31,7 +31,7 @@ ROUNDS = {"campaign": 10, "EVT3": 150, "EVT2": 150}
 """Damaged files of a kind; 40 of others. `make fuzz` reads more."""
 
 
-def store_of(folder: Path) -> bytes:
+def store_of(folder):
     """A finished campaign's results file."""
     path = folder / "results.sqlite"
     with Store(path, create=True) as store:
@@ -40,12 +40,12 @@ def store_of(folder: Path) -> bytes:
 
 
 @pytest.fixture(scope="module")
-def corpus(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Kind]:
+def corpus(tmp_path_factory):
     folder = tmp_path_factory.mktemp("corpus")
     return {kind.name: kind for kind in kinds(folder, store_of(folder))}
 
 
-def refused(kind: Kind, data: bytes, folder: Path) -> bool:
+def refused(kind, data, folder):
     """Read a file with these bytes; whether it was refused, in lines that name it."""
     path = folder / kind.file
     path.write_bytes(data)
@@ -62,14 +62,14 @@ def refused(kind: Kind, data: bytes, folder: Path) -> bool:
     return False
 
 
-def test_the_corpus_is_good(corpus: dict[str, Kind], tmp_path: Path) -> None:
+def test_the_corpus_is_good(corpus, tmp_path):
     assert tuple(corpus) == NAMES
     for kind in corpus.values():
         assert not refused(kind, kind.data, tmp_path), kind.name
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_damaged_files(corpus: dict[str, Kind], name: str, tmp_path: Path) -> None:
+def test_damaged_files(corpus, name, tmp_path):
     kind = corpus[name]
     rng = random.Random(zlib.crc32(name.encode()))
     rounds = ROUNDS.get(name, 40)
@@ -78,7 +78,7 @@ def test_damaged_files(corpus: dict[str, Kind], name: str, tmp_path: Path) -> No
     assert faults > 0
 
 
-def test_no_kernel_reads_or_writes_beside_its_arrays(corpus: dict[str, Kind], tmp_path: Path) -> None:
+def test_no_kernel_reads_or_writes_beside_its_arrays(corpus, tmp_path):
     """The same files in a process whose kernels check every index."""
     code = (
         "import pathlib, random, sys; from tests.fuzz.corpus import read_recording\n"

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-from typing import Any
 
 from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.blocks import Kind, Message, split
@@ -13,7 +12,7 @@ from evlcp_sdk.link.resolve import load_link
 PROFILES = ("wh4x2", "wh8", "raw8")
 
 
-def messages() -> list[Message]:
+def messages():
     beacon = Beacon(35.156789012, -136.965432101, 52.345, 123.45, 2.5, 0.96, b"lane 2")
     return [
         Message(Kind.BEACON, 7, 1_800_000_000, beacon.pack()),
@@ -23,7 +22,7 @@ def messages() -> list[Message]:
     ]
 
 
-def vectors() -> dict[str, Any]:
+def vectors():
     packets = []
     for profile in PROFILES:
         for code in ("polar", "none"):

@@ -23,7 +23,7 @@ PREAMBLE = [0, 1, 0, 0, 1, 1]
 PILOTS = np.array([[0, 1, 1, 0, 0, 1, 0], [1, 1, 0, 0, 1, 0, 1], [0, 0, 1, 0, 1, 1, 0]])
 
 
-def test_nrz_words_are_balanced_and_have_short_runs() -> None:
+def test_nrz_words_are_balanced_and_have_short_runs():
     words = Nrz().codewords()
     assert words.shape == (256, 10)
     for word in words.tolist():
@@ -43,7 +43,7 @@ def test_nrz_words_are_balanced_and_have_short_runs() -> None:
         Nrz(bits=9, disparity=0, longest_run=4).codewords()
 
 
-def test_a_pulse_is_one_chip_of_its_time() -> None:
+def test_a_pulse_is_one_chip_of_its_time():
     words = Ppm(positions=3, pulses=2).codewords()
     assert words.shape == (9, 6)
     assert (words.reshape(9, 2, 3).sum(-1) == 1).all()
@@ -54,7 +54,7 @@ def test_a_pulse_is_one_chip_of_its_time() -> None:
 
 
 @pytest.mark.parametrize("slots", [4, 8])
-def test_dimmed_codes_are_lit_once_a_value(slots: int) -> None:
+def test_dimmed_codes_are_lit_once_a_value(slots):
     for chips in (
         DimmedPilots(slots).preamble(),
         DimmedPilots(slots).codes(16),
@@ -69,7 +69,7 @@ def test_dimmed_codes_are_lit_once_a_value(slots: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_presence_is_bayes_rule_over_edges(seed: int) -> None:
+def test_presence_is_bayes_rule_over_edges(seed):
     rng = np.random.default_rng(seed)
     book = Codebook("x", np.array(PREAMBLE), PILOTS, Ppm(4, 1).codewords())
     sums = rng.integers(-2, 3, (7, 9, 8)).astype(np.int16)
@@ -95,7 +95,7 @@ def test_presence_is_bayes_rule_over_edges(seed: int) -> None:
 
 
 @pytest.mark.parametrize("last", [0, 1])
-def test_the_last_chip_is_read_by_the_edge_that_ends_it(last: int) -> None:
+def test_the_last_chip_is_read_by_the_edge_that_ends_it(last):
     book = Codebook("x", np.array(PREAMBLE), PILOTS, np.array([[0, 1, 0, 0], [0, 1, 0, 1]]))
     sums = ideal_sums(book, [last] * 3, after=[1 - last] * 3, missing=0.5)
     # Nothing is seen of the last chip itself.
@@ -115,7 +115,7 @@ SCENES = {
 
 
 @pytest.mark.parametrize("name", SCENES)
-def test_other_codes_at_50_m_at_night(name: str) -> None:
+def test_other_codes_at_50_m_at_night(name):
     link = load_link(overrides=SCENES[name])
     assert (link.table["separation"]["id"], link.table["decoding"]["id"]) == ("edges", "edges")
     source = simulate("night", seed=1, link=link, overrides=["duration_s=0.09", "motion.distance_m=50"])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.testing import ideal_view
 
@@ -29,12 +29,12 @@ LAYOUTS = {
 RANGINGS = [entry.algorithm.id for entry in Registry.load().installed("ranging")]
 
 
-def link_with(layout: str, *overrides: str) -> Link:
+def link_with(layout, *overrides):
     return load_link(overrides=[*LAYOUTS[layout], *overrides])
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_a_link_that_names_no_ranging_measures_its_bar(layout: str) -> None:
+def test_a_link_that_names_no_ranging_measures_its_bar(layout):
     link = link_with(layout)
     # Of two clusters beside one another, each has light on its other side: both look further out.
     beside = {"1 clusters": "none", "2 clusters": "none", "one row of two": "none", "not alike": "centroid"}
@@ -45,7 +45,7 @@ def test_a_link_that_names_no_ranging_measures_its_bar(layout: str) -> None:
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 @pytest.mark.parametrize("name", RANGINGS)
-def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str, layout: str) -> None:
+def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name, layout):
     link = link_with(layout, f"ranging.id={name}")
     try:
         measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
@@ -76,7 +76,7 @@ def test_what_is_accepted_measures_and_what_is_recommended_is_accepted(name: str
 
 
 @pytest.mark.parametrize("modulation", ["nrz", "ppm"])
-def test_joint_scale_reads_pilots_where_codewords_are_no_pair_codes(modulation: str) -> None:
+def test_joint_scale_reads_pilots_where_codewords_are_no_pair_codes(modulation):
     link = link_with("16 clusters", f"modulation.id={modulation}")
     measure = link.algorithm("ranging").compile(link.camera, link.bar, link.codebook)
     view = ideal_view(link.codebook, np.arange(16))
@@ -89,7 +89,7 @@ def test_joint_scale_reads_pilots_where_codewords_are_no_pair_codes(modulation: 
     assert measure(replace(view, sums=info)) == found
 
 
-def test_joint_scale_refuses_pilots_of_other_codes() -> None:
+def test_joint_scale_refuses_pilots_of_other_codes():
     link = link_with(
         "16 clusters", "modulation.id=wh4x2-dimmed", "pilots.id=wh-dimmed", "ranging.id=joint-scale"
     )

@@ -11,7 +11,7 @@ from scipy.stats import norm
 
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.scene.bar import BarLayout, LedColumns
-from evlcp_sdk.values import FrameView, PresenceMap, Range, SoftSymbols
+from evlcp_sdk.values import FrameView, PresenceMap, SoftSymbols
 
 LINK = load_link()
 PILOTS = LINK.codebook.pilot_edges.astype(float)
@@ -20,19 +20,19 @@ K = 16
 
 
 def view_of(
-    distance_m: float,
+    distance_m,
     *,
-    shift_px: float = 0.3,
-    tilt: float = 0.0,
-    blur_px: float = 0.45,
-    motion_px: float = 0.0,
-    seed: int = 0,
-    noise: float = 0.0,
-    upside_down: bool = False,
-    across: bool = False,
-    dark: tuple[int, ...] = (),
-    wrong: tuple[int, ...] = (),
-) -> FrameView:
+    shift_px=0.3,
+    tilt=0.0,
+    blur_px=0.45,
+    motion_px=0.0,
+    seed=0,
+    noise=0.0,
+    upside_down=False,
+    across=False,
+    dark=(),
+    wrong=(),
+):
     """A frame as the model has it: each row's sums follow the share of each cluster's light in it."""
     rng = np.random.default_rng(seed)
     spacing = LINK.camera.focal_px * 0.06 / distance_m
@@ -75,7 +75,7 @@ def view_of(
     return FrameView(chips.astype(np.int16), offset, presence, soft)
 
 
-def measured(view: FrameView, **parameters: float) -> Range:
+def measured(view, **parameters):
     return JointScaleRanging(**parameters).compile(LINK.camera, LINK.bar, LINK.codebook)(view)
 
 
@@ -93,13 +93,13 @@ def measured(view: FrameView, **parameters: float) -> Range:
     ],
     ids=str,
 )
-def test_it_stands_tilt_motion_and_damage(how: dict[str, float]) -> None:
+def test_it_stands_tilt_motion_and_damage(how):
     found = measured(view_of(50.0, **how))
     assert found.distance_m == pytest.approx(50, rel=4e-3)
     assert found.pairs == (13 if "dark" in how else 15)
 
 
-def test_unknown_symbols_leave_the_pilot_of_their_clusters() -> None:
+def test_unknown_symbols_leave_the_pilot_of_their_clusters():
     sigma_m = []
     for seed in range(4, 12):
         view = view_of(50.0, noise=0.5, seed=seed)
@@ -117,7 +117,7 @@ def test_unknown_symbols_leave_the_pilot_of_their_clusters() -> None:
 
 
 @pytest.mark.parametrize("shift", [0, 7])
-def test_values_that_the_fit_does_not_explain_give_no_distance(shift: int) -> None:
+def test_values_that_the_fit_does_not_explain_give_no_distance(shift):
     """Noise with the cells of a bar, and a bar whose cells lie a cluster off."""
     view = view_of(50.0, noise=0.5, seed=4)
     sums = np.roll(view.sums, shift, 1)
@@ -128,7 +128,7 @@ def test_values_that_the_fit_does_not_explain_give_no_distance(shift: int) -> No
     assert found.pairs == 0
 
 
-def test_sigma_is_the_spread() -> None:
+def test_sigma_is_the_spread():
     errors = []
     for seed in range(60):
         rng = np.random.default_rng(seed)
@@ -139,13 +139,13 @@ def test_sigma_is_the_spread() -> None:
     assert abs(np.mean(errors)) < 0.5
 
 
-def side_by_side(view: FrameView) -> FrameView:
+def side_by_side(view):
     """The lower half of a bar, moved beside the upper one."""
     _, height, _ = view.sums.shape
     # The row of the middle boundary, in whole cells: what is cut off belongs to no pair of neighbours.
     half = height // 4 * 2
 
-    def moved(image: np.ndarray, rows: int) -> np.ndarray:
+    def moved(image, rows):
         return np.concatenate([image[:, :rows], image[:, rows : 2 * rows]], axis=2)
 
     seen, dark = view.presence, np.zeros((K // 2, half // 2, view.sums.shape[2] // 2), np.bool_)
@@ -158,7 +158,7 @@ def side_by_side(view: FrameView) -> FrameView:
     return replace(view, sums=sums, presence=presence)
 
 
-def test_two_columns_give_the_distance_of_both_and_its_sigma() -> None:
+def test_two_columns_give_the_distance_of_both_and_its_sigma():
     bar = BarLayout(LedColumns(columns=2, rows=48))
     measure = JointScaleRanging().compile(LINK.camera, bar, LINK.codebook)
     errors, sigmas = [], []
@@ -199,7 +199,7 @@ def values_of(codes, places, rows):
 
 
 @pytest.mark.parametrize("dim", [0.05, 0.5, 2.0])
-def test_boundaries_stay_where_one_sign_is_missed(dim: float) -> None:
+def test_boundaries_stay_where_one_sign_is_missed(dim):
     """Pilots, and symbols, say more steps of one sign at some boundaries."""
     codes, spacing = random_codes(np.random.default_rng(3)), 8.6
     values = 0.6 * values_of(codes, 74.5 + spacing * (np.arange(1, K) - K / 2), 150)
@@ -208,7 +208,7 @@ def test_boundaries_stay_where_one_sign_is_missed(dim: float) -> None:
     assert fit[0] == pytest.approx(spacing, rel=2e-5)
 
 
-def test_boundaries_out_of_line_are_left_out_and_shown() -> None:
+def test_boundaries_out_of_line_are_left_out_and_shown():
     """By up to half a pixel: of those farther off, a row's values say no more."""
     codes, spacing = random_codes(np.random.default_rng(5)), 8.6
     shift = np.zeros(K - 1)
@@ -221,7 +221,7 @@ def test_boundaries_out_of_line_are_left_out_and_shown() -> None:
     assert_allclose(off, shift, atol=0.16)
 
 
-def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
+def test_shifts_by_sign_and_by_repeated_values_are_found():
     """Steps up lie 0.08 px lower than steps down, and what repeats a value looks smaller by 0.05 px."""
     codes, spacing = random_codes(np.random.default_rng(7)), 8.6
     boundaries, values = 74.5 + spacing * (np.arange(1, K) - K / 2), np.empty((16, 150))
@@ -237,7 +237,7 @@ def test_shifts_by_sign_and_by_repeated_values_are_found() -> None:
     assert np.abs(off).max() < 0.005
 
 
-def test_a_value_is_read_half_a_chip_before_its_second_chips_middle() -> None:
+def test_a_value_is_read_half_a_chip_before_its_second_chips_middle():
     """Also where the image, held still by whole pixels, jumps between its chips."""
     codes, spacing = random_codes(np.random.default_rng(7)), 8.6
     place, values = 0.34 * (np.arange(32) + 0.5), np.empty((16, 150))
@@ -250,7 +250,7 @@ def test_a_value_is_read_half_a_chip_before_its_second_chips_middle() -> None:
     assert_allclose(fit[:3], [spacing, 0, 0], atol=1e-5)
 
 
-def test_a_wave_of_the_pixels_shows_in_the_boundaries() -> None:
+def test_a_wave_of_the_pixels_shows_in_the_boundaries():
     """Boundaries seem off by 0.02 px times the sine of their place on the pixels."""
     codes, spacing, b = random_codes(np.random.default_rng(8)), 8 + 1 / 15, np.arange(1, K) - K / 2
     places = 74.7 + spacing * b

@@ -5,16 +5,14 @@ import pytest
 from evlcp_kalman.tracking import KalmanTracking
 from numpy.testing import assert_allclose
 
-from evlcp_sdk.plugin.roles import Filter
 
-
-def distance_filter(**parameters: float) -> Filter:
+def distance_filter(**parameters):
     found = KalmanTracking(**parameters).compile().distance
     assert found is not None
     return found
 
 
-def run(filter_: Filter, t_us: np.ndarray, values: np.ndarray, sigma: float) -> np.ndarray:
+def run(filter_, t_us, values, sigma):
     state, out = filter_.init(), []
     for t, v in zip(t_us, values, strict=True):
         state, value, s = filter_.step(state, t, np.array([v]), sigma)
@@ -22,7 +20,7 @@ def run(filter_: Filter, t_us: np.ndarray, values: np.ndarray, sigma: float) -> 
     return np.array(out)
 
 
-def test_it_is_the_textbook_filter() -> None:
+def test_it_is_the_textbook_filter():
     """Step by step with full matrices, covariance in Joseph's form."""
     q, speed, sigma = 2.0, 15.0, 0.1
     rng = np.random.default_rng(0)
@@ -43,7 +41,7 @@ def test_it_is_the_textbook_filter() -> None:
     assert_allclose(got, want, rtol=1e-9)
 
 
-def position_errors(measured: np.ndarray, true: np.ndarray, **parameters: float) -> np.ndarray:
+def position_errors(measured, true, **parameters):
     """Of the values and of the predictions a step ahead, (n, 2); 1.5 ms a step, 0.25 px of noise."""
     filter_ = KalmanTracking(**parameters).compile().position
     state, out = filter_.init(), []
@@ -54,7 +52,7 @@ def position_errors(measured: np.ndarray, true: np.ndarray, **parameters: float)
     return np.array(out)
 
 
-def shaken(n: int, jolt_px_s: float = 0.0) -> np.ndarray:
+def shaken(n, jolt_px_s=0.0):
     """A bar's centre on a shaking camera, whose speed changes at once in the middle."""
     t = 1.5e-3 * np.arange(n)
     after = np.maximum(t - t[n // 2], 0)
@@ -63,7 +61,7 @@ def shaken(n: int, jolt_px_s: float = 0.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("jolt_px_s", [-7000.0, 3000.0, 7000.0])
-def test_a_pothole_is_followed(jolt_px_s: float) -> None:
+def test_a_pothole_is_followed(jolt_px_s):
     true = shaken(120, jolt_px_s)
     measured = true + np.random.default_rng(3).normal(0, 0.25, true.shape)
     errors = position_errors(measured, true)
@@ -74,7 +72,7 @@ def test_a_pothole_is_followed(jolt_px_s: float) -> None:
     assert position_errors(measured, true, jolt_px_s=0.0)[:, 0].max() > 10
 
 
-def test_a_stray_position_is_no_jolt() -> None:
+def test_a_stray_position_is_no_jolt():
     true = shaken(120)
     measured = true + np.random.default_rng(4).normal(0, 0.25, true.shape)
     measured[50] += (60.0, 0.0)

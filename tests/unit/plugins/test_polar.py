@@ -13,47 +13,46 @@ from scipy import optimize, stats
 
 from evlcp_sdk.air.crc import crc24
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.plugin.roles import Code
 
 Bits = NDArray[np.uint8]
 
 
-def matrix(n: int) -> NDArray[np.int64]:
+def matrix(n):
     found = np.ones((1, 1), np.int64)
     while len(found) < n:
         found = np.kron(found, [[1, 0], [1, 1]])
     return found
 
 
-def every_word(k: int) -> Bits:
+def every_word(k):
     return np.array(list(product((0, 1), repeat=k)), np.uint8)
 
 
-def best_inputs(n: int, k: int) -> NDArray[np.bool_]:
+def best_inputs(n, k):
     order = [i for i in RELIABILITY if i < n]
     found = np.zeros(n, bool)
     found[order[-k:]] = True
     return found
 
 
-def single_nodes(information: NDArray[np.bool_]) -> NDArray[np.int64]:
+def single_nodes(information):
     """Every input by itself."""
     n = len(information)
     return np.stack([np.arange(n), np.zeros(n, np.int64), information], 1).astype(np.int64)
 
 
-def decoded(llr: NDArray[np.float32], nodes: NDArray[np.int64], size: int, limit: float = np.inf):
+def decoded(llr, nodes, size, limit=np.inf):
     codewords, metric = np.empty((size, len(llr)), np.uint8), np.empty(size)
     found = _kernels.list_decode(llr, nodes, size, limit, codewords, metric)
     order = np.argsort(metric[:found])
     return codewords[order], metric[order]
 
 
-def discrepancy(llr: NDArray[np.floating], codewords: Bits) -> NDArray[np.float64]:
+def discrepancy(llr, codewords):
     return (np.abs(llr) * ((llr < 0) != codewords)).sum(-1).astype(float)
 
 
-def received(coded: Bits, bit_error_rate: float, rng: np.random.Generator, hard: bool) -> NDArray[np.float32]:
+def received(coded, bit_error_rate, rng, hard):
     """LLRs of an AWGN channel with a hard-decision error rate, or of a BSC."""
     sign = 1.0 - 2.0 * coded
     if hard:
@@ -65,7 +64,7 @@ def received(coded: Bits, bit_error_rate: float, rng: np.random.Generator, hard:
 # The code.
 
 
-def test_the_sequence_is_in_order() -> None:
+def test_the_sequence_is_in_order():
     """A permutation that keeps the partial order of all channels (Schuerch 2016).
 
     An input with one binary digit more is better, in the sequence too. So is one with a digit moved up by
@@ -86,7 +85,7 @@ def test_the_sequence_is_in_order() -> None:
     assert against == 20
 
 
-def by_the_standard(message: Bits, length: int) -> Bits:
+def by_the_standard(message, length):
     """One codeword, from the text of 3GPP TS 38.212, 5.3.1.2 and 5.4.1, and docs/error-correction.md."""
     k = len(message) + 24
     n = 32
@@ -95,7 +94,7 @@ def by_the_standard(message: Bits, length: int) -> Bits:
     pieces = [0, 1, 2, 4, 3, 5, 6, 7, 8, 16, 9, 17, 10, 18, 11, 19, 12, 20, 13, 21, 14, 22, 15, 23]
     pieces += [24, 25, 26, 28, 27, 29, 30, 31]
     interleaved = [pieces[32 * i // n] * (n // 32) + i % (n // 32) for i in range(n)]
-    frozen: set[int] = set()
+    frozen = set()
     if 16 * k <= 7 * length:
         kept = interleaved[n - length :]
         frozen |= set(interleaved[: n - length])
@@ -111,7 +110,7 @@ def by_the_standard(message: Bits, length: int) -> Bits:
 
 
 @pytest.mark.parametrize("rate", [0.15, 0.3, 0.43, 0.45, 0.5, 0.8])
-def test_encoding_by_the_standard(rate: float) -> None:
+def test_encoding_by_the_standard(rate):
     rng = np.random.default_rng(0)
     for length in (40, 64, 100, 130, 200, 256, 300, 640, 800, 960, 1024):
         if rate * length < 32:
@@ -121,7 +120,7 @@ def test_encoding_by_the_standard(rate: float) -> None:
         assert_array_equal(code.encode(message), by_the_standard(message, length))
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_what_does_not_fit_is_refused():
     with pytest.raises(ConfigError, match="a block of 63 bits, expected at least 64 at rate"):
         Polar().compile(63)
     with pytest.raises(ConfigError, match="max_list_size = 4: expected at least list_size = 8"):
@@ -129,7 +128,7 @@ def test_what_does_not_fit_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("length", "rate"), [(960, 0.97), (960, 0.99), (45, 0.9), (512, 0.999), (64, 0.85)])
-def test_a_code_decodes_at_least_what_has_no_errors_or_is_refused(length: int, rate: float) -> None:
+def test_a_code_decodes_at_least_what_has_no_errors_or_is_refused(length, rate):
     """Of 960 bits, 57.6 are in reserve: 904 bits of a message leave less, and nothing would ever pass."""
     size = (int(rate * length) - 24) // 8 * 8
     if size + max(0.06 * length, np.log2(1e9)) >= length:
@@ -146,10 +145,10 @@ def test_a_code_decodes_at_least_what_has_no_errors_or_is_refused(length: int, r
 # The decoder.
 
 
-def twin(llr: NDArray[np.float64], information: NDArray[np.bool_], size: int) -> list[tuple[float, Bits]]:
+def twin(llr, information, size):
     """Successive-cancellation list decoding as it is defined: every LLR from the start, input by input."""
 
-    def leaf(values: NDArray[np.float64], before: Bits) -> float:
+    def leaf(values, before):
         half = len(values) // 2
         if not half:
             return float(values[0])
@@ -173,7 +172,7 @@ def twin(llr: NDArray[np.float64], information: NDArray[np.bool_], size: int) ->
 
 @pytest.mark.parametrize("size", [1, 2, 4, 8])
 @pytest.mark.parametrize(("n", "k"), [(16, 9), (32, 16), (32, 31), (64, 24), (64, 50)])
-def test_list_decoding_against_its_twin(n: int, k: int, size: int) -> None:
+def test_list_decoding_against_its_twin(n, k, size):
     information = best_inputs(n, k)
     rng = np.random.default_rng(n + k + size)
     for mean in (0.0, 1.0):
@@ -187,7 +186,7 @@ def test_list_decoding_against_its_twin(n: int, k: int, size: int) -> None:
 
 
 @pytest.mark.parametrize(("length", "rate"), [(40, 0.9), (80, 0.4), (90, 0.4), (64, 0.5)])
-def test_shortened_and_punctured_codes_against_brute_force(length: int, rate: float) -> None:
+def test_shortened_and_punctured_codes_against_brute_force(length, rate):
     """All 256 messages of a byte: what is decoded is the most likely one."""
     code = Polar(rate=rate, undetected=0.999, reserve=0, list_size=32).compile(length)
     assert code.message_bits == 8
@@ -211,8 +210,8 @@ def test_shortened_and_punctured_codes_against_brute_force(length: int, rate: fl
 # Plausibility.
 
 
-def chernoff(weight: NDArray[np.float64], total: float) -> float:
-    def bound(log_z: float) -> float:
+def chernoff(weight, total):
+    def bound(log_z):
         z = np.exp(log_z)
         return float(z * total + np.logaddexp(0, -z * weight).sum() - len(weight) * np.log(2))
 
@@ -221,7 +220,7 @@ def chernoff(weight: NDArray[np.float64], total: float) -> float:
 
 @pytest.mark.parametrize("kind", ["equal", "normal", "wide", "one"])
 @pytest.mark.parametrize(("n", "share"), [(40, -10.0), (256, -93.0), (960, -337.0)])
-def test_the_limit_solves_the_bound(n: int, share: float, kind: str) -> None:
+def test_the_limit_solves_the_bound(n, share, kind):
     rng = np.random.default_rng(n)
     weight = {
         "equal": np.full(n, 0.3),
@@ -236,7 +235,7 @@ def test_the_limit_solves_the_bound(n: int, share: float, kind: str) -> None:
     assert discrepancy_limit(padded, share) == limit
 
 
-def test_a_reserve_is_kept() -> None:
+def test_a_reserve_is_kept():
     """Bits without errors that are needed: 456 of the message, and 76.8 in reserve or 29.9 of a billionth."""
     message = np.random.default_rng(0).integers(0, 2, 456).astype(np.uint8)
     order = np.random.default_rng(1).permutation(960)
@@ -251,7 +250,7 @@ def test_a_reserve_is_kept() -> None:
                 assert code.decode(llr).ok
 
 
-def test_a_scale_of_the_llrs_changes_nothing() -> None:
+def test_a_scale_of_the_llrs_changes_nothing():
     code = Polar().compile(256)
     rng = np.random.default_rng(0)
     message = rng.integers(0, 2, 104).astype(np.uint8)
@@ -267,7 +266,7 @@ def test_a_scale_of_the_llrs_changes_nothing() -> None:
 # Frame errors.
 
 
-def lost(code: Code, blocks: int, bit_error_rate: float, hard: bool, seed: int = 0) -> int:
+def lost(code, blocks, bit_error_rate, hard, seed=0):
     rng = np.random.default_rng(seed)
     missed = 0
     for _ in range(blocks):
@@ -280,6 +279,6 @@ def lost(code: Code, blocks: int, bit_error_rate: float, hard: bool, seed: int =
 
 @pytest.mark.parametrize(("length", "blocks"), [(256, 1000), (960, 300)])
 @pytest.mark.parametrize("bit_error_rate", [0.04, 0.06])
-def test_no_message_is_lost_where_the_link_works(length: int, blocks: int, bit_error_rate: float) -> None:
+def test_no_message_is_lost_where_the_link_works(length, blocks, bit_error_rate):
     """Soft input; none of 1000 is a frame error rate below 3e-3 with 95 % confidence."""
     assert lost(Polar().compile(length), blocks, bit_error_rate, hard=False) == 0

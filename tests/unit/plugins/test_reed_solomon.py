@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 from evlcp_reed_solomon.correction import ReedSolomon
 from numpy.testing import assert_array_equal
-from numpy.typing import NDArray
 
 from evlcp_sdk.air.crc import crc24
 from evlcp_sdk.errors import ConfigError
 
 
-def product(a: int, b: int) -> int:
+def product(a, b):
     """Of two polynomials over GF(2), modulo x^8 + x^4 + x^3 + x^2 + 1."""
     found = 0
     while b:
@@ -23,27 +22,27 @@ def product(a: int, b: int) -> int:
     return found
 
 
-def at(polynomial: NDArray[np.uint8], x: int) -> int:
+def at(polynomial, x):
     value = 0
     for coefficient in polynomial.tolist():
         value = product(value, x) ^ coefficient
     return value
 
 
-def words_of(sent: NDArray[np.uint8], words: int, data: int) -> list[NDArray[np.uint8]]:
+def words_of(sent, words, data):
     return [np.concatenate([sent[w:data:words], sent[data + w :: words]]) for w in range(words)]
 
 
-def message_of(bits: int, seed: int = 0) -> NDArray[np.uint8]:
+def message_of(bits, seed=0):
     return np.random.default_rng(seed).integers(0, 2, bits).astype(np.uint8)
 
 
-def llr_of(coded: NDArray[np.uint8]) -> NDArray[np.float32]:
+def llr_of(coded):
     return (8 * (1 - 2 * coded.astype(np.float32))).astype(np.float32)
 
 
 @pytest.mark.parametrize(("length", "rate"), [(256, 0.5), (960, 0.5), (2040, 0.5), (2048, 0.8), (4100, 0.3)])
-def test_every_codeword_has_the_roots_of_the_generator(length: int, rate: float) -> None:
+def test_every_codeword_has_the_roots_of_the_generator(length, rate):
     code = ReedSolomon(rate=rate).compile(length)
     message = message_of(code.message_bits)
     coded = code.encode(message)
@@ -62,7 +61,7 @@ def test_every_codeword_has_the_roots_of_the_generator(length: int, rate: float)
 
 
 @pytest.mark.parametrize("length", [256, 960, 2600])
-def test_half_the_parity_in_wrong_bytes(length: int) -> None:
+def test_half_the_parity_in_wrong_bytes(length):
     """As many wrong bytes in each codeword as half its parity, as sure as the others; one more is lost."""
     code = ReedSolomon().compile(length)
     size = length // 8
@@ -85,7 +84,7 @@ def test_half_the_parity_in_wrong_bytes(length: int) -> None:
             assert found.flipped == (received != code.encode(message)).sum()
 
 
-def test_bytes_that_were_not_received_or_are_unsure() -> None:
+def test_bytes_that_were_not_received_or_are_unsure():
     code = ReedSolomon().compile(960)
     message = message_of(code.message_bits)
     rng = np.random.default_rng(2)
@@ -101,7 +100,7 @@ def test_bytes_that_were_not_received_or_are_unsure() -> None:
     assert_array_equal(found.bits, message)
 
 
-def test_what_is_no_number_says_nothing() -> None:
+def test_what_is_no_number_says_nothing():
     """As with `polar`: 40 bytes that are NaN are erased; as received ones they are too many to correct."""
     code = ReedSolomon().compile(960)
     message = message_of(code.message_bits)
@@ -116,7 +115,7 @@ def test_what_is_no_number_says_nothing() -> None:
     assert found.flipped == 64
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_what_does_not_fit_is_refused():
     with pytest.raises(ConfigError, match="expected 4 bytes of message and CRC"):
         ReedSolomon().compile(48)
     with pytest.raises(ConfigError, match="and 8 of parity"):

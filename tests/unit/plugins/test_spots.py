@@ -4,27 +4,25 @@ import numpy as np
 import pytest
 from evlcp_regions.spots import Spots
 
-from evlcp_sdk.link.resolve import Link, resolve
+from evlcp_sdk.link.resolve import resolve
 from evlcp_sdk.testing.recordings import merged
-from evlcp_sdk.values import Events, Region
+from evlcp_sdk.values import Events
 
 ONE = {"rows": 1, "columns": 1, "cluster_rows": 1, "cluster_columns": 1}
 STEP_US = 1500
 
 
-def link_of(rate_hz: float) -> Link:
+def link_of(rate_hz):
     return resolve({"bar": ONE, "air": {"chip_rate_hz": rate_hz}, "framing": {"id": "uart"}})
 
 
-def shaking(t_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def shaking(t_us):
     """Where a light is in the image of a camera that shakes, up to 1 px a ms fast."""
     t = t_us * 1e-6
     return 600 + 25 * np.sin(2 * np.pi * 4 * t), 300 + 12 * np.sin(2 * np.pi * 9 * t + 1)
 
 
-def events_of(
-    rng: np.random.Generator, rate_hz: float, seconds: float, burst: int, noise_hz: float
-) -> Events:
+def events_of(rng, rate_hz, seconds, burst, noise_hz):
     """Bursts of a light of random bits with a spread of 3 px, dark for many bits, and noise all over."""
     bits = np.repeat(rng.integers(0, 2, int(seconds * rate_hz)), rng.integers(1, 6, int(seconds * rate_hz)))
     edges = np.flatnonzero(np.diff(bits)) + 1
@@ -42,7 +40,7 @@ def events_of(
     return merged(Events.of(np.floor(t), np.rint(x), np.rint(y), p))
 
 
-def regions_of(link: Link, events: Events, seconds: float) -> list[tuple[int, list[Region]]]:
+def regions_of(link, events, seconds):
     detector = Spots().compile(link.camera, link.codebook, link.packet)
     state, found = detector.init(), []
     for start_us in range(0, int(seconds * 1e6), STEP_US):
@@ -53,7 +51,7 @@ def regions_of(link: Link, events: Events, seconds: float) -> list[tuple[int, li
 
 
 @pytest.mark.parametrize(("rate_hz", "burst"), [(500.0, 100), (500.0, 20), (3125.0, 60), (10_000.0, 60)])
-def test_a_light_is_followed_though_it_shakes_and_is_dark_for_long(rate_hz: float, burst: int) -> None:
+def test_a_light_is_followed_though_it_shakes_and_is_dark_for_long(rate_hz, burst):
     link = link_of(rate_hz)
     seconds = 0.8 if rate_hz < 1000 else 0.3
     events = events_of(np.random.default_rng(1), rate_hz, seconds, burst, 20_000.0)
@@ -75,7 +73,7 @@ def test_a_light_is_followed_though_it_shakes_and_is_dark_for_long(rate_hz: floa
     assert inside >= 0.985 * total
 
 
-def test_there_is_no_light_in_noise_or_in_what_moves() -> None:
+def test_there_is_no_light_in_noise_or_in_what_moves():
     rng = np.random.default_rng(2)
     n = 20_000
     t = np.sort(rng.uniform(0, 4e5, n))
@@ -88,14 +86,14 @@ def test_there_is_no_light_in_noise_or_in_what_moves() -> None:
     assert not any(regions for _, regions in regions_of(link_of(500.0), noise, 0.2))
 
 
-def moved(events: Events, right: int, share: float, late_us: int, rng: np.random.Generator) -> Events:
+def moved(events, right, share, late_us, rng):
     """Some of the events elsewhere and later, as a lens scatters light and dim pixels see it."""
     kept = rng.random(len(events)) < share
     t = events.t_us[kept] + late_us + rng.integers(0, 40, int(kept.sum()))
     return merged(Events.of(t, events.x[kept].astype(np.int64) + right, events.y[kept], events.p[kept]))
 
 
-def places_of(found: list[tuple[int, list[Region]]], from_us: int, x_px: float) -> float:
+def places_of(found, from_us, x_px):
     """In what share of the steps from a time on there is a light some columns beside the shaking one."""
     late = [(start, regions) for start, regions in found if start >= from_us]
     hits = 0
@@ -107,7 +105,7 @@ def places_of(found: list[tuple[int, list[Region]]], from_us: int, x_px: float) 
 
 @pytest.mark.parametrize("rate_hz", [500.0, 3125.0, 10_000.0])
 @pytest.mark.parametrize("late_us", [0, 60, 300])
-def test_what_the_lens_scatters_is_no_light_and_a_dim_one_beside_is(rate_hz: float, late_us: int) -> None:
+def test_what_the_lens_scatters_is_no_light_and_a_dim_one_beside_is(rate_hz, late_us):
     """Three times dimmer either: one goes with the edges of the bright light, one has its own."""
     rng = np.random.default_rng(5)
     seconds = 1.0 if rate_hz < 1000 else 0.3
@@ -122,7 +120,7 @@ def test_what_the_lens_scatters_is_no_light_and_a_dim_one_beside_is(rate_hz: flo
     assert places_of(found, 20_000, -70) < 0.03
 
 
-def beside_one_another(rng: np.random.Generator, places: dict[int, tuple[float, float]]) -> Events:
+def beside_one_another(rng, places):
     """Lights of their own edges so many rows below the shaking place, from a time to a time, s."""
     parts = []
     for down, (from_s, until_s) in places.items():
@@ -132,14 +130,14 @@ def beside_one_another(rng: np.random.Generator, places: dict[int, tuple[float, 
     return merged(*parts)
 
 
-def test_a_large_light_is_one_though_its_places_come_and_go() -> None:
+def test_a_large_light_is_one_though_its_places_come_and_go():
     """The ends have a neighbour on one side; then one in the middle is lost, and that has one less."""
     places = {0: (0.0, 0.18), 40: (0.0, 0.18), 80: (0.0, 0.1), 120: (0.0, 0.18)}
     found = regions_of(link_of(10_000.0), beside_one_another(np.random.default_rng(4), places), 0.3)
     assert not any(regions for _, regions in found)
 
 
-def test_two_lights_beside_one_another_are_two() -> None:
+def test_two_lights_beside_one_another_are_two():
     events = beside_one_another(np.random.default_rng(4), {0: (0.0, 0.3), 36: (0.0, 0.3)})
     found = regions_of(link_of(10_000.0), events, 0.3)
     assert all(len(regions) == 2 for start, regions in found if start > 30_000)

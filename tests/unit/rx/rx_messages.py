@@ -1,6 +1,5 @@
 """What tests of messages share: packets that carry blocks, and an operator who signs."""
 
-from collections.abc import Iterable
 from functools import cache
 from math import nan
 
@@ -18,7 +17,7 @@ CODER = load_link().block_coder()
 PLACE = Beacon(35.1, 136.9, 52.0, 10.0, 0.0, 0.96, b"lane 2")
 
 
-def packet_of(llr: np.ndarray, number: int, transmitter: int = 0, lost: Iterable[int] = ()) -> Packet:
+def packet_of(llr, number, transmitter=0, lost=()):
     """A packet whose frames have these LLRs, float (960,); lost frames are missing."""
     frames = tuple(
         Frame(
@@ -35,20 +34,20 @@ def packet_of(llr: np.ndarray, number: int, transmitter: int = 0, lost: Iterable
     return Packet(transmitter, number, 34600.0 * number, 100.0, frames, 10)
 
 
-def noisy(block: bytes, ber: float, rng: np.random.Generator) -> np.ndarray:
+def noisy(block, ber, rng):
     sigma = 1 / norm.isf(ber)
     air = CODER.air_bits(block)
     return 2 * (1 - 2.0 * air + rng.normal(0, sigma, air.size)) / sigma**2
 
 
-def blocks_of(*messages: Message, digest: bytes = CODER.digest) -> list[bytes]:
+def blocks_of(*messages, digest=CODER.digest):
     return [b.pack(CODER.block_bytes) for m in messages for b in split(m, digest, CODER.block_bytes)]
 
 
 class Operator:
     """A key and what it signs."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         pytest.importorskip("cryptography", reason="the extra sign is not installed")
         from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
@@ -56,15 +55,15 @@ class Operator:
         self.public = signing.public_key(self._key)
         self.trusted = (signing.TrustedKey(self.public),)
 
-    def sign(self, message: Message) -> Message:
+    def sign(self, message):
         return signing.sign(message, CODER.digest, self._key)
 
-    def beacon(self, sequence: int, place: Beacon = PLACE, transmitter_id: int = 7) -> list[Message]:
+    def beacon(self, sequence, place=PLACE, transmitter_id=7):
         """A beacon and its signature."""
         message = Message(Kind.BEACON, transmitter_id, sequence, place.pack())
         return [message, self.sign(message)]
 
 
 @cache
-def operator() -> Operator:
+def operator():
     return Operator()

@@ -1,40 +1,35 @@
 """What tests of the receiver share: a stream in pieces, and all that is said of it."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.rx.receiver import Receiver
-from evlcp_sdk.testing.recordings import IdealBar
-from evlcp_sdk.values import Events, Frame, Packet
+from evlcp_sdk.values import Events
 
 LINK = load_link()
 
 
-def received(
-    link: Link | list[Link], events: Events, cuts: Iterable[int] = (), **options: Any
-) -> tuple[Receiver, list[Packet]]:
+def received(link, events, cuts=(), **options):
     """A receiver after a stream that is cut before these events, and its packets.
 
     What algorithms of the SDK give is checked, too, as strangers' is.
     """
     links = [replace(one, built_in=frozenset()) for one in (link if isinstance(link, list) else [link])]
     receiver = Receiver(links if isinstance(link, list) else links[0], **options)
-    packets: list[Packet] = []
+    packets = []
     for begin, end in pairwise([0, *sorted(cuts), len(events)]):
         packets += receiver.feed(events[begin:end])
     return receiver, packets + receiver.close()
 
 
-def frames_of(packets: list[Packet]) -> list[Frame]:
+def frames_of(packets):
     return [frame for packet in packets for frame in packet.frames]
 
 
-def said(frame: Frame) -> tuple[object, ...]:
+def said(frame):
     """All of a frame, to the last bit."""
     soft = frame.soft
     return (
@@ -44,14 +39,7 @@ def said(frame: Frame) -> tuple[object, ...]:
     )
 
 
-def right_frames(
-    packets: list[Packet],
-    bar: IdealBar,
-    link: Link = LINK,
-    *,
-    t0_us: int = 0,
-    late_us: tuple[float, float] = (0, 60),
-) -> int:
+def right_frames(packets, bar, link=LINK, *, t0_us=0, late_us=(0, 60)):
     """How many frames there are, each of which says what was sent at its time; an edge's events come late.
 
     Their packets begin when they were sent, and have each frame once.
@@ -70,9 +58,7 @@ def right_frames(
     return len(frames_of(packets))
 
 
-def lamp_events(
-    x: int, y: int, size: int, flicker_hz: float, duration_us: int, *, duty: float = 0.5
-) -> Events:
+def lamp_events(x, y, size, flicker_hz, duration_us, *, duty=0.5):
     """A square lamp that flickers: its pixels send three events at each change of its light."""
     rng = np.random.default_rng(0)
     period_us = 1e6 / flicker_hz
@@ -88,7 +74,7 @@ def lamp_events(
     return Events.of(*(c[order] for c in columns))
 
 
-def noise_events(rate_hz: float, duration_us: int) -> Events:
+def noise_events(rate_hz, duration_us):
     """Random events all over a 1280x720 sensor."""
     rng = np.random.default_rng(0)
     n = rng.poisson(rate_hz * duration_us * 1e-6)

@@ -8,7 +8,6 @@ from hypothesis import assume, given, strategies as st
 from rx_streams import LINK, frames_of, noise_events, received
 
 from evlcp_sdk.air.frames import PacketFormat
-from evlcp_sdk.rx.alignment import DueFrame
 from evlcp_sdk.rx.transmitters import PacketGrid, RowDelay, measure_row_delay
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
 from evlcp_sdk.values import Events, SyncLock
@@ -22,7 +21,7 @@ FORMATS = [
 ]
 
 
-def on_air(form: PacketFormat, packets: int) -> list[tuple[int, int, float, float]]:
+def on_air(form, packets):
     """(packet, frame, start and end, us) of every frame, chip after chip from `ZERO_US` on."""
     found, chip = [], 0
     for packet in range(packets):
@@ -34,12 +33,12 @@ def on_air(form: PacketFormat, packets: int) -> list[tuple[int, int, float, floa
     return found
 
 
-def lock_of(form: PacketFormat, packet: int, late_us: float = 0.0, delay_us: float = -20.0) -> SyncLock:
+def lock_of(form, packet, late_us=0.0, delay_us=-20.0):
     start_us = ZERO_US + packet * form.packet_chips * CHIP_US + late_us
     return SyncLock(start_us, CHIP_US, delay_us, delay_us - 10, 1.0)
 
 
-def due_until(grid: PacketGrid, until_us: float) -> list[DueFrame]:
+def due_until(grid, until_us):
     found = []
     while (due := grid.due(until_us)) is not None:
         found.append(due)
@@ -49,9 +48,7 @@ def due_until(grid: PacketGrid, until_us: float) -> list[DueFrame]:
 
 @pytest.mark.parametrize("form", FORMATS)
 @given(st.integers(0, 3), st.floats(0, 40_000), st.floats(0, 60_000))
-def test_frames_are_due_as_they_are_on_air(
-    form: PacketFormat, heard: int, earliest_us: float, until_us: float
-) -> None:
+def test_frames_are_due_as_they_are_on_air(form, heard, earliest_us, until_us):
     grid = PacketGrid(form)
     grid.restart(lock_of(form, heard), earliest_us)
     found = due_until(grid, until_us)
@@ -73,7 +70,7 @@ def test_frames_are_due_as_they_are_on_air(
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("after", [0, 1])
-def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat, after: int) -> None:
+def test_the_events_after_the_last_edge_are_waited_for(form, after):
     """And the chips after it that are read with it."""
     grid = PacketGrid(form, chips_after=after)
     assert grid.next is None
@@ -88,7 +85,7 @@ def test_the_events_after_the_last_edge_are_waited_for(form: PacketFormat, after
 
 @pytest.mark.parametrize("form", FORMATS)
 @pytest.mark.parametrize("late_us", [-90.0, 0.0, 90.0, -110.0, 110.0, 1500.0])
-def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form: PacketFormat, late_us: float) -> None:
+def test_a_lock_near_the_grid_moves_it_and_another_begins_anew(form, late_us):
     """A lock off the grid begins another."""
     grid, lock = PacketGrid(form), lock_of(form, 3, late_us)
     assert not grid.follow(lock)

@@ -1,19 +1,16 @@
 """An algorithm that fails is told by name, in one line."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 from evlcp_sdk.errors import ConfigError, InputError, PluginError, PluginWarning
 from evlcp_sdk.io import open_source
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.plugin.roles import Corrected, Filter, Tracker
@@ -26,8 +23,8 @@ EVENTS = ideal_events(LINK, IdealBar(random_symbols(LINK, 2)))
 ROLES = ("synchronization", "separation", "decoding", "ranging", "tracking")
 
 
-def raises(fault: BaseException) -> Callable[..., Any]:
-    def act(*_args: object) -> Any:
+def raises(fault):
+    def act(*_args):
         raise fault
 
     return act
@@ -37,37 +34,37 @@ fails = raises(KeyError("boom"))
 
 
 class MuteError(Exception):
-    def __str__(self) -> str:
+    def __str__(self):
         raise RuntimeError("no words")
 
 
-def link_with(role: str, compiled: Callable[..., Any]) -> Link:
+def link_with(role, compiled):
     return LINK.with_algorithm(role, SimpleNamespace(compile=compiled), id="mine")
 
 
-def received(link: Link) -> None:
+def received(link):
     receiver = Receiver(link)
     receiver.feed(EVENTS)
     receiver.close()
 
 
-def changed(role: str, change: Callable[[Any], Any]) -> Link:
+def changed(role, change):
     """The link with an algorithm that gives something else than the built-in one."""
     compiled = LINK.algorithm(role).compile
     if role == "synchronization":
 
-        def step(state: Any, *given: Any, sync: Any) -> tuple[Any, Any]:
+        def step(state, *given, sync):
             state, locks = sync.step(state, *given)
             return state, [change(lock) for lock in locks]
 
-        def compile_sync(*given: Any) -> Any:
+        def compile_sync(*given):
             sync = compiled(*given)
             return SimpleNamespace(init=sync.init, step=partial(step, sync=sync))
 
         return link_with(role, compile_sync)
     if role == "tracking":
 
-        def compile_tracker() -> Tracker:
+        def compile_tracker():
             tracker = compiled()
             return Tracker(*(Changed(one, change) for one in (tracker.position, tracker.distance)))
 
@@ -78,16 +75,16 @@ def changed(role: str, change: Callable[[Any], Any]) -> Link:
 class Changed(Filter):
     """A filter whose values are changed."""
 
-    def __init__(self, filter_: Filter, change: Callable[[Any], Any]) -> None:
+    def __init__(self, filter_, change):
         self._filter, self._change = filter_, change
 
-    def init(self) -> Any:
+    def init(self):
         return self._filter.init()
 
-    def predict(self, state: Any, t_us: float) -> Any:
+    def predict(self, state, t_us):
         return self._filter.predict(state, t_us)
 
-    def step(self, state: Any, t_us: float, value: Any, sigma: float) -> Any:
+    def step(self, state, t_us, value, sigma):
         state, values, sigma = self._filter.step(state, t_us, value, sigma)
         return state, *self._change((values, sigma))
 
@@ -103,7 +100,7 @@ class Changed(Filter):
         ("ranging", ConfigError("no such key"), "ConfigError: no such key"),
     ],
 )
-def test_what_fails_in_a_frame_is_named(role: str, fault: BaseException, says: str) -> None:
+def test_what_fails_in_a_frame_is_named(role, fault, says):
     with pytest.raises(PluginError) as told:
         received(changed(role, raises(fault)))
     assert str(told.value).startswith(f"{role} algorithm 'mine': {says} (test_guard.py, line ")
@@ -111,13 +108,13 @@ def test_what_fails_in_a_frame_is_named(role: str, fault: BaseException, says: s
     assert told.value.__cause__ is fault
 
 
-def test_an_interrupt_in_an_algorithm_is_the_user_s() -> None:
+def test_an_interrupt_in_an_algorithm_is_the_user_s():
     with pytest.raises(KeyboardInterrupt):
         received(changed("ranging", raises(KeyboardInterrupt())))
 
 
 @pytest.mark.parametrize("role", ROLES)
-def test_what_fails_to_compile_is_named_and_what_it_refuses_stays(role: str) -> None:
+def test_what_fails_to_compile_is_named_and_what_it_refuses_stays(role):
     with pytest.raises(PluginError, match=f"{role} algorithm 'mine': KeyError"):
         Receiver(link_with(role, fails))
     with pytest.raises(ConfigError, match=r"^ranging\.clusters"):
@@ -135,34 +132,34 @@ FUNCTION, METHODS = "a function", r"an object with init\(\) and step\(\)"
         ("separation", None, rf"NoneType at compile\(\), expected {FUNCTION}"),
         ("decoding", 3, rf"int at compile\(\), expected {FUNCTION}"),
         ("tracking", None, "NoneType, expected Tracker"),
-        ("tracking", Tracker(None, 5), r"int at compile\(\), .* init\(\) and step\(\) and predict\(\)"),  # type: ignore[arg-type]
+        ("tracking", Tracker(None, 5), r"int at compile\(\), .* init\(\) and step\(\) and predict\(\)"),
     ],
 )
-def test_what_compiles_to_nothing_that_runs_is_named(role: str, gives: object, says: str) -> None:
+def test_what_compiles_to_nothing_that_runs_is_named(role, gives, says):
     with pytest.raises(PluginError, match=f"^{role} algorithm 'mine': gave {says}; try: evlcp check"):
         Receiver(link_with(role, lambda *_: gives))
 
 
-def test_more_locks_than_a_step_has_room_for_are_refused() -> None:
+def test_more_locks_than_a_step_has_room_for_are_refused():
     lock = SyncLock(0.0, 100.0, 10.0, 20.0, 1.0)
     gives = SimpleNamespace(init=lambda: None, step=lambda *_: (None, [lock] * 1001))
     with pytest.raises(PluginError, match=r"gave 1001 locks in a step, expected at most 1000"):
         received(link_with("synchronization", lambda *_: gives))
 
 
-def but(**changes: Any) -> Callable[[Any], Any]:
+def but(**changes):
     return lambda found: replace(found, **changes)
 
 
-def bent(**changes: Any) -> Callable[[Any], Any]:
+def bent(**changes):
     """What it says of a lean, of three boundaries, is so."""
     return but(bend=replace(Bend(*np.ones((3, 3))), **changes))
 
 
-def spoilt(name: str, value: float, kind: Any = None) -> Callable[[Any], Any]:
+def spoilt(name, value, kind=None):
     """One value of an array is another."""
 
-    def change(found: Any) -> Any:
+    def change(found):
         array = getattr(found, name).astype(kind or getattr(found, name).dtype, copy=True)
         array.flat[0] = value
         return replace(found, **{name: array})
@@ -170,7 +167,7 @@ def spoilt(name: str, value: float, kind: Any = None) -> Callable[[Any], Any]:
     return change
 
 
-ODD: list[tuple[str, Callable[[Any], Any], str]] = [
+ODD = [
     ("synchronization", lambda _: (0.0, 100.0), "tuple, expected SyncLock"),
     ("synchronization", but(chip_us=-100.0), r"chip_us = -100\.0, expected a number from 50 to 200"),
     ("synchronization", but(packet_t_us=-1e15), r"packet_t_us = -1000000000000000\.0, expected"),
@@ -209,9 +206,7 @@ ODD: list[tuple[str, Callable[[Any], Any], str]] = [
 @pytest.mark.parametrize(
     ("role", "change", "says"), ODD, ids=[f"{role}-{says[:30]}" for role, _, says in ODD]
 )
-def test_what_no_next_stage_can_work_with_is_named(
-    role: str, change: Callable[[Any], Any], says: str
-) -> None:
+def test_what_no_next_stage_can_work_with_is_named(role, change, says):
     with pytest.raises(
         PluginError, match=rf"^{role} algorithm 'mine': gave {says}.*; try: evlcp check"
     ) as told:
@@ -230,7 +225,7 @@ def test_what_no_next_stage_can_work_with_is_named(
         ("ranging", but(bend=None)),
     ],
 )
-def test_other_types_of_right_values_pass(role: str, change: Callable[[Any], Any]) -> None:
+def test_other_types_of_right_values_pass(role, change):
     received(changed(role, change))
 
 
@@ -242,10 +237,10 @@ def test_other_types_of_right_values_pass(role: str, change: Callable[[Any], Any
         ("nothing", "TypeError: gave NoneType at compile"),
     ],
 )
-def test_an_error_correction_that_gives_another_thing_is_named(gives: object, says: str) -> None:
+def test_an_error_correction_that_gives_another_thing_is_named(gives, says):
     built_in = LINK.algorithm("error-correction").compile
 
-    def compile_code(length: int) -> Any:
+    def compile_code(length):
         if gives == "nothing":
             return None
         return SimpleNamespace(message_bits=built_in(length).message_bits, decode=lambda *_: gives)
@@ -254,14 +249,14 @@ def test_an_error_correction_that_gives_another_thing_is_named(gives: object, sa
         received(link_with("error-correction", compile_code))
 
 
-def test_hooks_that_exit_end_nothing(demo_raw: Path) -> None:
+def test_hooks_that_exit_end_nothing(demo_raw):
     class Exits:
         @hookimpl
-        def evlcp_open_events(self, url: str) -> None:
+        def evlcp_open_events(self, url):
             raise SystemExit(0)
 
         @hookimpl
-        def evlcp_stage_finished(self, stage: str) -> None:
+        def evlcp_stage_finished(self, stage):
             raise SystemExit(0)
 
     registry = Registry.load(Exits())

@@ -1,6 +1,5 @@
 """Packets to messages: parts in any order, repetitions added, beacons with their signatures."""
 
-from collections.abc import Iterable
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 
@@ -11,23 +10,20 @@ from rx_messages import CODER, PLACE, Operator, blocks_of, noisy, operator, pack
 from evlcp_sdk.air.blocks import Block, Kind, Message, split
 from evlcp_sdk.link.sections import MessageSpec
 from evlcp_sdk.rx.inbox import MessageAssembler
-from evlcp_sdk.utc import ClockZero
-from evlcp_sdk.values import Packet, ReceivedMessage
+from evlcp_sdk.values import Packet
 
 
 class Feed:
     """An assembler that is fed with blocks."""
 
-    def __init__(self, zero: ClockZero = None, **spec: object) -> None:
-        told = replace(MessageSpec(), **spec)  # type: ignore[arg-type]
+    def __init__(self, zero=None, **spec):
+        told = replace(MessageSpec(), **spec)
         self.assembler = MessageAssembler(CODER, told, clock_zero=zero)
         self.number = 0
         self.rng = np.random.default_rng(5)
 
-    def __call__(
-        self, blocks: Iterable[bytes], ber: float = 1e-4, transmitter: int = 0
-    ) -> list[ReceivedMessage]:
-        found: list[ReceivedMessage] = []
+    def __call__(self, blocks, ber=1e-4, transmitter=0):
+        found = []
         for block in blocks:
             packet = packet_of(noisy(block, ber, self.rng), self.number, transmitter)
             found += self.assembler.add(packet).messages
@@ -35,11 +31,11 @@ class Feed:
         return found
 
     @property
-    def counts(self) -> dict[str, int]:
+    def counts(self):
         return {k: v for k, v in self.assembler.counts.items() if v}
 
 
-def test_a_long_message_in_any_order_with_duplicates() -> None:
+def test_a_long_message_in_any_order_with_duplicates():
     text = "Baustelle nach 300 m, rechter Fahrstreifen gesperrt, bitte 60. " * 8
     blocks = blocks_of(Message(Kind.TEXT, 7, 3, text.encode()))
     order = np.random.default_rng(1).permutation(np.repeat(np.arange(len(blocks)), 2))
@@ -57,7 +53,7 @@ def test_a_long_message_in_any_order_with_duplicates() -> None:
     }
 
 
-def test_state_is_bounded() -> None:
+def test_state_is_bounded():
     feed = Feed(combine_packets=4)
     for sequence in range(40):
         feed(blocks_of(Message(Kind.DATA, 1, sequence, bytes(41)))[:1], transmitter=sequence % 20)
@@ -70,7 +66,7 @@ def test_state_is_bounded() -> None:
     assert feed.counts["parts_missing"] == 40
 
 
-def test_another_message_under_the_same_number_replaces_it() -> None:
+def test_another_message_under_the_same_number_replaces_it():
     feed = Feed()
     one, two = (blocks_of(Message(Kind.DATA, 7, 3, bytes([v]) * 80)) for v in (1, 2))
     assert not feed(one[:1])
@@ -81,7 +77,7 @@ def test_another_message_under_the_same_number_replaces_it() -> None:
 
 
 @pytest.mark.parametrize("length", [80, 100])
-def test_parts_of_two_messages_under_one_number_are_not_one_message(length: int) -> None:
+def test_parts_of_two_messages_under_one_number_are_not_one_message(length):
     """A transmitter that starts anew with another message, and the first part of the new one is lost."""
     feed = Feed()
     one, two = (blocks_of(Message(Kind.DATA, 7, 3, bytes([v]) * length)) for v in (1, 2))
@@ -94,7 +90,7 @@ def test_parts_of_two_messages_under_one_number_are_not_one_message(length: int)
     assert [m.message.payload for m in found] == [bytes([2]) * length]
 
 
-def test_repetitions_are_added_until_they_decode() -> None:
+def test_repetitions_are_added_until_they_decode():
     # At this bit error rate no packet decodes by itself: half the bits are message, capacity is 0.53 (soft).
     blocks = blocks_of(Message(Kind.DATA, 7, 3, bytes(range(100))))
     assert len(blocks) == 3
@@ -108,7 +104,7 @@ def test_repetitions_are_added_until_they_decode() -> None:
     assert alone.counts == {"blocks_tried": 15, "blocks_failed": 15}
 
 
-def test_different_blocks_are_not_added() -> None:
+def test_different_blocks_are_not_added():
     # Blocks of one message, alike in header and payload but for their number.
     blocks = blocks_of(Message(Kind.DATA, 7, 3, bytes(40 * 40)))
     feed = Feed(combine_packets=64)
@@ -122,7 +118,7 @@ def test_different_blocks_are_not_added() -> None:
     ("lost", "hidden"),
     [(range(3), []), (range(4, 7), []), (range(7, 10), []), ([], [4, 5, 6, 12]), ([], [0, 1, 7, 8, 14, 15])],
 )
-def test_lost_frames_and_hidden_clusters_count_as_unknown(lost: Iterable[int], hidden: list[int]) -> None:
+def test_lost_frames_and_hidden_clusters_count_as_unknown(lost, hidden):
     """Clusters that are not given have LLR 0, and the error correction carries the message over them."""
     block = blocks_of(Message(Kind.TEXT, 1, 0, b"Hello"))[0]
     llr = noisy(block, 0.01, np.random.default_rng(3)).reshape(10, 16, 6)
@@ -132,7 +128,7 @@ def test_lost_frames_and_hidden_clusters_count_as_unknown(lost: Iterable[int], h
     assert (packet.block, packet.block_packets) == (Block.unpack(block), 1)
 
 
-def test_a_reflection_says_nothing_new() -> None:
+def test_a_reflection_says_nothing_new():
     blocks = blocks_of(Message(Kind.TEXT, 1, 0, b"Hello"))
     packet = packet_of(noisy(blocks[0], 0.01, np.random.default_rng(3)), 0, transmitter=1)
     echo = replace(packet, frames=tuple(replace(f, echo_of=0) for f in packet.frames))
@@ -142,13 +138,13 @@ def test_a_reflection_says_nothing_new() -> None:
     assert assembler.add(packet).messages
 
 
-def test_another_codebook_is_told() -> None:
+def test_another_codebook_is_told():
     feed = Feed()
     assert not feed(blocks_of(Message(Kind.TEXT, 1, 0, b"Hi"), digest=b"\0\0\0\0"))
     assert feed.counts == {"blocks_tried": 1, "blocks_decoded": 1, "blocks_other_codebook": 1}
 
 
-def test_bytes_that_mean_nothing_are_counted() -> None:
+def test_bytes_that_mean_nothing_are_counted():
     feed = Feed()
     assert not feed([b"\x33".ljust(CODER.block_bytes, b"\0")])
     assert feed.counts["blocks_malformed"] == 1
@@ -158,11 +154,11 @@ def test_bytes_that_mean_nothing_are_counted() -> None:
     assert "messages" not in feed.counts
 
 
-def trusts(found: list[ReceivedMessage]) -> list[str]:
+def trusts(found):
     return [m.trust for m in found]
 
 
-def test_a_signed_beacon_is_verified_once_its_signature_is_there() -> None:
+def test_a_signed_beacon_is_verified_once_its_signature_is_there():
     feed = Feed(trusted_keys=operator().trusted)
     blocks = blocks_of(*operator().beacon(5))
     assert len(blocks) == 3
@@ -193,9 +189,7 @@ SIGNED = datetime(2026, 3, 1, 12, tzinfo=UTC)
         (timedelta(seconds=40), ", 40.1 s before", 40.0692),
     ],
 )
-def test_a_fresh_receiver_says_how_old_an_old_recording_is(
-    later: timedelta | None, reason: str, age_s: float | None
-) -> None:
+def test_a_fresh_receiver_says_how_old_an_old_recording_is(later, reason, age_s):
     """A recording of March, received in whatever way: never just `verified`."""
     feed = Feed(None if later is None else SIGNED + later, trusted_keys=operator().trusted)
     found = feed(blocks_of(*operator().beacon(int(SIGNED.timestamp()))))
@@ -205,20 +199,20 @@ def test_a_fresh_receiver_says_how_old_an_old_recording_is(
     assert feed.assembler.counts["beacons_undated"] == (later is None)
 
 
-def test_every_forgery_of_two_thousand_is_found_out() -> None:
+def test_every_forgery_of_two_thousand_is_found_out():
     """A lamp beside the honest one shows tampered, unsigned, replayed or wrongly signed beacons."""
     rng, other = np.random.default_rng(11), Operator()
     feed = Feed(trusted_keys=operator().trusted)
     assembler = feed.assembler
 
-    def show(messages: list[Message]) -> list[ReceivedMessage]:
+    def show(messages):
         """Hand blocks over as if decoded: forgery is of bytes, not of light."""
         inbox = type(assembler._inboxes[0])()
         packet = Packet(1, 0, 0.0, 100.0, (), 10)
         blocks = [block for message in messages for block in split(message, CODER.digest, CODER.block_bytes)]
         return [found for block in blocks for found in assembler._take(inbox, block, packet)]
 
-    def tampered(message: Message, first_bit: int) -> Message:
+    def tampered(message, first_bit):
         payload = bytearray(message.payload)
         at = int(rng.integers(first_bit, 8 * len(payload)))
         payload[at // 8] ^= 1 << at % 8

@@ -58,7 +58,7 @@ def test_times_count_alike_at_every_chip_rate(chip_us):
         assert pixels[2, 3] & _kernels.SCORES == 10 + score, chips
 
 
-def test_a_bar_is_measured_beside_light_that_is_everywhere() -> None:
+def test_a_bar_is_measured_beside_light_that_is_everywhere():
     """A lit row across the image is a halo's; the bar's last row has half of its pixels awake."""
     blinks, rose = np.zeros((HEIGHT, WIDTH), bool), np.full((HEIGHT, WIDTH), 1000)
     blinks[4:12, 9:13] = blinks[12, 9:11] = blinks[1] = True
@@ -97,7 +97,7 @@ def test_events_in_boxes(n):
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_boundaries_are_where_lines_balance(seed) -> None:
+def test_boundaries_are_where_lines_balance(seed):
     """Each line's light is shared out as a boundary between two centres cuts it, however bright it is."""
     rng = np.random.default_rng(seed)
     start, end, share = *rng.permutation([rng.uniform(0, 4), rng.uniform(7, 11)]), rng.uniform(0.2, 0.8)
@@ -114,7 +114,7 @@ def test_boundaries_are_where_lines_balance(seed) -> None:
 
 
 @pytest.mark.parametrize("turn", [1j, 1.0, np.exp(1.2j), np.exp(0.5j)])
-def test_the_middle_across_a_line_of_light_and_its_profile(turn) -> None:
+def test_the_middle_across_a_line_of_light_and_its_profile(turn):
     """A bell of light about the line through (11.3, 7.8), which edges switch; looked at from beside it."""
     edges, found = np.array([1, -1, 0, 1]), np.zeros(WIDTH)
     rows, columns = np.mgrid[:HEIGHT, :WIDTH]
@@ -128,7 +128,7 @@ def test_the_middle_across_a_line_of_light_and_its_profile(turn) -> None:
     assert_allclose(found[: len(summed)], summed, rtol=2e-3, atol=30)
 
 
-def test_flanks_are_as_wide_as_they_are() -> None:
+def test_flanks_are_as_wide_as_they_are():
     """In the mean over places within pixels; above seven tenths of the most they are not counted."""
     columns, widths = np.arange(20), (1.0, 2.0, 3.5)
     for width in widths:

@@ -2,7 +2,6 @@
 
 import math
 import tracemalloc
-from collections.abc import Iterable, Iterator
 from itertools import pairwise, product
 
 import numpy as np
@@ -22,7 +21,7 @@ SPEC = RegionSpec(step_us=1000)
 KEEP_US = 20_000
 
 
-def blobs(columns: int, rows: int, until_us: int) -> Events:
+def blobs(columns, rows, until_us):
     """Blobs of 9 px in a grid of 60 px, each with a code of its own."""
     places = product(range(15, 60 * columns, 60), range(15, 60 * rows, 60))
     found = merged(
@@ -34,7 +33,7 @@ def blobs(columns: int, rows: int, until_us: int) -> Events:
     return found[: found.t_us.searchsorted(until_us)]
 
 
-def stepped(events: Events, until_us: int, **limits: int) -> Iterator[RegionFollower]:
+def stepped(events, until_us, **limits):
     """A follower with these limits after each step of a stream."""
     regions = RegionFollower(SPEC, CameraModel(), LINK.packet.chip_us, None, KEEP_US, Limits(**limits))
     bounds = np.searchsorted(events.t_us, np.arange(0, until_us + 1, SPEC.step_us)).tolist()
@@ -43,13 +42,13 @@ def stepped(events: Events, until_us: int, **limits: int) -> Iterator[RegionFoll
         yield regions
 
 
-def bytes_of(pieces: Iterable[tuple[int, Events]]) -> int:
+def bytes_of(pieces):
     """Counted anew."""
     return sum(PIECE_BYTES + EVENT_BYTES * len(events) for _, events in pieces)
 
 
 @pytest.mark.parametrize("size", [7, 1000, 10**6])
-def test_a_step_takes_its_first_events(size: int) -> None:
+def test_a_step_takes_its_first_events(size):
     events = noise_events(3e6, 3000)
     timeline = Timeline(1000, 1280, 720, 2000)
     pieces = (events[a : a + size] for a in range(0, len(events), size))
@@ -63,7 +62,7 @@ def test_a_step_takes_its_first_events(size: int) -> None:
     assert timeline.dropped == len(events) - sum(len(s.events) for s in steps) > 2000
 
 
-def test_small_pieces_of_a_step_take_the_memory_of_their_events() -> None:
+def test_small_pieces_of_a_step_take_the_memory_of_their_events():
     events = Events.of(np.zeros(20_000, np.int64), *np.ones((3, 20_000), np.int64))
     timeline = Timeline(1000, 1280, 720, 10**6)
     tracemalloc.start()
@@ -77,7 +76,7 @@ def test_small_pieces_of_a_step_take_the_memory_of_their_events() -> None:
     assert len(step.events) == 20_000
 
 
-def test_the_whole_image_is_forgotten_sooner_where_it_takes_too_much() -> None:
+def test_the_whole_image_is_forgotten_sooner_where_it_takes_too_much():
     events = noise_events(6.6e6, 30_000)
     for regions in stepped(events, 30_000, recent_bytes=400_000):
         assert bytes_of(regions._recent) <= 400_000
@@ -87,7 +86,7 @@ def test_the_whole_image_is_forgotten_sooner_where_it_takes_too_much() -> None:
     assert free.counts["steps_forgotten"] == 0
 
 
-def test_the_oldest_events_of_regions_are_forgotten() -> None:
+def test_the_oldest_events_of_regions_are_forgotten():
     events = blobs(5, 4, 40_000)
     for regions in stepped(events, 40_000, region_bytes=150_000):
         held = [bytes_of(one.pieces) for one in regions.alive]
@@ -105,7 +104,7 @@ def test_the_oldest_events_of_regions_are_forgotten() -> None:
     assert free.counts["dropped_no_room"] == 0
 
 
-def test_a_region_that_had_its_time_gives_way() -> None:
+def test_a_region_that_had_its_time_gives_way():
     events = blobs(6, 3, 60_000)
     seen = set()
     for regions in stepped(events, 60_000, regions=7):
@@ -119,7 +118,7 @@ def test_a_region_that_had_its_time_gives_way() -> None:
     assert len(free.alive) == 18
 
 
-def test_of_many_areas_those_with_the_most_rises_are_looked_at() -> None:
+def test_of_many_areas_those_with_the_most_rises_are_looked_at():
     dim = blobs(8, 5, 40_000)
     dim = dim[np.random.default_rng(2).random(len(dim)) < 0.6]
     bar = ideal_events(LINK, IdealBar(random_symbols(LINK, 2), x_px=900))
@@ -128,7 +127,7 @@ def test_of_many_areas_those_with_the_most_rises_are_looked_at() -> None:
     assert any(abs(one.latest.x_px - 900) < 5 for one in regions.alive)
 
 
-def test_within_the_defaults_nothing_is_left_out() -> None:
+def test_within_the_defaults_nothing_is_left_out():
     bar = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1), x_px=700))
     events = merged(blobs(2, 4, 120_000), bar, noise_events(1.7e6, 120_000))
     receiver = Receiver(LINK)
@@ -143,7 +142,7 @@ def test_within_the_defaults_nothing_is_left_out() -> None:
     assert [counts[name] for name in (*names, "regions_gave_way", "frames_cut")] == [0] * 7
 
 
-def test_the_memory_of_a_receiver_is_bounded() -> None:
+def test_the_memory_of_a_receiver_is_bounded():
     """Many events, at the limits that take a tenth of the memory, and at the defaults, which take it all."""
     events = noise_events(66e6, 60_000)
     peaks = []

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
-from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import hadamard
 from evlcp_sdk.rx.placement import layout_of, lit, masked, placements
@@ -19,13 +18,7 @@ SIZE = (48, 224)
 SEEDS = range(6)
 
 
-def drawn(
-    centres_m: NDArray[np.float64],
-    *instances: tuple[complex, complex],
-    size: tuple[int, int] = SIZE,
-    half_px: float = 2.0,
-    conj: bool = False,
-) -> PresenceMap:
+def drawn(centres_m, *instances, size=SIZE, half_px=2.0, conj=False):
     """Cells of 2 px whose middle lies in a cluster of an instance (scale, shift)."""
     width, height = size
     y, x = np.mgrid[: height // 2, : width // 2] * 2 + 0.5
@@ -42,7 +35,7 @@ def drawn(
     return PresenceMap(selected.astype(np.float32), 2, selected, pixels)
 
 
-def cluttered(presence: PresenceMap, rng: np.random.Generator, share: float) -> PresenceMap:
+def cluttered(presence, rng, share):
     """A share of all cells shows clusters at random."""
     selected = presence.selected.copy()
     hit = rng.random(selected.shape[1:]) < share
@@ -52,14 +45,14 @@ def cluttered(presence: PresenceMap, rng: np.random.Generator, share: float) -> 
     return PresenceMap(selected.astype(np.float32), 2, selected, pixels)
 
 
-def covered(presence: PresenceMap, clusters: list[int]) -> PresenceMap:
+def covered(presence, clusters):
     keep = ~np.isin(np.arange(len(presence.selected)), clusters)[:, None, None]
     return PresenceMap(presence.probability * keep, 2, presence.selected & keep, presence.pixels * keep)
 
 
 @settings(max_examples=40)
 @given(st.floats(40, 200), st.floats(-math.pi, math.pi), st.floats(0, 2), st.floats(0, 2))
-def test_a_bar_at_any_size_and_turn(px_per_m: float, turn: float, right: float, down: float) -> None:
+def test_a_bar_at_any_size_and_turn(px_per_m, turn, right, down):
     scale, shift = px_per_m * np.exp(1j * turn), complex(112 + right, 112 + down)
     (found,) = placements(drawn(CENTRES, (scale, shift), size=(224, 224)), LINE)
     # A cell is two pixels wide.
@@ -69,7 +62,7 @@ def test_a_bar_at_any_size_and_turn(px_per_m: float, turn: float, right: float, 
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_clutter_and_a_cover(seed: int) -> None:
+def test_clutter_and_a_cover(seed):
     rng = np.random.default_rng(seed)
     hidden = sorted(rng.choice(16, 8, replace=False).tolist())
     scale, shift = 150 * np.exp(0.02j), 24.3 + 110.2j
@@ -81,7 +74,7 @@ def test_clutter_and_a_cover(seed: int) -> None:
     assert not set(np.flatnonzero(~found.seen)) - set(hidden)
 
 
-def test_a_reflection_beside_stays_out_of_the_footprints() -> None:
+def test_a_reflection_beside_stays_out_of_the_footprints():
     bar, image = (100 + 0j, 12.0 + 60j), (100 + 0j, 34.0 + 60j)
     presence = drawn(CENTRES, bar, image, size=(48, 120))
     found = placements(presence, LINE)
@@ -95,7 +88,7 @@ def test_a_reflection_beside_stays_out_of_the_footprints() -> None:
         assert not (only.selected & ~presence.selected).any()
 
 
-def test_a_halo_is_not_in_the_footprints() -> None:
+def test_a_halo_is_not_in_the_footprints():
     """Around a bar four pixels wide, cells show the cluster in their row, or one of any row as often."""
     rng = np.random.default_rng(1)
     presence = drawn(CENTRES, (150, 24 + 110j))
@@ -111,7 +104,7 @@ def test_a_halo_is_not_in_the_footprints() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_bayes_cell_by_cell(seed: int) -> None:
+def test_bayes_cell_by_cell(seed):
     rng = np.random.default_rng(seed)
     probability, prior = (rng.dirichlet(np.full(6, 0.3), (7, 4)).T[:-1] for _ in range(2))
     probability[:, :, 3] = prior[:, :2] = 0
@@ -130,7 +123,7 @@ def test_bayes_cell_by_cell(seed: int) -> None:
     np.testing.assert_allclose(presence.informed().probability, want, rtol=2e-3, atol=1e-5)
 
 
-def test_a_hidden_cluster_is_not_lit_by_its_neighbours() -> None:
+def test_a_hidden_cluster_is_not_lit_by_its_neighbours():
     """Clusters 5 and 6 are covered; blur carries a tenth of their neighbours' light into their places."""
     codes = np.concatenate([hadamard(8), -hadamard(8)]).astype(np.int64)
     whole = drawn(CENTRES, (150, 24 + 110j))
@@ -150,7 +143,7 @@ def test_a_hidden_cluster_is_not_lit_by_its_neighbours() -> None:
     assert only.probability[[4, 7]].any((1, 2)).all()
 
 
-def test_few_clusters_are_enough_where_the_scale_is_known() -> None:
+def test_few_clusters_are_enough_where_the_scale_is_known():
     whole = drawn(CENTRES, (150, 24 + 110j))
     (before,) = placements(whole, LINE)
     for hidden in (range(11), range(5, 16), [k for k in range(16) if k not in (2, 6, 7, 8, 13)]):
@@ -164,7 +157,7 @@ def test_few_clusters_are_enough_where_the_scale_is_known() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_clusters_out_of_their_order_are_no_bar(seed: int) -> None:
+def test_clusters_out_of_their_order_are_no_bar(seed):
     rng = np.random.default_rng(seed)
     order = rng.permutation(16)
     presence = drawn(CENTRES[order], (150, 24 + 110j))
@@ -174,7 +167,7 @@ def test_clusters_out_of_their_order_are_no_bar(seed: int) -> None:
 
 
 @pytest.mark.parametrize("conj", [False, True])
-def test_a_panel_and_its_mirror_image(conj: bool) -> None:
+def test_a_panel_and_its_mirror_image(conj):
     centres = PANEL.cluster_centres_m()
     layout = layout_of(centres)
     scale, shift = 300 * np.exp(0.1j), 64.2 + 63.7j
@@ -187,7 +180,7 @@ def test_a_panel_and_its_mirror_image(conj: bool) -> None:
 
 
 @pytest.mark.parametrize("column", [0, 1])
-def test_one_column_of_two_is_not_taken_for_the_other_in_a_mirror(column: int) -> None:
+def test_one_column_of_two_is_not_taken_for_the_other_in_a_mirror(column):
     """It looks the same in both; in an image the layout then stands on the other side."""
     centres = BarLayout(LedColumns(columns=2, apart_m=2.0, rows=48)).cluster_centres_m()
     layout = layout_of(centres)
@@ -203,7 +196,7 @@ def test_one_column_of_two_is_not_taken_for_the_other_in_a_mirror(column: int) -
     assert not any(one.mirrored for one in found)
 
 
-def test_one_cluster_is_where_its_cells_are() -> None:
+def test_one_cluster_is_where_its_cells_are():
     layout = layout_of(np.zeros((1, 2)))
     presence = drawn(np.zeros((1, 2)), size=(40, 40))
     presence.selected[0, 3:5, 7:9] = True
@@ -212,5 +205,5 @@ def test_one_cluster_is_where_its_cells_are() -> None:
     assert masked(presence, layout, found) is presence
 
 
-def test_nothing_seen_is_nowhere() -> None:
+def test_nothing_seen_is_nowhere():
     assert placements(drawn(CENTRES), LINE) == []

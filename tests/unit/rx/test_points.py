@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings, strategies as st
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 from rx_streams import LINK, frames_of, received
 
 from evlcp_sdk.files import shipped
@@ -26,8 +25,8 @@ FINE = 8
 """Parts that a pixel's side is cut into to draw with."""
 
 
-def drawn(layout: NDArray[np.float64], turn: complex, shift: complex, half_m: NDArray[np.float64],
-          size: tuple[int, int]) -> PresenceMap:  # fmt: skip
+def drawn(layout, turn, shift, half_m,
+          size):  # fmt: skip
     """Clusters as boxes of `half_m`, each pixel with its share of each: an ideal image."""
     width, height = size
     y, x = (np.mgrid[: height * FINE, : width * FINE] + 0.5) / FINE - 0.5
@@ -40,33 +39,31 @@ def drawn(layout: NDArray[np.float64], turn: complex, shift: complex, half_m: ND
     return PresenceMap(cells.astype(np.float32), 2, cells, pixels)
 
 
-def points_of(
-    presence: PresenceMap, centres_m: NDArray[np.float64] = CENTRES
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def points_of(presence, centres_m=CENTRES):
     layout = layout_of(centres_m)
     return points_finder(layout, *alone(len(centres_m)))(
         presence, placements(presence, layout)[0], heard_of(presence.pixels), (0.0, 0.0)
     )[:2]
 
 
-def alone(clusters: int) -> tuple[NDArray[np.int64], int]:
+def alone(clusters):
     """Pilots of which each has one edge, at which no other has one."""
     return np.eye(clusters, dtype=np.int64), 1
 
 
-def heard_of(light: NDArray[np.float32]) -> NDArray[np.int16]:
+def heard_of(light):
     """Polarity sums of such pilots, in hundreds of a pixel's light."""
     return np.concatenate([np.zeros((1, *light.shape[1:]), np.int16), np.rint(100 * light).astype(np.int16)])
 
 
-def truth_of(turn: complex, shift: complex, layout: NDArray[np.float64]) -> NDArray[np.float64]:
+def truth_of(turn, shift, layout):
     z = turn * (layout[:, 0] + 1j * layout[:, 1]) + shift
     return np.stack([z.real, z.imag], -1)
 
 
 @settings(max_examples=25)
 @given(st.floats(75, 220), st.floats(-0.15, 0.15), st.floats(0, 1), st.floats(0, 1))
-def test_points_of_an_ideal_bar(px_per_m: float, roll: float, dx: float, dy: float) -> None:
+def test_points_of_an_ideal_bar(px_per_m, roll, dx, dy):
     turn, shift = px_per_m * np.exp(1j * roll), complex(24 + dx, 112 + dy)
     presence = drawn(CENTRES, turn, shift, np.array([1.2 / px_per_m, 0.03]), (48, 224))
     points, sigma = points_of(presence)
@@ -79,7 +76,7 @@ def test_points_of_an_ideal_bar(px_per_m: float, roll: float, dx: float, dy: flo
     assert (sigma[[0, -1]] > sigma[1]).all()
 
 
-def test_a_lying_bar_and_one_upside_down() -> None:
+def test_a_lying_bar_and_one_upside_down():
     for turn in (-150.0 + 0j, 150j, -150j):
         size = (48, 200) if turn.real else (200, 48)
         shift = complex(size[0] / 2 + 0.3, size[1] / 2 - 0.2)
@@ -88,7 +85,7 @@ def test_a_lying_bar_and_one_upside_down() -> None:
         assert np.abs(points - truth_of(turn, shift, CENTRES)).max() < 0.2
 
 
-def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out() -> None:
+def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out():
     presence = drawn(CENTRES, 150, 24.3 + 100.4j, np.array([0.008, 0.03]), (48, 200))
     want = truth_of(150, 24.3 + 100.4j, CENTRES)
     selected, pixels = presence.selected.copy(), presence.pixels.copy()
@@ -103,7 +100,7 @@ def test_dark_clusters_are_unseen_and_cells_out_of_place_are_left_out() -> None:
 
 
 @pytest.mark.parametrize("down", [1, -1], ids=["upright", "mirrored"])
-def test_a_panel_has_neighbours_on_both_axes(down: int) -> None:
+def test_a_panel_has_neighbours_on_both_axes(down):
     panel = BarLayout(LedGrid(rows=16, columns=16, cluster_rows=4, cluster_columns=4))
     layout = panel.cluster_centres_m()
     turn, shift = 700 * np.exp(0.05j), 64.2 + 63.7j
@@ -113,7 +110,7 @@ def test_a_panel_has_neighbours_on_both_axes(down: int) -> None:
     assert np.abs(points - truth_of(turn, shift, shown)).max() < 0.25
 
 
-def test_two_clusters_give_no_points() -> None:
+def test_two_clusters_give_no_points():
     presence = drawn(CENTRES, 150, 24 + 100j, np.array([0.008, 0.03]), (48, 200))
     layout = layout_of(CENTRES)
     placement = replace(placements(presence, layout)[0], seen=np.arange(16) < 2)
@@ -127,7 +124,7 @@ def test_two_clusters_give_no_points() -> None:
 
 @settings(max_examples=25)
 @given(st.floats(0, 2))
-def test_cells_that_hold_more_of_one_side_do_not_shift_a_bar(dx: float) -> None:
+def test_cells_that_hold_more_of_one_side_do_not_shift_a_bar(dx):
     turn, shift = 150.0, complex(24 + dx, 100)
     whole = drawn(CENTRES, turn, shift, np.array([2.6 / turn, 0.03]), (48, 200))
     first = 2 * int((24 + dx - 2) / 2)
@@ -142,14 +139,12 @@ def test_cells_that_hold_more_of_one_side_do_not_shift_a_bar(dx: float) -> None:
     assert np.abs(np.subtract(centre_px, (shift.real + 8, shift.imag + 2))).max() <= 0.5 / FINE
 
 
-def lies(points: NDArray[np.float64]) -> bool:
+def lies(points):
     """Whether a bar is wider than it is high."""
     return bool(np.ptp(points[:, 0]) > np.ptp(points[:, 1]))
 
 
-def simulated(
-    scene: str, sets: list[str], seed: int | None = None, lying: bool = False, **link: dict[str, float]
-) -> NDArray[np.float64]:
+def simulated(scene, sets, seed=None, lying=False, **link):
     """By how much points of a scene's upright or lying bar are off its truth, px, (frames, K, 2)."""
     simulation = Simulation(load_scene(scene, sets), seed)
     receiver = Receiver(resolve(link))
@@ -164,7 +159,7 @@ def simulated(
     return np.array(points)[mine] - want
 
 
-def test_the_image_of_a_still_bar_is_found_at_any_place_within_pixels() -> None:
+def test_the_image_of_a_still_bar_is_found_at_any_place_within_pixels():
     sets = ["motion.distance_m=30", "motion.speed_mps=0", "motion.vib_rate_rad_s=0"]
     off = simulated("drive-30kmh", ["duration_s=0.1", "motion.lateral_mps=0.15", "motion.yaw_deg=0.4", *sets])
     assert len(off) > 15
@@ -172,7 +167,7 @@ def test_the_image_of_a_still_bar_is_found_at_any_place_within_pixels() -> None:
     assert np.abs(off.mean(1)[:, 0]).max() < 0.12
 
 
-def test_a_track_that_trembles_does_not_move_the_points_along_a_bar() -> None:
+def test_a_track_that_trembles_does_not_move_the_points_along_a_bar():
     """Of a lying bar, whose columns its region knows by which LEDs happen to blink."""
     sets = ["duration_s=0.15", "motion.distance_m=43.0", 'world.attitude="none"']
     off = simulated("examples/scenes/portal.toml", sets, 301, lying=True).mean(1)
@@ -181,7 +176,7 @@ def test_a_track_that_trembles_does_not_move_the_points_along_a_bar() -> None:
     assert (off.std(0) < (0.1, 0.05)).all()
 
 
-def test_points_of_a_turning_camera_lie_where_they_are() -> None:
+def test_points_of_a_turning_camera_lie_where_they_are():
     """At 45 degrees a second the image moves by half a pixel in a chip."""
     sets = ["duration_s=0.1", 'motion.path_file="turning.csv"', "motion.vib_rate_rad_s=0.02"]
     off = simulated("examples/scenes/one-bar.toml", sets, 5)
@@ -193,7 +188,7 @@ def test_points_of_a_turning_camera_lie_where_they_are() -> None:
     assert shape.std() < 0.2
 
 
-def test_sigma_is_the_scatter_about_the_similarity() -> None:
+def test_sigma_is_the_scatter_about_the_similarity():
     squares, freedom = 0.0, 0
     for frame in frames_of(received(LINK, read_events(shipped("recordings", "night-50m-30kmh-cut.raw")))[1]):
         seen = np.isfinite(frame.points_px[:, 0])

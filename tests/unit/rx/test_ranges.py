@@ -1,11 +1,9 @@
 """Distances together: drives whose truth is known, with errors drawn as the sigmas say, or not so."""
 
 import math
-from collections.abc import Callable, Iterable
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.integrate import quad
 from scipy.stats import norm
 
@@ -21,7 +19,7 @@ FOCAL_PX = 7200.0
 AHEAD = BarSight()
 
 
-def bend_of(lean_deg: float, distance_m: float, noise_px: float, rng: np.random.Generator) -> Bend:
+def bend_of(lean_deg, distance_m, noise_px, rng):
     """Boundaries of a leaning bar, where a pinhole sees them: by perspective, not by a parabola."""
     sine, cosine = math.sin(math.radians(lean_deg)), math.cos(math.radians(lean_deg))
     along = PLACES * SPACING_M
@@ -34,17 +32,17 @@ def bend_of(lean_deg: float, distance_m: float, noise_px: float, rng: np.random.
 
 def drive(
     *,
-    frames: int,
-    sigma_m: float,
-    said_m: float | None = None,
-    start_m: float = 50.0,
-    speed_m_s: float = -10.0,
-    late_chips: float = 8.0,
-    lean_deg: float = 0.0,
-    bend_px: float | None = None,
-    outliers: tuple[int, ...] = (),
-    seed: int = 0,
-) -> np.ndarray:
+    frames,
+    sigma_m,
+    said_m=None,
+    start_m=50.0,
+    speed_m_s=-10.0,
+    late_chips=8.0,
+    lean_deg=0.0,
+    bend_px=None,
+    outliers=(),
+    seed=0,
+):
     """Errors and sigmas, float64 (frames, 2), of a drive whose distances err by `sigma_m`, said `said_m`."""
     rng = np.random.default_rng(seed)
     true, measured = [], []
@@ -61,7 +59,7 @@ def drive(
     return np.array([(one.distance_m - true_m, one.sigma_m) for one, true_m in zip(found, true, strict=True)])
 
 
-def kept(measured: Iterable[Range], sight: BarSight = AHEAD) -> tuple[Ranges, list[Range]]:
+def kept(measured, sight=AHEAD):
     """What is remembered after frames with these distances, and the distances as they should be."""
     keeper, state, out = RangeKeeper(), Ranges(), []
     for i, one in enumerate(measured):
@@ -70,24 +68,22 @@ def kept(measured: Iterable[Range], sight: BarSight = AHEAD) -> tuple[Ranges, li
     return state, out
 
 
-def nees(errors: np.ndarray) -> float:
+def nees(errors):
     return float(np.mean((errors[:, 0] / errors[:, 1]) ** 2))
 
 
-def test_without_a_distance_nothing_changes() -> None:
+def test_without_a_distance_nothing_changes():
     keeper, state = RangeKeeper(), Ranges()
     for measured in (Range(math.nan, math.nan, 0), Range(50.0, math.nan, 3), Range(0.0, 0.0, 3)):
         assert keeper.step(state, 0.0, CHIP_US, measured, AHEAD) == (state, measured)
 
 
-def foreshortened(
-    along: float = 0.0, about_deg: float = 0.0, sigma_deg: float = 0.7, share: float = 0.1
-) -> tuple[float, float]:
+def foreshortened(along=0.0, about_deg=0.0, sigma_deg=0.7, share=0.1):
     """Mean and standard deviation of the foreshortening over what is likely of a lean, by quadrature."""
     sigma, most, about = math.radians(sigma_deg), math.radians(5), math.radians(about_deg)
 
-    def mean_of(value: Callable[[float], float]) -> float:
-        def weighed(a: float) -> float:
+    def mean_of(value):
+        def weighed(a):
             chance = (1 - share) * norm.pdf(a, 0, sigma) + share / (2 * most)
             return chance * value(math.cos(about + a) + along * math.sin(about + a))
 
@@ -98,7 +94,7 @@ def foreshortened(
 
 
 @pytest.mark.parametrize("along", [0.0, 0.05, -0.05])
-def test_a_first_distance_stays_but_for_the_lean_that_is_likely(along: float) -> None:
+def test_a_first_distance_stays_but_for_the_lean_that_is_likely(along):
     """A bar 360 px off the middle looks shorter or longer by a twentieth of its lean, which is not known."""
     _, (found,) = kept([Range(50.0, 0.02, 15)], BarSight(along))
     mean, spread = foreshortened(along)
@@ -108,7 +104,7 @@ def test_a_first_distance_stays_but_for_the_lean_that_is_likely(along: float) ->
 
 @pytest.mark.parametrize("along", [0.0, -0.04])
 @pytest.mark.parametrize("lean_deg", [-4.0, 0.0, 12.0])
-def test_an_attitude_tells_the_lean(lean_deg: float, along: float) -> None:
+def test_an_attitude_tells_the_lean(lean_deg, along):
     sight = BarSight(along, sine=math.sin(math.radians(lean_deg)), sigma=math.radians(0.3))
     _, (found,) = kept([Range(50.0, 0.02, 15)], sight)
     mean, spread = foreshortened(along, lean_deg, 0.3, 6e-5)
@@ -116,7 +112,7 @@ def test_an_attitude_tells_the_lean(lean_deg: float, along: float) -> None:
     assert found.sigma_m == pytest.approx(math.hypot(0.02 * mean, 50 * spread), rel=0.03)
 
 
-def test_distances_are_brought_to_the_pilot() -> None:
+def test_distances_are_brought_to_the_pilot():
     """A frame is read in 3.2 ms, in whose second half a car at 30 m/s is nearer by 24 mm."""
     errors = drive(frames=60, sigma_m=0.002, speed_m_s=-30.0, bend_px=0.01, seed=1)
     assert abs(errors[20:, 0].mean()) < 0.005
@@ -126,7 +122,7 @@ def test_distances_are_brought_to_the_pilot() -> None:
 
 
 @pytest.mark.parametrize("truth", [0.6, 1.0, 3.0])
-def test_sigmas_become_true(truth: float) -> None:
+def test_sigmas_become_true(truth):
     """Errors of three times the sigma that the ranging says, or of little more than half."""
     late = np.concatenate(
         [drive(frames=90, sigma_m=0.05 * truth, said_m=0.05, bend_px=0.01, seed=s)[20:] for s in range(12)]
@@ -136,7 +132,7 @@ def test_sigmas_become_true(truth: float) -> None:
 
 
 @pytest.mark.parametrize("lean_deg", [-5.0, -3.0, 0.0, 4.0])
-def test_a_lean_is_found_in_the_bend(lean_deg: float) -> None:
+def test_a_lean_is_found_in_the_bend(lean_deg):
     errors = np.stack(
         [
             drive(frames=60, sigma_m=0.015, start_m=42.0, lean_deg=lean_deg, bend_px=0.04, seed=s)
@@ -149,11 +145,11 @@ def test_a_lean_is_found_in_the_bend(lean_deg: float) -> None:
     assert abs(errors[:, -1, 0].mean()) < 0.02
 
 
-def test_a_distance_keeps_nothing_of_old_bends_and_distances() -> None:
+def test_a_distance_keeps_nothing_of_old_bends_and_distances():
     rng = np.random.default_rng(5)
     measured = [Range(45.1, 0.01, 15, 8.0, bend_of(4.0, 45.0, 0.04, rng)) for _ in range(400)]
     state, _ = kept(measured)
-    weight = measured[-1].bend.weight  # type: ignore[union-attr]
+    weight = measured[-1].bend.weight
     assert len(state.past) <= 0.3 / (FRAME_US * 1e-6) + 1
     assert state.bend[0].max() < 1.01 * weight.max() / (1 - math.exp(-FRAME_US * 1e-6))
     new, _ = RangeKeeper().step(state, 400 * FRAME_US + 20e6, CHIP_US, measured[-1], AHEAD)
@@ -161,7 +157,7 @@ def test_a_distance_keeps_nothing_of_old_bends_and_distances() -> None:
     assert new.bend[0] == pytest.approx(weight)
 
 
-def wavy(spacing_px: float, start: float, height_px: float, rng: np.random.Generator) -> tuple[Range, float]:
+def wavy(spacing_px, start, height_px, rng):
     """A frame of a level bar whose boundaries seem off by a wave of the pixels, and its distance.
 
     As a ranging gives it that fits a straight scale to them: least squares of the boundaries.
@@ -181,7 +177,7 @@ def wavy(spacing_px: float, start: float, height_px: float, rng: np.random.Gener
     return Range(FOCAL_PX * SPACING_M / fitted, 0.02 / 16.7 / fitted * true_m, 15, 8.0, bend), true_m
 
 
-def waves(spacings_px: NDArray[np.float64], height_px: float, rng: np.random.Generator) -> list[float]:
+def waves(spacings_px, height_px, rng):
     """Error and sigma of the last of some distances, and what it was before."""
     start = rng.uniform()
     frames = [wavy(spacing_px, start, height_px, rng) for spacing_px in spacings_px.tolist()]
@@ -190,7 +186,7 @@ def waves(spacings_px: NDArray[np.float64], height_px: float, rng: np.random.Gen
     return [found[-1].distance_m - true_m, found[-1].sigma_m, measured.distance_m - true_m, measured.sigma_m]
 
 
-def test_a_wave_of_the_pixels_is_learnt_and_taken_out() -> None:
+def test_a_wave_of_the_pixels_is_learnt_and_taken_out():
     """At a spacing of 8 px and a fifteenth a wave looks like a lean, and the same in every frame."""
     # Farther away boundaries lie in many ways on the pixels; then the car stands.
     spacings_px = np.minimum(7.6 + 0.02 * np.arange(60), 8 + 1 / 15)
@@ -201,7 +197,7 @@ def test_a_wave_of_the_pixels_is_learnt_and_taken_out() -> None:
     assert np.mean((error / sigma) ** 2) < 1.5
 
 
-def test_what_is_not_known_of_the_wave_is_in_the_sigma() -> None:
+def test_what_is_not_known_of_the_wave_is_in_the_sigma():
     """A camera that stands: all frames err alike, and their scatter says nothing of it."""
     rng, still_px = np.random.default_rng(10), np.full(60, 8 + 1 / 15)
     found = [waves(still_px, height_px, rng) for height_px in rng.normal(0, 0.07, 40)]
@@ -211,7 +207,7 @@ def test_what_is_not_known_of_the_wave_is_in_the_sigma() -> None:
     assert np.mean((raw / raw_sigma) ** 2) > 10
 
 
-def bent(frames: int, off_px: np.ndarray, rng: np.random.Generator) -> list[Range]:
+def bent(frames, off_px, rng):
     """Frames of a bar 45 m away whose boundaries seem to lie off by so much, (15,): a scale through all."""
     spacing_px = FOCAL_PX * SPACING_M / 45
     one_px, found = spacing_px * SPACING_M / 45, []
@@ -224,7 +220,7 @@ def bent(frames: int, off_px: np.ndarray, rng: np.random.Generator) -> list[Rang
 
 
 @pytest.mark.parametrize("height_px", [1.0, 0.2])
-def test_what_bends_an_image_does_not_average_away(height_px: float) -> None:
+def test_what_bends_an_image_does_not_average_away(height_px):
     """A drop over the bar's lower half: all frames err alike, and each shows it, or some together."""
     rng, at = np.random.default_rng(12), PLACES / 4 - 1
     off_px = height_px * at * np.exp((1 - at**2) / 2)
@@ -245,7 +241,7 @@ def test_what_bends_an_image_does_not_average_away(height_px: float) -> None:
     assert again[-1].sigma_m == pytest.approx(straight[-1].sigma_m, rel=0.3)
 
 
-def test_clusters_with_dark_leds_are_taken_out_and_shown() -> None:
+def test_clusters_with_dark_leds_are_taken_out_and_shown():
     off_px = np.zeros(15)
     off_px[[1, 2, 8, 13]] = -0.7, -1.4, 0.7, 0.7
     measured = bent(20, off_px, np.random.default_rng(13))
@@ -267,7 +263,7 @@ def test_clusters_with_dark_leds_are_taken_out_and_shown() -> None:
 
 
 @pytest.mark.parametrize("sigma_m", [0.0, 1e-12])
-def test_ideal_distances_stay(sigma_m: float) -> None:
+def test_ideal_distances_stay(sigma_m):
     mean, spread = foreshortened()
     for found in kept([Range(50.0, sigma_m, 15)] * 120)[1]:
         assert found.distance_m == pytest.approx(50 * mean, abs=2e-4)

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from evlcp_sdk.air.codebook import hadamard
 from evlcp_sdk.rx import _kernels
@@ -15,9 +14,7 @@ WORDS = np.concatenate([ROWS, -ROWS])
 BITS = np.arange(16)[:, None] >> np.arange(3, -1, -1) & 1
 
 
-def sent_and_read(
-    rng: np.random.Generator, noise: float, scale: float
-) -> tuple[NDArray[np.int64], SoftSymbols]:
+def sent_and_read(rng, noise, scale):
     """A frame over a Gaussian channel, by max-log, its LLRs off by a factor."""
     sent = rng.integers(0, 16, 16)
     gain = rng.uniform(0.8, 1.2, 16)
@@ -31,7 +28,7 @@ def sent_and_read(
 
 @pytest.mark.parametrize("scale", [0.01, 1.0, 50.0])
 @pytest.mark.parametrize(("noise", "least"), [(0.6, 0.5), (0.7, 0.5), (0.8, 0.5), (0.9, 0.4), (1.4, 0.4)])
-def test_of_frames_with_quality_q_one_less_q_are_wrong(noise: float, least: float, scale: float) -> None:
+def test_of_frames_with_quality_q_one_less_q_are_wrong(noise, least, scale):
     """Within a factor of 2; where most are wrong, 0.4 as many are said to be."""
     rng = np.random.default_rng(7)
     wrong, doubt = [], []
@@ -45,7 +42,7 @@ def test_of_frames_with_quality_q_one_less_q_are_wrong(noise: float, least: floa
     assert least < np.mean(doubt) / np.mean(wrong) < 2
 
 
-def test_what_is_rather_wrong_is_not_given() -> None:
+def test_what_is_rather_wrong_is_not_given():
     rng = np.random.default_rng(3)
     hidden = right = 0
     for _ in range(300):
@@ -60,7 +57,7 @@ def test_what_is_rather_wrong_is_not_given() -> None:
     assert right < 0.6 * hidden
 
 
-def test_of_what_is_not_seen_nothing_is_given() -> None:
+def test_of_what_is_not_seen_nothing_is_given():
     _, read = sent_and_read(np.random.default_rng(0), 0.1, 1.0)
     seen = np.arange(16) != 5
     soft = calibrate_llr(read, seen)
@@ -74,7 +71,7 @@ def test_of_what_is_not_seen_nothing_is_given() -> None:
         assert none.quality == 0
 
 
-def test_silence_is_not_what_a_cluster_says() -> None:
+def test_silence_is_not_what_a_cluster_says():
     """Two clusters side by side; the second one's info segment has an event in one chip of eight."""
     rng = np.random.default_rng(0)
     sums = np.where(rng.random((32, 6, 8)) < 0.6, 1, 0).astype(np.int16)

@@ -5,21 +5,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from numpy.typing import NDArray
 from rx_streams import LINK, frames_of, noise_events, received, right_frames
 
 from evlcp_sdk.errors import StreamError
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx.framing import SkippedFrame
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import Attitude
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, Packet, PresenceMap
+from evlcp_sdk.values import Events, PresenceMap
 
 
-def packets_of(bar: IdealBar, link: Link = LINK) -> list[Packet]:
+def packets_of(bar, link=LINK):
     return received(link, ideal_events(link, bar))[1]
 
 
@@ -38,7 +37,7 @@ def packets_of(bar: IdealBar, link: Link = LINK) -> list[Packet]:
         ("air.pilot_every=4 air.frames_per_packet=20 modulation.id=raw8", 0),
     ],
 )
-def test_every_link_is_read_to_the_last_frame(sets: str, ppm: float) -> None:
+def test_every_link_is_read_to_the_last_frame(sets, ppm):
     link = load_link(overrides=sets.split())
     every = link.packet.pilot_every
     # Where pilots are few it moves by a spacing while one of eight frames holds.
@@ -53,7 +52,7 @@ def test_every_link_is_read_to_the_last_frame(sets: str, ppm: float) -> None:
 
 
 @pytest.mark.parametrize(("every", "start_us", "first"), [(1, -15_000.0, 4), (4, -8_300.0, 4)])
-def test_frames_before_the_first_preamble_are_decoded(every: int, start_us: float, first: int) -> None:
+def test_frames_before_the_first_preamble_are_decoded(every, start_us, first):
     """Those that began in the recording, and of few pilots those whose pilot did."""
     link = load_link(overrides=[f"air.pilot_every={every}"])
     bar = IdealBar(random_symbols(link, 3), start_us=start_us)
@@ -62,13 +61,13 @@ def test_frames_before_the_first_preamble_are_decoded(every: int, start_us: floa
     assert right_frames(packets, bar, link) == 30 - first
 
 
-def between(events: Events, bar: IdealBar, first: float, end: float) -> NDArray[np.bool_]:
+def between(events, bar, first, end):
     """Events from one chip after the start of a bar to another."""
     start_us = bar.start_us + 100 * first
     return (events.t_us >= start_us) & (events.t_us < start_us + 100 * (end - first))
 
 
-def frame_chip(link: Link, packet: int, frame: int) -> int:
+def frame_chip(link, packet, frame):
     return packet * link.packet.packet_chips + link.packet.frame_start_chip(frame)
 
 
@@ -80,9 +79,7 @@ def frame_chip(link: Link, packet: int, frame: int) -> int:
         (1, (2, 0), (9, 0), [0, 1, 9], {"frames_rejected": 0, "frames_dark": 7}),
     ],
 )
-def test_a_bar_in_the_dark(
-    every: int, first: tuple[int, int], end: tuple[int, int], given_: list[int], count: dict[str, int]
-) -> None:
+def test_a_bar_in_the_dark(every, first, end, given_, count):
     """A dark pilot takes its frames with it; a bar out of sight is not rejected; each says why."""
     link = load_link(overrides=[f"air.pilot_every={every}"])
     bar = IdealBar(random_symbols(link, 3))
@@ -105,7 +102,7 @@ def test_a_bar_in_the_dark(
     assert {name: receiver.counts[name] for name in count} == count
 
 
-def flashes(start_us: int, seed: int = 7) -> Events:
+def flashes(start_us, seed=7):
     """Light that rises twentyfold in 2 ms about the bar: every pixel fires every 200 us."""
     rng = np.random.default_rng(seed)
     x, y = (v.ravel() for v in np.meshgrid(np.arange(350, 450), np.arange(270, 430)))
@@ -117,9 +114,7 @@ def flashes(start_us: int, seed: int = 7) -> Events:
     ("drowned", "start_us", "which"),
     [(True, 5000.0, (1, 4)), (False, 5000.0, (1, 4)), (True, -15_000.0, (0, 8))],
 )
-def test_a_step_of_light_costs_the_frame_that_it_drowns(
-    drowned: bool, start_us: float, which: tuple[int, int]
-) -> None:
+def test_a_step_of_light_costs_the_frame_that_it_drowns(drowned, start_us, which):
     """The bar has been where its trail lights up, too, and is not dragged back; nor before the first lock."""
     bar = IdealBar(random_symbols(LINK, 4), shake_px=16, shake_hz=10, start_us=start_us)
     first_us = int(bar.start_us) + 100 * (frame_chip(LINK, *which) + LINK.packet.pilot_chips)
@@ -137,7 +132,7 @@ def test_a_step_of_light_costs_the_frame_that_it_drowns(
 
 
 @pytest.mark.parametrize("sooner_us", [30, 45, 60])
-def test_events_that_come_sooner_in_brighter_light(sooner_us: int) -> None:
+def test_events_that_come_sooner_in_brighter_light(sooner_us):
     """From a frame on, well before the next preamble, and half as many."""
     bar = IdealBar(random_symbols(LINK, 3))
     e = ideal_events(LINK, bar, delay_on_us=70.0, delay_off_us=70.0)
@@ -146,7 +141,7 @@ def test_events_that_come_sooner_in_brighter_light(sooner_us: int) -> None:
     assert right_frames(received(LINK, moved)[1], bar, late_us=(0, 90)) == 30
 
 
-def test_a_bar_that_says_nothing_is_no_transmitter() -> None:
+def test_a_bar_that_says_nothing_is_no_transmitter():
     """Preambles and pilots show its clusters; the info segments are dark."""
     bar, packet = IdealBar(random_symbols(LINK, 2)), LINK.packet
     events = ideal_events(LINK, bar)
@@ -160,7 +155,7 @@ def test_a_bar_that_says_nothing_is_no_transmitter() -> None:
     assert (receiver.counts["frames_unread"], receiver.counts["frames"]) == (20, 0)
 
 
-def test_a_frame_that_the_end_cuts_is_not_given() -> None:
+def test_a_frame_that_the_end_cuts_is_not_given():
     """Its last events come late, 20 to 70 us after their edges: the stream must go on for 2.5 chips more.
 
     One that is decoded before the stream ends there is counted.
@@ -175,7 +170,7 @@ def test_a_frame_that_the_end_cuts_is_not_given() -> None:
         assert receiver.counts["frames_at_end"] == cut, after_us
 
 
-def test_distance_is_that_of_the_spacing() -> None:
+def test_distance_is_that_of_the_spacing():
     bar = IdealBar(random_symbols(LINK, 3), cluster_px=9.0)
     ranges = [f.range for f in frames_of(packets_of(bar))]
     want = LINK.camera.focal_px * 0.06 / 9.0
@@ -185,7 +180,7 @@ def test_distance_is_that_of_the_spacing() -> None:
 
 
 @pytest.mark.parametrize(("shake_px", "shake_hz"), [(16, 15), (60, 15), (250, 5)])
-def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px: float, shake_hz: float) -> None:
+def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px, shake_hz):
     """Round in a circle at 1.5, 5.7 and 7.9 px/ms: in any direction, along the bar and across it."""
     bar = IdealBar(random_symbols(LINK, 4), shake_px=shake_px, shake_hz=shake_hz)
     receiver, packets = received(LINK, ideal_events(LINK, bar))
@@ -197,7 +192,7 @@ def test_a_bar_that_sweeps_from_the_first_frame_on(shake_px: float, shake_hz: fl
 
 
 @pytest.mark.parametrize("apart_px", [10, 14])
-def test_two_bars_a_few_pixels_apart_are_two(apart_px: int) -> None:
+def test_two_bars_a_few_pixels_apart_are_two(apart_px):
     """Each with a clock and a payload of its own."""
     one = IdealBar(random_symbols(LINK, 3, seed=1), start_us=0)
     two = IdealBar(random_symbols(LINK, 3, seed=2), start_us=12_345, x_px=one.x_px + apart_px, ppm=40)
@@ -208,7 +203,7 @@ def test_two_bars_a_few_pixels_apart_are_two(apart_px: int) -> None:
         assert len(frames_of(mine)) >= 28
 
 
-def test_random_blinking_at_the_chip_rate_is_no_transmitter() -> None:
+def test_random_blinking_at_the_chip_rate_is_no_transmitter():
     rng = np.random.default_rng(5)
     chips = np.repeat(rng.integers(0, 2, (1500, 1)), 64 * 4, axis=1)
     edges = np.diff(chips, axis=0, prepend=0)
@@ -218,7 +213,7 @@ def test_random_blinking_at_the_chip_rate_is_no_transmitter() -> None:
     assert received(LINK, events)[1] == []
 
 
-def test_a_dark_cluster_costs_only_itself() -> None:
+def test_a_dark_cluster_costs_only_itself():
     bar = IdealBar(random_symbols(LINK, 2))
     events = ideal_events(LINK, bar)
     top = 350.7 - 64 + 5 * 8
@@ -230,7 +225,7 @@ def test_a_dark_cluster_costs_only_itself() -> None:
         assert f.range.distance_m == pytest.approx(LINK.camera.focal_px * 0.06 / 8, rel=5e-3)
 
 
-def test_a_bar_in_pieces_too_small_to_place_is_put_together() -> None:
+def test_a_bar_in_pieces_too_small_to_place_is_put_together():
     """Three pieces of four clusters: each hears the preamble, and none shows so many that they are sure."""
     hidden = [4, 5, 10, 11]
     bar = IdealBar(random_symbols(LINK, 2, seed=3), start_us=0, cluster_px=12)
@@ -244,7 +239,7 @@ def test_a_bar_in_pieces_too_small_to_place_is_put_together() -> None:
     assert all(frame.soft.symbols.tolist() in sent.tolist() for frame in frames)
 
 
-def test_a_bar_lost_from_sight_goes_on_as_the_same() -> None:
+def test_a_bar_lost_from_sight_goes_on_as_the_same():
     bar = IdealBar(random_symbols(LINK, 6), ppm=30)
     events = ideal_events(LINK, bar)
     hidden = (events.t_us >= 80_000) & (events.t_us < 150_000)
@@ -257,7 +252,7 @@ def test_a_bar_lost_from_sight_goes_on_as_the_same() -> None:
 
 
 @pytest.mark.parametrize("at_us", [61_810, 74_000, 88_500, 101_000])
-def test_a_transmitter_that_starts_anew_is_another(at_us: float) -> None:
+def test_a_transmitter_that_starts_anew_is_another(at_us):
     """In the middle of a packet, with another clock, and again: read from its first whole frame on.
 
     Also where its frames stand on the old grid for a part of each packet.
@@ -295,7 +290,7 @@ STREAM = merged(
 )
 
 
-def test_an_attitude_makes_distances_shorter_by_what_the_bar_leans() -> None:
+def test_an_attitude_makes_distances_shorter_by_what_the_bar_leans():
     # These images have no bend, which `joint-scale` would see.
     poc = load_link(overrides=["ranging.id=poc"])
     receiver, pitched = received(poc, STREAM, attitude=Attitude(6.0, 0.0))
@@ -311,7 +306,7 @@ def test_an_attitude_makes_distances_shorter_by_what_the_bar_leans() -> None:
 
 
 @pytest.mark.parametrize("t0_us", [-123_457, 16_777_001, 1_700_000_000_123_457])
-def test_a_frame_says_the_same_at_any_time_of_the_clock(t0_us: int) -> None:
+def test_a_frame_says_the_same_at_any_time_of_the_clock(t0_us):
     _, later = received(LINK, Events(STREAM.t_us + t0_us, STREAM.x, STREAM.y, STREAM.p))
     for one, other in zip(received(LINK, STREAM)[1], later, strict=True):
         assert abs(other.t_us - t0_us - one.t_us) <= 0.25
@@ -323,7 +318,7 @@ def test_a_frame_says_the_same_at_any_time_of_the_clock(t0_us: int) -> None:
             assert abs(b.points_t_us - t0_us - a.points_t_us) <= 0.25
 
 
-def test_what_is_dropped_is_counted() -> None:
+def test_what_is_dropped_is_counted():
     receiver = Receiver(LINK)
     receiver.feed(Events.of([10, 20, 15, 30], [1, 1280, 1, 1], [1, 1, 1, 720], [0, 1, 0, 1]))
     receiver.feed(Events.of([9, 40], [1, 1], [1, 1], [0, 1]))
@@ -339,7 +334,7 @@ def test_what_is_dropped_is_counted() -> None:
 
 
 @pytest.mark.parametrize("back_us", [100_000, 3_000_000, 10**15])
-def test_a_camera_that_restarts_its_clock_is_heard_again(back_us: int) -> None:
+def test_a_camera_that_restarts_its_clock_is_heard_again(back_us):
     bar, late_us = IdealBar(random_symbols(LINK, 2)), 10**12
     parts = [ideal_events(LINK, bar, t0_us=t0_us) for t0_us in (late_us, late_us - back_us)]
     receiver, packets = received(LINK, Events.concat(parts), [len(parts[0])])
@@ -353,17 +348,17 @@ def test_a_camera_that_restarts_its_clock_is_heard_again(back_us: int) -> None:
 class Probe:
     """Values of the stages that finish."""
 
-    def __init__(self) -> None:
-        self.seen: dict[str, list[object]] = {}
+    def __init__(self):
+        self.seen = {}
 
     @hookimpl
-    def evlcp_stage_finished(self, stage: str, value: object, elapsed_s: float) -> None:
+    def evlcp_stage_finished(self, stage, value, elapsed_s):
         assert elapsed_s >= 0
         self.seen.setdefault(stage, []).append(value)
 
 
 @pytest.mark.parametrize("width_px", [1, 2, 5, 6])
-def test_probes_see_every_stage(width_px: int) -> None:
+def test_probes_see_every_stage(width_px):
     """A thin bar stands in the middle of a cell."""
     probe = Probe()
     bar = IdealBar(random_symbols(LINK, 2), width_px=width_px, x_px=400.0)

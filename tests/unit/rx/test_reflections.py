@@ -1,7 +1,6 @@
 """Which transmitter is the reflection of which: the evidence, the decision, and the receiver."""
 
 import math
-from collections.abc import Iterable
 from itertools import pairwise, permutations
 
 import numpy as np
@@ -14,7 +13,7 @@ from evlcp_sdk.air.frames import PacketFormat
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.reflections import FrameDetection, Reflections, repeats
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, Frame, Packet, Range, SoftSymbols
+from evlcp_sdk.values import Events, Frame, Range, SoftSymbols
 
 FORMAT = PacketFormat()
 PERIOD_US = FORMAT.packet_chips * FORMAT.chip_us
@@ -23,16 +22,8 @@ Symbols = NDArray[np.int64]
 
 
 def sighting(
-    transmitter: int,
-    number: int,
-    symbols: Symbols,
-    *,
-    late_us: float = 0.0,
-    y_px: float = 300.0,
-    x_px: float | None = None,
-    light: float = 100.0,
-    mirrored: bool = False,
-) -> FrameDetection:
+    transmitter, number, symbols, *, late_us=0.0, y_px=300.0, x_px=None, light=100.0, mirrored=False
+):
     """The frame of a number since the start."""
     packet, index = divmod(number, FORMAT.frames)
     t_us = packet * PERIOD_US + FORMAT.frame_start_chip(index) * FORMAT.chip_us + late_us
@@ -44,12 +35,12 @@ def sighting(
     return FrameDetection(frame, *times, light, int((symbols >= 0).sum()), mirrored)
 
 
-def said(number: int, seed: int = 0) -> Symbols:
+def said(number, seed=0):
     """What a frame says."""
     return np.random.default_rng((seed, number)).integers(0, CODEWORDS, 16)
 
 
-def misread(symbols: Symbols, right: int, rng: np.random.Generator) -> Symbols:
+def misread(symbols, right, rng):
     """Symbols of which so many are right, at random places."""
     wrong = rng.permutation(len(symbols))[right:]
     found = symbols.copy()
@@ -58,7 +49,7 @@ def misread(symbols: Symbols, right: int, rng: np.random.Generator) -> Symbols:
 
 
 @pytest.mark.parametrize(("codewords", "clusters"), [(64, 16), (16, 16), (256, 16), (64, 2), (2, 16)])
-def test_evidence_is_the_likelihood_ratio_of_the_two_models(codewords: int, clusters: int) -> None:
+def test_evidence_is_the_likelihood_ratio_of_the_two_models(codewords, clusters):
     """Of models in which a share of the symbols is repeated and the rest drawn, case by case."""
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -71,7 +62,7 @@ def test_evidence_is_the_likelihood_ratio_of_the_two_models(codewords: int, clus
         assert repeats(one, other, codewords) == pytest.approx(ratio, abs=1e-9)
 
 
-def judged(*steps: Iterable[FrameDetection], echoes: Reflections | None = None) -> dict[int, int]:
+def judged(*steps, echoes=None):
     """What is a reflection of what, after these time steps."""
     echoes = Reflections(FORMAT, CODEWORDS) if echoes is None else echoes
     for step in steps:
@@ -79,7 +70,7 @@ def judged(*steps: Iterable[FrameDetection], echoes: Reflections | None = None) 
     return {k: of for k in range(50) if (of := echoes.echo_of(k)) is not None}
 
 
-def test_independent_payloads_are_never_taken_for_one() -> None:
+def test_independent_payloads_are_never_taken_for_one():
     """Two transmitters on one clock with other data: 500 pairs of 100 frames, none is a reflection."""
     rng = np.random.default_rng(2)
     for _ in range(50):
@@ -90,7 +81,7 @@ def test_independent_payloads_are_never_taken_for_one() -> None:
 
 
 @pytest.mark.parametrize(("right", "frames"), [(16, 1), (12, 1), (8, 1), (4, 10)])
-def test_the_first_frame_is_enough_where_half_of_it_is_right(right: int, frames: int) -> None:
+def test_the_first_frame_is_enough_where_half_of_it_is_right(right, frames):
     rng = np.random.default_rng(3)
     for _ in range(20):
         steps = [
@@ -101,7 +92,7 @@ def test_the_first_frame_is_enough_where_half_of_it_is_right(right: int, frames:
 
 
 @pytest.mark.parametrize("clusters", [8, 6])
-def test_a_partial_reflection(clusters: int) -> None:
+def test_a_partial_reflection(clusters):
     """Only some clusters of the mirror image are seen: those are compared."""
     part = said(0)
     part[: 16 - clusters] = -1
@@ -113,7 +104,7 @@ def test_a_partial_reflection(clusters: int) -> None:
     assert judged([sighting(0, 0, rest), sighting(1, 0, part, light=70)]) == {}
 
 
-def test_frames_at_other_times_are_not_compared() -> None:
+def test_frames_at_other_times_are_not_compared():
     echoes = Reflections(FORMAT, CODEWORDS)
     steps = [[sighting(0, n, said(n)), sighting(1, n, said(n), late_us=60)] for n in range(20)]
     assert judged(*steps, echoes=echoes) == {}
@@ -123,7 +114,7 @@ def test_frames_at_other_times_are_not_compared() -> None:
 
 
 @pytest.mark.parametrize("order", list(permutations(range(3))))
-def test_a_bar_with_two_reflections(order: tuple[int, ...]) -> None:
+def test_a_bar_with_two_reflections(order):
     """In whatever order they are numbered and come: both are reflections of the bar, none of the other."""
     bar, road, rail = order
     echoes = Reflections(FORMAT, CODEWORDS)
@@ -136,13 +127,13 @@ def test_a_bar_with_two_reflections(order: tuple[int, ...]) -> None:
         assert judged(seen[::-1] if n == 1 else seen, echoes=echoes) == {road: bar, rail: bar}
 
 
-def test_two_bars_with_a_reflection_each() -> None:
+def test_two_bars_with_a_reflection_each():
     seen = [sighting(k, 0, said(0, seed=k // 2), light=100 - 30 * (k % 2)) for k in range(4)]
     assert judged(seen) == {1: 0, 3: 2}
 
 
 @pytest.mark.parametrize(("off_px", "found"), [(0.0, {}), (4.0, {}), (6.0, {1: 0})])
-def test_one_image_seen_by_two_regions_is_no_reflection(off_px: float, found: dict[int, int]) -> None:
+def test_one_image_seen_by_two_regions_is_no_reflection(off_px, found):
     assert found == judged(
         *(
             [sighting(0, n, said(n), x_px=400.0), sighting(1, n, said(n), x_px=400.0 + off_px)]
@@ -152,7 +143,7 @@ def test_one_image_seen_by_two_regions_is_no_reflection(off_px: float, found: di
 
 
 @pytest.mark.parametrize("light", [100.0, 85.0, 50.0, 30.0])
-def test_the_verdict_is_stable(light: float) -> None:
+def test_the_verdict_is_stable(light):
     """Frame by frame, now the one has more light, now the other."""
     rng, echoes = np.random.default_rng(5), Reflections(FORMAT, CODEWORDS)
     verdicts = []
@@ -166,13 +157,13 @@ def test_the_verdict_is_stable(light: float) -> None:
 
 
 @pytest.mark.parametrize("light", [70, 150, 500])
-def test_light_tells_the_bar_unless_one_stands_upside_down(light: float) -> None:
+def test_light_tells_the_bar_unless_one_stands_upside_down(light):
     assert judged(
         *([sighting(0, n, said(n), light=light, mirrored=True), sighting(1, n, said(n))] for n in range(5))
     ) == {0: 1}
 
 
-def test_a_bar_that_appears_after_its_reflection_takes_its_place() -> None:
+def test_a_bar_that_appears_after_its_reflection_takes_its_place():
     echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(12):
         seen = [sighting(0, n, said(n), light=60, mirrored=True), sighting(1, n, said(n), light=100)]
@@ -182,7 +173,7 @@ def test_a_bar_that_appears_after_its_reflection_takes_its_place() -> None:
     assert judged(last, echoes=echoes) == {0: 1, 2: 1}
 
 
-def test_a_reflection_outlives_its_bar_by_a_second() -> None:
+def test_a_reflection_outlives_its_bar_by_a_second():
     echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(401):
         image = sighting(1, n, said(n), light=70)
@@ -192,7 +183,7 @@ def test_a_reflection_outlives_its_bar_by_a_second() -> None:
         assert judged(seen, echoes=echoes) == ({1: 0} if t_us <= 1e6 or n == 400 else {})
 
 
-def test_memory_is_bounded() -> None:
+def test_memory_is_bounded():
     echoes = Reflections(FORMAT, CODEWORDS)
     for n in range(2000):
         echoes.judge([sighting(k, n, said(n, seed=k), late_us=k) for k in (0, 1, 2 + n // 50)])
@@ -200,7 +191,7 @@ def test_memory_is_bounded() -> None:
         assert len(echoes._pairs) <= 3 + 2 * 8
 
 
-def reflected(events: Events, *, missing: float) -> Events:
+def reflected(events, *, missing):
     """The same events 80 columns to the right, a little later, with some of them missing."""
     kept = events[np.random.default_rng(1).random(len(events)) >= missing]
     return Events.of(kept.t_us + 7, kept.x + 80, kept.y, kept.p)
@@ -210,7 +201,7 @@ BAR = IdealBar(random_symbols(LINK, 3), shake_px=2.0)
 OWN = ideal_events(LINK, BAR)
 
 
-def by_side(events: Events) -> tuple[list[Packet], list[Packet]]:
+def by_side(events):
     """Packets on the bar's side of column 440, and on the other."""
     receiver, packets = received(LINK, events)
     counts = receiver.counts
@@ -221,7 +212,7 @@ def by_side(events: Events) -> tuple[list[Packet], list[Packet]]:
     return [p for p in packets if p.frames[0].x_px < 440], [p for p in packets if p.frames[0].x_px > 440]
 
 
-def test_a_rail_shows_the_bar_again() -> None:
+def test_a_rail_shows_the_bar_again():
     """It is lower than the bar: its image is cut. Nothing else tells events from the same ones."""
     of_bar, of_rail = by_side(merged(OWN, reflected(OWN[OWN.y < 370], missing=0.4)))
     assert len(frames_of(of_bar)) == len(frames_of(of_rail)) == 30
@@ -233,7 +224,7 @@ def test_a_rail_shows_the_bar_again() -> None:
 
 
 @pytest.mark.parametrize(("share", "farther_m"), [(None, 0.0), (None, 12.0), (0.25, 0.0)])
-def test_two_bars_that_one_controller_feeds(share: float | None, farther_m: float) -> None:
+def test_two_bars_that_one_controller_feeds(share, farther_m):
     """Both are given, and the image that a rail shows of the one is that of either."""
     fed = {"seed": 3, "start_chip": 120.0, "ppm": 20.0}
     bars = [fed | {"x_m": -1.5}, fed | {"x_m": 2.5, "z_m": farther_m}]

@@ -1,9 +1,7 @@
 """Finding and following blinking regions."""
 
-from collections.abc import Iterator
 from dataclasses import replace
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,7 +11,7 @@ from evlcp_sdk.air.frames import packet_chips
 from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.link.sections import RegionSpec
 from evlcp_sdk.rx.boxes import clear_of, cut_off
-from evlcp_sdk.rx.regions import Followed, Places, RegionFollower, ShownPlace
+from evlcp_sdk.rx.regions import Places, RegionFollower, ShownPlace
 from evlcp_sdk.rx.rhythm import Rhythm
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
@@ -26,34 +24,34 @@ BAR_EVENTS = ideal_events(LINK, BAR)
 CENTRE, SIZE = (BAR.x_px - 0.5, BAR.y_px - 0.5), (4.0, 128.0)
 
 
-def follower(spec: RegionSpec = SPEC, **options: Any) -> RegionFollower:
+def follower(spec=SPEC, **options):
     return RegionFollower(spec, CameraModel(), LINK.packet.chip_us, **options)
 
 
-def steps(events: Events, until_us: int) -> Iterator[tuple[int, Events]]:
+def steps(events, until_us):
     bounds = np.searchsorted(events.t_us, np.arange(0, until_us + 1, STEP_US))
     return ((n * STEP_US, events[a:b]) for n, (a, b) in enumerate(pairwise(bounds)))
 
 
-def stepped(regions: RegionFollower, events: Events, until_us: int) -> Iterator[tuple[int, list[Followed]]]:
+def stepped(regions, events, until_us):
     """The regions of each step, after its start, us."""
     return ((start, regions.step(start, part)) for start, part in steps(events, until_us))
 
 
-def followed(events: Events, until_us: int, spec: RegionSpec = SPEC) -> dict[int, list[Followed]]:
+def followed(events, until_us, spec=SPEC):
     return dict(stepped(follower(spec), events, until_us))
 
 
-def raised(events: Events, by_px: int) -> Events:
+def raised(events, by_px):
     return Events.of(events.t_us, events.x, events.y - by_px, events.p)
 
 
-def in_order(t: Any, x: Any, y: Any, p: Any) -> Events:
+def in_order(t, x, y, p):
     order = np.argsort(t, kind="stable")
     return Events.of(*(np.asarray(column)[order] for column in (t, x, y, p)))
 
 
-def test_a_bar_is_found_within_three_steps_and_measured() -> None:
+def test_a_bar_is_found_within_three_steps_and_measured():
     """The events from before it was found are kept."""
     bar = replace(BAR, start_us=3000)
     events = ideal_events(LINK, bar)
@@ -70,7 +68,7 @@ def test_a_bar_is_found_within_three_steps_and_measured() -> None:
 
 
 @pytest.mark.parametrize(("shake_px", "shake_hz"), [(16, 15), (4, 60)])
-def test_a_shaking_bar_is_followed(shake_px: float, shake_hz: float) -> None:
+def test_a_shaking_bar_is_followed(shake_px, shake_hz):
     """1.5 px/ms is the most that the paper has seen."""
     bar = IdealBar(random_symbols(LINK, 3), shake_px=shake_px, shake_hz=shake_hz, start_us=0)
     by_step = followed(ideal_events(LINK, bar), 100_000)
@@ -83,7 +81,7 @@ def test_a_shaking_bar_is_followed(shake_px: float, shake_hz: float) -> None:
 
 
 @pytest.mark.parametrize("way", [(1, 0), (-1, 0), (0, 1), (0, -1)])
-def test_a_bar_that_leaves_the_image_fast_is_let_go(way: tuple[int, int]) -> None:
+def test_a_bar_that_leaves_the_image_fast_is_let_go(way):
     """The filter's prediction runs on off the sensor until the region is released."""
     kalman = load_link(overrides=["tracking.id=kalman"]).algorithm("tracking").compile()
     regions = follower(position=kalman.position)
@@ -99,7 +97,7 @@ def test_a_bar_that_leaves_the_image_fast_is_let_go(way: tuple[int, int]) -> Non
 
 
 @pytest.mark.parametrize("end", ["top", "bottom"])
-def test_an_end_that_is_dark_for_a_while_is_still_there(end: str) -> None:
+def test_an_end_that_is_dark_for_a_while_is_still_there(end):
     dark = (BAR_EVENTS.t_us >= 30_000) & (BAR_EVENTS.t_us < 33_000)
     dark &= BAR_EVENTS.y < 309 if end == "top" else BAR_EVENTS.y >= 411
     (region,) = followed(BAR_EVENTS[~dark], 60_000)[59_000]
@@ -110,7 +108,7 @@ def test_an_end_that_is_dark_for_a_while_is_still_there(end: str) -> None:
 
 
 @pytest.mark.parametrize("shows_again", [False, True])
-def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_again: bool) -> None:
+def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_again):
     """Its lower quarter is hidden, for a while or all the time; one pixel in four above it blinks, too."""
     hidden = (BAR_EVENTS.y >= 392) & (BAR_EVENTS.t_us < (30_000 if shows_again else 60_000))
     leaf = BAR_EVENTS[(BAR_EVENTS.x == 399) & (BAR_EVENTS.y < 306) & (BAR_EVENTS.t_us >= 15_000)]
@@ -124,13 +122,13 @@ def test_a_bar_with_a_hidden_end_is_not_drawn_to_leaves_beyond_the_other(shows_a
 
 
 @pytest.mark.parametrize("merge_px", [8, 15, 16, 32])
-def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px: int) -> None:
+def test_bars_farther_apart_than_the_gap_are_two_regions_for_every_gap(merge_px):
     events = merged(BAR_EVENTS, ideal_events(LINK, replace(BAR, x_px=500, start_us=5300)))
     found = followed(events, 30_000, replace(SPEC, merge_px=merge_px))[29_000]
     assert sorted(round(t.latest.x_px) for t in found) == [400, 500]
 
 
-def test_what_fades_is_released() -> None:
+def test_what_fades_is_released():
     ends = 34_600
     events = BAR_EVENTS[BAR_EVENTS.t_us < ends]
     alive = {
@@ -145,20 +143,20 @@ def test_what_fades_is_released() -> None:
 @pytest.mark.parametrize(
     ("hz", "duty"), [(100, 0.05), (120, 0.1), (300, 0.5), (1000, 0.2), (2000, 0.05), (2000, 0.5), (4000, 0.2)]
 )
-def test_lamps_and_noise_are_no_regions(hz: float, duty: float) -> None:
+def test_lamps_and_noise_are_no_regions(hz, duty):
     lamp = lamp_events(300, 300, 20, hz, 60_000, duty=duty)
     assert not any(followed(merged(lamp, noise_events(500_000, 60_000)), 60_000).values())
 
 
 @pytest.mark.parametrize("later_us", range(0, STEP_US, 125))
-def test_a_lamp_of_two_chips_is_no_region(later_us: int) -> None:
+def test_a_lamp_of_two_chips_is_no_region(later_us):
     """Wherever in a step its pixels are known as a lamp's, having been candidates in the step before."""
     lamp = lamp_events(300, 300, 20, 1e6 / (2 * LINK.packet.chip_us), 30_000)
     lamp = Events.of(lamp.t_us + later_us, lamp.x, lamp.y, lamp.p)
     assert not any(followed(lamp, 29_000).values())
 
 
-def test_a_moving_edge_is_no_region() -> None:
+def test_a_moving_edge_is_no_region():
     """A bright post that crosses the image at 3 px/ms: each pixel sees it come and go once."""
     column, row = (v.ravel() for v in np.meshgrid(np.arange(100, 400), np.arange(100, 500)))
     late_us = np.array([0, 20, 40, 3000, 3020, 3040])[:, None]
@@ -168,7 +166,7 @@ def test_a_moving_edge_is_no_region() -> None:
     assert not any(followed(events, 100_000).values())
 
 
-def test_what_a_bar_has_left_is_no_region() -> None:
+def test_what_a_bar_has_left_is_no_region():
     """Where a bar was, its veil lets each pixel rise with a chip now and then, not twice within 12 chips."""
     seen = ideal_events(LINK, replace(BAR, width_px=12))
     seen = seen[seen.t_us < 30_000]
@@ -184,7 +182,7 @@ def test_what_a_bar_has_left_is_no_region() -> None:
     assert not by_step[149_000]
 
 
-def test_a_bar_is_found_before_a_panel_of_4_khz() -> None:
+def test_a_bar_is_found_before_a_panel_of_4_khz():
     """Its rises come two and a half chips apart: it belongs to no region, and does not widen the bar's."""
     panel = lamp_events(385, 340, 30, 4000.0, 30_000, duty=0.5)
     beside = (panel.x < 396) | (panel.x > 406)
@@ -195,7 +193,7 @@ def test_a_bar_is_found_before_a_panel_of_4_khz() -> None:
 
 @pytest.mark.parametrize("jitter_us", [8, 16])
 @pytest.mark.parametrize("hz", [2700, 3600, 4400])
-def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz: int, jitter_us: int) -> None:
+def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz, jitter_us):
     """Its rises come 3.7, 2.8 or 2.3 chips apart: with a pixel's jitter, on the chips most of the time.
 
     With a readout that many pixels wait for, the number of whole chips changes, too.
@@ -215,7 +213,7 @@ def test_a_lamp_near_whole_chips_is_known_by_its_steady_time(hz: int, jitter_us:
 
 
 @pytest.mark.parametrize("jitter_us", [3, 10])
-def test_a_code_is_hardly_taken_for_a_lamp(jitter_us: int) -> None:
+def test_a_code_is_hardly_taken_for_a_lamp(jitter_us):
     """Of a pixel of each cluster, in a hundred packets: those of the steadiest pilot most."""
     rng, packet, codebook = np.random.default_rng(jitter_us), LINK.packet, LINK.codebook
     sent = random_symbols(LINK, 100, jitter_us)
@@ -233,7 +231,7 @@ def test_a_code_is_hardly_taken_for_a_lamp(jitter_us: int) -> None:
     assert lost.max() < 0.15
 
 
-def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
+def test_a_region_takes_its_bars_size_and_gathers_its_events():
     """Only the upper half is lit at first; the events of the whole come back from the image's."""
     kept = BAR_EVENTS[(BAR_EVENTS.y < 345) | (BAR_EVENTS.t_us >= 20_000)]
     regions = follower(keep_us=50_000)
@@ -253,7 +251,7 @@ def test_a_region_takes_its_bars_size_and_gathers_its_events() -> None:
     assert regions.shape(region, ShownPlace(24_000.0, (x + 1, y), (4.0, 131.0))) == pytest.approx(3)
 
 
-def test_what_frames_have_shown_to_be_two_stays_two() -> None:
+def test_what_frames_have_shown_to_be_two_stays_two():
     """A bar over its image, found as one: a jolt brings one region over the other; a pole hides the bar."""
     below = CENTRE[0], CENTRE[1] + 138
     image = ideal_events(LINK, replace(BAR, y_px=BAR.y_px + 138), seed=2)
@@ -280,7 +278,7 @@ def test_what_frames_have_shown_to_be_two_stays_two() -> None:
     assert [round(one.latest.y_px) for one in regions.alive] == pytest.approx([488, 350], abs=2)
 
 
-def test_a_region_does_not_go_on_to_the_bar_below() -> None:
+def test_a_region_does_not_go_on_to_the_bar_below():
     """Four dark rows are between them, and the region seems to move there by 7 px a step."""
     below = CENTRE[0], CENTRE[1] + 132
     regions = follower()
@@ -314,7 +312,7 @@ def test_a_region_does_not_go_on_to_the_bar_below() -> None:
         ([(5, 105, 25, 200)], (0, 0, 30, 100)),
     ],
 )
-def test_what_other_bars_cut_off(others: list[tuple[int, int, int, int]], left: tuple[int, ...]) -> None:
+def test_what_other_bars_cut_off(others, left):
     """Of a box with a seam of 5 px around a bar."""
     assert cut_off((0, 0, 30, 100), (5, 5, 25, 95), others) == left
 
@@ -330,13 +328,11 @@ def test_what_other_bars_cut_off(others: list[tuple[int, int, int, int]], left: 
         ([(-5, -5, 25, 105)], (0, 0, 0, 0)),
     ],
 )
-def test_the_part_of_a_box_that_is_clear_of_others(
-    others: list[tuple[int, int, int, int]], clear: tuple[int, int, int, int]
-) -> None:
+def test_the_part_of_a_box_that_is_clear_of_others(others, clear):
     assert clear_of((0, 0, 20, 100), others) == clear
 
 
-def test_of_two_regions_that_follow_the_same_the_older_stays() -> None:
+def test_of_two_regions_that_follow_the_same_the_older_stays():
     regions = follower()
     for start, found in stepped(regions, BAR_EVENTS, 15_000):
         if start == 10_000:

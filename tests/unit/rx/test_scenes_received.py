@@ -1,6 +1,5 @@
 """Figures that the receiver gives of some scenes, to four digits: whoever moves one means to, or is wrong."""
 
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -10,13 +9,13 @@ from rx_streams import LINK, frames_of, received
 import evlcp_sdk as evlcp
 from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
-from evlcp_sdk.link.resolve import Link, load_link, resolve
+from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.sim import load_scene
-from evlcp_sdk.values import Events, Packet
+from evlcp_sdk.values import Events
 from tests.conftest import ROOT
 
 
-def figures(packets: list[Packet]) -> list[float]:
+def figures(packets):
     """Frames; means of distance, sigma, place, time, LLRs, quality, symbols and points; reflections."""
     frames = frames_of(packets)
     ranges = np.array([(f.range.distance_m, f.range.sigma_m, f.x_px, f.y_px, f.t_us) for f in frames])
@@ -29,11 +28,11 @@ def figures(packets: list[Packet]) -> list[float]:
     return [len(frames), *np.nanmean(ranges, 0), *soft.mean(0), *points, echoes]
 
 
-def recording() -> Events:
+def recording():
     return read_events(shipped("recordings", "night-50m-30kmh-cut.raw"))
 
 
-def simulated(scene: str, **overrides: object) -> Events:
+def simulated(scene, **overrides):
     """A scene that is kept, or a preset's."""
     path = ROOT / "examples" / "scenes" / f"{scene}.toml"
     source = evlcp.simulate(load_scene(path if path.exists() else scene, overrides), seed=1)
@@ -44,7 +43,7 @@ PANEL = {"rows": 16, "columns": 16, "led_pitch_m": 0.02, "cluster_rows": 4, "clu
 RAW = {"modulation": {"id": "raw8"}, "air": {"pilot_every": 4}}
 NRZ = {"modulation": {"id": "nrz"}}
 FEEDBACK = {"decoding": {"id": "motion-feedback"}, "ranging": {"id": "centroid"}}
-SCENES: dict[str, tuple[Link, Callable[[], Events], str]] = {
+SCENES = {
     "a recording": (
         LINK,
         recording,
@@ -100,6 +99,6 @@ SCENES: dict[str, tuple[Link, Callable[[], Events], str]] = {
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_figures_are_those_of_before(scene: str) -> None:
+def test_figures_are_those_of_before(scene):
     link, events, wanted = SCENES[scene]
     assert figures(received(link, events())[1]) == pytest.approx([*map(float, wanted.split())], rel=1e-4)

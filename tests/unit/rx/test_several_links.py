@@ -2,22 +2,20 @@
 
 from collections import Counter
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 from rx_streams import frames_of, noise_events, received, right_frames, said
 
 from evlcp_sdk.errors import ConfigError
-from evlcp_sdk.link.resolve import Link, load_link, resolve
+from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.run import receive_to_folder
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.simulated import simulate
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, Packet, changed
+from evlcp_sdk.values import changed
 
 
-def named(name: str, **sections: dict[str, object]) -> Link:
+def named(name, **sections):
     return replace(resolve(sections), name=name)
 
 
@@ -34,15 +32,15 @@ LAMP = named(
 LEFT, RIGHT = 300.3, 800.7
 
 
-def at(link: Link, x_px: float, seconds: float = 0.12, start_us: float = 5000.0) -> tuple[IdealBar, Events]:
+def at(link, x_px, seconds=0.12, start_us=5000.0):
     """A transmitter at a column for some time, and its events."""
     packets = max(int(seconds * link.packet.chip_rate_hz / link.packet.packet_chips), 1)
     small = {} if link.codebook.clusters == 1 else {"cluster_px": 4.0, "width_px": 2}
-    bar = IdealBar(random_symbols(link, packets, int(x_px)), x_px, start_us=start_us, **small)  # type: ignore[arg-type]
+    bar = IdealBar(random_symbols(link, packets, int(x_px)), x_px, start_us=start_us, **small)
     return bar, ideal_events(link, bar, seed=int(x_px))
 
 
-def right(packets: list[Packet], link: Link, bar: IdealBar) -> int:
+def right(packets, link, bar):
     """Frames in a bar's place: all say what it sent, and name its link."""
     here = [p for p in packets if abs(p.frames[0].x_px - bar.x_px) < 50]
     assert {f.link for f in frames_of(here)} == {link.name}
@@ -53,7 +51,7 @@ def right(packets: list[Packet], link: Link, bar: IdealBar) -> int:
 @pytest.mark.parametrize(
     "links", [(BAR, HALF), (BAR, SLOW), (BAR, WH8), (WH8, BAR), (BAR, LAMP)], ids=lambda links: links[-1].name
 )
-def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links: tuple[Link, Link]) -> None:
+def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links):
     (one, here), (two, there) = at(links[0], LEFT), at(links[1], RIGHT)
     receiver, packets = received(list(links), merged(here, there))
     assert right(packets, links[0], one) == len(one.symbols) * 10
@@ -68,7 +66,7 @@ def test_each_transmitter_is_read_by_its_own_link_and_by_no_other(links: tuple[L
     assert receiver.link_counts[links[0].name]["frames"] == 10 * len(one.symbols)
 
 
-def test_what_is_heard_alone_is_the_same_with_another_link_beside() -> None:
+def test_what_is_heard_alone_is_the_same_with_another_link_beside():
     events = merged(at(BAR, LEFT)[1], at(BAR, RIGHT)[1], noise_events(20_000, 120_000))
     alone, single = received(BAR, events)
     _, both = received([BAR, SLOW], events)
@@ -78,7 +76,7 @@ def test_what_is_heard_alone_is_the_same_with_another_link_beside() -> None:
     assert alone.link_counts == {}
 
 
-def test_a_place_that_is_left_is_free_for_another_link() -> None:
+def test_a_place_that_is_left_is_free_for_another_link():
     one, first = at(BAR, LEFT, 0.1)
     two, second = at(WH8, LEFT, 0.1, start_us=400_000.0)
     packets = received([BAR, WH8], merged(first, second))[1]
@@ -98,7 +96,7 @@ def test_a_place_that_is_left_is_free_for_another_link() -> None:
         ([BAR, named("fine", regions={"step_us": 1000}, modulation={"id": "wh8"})], "step_us = 1500"),
     ],
 )
-def test_links_that_cannot_be_received_together_are_refused(links: list[Link], said: str) -> None:
+def test_links_that_cannot_be_received_together_are_refused(links, said):
     with pytest.raises(ConfigError, match=said):
         Receiver(links)
 
@@ -106,7 +104,7 @@ def test_links_that_cannot_be_received_together_are_refused(links: list[Link], s
 LAMP_TABLE = "[bar]\nrows = 1\ncolumns = 1\ncluster_rows = 1\ncluster_columns = 1\n[ranging]\nid = 'none'\n"
 
 
-def lamps_received(folder: Path, scene: str, *others: Link) -> dict[str, Any]:
+def lamps_received(folder, scene, *others):
     """What is summed up of a simulated scene with a lamp, received by its link and by others."""
     (folder / "lamp.toml").write_text(LAMP_TABLE)
     (folder / "scene.toml").write_text(scene)
@@ -116,7 +114,7 @@ def lamps_received(folder: Path, scene: str, *others: Link) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("seed", [0, 2])
-def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed: int, tmp_path: Path) -> None:
+def test_what_one_lamp_s_link_rejects_in_a_bar_is_the_bar_s(seed, tmp_path):
     """A link of one cluster reads each part of a bar as a lamp, until the bar holds its place.
 
     In the second scene a region's last frames show that it is a part of another.

@@ -10,12 +10,12 @@ from rx_streams import LINK, frames_of, noise_events, received, said
 
 from evlcp_sdk.files import shipped
 from evlcp_sdk.io import read_events
-from evlcp_sdk.link.resolve import Link, load_link, resolve
+from evlcp_sdk.link.resolve import load_link, resolve
 from evlcp_sdk.rx.limits import Limits
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.scene.attitude import AttitudeLog
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Events, Frame, Packet
+from evlcp_sdk.values import Events
 
 FEW_PILOTS = load_link(overrides=["air.pilot_every=4"])
 BAR, WH8 = (replace(resolve({"modulation": {"id": id}}), name=id) for id in ("wh4x2", "wh8"))
@@ -33,33 +33,33 @@ OTHER = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1), 900.7, 300.2, st
 BOTH = merged(OWN, OTHER, noise_events(120_000, 200_000))
 
 
-def few_pilots() -> Events:
+def few_pilots():
     return ideal_events(FEW_PILOTS, IdealBar(random_symbols(FEW_PILOTS, 3)))
 
 
-def recording() -> Events:
+def recording():
     return read_events(shipped("recordings", "night-50m-30kmh-cut.raw"))
 
 
-def growing_together() -> Events:
+def growing_together():
     """A bar comes nearer to another by a column a step."""
     near = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 2), x_px=440, start_us=10_000))
     moved = Events.of(near.t_us, near.x - np.minimum(near.t_us // 1500, 40), near.y, near.p)
     return merged(ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1))), moved)
 
 
-def a_rail() -> Events:
+def a_rail():
     """It shows the bar again, cut and with events missing."""
     part = OWN[(OWN.y < 370) & (np.random.default_rng(1).random(len(OWN)) >= 0.4)]
     return merged(OWN, Events.of(part.t_us + 7, part.x + 80, part.y + 20, part.p))
 
 
-def two_links() -> Events:
+def two_links():
     lamp = IdealBar(random_symbols(LAMP, 6), 800.7, cluster_px=4.0, width_px=2)
     return merged(ideal_events(BAR, IdealBar(random_symbols(BAR, 2), 300.3)), ideal_events(LAMP, lamp))
 
 
-def crowd() -> Events:
+def crowd():
     """Eight blinking blobs, a bar and noise: more than small limits let in."""
     blobs = [
         ideal_events(LINK, IdealBar(random_symbols(LINK, 3, n), 60.0 * n, 120, 0.6, 3, start_us=300 * n))
@@ -91,14 +91,14 @@ SCENES = {
 
 
 @pytest.mark.parametrize("scene", SCENES)
-def test_any_split_gives_the_same(scene: str) -> None:
+def test_any_split_gives_the_same(scene):
     """Each frame is told once and in order; it is that of its packet, but for what is known later."""
     link, events, options, least = SCENES[scene]
     events, found = events(), []
     random = [np.random.default_rng(many).integers(0, len(events), many) for many in (3, 40)]
     slices = events.t_us.searchsorted(np.arange(1000, int(events.t_us[-1]), 1000))
     for cuts in ([], *random, slices):
-        told: list[Frame] = []
+        told = []
         receiver, packets = received(link, events, cuts, on_frame=told.append, **options)
         whole = [(p.t_us, p.chip_us, p.link, p.echo_of, [said(f) for f in p.frames]) for p in packets]
         found.append(([said(frame) for frame in told], whole, receiver.counts))
@@ -112,25 +112,23 @@ def test_any_split_gives_the_same(scene: str) -> None:
         assert order == sorted(set(order))
 
 
-def lateness(frames: list[tuple[Frame, int]], events: Events) -> list[float]:
+def lateness(frames, events):
     """How long after the last edge of each frame the events reach that were fed when it was told, us."""
     long_us = LINK.packet.frame_chips * LINK.packet.chip_us
     return [float(events.t_us[fed - 1]) - frame.t_us - long_us for frame, fed in frames]
 
 
-def told_by_slices(
-    links: Link | list[Link], events: Events, slice_us: int
-) -> tuple[list[tuple[Frame, int]], list[Packet]]:
+def told_by_slices(links, events, slice_us):
     """Frames as they are told, each with how many events were fed by then; and the packets."""
     cuts = events.t_us.searchsorted(np.arange(0, int(events.t_us[-1]), slice_us)).tolist()
-    frames: list[tuple[Frame, int]] = []
+    frames = []
     receiver, packets = Receiver(links, on_frame=lambda frame: frames.append((frame, fed))), []
     for begin, fed in pairwise([*cuts, len(events)]):
         packets += receiver.feed(events[begin:fed])
     return frames, packets + receiver.close()
 
 
-def test_a_frame_is_told_with_the_slice_that_ends_it() -> None:
+def test_a_frame_is_told_with_the_slice_that_ends_it():
     frames, _ = told_by_slices(LINK, BOTH, 250)
     # Those before the first lock have been there for long. Events are 20 to 30 us late; it waits half a chip.
     after = lateness([one for one in frames if one[0].packet > 0], BOTH)
@@ -139,7 +137,7 @@ def test_a_frame_is_told_with_the_slice_that_ends_it() -> None:
     assert max(after) < 100 + 250
 
 
-def test_frames_from_before_the_first_lock_come_a_few_a_step() -> None:
+def test_frames_from_before_the_first_lock_come_a_few_a_step():
     """Each step gives one frame that ends in it and two older ones, until none is left."""
     events = ideal_events(LINK, IdealBar(random_symbols(LINK, 2), start_us=-5_000))
     frames, _ = told_by_slices(LINK, events, LINK.regions.step_us)
@@ -150,7 +148,7 @@ def test_frames_from_before_the_first_lock_come_a_few_a_step() -> None:
     assert [f.frame for f, _ in frames] == [*range(1, 10), *range(10)]
 
 
-def test_of_several_links_a_frame_comes_at_once_where_its_transmitter_holds_its_place() -> None:
+def test_of_several_links_a_frame_comes_at_once_where_its_transmitter_holds_its_place():
     left = ideal_events(BAR, IdealBar(random_symbols(BAR, 7), 300.3))
     events = merged(left, ideal_events(WH8, IdealBar(random_symbols(WH8, 7), 800.7), seed=1))
     frames, _ = told_by_slices([BAR, WH8], events, 250)

@@ -6,14 +6,13 @@ from itertools import product
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 import evlcp_sdk as evlcp
 from evlcp_sdk.rx.spread import Spread, compare, expected_lengths
 
 
-def pixel_light(lit: NDArray[np.bool_], per_px: int, sigma_px: float) -> NDArray[np.float64]:
+def pixel_light(lit, per_px, sigma_px):
     """Light of pixels centred on every sample, of samples that are lit and blurred by a Gaussian."""
     light = gaussian_filter(lit.astype(float), sigma_px * per_px, truncate=6)
     whole = np.cumsum(np.cumsum(np.pad(light, ((1, 0), (1, 0))), 0), 1)
@@ -22,7 +21,7 @@ def pixel_light(lit: NDArray[np.bool_], per_px: int, sigma_px: float) -> NDArray
 
 
 @pytest.mark.parametrize("blur_px", [1.0, 1.6])
-def test_expected_lengths_against_light_by_brute_force(blur_px: float) -> None:
+def test_expected_lengths_against_light_by_brute_force(blur_px):
     """Two clusters sampled 12 times a px, of a blur beside which the lens has little, on a background."""
     spacing, per_px, background = 9.0, 12, 0.3
     sigma = math.hypot(0.42 * 0.26, 0.36, blur_px)
@@ -49,17 +48,17 @@ def test_expected_lengths_against_light_by_brute_force(blur_px: float) -> None:
     assert found == pytest.approx(want, abs=0.2)
 
 
-def sharper(one: Spread, other: Spread) -> float | None:
+def sharper(one, other):
     found = compare(one, other)
     return None if found is None else found[0]
 
 
-def alike(one: Spread, other: Spread) -> float:
+def alike(one, other):
     found = compare(one, other)
     return found[1]
 
 
-def answering(lengths: NDArray[np.float64], spacing_px: float = 9.0, frames: int = 1) -> Spread:
+def answering(lengths, spacing_px=9.0, frames=1):
     """Pixels that answer as if the lengths were these."""
     asked = 10_000
     between = np.zeros((2, 2, 3), np.int64)
@@ -72,7 +71,7 @@ def answering(lengths: NDArray[np.float64], spacing_px: float = 9.0, frames: int
     return Spread(between * frames, across * frames, spacing_px * frames, frames)
 
 
-def test_lengths_of_answers() -> None:
+def test_lengths_of_answers():
     want = np.array([0.4, 1.6, 4.3])
     for frames in (1, 7):
         assert answering(want, frames=frames).lengths() == pytest.approx(want, abs=0.01)
@@ -85,7 +84,7 @@ def test_lengths_of_answers() -> None:
     assert beside.lengths() == pytest.approx(want, abs=0.01)
 
 
-def test_what_pixels_do_not_say_is_not_known() -> None:
+def test_what_pixels_do_not_say_is_not_known():
     some = answering(np.array([0.4, 1.6, 4.3]))
     nothing = replace(some, between=np.zeros_like(some.between))
     assert nothing.lengths() is None
@@ -98,7 +97,7 @@ def test_what_pixels_do_not_say_is_not_known() -> None:
     assert sharper(panel, panel) == pytest.approx(0)
 
 
-def dimmed(background: float, share: float, blur_px: float) -> float:
+def dimmed(background, share, blur_px):
     """Background in the light of an image of a share of the light, which blur spreads across the line."""
     return background / share * math.hypot(0.42, blur_px) / 0.42
 
@@ -111,7 +110,7 @@ SEEN = [
 
 
 @pytest.mark.parametrize(("background", "share", "blur_px"), SEEN)
-def test_the_sharper_and_brighter_one_is_the_bar(background: float, share: float, blur_px: float) -> None:
+def test_the_sharper_and_brighter_one_is_the_bar(background, share, blur_px):
     (bar,) = expected_lengths(9.0, np.array([0.0]), [background])
     (image,) = expected_lengths(9.0, np.array([blur_px]), [dimmed(background, share, blur_px)])
     odds = [sharper(answering(bar, frames=n), answering(image, frames=n)) for n in (1, 10)]
@@ -128,7 +127,7 @@ def test_the_sharper_and_brighter_one_is_the_bar(background: float, share: float
 
 @pytest.mark.parametrize("background", [0.01, 0.03, 0.3])
 @pytest.mark.parametrize("farther", [1.0, 1.1, 1.5])
-def test_two_bars_are_alike_and_images_are_not(background: float, farther: float) -> None:
+def test_two_bars_are_alike_and_images_are_not(background, farther):
     """Also where one is farther: its strip is narrower, and the light of a pixel less by as much."""
     (bar,) = expected_lengths(9.0, np.zeros(1), [background])
     (other,) = expected_lengths(9.0 / farther, np.zeros(1), [background * farther])
@@ -142,7 +141,7 @@ def test_two_bars_are_alike_and_images_are_not(background: float, farther: float
         assert alike(answering(bar, frames=10), answering(image, frames=10)) < -0.5
 
 
-def test_a_blurred_image_in_a_window_is_not_the_bar() -> None:
+def test_a_blurred_image_in_a_window_is_not_the_bar():
     """At 50 m by day: 30 % of the light, blurred by 1 px, wakes more pixels than the bar."""
     scene = [
         "duration_s=0.04",
@@ -161,7 +160,7 @@ def test_a_blurred_image_in_a_window_is_not_the_bar() -> None:
     assert [f.echo_of is None for f in frames] == own.tolist()
 
 
-def test_what_is_clear_for_long_stays_clear() -> None:
+def test_what_is_clear_for_long_stays_clear():
     """After minutes the other hypothesis is less likely than the smallest number that is not 0."""
     (bar,) = expected_lengths(25.0, np.zeros(1), [0.004])
     (image,) = expected_lengths(25.0, np.zeros(1), [0.3])

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from evlcp_sdk.rx.straight import Straight, straighten
+from evlcp_sdk.rx.straight import straighten
 
 PLACES = np.arange(1.0, 16) - 8
 NOISE_PX = 0.06
@@ -12,7 +12,7 @@ SPACING_PX = 9.0
 Floats = NDArray[np.float64]
 
 
-def drops(rng: np.random.Generator) -> Floats:
+def drops(rng):
     """How one to three drops on or beside a bar, a tenth to a third of it wide, bend it along itself, px."""
     along_px, off = PLACES * SPACING_PX, np.zeros(15)
     for _ in range(rng.integers(1, 4)):
@@ -23,12 +23,12 @@ def drops(rng: np.random.Generator) -> Floats:
     return off
 
 
-def dark(rng: np.random.Generator) -> Floats:
+def dark(rng):
     """A quarter of the boundaries off by up to a LED, as those beside them are dark."""
     return np.asarray((rng.random(15) < 0.25) * rng.choice([-1, 1], 15) * rng.uniform(0.3, 1.5, 15))
 
 
-def seen(error_px: Floats, rng: np.random.Generator) -> tuple[float, Straight | None]:
+def seen(error_px, rng):
     """What a scale through boundaries with such errors is too short by, px, and what they say of it."""
     off = error_px + NOISE_PX * rng.standard_normal(15)
     slope, mean = np.polyfit(PLACES, off, 1)
@@ -36,7 +36,7 @@ def seen(error_px: Floats, rng: np.random.Generator) -> tuple[float, Straight | 
     return -slope, straighten(PLACES, off - slope * PLACES - mean + 0.01 * (PLACES**2 - 56 / 3), 0.1, 0.01)
 
 
-def judged(error_px: Floats, rng: np.random.Generator) -> tuple[float, float, float] | None:
+def judged(error_px, rng):
     """Error of the scale, that of the straight bar's spacing, px, and the square of that by its variance."""
     short, found = seen(error_px, rng)
     if found is None:
@@ -44,7 +44,7 @@ def judged(error_px: Floats, rng: np.random.Generator) -> tuple[float, float, fl
     return short, short - found.slope, (short - found.slope) ** 2 / found.variance
 
 
-def test_noise_and_a_lean_bend_nothing() -> None:
+def test_noise_and_a_lean_bend_nothing():
     rng = np.random.default_rng(1)
     assert [seen(np.zeros(15), rng)[1] for _ in range(1000)] == 1000 * [None]
     # Of boundaries that scatter as much as is expected, 1 of 700.
@@ -55,7 +55,7 @@ def test_noise_and_a_lean_bend_nothing() -> None:
     assert straighten(PLACES[:5], 9 * off[0, :5], 0.1, 0.0) is None
 
 
-def test_dark_leds_are_told_from_a_straight_bar() -> None:
+def test_dark_leds_are_told_from_a_straight_bar():
     """Most boundaries agree: the error is a third of that of a scale through all, and its sigma is true."""
     rng = np.random.default_rng(2)
     found = np.array([one for _ in range(400) if (one := judged(dark(rng), rng)) is not None])
@@ -71,7 +71,7 @@ def test_dark_leds_are_told_from_a_straight_bar() -> None:
     assert np.flatnonzero(np.abs(told.rest_px) > 0.4).tolist() == [2, 9]
 
 
-def test_what_drops_add_to_a_scale_is_in_the_sigma() -> None:
+def test_what_drops_add_to_a_scale_is_in_the_sigma():
     """Most of it is seen by how neighbours err, but a drop over half of a bar hardly bends it."""
     rng = np.random.default_rng(3)
     found = np.array([one for _ in range(400) if (one := judged(drops(rng), rng)) is not None])

@@ -7,23 +7,22 @@ import numpy as np
 import pytest
 from rx_messages import CODER, PLACE, Operator, operator
 
-from evlcp_sdk.air.beacons import Beacon
 from evlcp_sdk.air.signing import TrustedKey
 from evlcp_sdk.link.sections import MessageSpec
-from evlcp_sdk.rx.trust import BeaconJudge, Standing
+from evlcp_sdk.rx.trust import BeaconJudge
 
 SIGNED_S = calendar.timegm((2026, 3, 1, 12, 0, 0))
 METRE_DEG = 1 / 111_000
 
 
-def judge_of(*keys: TrustedKey, **spec: object) -> BeaconJudge:
-    return BeaconJudge(MessageSpec(trusted_keys=keys, **spec), CODER.digest)  # type: ignore[arg-type]
+def judge_of(*keys, **spec):
+    return BeaconJudge(MessageSpec(trusted_keys=keys, **spec), CODER.digest)
 
 
-def judged(now_s: float | None = None, *, keys: tuple[TrustedKey, ...] = (), **may: object) -> Standing:
+def judged(now_s=None, *, keys=(), **may):
     """What is thought of the operator's beacon, whose key may sign so much."""
     spec = {name: may.pop(name) for name in ("max_age_s", "revoked_keys", "oldest_sequence") if name in may}
-    keys = keys or (TrustedKey(operator().public, **may),)  # type: ignore[arg-type]
+    keys = keys or (TrustedKey(operator().public, **may),)
     message, signature = operator().beacon(SIGNED_S)
     return judge_of(*keys, **spec).judge(message, PLACE, signature, now_s)
 
@@ -32,7 +31,7 @@ def judged(now_s: float | None = None, *, keys: tuple[TrustedKey, ...] = (), **m
     ("first", "last", "trust"),
     [(0, 6, "forged"), (0, 7, "verified"), (7, 7, "verified"), (7, 9, "verified"), (8, 9, "forged")],
 )
-def test_a_key_is_for_its_transmitter_ids(first: int, last: int, trust: str) -> None:
+def test_a_key_is_for_its_transmitter_ids(first, last, trust):
     found = judged(first_id=first, last_id=last)
     assert found.trust == trust
     assert found.why == ("" if trust == "verified" else "signed by a key that is not for transmitter 7")
@@ -49,7 +48,7 @@ def test_a_key_is_for_its_transmitter_ids(first: int, last: int, trust: str) -> 
         (-99_000, 0, 100_000, "verified"),
     ],
 )
-def test_a_key_is_for_its_area(north_m: float, east_m: float, radius_m: float, trust: str) -> None:
+def test_a_key_is_for_its_area(north_m, east_m, radius_m, trust):
     # A metre of the sphere, good to a few parts in a thousand here.
     centre = (35.1 + north_m / 110_940, 136.9 + east_m / (111_412 * np.cos(np.radians(35.1))))
     found = judged(latitude_deg=centre[0], longitude_deg=centre[1], radius_m=radius_m)
@@ -57,7 +56,7 @@ def test_a_key_is_for_its_area(north_m: float, east_m: float, radius_m: float, t
     assert found.why == ("" if trust == "verified" else "signed by a key that is not for this place")
 
 
-def test_several_entries_of_a_key_are_one_or_the_other() -> None:
+def test_several_entries_of_a_key_are_one_or_the_other():
     far = TrustedKey(operator().public, latitude_deg=0.0, longitude_deg=0.0, radius_m=10.0)
     others = TrustedKey(operator().public, first_id=8)
     near = TrustedKey(operator().public, latitude_deg=35.1, longitude_deg=136.9, radius_m=10.0)
@@ -79,7 +78,7 @@ def test_several_entries_of_a_key_are_one_or_the_other() -> None:
         ("", "", -0.001, ""),
     ],
 )
-def test_a_key_is_valid_from_and_to(valid_from: str, valid_to: str, now_days: float | None, why: str) -> None:
+def test_a_key_is_valid_from_and_to(valid_from, valid_to, now_days, why):
     now_s = None if now_days is None else SIGNED_S + 86400 * now_days
     found = judged(now_s, valid_from=valid_from, valid_to=valid_to)
     assert found.trust == ("unverified" if why else "verified")
@@ -87,7 +86,7 @@ def test_a_key_is_valid_from_and_to(valid_from: str, valid_to: str, now_days: fl
     assert found.why.startswith("signed 2026-03-01 12:00:00 UTC" if why else "")
 
 
-def test_a_revoked_key_signs_nothing() -> None:
+def test_a_revoked_key_signs_nothing():
     assert judged(revoked_keys=(operator().public,)) == ("forged", "signed by a key that is revoked")
     # Revoked only, and trusted never.
     message, signature = operator().beacon(SIGNED_S)
@@ -103,7 +102,7 @@ def test_a_revoked_key_signs_nothing() -> None:
         (None, "; when it was received is not known, and messages.max_age_s = 100"),
     ],
 )
-def test_a_beacon_older_than_the_receiver_asks_for(age_s: float | None, why: str) -> None:
+def test_a_beacon_older_than_the_receiver_asks_for(age_s, why):
     found = judged(None if age_s is None else SIGNED_S + age_s, max_age_s=100.0)
     assert found.trust == ("unverified" if why else "verified")
     assert found.why.endswith(why)
@@ -125,10 +124,8 @@ def test_a_beacon_older_than_the_receiver_asks_for(age_s: float | None, why: str
         ({"user": b"lane 3"}, 7, None, ""),
     ],
 )
-def test_an_unsigned_beacon_that_contradicts_a_verified_one_is_forged(
-    change: dict[str, float], transmitter_id: int, signed_by: Operator | None, how: str
-) -> None:
-    judge, liar = judge_of(*operator().trusted), replace(PLACE, **change)  # type: ignore[arg-type]
+def test_an_unsigned_beacon_that_contradicts_a_verified_one_is_forged(change, transmitter_id, signed_by, how):
+    judge, liar = judge_of(*operator().trusted), replace(PLACE, **change)
     claim, right = operator().beacon(SIGNED_S + 1, liar, transmitter_id)
     signature = signed_by.sign(claim) if signed_by else None
     assert judge.judge(claim, liar, signature, None).trust == "unverified"
@@ -141,12 +138,12 @@ def test_an_unsigned_beacon_that_contradicts_a_verified_one_is_forged(
     assert judge.judge(claim, liar, right, None) == ("verified", "")
 
 
-def test_an_old_beacon_is_replayed() -> None:
+def test_an_old_beacon_is_replayed():
     reason = f"replayed: sequence {SIGNED_S} is older than messages.oldest_sequence {SIGNED_S + 1}"
     assert judged(oldest_sequence=SIGNED_S + 1) == ("forged", reason)
     judge = judge_of(*operator().trusted)
 
-    def shown(sequence: int, place: Beacon, transmitter_id: int = 7) -> Standing:
+    def shown(sequence, place, transmitter_id=7):
         message, signature = operator().beacon(sequence, place, transmitter_id)
         return judge.judge(message, place, signature, None)
 

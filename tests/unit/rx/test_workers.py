@@ -3,22 +3,19 @@
 import multiprocessing
 import os
 import signal
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
 
 import pytest
 from rx_streams import LINK, frames_of, noise_events, received, said
 
 from evlcp_sdk.errors import ConfigError, PluginError, WorkerError
-from evlcp_sdk.link.resolve import Link, load_link
+from evlcp_sdk.link.resolve import load_link
 from evlcp_sdk.plugin.hooks import hookimpl
 from evlcp_sdk.plugin.registry import Registry
 from evlcp_sdk.rx import workers
 from evlcp_sdk.rx.receiver import Receiver
 from evlcp_sdk.rx.workers import load_kernels
 from evlcp_sdk.testing.recordings import IdealBar, ideal_events, merged, random_symbols
-from evlcp_sdk.values import Frame, FrameView, Range
 
 OWN = ideal_events(LINK, IdealBar(random_symbols(LINK, 3), ppm=50, shake_px=6, shake_hz=12))
 OTHER = ideal_events(LINK, IdealBar(random_symbols(LINK, 3, 1), 900.7, 300.2, start_us=19_350))
@@ -29,22 +26,22 @@ EVENTS = merged(OWN, OTHER, noise_events(20_000, 120_000))
 class Broken:
     """A ranging that measures nothing but fails."""
 
-    def compile(self, *_given: Any) -> Callable[[FrameView], Range]:
+    def compile(self, *_given):
         return fail
 
 
-def fail(view: FrameView) -> Range:
+def fail(view):
     raise ZeroDivisionError("boom")
 
 
-def test_the_same_whoever_decodes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_same_whoever_decodes(monkeypatch):
     """Frames, counts and order, of two links, where memory for events is short."""
-    links: list[Link] = [LINK, replace(load_link(overrides=["modulation.id=wh8"]), name="wh8")]
+    links = [LINK, replace(load_link(overrides=["modulation.id=wh8"]), name="wh8")]
     monkeypatch.setattr(workers, "_ROOM_BYTES", 1 << 20)
     for link in (LINK, links):
         outcomes = []
         for many in (1, 3):
-            told: list[Frame] = []
+            told = []
             receiver, packets = received(link, EVENTS, (40_000,), on_frame=told.append, workers=many)
             frames = [(p.t_us, p.link, p.echo_of, [said(f) for f in p.frames]) for p in packets]
             outcomes.append((frames, receiver.counts, sorted(said(f)[1:] for f in told)))
@@ -58,9 +55,7 @@ def test_the_same_whoever_decodes(monkeypatch: pytest.MonkeyPatch) -> None:
     ("sent", "says"),
     [(signal.SIGKILL, "ended by SIGKILL"), (signal.SIGSTOP, "did not answer for 0.5 s, and was ended")],
 )
-def test_a_worker_that_ends_or_stalls_is_named(
-    monkeypatch: pytest.MonkeyPatch, sent: signal.Signals, says: str, begun: int
-) -> None:
+def test_a_worker_that_ends_or_stalls_is_named(monkeypatch, sent, says, begun):
     """Before it has a bar, and among frames."""
     monkeypatch.setattr(workers, "_STALL_S", 0.5)
     receiver = Receiver(LINK, workers=2)
@@ -74,7 +69,7 @@ def test_a_worker_that_ends_or_stalls_is_named(
     assert child.exitcode == -signal.SIGKILL
 
 
-def test_what_fails_in_a_worker_is_named() -> None:
+def test_what_fails_in_a_worker_is_named():
     """As it is where it runs here."""
     broken = LINK.with_algorithm("ranging", Broken(), id="broken")
     for many in (1, 2):
@@ -82,13 +77,13 @@ def test_what_fails_in_a_worker_is_named() -> None:
             received(broken, EVENTS, workers=many)
 
 
-def test_what_cannot_be() -> None:
+def test_what_cannot_be():
     with pytest.raises(ConfigError, match=r"^workers: 0, expected 1 or more"):
         Receiver(LINK, workers=0)
 
     class Listens:
         @hookimpl
-        def evlcp_stage_finished(self) -> None: ...
+        def evlcp_stage_finished(self): ...
 
     with pytest.raises(ConfigError, match=r"^workers: 2, expected 1, as a sink or plugin follows the stages"):
         Receiver(LINK, Registry.load(Listens()).hook, workers=2)
@@ -121,9 +116,7 @@ def test_what_cannot_be() -> None:
         ["ranging.id=poc", "decoding.id=wh-transform"],
     ],
 )
-def test_kernels_are_loaded_by_frames_that_are_read(
-    monkeypatch: pytest.MonkeyPatch, overrides: list[str]
-) -> None:
+def test_kernels_are_loaded_by_frames_that_are_read(monkeypatch, overrides):
     """Or else most would be loaded with the first frame of a stream."""
     read = []
     monkeypatch.setattr(workers, "_measure_spread", read.append)
