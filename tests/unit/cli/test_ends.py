@@ -15,7 +15,9 @@ import pytest
 import evlcp_sdk.io.describe
 
 Evlcp = Callable[..., Any]
+Shell = Callable[[str], subprocess.CompletedProcess[str]]
 MAIN = "from evlcp_sdk.cli.main import main; main()"
+EVLCP = f"{sys.executable} -c '{MAIN}'"
 SAYS_WHEN_READY = """
 import sys
 from evlcp_sdk.cli.main import main
@@ -33,47 +35,32 @@ main()
 
 
 @pytest.fixture(params=["buffered", "unbuffered"])
-def environment(request: pytest.FixtureRequest) -> dict[str, str]:
-    """Of a command whose output is kept until it ends, as a login has it, or is written at once."""
+def shell(request: pytest.FixtureRequest) -> Shell:
+    """Run a command line, whose output is kept until it ends, as a login has it, or is written at once."""
     own = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    return own | ({"PYTHONUNBUFFERED": "1"} if request.param == "unbuffered" else {})
+    own |= {"PYTHONUNBUFFERED": "1"} if request.param == "unbuffered" else {}
+    return lambda line: subprocess.run(
+        ["bash", "-c", line], env=own, capture_output=True, text=True, check=False
+    )
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 @pytest.mark.parametrize("arguments", ["plugins", "--version", "receive {demo} --json-lines -"])
-def test_a_full_stdout_is_one_line(arguments: str, demo_raw: Path, environment: dict[str, str]) -> None:
-    with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-c", MAIN, *arguments.format(demo=demo_raw).split()],
-            env=environment,
-            stdout=full,
-            stderr=subprocess.PIPE,
-            text=True,
-            check=False,
-        )
+def test_a_full_stdout_is_one_line(arguments: str, demo_raw: Path, shell: Shell) -> None:
+    done = shell(f"{EVLCP} {arguments.format(demo=demo_raw)} > /dev/full")
     assert done.stderr == "evlcp: standard output: No space left on device\n"
     assert done.returncode == 1
 
 
-def test_a_reader_who_leaves_is_no_fault(environment: dict[str, str]) -> None:
-    command = f"{sys.executable} -c '{MAIN}' plugins --json | true; exit ${{PIPESTATUS[0]}}"
-    done = subprocess.run(
-        ["bash", "-c", command], env=environment, capture_output=True, text=True, check=False
-    )
+def test_a_reader_who_leaves_is_no_fault(shell: Shell) -> None:
+    done = shell(f"{EVLCP} plugins --json | true; exit ${{PIPESTATUS[0]}}")
     assert done.stderr == ""
     assert done.returncode in (0, 1)
 
 
-def test_a_reader_of_lines_who_leaves_ends_the_run(demo_raw: Path, environment: dict[str, str]) -> None:
+def test_a_reader_of_lines_who_leaves_ends_the_run(demo_raw: Path, shell: Shell) -> None:
     """What comes in by a pipe goes out by another, whose reader takes one line."""
-    command = f"cat {demo_raw} | {sys.executable} -c '{MAIN}' receive - --json-lines - | head -n 1"
-    done = subprocess.run(
-        ["bash", "-c", f"{command}; exit ${{PIPESTATUS[1]}}"],
-        env=environment,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
+    done = shell(f"cat {demo_raw} | {EVLCP} receive - --json-lines - | head -n 1; exit ${{PIPESTATUS[1]}}")
     assert (done.returncode, done.stderr) == (0, "")
     assert json.loads(done.stdout)["line"] == "frame"
 
@@ -100,14 +87,8 @@ def test_the_entry_point_can_be_interrupted_from_the_start() -> None:
     """What it imports before it can catch an interrupt is next to nothing."""
     code = "import sys; import evlcp_sdk.cli.main; print(*sys.modules)"
     said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
-    assert {name for name in said.split() if name.startswith("evlcp")} == {
-        *(
-            "evlcp_sdk",
-            "evlcp_sdk.cli",
-            "evlcp_sdk.cli.main",
-            "evlcp_sdk.cli._complain",
-            "evlcp_sdk.printable",
-        ),
+    assert {name.removeprefix("evlcp_sdk") for name in said.split() if name.startswith("evlcp")} == {
+        *("", ".cli", ".cli.main", ".cli._complain", ".printable")
     }
     assert not {"typer", "rich", "typing", "pathlib", "logging"} & set(said.split())
 
