@@ -8,30 +8,25 @@ import pytest
 
 from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.scene.attitude import AttitudeLog
-from evlcp_sdk.scene.sites import LocalAxes
+from evlcp_sdk.scene.sites import BarSite, LocalAxes
 from evlcp_sdk.sim import Simulation, load_scene, resolve_scene, sites_of, truth_of
 from evlcp_sdk.sim.leds import lit_strips
 from evlcp_sdk.sim.motion import CameraPath, project
 from evlcp_sdk.sim.world import attitude_log, scene_to_enu, sites_said
 
 WORLD = {"latitude_deg": 35.1, "longitude_deg": 137.2, "height_m": 40.0, "heading_deg": 30.0}
-SCENE = resolve_scene(
-    {
-        "duration_s": 0.02,
-        "world": WORLD,
-        "motion": {"distance_m": 50.0, "yaw_deg": 2.0, "pitch_deg": -1.0, "roll_deg": 4.0},
-        "bars": [
-            {"x_m": -2.0, "y_m": -0.5, "lean_deg": 10.0},
-            {"x_m": 2.5, "z_m": 6.0, "tilt_deg": 20.0, "transmitter_id": 77},
-            {"x_m": 0.5, "y_m": -2.0, "z_m": 3.0},
-        ],
-    }
-)
+MOTION = {"distance_m": 50.0, "yaw_deg": 2.0, "pitch_deg": -1.0, "roll_deg": 4.0}
+BARS = [
+    {"x_m": -2.0, "y_m": -0.5, "lean_deg": 10.0},
+    {"x_m": 2.5, "z_m": 6.0, "tilt_deg": 20.0, "transmitter_id": 77},
+    {"x_m": 0.5, "y_m": -2.0, "z_m": 3.0},
+]
+SCENE = resolve_scene({"duration_s": 0.02, "world": WORLD, "motion": MOTION, "bars": BARS})
 
 
-def turned(heading_deg: float, pitch_deg: float, roll_deg: float) -> np.ndarray:
+def turned(*degrees: float) -> np.ndarray:
     """Rows: the camera's right, down and ahead in east, north, up, from the attitude's definition."""
-    h, p, r = np.radians([heading_deg, pitch_deg, roll_deg])
+    h, p, r = np.radians(degrees)
     ahead = np.array([np.sin(h) * np.cos(p), np.cos(h) * np.cos(p), np.sin(p)])
     level = np.array([np.cos(h), -np.sin(h), 0.0])
     above = np.cross(level, ahead)
@@ -47,9 +42,8 @@ def test_sites_and_camera_say_what_the_image_shows() -> None:
     assert [s.transmitter_id for s in sites] == [1, 77, 3]
     camera = SCENE.camera
     for i in (0, 19):
-        here = tuple(path[key][i] for key in ("latitude_deg", "longitude_deg", "height_m"))
-        axes = turned(path["heading_deg"][i], path["pitch_deg"][i], path["roll_deg"][i])
-        local = LocalAxes(*here)
+        local = LocalAxes(*(path[key][i] for key in ("latitude_deg", "longitude_deg", "height_m")))
+        axes = turned(*(path[key][i] for key in ("heading_deg", "pitch_deg", "roll_deg")))
         position, attitude = simulation.path.at(truth["t_s"][i] * 1e6)
         for site, light in zip(sites, simulation.bars, strict=True):
             seen = camera.project(site.cluster_positions_m(16, local) @ axes.T)
@@ -117,22 +111,23 @@ def test_what_is_said_of_sites_is_wrong_as_told() -> None:
     assert [s.transmitter_id for s in said] == [1, 77, 3]
     assert replace(said[0], transmitter_id=77) == true[1]
     assert said[2] == true[2]
-    here = true[0].latitude_deg, true[0].longitude_deg, true[0].height_m
-    off = pymap3d.geodetic2enu(said[1].latitude_deg, said[1].longitude_deg, said[1].height_m, *here)
-    np.testing.assert_allclose(off, [0.3, -0.4, 1.2], atol=1e-5)
+    np.testing.assert_allclose(off_m(said[1], true[0]), [0.3, -0.4, 1.2], atol=1e-5)
     with pytest.raises(ConfigError, match=r"bars\.2\.site_of = 3: expected one of 3 bars"):
         sites_said(replace(wrong, bars=(one, two, replace(three, site_of=3))), 5)
+
+
+def off_m(said: BarSite, true: BarSite) -> tuple[float, float, float]:
+    """Where a site is said to be of where it is: east, north and up, m."""
+    here, there = ((s.latitude_deg, s.longitude_deg, s.height_m) for s in (said, true))
+    return pymap3d.geodetic2enu(*here, *there)
 
 
 def test_a_survey_errs_by_what_it_says() -> None:
     assert SCENE.world is not None
     scene = replace(SCENE, world=replace(SCENE.world, survey_sigma_m=0.2))
-    true, errors = sites_of(scene), []
-    for seed in range(100):
-        for site, said in zip(true, sites_said(scene, seed), strict=True):
-            assert said.position_sigma_m == 0.2
-            here = site.latitude_deg, site.longitude_deg, site.height_m
-            errors.append(pymap3d.geodetic2enu(said.latitude_deg, said.longitude_deg, said.height_m, *here))
+    surveys = [sites_said(scene, seed) for seed in range(100)]
+    assert {site.position_sigma_m for survey in surveys for site in survey} == {0.2}
+    errors = [off_m(*both) for survey in surveys for both in zip(survey, sites_of(scene), strict=True)]
     # 300 draws: the spread is known to 4 %.
     np.testing.assert_allclose(np.std(errors, 0), 0.2, rtol=0.16)
 
@@ -148,11 +143,8 @@ def test_what_is_said_of_the_attitude_is_wrong_as_told() -> None:
         return log
 
     right, off = said(), said(attitude_off_deg=(1.0, -2.0, 3.0))
-    np.testing.assert_allclose(off.pitch_deg - right.pitch_deg, 1.0)
-    np.testing.assert_allclose(off.roll_deg - right.roll_deg, -2.0)
-    assert off.heading_deg is not None
-    assert right.heading_deg is not None
-    np.testing.assert_allclose(off.heading_deg - right.heading_deg, 3.0)
+    for name, off_deg in (("pitch_deg", 1.0), ("roll_deg", -2.0), ("heading_deg", 3.0)):
+        np.testing.assert_allclose(getattr(off, name) - getattr(right, name), off_deg)
     late = said(attitude_late_ms=10.0)
     np.testing.assert_allclose(late.pitch_deg[10:], right.pitch_deg[:-10])
     assert np.ptp(right.pitch_deg) > 0.01
