@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from evlcp_sdk.errors import ConfigError
 from evlcp_sdk.io import read_events
 from evlcp_sdk.scene.camera import CameraModel
 from evlcp_sdk.sim import (
@@ -18,7 +17,6 @@ from evlcp_sdk.sim import (
     Scene,
     Simulation,
     load_scene,
-    resolve_scene,
     simulation,
     truth_of,
 )
@@ -104,19 +102,3 @@ def test_statistics_are_near_those_of_the_independent_recording(name: str) -> No
     rate = [len(e) / (e.t_us[-1] - e.t_us[0]) for e in (ours, theirs)]
     assert rate[0] == pytest.approx(rate[1], rel=0.15)
     assert abs(float(ours.p.mean()) - float(theirs.p.mean())) < 0.05
-
-
-def test_a_truth_gives_its_scene_again() -> None:
-    found = json.loads(json.dumps(truth_of(SHORT).to_table()))
-    assert resolve_scene(found["simulator"]) == SHORT
-    # Without its own record, all that the shared keys tell.
-    again = scene_of_truth(found)
-    assert [b.x_m for b in again.bars] == [b.x_m for b in SHORT.bars]
-    assert truth_of(again).to_table()["bars"][0]["symbols"] == found["bars"][0]["symbols"]
-    assert truth_of(again).to_table()["bars"][1]["start_chip"] == found["bars"][1]["start_chip"]
-    assert again.sensor == replace(SHORT.sensor, hot_share=found["scene"]["hot_pixels"] / (1280 * 720))
-    found["scene"]["hpf_us"] = 3.0
-    with pytest.raises(ConfigError, match="high-pass"):
-        scene_of_truth(found)
-    with pytest.raises(ConfigError, match="not a scene's truth"):
-        scene_of_truth({"scene": {}})
