@@ -97,6 +97,10 @@ class Server(ABC):
     async def _tell_all(self) -> None:
         """Send what comes until it has ended."""
 
+    @abstractmethod
+    def _abort(self) -> None:
+        """Close connections that nothing else closes when the loop ends."""
+
     async def start(self) -> "asyncio.Task[None]":
         """Listen; the task that is done when clients have had the last words.
 
@@ -124,6 +128,7 @@ class Server(ABC):
                     asyncio.get_running_loop().remove_reader(one.fileno())
                 for _ in range(5):
                     await asyncio.sleep(0)
+                self._abort()
                 listening.close()
 
         return asyncio.create_task(serve())

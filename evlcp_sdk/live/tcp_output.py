@@ -70,6 +70,9 @@ class TcpOutput(Server):
             for news in self._mine.take(0):
                 self._tell(news)
 
+    def _abort(self) -> None:
+        return
+
     def _tell(self, news: News) -> None:
         if self._zero is None:
             self._zero = datetime.now(UTC) - timedelta(microseconds=news.t_us)

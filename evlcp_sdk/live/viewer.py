@@ -19,6 +19,7 @@ from importlib.resources import files
 from ipaddress import ip_address
 from typing import TYPE_CHECKING, Any, Final
 from urllib.parse import urlsplit
+from weakref import WeakSet
 
 from markupsafe import Markup
 
@@ -114,6 +115,7 @@ class Viewer(Server):
         self._name, self._links, self._sites = name, links, len(sites)
         self._token = secrets.token_urlsafe(16)
         self._browsers: set[_Browser] = set()
+        self._opened: WeakSet[ServerConnection] = WeakSet()
         self._kept = {kind: deque[str](maxlen=most) for kind, most in _KEPT.items()}
         self._page = ""
 
@@ -124,10 +126,23 @@ class Viewer(Server):
         return f"http://{host}:{self.port}/{self._token}/"
 
     async def _listen(self) -> Any:
-        serve = import_extra("websockets.asyncio.server", "live").serve
+        websockets = import_extra("websockets.asyncio.server", "live")
+
+        def opened(*given: Any, **options: Any) -> "ServerConnection":
+            connection: ServerConnection = websockets.ServerConnection(*given, **options)
+            self._opened.add(connection)
+            return connection
+
         self._page = page(self._name)
-        given = {"process_request": self._answer, "compression": None, "max_size": _MOST_SAID}
-        return await serve(self._serve, self._host, self.port, server_header=None, **given)
+        given = {"compression": None, "max_size": _MOST_SAID, "server_header": None}
+        asked = {"process_request": self._answer, "create_connection": opened}
+        return await websockets.serve(self._serve, self._host, self.port, **given, **asked)
+
+    def _abort(self) -> None:
+        # A browser opens connections that it may need: their handshake, cancelled, would leave them open.
+        for connection in self._opened:
+            if connection.request is None:
+                connection.transport.abort()
 
     async def _tell_all(self) -> None:
         loop, turn_s = asyncio.get_running_loop(), 0.0
