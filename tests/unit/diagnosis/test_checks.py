@@ -173,10 +173,9 @@ def test_what_is_said_of_a_recording(verdict: str, given: dict[str, Any], said: 
 
 
 def test_bars_that_say_the_same_are_doubted_where_it_matters_which_is_which() -> None:
+    counts = {"events": 50_000, "frames_alike": 40}
     for positions, verdict in ({}, "note"), (NO_POSITIONS | {"fixes": 5}, "doubt"):
-        found = find(
-            Facts(LINK, NOTHING, {"events": 50_000, "frames_alike": 40}, positions=positions), verdict
-        )
+        found = find(Facts(LINK, NOTHING, counts, positions=positions), verdict)
         assert [one.code for one in found].count("same-symbols") == 1
 
 
@@ -264,10 +263,8 @@ def test_light_without_frames(start_us: float, lit_us: tuple[float, float] | Non
     assert says is None or found[0].text == says
     # Where nothing is received is said in any case, but a road without bars is nothing wrong.
     (note,) = find(facts, "note")
-    first_ms = round((start_us - 5e3) / 1e3)
-    assert note.text == (
-        f"frames in 208 ms of 1000 ms: nothing before {first_ms} ms, nothing after {first_ms + 202} ms"
-    )
+    ms = round((start_us - 5e3) / 1e3)
+    assert note.text == f"frames in 208 ms of 1000 ms: nothing before {ms} ms, nothing after {ms + 202} ms"
     assert find(replace(facts, last_us=3e5), "note") == []
     # A reflection may be lit without a frame.
     mirrored = tally_of(RANDOM, every_us=3200.0, start_us=start_us, echo_of=3)

@@ -140,9 +140,7 @@ def test_angles_that_are_all_wrong_are_not_the_principal_point() -> None:
         seen.append(CalibrationView(tuple(bars), place, 0.01, Attitude(4.0, 0.0, 0.0).rotation(), 0.1))
     assert calibrate(seen, camera).camera.focal_mm == pytest.approx(35.0, abs=0.2)
     level = Attitude(0.07, 0.0, 0.0).rotation()
-    with pytest.raises(
-        ConfigError, match=r"centre_y_px = [\d.-]+ would fit the views, 360 is configured and 26 "
-    ):
+    with pytest.raises(ConfigError, match=r"centre_y_px = [\d.-]+ would fit .*, 360 is configured and 26 "):
         calibrate([dataclasses.replace(view, rotation=level) for view in seen], camera)
 
 

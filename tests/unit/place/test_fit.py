@@ -126,7 +126,7 @@ def test_equations_are_those_of_numerical_slopes() -> None:
     scale = np.sqrt(np.diag(slope.T @ slope))
     # The roll is about the level forward axis, not the pitched one.
     np.testing.assert_allclose(
-        matrix / np.outer(scale, scale), slope.T @ slope / np.outer(scale, scale), atol=1e-3
+        matrix / scale / scale[:, None], (slope / scale).T @ (slope / scale), atol=1e-3
     )
     np.testing.assert_allclose(side / scale, slope.T @ at_rest / scale, atol=2e-3)
     # Without the bars' own, the step is that of all.
@@ -209,9 +209,8 @@ def test_a_mean_shift_test_is_the_larger_fit(bound: float) -> None:
     seen = rng.normal(size=40) + wrong @ [1.0, -2.0, 0.5]
     spread = np.linalg.inv(rows.T @ rows)
     left = seen - rows @ (spread @ (rows.T @ seen))
-    value, freedom, added, unseen = _test(
-        wrong.T @ wrong, rows.T @ wrong, wrong.T @ left, spread, bound * np.eye(3)
-    )
+    fault = wrong.T @ wrong, rows.T @ wrong, wrong.T @ left
+    value, freedom, added, unseen = _test(*fault, spread, bound * np.eye(3))
     both = np.concatenate([rows, wrong], 1)
     better = seen - both @ np.linalg.lstsq(both, seen, rcond=None)[0]
     assert freedom == 3
@@ -356,7 +355,6 @@ def test_what_points_share_grows_with_the_whole_layout(layout, length_m, dark) -
     spec = ErrorModel(shared_along_px=0.05, shared_share=0.002, stretch_share=0.003)
     view = BarView(0, enu_m, points, np.full(len(enu_m), 0.1), (0.1, 0.2, 0.004))
     found = shared_errors(view, seen, spec, 1.0)
-    assert np.linalg.eigvalsh(found.root)[-1] == pytest.approx(
-        math.hypot(0.05, 0.002 * 250 * length_m), rel=1e-9
-    )
+    longest = math.hypot(0.05, 0.002 * 250 * length_m)
+    assert np.linalg.eigvalsh(found.root)[-1] == pytest.approx(longest, rel=1e-9)
     assert found.survey == pytest.approx([0.1, 0.2, 0.005])

@@ -183,7 +183,7 @@ def test_a_gap_beside_a_fix_is_known_by_how_far_a_polynomial_may_be_off() -> Non
 BENT = CameraModel(focal_mm=8.0, k1=-0.2, k2=0.05, p1=1e-3, p2=-1e-3, centre_x_px=650.0, centre_y_px=350.0)
 LENS = CameraSigma(0.04, 2.0, 2.0, 0.01, 0.01, 1e-4, 1e-4)
 STRETCHED = ErrorModel(
-    shaken_sigma_px=0.1, shared_sigma_px=0.17320508, shared_share=0.002, stretch_share=0.004
+    shaken_sigma_px=0.1, shared_sigma_px=0.03**0.5, shared_share=0.002, stretch_share=0.004
 )
 SOFT = SoftSymbols(np.zeros(16, np.int64), np.zeros((16, 6), np.float32), 1.0)
 
@@ -224,9 +224,8 @@ def test_every_error_is_in_its_covariance() -> None:
     for _ in range(400):
         root = LENS.root(BENT)
         off = root @ rng.normal(size=7)
-        values = {
-            name: getattr(BENT, name) + v for name, v in zip(CAMERA_PARAMETERS[1:], off[1:], strict=True)
-        }
+        names = CAMERA_PARAMETERS[1:]
+        values = {name: getattr(BENT, name) + v for name, v in zip(names, off[1:], strict=True)}
         lens = replace(BENT, focal_mm=BENT.focal_mm * (1 + off[0] / BENT.focal_px), **values)
         shift = math.hypot(0.2, 0.002 * BENT.focal_px * 0.96 / 25)
         x, y = lens.project(true) + rng.normal(0, shift, 2)

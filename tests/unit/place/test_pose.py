@@ -70,9 +70,8 @@ def drawn(
         # A bias of each angle, an offset in time that moves all of them, and noise.
         off = np.degrees(known.standing()) @ rng.normal(size=4) + rng.normal(0, known.white_sigma_deg, 3)
         heading = None if known.heading_deg is None else known.heading_deg + off[2]
-        told = replace(
-            known, pitch_deg=known.pitch_deg + off[0], roll_deg=known.roll_deg + off[1], heading_deg=heading
-        )
+        pitch, roll = known.pitch_deg + off[0], known.roll_deg + off[1]
+        told = replace(known, pitch_deg=pitch, roll_deg=roll, heading_deg=heading)
     return seen, told, CameraSigma(focal_mm=focal * CAMERA.focal_mm)
 
 

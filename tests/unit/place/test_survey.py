@@ -75,9 +75,7 @@ def test_bars_come_back_within_their_sigmas() -> None:
             wide.append(bar.site.position_sigma_m)
             assert bar.views == 7
             assert bar.site.length_m == 0.96
-            assert np.linalg.eigvalsh(bar.covariance_m2)[-1] == pytest.approx(
-                (bar.site.position_sigma_m or 0) ** 2
-            )
+            assert np.linalg.eigvalsh(bar.covariance_m2)[-1] == pytest.approx(bar.site.position_sigma_m**2)
             off = math.degrees(math.acos(min(bar.site.axis_enu() @ true.axis_enu(), 1)))
             assert off < 4 * bar.site.attitude_sigma_deg
     # The two bars of a survey share its errors: the bounds are those of the surveys.
@@ -160,9 +158,8 @@ def poses_of(stream: list[Packet], plan: PositionPlan, told: Attitude) -> list[K
 def own_poses(rng: np.random.Generator, stream: list[Packet]) -> list[KnownPose]:
     bias = BIAS_DEG * rng.normal(size=3)
     told = Attitude(2.0 + bias[0], 0.5 + bias[1], 3.0 + bias[2], BIAS_DEG, BIAS_DEG)
-    return poses_of(
-        stream, PositionPlan(tuple(site_of(n, SITE_M * rng.normal(size=3)) for n in (0, 1))), told
-    )
+    sites = tuple(site_of(n, SITE_M * rng.normal(size=3)) for n in (0, 1))
+    return poses_of(stream, PositionPlan(sites), told)
 
 
 def test_a_new_bar_is_surveyed_within_its_sigmas() -> None:

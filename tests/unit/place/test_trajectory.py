@@ -104,11 +104,8 @@ def dense(fixes: list[Fix], names: list[str]) -> tuple[Floats, Floats, Floats]:
             power = SPEC.acceleration_m2_s3 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
             add(block(6, (9 * i, np.eye(6)), (9 * i - 9, -step)), np.zeros(6), np.kron(power, np.eye(3)))
             fade = np.exp(-dt / SPEC.slow_s)
-            add(
-                block(3, (9 * i + 6, np.eye(3)), (9 * i - 3, -fade * np.eye(3))),
-                np.zeros(3),
-                (1 - fade**2) * np.eye(3),
-            )
+            row = block(3, (9 * i + 6, np.eye(3)), (9 * i - 3, -fade * np.eye(3)))
+            add(row, np.zeros(3), (1 - fade**2) * np.eye(3))
     a, b = np.concatenate(rows), np.concatenate(right)
     covariance = np.linalg.inv(a.T @ a)
     mean = covariance @ (a.T @ b)
@@ -386,9 +383,7 @@ def drive(rng: np.random.Generator) -> tuple[list[Fix], dict[tuple[str, str], fl
         turned = Attitude(*angles_deg(t)).rotation()
         measured = angles_deg(t + late_s) - [truth["attitude", name] for name in names]
         rate = (angles_deg(t + 1e-3) - angles_deg(t - 1e-3)) / 2e-3
-        attitude = Attitude(
-            *measured, BIAS_DEG, BIAS_DEG, time_sigma_us=TIME_US, rate_deg_s=tuple(rate.tolist())
-        )
+        attitude = Attitude(*measured, BIAS_DEG, BIAS_DEG, time_sigma_us=TIME_US, rate_deg_s=tuple(rate))
         views = []
         for b in range(8):
             centre = np.array([(-1) ** b * 4.0, 60 + 25.0 * b, 0.5 * (b % 3)])

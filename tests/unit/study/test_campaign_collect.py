@@ -83,9 +83,8 @@ def test_a_job_that_fails_does_not_stop_the_others(tmp_path: Path, executor: Exe
     messages = {job.scene["n"]: fault.message for job, fault in progress.faults}
     assert messages.keys() == {1, 3}
     assert messages[1] == "this scene cannot be rendered"
-    assert messages[3].startswith(
-        "a fault of evlcp itself, not of what you gave: ValueError: a fault in a plugin"
-    )
+    fault = "a fault of evlcp itself, not of what you gave: ValueError: a fault in a plugin"
+    assert messages[3].startswith(fault)
     assert len(messages[3].splitlines()) == 1
     assert progress.done == 24
     assert [t.tasks for t in totals] == [4, 4, 0, 0, 4, 4, 0, 0, 4, 4]
@@ -233,6 +232,7 @@ def test_workers_may_die_and_come(cluster: Cluster, tmp_path: Path) -> None:
 
 
 def test_a_scheduler_that_dies_keeps_what_was_finished(cluster: Cluster, tmp_path: Path) -> None:
+    plan = fake_plan(25, 2, 4, seconds=0.02)
     cluster.add_worker()
 
     def watch(progress: Progress) -> None:
@@ -240,9 +240,7 @@ def test_a_scheduler_that_dies_keeps_what_was_finished(cluster: Cluster, tmp_pat
             cluster.processes[0].kill()
 
     with pytest.raises(EvlcpError, match="scheduler is gone; what was finished is kept") as told:
-        collected(
-            fake_plan(25, 2, 4, seconds=0.02), tmp_path / "a.sqlite", DaskCluster(cluster.address), watch
-        )
+        collected(plan, tmp_path / "a.sqlite", DaskCluster(cluster.address), watch)
     assert len(str(told.value).splitlines()) == 1
     assert kept(tmp_path / "a.sqlite") >= 40
 

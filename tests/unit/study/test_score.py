@@ -169,9 +169,8 @@ def test_other_links_are_scored_as_plain_loops_score_them(name: str, tmp_path: P
                 figures |= {"nees": np.mean(by_hand["nees"])}
                 figures |= {"erased": by_hand["erased"] / by_hand["visible"]}
                 figures |= {"claimed": by_hand["claimed"] / by_hand["hidden"]}
-            assert {key: bar[key] for key in figures} == {
-                k: round(float(v), DIGITS[k]) for k, v in figures.items()
-            }
+            wanted = {k: round(float(v), DIGITS[k]) for k, v in figures.items()}
+            assert {key: bar[key] for key in figures} == wanted
     # What compare and sweep count is the road score, added up over the bars.
     counted, by_hand = statistics_of(frames, known, packets=4), score(rows, truth, lengths, road=True)
     total = counted.total()

@@ -114,10 +114,8 @@ def test_intervals_of_bursts_cover(recordings: int) -> None:
     assert 0.89 <= np.mean(inside) <= 0.98
     # Errors taken as independent say far too much.
     total = recordings * BITS
-    naive = [
-        low <= 0.01 <= high for low, high in (binomtest(int(k), total).proportion_ci() for k in errors.sum(1))
-    ]
-    assert np.mean(naive) < 0.35
+    naive = [binomtest(int(k), total).proportion_ci() for k in errors.sum(1)]
+    assert np.mean([low <= 0.01 <= high for low, high in naive]) < 0.35
 
 
 def test_the_interval_of_a_root_mean_square_is_the_root_of_the_ratios() -> None:
